@@ -1,0 +1,1 @@
+"""The only door to the log: live data goes in, episodes come out."""

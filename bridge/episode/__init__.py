@@ -1,0 +1,1 @@
+"""What one recording is: schema, reader, writer, check, provenance, catalogue."""

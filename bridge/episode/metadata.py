@@ -1,0 +1,87 @@
+"""Metadata records of an episode: who, what, how it ended, and where a derived one came from.
+
+MCAP metadata maps strings to strings; every value here is stored as JSON text so that types
+survive the round trip.
+"""
+
+import json
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+SCHEMA_VERSION = 1
+KINDS = ("scan", "trial", "probe", "imported")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeInfo:
+    """The ``episode`` metadata record."""
+
+    id: str
+    kind: str
+    """One of scan, trial, probe, imported."""
+    task: str = ""
+    instruction: str = ""
+    condition: str = ""
+    """without_replanning or with_replanning."""
+    policy: str = ""
+    trial: int | None = None
+    start_id: str | None = None
+    start_seed: int | None = None
+    operator: str = ""
+    robot: str = ""
+    cell: str = ""
+    stand_in: bool = False
+    tags: tuple[str, ...] = ()
+    schema_version: int = SCHEMA_VERSION
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """The ``outcome`` metadata record: what the operator says happened."""
+
+    result: str
+    """success, failure or unknown."""
+    unit: str = "trial"
+    k: int = 0
+    n: int = 1
+    by: str = "operator"
+    detail: str | None = None
+    stages: tuple[dict[str, str], ...] = ()
+    schema_version: int = SCHEMA_VERSION
+
+
+@dataclass(frozen=True, kw_only=True)
+class Derived:
+    """The ``derived`` metadata record: what the twin made this episode from."""
+
+    kind: str
+    """replay, localised or views."""
+    source_episode: str
+    source_sha256: str
+    plan_id: str | None = None
+    trajectory: str | None = None
+    """planned or executed."""
+    mode: str | None = None
+    """kinematic or dynamic."""
+    scene_hash: str | None = None
+    engine: str | None = None
+    seed: int | None = None
+    calibration_id: str | None = None
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+def to_strings(record: object) -> dict[str, str]:
+    """Turn one of the records above into an MCAP metadata map."""
+    values = asdict(record)  # type: ignore[call-overload]
+    return {name: json.dumps(value) for name, value in values.items()}
+
+
+def from_strings(values: dict[str, str]) -> dict[str, Any]:
+    """Read an MCAP metadata map; plain text that is not JSON is kept as it is."""
+    record = {}
+    for name, text in values.items():
+        try:
+            record[name] = json.loads(text)
+        except ValueError:
+            record[name] = text
+    return record

@@ -1,0 +1,294 @@
+"""Typed records over the ROS 2 messages an episode holds, with their CDR form.
+
+``stamp_ns`` is the source time (``header.stamp``). Camera intrinsics follow ``Camera`` (pixel
+centres at +0.5) in memory and ROS (centres at whole numbers) on disk.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt16
+
+from bridge.clock import join_ns, split_ns
+from bridge.episode import cdr, schema
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+
+
+def _header(stamp_ns: int, frame_id: str) -> dict[str, object]:
+    sec, nanosec = split_ns(stamp_ns)
+    return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
+
+
+def stamp_of(message: cdr.Message) -> int:
+    """Return ``header.stamp`` of a decoded message [ns]."""
+    stamp = message["header"]["stamp"]
+    return join_ns(stamp["sec"], stamp["nanosec"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointSample:
+    """Joint positions, and velocities and efforts where known [rad, m; per second; Nm, N]."""
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    position: Float[np.ndarray, " num_joints"]
+    velocity: Float[np.ndarray, " num_velocities"]
+    effort: Float[np.ndarray, " num_efforts"]
+
+    def to_cdr(self) -> bytes:
+        """Serialise as sensor_msgs/JointState."""
+        message = {
+            "header": _header(self.stamp_ns, ""),
+            "name": list(self.names),
+            "position": self.position,
+            "velocity": self.velocity,
+            "effort": self.effort,
+        }
+        return cdr.encode(schema.JOINT_STATE, message)
+
+    @staticmethod
+    def from_cdr(data: bytes) -> "JointSample":
+        """Read a sensor_msgs/JointState."""
+        message = cdr.decode(schema.JOINT_STATE, data)
+        return JointSample(
+            stamp_ns=stamp_of(message),
+            names=tuple(message["name"]),
+            position=np.asarray(message["position"]),
+            velocity=np.asarray(message["velocity"]),
+            effort=np.asarray(message["effort"]),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompressedColor:
+    """A JPEG or PNG colour image as it travels."""
+
+    stamp_ns: int
+    frame_id: str
+    format: str
+    data: bytes
+
+    def to_cdr(self) -> bytes:
+        """Serialise as sensor_msgs/CompressedImage."""
+        message = {
+            "header": _header(self.stamp_ns, self.frame_id),
+            "format": self.format,
+            "data": self.data,
+        }
+        return cdr.encode(schema.COMPRESSED_IMAGE, message)
+
+    @staticmethod
+    def from_cdr(data: bytes) -> "CompressedColor":
+        """Read a sensor_msgs/CompressedImage."""
+        message = cdr.decode(schema.COMPRESSED_IMAGE, data)
+        return CompressedColor(
+            stamp_ns=stamp_of(message),
+            frame_id=message["header"]["frame_id"],
+            format=message["format"],
+            data=message["data"],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthImage:
+    """Depth along the optical axis in whole millimetres; 0 is "no measurement"."""
+
+    stamp_ns: int
+    frame_id: str
+    depth_mm: UInt16[np.ndarray, "height width"]
+
+    def to_cdr(self) -> bytes:
+        """Serialise as sensor_msgs/Image with encoding 16UC1."""
+        height, width = self.depth_mm.shape
+        message = {
+            "header": _header(self.stamp_ns, self.frame_id),
+            "height": height,
+            "width": width,
+            "encoding": "16UC1",
+            "is_bigendian": 0,
+            "step": 2 * width,
+            "data": self.depth_mm.astype("<u2").tobytes(),
+        }
+        return cdr.encode(schema.IMAGE, message)
+
+    @staticmethod
+    def from_cdr(data: bytes) -> "DepthImage":
+        """Read a sensor_msgs/Image; refuses other encodings and sizes that do not match."""
+        message = cdr.decode(schema.IMAGE, data)
+        height, width = message["height"], message["width"]
+        if message["encoding"] not in ("16UC1", "mono16"):
+            raise cdr.MalformedMessageError(
+                type_name=schema.IMAGE, found=f"encoding {message['encoding']!r}, expected '16UC1'"
+            )
+        if len(message["data"]) != 2 * height * width:
+            raise cdr.MalformedMessageError(
+                type_name=schema.IMAGE,
+                found=f"{len(message['data'])} bytes for {width} x {height} 16-bit pixels",
+            )
+        order = ">u2" if message["is_bigendian"] else "<u2"
+        depth_mm = np.frombuffer(message["data"], dtype=order).reshape(height, width)
+        return DepthImage(
+            stamp_ns=stamp_of(message),
+            frame_id=message["header"]["frame_id"],
+            depth_mm=depth_mm.astype(np.uint16, copy=False),
+        )
+
+    def depth_m(self) -> Float[np.ndarray, "height width"]:
+        """Depth in metres, 0 where there is no measurement."""
+        return self.depth_mm.astype(np.float32) * np.float32(1e-3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraInfo:
+    """Intrinsics of one image stream and the frame its images are taken in."""
+
+    stamp_ns: int
+    frame_id: str
+    camera: Camera
+
+    def to_cdr(self) -> bytes:
+        """Serialise as sensor_msgs/CameraInfo without distortion."""
+        fx, fy, cx, cy = self.camera.to_ros()
+        message = {
+            "header": _header(self.stamp_ns, self.frame_id),
+            "height": self.camera.height,
+            "width": self.camera.width,
+            "distortion_model": "plumb_bob",
+            "d": [0.0] * 5,
+            "k": [fx, 0, cx, 0, fy, cy, 0, 0, 1],
+            "r": [1, 0, 0, 0, 1, 0, 0, 0, 1],
+            "p": [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0],
+        }
+        return cdr.encode(schema.CAMERA_INFO, message)
+
+    @staticmethod
+    def from_cdr(data: bytes) -> "CameraInfo":
+        """Read a sensor_msgs/CameraInfo; refuses lens distortion instead of ignoring it."""
+        message = cdr.decode(schema.CAMERA_INFO, data)
+        if np.any(np.asarray(message["d"]) != 0):
+            raise cdr.MalformedMessageError(
+                type_name=schema.CAMERA_INFO,
+                found="lens distortion is not zero; publish rectified images",
+            )
+        k = message["k"]
+        camera = Camera.from_ros(
+            width=message["width"],
+            height=message["height"],
+            fx=float(k[0]),
+            fy=float(k[4]),
+            cx=float(k[2]),
+            cy=float(k[5]),
+        )
+        return CameraInfo(
+            stamp_ns=stamp_of(message), frame_id=message["header"]["frame_id"], camera=camera
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameTransform:
+    """``T_parent_child`` at one instant."""
+
+    stamp_ns: int
+    parent: str
+    child: str
+    T_parent_child: Float[np.ndarray, "4 4"]
+
+
+def _pose_fields(
+    T: Float[np.ndarray, "4 4"], position: str, rotation: str
+) -> dict[str, dict[str, float]]:
+    q, p = se3.split(T)
+    return {
+        position: dict(zip("xyz", map(float, p), strict=True)),
+        rotation: dict(zip("wxyz", map(float, q), strict=True)),
+    }
+
+
+def _transform_of(
+    position: dict[str, float], rotation: dict[str, float]
+) -> Float[np.ndarray, "4 4"]:
+    q = np.array([rotation[axis] for axis in "wxyz"])
+    return se3.transform_from(q, np.array([position[axis] for axis in "xyz"]))
+
+
+def transforms_to_cdr(transforms: list[FrameTransform]) -> bytes:
+    """Serialise as tf2_msgs/TFMessage."""
+    items = [
+        {
+            "header": _header(item.stamp_ns, item.parent),
+            "child_frame_id": item.child,
+            "transform": _pose_fields(item.T_parent_child, "translation", "rotation"),
+        }
+        for item in transforms
+    ]
+    return cdr.encode(schema.TF_MESSAGE, {"transforms": items})
+
+
+def transforms_from_cdr(data: bytes) -> list[FrameTransform]:
+    """Read a tf2_msgs/TFMessage."""
+    return [
+        FrameTransform(
+            stamp_ns=stamp_of(item),
+            parent=item["header"]["frame_id"],
+            child=item["child_frame_id"],
+            T_parent_child=_transform_of(
+                item["transform"]["translation"], item["transform"]["rotation"]
+            ),
+        )
+        for item in cdr.decode(schema.TF_MESSAGE, data)["transforms"]
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseSample:
+    """Pose ``T_frame_body`` of one body at one instant (geometry_msgs/PoseStamped)."""
+
+    stamp_ns: int
+    frame_id: str
+    T_frame_body: Float[np.ndarray, "4 4"]
+
+    def to_cdr(self) -> bytes:
+        """Serialise as geometry_msgs/PoseStamped."""
+        message = {
+            "header": _header(self.stamp_ns, self.frame_id),
+            "pose": _pose_fields(self.T_frame_body, "position", "orientation"),
+        }
+        return cdr.encode(schema.POSE_STAMPED, message)
+
+    @staticmethod
+    def from_cdr(data: bytes) -> "PoseSample":
+        """Read a geometry_msgs/PoseStamped."""
+        message = cdr.decode(schema.POSE_STAMPED, data)
+        pose = message["pose"]
+        return PoseSample(
+            stamp_ns=stamp_of(message),
+            frame_id=message["header"]["frame_id"],
+            T_frame_body=_transform_of(pose["position"], pose["orientation"]),
+        )
+
+
+def string_to_cdr(text: str) -> bytes:
+    """Serialise as std_msgs/String."""
+    return cdr.encode(schema.STRING, {"data": text})
+
+
+def string_from_cdr(data: bytes) -> str:
+    """Read a std_msgs/String."""
+    return str(cdr.decode(schema.STRING, data)["data"])
+
+
+def joint_trajectory_to_cdr(
+    *,
+    stamp_ns: int,
+    names: tuple[str, ...],
+    times_ns: list[int],
+    positions_rad: Float[np.ndarray, "num_points num_joints"],
+) -> bytes:
+    """Serialise as trajectory_msgs/JointTrajectory, for viewers."""
+    points = []
+    for t_ns, row in zip(times_ns, positions_rad, strict=True):
+        sec, nanosec = split_ns(t_ns)
+        points.append({"positions": row, "time_from_start": {"sec": sec, "nanosec": nanosec}})
+    message = {"header": _header(stamp_ns, ""), "joint_names": list(names), "points": points}
+    return cdr.encode(schema.JOINT_TRAJECTORY, message)

@@ -1,0 +1,104 @@
+"""Topics and the schema each carries. ``docs/episode_format.md`` explains them field by field."""
+
+import json
+import re
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+
+from bridge.episode import ros2_definitions
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+IMAGE = "sensor_msgs/msg/Image"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+STRING = "std_msgs/msg/String"
+POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+PLAN = "gst/Plan"
+VERDICT = "gst/Verdict"
+LOCALISATION = "gst/Localisation"
+EVENT = "gst/Event"
+DROPS = "recorder/Drops"
+POSES_IN_FRAME = "foxglove.PosesInFrame"
+
+DROPS_TOPIC = "/recorder/drops"
+TRUTH_PREFIX = "/standin/truth/"
+
+_JSON_SCHEMAS = {
+    PLAN: ("bridge.task", "schemas/plan.schema.json"),
+    VERDICT: ("bridge.task", "schemas/verdict.schema.json"),
+    LOCALISATION: ("bridge.task", "schemas/localisation.schema.json"),
+    EVENT: ("bridge.episode", "schemas/event.schema.json"),
+    DROPS: ("bridge.episode", "schemas/drops.schema.json"),
+    POSES_IN_FRAME: ("bridge.episode", "schemas/poses_in_frame.schema.json"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schema:
+    """What the MCAP schema and channel records of one message type say."""
+
+    name: str
+    schema_encoding: str
+    message_encoding: str
+    data: bytes
+
+
+@cache
+def schema_for(name: str) -> Schema | None:
+    """Return the schema of a type this project knows, or None."""
+    if name in ros2_definitions.DEFINITIONS:
+        text = ros2_definitions.schema_text(name)
+        return Schema(
+            name=name, schema_encoding="ros2msg", message_encoding="cdr", data=text.encode()
+        )
+    if name in _JSON_SCHEMAS:
+        package, path = _JSON_SCHEMAS[name]
+        text = resources.files(package).joinpath(path).read_text()
+        return Schema(
+            name=name, schema_encoding="jsonschema", message_encoding="json", data=text.encode()
+        )
+    return None
+
+
+def json_schema_version(name: str) -> int:
+    """Return the major version of one of our JSON schemas."""
+    schema = schema_for(name)
+    if schema is None or schema.schema_encoding != "jsonschema":
+        message = f"{name} has no JSON schema"
+        raise KeyError(message)
+    return int(json.loads(schema.data).get("version", 1))
+
+
+_TOPIC_RULES: tuple[tuple[str, str], ...] = (
+    (r"/cam/[^/]+/color/image$", COMPRESSED_IMAGE),
+    (r"/cam/[^/]+/depth/image$", IMAGE),
+    (r"/cam/[^/]+/(color|depth)/info$", CAMERA_INFO),
+    (r"/joint_states$", JOINT_STATE),
+    (r"/gripper/state$", JOINT_STATE),
+    (r"^/tf(_static)?$", TF_MESSAGE),
+    (r"^/robot_description$", STRING),
+    (r"/plan$", PLAN),
+    (r"/plan/trajectory$", JOINT_TRAJECTORY),
+    (r"/plan/path$", POSES_IN_FRAME),
+    (r"/event$", EVENT),
+    (r"/verdict$", VERDICT),
+    (r"/object/[^/]+/pose$", POSE_STAMPED),
+    (r"/localisation$", LOCALISATION),
+    (r"^/recorder/drops$", DROPS),
+)
+
+
+def type_of_topic(topic: str) -> str | None:
+    """Return the message type a topic of ours carries, or None for a foreign topic."""
+    for pattern, name in _TOPIC_RULES:
+        if re.search(pattern, topic):
+            return name
+    return None
+
+
+def is_truth(topic: str) -> bool:
+    """Say whether a topic holds stand-in ground truth, which ``twin`` must never read."""
+    return topic.startswith(TRUTH_PREFIX)

@@ -1,0 +1,235 @@
+"""Decode what an episode holds: joints, plans, events, cameras, poses."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from bridge.episode import schema
+from bridge.episode.reader import Episode
+from bridge.episode.records import (
+    CameraInfo,
+    CompressedColor,
+    DepthImage,
+    JointSample,
+    PoseSample,
+    string_from_cdr,
+    transforms_from_cdr,
+)
+from bridge.episode.transforms import TransformTree
+from bridge.errors import EpisodeError
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.geometry.trajectory import PoseTrajectory
+from bridge.media.color import decode_color
+from bridge.task.plan import Plan
+from bridge.task.record import parse_record
+from bridge.task.verdict import Verdict
+
+PAIRING_TOLERANCE_NS = 20_000_000
+"""Colour and depth of one frame lie at most this far apart."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RgbdFrame:
+    """Colour and depth of one instant with both cameras and both poses in the root frame."""
+
+    camera_id: str
+    stamp_ns: int
+    image_u8: UInt8[np.ndarray, "height width 3"]
+    depth_m: Float[np.ndarray, "depth_height depth_width"]
+    color_camera: Camera
+    depth_camera: Camera
+    T_base_color: Float[np.ndarray, "4 4"]
+    T_base_depth: Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointTrack:
+    """Joint positions over source time."""
+
+    names: tuple[str, ...]
+    stamps_ns: np.ndarray
+    position: Float[np.ndarray, "num_samples num_joints"]
+
+    def at(self, stamps_ns: np.ndarray) -> Float[np.ndarray, "num_queries num_joints"]:
+        """Interpolate linearly; outside the range the nearest end."""
+        columns = [
+            np.interp(stamps_ns, self.stamps_ns, self.position[:, joint])
+            for joint in range(len(self.names))
+        ]
+        return np.stack(columns, axis=1)
+
+
+def transform_tree(episode: Episode) -> TransformTree:
+    """Collect ``/tf`` and ``/tf_static``."""
+    transforms = []
+    for message in episode.messages(episode.topics_of_type(schema.TF_MESSAGE)):
+        transforms.extend(transforms_from_cdr(message.data))
+    return TransformTree(transforms)
+
+
+def camera_ids(episode: Episode) -> list[str]:
+    """Cameras that have colour images: the ``<id>`` of ``.../cam/<id>/color/image``."""
+    return sorted(
+        topic.split("/")[-3] for topic in episode.topics() if topic.endswith("/color/image")
+    )
+
+
+def _camera_topic(episode: Episode, camera_id: str, tail: str) -> str:
+    ending = f"/cam/{camera_id}/{tail}"
+    for topic in episode.topics():
+        if topic.endswith(ending) and not schema.is_truth(topic):
+            return topic
+    raise EpisodeError(
+        path=episode.path,
+        found=f"no topic ends with {ending}",
+        hint=f"Cameras here: {', '.join(camera_ids(episode)) or 'none'}.",
+    )
+
+
+def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> CameraInfo:
+    """Return the first intrinsics of ``color`` or ``depth``."""
+    topic = _camera_topic(episode, camera_id, f"{stream}/info")
+    for message in episode.messages([topic]):
+        return CameraInfo.from_cdr(message.data)
+    raise EpisodeError(path=episode.path, found=f"{topic} is empty", hint="Record it again.")
+
+
+def rgbd_frames(
+    episode: Episode, camera_id: str, tree: TransformTree | None = None
+) -> Iterator[RgbdFrame]:
+    """Yield posed frames in time order; colour without depth nearby is passed over."""
+    tree = transform_tree(episode) if tree is None else tree
+    color_info = camera_info(episode, camera_id, "color")
+    depth_info = camera_info(episode, camera_id, "depth")
+    color_topic = _camera_topic(episode, camera_id, "color/image")
+    depth_topic = _camera_topic(episode, camera_id, "depth/image")
+    waiting_colors: list[CompressedColor] = []
+    waiting_depths: list[DepthImage] = []
+    for message in episode.messages([color_topic, depth_topic]):
+        if message.topic == color_topic:
+            waiting_colors.append(CompressedColor.from_cdr(message.data))
+        else:
+            waiting_depths.append(DepthImage.from_cdr(message.data))
+        pair = _pop_pair(waiting_colors, waiting_depths)
+        if pair is not None:
+            color, depth = pair
+            yield RgbdFrame(
+                camera_id=camera_id,
+                stamp_ns=color.stamp_ns,
+                image_u8=decode_color(color.data),
+                depth_m=depth.depth_m(),
+                color_camera=color_info.camera,
+                depth_camera=depth_info.camera,
+                T_base_color=tree.T_root_frame(color_info.frame_id, color.stamp_ns),
+                T_base_depth=tree.T_root_frame(depth_info.frame_id, depth.stamp_ns),
+            )
+
+
+def _pop_pair(
+    colors: list[CompressedColor], depths: list[DepthImage]
+) -> tuple[CompressedColor, DepthImage] | None:
+    while colors and depths:
+        gap_ns = colors[0].stamp_ns - depths[0].stamp_ns
+        if abs(gap_ns) <= PAIRING_TOLERANCE_NS:
+            return colors.pop(0), depths.pop(0)
+        (depths if gap_ns > 0 else colors).pop(0)
+    return None
+
+
+def joint_track(episode: Episode, ending: str = "/joint_states") -> JointTrack:
+    """Collect the joint states of the topic with this ending, ordered by source time."""
+    topics = [
+        topic for topic in episode.topics_of_type(schema.JOINT_STATE) if topic.endswith(ending)
+    ]
+    samples = [JointSample.from_cdr(message.data) for message in episode.messages(topics)]
+    if not samples:
+        raise EpisodeError(
+            path=episode.path,
+            found=f"no joint states on a topic ending with {ending}",
+            hint="Record the robot's joint states; robot-gst info lists the topics.",
+        )
+    samples.sort(key=lambda sample: sample.stamp_ns)
+    return JointTrack(
+        names=samples[0].names,
+        stamps_ns=np.array([sample.stamp_ns for sample in samples], dtype=np.int64),
+        position=np.stack([sample.position for sample in samples]),
+    )
+
+
+def plans(episode: Episode) -> list[tuple[int, Plan]]:
+    """Return every plan with its source time [ns], in order, also those never executed."""
+    messages = episode.messages(episode.topics_of_type(schema.PLAN))
+    return [(message.publish_time_ns, Plan.from_json(message.data)) for message in messages]
+
+
+def verdicts(episode: Episode) -> list[tuple[int, Verdict]]:
+    """Return every verdict with its source time [ns]."""
+    messages = episode.messages(episode.topics_of_type(schema.VERDICT))
+    return [(message.publish_time_ns, Verdict.from_json(message.data)) for message in messages]
+
+
+def events(episode: Episode) -> list[dict[str, Any]]:
+    """Return every event record in log order."""
+    return [
+        parse_record(message.data, name="event", package="bridge.episode")
+        for message in episode.messages(episode.topics_of_type(schema.EVENT))
+    ]
+
+
+def localisations(episode: Episode) -> list[dict[str, Any]]:
+    """Return every localisation record in log order."""
+    return [
+        parse_record(message.data, name="localisation")
+        for message in episode.messages(episode.topics_of_type(schema.LOCALISATION))
+    ]
+
+
+def executed_interval_ns(episode: Episode, plan_id: str) -> tuple[int, int] | None:
+    """Source times between which a plan was executed, or None if it never was."""
+    start = None
+    for event in events(episode):
+        if event.get("plan_id") != plan_id:
+            continue
+        if event["type"] == "execution_started":
+            start = event["stamp_ns"]
+        elif event["type"] == "execution_ended" and start is not None:
+            return start, event["stamp_ns"]
+    return None
+
+
+def pose_track(episode: Episode, topic: str) -> PoseTrajectory:
+    """Collect the poses of one PoseStamped topic, ordered by source time, duplicates dropped."""
+    samples = {}
+    for message in episode.messages([topic]):
+        sample = PoseSample.from_cdr(message.data)
+        samples[sample.stamp_ns] = sample.T_frame_body
+    if not samples:
+        raise EpisodeError(
+            path=episode.path, found=f"no poses on {topic}", hint="robot-gst info lists the topics."
+        )
+    stamps = sorted(samples)
+    q, p = se3.split(np.stack([samples[stamp] for stamp in stamps]))
+    return PoseTrajectory(np.array(stamps, dtype=np.int64), p, q)
+
+
+def object_pose_topics(episode: Episode) -> dict[str, str]:
+    """Map object ids to their pose topics (derived episodes; never stand-in truth)."""
+    return {
+        topic.split("/")[-2]: topic
+        for topic in episode.topics_of_type(schema.POSE_STAMPED)
+        if "/object/" in topic
+    }
+
+
+def robot_description(episode: Episode) -> str | None:
+    """Return the URDF text, from ``/robot_description`` or the attachment ``robot.urdf``."""
+    for message in episode.messages(
+        topic for topic in episode.topics() if topic == "/robot_description"
+    ):
+        return string_from_cdr(message.data)
+    attached = episode.attachment("robot.urdf")
+    return None if attached is None else attached.decode()

@@ -1,0 +1,63 @@
+"""The frames of an episode over time: ``/tf`` and ``/tf_static`` as one tree."""
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode.records import FrameTransform
+from bridge.errors import BridgeError
+from bridge.geometry import se3
+from bridge.geometry.trajectory import PoseTrajectory
+
+
+class FrameNotFoundError(BridgeError):
+    """No transform leads to a frame."""
+
+    def __init__(self, *, frame: str, known: list[str]) -> None:
+        """Remember the frame and list those that exist."""
+        self.frame = frame
+        listed = ", ".join(known) or "none"
+        super().__init__(f"no transform for frame {frame!r}. Frames in this episode: {listed}.")
+
+
+class TransformTree:
+    """Answers ``T_root_frame`` at any stamp, interpolating moving frames."""
+
+    def __init__(self, transforms: list[FrameTransform]) -> None:
+        """Collect transforms in any order; static ones are those seen once."""
+        collected: dict[str, tuple[str, dict[int, Float[np.ndarray, "4 4"]]]] = {}
+        for item in transforms:
+            _, samples = collected.setdefault(item.child, (item.parent, {}))
+            samples[item.stamp_ns] = item.T_parent_child
+        self._parents = {child: parent for child, (parent, _) in collected.items()}
+        self._tracks: dict[str, PoseTrajectory] = {}
+        for child, (_, samples) in collected.items():
+            stamps = sorted(samples)
+            q, p = se3.split(np.stack([samples[stamp] for stamp in stamps]))
+            self._tracks[child] = PoseTrajectory(np.array(stamps, dtype=np.int64), p, q)
+
+    def frames(self) -> list[str]:
+        """All frames, parents included."""
+        return sorted(set(self._parents) | set(self._parents.values()))
+
+    def root_of(self, frame: str) -> str:
+        """Follow parents up to the frame that has none."""
+        if frame not in self._parents and frame not in self._parents.values():
+            raise FrameNotFoundError(frame=frame, known=self.frames())
+        seen = set()
+        while frame in self._parents and frame not in seen:
+            seen.add(frame)
+            frame = self._parents[frame]
+        return frame
+
+    def T_root_frame(self, frame: str, stamp_ns: int) -> Float[np.ndarray, "4 4"]:  # noqa: N802
+        """Pose of a frame in its root at one instant.
+
+        Raises:
+            FrameNotFoundError: When no transform names the frame; lists those that exist.
+        """
+        root = self.root_of(frame)
+        T = np.eye(4)
+        while frame != root:
+            T = self._tracks[frame].at(np.array([stamp_ns])).transforms()[0] @ T
+            frame = self._parents[frame]
+        return T

@@ -1,0 +1,83 @@
+"""The family of errors whose message a user can act on.
+
+Every error states what was found, where, and what to do. ``exit_code`` is the status the command
+line ends with (see the architecture page): 1 failed or broken file, 2 wrong use, 3 a threshold.
+"""
+
+from pathlib import Path
+
+
+class GstError(Exception):
+    """Base of all errors that are the user's business; anything else is a bug."""
+
+    exit_code = 1
+
+
+class BridgeError(GstError):
+    """Something went wrong between the wire and the episode."""
+
+
+class UsageError(GstError):
+    """The command was called with something that cannot be right."""
+
+    exit_code = 2
+
+
+class MissingDependencyError(GstError):
+    """An optional package is not installed."""
+
+    def __init__(self, *, package: str, extra: str, purpose: str) -> None:
+        """Remember the package and the extra that brings it."""
+        self.package = package
+        self.extra = extra
+        super().__init__(
+            f"{package} is not installed, and {purpose} needs it. "
+            f"Install the extra: pip install 'robot-gst[{extra}]'."
+        )
+
+
+class PathNotFoundError(UsageError):
+    """A file or folder named by the user is not there."""
+
+    def __init__(self, *, path: Path, what: str, hint: str) -> None:
+        """Remember which path was missing."""
+        self.path = path
+        super().__init__(f"{what} not found: {path}. {hint}")
+
+
+class EpisodeError(BridgeError):
+    """An episode file breaks its contract."""
+
+    def __init__(self, *, path: Path, found: str, hint: str) -> None:
+        """Remember the file and what was found in it."""
+        self.path = path
+        self.found = found
+        super().__init__(f"{path}: {found}. {hint}")
+
+
+class SchemaVersionError(EpisodeError):
+    """A record was written by a newer major version than this reader knows."""
+
+    def __init__(self, *, path: Path, name: str, found: int, known: int) -> None:
+        """Remember both versions."""
+        self.name = name
+        self.found_version = found
+        self.known_version = known
+        super().__init__(
+            path=path,
+            found=f"{name} has schema version {found}, this reader knows {known}",
+            hint="Upgrade robot-gst, or re-record with the older version.",
+        )
+
+
+class InvalidRecordError(BridgeError):
+    """A JSON record (plan, verdict, event ...) does not fit its schema."""
+
+    def __init__(self, *, name: str, where: str, found: str) -> None:
+        """Remember the record's name and the offending place."""
+        self.name = name
+        self.where = where
+        super().__init__(
+            f"{name} is invalid at {where or 'the top level'}: {found}. "
+            f"Its schema is bridge/task/schemas or bridge/episode/schemas; see docs/episode_format.md."
+        )

@@ -1,0 +1,1 @@
+"""Frames, SE(3), trajectories and camera models; NumPy only."""

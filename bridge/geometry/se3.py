@@ -1,0 +1,151 @@
+"""Rigid transforms as 4x4 matrices ``T_a_b`` (points of frame b expressed in frame a).
+
+Quaternions are ``wxyz``, scalar first, with w >= 0. Storage is quaternion plus translation;
+matrices exist only in memory.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+
+def transform_from(
+    q_wxyz: Float[np.ndarray, "*batch 4"], p_m: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """Build ``T_a_b`` from the rotation ``q_a_b_wxyz`` and the origin ``p_a_b`` [m]."""
+    T = np.zeros((*q_wxyz.shape[:-1], 4, 4))
+    T[..., :3, :3] = rotation_from_quaternion(q_wxyz)
+    T[..., :3, 3] = p_m
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def rotation_from_quaternion(
+    q_wxyz: Float[np.ndarray, "*batch 4"],
+) -> Float[np.ndarray, "*batch 3 3"]:
+    """Turn (not necessarily unit) quaternions into rotation matrices."""
+    w, x, y, z = np.moveaxis(q_wxyz / np.linalg.norm(q_wxyz, axis=-1, keepdims=True), -1, 0)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_rotation(
+    R: Float[np.ndarray, "*batch 3 3"],
+) -> Float[np.ndarray, "*batch 4"]:
+    """Turn rotation matrices into unit quaternions with w >= 0 (Shepperd's method)."""
+    trace = np.trace(R, axis1=-2, axis2=-1)
+    r = [[R[..., i, j] for j in range(3)] for i in range(3)]
+    # Four candidates, one per dominant component; each is exact where its pivot is largest.
+    candidates = np.stack(
+        [
+            np.stack([1 + trace, r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]], -1),
+            np.stack(
+                [
+                    r[2][1] - r[1][2],
+                    1 + r[0][0] - r[1][1] - r[2][2],
+                    r[0][1] + r[1][0],
+                    r[0][2] + r[2][0],
+                ],
+                -1,
+            ),
+            np.stack(
+                [
+                    r[0][2] - r[2][0],
+                    r[0][1] + r[1][0],
+                    1 - r[0][0] + r[1][1] - r[2][2],
+                    r[1][2] + r[2][1],
+                ],
+                -1,
+            ),
+            np.stack(
+                [
+                    r[1][0] - r[0][1],
+                    r[0][2] + r[2][0],
+                    r[1][2] + r[2][1],
+                    1 - r[0][0] - r[1][1] + r[2][2],
+                ],
+                -1,
+            ),
+        ],
+        axis=-2,
+    )
+    pivots = np.stack([trace, r[0][0], r[1][1], r[2][2]], axis=-1)
+    best = np.argmax(pivots, axis=-1)[..., None, None]
+    q = np.take_along_axis(candidates, best, axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0, -q, q)
+
+
+def split(
+    T: Float[np.ndarray, "*batch 4 4"],
+) -> tuple[Float[np.ndarray, "*batch 4"], Float[np.ndarray, "*batch 3"]]:
+    """Split ``T_a_b`` into ``q_a_b_wxyz`` and ``p_a_b`` [m], the form that is stored."""
+    return quaternion_from_rotation(T[..., :3, :3]), T[..., :3, 3].copy()
+
+
+def invert(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"]:
+    """Return ``T_b_a`` for ``T_a_b``."""
+    R_inverse = np.swapaxes(T[..., :3, :3], -1, -2)
+    inverse = np.zeros_like(T)
+    inverse[..., :3, :3] = R_inverse
+    inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", R_inverse, T[..., :3, 3])
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def apply(
+    T_a_b: Float[np.ndarray, "4 4"], p_b: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch 3"]:
+    """Carry points from frame b to frame a [m]."""
+    return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def rotation_angle_rad(R: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:
+    """Return the angle of a rotation, stable near 0 and pi [rad]."""
+    skew = np.stack(
+        [
+            R[..., 2, 1] - R[..., 1, 2],
+            R[..., 0, 2] - R[..., 2, 0],
+            R[..., 1, 0] - R[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    trace = np.trace(R, axis1=-2, axis2=-1)
+    return np.asarray(np.arctan2(np.linalg.norm(skew, axis=-1), trace - 1.0))
+
+
+def interpolate_quaternion(
+    q_start_wxyz: Float[np.ndarray, "*batch 4"],
+    q_end_wxyz: Float[np.ndarray, "*batch 4"],
+    fraction: Float[np.ndarray, "*batch"],
+) -> Float[np.ndarray, "*batch 4"]:
+    """Interpolate along the shorter arc at constant angular speed (Shoemake 1985)."""
+    dot = np.sum(q_start_wxyz * q_end_wxyz, axis=-1)
+    q_end = np.where(dot[..., None] < 0, -q_end_wxyz, q_end_wxyz)
+    angle = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))
+    sine = np.sin(angle)
+    nearly_equal = sine < 1e-9
+    safe_sine = np.where(nearly_equal, 1.0, sine)
+    weight_start = np.where(nearly_equal, 1 - fraction, np.sin((1 - fraction) * angle) / safe_sine)
+    weight_end = np.where(nearly_equal, fraction, np.sin(fraction * angle) / safe_sine)
+    q = weight_start[..., None] * q_start_wxyz + weight_end[..., None] * q_end
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+
+
+def look_at(
+    p_world_eye: Float[np.ndarray, "3"],
+    p_world_target: Float[np.ndarray, "3"],
+    up_world: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "4 4"]:
+    """Pose ``T_world_camera`` of an OpenCV camera (+Z forward, +Y down) facing a target."""
+    forward = p_world_target - p_world_eye
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, up_world)
+    right = right / np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T[:3, 3] = p_world_eye
+    return T

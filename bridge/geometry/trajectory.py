@@ -1,0 +1,48 @@
+"""Poses over time: integer stamps, positions, quaternions."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bridge.geometry import se3
+
+
+@dataclass(frozen=True)
+class PoseTrajectory:
+    """Poses ``T_frame_body`` at strictly increasing stamps."""
+
+    stamps_ns: Int[np.ndarray, " num_poses"]
+    p_m: Float[np.ndarray, "num_poses 3"]
+    q_wxyz: Float[np.ndarray, "num_poses 4"]
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.stamps_ns)
+
+    def at(self, stamps_ns: Int[np.ndarray, " num_queries"]) -> "PoseTrajectory":
+        """Interpolate (linear, slerp); stamps outside the range take the nearest end."""
+        if len(self) == 1:
+            index = np.zeros(len(stamps_ns), dtype=np.int64)
+            return PoseTrajectory(stamps_ns, self.p_m[index], self.q_wxyz[index])
+        after = np.clip(np.searchsorted(self.stamps_ns, stamps_ns), 1, len(self) - 1)
+        before = after - 1
+        span = (self.stamps_ns[after] - self.stamps_ns[before]).astype(np.float64)
+        offset = (stamps_ns - self.stamps_ns[before]).astype(np.float64)
+        fraction = np.clip(offset / np.maximum(span, 1.0), 0.0, 1.0)
+        p = self.p_m[before] + fraction[:, None] * (self.p_m[after] - self.p_m[before])
+        q = se3.interpolate_quaternion(self.q_wxyz[before], self.q_wxyz[after], fraction)
+        return PoseTrajectory(stamps_ns, p, q)
+
+    def transforms(self) -> Float[np.ndarray, "num_poses 4 4"]:
+        """Return the poses as matrices."""
+        return se3.transform_from(self.q_wxyz, self.p_m)
+
+    def path_length_m(self) -> float:
+        """Sum of the distances between neighbouring positions [m]."""
+        return float(np.linalg.norm(np.diff(self.p_m, axis=0), axis=1).sum())
+
+    def normalised_time(self, num_samples: int) -> "PoseTrajectory":
+        """Resample uniformly from the first to the last stamp; for runs without a common clock."""
+        first, last = int(self.stamps_ns[0]), int(self.stamps_ns[-1])
+        return self.at(np.linspace(first, last, num_samples).round().astype(np.int64))

@@ -1,0 +1,63 @@
+"""JPEG and PNG colour images."""
+
+import io
+
+import numpy as np
+from jaxtyping import UInt8
+
+from bridge.errors import BridgeError, MissingDependencyError
+
+JPEG_QUALITY = 90
+JPEG_MAGIC = b"\xff\xd8"
+MAX_PIXELS = 64_000_000
+"""Refuse larger images: a few bytes of PNG can claim gigabytes."""
+
+
+class UnreadableImageError(BridgeError):
+    """The bytes are not an image we can decode."""
+
+    def __init__(self, *, found: str) -> None:
+        """Remember what the decoder said."""
+        super().__init__(f"unreadable image: {found}. Expected JPEG or 8-bit PNG.")
+
+
+def encode_jpeg(image_u8: UInt8[np.ndarray, "height width 3"], quality: int = JPEG_QUALITY) -> bytes:
+    """Compress an sRGB image as JPEG."""
+    try:
+        import simplejpeg  # noqa: PLC0415  # the extra [record] brings it; reading PNG needs none
+    except ImportError as error:
+        raise MissingDependencyError(
+            package="simplejpeg", extra="record", purpose="JPEG encoding"
+        ) from error
+    return bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(image_u8), quality=quality))
+
+
+def decode_color(data: bytes) -> UInt8[np.ndarray, "height width 3"]:
+    """Decode JPEG or PNG bytes to an sRGB image."""
+    if data[:2] == JPEG_MAGIC:
+        return _decode_jpeg(data)
+    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415  # heavy, only for PNG
+
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise UnreadableImageError(found=f"{image.width} x {image.height} pixels")
+            return np.asarray(image.convert("RGB"))
+    except (UnidentifiedImageError, OSError, ValueError) as error:
+        raise UnreadableImageError(found=str(error)[:120]) from error
+
+
+def _decode_jpeg(data: bytes) -> UInt8[np.ndarray, "height width 3"]:
+    try:
+        import simplejpeg  # noqa: PLC0415
+    except ImportError as error:
+        raise MissingDependencyError(
+            package="simplejpeg", extra="record", purpose="JPEG decoding"
+        ) from error
+    try:
+        height, width, _, _ = simplejpeg.decode_jpeg_header(data)
+        if width * height > MAX_PIXELS:
+            raise UnreadableImageError(found=f"{width} x {height} pixels")
+        return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB"))
+    except ValueError as error:
+        raise UnreadableImageError(found=str(error)[:120]) from error

@@ -1,0 +1,1 @@
+"""From the wire to the episode: queue, ledger of losses, lifecycle, control."""

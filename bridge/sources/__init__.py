@@ -1,0 +1,1 @@
+"""Who speaks on the wire: an RGB-D folder and the stand-in cell."""

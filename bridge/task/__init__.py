@@ -1,0 +1,1 @@
+"""What is to be achieved: task files, plans, verdicts and hard predicates; NumPy only."""

@@ -1,0 +1,124 @@
+"""gst plan v1: the stages, constraints and trajectory tau = {(p_t, q_t, g_t)} of one attempt."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bridge.task.record import check_record, parse_record
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Waypoint:
+    """One commanded instant of the tool centre point, in the plan's frame."""
+
+    t_ns: int
+    """Time from the start of the trajectory."""
+    p_m: tuple[float, float, float]
+    q_wxyz: tuple[float, float, float, float]
+    g: int
+    """Gripper: 1 closed, 0 open."""
+    width_m: float | None = None
+    joints_rad: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """One step of the plan with the contacts it allows and the state it should end in."""
+
+    id: str
+    text: str
+    subgoal: tuple[dict[str, Any], ...] = ()
+    path: tuple[dict[str, Any], ...] = ()
+    grasp: str | None = None
+    release: str | None = None
+    allowed_contacts: tuple[tuple[str, str], ...] = ()
+    terminal: tuple[dict[str, Any], ...] = ()
+    predicted_objects: dict[str, dict[str, list[float]]] = field(default_factory=dict)
+    t_start_ns: int = 0
+    t_end_ns: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What will be commanded, and why; the authority over the viewers' trajectory topics."""
+
+    id: str
+    planner: str
+    policy: str
+    condition: str
+    robot: str
+    frame: str
+    instruction: str
+    stages: tuple[Stage, ...]
+    tau: tuple[Waypoint, ...]
+    task: str = ""
+    parent_id: str | None = None
+    round: int = 0
+    start_id: str | None = None
+    grounding_source: str = ""
+    entities: dict[str, Any] = field(default_factory=dict)
+    keypoints_m: tuple[tuple[float, float, float], ...] = ()
+    joint_names: tuple[str, ...] = ()
+
+    def to_json(self) -> bytes:
+        """Serialise, refusing what the schema refuses."""
+        record = json.loads(json.dumps({"schema_version": SCHEMA_VERSION, **asdict(self)}))
+        check_record(record, name="plan")
+        return json.dumps(record, separators=(",", ":")).encode()
+
+    @staticmethod
+    def from_json(data: bytes) -> "Plan":
+        """Parse and check. Raises ``InvalidRecordError`` naming what does not fit."""
+        record = parse_record(data, name="plan")
+        known = {name: record[name] for name in Plan.__dataclass_fields__ if name in record}
+        known["stages"] = tuple(_stage(stage) for stage in record["stages"])
+        known["tau"] = tuple(_waypoint(waypoint) for waypoint in record["tau"])
+        known["keypoints_m"] = tuple(tuple(p) for p in record.get("keypoints_m", []))
+        known["joint_names"] = tuple(record.get("joint_names", []))
+        return Plan(**known)
+
+    def times_ns(self) -> Int[np.ndarray, " num_waypoints"]:
+        """Waypoint times from the start of the trajectory."""
+        return np.array([waypoint.t_ns for waypoint in self.tau], dtype=np.int64)
+
+    def positions_m(self) -> Float[np.ndarray, "num_waypoints 3"]:
+        """Commanded tool positions."""
+        return np.array([waypoint.p_m for waypoint in self.tau], dtype=np.float64)
+
+    def quaternions_wxyz(self) -> Float[np.ndarray, "num_waypoints 4"]:
+        """Commanded tool orientations."""
+        return np.array([waypoint.q_wxyz for waypoint in self.tau], dtype=np.float64)
+
+    def stage_at(self, t_ns: int) -> Stage | None:
+        """Return the stage that covers a time from the start, or None after the last."""
+        for stage in self.stages:
+            if stage.t_start_ns <= t_ns < stage.t_end_ns:
+                return stage
+        return self.stages[-1] if self.stages and t_ns >= self.stages[-1].t_end_ns else None
+
+
+def _stage(record: dict[str, Any]) -> Stage:
+    known = {name: record[name] for name in Stage.__dataclass_fields__ if name in record}
+    for name in ("subgoal", "path", "terminal"):
+        known[name] = tuple(record.get(name, []))
+    known["allowed_contacts"] = tuple(
+        (pair[0], pair[1]) for pair in record.get("allowed_contacts", [])
+    )
+    return Stage(**known)
+
+
+def _waypoint(record: dict[str, Any]) -> Waypoint:
+    joints = record.get("joints_rad")
+    return Waypoint(
+        t_ns=record["t_ns"],
+        p_m=tuple(record["p_m"]),
+        q_wxyz=tuple(record["q_wxyz"]),
+        g=record["g"],
+        width_m=record.get("width_m"),
+        joints_rad=None if joints is None else tuple(joints),
+    )

@@ -1,0 +1,127 @@
+"""Hard success predicates: data in the task file, one evaluation for recorded and replayed states.
+
+Errata resolution 9 and 10: the predicate reads the settled final state x_{T+1}; its semantics
+(terminal, held for t seconds) are part of the predicate itself.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bridge.errors import UsageError
+from bridge.geometry import se3
+from bridge.task.task_file import ObjectModel, Task
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rollout:
+    """Object states over time, recorded or replayed."""
+
+    stamps_ns: Int[np.ndarray, " num_steps"]
+    Ts_base_object: Mapping[str, Float[np.ndarray, "num_steps 4 4"]]
+    finger_contact: Mapping[str, Bool[np.ndarray, " num_steps"]]
+    """Per object: whether a finger touches it. An object may be missing: unknown."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """What one predicate said. ``value`` is None when the states do not decide it."""
+
+    kind: str
+    value: bool | None
+    detail: str
+
+
+def evaluate_success(task: Task, rollout: Rollout) -> list[Finding]:
+    """Evaluate every success predicate of a task on a rollout's final state."""
+    return [_evaluate(spec, task, rollout) for spec in task.success]
+
+
+def all_hold(findings: list[Finding]) -> bool | None:
+    """Conjunction in three-valued logic."""
+    values = [finding.value for finding in findings]
+    if False in values:
+        return False
+    return None if None in values or not values else True
+
+
+def already_true_at_start(task: Task, rollout: Rollout) -> bool:
+    """Say whether the geometric part of the goal held before anything moved (a useless trial)."""
+    start = Rollout(
+        stamps_ns=rollout.stamps_ns[:1],
+        Ts_base_object={key: Ts[:1] for key, Ts in rollout.Ts_base_object.items()},
+        finger_contact={},
+    )
+    inside = [
+        _evaluate(spec, task, start).value for spec in task.success if spec["kind"] == "inside"
+    ]
+    return bool(inside) and all(value is True for value in inside)
+
+
+def _evaluate(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
+    rule = _RULES.get(spec["kind"])
+    if rule is None:
+        message = f"success predicate {spec['kind']!r} is unknown. Known: {', '.join(_RULES)}."
+        raise UsageError(message)
+    object_id = spec["object"]
+    if object_id not in rollout.Ts_base_object:
+        return Finding(kind=spec["kind"], value=None, detail=f"{object_id} was not localised")
+    return rule(spec, task, rollout)
+
+
+def _inside(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
+    container_id = spec["container"]
+    if container_id not in rollout.Ts_base_object:
+        return Finding(kind="inside", value=None, detail=f"{container_id} was not localised")
+    container = task.objects[container_id]
+    T_container_base = se3.invert(rollout.Ts_base_object[container_id][-1])
+    p = se3.apply(T_container_base, rollout.Ts_base_object[spec["object"]][-1][:3, 3])
+    excess = _cavity_excess_m(container, p, float(spec.get("margin_m", 0.0)))
+    detail = f"{spec['object']} centre is {abs(excess) * 1e3:.0f} mm " + (
+        f"outside {container_id}" if excess > 0 else f"within {container_id}"
+    )
+    return Finding(kind="inside", value=bool(excess <= 0), detail=detail)
+
+
+def _cavity_excess_m(
+    container: ObjectModel, p_container: Float[np.ndarray, "3"], margin_m: float
+) -> float:
+    """Largest distance by which a point leaves the cavity; negative inside [m]."""
+    inner = np.array(container.inner_m)
+    centre = np.array([0.0, 0.0, container.wall_m + inner[2] / 2])
+    return float(np.max(np.abs(p_container - centre) - inner / 2 + margin_m))
+
+
+def _settled(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
+    held_ns = round(spec["for_s"] * 1e9)
+    stamps = rollout.stamps_ns
+    tail = stamps >= stamps[-1] - held_ns
+    if tail.sum() < 2 or stamps[-1] - stamps[0] < held_ns:
+        return Finding(kind="settled", value=None, detail="too short to tell")
+    p = rollout.Ts_base_object[spec["object"]][tail][:, :3, 3]
+    seconds = np.diff(stamps[tail]) * 1e-9
+    speed = float(np.max(np.linalg.norm(np.diff(p, axis=0), axis=1) / seconds))
+    return Finding(
+        kind="settled",
+        value=bool(speed <= spec["max_speed_m_s"]),
+        detail=f"{spec['object']} moves at up to {speed * 1e3:.0f} mm/s in the last {spec['for_s']} s",
+    )
+
+
+def _no_finger_contact(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
+    contact = rollout.finger_contact.get(spec["object"])
+    if contact is None:
+        return Finding(kind="no_finger_contact", value=None, detail="finger contact is not known")
+    touching = bool(contact[-1])
+    detail = f"a finger {'touches' if touching else 'does not touch'} {spec['object']} at the end"
+    return Finding(kind="no_finger_contact", value=not touching, detail=detail)
+
+
+_RULES: dict[str, Callable[[Mapping[str, Any], Task, Rollout], Finding]] = {
+    "inside": _inside,
+    "settled": _settled,
+    "no_finger_contact": _no_finger_contact,
+}

@@ -1,0 +1,53 @@
+"""JSON records checked against their schema: plan, verdict, localisation, outcome, event, drops."""
+
+import json
+from collections.abc import Mapping
+from functools import cache
+from importlib import resources
+from typing import Any
+
+from jsonschema import Draft202012Validator
+
+from bridge.errors import InvalidRecordError
+
+
+@cache
+def validator(package: str, path: str) -> Draft202012Validator:
+    """Load one of our JSON Schemas, once."""
+    text = resources.files(package).joinpath(path).read_text()
+    return Draft202012Validator(json.loads(text))
+
+
+def check_record(
+    record: Mapping[str, Any], *, name: str, package: str = "bridge.task"
+) -> Mapping[str, Any]:
+    """Return the record if it fits ``schemas/<name>.schema.json``.
+
+    Raises:
+        InvalidRecordError: With the place and the value that does not fit.
+    """
+    checker = validator(package, f"schemas/{name}.schema.json")
+    version = record.get("schema_version")
+    known = checker.schema["version"]
+    if isinstance(version, int) and version > known:
+        raise InvalidRecordError(
+            name=name,
+            where="schema_version",
+            found=f"version {version} is newer than the {known} this reader knows; upgrade",
+        )
+    error = next(iter(checker.iter_errors(record)), None)
+    if error is not None:
+        where = "/".join(str(part) for part in error.absolute_path)
+        raise InvalidRecordError(name=name, where=where, found=error.message[:300])
+    return record
+
+
+def parse_record(data: bytes, *, name: str, package: str = "bridge.task") -> dict[str, Any]:
+    """Parse JSON bytes and check them."""
+    try:
+        record = json.loads(data)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise InvalidRecordError(name=name, where="", found=f"not JSON ({error})") from error
+    if not isinstance(record, dict):
+        raise InvalidRecordError(name=name, where="", found="not a JSON object")
+    return dict(check_record(record, name=name, package=package))

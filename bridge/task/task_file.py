@@ -1,0 +1,159 @@
+"""A task as data: objects, stages, start distribution and success predicate."""
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.errors import UsageError
+from bridge.geometry import se3
+from bridge.task.data import dataset_file
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectModel:
+    """Shape and nominal properties of one object."""
+
+    id: str
+    shape: str
+    """box (size_m, origin at the centre) or open_box (inner_m and wall_m, origin under the floor)."""
+    size_m: tuple[float, float, float]
+    """Outer extents."""
+    color_srgb: tuple[int, int, int]
+    wall_m: float = 0.0
+    mass_kg: float = 0.1
+    fixed: bool = False
+    symmetry: str = "none"
+
+    @property
+    def inner_m(self) -> tuple[float, float, float]:
+        """Extents of the cavity of an open box."""
+        x, y, z = self.size_m
+        return x - 2 * self.wall_m, y - 2 * self.wall_m, z - self.wall_m
+
+    def panels(self) -> list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]:
+        """Solid boxes the object is made of: (centre, extents) in the object frame [m]."""
+        size = np.array(self.size_m)
+        if self.shape == "box":
+            return [(np.zeros(3), size)]
+        x, y, z = size
+        wall = self.wall_m
+        return [
+            (np.array([0, 0, wall / 2]), np.array([x, y, wall])),
+            (np.array([(x - wall) / 2, 0, z / 2]), np.array([wall, y, z])),
+            (np.array([-(x - wall) / 2, 0, z / 2]), np.array([wall, y, z])),
+            (np.array([0, (y - wall) / 2, z / 2]), np.array([x - 2 * wall, wall, z])),
+            (np.array([0, -(y - wall) / 2, z / 2]), np.array([x - 2 * wall, wall, z])),
+        ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartRange:
+    """Uniform ranges an object's start pose is drawn from."""
+
+    x_m: tuple[float, float]
+    y_m: tuple[float, float]
+    yaw_rad: tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """One task file."""
+
+    name: str
+    instruction: str
+    objects: dict[str, ObjectModel]
+    manipulated: tuple[str, ...]
+    containers: tuple[str, ...]
+    start: dict[str, StartRange]
+    stages: tuple[dict[str, Any], ...]
+    success: tuple[dict[str, Any], ...]
+
+    def draw_start(self, rng: np.random.Generator) -> dict[str, Float[np.ndarray, "4 4"]]:
+        """Draw ``T_base_object`` for every object, resting on the table top z = 0."""
+        poses = {}
+        for object_id, limits in self.start.items():
+            yaw = rng.uniform(*limits.yaw_rad)
+            model = self.objects[object_id]
+            height = model.size_m[2] / 2 if model.shape == "box" else 0.0
+            p = np.array([rng.uniform(*limits.x_m), rng.uniform(*limits.y_m), height])
+            q = np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
+            poses[object_id] = se3.transform_from(q, p)
+        return poses
+
+
+def load_task(name: str) -> Task:
+    """Load ``datasets/tasks/<name>.toml`` or a TOML file by path.
+
+    Raises:
+        UsageError: Unknown name (lists those that exist), or a file that is no task.
+    """
+    path = dataset_file("tasks", name)
+    try:
+        table = tomllib.loads(path.read_text())
+        return _task_from(table)
+    except tomllib.TOMLDecodeError as error:
+        message = f"{path} is not valid TOML: {error}."
+        raise UsageError(message) from error
+    except (KeyError, TypeError, ValueError) as error:
+        message = f"{path} is not a task file: {type(error).__name__} {error}. See docs/tasks.md."
+        raise UsageError(message) from error
+
+
+def read_tables(path: Path) -> dict[str, Any]:
+    """Parse a TOML file, with one clear sentence when it is broken."""
+    try:
+        return tomllib.loads(path.read_text())
+    except (tomllib.TOMLDecodeError, OSError) as error:
+        message = f"{path} cannot be read as TOML: {error}."
+        raise UsageError(message) from error
+
+
+def _task_from(table: dict[str, Any]) -> Task:
+    if table["schema_version"] > SCHEMA_VERSION:
+        message = f"schema_version {table['schema_version']} is newer than {SCHEMA_VERSION}"
+        raise ValueError(message)
+    return Task(
+        name=table["name"],
+        instruction=table["instruction"],
+        objects={key: _object_from(key, value) for key, value in table["objects"].items()},
+        manipulated=tuple(table["manipulated"]),
+        containers=tuple(table["containers"]),
+        start={key: _start_from(value) for key, value in table["start"].items()},
+        stages=tuple(table["stages"]),
+        success=tuple(table["success"]),
+    )
+
+
+def _object_from(object_id: str, table: dict[str, Any]) -> ObjectModel:
+    if table["shape"] == "open_box":
+        wall = table["wall_m"]
+        x, y, z = table["inner_m"]
+        size = (x + 2 * wall, y + 2 * wall, z + wall)
+    elif table["shape"] == "box":
+        wall = 0.0
+        size = tuple(table["size_m"])
+    else:
+        message = f"objects.{object_id}.shape {table['shape']!r}; known: box, open_box"
+        raise ValueError(message)
+    return ObjectModel(
+        id=object_id,
+        shape=table["shape"],
+        size_m=size,
+        wall_m=wall,
+        color_srgb=tuple(table["color_srgb"]),
+        mass_kg=table.get("mass_kg", 0.1),
+        fixed=table.get("fixed", False),
+        symmetry=table.get("symmetry", "none"),
+    )
+
+
+def _start_from(table: dict[str, Any]) -> StartRange:
+    return StartRange(
+        x_m=tuple(table["x_m"]), y_m=tuple(table["y_m"]), yaw_rad=tuple(table["yaw_rad"])
+    )

@@ -1,0 +1,80 @@
+"""gst verdict v1: the acceptance indicator I(tau) with its three factors and first failure."""
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from bridge.task.record import check_record, parse_record
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Factor:
+    """One factor of I(tau). ``value`` is None when it could not be decided."""
+
+    value: bool | None
+    first_t_ns: int | None = None
+    cause: str | None = None
+    bodies: tuple[str, ...] = ()
+    detail: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """I(tau) = ik x clearance x terminal; ``accepted`` is None when any factor is undecided
+    and none is false.
+    """
+
+    plan_id: str
+    trajectory: str
+    mode: str
+    ik: Factor
+    clearance: Factor
+    terminal: Factor
+    engine: str
+    seed: int
+    scene_hash: str | None = None
+    calibration_id: str | None = None
+    p_success: dict[str, float] | None = None
+    reason: str | None = None
+
+    @property
+    def accepted(self) -> bool | None:
+        """The product of the factors in three-valued logic; never yes by default."""
+        values = [self.ik.value, self.clearance.value, self.terminal.value]
+        if False in values:
+            return False
+        return None if None in values else True
+
+    @property
+    def first_failing(self) -> str | None:
+        """Name of the first factor that is false, in the order ik, clearance, terminal."""
+        for name in ("ik", "clearance", "terminal"):
+            if getattr(self, name).value is False:
+                return name
+        return None
+
+    def to_json(self) -> bytes:
+        """Serialise, refusing what the schema refuses."""
+        record = {"schema_version": SCHEMA_VERSION, "accepted": self.accepted, **asdict(self)}
+        record = json.loads(json.dumps(record))
+        check_record(record, name="verdict")
+        return json.dumps(record, separators=(",", ":")).encode()
+
+    @staticmethod
+    def from_json(data: bytes) -> "Verdict":
+        """Parse and check. Raises ``InvalidRecordError`` naming what does not fit."""
+        record = parse_record(data, name="verdict")
+        known = {name: record[name] for name in Verdict.__dataclass_fields__ if name in record}
+        for name in ("ik", "clearance", "terminal"):
+            known[name] = _factor(record[name])
+        known.setdefault("trajectory", "planned")
+        known.setdefault("mode", "dynamic")
+        return Verdict(**known)
+
+
+def _factor(record: dict[str, Any]) -> Factor:
+    known = {name: record[name] for name in Factor.__dataclass_fields__ if name in record}
+    known["bodies"] = tuple(record.get("bodies", []))
+    return Factor(**known)

@@ -1,0 +1,90 @@
+"""What the commands print: data on stdout, progress and remarks on stderr."""
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+PLAIN_PERIOD_S = 10.0
+"""Without a terminal, progress is one line each this many seconds."""
+
+Advance = Callable[[int, str], None]
+"""Called as ``advance(done, note)`` by long work."""
+
+
+@Parameter(name="*", group="Output")
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """How a command talks; every command takes these."""
+
+    json: bool = False
+    """Print the result as JSON on standard output."""
+    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False
+    """Say more about what is going on."""
+    quiet: Annotated[bool, Parameter(name=("--quiet", "-q"))] = False
+    """Say nothing but results and errors."""
+
+    def say(self, text: str) -> None:
+        """Print a remark on stderr unless quiet."""
+        if not self.quiet:
+            _err().print(text, highlight=False, markup=False)
+
+    def detail(self, text: str) -> None:
+        """Print a remark on stderr when verbose."""
+        if self.verbose:
+            _err().print(text, highlight=False, markup=False, style="dim")
+
+    def result(self, data: Mapping[str, Any], text: str) -> None:
+        """Print the result: ``data`` as JSON with ``--json``, else ``text``."""
+        if self.json:
+            sys.stdout.write(json.dumps(data, indent=2, default=str) + "\n")
+        else:
+            sys.stdout.write(text.rstrip("\n") + "\n")
+        sys.stdout.flush()
+
+    @contextmanager
+    def progress(self, label: str, total: int) -> Iterator[Advance]:
+        """Show progress: a bar on a terminal, otherwise a plain line each ten seconds."""
+        if self.quiet:
+            yield lambda done, note: None
+        elif sys.stderr.isatty():
+            yield from _bar(label, total)
+        else:
+            yield from _plain(label, total)
+
+
+def _err() -> Console:
+    return Console(stderr=True, soft_wrap=True)
+
+
+def _bar(label: str, total: int) -> Iterator[Advance]:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with Progress(*columns, console=_err()) as progress:
+        task = progress.add_task(label, total=total, note="")
+        yield lambda done, note: progress.update(task, completed=done, note=note)
+
+
+def _plain(label: str, total: int) -> Iterator[Advance]:
+    last = time.monotonic()
+
+    def advance(done: int, note: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= PLAIN_PERIOD_S:
+            last = time.monotonic()
+            sys.stderr.write(f"{label}: {done} of {total} {note}\n")
+            sys.stderr.flush()
+
+    yield advance

@@ -1,0 +1,1 @@
+"""Zenoh sessions, keys and encodings; the only room that imports zenoh."""

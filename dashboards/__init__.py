@@ -1,0 +1,1 @@
+"""Review pages over what the evaluator computed; no arithmetic here."""

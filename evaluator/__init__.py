@@ -1,0 +1,1 @@
+"""How far twin and reality disagree, and how sure we are."""

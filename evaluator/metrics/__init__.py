@@ -1,0 +1,1 @@
+"""Arrays in, errors out: trajectory, image, outcome."""

@@ -1,0 +1,1 @@
+"""Numbers in, judgement out: intervals, agreement, paired tests."""

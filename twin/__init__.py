@@ -1,0 +1,1 @@
+"""Rebuilds the place and re-lives the episode."""

@@ -1,0 +1,1 @@
+"""What moves when touched: rigid bodies and contact (PyBullet)."""

@@ -1,0 +1,1 @@
+"""Follow the log or let physics answer; the acceptance indicator; writes an episode."""

@@ -1,0 +1,1 @@
+"""URDF models, kinematics, inverse kinematics, hulls."""

@@ -1,0 +1,1 @@
+"""Gaussian splats: initialise, rasterise, fit, localise, store."""
