@@ -1,0 +1,1 @@
+"""Commands of the room ``evaluator``; imports stay late so that --help is quick."""
