@@ -79,5 +79,5 @@ class InvalidRecordError(BridgeError):
         self.where = where
         super().__init__(
             f"{name} is invalid at {where or 'the top level'}: {found}. "
-            f"Its schema is bridge/task/schemas or bridge/episode/schemas; see docs/episode_format.md."
+            "See docs/episode_format.md for its schema."
         )

@@ -47,7 +47,7 @@ class MalformedMessageError(BridgeError):
 class _Field(NamedTuple):
     name: str
     type_name: str
-    count: int | None  # None: one value; 0: sequence; n: fixed array of n
+    length: int | None  # None: one value; 0: sequence; n: fixed array of n
 
 
 @cache
@@ -77,7 +77,7 @@ def _align(out: bytearray, size: int) -> None:
 def _write(out: bytearray, type_name: str, message: Mapping[str, Any]) -> None:
     for field in _fields(type_name):
         value = message.get(field.name)
-        if field.count is None:
+        if field.length is None:
             _write_value(out, field.type_name, value)
         elif field.type_name in _PRIMITIVES:
             _write_array(out, field, value)
@@ -89,16 +89,16 @@ def _write(out: bytearray, type_name: str, message: Mapping[str, Any]) -> None:
                 _write_value(out, field.type_name, item)
 
 
-def _write_array(out: bytearray, field: _Field, value: Any) -> None:  # noqa: ANN401
+def _write_array(out: bytearray, field: _Field, value: Any) -> None:
     code = _PRIMITIVES[field.type_name]
     if isinstance(value, bytes | bytearray | memoryview):
         raw, length = bytes(value), len(value)
     else:
-        array = np.asarray([0] * (field.count or 0) if value is None else value)
+        array = np.asarray([0] * (field.length or 0) if value is None else value)
         raw, length = array.astype("<" + code).tobytes(), array.size
-    if field.count:
-        if length != field.count:
-            message = f"{field.name} needs {field.count} values, got {length}"
+    if field.length:
+        if length != field.length:
+            message = f"{field.name} needs {field.length} values, got {length}"
             raise ValueError(message)
     else:
         _align(out, 4)
@@ -108,7 +108,7 @@ def _write_array(out: bytearray, field: _Field, value: Any) -> None:  # noqa: AN
         out.extend(raw)
 
 
-def _write_value(out: bytearray, type_name: str, value: Any) -> None:  # noqa: ANN401
+def _write_value(out: bytearray, type_name: str, value: Any) -> None:
     if type_name == "string":
         raw = (value or "").encode() + b"\0"
         _align(out, 4)
@@ -143,10 +143,10 @@ class _Reader:
     def message(self, type_name: str) -> Message:
         return {field.name: self.field(field) for field in _fields(type_name)}
 
-    def field(self, field: _Field) -> Any:  # noqa: ANN401
-        if field.count is None:
+    def field(self, field: _Field) -> Any:
+        if field.length is None:
             return self.value(field.type_name)
-        length = field.count or self.value("uint32")
+        length = field.length or self.value("uint32")
         if field.type_name in _PRIMITIVES:
             return self.array(field.type_name, length)
         if length > len(self.data) - self.at:  # each item takes at least one byte
@@ -154,7 +154,7 @@ class _Reader:
             raise ValueError(message)
         return [self.value(field.type_name) for _ in range(length)]
 
-    def array(self, type_name: str, length: int) -> Any:  # noqa: ANN401
+    def array(self, type_name: str, length: int) -> Any:
         code = _PRIMITIVES[type_name]
         size = struct.calcsize(code)
         if length:
@@ -169,7 +169,7 @@ class _Reader:
             return bytes(raw)
         return np.frombuffer(raw, dtype=self.order + code)
 
-    def value(self, type_name: str) -> Any:  # noqa: ANN401
+    def value(self, type_name: str) -> Any:
         if type_name == "string":
             length = self.value("uint32")
             if self.at + length > len(self.data):

@@ -38,9 +38,7 @@ class TopicSummary:
 class Episode:
     """An opened, finished episode file. Cheap to make: only the summary is read."""
 
-    def __init__(
-        self, path: Path, summary: Summary, records: dict[str, dict[str, Any]]
-    ) -> None:
+    def __init__(self, path: Path, summary: Summary, records: dict[str, dict[str, Any]]) -> None:
         """Use ``Episode.open``."""
         self.path = path
         self._summary = summary

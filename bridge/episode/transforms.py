@@ -49,7 +49,7 @@ class TransformTree:
             frame = self._parents[frame]
         return frame
 
-    def T_root_frame(self, frame: str, stamp_ns: int) -> Float[np.ndarray, "4 4"]:  # noqa: N802
+    def T_root_frame(self, frame: str, stamp_ns: int) -> Float[np.ndarray, "4 4"]:
         """Pose of a frame in its root at one instant.
 
         Raises:

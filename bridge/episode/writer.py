@@ -139,7 +139,11 @@ class EpisodeWriter:
     def attach(self, name: str, data: bytes, *, media_type: str, log_time_ns: int) -> None:
         """Add an attachment, for example ``robot.urdf``."""
         self._writer.add_attachment(
-            create_time=log_time_ns, log_time=log_time_ns, name=name, media_type=media_type, data=data
+            create_time=log_time_ns,
+            log_time=log_time_ns,
+            name=name,
+            media_type=media_type,
+            data=data,
         )
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
@@ -153,7 +157,7 @@ class EpisodeWriter:
         outcome: metadata.Outcome | None = None,
         derived: metadata.Derived | None = None,
     ) -> None:
-        """Add the ``episode``, ``software`` and, where given, ``outcome`` and ``derived`` records."""
+        """Add the ``episode`` and ``software`` records, and the others where given."""
         self.add_metadata("episode", metadata.to_strings(info))
         self.add_metadata("software", provenance.software())
         if outcome is not None:
@@ -165,7 +169,7 @@ class EpisodeWriter:
         """Finish, sync to disk and give the file its final name."""
         if self._open:
             self._open = False
-            self._writer.finish()
+            self._writer.finish()  # type: ignore[no-untyped-call]
             self._stream.flush()
             os.fsync(self._stream.fileno())
             self._stream.close()

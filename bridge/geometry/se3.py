@@ -76,7 +76,7 @@ def quaternion_from_rotation(
     best = np.argmax(pivots, axis=-1)[..., None, None]
     q = np.take_along_axis(candidates, best, axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., :1] < 0, -q, q)
+    return np.asarray(np.where(q[..., :1] < 0, -q, q))
 
 
 def split(
@@ -100,7 +100,7 @@ def apply(
     T_a_b: Float[np.ndarray, "4 4"], p_b: Float[np.ndarray, "*batch 3"]
 ) -> Float[np.ndarray, "*batch 3"]:
     """Carry points from frame b to frame a [m]."""
-    return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    return np.asarray(p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])
 
 
 def rotation_angle_rad(R: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:
@@ -132,7 +132,7 @@ def interpolate_quaternion(
     weight_start = np.where(nearly_equal, 1 - fraction, np.sin((1 - fraction) * angle) / safe_sine)
     weight_end = np.where(nearly_equal, fraction, np.sin(fraction * angle) / safe_sine)
     q = weight_start[..., None] * q_start_wxyz + weight_end[..., None] * q_end
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
 
 
 def look_at(

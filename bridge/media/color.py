@@ -21,7 +21,9 @@ class UnreadableImageError(BridgeError):
         super().__init__(f"unreadable image: {found}. Expected JPEG or 8-bit PNG.")
 
 
-def encode_jpeg(image_u8: UInt8[np.ndarray, "height width 3"], quality: int = JPEG_QUALITY) -> bytes:
+def encode_jpeg(
+    image_u8: UInt8[np.ndarray, "height width 3"], quality: int = JPEG_QUALITY
+) -> bytes:
     """Compress an sRGB image as JPEG."""
     try:
         import simplejpeg  # noqa: PLC0415  # the extra [record] brings it; reading PNG needs none

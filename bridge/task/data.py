@@ -1,4 +1,4 @@
-"""Find the files of ``datasets/``: beside the packages in a checkout, inside them when installed."""
+"""Find the files of ``datasets/``: beside the packages in a checkout, else inside the wheel."""
 
 from pathlib import Path
 

@@ -107,7 +107,8 @@ def _settled(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
     return Finding(
         kind="settled",
         value=bool(speed <= spec["max_speed_m_s"]),
-        detail=f"{spec['object']} moves at up to {speed * 1e3:.0f} mm/s in the last {spec['for_s']} s",
+        detail=f"{spec['object']} moves at up to {speed * 1e3:.0f} mm/s "
+        f"in the last {spec['for_s']} s",
     )
 
 

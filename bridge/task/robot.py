@@ -6,7 +6,7 @@ and the gripper (``datasets/robots/parallel_gripper.urdf``) is hung on ``tool0``
 
 import re
 import sysconfig
-import xml.etree.ElementTree as ElementTree
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 from bridge.errors import MissingDependencyError, UsageError
@@ -43,15 +43,13 @@ def _data_root() -> Path:
 
 def ur5_with_gripper_urdf() -> str:
     """Return the URDF text; mesh names stay ``package://`` URIs, see ``resolve_mesh``."""
-    arm = ElementTree.parse(
-        _data_root() / "robots" / "ur_description" / "urdf" / "ur5_robot.urdf"
-    ).getroot()
-    gripper = ElementTree.parse(dataset_file("robots", "parallel_gripper", ".urdf")).getroot()
+    arm = ET.parse(_data_root() / "robots" / "ur_description" / "urdf" / "ur5_robot.urdf").getroot()
+    gripper = ET.parse(dataset_file("robots", "parallel_gripper", ".urdf")).getroot()
     for element in [item for item in arm if item.tag in ("transmission", "gazebo")]:
         arm.remove(element)
     arm.extend(list(gripper))
     arm.set("name", ROBOT_NAME)
-    return ElementTree.tostring(arm, encoding="unicode")
+    return ET.tostring(arm, encoding="unicode")
 
 
 def resolve_mesh(uri: str) -> Path:

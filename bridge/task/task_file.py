@@ -21,7 +21,7 @@ class ObjectModel:
 
     id: str
     shape: str
-    """box (size_m, origin at the centre) or open_box (inner_m and wall_m, origin under the floor)."""
+    """box (origin at the centre) or open_box (origin under the floor)."""
     size_m: tuple[float, float, float]
     """Outer extents."""
     color_srgb: tuple[int, int, int]

@@ -22,9 +22,7 @@ class Factor:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """I(tau) = ik x clearance x terminal; ``accepted`` is None when any factor is undecided
-    and none is false.
-    """
+    """I(tau) = ik x clearance x terminal, with the first failure of each factor."""
 
     plan_id: str
     trajectory: str
