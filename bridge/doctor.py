@@ -1,0 +1,80 @@
+"""What is installed, what is missing, and how to get it."""
+
+import shutil
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+EXTRAS: dict[str, tuple[str, ...]] = {
+    "base": ("numpy", "mcap", "cyclopts", "rich", "zstandard", "jaxtyping", "jsonschema"),
+    "record": ("eclipse-zenoh", "simplejpeg", "rosbags", "pillow"),
+    "twin": ("torch", "open3d", "pybullet", "python-fcl", "pin", "scipy", "example-robot-data"),
+    "report": ("pandas", "pyarrow", "plotly", "matplotlib"),
+    "dashboard": ("starlette", "uvicorn", "jinja2", "rerun-sdk"),
+    "standin": ("mujoco", "open3d", "pin", "example-robot-data"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One line of the report."""
+
+    what: str
+    found: str
+    ok: bool
+    advice: str = ""
+
+
+def examine() -> list[Finding]:
+    """Look at packages, the native extension, system libraries and programs; import nothing."""
+    findings = [_package(name, extra) for extra, names in EXTRAS.items() for name in names]
+    findings.append(_native())
+    findings.append(_program("chromium", "needed only to test the dashboard: apt install chromium"))
+    findings.extend(_system_libraries())
+    return findings
+
+
+def _package(name: str, extra: str) -> Finding:
+    try:
+        found = metadata.version(name)
+    except metadata.PackageNotFoundError:
+        advice = f"pip install 'robot-gst[{extra}]'" if extra != "base" else "pip install robot-gst"
+        return Finding(what=f"{name} [{extra}]", found="missing", ok=False, advice=advice)
+    return Finding(what=f"{name} [{extra}]", found=found, ok=True)
+
+
+def _native() -> Finding:
+    from importlib.util import find_spec  # noqa: PLC0415  # keeps this module's imports plain
+
+    spec = find_spec("twin.scene._splat")
+    if spec is None:
+        advice = "run make, or pip install . with a C++17 compiler present"
+        return Finding(what="splat rasteriser", found="not built", ok=False, advice=advice)
+    return Finding(what="splat rasteriser", found="built", ok=True)
+
+
+def _program(name: str, advice: str) -> Finding:
+    found = shutil.which(name)
+    return Finding(
+        what=name, found="present" if found else "missing", ok=True, advice="" if found else advice
+    )
+
+
+def _system_libraries() -> list[Finding]:
+    """Open3D opens these when imported."""
+    wanted = {"libEGL.so.1": "libegl1", "libGL.so.1": "libgl1", "libX11.so.6": "libx11-6"}
+    wanted |= {"libusb-1.0.so.0": "libusb-1.0-0", "libudev.so.1": "libudev1"}
+    wanted |= {"libidn2.so.0": "libidn2-0"}
+    folders = [Path("/lib"), Path("/usr/lib"), *Path("/usr/lib").glob("*-linux-gnu")]
+    findings = []
+    for library, package in wanted.items():
+        present = any((folder / library).exists() for folder in folders)
+        findings.append(
+            Finding(
+                what=library,
+                found="present" if present else "missing",
+                ok=present,
+                advice="" if present else f"apt-get install --no-install-recommends {package}",
+            )
+        )
+    return findings

@@ -1,0 +1,97 @@
+"""List a run's episodes, and labels given after the fact (sidecars; no episode is rewritten)."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from bridge.episode.metadata import Outcome
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder, check_episode_id
+from bridge.errors import BridgeError, PathNotFoundError
+from bridge.task.record import check_record, parse_record
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One line of ``robot-gst ls``. ``error`` is set when the file could not be read."""
+
+    file: str
+    id: str
+    kind: str = ""
+    task: str = ""
+    condition: str = ""
+    policy: str = ""
+    start_id: str | None = None
+    outcome: str = "unknown"
+    duration_s: float = 0.0
+    size_bytes: int = 0
+    stand_in: bool = False
+    error: str = ""
+
+
+def list_episodes(run: RunFolder) -> list[Entry]:
+    """Return an entry for every recorded episode; a broken one is listed with its error."""
+    return [_entry(run, path) for path in run.episodes()]
+
+
+def _entry(run: RunFolder, path: Path) -> Entry:
+    size = path.stat().st_size
+    try:
+        episode = Episode.open(path)
+        outcome = outcome_of(run, episode)
+    except BridgeError as error:
+        return Entry(file=path.name, id=path.stem, size_bytes=size, error=str(error))
+    info = episode.info
+    return Entry(
+        file=path.name,
+        id=info.id,
+        kind=info.kind,
+        task=info.task,
+        condition=info.condition,
+        policy=info.policy,
+        start_id=info.start_id,
+        outcome=outcome.result if outcome else "unknown",
+        duration_s=episode.duration_s,
+        size_bytes=size,
+        stand_in=info.stand_in,
+    )
+
+
+def _sidecar(run: RunFolder, episode_id: str) -> Path:
+    return run.notes_dir / f"{check_episode_id(episode_id)}.outcome.json"
+
+
+def outcome_of(run: RunFolder, episode: Episode) -> Outcome | None:
+    """Return the label given after the fact if there is one, else what the episode says."""
+    path = _sidecar(run, episode.info.id)
+    if not path.is_file():
+        return episode.outcome
+    record = parse_record(path.read_bytes(), name="outcome")
+    return outcome_from(record)
+
+
+def outcome_from(record: dict[str, Any]) -> Outcome:
+    """Build an ``Outcome`` from a checked record."""
+    known = {name: record[name] for name in Outcome.__dataclass_fields__ if name in record}
+    known["stages"] = tuple(known.get("stages", ()))
+    return Outcome(**known)
+
+
+def label_episode(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:
+    """Write a label beside the run; the episode file is not touched."""
+    if not (run.episodes_dir / f"{check_episode_id(episode_id)}.mcap").is_file():
+        names = ", ".join(path.stem for path in run.episodes()[:10]) or "none"
+        raise PathNotFoundError(
+            path=run.episodes_dir / f"{episode_id}.mcap",
+            what="episode",
+            hint=f"Episodes here: {names}.",
+        )
+    record = json.loads(json.dumps(asdict(outcome)))
+    check_record(record, name="outcome")
+    path = _sidecar(run, episode_id)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(record, indent=1) + "\n")
+    temporary.replace(path)
+    return path
