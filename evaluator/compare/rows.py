@@ -1,0 +1,95 @@
+"""What a comparison is made of: one row per recorded trial, with what the twin said of it."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from evaluator.result import Exclusion, Measurement, Results, Table
+
+
+@dataclass(frozen=True, kw_only=True)
+class TcpErrorSeries:
+    """Distance between the recorded and a replayed tool centre point over time."""
+
+    against: str
+    """``planned`` or ``executed``: which replay."""
+    t_s: Float[np.ndarray, " num_samples"]
+    """Time from the start of the execution [s]."""
+    position_m: Float[np.ndarray, " num_samples"]
+    rotation_rad: Float[np.ndarray, " num_samples"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialRow:
+    """One recorded trial beside its replays. None means unknown, undecided or not there."""
+
+    episode: str
+    """Id of the recorded episode, or the trial id of a trials CSV."""
+    task: str
+    condition: str
+    policy: str
+    start_id: str | None
+    cell: str
+    stand_in: bool
+    recorded: bool | None
+    """Task-level outcome as the operator labelled it."""
+    unit: str = "trial"
+    k: int | None = None
+    """Recorded successes in ``unit`` (1 of 1 for a trial; ducks in the basket for an object)."""
+    n: int | None = None
+    plan_id: str | None = None
+    """The plan actually sent: the last one whose execution started."""
+    num_plans: int = 0
+    num_plans_sent: int = 0
+    sim_planned: bool | None = None
+    """Headline sim: the sent plan, planned trajectory, dynamic, in the twin."""
+    sim_executed: bool | None = None
+    """Diagnosis only: the executed joints re-lived dynamically. Never enters r."""
+    verdict: bool | None = None
+    """The gate's verdict on the sent plan, made before its execution started."""
+    p_success: float | None = None
+    first_failing: str | None = None
+    """ik, clearance or terminal of the planned replay, or of the verdict where there is none."""
+    failing_detail: str | None = None
+    planned_replay: str | None = None
+    """File name of the derived episode ``sim_planned`` comes from."""
+    executed_replay: str | None = None
+    path: Path | None = None
+    tcp_errors: tuple[TcpErrorSeries, ...] = ()
+
+    @property
+    def recorded_word(self) -> str:
+        """``stand-in`` or ``real``: what the recorded side of this row is."""
+        return "stand-in" if self.stand_in else "real"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Everything ``compare_run`` found; the reports and the dashboard only show it."""
+
+    run: str
+    source: str
+    """run, trials or rates."""
+    stand_in: bool | None
+    rows: tuple[TrialRow, ...] = ()
+    measurements: tuple[Measurement, ...] = ()
+    tables: tuple[Table, ...] = ()
+    exclusions: tuple[Exclusion, ...] = ()
+    missing: tuple[str, ...] = ()
+    inputs: dict[str, str] = field(default_factory=dict)
+    """File name to content hash of every input."""
+
+    def results(self) -> Results:
+        """Return what goes into ``results.json``."""
+        return Results(
+            run=self.run,
+            source=self.source,
+            stand_in=self.stand_in,
+            measurements=self.measurements,
+            tables=self.tables,
+            exclusions=self.exclusions,
+            missing=self.missing,
+            provenance=dict(self.inputs),
+        )

@@ -1,0 +1,186 @@
+"""One measured number, and ``results.json``: everything one evaluation has to say.
+
+Undefined is undefined, with its reason; it is never 0, 1 or NaN.
+"""
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bridge.errors import InvalidRecordError, PathNotFoundError
+from bridge.task.record import check_record, parse_record
+from evaluator.errors import EvaluatorError
+
+SCHEMA_VERSION = 1
+
+Cell = str | int | float | bool | None
+"""What a table may hold; None is printed as undefined, never as zero."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interval:
+    """Where the true value plausibly lies."""
+
+    low: float
+    high: float
+    level: float
+    method: str
+    """For example ``wilson``; a method is always named."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """One measured number with all that is needed to judge it."""
+
+    id: str
+    """Dotted, stable: ``rate.recorded.cube_into_box.with_replanning``."""
+    value: float | None
+    unit: str
+    """``1`` for fractions and coefficients, ``pp``, ``m``, ``rad``, ``dB``, ``count``."""
+    definition: str
+    """One sentence: what was counted or computed, from what."""
+    interval: Interval | None = None
+    k: int | None = None
+    """Successes, where the value is k/n."""
+    n: int | None = None
+    counted: str | None = None
+    """What ``n`` counts: trial, object, pair, cell, image, run."""
+    reason_if_undefined: str | None = None
+    """Set exactly when ``value`` is None."""
+    reason_without_interval: str | None = None
+    episodes: tuple[str, ...] = ()
+    """The recorded episodes the number rests on."""
+
+    def __post_init__(self) -> None:
+        """Refuse NaN, infinity, and undefined values without a reason."""
+        if self.value is not None and not math.isfinite(self.value):
+            message = f"measurement {self.id} is {self.value}; say it is undefined and why"
+            raise ValueError(message)
+        if (self.value is None) != (self.reason_if_undefined is not None):
+            message = f"measurement {self.id} needs a value or a reason, and not both"
+            raise ValueError(message)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """Rows a report prints as they are."""
+
+    id: str
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    note: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exclusion:
+    """Something left out of a number, and why."""
+
+    episode: str
+    scope: str
+    """What it was left out of: ``agreement``, ``pairing``, ``views`` ..."""
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """The content of ``results.json``."""
+
+    run: str
+    source: str
+    """run, trials or rates."""
+    stand_in: bool | None
+    """None when the input does not say, as a rates CSV."""
+    measurements: tuple[Measurement, ...]
+    tables: tuple[Table, ...] = ()
+    exclusions: tuple[Exclusion, ...] = ()
+    missing: tuple[str, ...] = ()
+    """What could not be computed at all because its input is not there."""
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def get(self, measurement_id: str) -> Measurement:
+        """Return one measurement.
+
+        Raises:
+            EvaluatorError: Listing the ids that exist.
+        """
+        for measurement in self.measurements:
+            if measurement.id == measurement_id:
+                return measurement
+        names = ", ".join(measurement.id for measurement in self.measurements)
+        message = (
+            f"no measurement {measurement_id!r} in the results of {self.run}. There are: {names}."
+        )
+        raise EvaluatorError(message)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the JSON record, checked against the schema."""
+        record = json.loads(json.dumps({"schema_version": SCHEMA_VERSION, **asdict(self)}))
+        check_record(record, name="results", package="evaluator")
+        return dict(record)
+
+
+def write_results(results: Results, path: Path) -> Path:
+    """Write ``results.json``; a half-written file never carries the final name."""
+    text = json.dumps(results.to_record(), indent=1, allow_nan=False)
+    part = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(text + "\n")
+        os.replace(part, path)
+    except OSError as error:
+        message = f"cannot write {path}: {error.strerror}. Choose another folder with --out."
+        raise EvaluatorError(message) from error
+    return path
+
+
+def load_results(path: Path) -> Results:
+    """Read ``results.json``, or the one of a run folder.
+
+    Raises:
+        PathNotFoundError: When there is none.
+        InvalidRecordError: When it does not fit the schema, or is newer than this reader.
+    """
+    if path.is_dir():
+        path = path / "results" / "results.json"
+    if not path.is_file():
+        raise PathNotFoundError(
+            path=path, what="results", hint="Make them first: robot-gst evaluate RUN."
+        )
+    record = parse_record(path.read_bytes(), name="results", package="evaluator")
+    try:
+        return _from_record(record)
+    except ValueError as error:
+        raise InvalidRecordError(name="results", where="measurements", found=str(error)) from error
+
+
+def _from_record(record: Mapping[str, Any]) -> Results:
+    return Results(
+        run=record["run"],
+        source=record["source"],
+        stand_in=record["stand_in"],
+        measurements=tuple(_measurement(item) for item in record["measurements"]),
+        tables=tuple(_table(item) for item in record["tables"]),
+        exclusions=tuple(Exclusion(**item) for item in record["exclusions"]),
+        missing=tuple(record["missing"]),
+        provenance=record["provenance"],
+    )
+
+
+def _measurement(record: Mapping[str, Any]) -> Measurement:
+    interval = record.get("interval")
+    values = dict(record)
+    values["interval"] = None if interval is None else Interval(**interval)
+    values["episodes"] = tuple(record.get("episodes", ()))
+    return Measurement(**values)
+
+
+def _table(record: Mapping[str, Any]) -> Table:
+    values = dict(record)
+    values["columns"] = tuple(record["columns"])
+    values["rows"] = tuple(tuple(row) for row in record["rows"])
+    return Table(**values)
