@@ -1,1 +1,1 @@
-"""Arrays in, errors out: trajectory, image, outcome."""
+"""Arrays in, errors out: images, trajectories, outcomes."""

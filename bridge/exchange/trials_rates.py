@@ -1,0 +1,143 @@
+"""Rates CSV in: success rates as papers print them, with the counts they must come from.
+
+Columns: task, condition, side, unit, k, n, and rate (0..1) or rate_percent (0..100).
+"""
+
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from fractions import Fraction
+from pathlib import Path
+
+from bridge.exchange.trials_csv import UNITS, SourceRow, read_rows
+
+COLUMNS = ("task", "condition", "side", "unit", "k", "n", "rate", "rate_percent")
+SIDES = ("sim", "real", "stand-in")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RateRecord:
+    """One printed rate."""
+
+    task: str
+    condition: str
+    side: str
+    """sim, real or stand-in."""
+    unit: str
+    k: int | None
+    n: int | None
+    """None when the source gives a rate without its number of trials."""
+    rate: Fraction
+    """k/n where both are known, else as printed."""
+    row: int
+
+
+def read_rates(path: Path) -> list[RateRecord]:
+    """Read and check a rates CSV.
+
+    Raises:
+        TableError: For a rate that is no count of n, doubled cells, or units that differ in a task.
+    """
+    records: list[RateRecord] = []
+    for row in read_rows(path, ("task", "side"), COLUMNS):
+        record = _rate(row)
+        for other in records:
+            if other.task == record.task and other.unit != record.unit:
+                raise row.refuse(
+                    f"unit {record.unit!r} in task {record.task!r}, but row {other.row} says "
+                    f"{other.unit!r}",
+                    "One task is counted in one unit; mixing them changes what a rate means",
+                )
+            if _key(other) == _key(record):
+                raise row.refuse(
+                    f"{record.side} of {record.task!r} {record.condition!r} stands in row "
+                    f"{other.row} already",
+                    "Give each cell once",
+                )
+        records.append(record)
+    return records
+
+
+def _key(record: RateRecord) -> tuple[str, str, str]:
+    return record.task, record.condition, "sim" if record.side == "sim" else "recorded"
+
+
+def _rate(row: SourceRow) -> RateRecord:
+    if not row.text("task"):
+        raise row.refuse("task is empty", "Every rate needs its task")
+    side, unit = row.text("side"), row.text("unit") or "trial"
+    if side not in SIDES:
+        raise row.refuse(f"side is {side!r}", f"Sides: {', '.join(SIDES)}")
+    if unit not in UNITS:
+        raise row.refuse(f"unit is {unit!r}", f"Units: {', '.join(UNITS)}")
+    k, n = row.whole("k"), row.whole("n")
+    printed = _printed(row)
+    if n == 0 or (k is not None and n is not None and k > n):
+        raise row.refuse(f"{k} of {n} is not a possible count", "Check k and n")
+    if k is not None and n is None:
+        raise row.refuse("k without n", "Give both, or only the rate")
+    if printed is not None and n is not None:
+        k = _count(row, printed, n, k)
+    if k is not None and n is not None:
+        rate = Fraction(k, n)
+    elif printed is not None:
+        rate = printed[0]
+    else:
+        raise row.refuse("neither a rate nor both k and n", "Give k and n, or a rate")
+    return RateRecord(
+        task=row.text("task"),
+        condition=row.text("condition"),
+        side=side,
+        unit=unit,
+        k=k,
+        n=n,
+        rate=rate,
+        row=row.row,
+    )
+
+
+def _printed(row: SourceRow) -> tuple[Fraction, Fraction] | None:
+    """Return the rate as printed and half a unit of its last digit, both as fractions of 1."""
+    texts = {name: row.text(name) for name in ("rate", "rate_percent")}
+    given = {name: text for name, text in texts.items() if text}
+    if len(given) == 2:
+        raise row.refuse("both rate and rate_percent", "Give one of them")
+    if not given:
+        return None
+    name, text = next(iter(given.items()))
+    scale = 1 if name == "rate" else 100
+    try:
+        number = Decimal(text.removesuffix("%"))
+    except InvalidOperation:
+        number = Decimal("NaN")
+    if not number.is_finite() or not 0 <= number <= scale:
+        hint = f"{name} lies in 0..{scale}; percent go into the column rate_percent"
+        raise row.refuse(f"{name} is {text!r}", hint)
+    exponent = number.as_tuple().exponent
+    digits = -exponent if isinstance(exponent, int) and exponent < 0 else 0
+    half = Fraction(1, 2 * 10**digits) / scale
+    return Fraction(number) / scale, half
+
+
+def _count(row: SourceRow, printed: tuple[Fraction, Fraction], n: int, k: int | None) -> int:
+    """Return the count behind a printed rate, refusing what no count of n rounds to."""
+    rate, half = printed
+    nearest = int(rate * n + Fraction(1, 2))
+    fitting = [count for count in range(n + 1) if abs(Fraction(count, n) - rate) <= half]
+    if k is not None:
+        if k not in fitting:
+            raise row.refuse(
+                f"the rate {float(rate):.6g} is not {k}/{n} = {k / n:.6g}", "Correct one of them"
+            )
+        return k
+    if not fitting:
+        below = int(rate * n)
+        raise row.refuse(
+            f"{float(rate):.6g} x {n} = {float(rate * n):.6g} is no whole number of successes",
+            f"{below}/{n} = {below / n:.6g} and {below + 1}/{n} = {(below + 1) / n:.6g} are the "
+            "possible rates. Was another unit counted? 0.46 fits 23 of 50 objects, not 10 trials",
+        )
+    if len(fitting) > 1 and Fraction(nearest, n) != rate:
+        raise row.refuse(
+            f"{len(fitting)} counts of {n} round to {float(rate):.6g}", "Give k as well"
+        )
+    return nearest
