@@ -5,7 +5,6 @@ Undefined is undefined, with its reason; it is never 0, 1 or NaN.
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -131,7 +130,7 @@ def write_results(results: Results, path: Path) -> Path:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         part.write_text(text + "\n")
-        os.replace(part, path)
+        part.replace(path)
     except OSError as error:
         message = f"cannot write {path}: {error.strerror}. Choose another folder with --out."
         raise EvaluatorError(message) from error

@@ -59,7 +59,7 @@ def mean_curve(
     runs: Sequence[PoseTrajectory], num_samples: int = NORMALISED_SAMPLES
 ) -> Float[np.ndarray, "num_samples 3"]:
     """Average the positions of several runs over normalised time [m]."""
-    return np.mean(_curves(runs, num_samples), axis=0)
+    return np.asarray(_curves(runs, num_samples).mean(axis=0))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,5 +1,6 @@
-"""Does the twin say what then happens? Counts per trial, not rates: equal rates can hide that
-the twin was wrong about every single trial.
+"""Does the twin say what then happens? Counted per trial, not as rates.
+
+Equal rates can hide that the twin was wrong about every single trial.
 """
 
 import math

@@ -90,8 +90,9 @@ def mmrv(*, recorded: Sequence[Number], sim: Sequence[Number], gap: str = "recor
     if gap not in ("recorded", "sim"):
         message = f"gap {gap!r} is no MMRV convention; there are: recorded, sim"
         raise ValueError(message)
-    judge, judged = (recorded, sim) if gap == "recorded" else (sim, recorded)
-    worst: list[Number] = []
+    sides = [Fraction(v) for v in recorded], [Fraction(v) for v in sim]
+    judge, judged = sides if gap == "recorded" else sides[::-1]
+    worst = []
     cells = range(len(judge))
     for i in cells:
         violations = [
@@ -99,7 +100,7 @@ def mmrv(*, recorded: Sequence[Number], sim: Sequence[Number], gap: str = "recor
             for j in cells
             if (judged[i] > judged[j]) != (judge[i] > judge[j])
         ]
-        worst.append(max(violations, default=0))
+        worst.append(max(violations, default=Fraction(0)))
     return float(sum(worst) / len(worst))
 
 

@@ -1,4 +1,4 @@
-"""Intervals for success rates and for their differences. Never Wald: it collapses at 0/n and n/n."""
+"""Intervals for success rates and their differences. Never Wald: it collapses at 0/n and n/n."""
 
 import math
 
