@@ -18,33 +18,72 @@ HELP = (
     "execution, and say how far the twin can be trusted."
 )
 
-COMMANDS: tuple[tuple[str, str, str], ...] = (
-    ("demo", "dashboards.cli:demo", "The whole loop on a stand-in cell, in minutes."),
-    ("record", "bridge.cli:record", "Record episodes live over zenoh."),
-    ("ctl", "bridge.cli:ctl", "Start, stop, mark or label from anywhere."),
-    ("publish", "", "Speak on the wire: an RGB-D folder or the stand-in cell."),
-    ("import", "", "Bring other people's recordings into a run."),
-    ("info", "bridge.cli:info", "What an episode holds."),
-    ("check", "bridge.cli:check", "Whether an episode is whole, and what it declares lost."),
-    ("ls", "bridge.cli:ls", "List the episodes of a run."),
-    ("label", "bridge.cli:label", "Say after the fact how an episode ended."),
-    ("rebuild", "twin.cli:rebuild", "Episodes to a Gaussian-splat scene with held-out renders."),
-    ("render", "twin.cli:render", "Render the rebuilt scene to PNG."),
-    ("replay", "twin.cli:replay", "Re-live every planned and executed trajectory."),
-    ("gate", "twin.cli:gate", "Live verdicts over zenoh, before the robot moves."),
-    ("evaluate", "evaluator.cli:evaluate", "Success rates, agreement, image quality; a report."),
-    ("dashboard", "dashboards.cli:dashboard", "Review pages on the loopback address."),
-    ("doctor", "bridge.cli:doctor", "What is installed, what is missing, how to get it."),
+COMMANDS: tuple[tuple[str, str, str, str], ...] = (
+    ("demo", "dashboards.cli:demo", "The whole loop on a stand-in cell, in minutes.", "runs/demo"),
+    ("record", "bridge.cli:record", "Record episodes live over zenoh.", "runs/monday"),
+    ("ctl", "bridge.cli:ctl", "Start, stop, mark or label from anywhere.", "start --id trial_1"),
+    ("info", "bridge.cli:info", "What an episode holds.", "runs/demo/episodes/scan.mcap"),
+    ("check", "bridge.cli:check", "Whether an episode is whole, and what it lost.", "runs/demo"),
+    ("ls", "bridge.cli:ls", "List the episodes of a run.", "runs/demo"),
+    (
+        "label",
+        "bridge.cli:label",
+        "Say after the fact how an episode ended.",
+        "runs/demo trial_1 --result failure",
+    ),
+    (
+        "rebuild",
+        "twin.cli:rebuild",
+        "Episodes to a Gaussian-splat scene with held-out renders.",
+        "runs/monday --budget 60s",
+    ),
+    ("render", "twin.cli:render", "Render the rebuilt scene to PNG.", "runs/monday"),
+    (
+        "replay",
+        "twin.cli:replay",
+        "Re-live every planned and executed trajectory.",
+        "runs/monday --workers 2",
+    ),
+    ("gate", "twin.cli:gate", "Live verdicts over zenoh, before the robot moves.", "runs/monday"),
+    (
+        "evaluate",
+        "evaluator.cli:evaluate",
+        "Success rates, agreement, image quality; a report.",
+        "runs/monday",
+    ),
+    (
+        "dashboard",
+        "dashboards.cli:dashboard",
+        "Review pages on the loopback address.",
+        "runs/monday",
+    ),
+    ("doctor", "bridge.cli:doctor", "What is installed, what is missing, how to get it.", "--json"),
 )
 
-GROUPS: dict[str, tuple[tuple[str, str, str], ...]] = {
+GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
     "publish": (
-        ("folder", "bridge.cli:publish_folder", "Play an RGB-D folder as a live camera."),
-        ("standin", "bridge.cli:publish_standin", "The stand-in cell: a simulated laboratory."),
+        "Speak on the wire: an RGB-D folder or the stand-in cell.",
+        (
+            (
+                "folder",
+                "bridge.cli:publish_folder",
+                "Play an RGB-D folder as a live camera.",
+                "DIR --episode scan",
+            ),
+            (
+                "standin",
+                "bridge.cli:publish_standin",
+                "The stand-in cell: a simulated laboratory.",
+                "--trials 3 --seed 1",
+            ),
+        ),
     ),
     "import": (
-        ("rgbd", "bridge.cli:import_rgbd", "An RGB-D folder with a scene.json."),
-        ("kinova", "bridge.cli:import_kinova", "The Kinova reality-gap runs."),
+        "Bring other people's recordings into a run.",
+        (
+            ("rgbd", "bridge.cli:import_rgbd", "An RGB-D folder with a scene.json.", "DIR runs/x"),
+            ("kinova", "bridge.cli:import_kinova", "The Kinova reality-gap runs.", "DIR runs/x"),
+        ),
     ),
 }
 
@@ -59,15 +98,19 @@ def build_app() -> App:
         console=Console(),
         error_console=Console(stderr=True),
     )
-    for name, target, help_text in COMMANDS:
-        if name not in GROUPS:
-            app.command(target, name=name, help=help_text)
-            continue
-        group = App(name=name, help=help_text)
-        for sub_name, sub_target, sub_help in GROUPS[name]:
-            group.command(sub_target, name=sub_name, help=sub_help)
+    for name, target, text, example in COMMANDS:
+        app.command(target, name=name, help=_help(text, f"{name} {example}"))
+    for name, (text, members) in GROUPS.items():
+        group = App(name=name, help=text)
+        for member, target, member_text, example in members:
+            help_text = _help(member_text, f"{name} {member} {example}")
+            group.command(target, name=member, help=help_text)
         app.command(group)
     return app
+
+
+def _help(text: str, example: str) -> str:
+    return f"{text}\n\nExample: robot-gst {example}"
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -19,7 +19,7 @@ Advance = Callable[[int, str], None]
 """Called as ``advance(done, note)`` by long work."""
 
 
-@Parameter(name="*", group="Output")
+@Parameter(name="*", group="Output", negative=())
 @dataclass(frozen=True, kw_only=True)
 class Output:
     """How a command talks; every command takes these."""

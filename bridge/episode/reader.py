@@ -1,16 +1,30 @@
-"""Read one episode: metadata, topics, raw messages. ``views`` and ``streams`` decode them."""
+"""Read one episode: metadata, topics, raw messages; ``streams`` decodes them."""
 
+import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import McapReader, make_reader
 from mcap.summary import Summary
 
 from bridge.episode import metadata, schema
 from bridge.errors import EpisodeError, PathNotFoundError, SchemaVersionError
+
+DAMAGE = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    EOFError,
+    KeyError,
+    IndexError,
+    OverflowError,
+)
+"""What the ``mcap`` package raises on bytes that are not what they claim to be."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +77,7 @@ class Episode:
                     record.name: metadata.from_strings(record.metadata)
                     for record in reader.iter_metadata()
                 }
-        except (McapError, ValueError, EOFError) as error:
+        except DAMAGE as error:
             raise EpisodeError(
                 path=path,
                 found=f"not a finished MCAP file ({type(error).__name__}: {str(error)[:120]})",
@@ -150,15 +164,26 @@ class Episode:
             if summary.type_name == type_name and not schema.is_truth(topic)
         ]
 
-    def messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
-        """Yield messages in log order with CRCs checked, optionally of some topics only."""
+    def messages(
+        self,
+        topics: Iterable[str] | None = None,
+        *,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> Iterator[RawMessage]:
+        """Yield messages in log order with CRCs checked, optionally of some topics only.
+
+        ``start_ns`` (included) and ``end_ns`` (excluded) bound the log time.
+        """
         wanted = None if topics is None else list(topics)
         if wanted == []:
             return
         try:
             with self.path.open("rb") as stream:
                 reader: McapReader = make_reader(stream, validate_crcs=True)
-                for record, channel, message in reader.iter_messages(topics=wanted):
+                for record, channel, message in reader.iter_messages(
+                    topics=wanted, start_time=start_ns, end_time=end_ns
+                ):
                     yield RawMessage(
                         topic=channel.topic,
                         type_name=record.name if record else "",
@@ -167,7 +192,7 @@ class Episode:
                         sequence=message.sequence,
                         data=message.data,
                     )
-        except (McapError, EOFError) as error:
+        except DAMAGE as error:
             raise EpisodeError(
                 path=self.path,
                 found=f"damaged ({type(error).__name__}: {str(error)[:120]})",

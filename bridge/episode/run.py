@@ -6,12 +6,12 @@ from pathlib import Path
 
 from bridge.errors import PathNotFoundError, UsageError
 
-EPISODE_ID = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,120}$")
+EPISODE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,120}")
 
 
 def check_episode_id(episode_id: str) -> str:
     """Return the id if it is safe as a file name; remote requests cannot leave the run folder."""
-    if not EPISODE_ID.match(episode_id):
+    if not EPISODE_ID.fullmatch(episode_id):
         message = (
             f"episode id {episode_id!r} is not usable as a file name. "
             "Use letters, digits, '_' and '-', at most 121 characters."

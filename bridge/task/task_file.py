@@ -43,12 +43,13 @@ class ObjectModel:
             return [(np.zeros(3), size)]
         x, y, z = size
         wall = self.wall_m
+        height, middle = z - wall, (z + wall) / 2  # walls stand on the floor
         return [
             (np.array([0, 0, wall / 2]), np.array([x, y, wall])),
-            (np.array([(x - wall) / 2, 0, z / 2]), np.array([wall, y, z])),
-            (np.array([-(x - wall) / 2, 0, z / 2]), np.array([wall, y, z])),
-            (np.array([0, (y - wall) / 2, z / 2]), np.array([x - 2 * wall, wall, z])),
-            (np.array([0, -(y - wall) / 2, z / 2]), np.array([x - 2 * wall, wall, z])),
+            (np.array([(x - wall) / 2, 0, middle]), np.array([wall, y, height])),
+            (np.array([-(x - wall) / 2, 0, middle]), np.array([wall, y, height])),
+            (np.array([0, (y - wall) / 2, middle]), np.array([x - 2 * wall, wall, height])),
+            (np.array([0, -(y - wall) / 2, middle]), np.array([x - 2 * wall, wall, height])),
         ]
 
 

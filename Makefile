@@ -1,0 +1,56 @@
+# make demo    the whole loop on a stand-in cell, ends with the dashboard's address
+# make test    all tests but the very slow ones   make check   lint, types, import contracts
+# make bench   benchmarks against named references
+# Everything lives in .venv; the first target run makes it (about 5 GB, a few minutes).
+
+.DEFAULT_GOAL := help
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
+	command -v $$p >/dev/null 2>&1 && $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' && echo $$p && break; done)
+BIN := .venv/bin
+READY := .venv/.ready
+NATIVE := $(wildcard twin/scene/native/*)
+RUN ?= runs/demo
+export OMP_WAIT_POLICY ?= passive
+
+.PHONY: help setup demo test fast check format bench clean
+
+help:
+	@sed -n '1,5s/^# //p' Makefile
+
+setup: $(READY)
+
+$(READY): pyproject.toml constraints.txt CMakeLists.txt $(NATIVE)
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: apt-get install python3.11 python3.11-venv" >&2; exit 1; }
+	@.ci/system-packages $(PYTHON)
+	@test -x $(BIN)/python || { echo "Making .venv with $(PYTHON)"; $(PYTHON) -m venv .venv; }
+	@echo "Installing packages into .venv (about 5 GB the first time)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
+		"scikit-build-core>=0.11" nanobind cmake ninja torch==2.13.0
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
+		--no-build-isolation -e '.[all,dev]'
+	@touch $@
+
+demo: $(READY)
+	@$(BIN)/robot-gst demo $(RUN) $(DEMO)
+
+test: $(READY)
+	@$(BIN)/python -m pytest -q -m "not gpu and not hardware and not network" $(TEST)
+
+fast: $(READY)
+	@$(BIN)/python -m pytest -q $(TEST)
+
+check: $(READY)
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports --no-cache
+
+format: $(READY)
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+bench: $(READY)
+	@for file in benchmarks/bench_*.py; do $(BIN)/python $$file || exit 1; done
+
+clean:
+	rm -rf build .venv .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

@@ -1,0 +1,240 @@
+"""Write and read back, also with the official reader; break files on purpose."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from bridge.episode import metadata, schema, streams
+from bridge.episode.check import check_episode
+from bridge.episode.reader import Episode
+from bridge.episode.records import (
+    CameraInfo,
+    CompressedColor,
+    DepthImage,
+    FrameTransform,
+    JointSample,
+    PoseSample,
+    transforms_to_cdr,
+)
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import BridgeError, EpisodeError, SchemaVersionError, UsageError
+from bridge.geometry.camera import Camera
+from bridge.media.color import encode_jpeg
+
+CAMERA = Camera.from_ros(width=32, height=24, fx=30.0, fy=30.0, cx=15.5, cy=11.5)
+INFO = metadata.EpisodeInfo(id="e1", kind="trial", task="cube_into_box", tags=("a", "b"))
+
+
+def joint(stamp_ns: int) -> bytes:
+    return JointSample(
+        stamp_ns=stamp_ns,
+        names=("a", "b"),
+        position=np.array([stamp_ns * 1e-9, 2.0]),
+        velocity=np.zeros(2),
+        effort=np.zeros(0),
+    ).to_cdr()
+
+
+def write_episode(path: Path) -> Path:
+    with EpisodeWriter(path) as writer:
+        for stream in ("color", "depth"):
+            record = CameraInfo(stamp_ns=0, frame_id=f"side_{stream}_optical", camera=CAMERA)
+            topic = f"/c/cam/side/{stream}/info"
+            writer.write(topic, record.to_cdr(), type_name=schema.CAMERA_INFO, log_time_ns=1)
+        T = np.eye(4)
+        T[:3, 3] = [0.1, 0.2, 0.3]
+        transforms = [
+            FrameTransform(
+                stamp_ns=0, parent="base_link", child=f"side_{stream}_optical", T_parent_child=T
+            )
+            for stream in ("color", "depth")
+        ]
+        data = transforms_to_cdr(transforms)
+        writer.write("/tf_static", data, type_name=schema.TF_MESSAGE, log_time_ns=1)
+        for index in range(3):
+            stamp_ns = 10 + index * 100_000_000
+            image = np.full((24, 32, 3), 40 * index, dtype=np.uint8)
+            color = CompressedColor(
+                stamp_ns=stamp_ns,
+                frame_id="side_color_optical",
+                format="jpeg",
+                data=encode_jpeg(image),
+            )
+            depth = DepthImage(
+                stamp_ns=stamp_ns,
+                frame_id="side_depth_optical",
+                depth_mm=np.full((24, 32), 500 + index, dtype=np.uint16),
+            )
+            for topic, record, name in (
+                ("/c/cam/side/color/image", color, schema.COMPRESSED_IMAGE),
+                ("/c/cam/side/depth/image", depth, schema.IMAGE),
+            ):
+                writer.write(
+                    topic,
+                    record.to_cdr(),
+                    type_name=name,
+                    log_time_ns=stamp_ns + 5,
+                    publish_time_ns=stamp_ns,
+                )
+            writer.write(
+                "/c/joint_states",
+                joint(stamp_ns),
+                type_name=schema.JOINT_STATE,
+                log_time_ns=stamp_ns + 7,
+                publish_time_ns=stamp_ns,
+            )
+        writer.describe(INFO, outcome=metadata.Outcome(result="success", k=1))
+        writer.attach("robot.urdf", b"<robot/>", media_type="application/xml", log_time_ns=9)
+    return path
+
+
+@pytest.fixture
+def episode_path(tmp_path: Path) -> Path:
+    return write_episode(tmp_path / "e1.mcap")
+
+
+def test_metadata_survives_the_round_trip(episode_path: Path) -> None:
+    episode = Episode.open(episode_path)
+    assert episode.info == INFO
+    assert episode.outcome == metadata.Outcome(result="success", k=1)
+    assert episode.derived is None
+    assert episode.attachment("robot.urdf") == b"<robot/>"
+    assert streams.robot_description(episode) == "<robot/>"
+
+
+def test_frames_come_back_with_images_depth_and_poses(episode_path: Path) -> None:
+    frames = list(streams.rgbd_frames(Episode.open(episode_path), "side"))
+    assert [frame.stamp_ns for frame in frames] == [10, 100_000_010, 200_000_010]
+    assert frames[1].depth_m == pytest.approx(0.501)
+    assert abs(int(frames[2].image_u8.mean()) - 80) <= 1
+    assert frames[0].color_camera == CAMERA
+    np.testing.assert_allclose(frames[0].T_base_depth[:3, 3], [0.1, 0.2, 0.3])
+
+
+def test_both_times_of_every_message_are_kept(episode_path: Path) -> None:
+    messages = list(Episode.open(episode_path).messages(["/c/joint_states"]))
+    assert [m.log_time_ns - m.publish_time_ns for m in messages] == [7, 7, 7]
+    assert [m.sequence for m in messages] == [0, 1, 2]
+
+
+def test_the_official_reader_accepts_every_crc(episode_path: Path) -> None:
+    with episode_path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        assert sum(1 for _ in reader.iter_messages()) == 12
+    assert check_episode(episode_path).exit_code == 0
+
+
+def test_while_open_the_file_has_no_final_name(tmp_path: Path) -> None:
+    path = tmp_path / "open.mcap"
+    writer = EpisodeWriter(path)
+    writer.write("/c/joint_states", joint(1), type_name=schema.JOINT_STATE, log_time_ns=1)
+    assert not path.exists()
+    assert (tmp_path / "open.mcap.part").exists()
+    writer.close()
+    assert path.exists()
+    assert not (tmp_path / "open.mcap.part").exists()
+
+
+def test_an_exception_while_writing_leaves_only_the_part_file(tmp_path: Path) -> None:
+    path = tmp_path / "broken.mcap"
+    with pytest.raises(RuntimeError), EpisodeWriter(path):
+        raise RuntimeError
+    assert not path.exists()
+    assert path.with_name("broken.mcap.part").exists()
+
+
+def test_an_existing_episode_is_never_replaced(episode_path: Path) -> None:
+    before = episode_path.read_bytes()
+    with pytest.raises(UsageError, match="exists already"):
+        EpisodeWriter(episode_path)
+    assert episode_path.read_bytes() == before
+
+
+def test_a_truncated_file_is_refused_with_a_sentence(episode_path: Path) -> None:
+    episode_path.write_bytes(episode_path.read_bytes()[:-30])
+    with pytest.raises(EpisodeError, match="not a finished MCAP file"):
+        Episode.open(episode_path)
+    assert check_episode(episode_path).exit_code == 1
+
+
+def test_text_with_an_mcap_name_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "text.mcap"
+    path.write_text("hello")
+    with pytest.raises(EpisodeError, match="not a finished MCAP file"):
+        Episode.open(path)
+
+
+def test_a_flipped_bit_in_the_data_is_found(episode_path: Path) -> None:
+    data = bytearray(episode_path.read_bytes())
+    data[len(data) // 4] ^= 0x10
+    episode_path.write_bytes(bytes(data))
+    assert check_episode(episode_path).exit_code == 1
+
+
+def test_a_newer_schema_version_is_refused_with_both_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "new.mcap"
+    with EpisodeWriter(path) as writer:
+        writer.describe(metadata.EpisodeInfo(id="new", kind="trial", schema_version=9))
+    with pytest.raises(SchemaVersionError, match="version 9, this reader knows 1"):
+        Episode.open(path)
+
+
+def test_an_unknown_camera_is_answered_with_those_that_exist(episode_path: Path) -> None:
+    with pytest.raises(EpisodeError, match="Cameras here: side"):
+        list(streams.rgbd_frames(Episode.open(episode_path), "front"))
+
+
+def test_a_malformed_message_is_named_by_check(tmp_path: Path) -> None:
+    path = tmp_path / "bad.mcap"
+    with EpisodeWriter(path) as writer:
+        writer.write("/c/joint_states", b"\0\1\0\0xx", type_name=schema.JOINT_STATE, log_time_ns=1)
+        writer.describe(INFO)
+    report = check_episode(path)
+    assert report.exit_code == 1
+    assert "/c/joint_states" in report.faults[0]
+
+
+def test_declared_losses_have_their_own_exit_code(tmp_path: Path) -> None:
+    path = tmp_path / "lossy.mcap"
+    record = {
+        "schema_version": 1,
+        "topic": "/c/joint_states",
+        "second": 0,
+        "received": 5,
+        "gaps": 2,
+        "queue_drops": 1,
+        "bytes": 10,
+    }
+    with EpisodeWriter(path) as writer:
+        writer.write_json(schema.DROPS_TOPIC, record, type_name=schema.DROPS, log_time_ns=1)
+        writer.describe(INFO)
+    report = check_episode(path)
+    assert (report.exit_code, report.declared_losses) == (3, 3)
+
+
+def test_stand_in_truth_is_never_offered_as_a_stream(tmp_path: Path) -> None:
+    path = tmp_path / "truth.mcap"
+    pose = PoseSample(stamp_ns=1, frame_id="base_link", T_frame_body=np.eye(4)).to_cdr()
+    with EpisodeWriter(path) as writer:
+        topic = "/standin/truth/object/cube/pose"
+        writer.write(topic, pose, type_name=schema.POSE_STAMPED, log_time_ns=1)
+        writer.describe(INFO)
+    assert streams.object_pose_topics(Episode.open(path)) == {}
+
+
+def test_an_empty_episode_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "empty.mcap"
+    with EpisodeWriter(path) as writer:
+        writer.describe(INFO)
+    episode = Episode.open(path)
+    assert (episode.duration_s, episode.topics()) == (0.0, {})
+    assert check_episode(path).exit_code == 0
+
+
+def test_a_missing_frame_is_answered_with_those_that_exist(episode_path: Path) -> None:
+    tree = streams.transform_tree(Episode.open(episode_path))
+    with pytest.raises(BridgeError, match="base_link"):
+        tree.T_root_frame("nowhere", 0)

@@ -1,0 +1,52 @@
+"""Laws of pose trajectories."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bridge.geometry.trajectory import PoseTrajectory
+
+
+def spiral(num_poses: int = 20) -> PoseTrajectory:
+    t = np.linspace(0, 1, num_poses)
+    p = np.stack([np.cos(6 * t), np.sin(6 * t), t], axis=1)
+    q = Rotation.from_rotvec(np.outer(t, [0.2, 0.5, 1.5])).as_quat(scalar_first=True)
+    return PoseTrajectory((t * 1e9).astype(np.int64), p, q)
+
+
+def test_asking_at_the_stamps_returns_the_poses() -> None:
+    track = spiral()
+    again = track.at(track.stamps_ns)
+    np.testing.assert_allclose(again.p_m, track.p_m, atol=1e-12)
+    np.testing.assert_allclose(np.abs(np.sum(again.q_wxyz * track.q_wxyz, axis=1)), 1, atol=1e-12)
+
+
+def test_before_the_start_and_after_the_end_the_ends_are_held() -> None:
+    track = spiral()
+    held = track.at(np.array([-5_000, 9_000_000_000]))
+    np.testing.assert_allclose(held.p_m, track.p_m[[0, -1]])
+
+
+def test_halfway_between_two_poses_is_the_mean_position() -> None:
+    track = spiral()
+    middle = (track.stamps_ns[:1] + track.stamps_ns[1:2]) // 2
+    np.testing.assert_allclose(track.at(middle).p_m[0], track.p_m[:2].mean(axis=0), atol=1e-6)
+
+
+def test_normalised_time_keeps_both_ends() -> None:
+    resampled = spiral().normalised_time(7)
+    assert len(resampled) == 7
+    np.testing.assert_allclose(resampled.p_m[[0, -1]], spiral().p_m[[0, -1]], atol=1e-9)
+
+
+def test_the_length_of_a_straight_line_is_its_span() -> None:
+    p = np.array([[0.0, 0, 0], [0.3, 0, 0], [1.0, 0, 0]])
+    q = np.tile([1.0, 0, 0, 0], (3, 1))
+    track = PoseTrajectory(np.array([0, 1, 2]), p, q)
+    assert track.path_length_m() == pytest.approx(1.0)
+
+
+def test_one_pose_answers_every_stamp() -> None:
+    track = spiral()
+    single = PoseTrajectory(track.stamps_ns[:1], track.p_m[:1], track.q_wxyz[:1])
+    np.testing.assert_allclose(single.at(np.array([0, 10])).p_m, track.p_m[[0, 0]])

@@ -1,0 +1,76 @@
+"""Colour and depth decoding: round trips, rules of the folders, broken bytes."""
+
+import io
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from PIL import Image
+
+from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
+from bridge.media.depth import ROTATED_ENCODING, decode_depth_png, to_millimetres, undo_rotation
+
+depths = hnp.arrays(np.uint16, (4, 5))
+
+
+def png(array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(array).save(buffer, format="png")
+    return buffer.getvalue()
+
+
+def test_a_smooth_image_survives_jpeg() -> None:
+    ramp = np.linspace(0, 255, 64 * 48).reshape(48, 64).astype(np.uint8)
+    image = np.stack([ramp] * 3, axis=-1)
+    again = decode_color(encode_jpeg(image))
+    assert again.shape == image.shape
+    assert np.abs(again.astype(int) - image).max() < 12  # quality 90 keeps a ramp within this
+
+
+def test_png_colour_is_lossless() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (6, 7, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(decode_color(png(image)), image)
+
+
+@pytest.mark.parametrize("cut", [3, 40, 200])
+def test_a_truncated_jpeg_is_refused(cut: int) -> None:
+    data = encode_jpeg(np.zeros((16, 16, 3), dtype=np.uint8))[:cut]
+    with pytest.raises(UnreadableImageError, match="unreadable image"):
+        decode_color(data)
+
+
+@given(st.binary(max_size=64))
+def test_arbitrary_bytes_are_no_image(data: bytes) -> None:
+    with pytest.raises(UnreadableImageError):
+        decode_color(data)
+
+
+@given(depths)
+def test_depth_png_round_trip_is_exact(depth: np.ndarray) -> None:
+    np.testing.assert_array_equal(decode_depth_png(png(depth)), depth)
+
+
+@given(depths)
+def test_undoing_the_rotation_inverts_it(depth: np.ndarray) -> None:
+    rotated = (depth << np.uint16(3)) | (depth >> np.uint16(13))
+    np.testing.assert_array_equal(undo_rotation(rotated), depth)
+
+
+def test_every_invalid_code_becomes_zero() -> None:
+    stored = np.array([[0, 65535, 800]], dtype=np.uint16)
+    result = to_millimetres(stored, unit_m=1e-3, invalid_values=(0, 65535))
+    np.testing.assert_array_equal(result, [[0, 0, 800]])
+
+
+def test_tenths_of_a_millimetre_are_rounded_after_unrotating() -> None:
+    values = np.array([[5_004, 5_006, 0]], dtype=np.uint16)
+    stored = (values << np.uint16(3)) | (values >> np.uint16(13))
+    result = to_millimetres(stored, unit_m=1e-4, encoding=ROTATED_ENCODING)
+    np.testing.assert_array_equal(result, [[500, 501, 0]])
+
+
+def test_an_eight_bit_image_is_no_depth() -> None:
+    with pytest.raises(UnreadableImageError, match="16 bit"):
+        decode_depth_png(png(np.zeros((4, 4), dtype=np.uint8)))

@@ -1,0 +1,107 @@
+"""The front door: exit codes, one clear sentence, JSON on stdout."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+import robot_gst
+from bridge.episode.catalogue import label_episode, list_episodes
+from bridge.episode.metadata import EpisodeInfo, Outcome
+from bridge.episode.run import RunFolder, check_episode_id
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import UsageError
+
+
+@pytest.fixture
+def run_path(tmp_path: Path) -> Path:
+    run = RunFolder.create(tmp_path / "run")
+    with EpisodeWriter(run.episodes_dir / "t1.mcap") as writer:
+        writer.describe(EpisodeInfo(id="t1", kind="trial", stand_in=True))
+    return run.path
+
+
+def test_info_prints_json(run_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = robot_gst.run(["info", str(run_path / "episodes" / "t1.mcap"), "--json"])
+    assert code == 0
+    assert json.loads(capsys.readouterr().out)["info"]["id"] == "t1"
+
+
+def test_a_missing_episode_is_wrong_use(capsys: pytest.CaptureFixture[str]) -> None:
+    assert robot_gst.run(["info", "nowhere.mcap"]) == 2
+    assert "episode not found: nowhere.mcap" in capsys.readouterr().err
+
+
+def test_an_unknown_command_is_wrong_use(capsys: pytest.CaptureFixture[str]) -> None:
+    assert robot_gst.run(["fly"]) == 2
+    assert "fly" in capsys.readouterr().err
+
+
+def test_a_broken_episode_fails_the_check(run_path: Path) -> None:
+    (run_path / "episodes" / "bad.mcap").write_bytes(b"\x89MCAP0\r\nrest")
+    assert robot_gst.run(["check", str(run_path)]) == 1
+
+
+def test_a_clean_run_passes_the_check(run_path: Path) -> None:
+    assert robot_gst.run(["check", str(run_path)]) == 0
+
+
+def test_a_broken_episode_is_listed_with_its_error(run_path: Path) -> None:
+    (run_path / "episodes" / "bad.mcap").write_bytes(b"nothing")
+    entries = {entry.id: entry for entry in list_episodes(RunFolder.open(run_path))}
+    assert "not a finished MCAP file" in entries["bad"].error
+    assert entries["t1"].error == ""
+
+
+def test_a_label_given_later_wins_and_leaves_the_episode_untouched(run_path: Path) -> None:
+    run = RunFolder.open(run_path)
+    before = (run.episodes_dir / "t1.mcap").read_bytes()
+    assert robot_gst.run(["label", str(run_path), "t1", "--result", "failure"]) == 0
+    assert list_episodes(run)[0].outcome == "failure"
+    assert (run.episodes_dir / "t1.mcap").read_bytes() == before
+
+
+def test_a_label_that_is_no_outcome_is_refused(
+    run_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert robot_gst.run(["label", str(run_path), "t1", "--result", "maybe"]) == 1
+    assert "maybe" in capsys.readouterr().err
+
+
+def test_labelling_an_unknown_episode_lists_those_that_exist(run_path: Path) -> None:
+    with pytest.raises(UsageError, match="Episodes here: t1"):
+        label_episode(RunFolder.open(run_path), "t9", Outcome(result="success"))
+
+
+@pytest.mark.parametrize("name", ["", "../x", "a/b", ".hidden", "x" * 200, "a b", "a\n"])
+def test_an_episode_id_that_could_leave_the_run_is_refused(name: str) -> None:
+    with pytest.raises(UsageError, match="not usable as a file name"):
+        check_episode_id(name)
+
+
+def test_a_settings_file_fills_in_options(
+    run_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = tmp_path / "settings.toml"
+    settings.write_text("[ls]\njson = true\n")
+    assert robot_gst.run(["ls", str(run_path), "--config", str(settings)]) == 0
+    assert json.loads(capsys.readouterr().out)["episodes"][0]["id"] == "t1"
+
+
+def test_a_misspelt_setting_is_an_error(run_path: Path, tmp_path: Path) -> None:
+    settings = tmp_path / "settings.toml"
+    settings.write_text("[ls]\njsom = true\n")
+    assert robot_gst.run(["ls", str(run_path), "--config", str(settings)]) == 2
+
+
+def test_a_missing_settings_file_is_wrong_use(capsys: pytest.CaptureFixture[str]) -> None:
+    assert robot_gst.run(["ls", "x", "--config", "none.toml"]) == 2
+    assert "settings file not found" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", [command[0] for command in robot_gst.COMMANDS])
+def test_every_command_has_help_with_an_example(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert robot_gst.run([name, "--help"]) == 0
+    assert "Example" in capsys.readouterr().out

@@ -1,0 +1,64 @@
+"""What a static import check cannot see: what importing a light room really loads.
+
+``lint-imports`` does not look into a parent package's ``__init__`` (style page, trap 3).
+"""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+HEAVY = ("zenoh", "torch", "open3d", "mujoco", "pybullet", "rerun", "pandas")
+LIGHT_ROOMS = (
+    "bridge",
+    "bridge.geometry.se3",
+    "bridge.task.plan",
+    "bridge.task.predicate",
+    "bridge.episode.reader",
+    "bridge.episode.writer",
+    "bridge.episode.streams",
+    "bridge.cli",
+    "twin.cli",
+    "evaluator.cli",
+    "dashboards.cli",
+    "evaluator.result",
+    "robot_gst",
+)
+
+
+@pytest.mark.parametrize("room", LIGHT_ROOMS)
+def test_a_light_room_loads_nothing_heavy(room: str) -> None:
+    code = f"import sys; import {room}; print([name for name in {HEAVY!r} if name in sys.modules])"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_hugging_face_datasets_would_not_be_hidden() -> None:
+    assert not list((ROOT / "datasets").rglob("__init__.py"))
+    assert not list((ROOT / "tests").rglob("__init__.py"))
+
+
+def test_tests_and_datasets_are_not_importable_from_elsewhere(tmp_path: Path) -> None:
+    code = (
+        "import importlib.util as u; "
+        "print([n for n in ('datasets.tasks', 'tests.shape') if n.split('.')[0] in "
+        "('datasets', 'tests') and u.find_spec(n.split('.')[0])])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_only_the_wire_imports_zenoh() -> None:
+    offenders = [
+        str(path.relative_to(ROOT))
+        for room in ("bridge", "twin", "evaluator", "dashboards")
+        for path in (ROOT / room).rglob("*.py")
+        if "import zenoh" in path.read_text() and "bridge/wire" not in str(path)
+    ]
+    assert offenders == []
