@@ -23,6 +23,7 @@ DAMAGE = (
     KeyError,
     IndexError,
     OverflowError,
+    OSError,
 )
 """What the ``mcap`` package raises on bytes that are not what they claim to be."""
 
