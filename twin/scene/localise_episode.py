@@ -1,0 +1,258 @@
+"""Localise the objects of a recorded episode, and keep the answer as a derived episode."""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode import provenance, schema, streams
+from bridge.episode.metadata import Derived
+from bridge.episode.reader import Episode
+from bridge.episode.records import PoseSample
+from bridge.episode.run import RunFolder
+from bridge.episode.streams import RgbdFrame
+from bridge.episode.transforms import TransformTree
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import EpisodeError
+from bridge.geometry import se3
+from bridge.task.robot import BASE_FRAME
+from bridge.task.task_file import Task
+from twin.scene.localise import LocaliseConfig, LocalisedObject, localise_objects
+
+NO_SCENE = "noscene"
+STILL_WINDOW_NS = 100_000_000
+"""A camera is still when its pose is the same this long before and after an image."""
+STILL_DISTANCE_M = 1e-3
+STILL_ANGLE_RAD = 3e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """A stretch of an episode in which nothing was executed."""
+
+    name: str
+    """start, or end of an execution."""
+    plan_id: str | None
+    after_ns: int | None
+    before_ns: int | None
+
+
+def localise_episode(
+    episode: Episode,
+    task: Task,
+    config: LocaliseConfig | None = None,
+    *,
+    after_ns: int | None = None,
+    before_ns: int | None = None,
+) -> dict[str, LocalisedObject]:
+    """Localise from the last still frames before the first execution started.
+
+    Without an execution the still frames of the whole episode are used. Stand-in truth is never
+    read.
+
+    Args:
+        episode: Recorded, with posed colour and depth.
+        task: Whose objects are looked for.
+        config: Settings; the defaults when None.
+        after_ns: Only frames later than this source time; then ``before_ns`` counts alone.
+        before_ns: Only frames earlier than this source time.
+    """
+    config = LocaliseConfig() if config is None else config
+    if after_ns is None and before_ns is None:
+        before_ns = first_execution_ns(episode)
+    frames = still_frames(episode, config.max_frames_per_camera, after_ns, before_ns)
+    return localise_objects(frames, task, config)
+
+
+def first_execution_ns(episode: Episode) -> int | None:
+    """Source time of the first ``execution_started`` event, None without one."""
+    stamps = [
+        int(event["stamp_ns"])
+        for event in streams.events(episode)
+        if event["type"] == "execution_started"
+    ]
+    return min(stamps, default=None)
+
+
+def quiet_phases(episode: Episode) -> list[Phase]:
+    """The start of the episode, and what follows each execution until the next one."""
+    marks = sorted(
+        (
+            (int(event["stamp_ns"]), str(event["type"]), event.get("plan_id"))
+            for event in streams.events(episode)
+            if event["type"] in ("execution_started", "execution_ended")
+        ),
+        key=lambda mark: mark[0],
+    )
+    first = next((stamp for stamp, kind, _ in marks if kind == "execution_started"), None)
+    phases = [Phase(name="start", plan_id=None, after_ns=None, before_ns=first)]
+    for stamp, kind, plan_id in marks:
+        if kind == "execution_ended":
+            following = (s for s, k, _ in marks if k == "execution_started" and s > stamp)
+            phases.append(
+                Phase(name="end", plan_id=plan_id, after_ns=stamp, before_ns=next(following, None))
+            )
+    return phases
+
+
+def still_frames(
+    episode: Episode, max_per_camera: int, after_ns: int | None, before_ns: int | None
+) -> list[RgbdFrame]:
+    """The last frames of each camera in an interval during which that camera did not move."""
+    tree = streams.transform_tree(episode)
+    frames: list[RgbdFrame] = []
+    for camera_id in rgbd_camera_ids(episode):
+        frame_id = streams.camera_info(episode, camera_id, "color").frame_id
+        newest: deque[RgbdFrame] = deque(maxlen=max_per_camera)
+        for frame in _between(streams.rgbd_frames(episode, camera_id, tree), after_ns, before_ns):
+            if is_still(tree, frame_id, frame.stamp_ns, before_ns):
+                newest.append(frame)
+        frames.extend(newest)
+    return frames
+
+
+def rgbd_camera_ids(episode: Episode) -> list[str]:
+    """Cameras with colour and depth, both with intrinsics; never those of stand-in truth."""
+    topics = {topic for topic in episode.topics() if not schema.is_truth(topic)}
+    tails = ("color/image", "color/info", "depth/image", "depth/info")
+    stems = {topic.removesuffix(tails[0]) for topic in topics if topic.endswith("/" + tails[0])}
+    return sorted(
+        stem.split("/")[-2] for stem in stems if all(stem + tail in topics for tail in tails)
+    )
+
+
+def _between(
+    frames: Iterable[RgbdFrame], after_ns: int | None, before_ns: int | None
+) -> Iterator[RgbdFrame]:
+    for frame in frames:
+        if before_ns is not None and frame.stamp_ns >= before_ns:
+            return
+        if after_ns is None or frame.stamp_ns > after_ns:
+            yield frame
+
+
+def is_still(
+    tree: TransformTree, frame_id: str, stamp_ns: int, until_ns: int | None = None
+) -> bool:
+    """Say whether a frame's pose is the same shortly before and after an instant."""
+    last_ns = (
+        stamp_ns + STILL_WINDOW_NS
+        if until_ns is None
+        else min(stamp_ns + STILL_WINDOW_NS, until_ns)
+    )
+    before = tree.T_root_frame(frame_id, stamp_ns - STILL_WINDOW_NS)
+    after = tree.T_root_frame(frame_id, last_ns)
+    return bool(_moved_m(before, after) < STILL_DISTANCE_M) and (
+        float(se3.rotation_angle_rad(before[:3, :3].T @ after[:3, :3])) < STILL_ANGLE_RAD
+    )
+
+
+def _moved_m(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> float:
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
+
+
+def write_localised(
+    run: RunFolder,
+    episode: Episode,
+    task: Task,
+    config: LocaliseConfig | None = None,
+    *,
+    scene_hash: str | None = None,
+    force: bool = False,
+) -> Path:
+    """Write ``derived/<episode>.localised.<scene>.mcap`` and return its path.
+
+    Holds one gst localisation record per object for the start and after every execution, and a
+    PoseStamped per object that was found. A file made from the same bytes with the same settings
+    is kept unless ``force``.
+
+    Args:
+        run: Where derived episodes go.
+        episode: The recorded source.
+        task: Whose objects are looked for.
+        config: Settings; the defaults when None.
+        scene_hash: The scene the poses are meant for; its first eight digits name the file.
+        force: Write again even when it is there.
+    """
+    config = LocaliseConfig() if config is None else config
+    scene = scene_hash[:8] if scene_hash else NO_SCENE
+    path = run.derived_dir / f"{episode.path.stem}.localised.{scene}.mcap"
+    derived = Derived(
+        kind="localised",
+        source_episode=episode.info.id,
+        source_sha256=provenance.hash_file(episode.path),
+        scene_hash=scene_hash,
+        engine="colour_shape_fit",
+        settings={"task": task.name, **asdict(config)},
+    )
+    if path.exists() and not force and _made_from(path, derived):
+        return path
+    phases = [
+        (
+            phase,
+            localise_episode(
+                episode, task, config, after_ns=phase.after_ns, before_ns=phase.before_ns
+            ),
+        )
+        for phase in quiet_phases(episode)
+    ]
+    path.unlink(missing_ok=True)
+    path.with_name(path.name + ".part").unlink(missing_ok=True)
+    with EpisodeWriter(path) as writer:
+        writer.describe(episode.info, derived=derived)
+        for phase, objects in phases:
+            _write_phase(writer, _cell_of(episode), phase, objects)
+    return path
+
+
+def _made_from(path: Path, derived: Derived) -> bool:
+    try:
+        found = Episode.open(path).derived
+    except EpisodeError:
+        return False
+    return (
+        found is not None
+        and (found.source_sha256, found.scene_hash)
+        == (
+            derived.source_sha256,
+            derived.scene_hash,
+        )
+        and provenance.hash_settings(found.settings) == provenance.hash_settings(derived.settings)
+    )
+
+
+def _cell_of(episode: Episode) -> str:
+    if episode.info.cell:
+        return episode.info.cell
+    for topic in episode.topics_of_type(schema.COMPRESSED_IMAGE):
+        return topic.split("/")[1]
+    return "cell"
+
+
+def _write_phase(
+    writer: EpisodeWriter, cell: str, phase: Phase, objects: dict[str, LocalisedObject]
+) -> None:
+    for object_id, found in objects.items():
+        stamp_ns = found.stamp_ns or phase.after_ns or phase.before_ns or 0
+        record = {**found.to_record(), "phase": phase.name, "plan_id": phase.plan_id}
+        writer.write_json(
+            f"/{cell}/localisation",
+            record,
+            type_name=schema.LOCALISATION,
+            log_time_ns=stamp_ns,
+            publish_time_ns=stamp_ns,
+        )
+        if found.T_base_object is not None:
+            sample = PoseSample(
+                stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=found.T_base_object
+            )
+            writer.write(
+                f"/{cell}/object/{object_id}/pose",
+                sample.to_cdr(),
+                type_name=schema.POSE_STAMPED,
+                log_time_ns=stamp_ns,
+                publish_time_ns=stamp_ns,
+            )

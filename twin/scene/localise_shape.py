@@ -1,0 +1,109 @@
+"""The surface of a known shape, and where to begin laying it onto points."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import ConvexHull, QhullError
+
+from bridge.geometry import se3
+from bridge.task.task_file import ObjectModel
+
+
+def pose_of(state: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4 4"]:
+    """Turn (x, y, z, yaw) into ``T_base_object``."""
+    T = np.eye(4)
+    c, s = np.cos(state[3]), np.sin(state[3])
+    T[:2, :2] = [[c, -s], [s, c]]
+    T[:3, 3] = state[:3]
+    return T
+
+
+def rest_height_m(model: ObjectModel) -> float:
+    """Height of the object's origin when it stands on the table [m]."""
+    return model.size_m[2] / 2 if model.shape == "box" else 0.0
+
+
+def yaw_period_rad(model: ObjectModel) -> float:
+    """Turn after which the footprint looks the same: a quarter with equal sides, else a half."""
+    return np.pi / 2 if np.isclose(model.size_m[0], model.size_m[1]) else np.pi
+
+
+def starts(
+    points: Float[np.ndarray, "num_points 3"], model: ObjectModel
+) -> list[Float[np.ndarray, "4"]]:
+    """Candidate states: where a side is cut off, the known size is laid along either end."""
+    z = rest_height_m(model)
+    if model.shape == "box":
+        z = float(np.percentile(points[:, 2], 95)) - model.size_m[2] / 2
+    yaw = rectangle_yaw_rad(points[:, :2])
+    turns = np.arange(0.0, yaw_period_rad(model) - 1e-9, np.pi / 2)
+    states = []
+    for turn in turns:
+        c, s = np.cos(yaw + turn), np.sin(yaw + turn)
+        local = points[:, :2] @ np.array([[c, -s], [s, c]])
+        low, high = np.percentile(local, [1, 99], axis=0)
+        choices = []
+        for axis in (0, 1):
+            size = model.size_m[axis]
+            whole = abs(high[axis] - low[axis] - size) < max(0.01, size / 4)
+            middle = (low[axis] + high[axis]) / 2
+            choices.append(
+                (middle,) if whole else (low[axis] + size / 2, middle, high[axis] - size / 2)
+            )
+        states += [
+            np.array([c * u - s * v, s * u + c * v, z, yaw + turn])
+            for u in choices[0]
+            for v in choices[1]
+        ]
+    return states
+
+
+def rectangle_yaw_rad(xy: Float[np.ndarray, "num_points 2"]) -> float:
+    """Direction of a side of the smallest enclosing rectangle, in [-45, 45) degrees.
+
+    The smallest rectangle has a side along an edge of the hull (Freeman and Shapira 1975). The
+    outermost points are noisy, so the few per cent farthest out are left out first. Points on
+    one line have the direction 0.
+    """
+    distance = np.linalg.norm(xy - np.median(xy, axis=0), axis=1)
+    core = xy[distance <= np.percentile(distance, 98)]
+    try:
+        hull = core[ConvexHull(core).vertices]
+    except QhullError:
+        return 0.0
+    step = np.roll(hull, -1, axis=0) - hull
+    angles = np.unique(np.round(np.mod(np.arctan2(step[:, 1], step[:, 0]), np.pi / 2), 4))
+    c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
+    u = c * hull[:, 0] + s * hull[:, 1]
+    v = -s * hull[:, 0] + c * hull[:, 1]
+    best = float(angles[int(np.argmin(np.ptp(u, axis=1) * np.ptp(v, axis=1)))])
+    return float(np.mod(best + np.pi / 4, np.pi / 2) - np.pi / 4)
+
+
+def surface_distances(
+    points: Float[np.ndarray, "num_points 3"],
+    model: ObjectModel,
+    T_base_object: Float[np.ndarray, "4 4"],
+) -> tuple[Float[np.ndarray, " num_points"], Float[np.ndarray, "num_points 3"]]:
+    """Distance to the object's panels, negative inside one, and its gradient in the base frame.
+
+    Outside, the distance to a union is the smallest of the parts'; inside a panel the walls it
+    shares with a neighbour count too, which matters only for points deep in the material.
+    """
+    p = se3.apply(se3.invert(T_base_object), points)
+    rows = np.arange(len(p))
+    distances, gradients = [], []
+    for centre, extents in model.panels():
+        q = p - centre
+        excess = np.abs(q) - extents / 2
+        outside = np.maximum(excess, 0.0)
+        length = np.linalg.norm(outside, axis=1)
+        is_out = length > 1e-9
+        deepest = excess.argmax(axis=1)
+        inward = np.zeros_like(q)
+        inward[rows, deepest] = 1.0
+        away = np.where(is_out[:, None], outside / np.maximum(length, 1e-9)[:, None], inward)
+        distances.append(np.where(is_out, length, excess[rows, deepest]))
+        gradients.append(away * np.where(q < 0, -1.0, 1.0))
+    nearest = np.argmin(distances, axis=0)
+    gradient = np.stack(gradients)[nearest, rows] @ T_base_object[:3, :3].T
+    return np.stack(distances)[nearest, rows], gradient
