@@ -1,0 +1,73 @@
+"""The rasteriser again, slow and plain, in torch double precision with autograd.
+
+Every pixel meets every Gaussian; no tiles, no early stop. Written from the same equations.
+"""
+
+import numpy as np
+import torch
+
+MIP_VARIANCE_PX2 = 0.1
+MAX_ALPHA = 0.999
+MIN_MIP_RATIO = 2.5e-5
+NEAR_M = 0.02
+
+
+def rotation(quats):
+    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
+    return torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
+            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
+            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
+        ],
+        dim=1,
+    )
+
+
+def _jacobian(camera, p):
+    x, y, z = p.unbind(1)
+    margin_x, margin_y = 0.3 * camera.width, 0.3 * camera.height
+    tx = (x / z).clamp(
+        (-margin_x - camera.cx) / camera.fx, (camera.width + margin_x - camera.cx) / camera.fx
+    )
+    ty = (y / z).clamp(
+        (-margin_y - camera.cy) / camera.fy, (camera.height + margin_y - camera.cy) / camera.fy
+    )
+    zero = torch.zeros_like(z)
+    row_x = torch.stack([camera.fx / z, zero, -camera.fx * tx / z], 1)
+    row_y = torch.stack([zero, camera.fy / z, -camera.fy * ty / z], 1)
+    return torch.stack([row_x, row_y], 1)
+
+
+def draw(means, quats, scales_log, opacities_logit, colors, camera, T_camera_base, alpha_cut):
+    """Return planes (5, height, width): rgb, weighted depth, alpha."""
+    T = torch.as_tensor(np.asarray(T_camera_base), dtype=means.dtype)
+    p = means @ T[:3, :3].T + T[:3, 3]
+    front = p[:, 2] > NEAR_M
+    p = torch.where(front[:, None], p, torch.tensor([0.0, 0.0, 1.0], dtype=p.dtype))
+    A = _jacobian(camera, p) @ T[:3, :3] @ rotation(quats) @ torch.diag_embed(scales_log.exp())
+    cov = A @ A.transpose(1, 2)
+    mip = cov + MIP_VARIANCE_PX2 * torch.eye(2, dtype=cov.dtype)
+    ratio = torch.linalg.det(cov) / torch.linalg.det(mip)
+    opacity = torch.sigmoid(opacities_logit) * ratio.clamp(min=MIN_MIP_RATIO).sqrt()
+    opacity = torch.where(front, opacity, torch.zeros_like(opacity))
+    conic = torch.linalg.inv(mip)
+
+    u = camera.fx * p[:, 0] / p[:, 2] + camera.cx
+    v = camera.fy * p[:, 1] / p[:, 2] + camera.cy
+    columns = torch.arange(camera.width, dtype=p.dtype) + 0.5
+    rows = torch.arange(camera.height, dtype=p.dtype) + 0.5
+    dx = columns[None, None, :] - u[:, None, None]
+    dy = rows[None, :, None] - v[:, None, None]
+    k = conic[:, :, :, None, None]
+    distance2 = k[:, 0, 0] * dx**2 + 2 * k[:, 0, 1] * dx * dy + k[:, 1, 1] * dy**2
+    alpha = opacity[:, None, None] * torch.exp(-0.5 * distance2)
+    alpha = torch.where(alpha >= alpha_cut, alpha.clamp(max=MAX_ALPHA), torch.zeros_like(alpha))
+
+    order = torch.argsort(p[:, 2], stable=True)
+    alpha = alpha[order]
+    light = torch.cumprod(1 - alpha, dim=0)
+    light = torch.cat([torch.ones_like(light[:1]), light[:-1]])
+    weight = alpha * light
+    channels = torch.cat([colors, p[:, 2:3], torch.ones_like(p[:, 2:3])], dim=1)[order]
+    return torch.einsum("nhw,nc->chw", weight, channels)

@@ -1,0 +1,157 @@
+"""The native rasteriser against plain torch with autograd, and against finite differences."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32
+from twin.scene.raster import RasterConfig, Rasteriser
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.parity
+
+_spec = importlib.util.spec_from_file_location(
+    "splat_reference", Path(__file__).with_name("splat_reference.py")
+)
+splat_reference = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(splat_reference)
+
+CAMERA = Camera(width=45, height=37, fx=50.0, fy=48.0, cx=21.3, cy=19.1)
+FINE = RasterConfig(alpha_cut=2.0**-24, transmittance_stop=0.0, threads=1)
+
+
+def random_cloud(rng, count):
+    means = rng.uniform([-0.6, -0.5, 0.8], [0.6, 0.5, 2.5], size=(count, 3))
+    return GaussianCloud(
+        means_m=as_float32(means),
+        quats_wxyz=as_float32(rng.normal(size=(count, 4))),
+        scales_log=as_float32(np.log(rng.uniform(0.01, 0.12, size=(count, 3)))),
+        opacities_logit=as_float32(rng.normal(size=count)),
+        colors=as_float32(rng.uniform(size=(count, 3))),
+    )
+
+
+def tilted_pose():
+    return se3.look_at(
+        np.array([0.2, -0.1, -0.3]), np.array([0.0, 0.0, 1.6]), np.array([0.1, -1.0, 0.0])
+    )
+
+
+def reference_planes(cloud, T_base_camera, alpha_cut, dtype=None):
+    tensors = [
+        torch.tensor(rows, dtype=dtype or torch.float64, requires_grad=True)
+        for _, rows in arrays(cloud)
+    ]
+    T_camera_base = as_float32(se3.invert(T_base_camera))
+    return tensors, splat_reference.draw(*tensors, CAMERA, T_camera_base, alpha_cut)
+
+
+@pytest.mark.parametrize("isa", ["base", "auto"])
+def test_images_agree_with_the_reference(isa):
+    cloud = random_cloud(np.random.default_rng(1), 60)
+    config = RasterConfig(alpha_cut=1 / 255, transmittance_stop=0.0, threads=1, isa=isa)
+    planes = Rasteriser(config).draw_planes(cloud, CAMERA, tilted_pose())
+    _, expected = reference_planes(cloud, tilted_pose(), 1 / 255)
+    error = np.abs(planes - expected.detach().numpy())
+    # At the cut a contribution of 1/255 may fall to either side in float32: a few pixels.
+    assert np.quantile(error, 0.995) < 2e-4
+    assert error.max() < 2 * 2.5 / 255
+    assert expected.detach().numpy()[4].max() > 0.9  # the scene is not empty
+
+
+@pytest.mark.parametrize("isa", ["base", "auto"])
+def test_gradients_agree_with_autograd(isa):
+    rng = np.random.default_rng(2)
+    cloud = random_cloud(rng, 60)
+    rasteriser = Rasteriser(
+        RasterConfig(alpha_cut=2.0**-24, transmittance_stop=0.0, threads=1, isa=isa)
+    )
+    planes = rasteriser.draw_planes(cloud, CAMERA, tilted_pose())
+    upstream = rng.normal(size=planes.shape).astype(np.float32)
+    gradient = rasteriser.pull_back(planes, upstream)
+
+    tensors, expected = reference_planes(cloud, tilted_pose(), 2.0**-24)
+    (expected * torch.tensor(upstream, dtype=torch.float64)).sum().backward()
+    for (name, _), tensor in zip(arrays(cloud), tensors, strict=True):
+        found, wanted = getattr(gradient, name), tensor.grad.numpy()
+        relative = np.linalg.norm(found - wanted) / np.linalg.norm(wanted)
+        # float32 sums over a few thousand pixels, some behind almost opaque Gaussians
+        assert relative < 5e-4, name
+
+
+def test_gradients_agree_with_finite_differences():
+    rng = np.random.default_rng(3)
+    cloud = random_cloud(rng, 12)
+    rasteriser = Rasteriser(FINE)
+    planes = rasteriser.draw_planes(cloud, CAMERA, tilted_pose())
+    upstream = rng.normal(size=planes.shape).astype(np.float32)
+    gradient = rasteriser.pull_back(planes, upstream)
+    for name, rows in arrays(cloud):
+        direction = rng.normal(size=rows.shape)
+        step = 2e-4
+        values = []
+        for sign in (1, -1):
+            moved = as_float32(rows + sign * step * direction)
+            shifted = GaussianCloud(**(dict(arrays(cloud)) | {name: moved}))
+            drawn = rasteriser.draw_planes(shifted, CAMERA, tilted_pose()).astype(np.float64)
+            values.append(float((drawn * upstream).sum()))
+        numeric = (values[0] - values[1]) / (2 * step)
+        analytic = float((getattr(gradient, name) * direction).sum())
+        # float32 images differenced over 4e-4: about three digits remain
+        assert numeric == pytest.approx(analytic, rel=2e-2, abs=2e-2), name
+
+
+def test_the_two_instruction_sets_agree():
+    cloud = random_cloud(np.random.default_rng(4), 200)
+    pose = tilted_pose()
+    base = Rasteriser(RasterConfig(isa="base", threads=1)).draw_planes(cloud, CAMERA, pose)
+    best = Rasteriser(RasterConfig(isa="auto", threads=1)).draw_planes(cloud, CAMERA, pose)
+    assert np.quantile(np.abs(base - best), 0.99) < 1e-4
+
+
+def test_ssim_agrees_with_a_torch_convolution():
+    from twin.scene.raster import load_native
+
+    rng = np.random.default_rng(5)
+    x = rng.uniform(size=(3, 23, 31)).astype(np.float32)
+    y = np.clip(x + 0.1 * rng.normal(size=x.shape), 0, 1).astype(np.float32)
+    value, gradient = load_native().Similarity(1, "auto").mean(x, y)
+
+    offsets = torch.arange(11, dtype=torch.float64) - 5
+    tap = torch.exp(-(offsets**2) / (2 * 1.5**2))
+    window = torch.outer(tap, tap)[None, None] / tap.sum() ** 2
+
+    def blur(planes):
+        return torch.nn.functional.conv2d(planes[:, None], window, padding=5)[:, 0]
+
+    a = torch.tensor(x, dtype=torch.float64, requires_grad=True)
+    b = torch.tensor(y, dtype=torch.float64)
+    ma, mb = blur(a), blur(b)
+    va, vb, cov = blur(a * a) - ma**2, blur(b * b) - mb**2, blur(a * b) - ma * mb
+    ssim = (2 * ma * mb + 1e-4) * (2 * cov + 9e-4)
+    ssim = (ssim / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))).mean()
+    ssim.backward()
+    assert value == pytest.approx(float(ssim.detach()), abs=1e-5)
+    assert np.linalg.norm(gradient - a.grad.numpy()) < 1e-3 * np.linalg.norm(a.grad.numpy())
+
+
+def test_adam_agrees_with_torch():
+    from twin.scene.raster import load_native
+
+    rng = np.random.default_rng(6)
+    values = rng.normal(size=1000).astype(np.float32)
+    parameter = torch.tensor(values.copy(), requires_grad=True)
+    optimiser = torch.optim.Adam([parameter], lr=0.01, eps=1e-15)
+    first, second = np.zeros_like(values), np.zeros_like(values)
+    for step in range(1, 6):
+        gradient = rng.normal(size=1000).astype(np.float32)
+        load_native().adam_step(values, gradient, first, second, step, 0.01)
+        parameter.grad = torch.tensor(gradient)
+        optimiser.step()
+    np.testing.assert_allclose(values, parameter.detach().numpy(), rtol=1e-4, atol=1e-6)
+
+

@@ -1,0 +1,163 @@
+"""Choose posed RGB-D frames of a run: some to learn from, some held out."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from bridge.episode import schema, streams
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
+from bridge.episode.streams import RgbdFrame
+from bridge.geometry import se3
+from twin.errors import TwinError
+from twin.scene.settings import FrameConfig
+
+STILL_M = 0.002
+STILL_RAD = 0.0035
+"""A camera whose pose varies less than these stands still."""
+STILL_TRAIN_FRAMES = 4
+STILL_HOLDOUT_FRAMES = 2
+"""A camera that stands still shows the same again and again; this many frames are enough."""
+
+
+class NoFramesError(TwinError):
+    """There is nothing to rebuild from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameChoice:
+    """Stamps of one camera of one episode: what to learn from and what to hold out."""
+
+    episode: Episode
+    camera_id: str
+    still: bool
+    train_ns: frozenset[int]
+    holdout_ns: frozenset[int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sources:
+    """The episodes a scene is made from."""
+
+    episodes: tuple[Episode, ...]
+    remark: str
+    """Empty when there are scans."""
+
+
+def find_sources(run: RunFolder) -> Sources:
+    """Take all scans; without a scan, every episode that has posed RGB-D frames.
+
+    Raises:
+        NoFramesError: When no episode has a camera with colour, depth and intrinsics.
+    """
+    usable = [episode for path in run.episodes() if _has_rgbd(episode := Episode.open(path))]
+    scans = [episode for episode in usable if episode.info.kind == "scan"]
+    if scans:
+        return Sources(episodes=tuple(scans), remark="")
+    if not usable:
+        message = (
+            f"no episode in {run.episodes_dir} has colour and depth images with intrinsics. "
+            "Record a scan, or import an RGB-D folder: robot-gst import rgbd FOLDER RUN."
+        )
+        raise NoFramesError(message)
+    kinds = sorted({episode.info.kind for episode in usable})
+    remark = f"no scan in this run: using {len(usable)} episode(s) of kind {', '.join(kinds)}"
+    return Sources(episodes=tuple(usable), remark=remark)
+
+
+def _has_rgbd(episode: Episode) -> bool:
+    return bool(_rgbd_cameras(episode))
+
+
+def _rgbd_cameras(episode: Episode) -> list[str]:
+    topics = [topic for topic in episode.topics() if not schema.is_truth(topic)]
+    needed = ("color/image", "depth/image", "color/info", "depth/info")
+    return [
+        camera_id
+        for camera_id in streams.camera_ids(episode)
+        if all(any(t.endswith(f"/cam/{camera_id}/{tail}") for t in topics) for tail in needed)
+    ]
+
+
+def choose_frames(sources: Sources, config: FrameConfig) -> list[FrameChoice]:
+    """Hold out every n-th frame of each camera, then spread the training frames evenly.
+
+    Raises:
+        NoFramesError: When nothing is left to learn from.
+    """
+    found = [
+        (episode, camera_id)
+        for episode in sources.episodes
+        for camera_id in _rgbd_cameras(episode)
+    ]
+    train_share = max(1, config.max_train_frames // max(len(found), 1))
+    holdout_share = max(1, config.max_holdout_frames // max(len(found), 1))
+    choices = []
+    for episode, camera_id in found:
+        stamps, still = _stamps(episode, camera_id)
+        held = stamps[config.holdout_every // 2 :: config.holdout_every]
+        rest = np.setdiff1d(stamps, held)
+        train_count = min(train_share, STILL_TRAIN_FRAMES) if still else train_share
+        holdout_count = min(holdout_share, STILL_HOLDOUT_FRAMES) if still else holdout_share
+        choices.append(
+            FrameChoice(
+                episode=episode,
+                camera_id=camera_id,
+                still=still,
+                train_ns=frozenset(spread(rest, train_count).tolist()),
+                holdout_ns=frozenset(spread(held, holdout_count).tolist()),
+            )
+        )
+    if not any(choice.train_ns for choice in choices):
+        message = "the cameras of this run have no frames to learn from. Record a longer scan."
+        raise NoFramesError(message)
+    return choices
+
+
+def spread(values: np.ndarray, count: int) -> np.ndarray:
+    """Pick at most ``count`` values at even distances, both ends included."""
+    if len(values) <= count:
+        return values
+    return values[np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))]
+
+
+def _stamps(episode: Episode, camera_id: str) -> tuple[np.ndarray, bool]:
+    """Source stamps of the frames that have both images, and whether the camera stands still."""
+    stamps = np.array([frame_ns for frame_ns, _ in _paired_stamps(episode, camera_id)], dtype=int)
+    tree = streams.transform_tree(episode)
+    frame_id = streams.camera_info(episode, camera_id).frame_id
+    poses = [tree.T_root_frame(frame_id, int(stamp)) for stamp in spread(stamps, 40)]
+    still = all(
+        np.linalg.norm(T[:3, 3] - poses[0][:3, 3]) < STILL_M
+        and se3.rotation_angle_rad(poses[0][:3, :3].T @ T[:3, :3]) < STILL_RAD
+        for T in poses
+    )
+    return stamps, still and len(stamps) > 1
+
+
+def _paired_stamps(episode: Episode, camera_id: str) -> Iterator[tuple[int, int]]:
+    ending = f"/cam/{camera_id}/"
+    topics = [t for t in episode.topics() if ending in t and t.endswith("/image")]
+    colors, depths = (
+        np.array([m.publish_time_ns for m in episode.messages([t])], dtype=np.int64)
+        for t in sorted(t for t in topics if not schema.is_truth(t))[:2]
+    )
+    if not len(depths):
+        return
+    for stamp in np.unique(colors):
+        nearest = int(depths[np.argmin(np.abs(depths - stamp))])
+        if abs(nearest - int(stamp)) <= streams.PAIRING_TOLERANCE_NS:
+            yield int(stamp), nearest
+
+
+def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:
+    """Yield the frames of a choice that carry one of the stamps."""
+    if not stamps_ns:
+        return
+    last = max(stamps_ns)
+    for frame in streams.rgbd_frames(choice.episode, choice.camera_id):
+        if frame.stamp_ns in stamps_ns:
+            yield frame
+        if frame.stamp_ns >= last:
+            return

@@ -1,0 +1,25 @@
+// Mean structural similarity of two colour images and its gradient.
+#pragma once
+
+#include <vector>
+
+#include "kernels.hpp"
+
+namespace splat {
+
+class Similarity {
+  public:
+    Similarity(const Kernels& kernels, int threads) : kernels_(kernels), threads_(threads) {}
+
+    // ``rendered``, ``target`` and ``gradient`` are 3 x height x width; returns the mean over all
+    // pixels and channels, and fills the gradient of that mean with respect to ``rendered``.
+    double mean(const float* rendered, const float* target, float* gradient, int width,
+                int height);
+
+  private:
+    const Kernels& kernels_;
+    int threads_;
+    std::vector<float> maps_;
+};
+
+}  // namespace splat

@@ -1,0 +1,156 @@
+"""Draw Gaussians and pull gradients back, through the native extension ``twin.scene._splat``.
+
+The slow readable twin of this module is ``tests/parity/splat_reference.py``.
+"""
+
+import os
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from twin.errors import TwinError
+from twin.scene.gaussians import GaussianCloud, as_float32
+
+NUM_PLANES = 5
+"""Red, green, blue, sum of weighted depth, sum of weights."""
+
+
+class SplatExtensionMissingError(TwinError):
+    """The compiled part of ``twin.scene`` is not there."""
+
+    def __init__(self, *, reason: str) -> None:
+        """Remember why the import failed."""
+        self.reason = reason
+        super().__init__(
+            f"the splat rasteriser is not built ({reason}). Build it with a C++17 compiler: "
+            "pip install --no-build-isolation -e . (or pip install .) in the checkout."
+        )
+
+
+def load_native() -> ModuleType:
+    """Import the extension; idle OpenMP threads sleep instead of spinning.
+
+    Raises:
+        SplatExtensionMissingError: When it was never built.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read once, when libgomp is loaded
+    try:
+        from twin.scene import _splat  # noqa: PLC0415  # after the environment is set
+    except ImportError as error:
+        raise SplatExtensionMissingError(reason=str(error)[:160]) from error
+    return _splat
+
+
+@dataclass(frozen=True, kw_only=True)
+class RasterConfig:
+    """How precisely to draw."""
+
+    alpha_cut: float = 1.0 / 255.0
+    """Contributions with less alpha are dropped."""
+    transmittance_stop: float = 1e-4
+    """A tile ends once no pixel of it lets more light through."""
+    threads: int = 0
+    """0: all that OpenMP offers. The result has the same bits for any number."""
+    isa: str = "auto"
+    """Instruction set: auto, base or v3 (x86-64 with AVX2 and FMA)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloudGradient:
+    """Gradient of a scalar with respect to each array of a ``GaussianCloud``."""
+
+    means_m: Float32[np.ndarray, "num_splats 3"]
+    quats_wxyz: Float32[np.ndarray, "num_splats 4"]
+    scales_log: Float32[np.ndarray, "num_splats 3"]
+    opacities_logit: Float32[np.ndarray, " num_splats"]
+    colors: Float32[np.ndarray, "num_splats 3"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """What a camera sees of a cloud."""
+
+    image: Float32[np.ndarray, "height width 3"]
+    """Colour over black, not clipped."""
+    depth_m: Float32[np.ndarray, "height width"]
+    """Weighted mean depth along the optical axis; 0 where alpha is below one half."""
+    alpha: Float32[np.ndarray, "height width"]
+
+    def image_u8(self) -> np.ndarray:
+        """Colour as 8-bit sRGB."""
+        return np.rint(np.clip(self.image, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+class Rasteriser:
+    """Draws one camera after another, keeping its buffers.
+
+    Paper Eq. 2 with the product transmittance of the errata. Pixel centres are at +0.5; the
+    image covariance gets 0.1 px^2 and the opacity sqrt(det/det') (mip compensation).
+    """
+
+    def __init__(self, config: RasterConfig | None = None) -> None:
+        """Load the native code."""
+        self.config = config or RasterConfig()
+        self._native = load_native().Rasteriser(self.config.threads, self.config.isa)
+
+    @property
+    def isa(self) -> str:
+        """The instruction set that was chosen."""
+        return str(self._native.isa)
+
+    def draw_planes(
+        self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
+    ) -> Float32[np.ndarray, "5 height width"]:
+        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black."""
+        T_camera_base = as_float32(se3.invert(T_base_camera)[:3])
+        intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        planes: np.ndarray = self._native.draw(
+            cloud.means_m,
+            cloud.quats_wxyz,
+            cloud.scales_log,
+            cloud.opacities_logit,
+            cloud.colors,
+            T_camera_base,
+            intrinsics,
+            self.config.alpha_cut,
+            self.config.transmittance_stop,
+        )
+        return planes
+
+    def pull_back(
+        self,
+        planes: Float32[np.ndarray, "5 height width"],
+        plane_gradients: Float32[np.ndarray, "5 height width"],
+    ) -> CloudGradient:
+        """Carry a gradient on the planes of the last ``draw_planes`` back to its cloud."""
+        means, quats, scales, opacities, colors = self._native.pull(planes, plane_gradients)
+        return CloudGradient(
+            means_m=means,
+            quats_wxyz=quats,
+            scales_log=scales,
+            opacities_logit=opacities,
+            colors=colors,
+        )
+
+    def visible_mask(self) -> Bool[np.ndarray, " num_splats"]:
+        """Say which Gaussians could touch the last image."""
+        mask: np.ndarray = self._native.visible()
+        return mask
+
+    def view(
+        self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
+    ) -> View:
+        """Draw what one camera sees."""
+        planes = self.draw_planes(cloud, camera, T_base_camera)
+        alpha = planes[4]
+        solid = alpha >= 0.5
+        depth = np.where(solid, planes[3] / np.where(solid, alpha, 1.0), 0.0)
+        return View(
+            image=np.ascontiguousarray(np.moveaxis(planes[:3], 0, -1)),
+            depth_m=depth.astype(np.float32),
+            alpha=alpha,
+        )
