@@ -1,14 +1,26 @@
 """Commands of the room ``bridge``; imports stay late so that --help is quick."""
 
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from bridge.episode.message import StampedMessage
+from bridge.record.config import EpisodeAbout, RecorderConfig
+from bridge.sources.folder_config import FolderConfig
 from bridge.terminal import Output
+from bridge.wire.config import DEFAULT_ENDPOINT
 
 OUTPUT = Output()
+ABOUT = EpisodeAbout()
+RECORDER = RecorderConfig()
+FOLDER = FolderConfig()
+LOOPBACK = (DEFAULT_ENDPOINT,)
 
 
 def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
@@ -147,3 +159,272 @@ def doctor(*, output: Output = OUTPUT) -> int:
     ]
     output.result({"findings": [asdict(item) for item in findings]}, "\n".join(lines))
     return 0 if all(item.ok for item in findings) else 1
+
+
+@contextmanager
+def _stop_on_signals() -> Iterator[threading.Event]:
+    """Set the event on SIGINT or SIGTERM instead of ending the process."""
+    stop = threading.Event()
+    before = {
+        number: signal.signal(number, lambda *_: stop.set())
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def record(
+    run: Path,
+    /,
+    *,
+    episode: str | None = None,
+    duration_s: Annotated[float | None, Parameter(name=("--duration", "--duration-s"))] = None,
+    about: Annotated[EpisodeAbout, Parameter(name="*")] = ABOUT,
+    config: Annotated[RecorderConfig, Parameter(name="*")] = RECORDER,
+    listen: tuple[str, ...] = LOOPBACK,
+    connect: tuple[str, ...] = (),
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Record episodes live; everything published to this recorder ends up in one.
+
+    Without --episode it waits for robot-gst ctl start. SIGINT or SIGTERM finish the open episode.
+    Example: robot-gst record runs/monday --episode scan --duration 30
+
+    Args:
+        run: Run folder; made where needed.
+        episode: Start this episode at once.
+        duration_s: Stop after this long [s]; with --episode.
+        about: What is being recorded, with --episode.
+        config: The recorder's settings.
+        listen: Where to listen; other processes connect here.
+        connect: Other zenoh routers to join.
+        zenoh_config: zenoh configuration (JSON5), for example with access control.
+        output: How to talk.
+    """
+    from bridge.errors import UsageError
+    from bridge.record.control import parse_info
+    from bridge.record.process import run_recorder
+    from bridge.wire.config import WireConfig
+
+    if duration_s is not None and (episode is None or duration_s <= 0):
+        raise UsageError("--duration needs --episode ID and a time above zero.")
+    info = None if episode is None else parse_info(episode, asdict(about))
+    wire = WireConfig(mode="router", listen=listen, connect=connect, config=zenoh_config)
+    with _stop_on_signals() as stop:
+        answer = run_recorder(
+            run,
+            wire=wire,
+            config=config,
+            stop=stop,
+            output=output,
+            episode=info,
+            duration_s=duration_s,
+        )
+    data = answer or {"ok": True, "episode": None}
+    output.result(data, _describe_answer(data) if answer else "stopped; no episode was open")
+    return 0
+
+
+def _describe_answer(answer: dict[str, Any]) -> str:
+    """One line about a start, stop, mark or label."""
+    if answer.get("discarded"):
+        return f"{answer['episode']}: discarded"
+    if "messages" in answer:
+        return (
+            f"{answer['episode']}: {answer['messages']} messages, {answer['lost']} lost, "
+            f"{answer['undecodable']} undecodable, {answer['duration_s']:.1f} s"
+        )
+    return f"{answer['episode']}: ok"
+
+
+def ctl(
+    action: Literal["start", "stop", "mark", "label", "status"],
+    text: str = "",
+    /,
+    *,
+    id: str | None = None,
+    about: Annotated[EpisodeAbout, Parameter(name="*")] = ABOUT,
+    result: Literal["success", "failure", "unknown"] | None = None,
+    detail: str | None = None,
+    discard: bool = False,
+    recorder: str = "main",
+    connect: tuple[str, ...] = LOOPBACK,
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Control a recorder from anywhere.
+
+    Example: robot-gst ctl start --id trial_0001 --task cube_into_box --cell standin
+
+    Args:
+        action: start, stop, mark, label or status.
+        text: Words of a mark or label.
+        id: Episode to start, or to label after it has been finished.
+        about: What is being recorded (start).
+        result: How it went (stop, label).
+        detail: What happened, in words (stop, label).
+        discard: Throw the open episode away (stop).
+        recorder: Name of the recorder.
+        connect: Where it listens.
+        zenoh_config: zenoh configuration (JSON5).
+        output: How to talk.
+    """
+    from bridge.errors import UsageError
+    from bridge.record.client import RecorderClient
+    from bridge.record.process import describe_status
+    from bridge.wire.config import WireConfig
+    from bridge.wire.session import open_session
+
+    outcome = None
+    if result is not None:
+        outcome = {"result": result, "k": int(result == "success"), "n": 1, "detail": detail}
+    requests: dict[str, dict[str, Any]] = {
+        "start": {"id": id, "info": asdict(about)},
+        "stop": {"outcome": outcome, "discard": discard},
+        "mark": {"text": text},
+        "label": {"text": text, "outcome": outcome, "episode": id},
+        "status": {},
+    }
+    if action == "start" and id is None:
+        raise UsageError("start needs the new episode's id: robot-gst ctl start --id trial_0001.")
+    with open_session(WireConfig(connect=connect, config=zenoh_config)) as session:
+        answer = RecorderClient(session, recorder).ask(action, requests[action])
+    text = describe_status(answer) if action == "status" else _describe_answer(answer)
+    output.result(answer, text)
+    return 0
+
+
+def publish_folder(
+    folder: Path,
+    /,
+    *,
+    config: Annotated[FolderConfig, Parameter(name="*")] = FOLDER,
+    fast: bool = False,
+    episode: str | None = None,
+    recorder: str = "main",
+    connect: tuple[str, ...] = LOOPBACK,
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Publish an RGB-D folder (with a scene.json) as if it were a live camera.
+
+    Example: robot-gst publish folder data/kitchen --cell kitchen --camera kinect --episode scan
+
+    Args:
+        folder: Folder with scene.json, colour and depth images.
+        config: Names and rate.
+        fast: Send as fast as the recorder takes it; stamps keep their distance.
+        episode: Ask the recorder to record this episode from the first to the last frame.
+        recorder: Name of the recorder.
+        connect: Where it listens.
+        zenoh_config: zenoh configuration (JSON5).
+        output: How to talk.
+    """
+    from bridge.record.client import RecorderClient
+    from bridge.sources.folder import num_frames
+    from bridge.sources.folder_index import read_index
+    from bridge.sources.folder_publish import publish_folder_frames
+    from bridge.wire.config import WireConfig
+    from bridge.wire.session import open_session
+
+    index = read_index(folder)
+    answer: dict[str, Any] | None = None
+    wire = WireConfig(connect=connect, config=zenoh_config)
+    with _stop_on_signals() as stop, open_session(wire) as session:
+        client = RecorderClient(session, recorder)
+        if episode is not None:
+            info = {"kind": "scan", "cell": config.cell, "tags": [f"folder:{index.name}"]}
+            client.start(episode, info)
+        try:
+            with output.progress("publish", num_frames(index, config)) as advance:
+                sent = publish_folder_frames(
+                    session, index, config, fast=fast, should_stop=stop.is_set, advance=advance
+                )
+        finally:
+            if episode is not None:
+                answer = client.stop()
+    text = f"{sent['frames']} of {sent['of']} frames, {sent['messages']} messages sent"
+    if answer is not None:
+        text += f"\n{_describe_answer(answer)}"
+    output.result({"sent": sent, "recorded": answer}, text)
+    return 0
+
+
+def import_rgbd(
+    folder: Path,
+    run: Path,
+    /,
+    *,
+    episode: str = "scan",
+    config: Annotated[FolderConfig, Parameter(name="*")] = FOLDER,
+    output: Output = OUTPUT,
+) -> int:
+    """Turn an RGB-D folder (with a scene.json) into a scan episode.
+
+    Example: robot-gst import rgbd data/kitchen runs/kitchen --cell kitchen --camera kinect
+
+    Args:
+        folder: Folder with scene.json, colour and depth images.
+        run: Run folder; made where needed.
+        episode: Id of the new episode.
+        config: Names and rate.
+        output: How to talk.
+    """
+    from bridge.episode.metadata import EpisodeInfo
+    from bridge.episode.provenance import hash_file
+    from bridge.episode.run import RunFolder
+    from bridge.exchange.rgbd import write_scan
+    from bridge.sources.folder import folder_messages, num_frames
+    from bridge.sources.folder_index import read_index
+
+    index = read_index(folder)
+    info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
+    source = {
+        "folder": index.name,
+        "index_sha256": hash_file(index.path),
+        "depth_unit_m": index.depth_unit_m,
+        "depth_rounded_to_m": 1e-3,
+        "frames_left_out_without_pose": index.num_unposed,
+        "times": f"nominal, {config.rate_hz:g} Hz from 0; the folder has none",
+    }
+    total = num_frames(index, config)
+
+    with output.progress("import", total) as advance:
+
+        def messages() -> Iterator[StampedMessage]:
+            for done, frame in enumerate(folder_messages(index, config, 0), start=1):
+                yield from frame
+                advance(done, "")
+
+        path = write_scan(RunFolder.create(run), info, messages(), source=source)
+    data = {"file": str(path), "frames": total, "frames_left_out": index.num_unposed}
+    output.result(data, f"{path}: {total} frames")
+    return 0
+
+
+def import_kinova(folder: Path, run: Path, /, *, output: Output = OUTPUT) -> int:
+    """Turn the Kinova reality-gap runs into episodes: real ones recorded, simulated ones derived.
+
+    Example: robot-gst import kinova data/kinova runs/kinova
+
+    Args:
+        folder: Folder with real/Experiment1/*.tsv and sim/Experiment1/*.csv.
+        run: Run folder; made where needed.
+        output: How to talk.
+    """
+    from bridge.episode.run import RunFolder
+    from bridge.exchange.kinova import find_runs, import_runs
+
+    real, simulated = find_runs(folder)
+    files = []
+    with output.progress("import", len(real) + len(simulated)) as advance:
+        for path, _ in import_runs(folder, RunFolder.create(run)):
+            files.append(str(path))
+            advance(len(files), path.name)
+    data = {"real": len(real), "simulated": len(simulated), "files": files}
+    output.result(data, f"{len(real)} real and {len(simulated)} simulated runs in {run}")
+    return 0

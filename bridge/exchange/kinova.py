@@ -1,0 +1,252 @@
+"""The Kinova reality-gap runs (Collins, Howard, Leitner, ICRA 2019) as episodes.
+
+Real runs (``real/Experiment*/*.tsv``, motion capture at 100 Hz) become recorded episodes;
+simulator runs (``sim/Experiment*/*.csv``) become unpaired derived episodes.
+
+Three facts that the folder's notes leave open were settled by numbers (see
+``tests/bridge/exchange``): the nine ``Rot`` values are column by column (then R = Rx(roll)
+Ry(pitch) Rz(yaw) holds to 6e-6, row by row it is off by 0.04); PyBullet files hold quaternions as
+xyzw and MuJoCo files as wxyz (the other way round the end effector would turn 24 degrees
+differently from the real one, or start upside down).
+"""
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.clock import ns_from_s
+from bridge.episode import schema
+from bridge.episode.metadata import Derived, EpisodeInfo
+from bridge.episode.provenance import hash_file, hash_settings
+from bridge.episode.records import PoseSample
+from bridge.episode.run import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import BridgeError, PathNotFoundError
+from bridge.geometry import se3
+
+CELL = "kinova"
+FRAME = "world"
+"""Motion capture and simulator share it: robot base near the origin, z up."""
+TCP_TOPIC = f"/{CELL}/tcp/pose"
+CUBE_TOPIC = f"/{CELL}/object/cube/pose"
+BASE_TOPIC = f"/{CELL}/base/pose"
+_REAL_COLUMNS = 53
+_SIM_COLUMNS = 14
+_BODY_STARTS = {BASE_TOPIC: 2, TCP_TOPIC: 19, CUBE_TOPIC: 36}
+_REAL_NAME = re.compile(r"^(?P<task>[A-Za-z]+)(?P<number>\d+)_6D\.tsv$")
+_SIM_NAME = re.compile(r"^(?P<task>[A-Za-z]+)_(?P<engine>PyBullet|Mujoco)_(?P<number>\d+)\.csv$")
+_QUATERNION_ORDERS = {"PyBullet": "xyzw", "Mujoco": "wxyz"}
+CITATION = "Collins, Howard, Leitner: Quantifying the reality gap, ICRA 2019"
+
+
+class KinovaFormatError(BridgeError):
+    """A file of the data set does not look as its header says."""
+
+    def __init__(self, *, path: Path, found: str) -> None:
+        """Remember the file and what was found."""
+        self.path = path
+        super().__init__(f"{path}: {found}. Restore it from the original data set.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class KinovaRun:
+    """One run: poses of bodies over time, in the frame ``world``."""
+
+    path: Path
+    task: str
+    number: int
+    engine: str | None
+    """None for the real robot, else pybullet or mujoco."""
+    stamps_s: Float[np.ndarray, " num_samples"]
+    Ts_world_body: dict[str, Float[np.ndarray, "num_samples 4 4"]]
+    """By topic."""
+    num_lost: dict[str, int]
+    """Samples in which motion capture did not see the body; left out."""
+    seen_mask: dict[str, np.ndarray]
+
+
+def read_real_run(path: Path) -> KinovaRun:
+    """Read a motion-capture file.
+
+    Raises:
+        KinovaFormatError: When columns are missing or are not numbers.
+    """
+    name = _REAL_NAME.match(path.name)
+    if name is None:
+        raise KinovaFormatError(path=path, found="the name is not like Single0001_6D.tsv")
+    rows = _rows(path, "\t", _REAL_COLUMNS)
+    transforms, seen = {}, {}
+    for topic, start in _BODY_STARTS.items():
+        T = np.tile(np.eye(4), (len(rows), 1, 1))
+        T[:, :3, 3] = rows[:, start : start + 3] * 1e-3
+        # Column by column; see the module's docstring.
+        T[:, :3, :3] = rows[:, start + 7 : start + 16].reshape(-1, 3, 3).transpose(0, 2, 1)
+        determinant = np.linalg.det(T[:, :3, :3])
+        seen[topic] = np.isfinite(T).all(axis=(1, 2)) & (np.abs(determinant - 1) < 0.01)
+        transforms[topic] = T
+    return KinovaRun(
+        path=path,
+        task=name["task"].lower(),
+        number=int(name["number"]),
+        engine=None,
+        stamps_s=rows[:, 1],
+        Ts_world_body=transforms,
+        num_lost={topic: int((~mask).sum()) for topic, mask in seen.items()},
+        seen_mask=seen,
+    )
+
+
+def read_sim_run(path: Path, duration_s: float) -> KinovaRun:
+    """Read a simulator file; it has no times, so they are spread evenly over ``duration_s``."""
+    name = _SIM_NAME.match(path.name)
+    if name is None:
+        raise KinovaFormatError(path=path, found="the name is not like Single_PyBullet_0.csv")
+    rows = _rows(path, None, _SIM_COLUMNS)
+    order = [_QUATERNION_ORDERS[name["engine"]].index(axis) for axis in "wxyz"]
+    transforms = {
+        topic: se3.transform_from(
+            rows[:, start + 3 : start + 7][:, order], rows[:, start : start + 3]
+        )
+        for topic, start in ((TCP_TOPIC, 0), (CUBE_TOPIC, 7))
+    }
+    everything = np.ones(len(rows), dtype=bool)
+    return KinovaRun(
+        path=path,
+        task=name["task"].lower(),
+        number=int(name["number"]),
+        engine=name["engine"].lower(),
+        stamps_s=np.linspace(0.0, duration_s, len(rows)),
+        Ts_world_body=transforms,
+        num_lost=dict.fromkeys(transforms, 0),
+        seen_mask=dict.fromkeys(transforms, everything),
+    )
+
+
+def _rows(path: Path, separator: str | None, columns: int) -> Float[np.ndarray, "rows columns"]:
+    rows = []
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        if not line.strip():
+            continue
+        text = line if separator else line.replace(",", " ")
+        cells = text.split(separator)[:columns]
+        if len(cells) != columns:
+            found = f"line {number} has {len(cells)} columns, expected {columns}"
+            raise KinovaFormatError(path=path, found=found)
+        try:
+            rows.append([float(cell) if cell.strip() else np.nan for cell in cells])
+        except ValueError as error:
+            raise KinovaFormatError(path=path, found=f"line {number}: {error}") from error
+    if len(rows) < 2:
+        raise KinovaFormatError(path=path, found=f"{len(rows)} rows of data, need at least 2")
+    return np.array(rows)
+
+
+def find_runs(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Return the real and the simulated files of the data set, in name order."""
+    real = sorted(folder.glob("real/*/*_6D.tsv"))
+    simulated = sorted(folder.glob("sim/*/*.csv"))
+    if not real:
+        raise PathNotFoundError(
+            path=folder / "real",
+            what="real runs",
+            hint="Give the folder that holds real/Experiment1/*.tsv and sim/Experiment1/*.csv.",
+        )
+    return real, simulated
+
+
+def import_runs(folder: Path, run: RunFolder) -> Iterator[tuple[Path, KinovaRun]]:
+    """Write every run as an episode; yields the file and the run as each is done."""
+    real_paths, sim_paths = find_runs(folder)
+    durations: dict[tuple[str, str], list[float]] = {}
+    for path in real_paths:
+        real = read_real_run(path)
+        durations.setdefault((path.parent.name, real.task), []).append(float(real.stamps_s[-1]))
+        yield _write_real(real, run), real
+    for path in sim_paths:
+        task = path.name.split("_")[0].lower()
+        of_task = durations.get((path.parent.name, task))
+        if not of_task:
+            raise KinovaFormatError(path=path, found="no real run of its task gives its duration")
+        simulated = read_sim_run(path, float(np.mean(of_task)))
+        yield _write_sim(simulated, run, num_real=len(of_task)), simulated
+
+
+def _info(kinova: KinovaRun, suffix: str) -> EpisodeInfo:
+    return EpisodeInfo(
+        id=f"{kinova.task}_{suffix}",
+        kind="imported",
+        task=kinova.task,
+        trial=kinova.number,
+        robot="Kinova Mico2",
+        cell=CELL,
+        tags=("reality-gap", kinova.path.parent.name),
+    )
+
+
+def _write_real(kinova: KinovaRun, run: RunFolder) -> Path:
+    info = _info(kinova, f"{kinova.number:04d}")
+    path = run.episodes_dir / f"{info.id}.mcap"
+    if path.exists():  # written whole by an earlier import
+        return path
+    with EpisodeWriter(path) as writer:
+        writer.describe(info)
+        _write_poses(writer, kinova)
+        writer.add_metadata("source", _source(kinova, "seconds since the start of the capture"))
+    return path
+
+
+def _write_sim(kinova: KinovaRun, run: RunFolder, num_real: int) -> Path:
+    settings = {
+        "file": kinova.path.name,
+        "file_sha256": hash_file(kinova.path),
+        "pairing": "unpaired, no time column: normalised time",
+        "duration_s": float(kinova.stamps_s[-1]),
+        "duration_from": f"mean of {num_real} real runs of this task",
+    }
+    info = _info(kinova, f"{kinova.engine}_{kinova.number}")
+    derived = Derived(
+        kind="replay",
+        source_episode="",
+        source_sha256="",
+        trajectory="planned",
+        mode="dynamic",
+        engine=kinova.engine,
+        settings=settings,
+    )
+    name = (
+        f"{kinova.task}.replay.planned.dynamic.unpaired.{kinova.engine}.{hash_settings(settings)}"
+    )
+    path = run.derived_dir / f"{name}.mcap"
+    if path.exists():
+        return path
+    with EpisodeWriter(path) as writer:
+        writer.describe(info, derived=derived)
+        _write_poses(writer, kinova)
+        writer.add_metadata("source", _source(kinova, "spread evenly; the file has no time column"))
+    return path
+
+
+def _source(kinova: KinovaRun, times: str) -> dict[str, str]:
+    record: dict[str, Any] = {
+        "file": kinova.path.name,
+        "citation": CITATION,
+        "times": times,
+        "samples_left_out": kinova.num_lost,
+    }
+    return {name: json.dumps(value) for name, value in record.items()}
+
+
+def _write_poses(writer: EpisodeWriter, kinova: KinovaRun) -> None:
+    for index, stamp_s in enumerate(kinova.stamps_s):
+        stamp_ns = ns_from_s(float(stamp_s))
+        for topic, transforms in kinova.Ts_world_body.items():
+            if not kinova.seen_mask[topic][index]:
+                continue
+            pose = PoseSample(stamp_ns=stamp_ns, frame_id=FRAME, T_frame_body=transforms[index])
+            writer.write(topic, pose.to_cdr(), type_name=schema.POSE_STAMPED, log_time_ns=stamp_ns)

@@ -1,0 +1,134 @@
+"""The recorder's control keys: ``rec/<recorder>/ctl/{start,stop,mark,label,status}``, JSON."""
+
+import json
+from collections.abc import Callable
+from dataclasses import MISSING, fields
+from typing import Any, TypeVar, get_origin
+
+from bridge.episode import metadata
+from bridge.episode.run import check_episode_id
+from bridge.record.errors import ControlError
+from bridge.record.recorder import Recorder
+from bridge.wire.session import Service, WireSession
+
+RESULTS = ("success", "failure", "unknown")
+Record = TypeVar("Record")
+
+
+def control_key(recorder: str, verb: str) -> str:
+    """The key that one command is sent to."""
+    return f"rec/{recorder}/ctl/{verb}"
+
+
+def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
+    """Answer the control keys until the session closes."""
+
+    def start(request: dict[str, Any]) -> dict[str, Any]:
+        _only(request, "start", {"id", "info"})
+        return recorder.start(parse_info(request.get("id"), request.get("info") or {}))
+
+    def stop(request: dict[str, Any]) -> dict[str, Any]:
+        _only(request, "stop", {"outcome", "discard"})
+        outcome = parse_outcome(request.get("outcome"))
+        return recorder.stop(outcome=outcome, discard=request.get("discard") is True)
+
+    def mark(request: dict[str, Any]) -> dict[str, Any]:
+        _only(request, "mark", {"text"})
+        return recorder.mark(_text(request))
+
+    def label(request: dict[str, Any]) -> dict[str, Any]:
+        _only(request, "label", {"text", "outcome", "episode"})
+        episode = request.get("episode")
+        return recorder.label(
+            text=_text(request),
+            outcome=parse_outcome(request.get("outcome")),
+            episode=None if episode is None else check_episode_id(str(episode)),
+        )
+
+    verbs: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+        "start": start,
+        "stop": stop,
+        "mark": mark,
+        "label": label,
+        "status": lambda request: recorder.status(),
+    }
+    return [
+        session.serve(control_key(recorder.config.recorder, verb), _json_handler(verb, act))
+        for verb, act in verbs.items()
+    ]
+
+
+def _json_handler(
+    verb: str, act: Callable[[dict[str, Any]], dict[str, Any]]
+) -> Callable[[bytes], bytes]:
+    def handler(payload: bytes) -> bytes:
+        try:
+            request = json.loads(payload or b"{}")
+        except (ValueError, RecursionError) as error:
+            raise ControlError(f"{verb}: the request is not JSON ({error}).") from error
+        if not isinstance(request, dict):
+            raise ControlError(f"{verb}: the request must be a JSON object, got {request!r:.80}.")
+        return json.dumps(act(request)).encode()
+
+    return handler
+
+
+def _only(request: dict[str, Any], verb: str, known: set[str]) -> None:
+    unknown = sorted(set(request) - known)
+    if unknown:
+        raise ControlError(
+            f"{verb} does not know {', '.join(unknown)}. It knows: {', '.join(sorted(known))}."
+        )
+
+
+def _text(request: dict[str, Any]) -> str:
+    text = request.get("text", "")
+    if not isinstance(text, str):
+        raise ControlError(f"text must be a string, got {text!r:.80}.")
+    return text
+
+
+def parse_info(episode_id: Any, info: dict[str, Any]) -> metadata.EpisodeInfo:
+    """Build the episode's description from a request; unknown fields are refused."""
+    if not isinstance(episode_id, str):
+        raise ControlError(f"start needs an episode id as a string, got {episode_id!r:.80}.")
+    check_episode_id(episode_id)
+    values = {"kind": "trial", **info, "id": episode_id}
+    made = _build(metadata.EpisodeInfo, values, "info")
+    if made.kind not in metadata.KINDS:
+        raise ControlError(f"kind {made.kind!r} is unknown. Kinds: {', '.join(metadata.KINDS)}.")
+    if made.cell:
+        check_episode_id(made.cell)  # becomes part of a topic
+    return made
+
+
+def parse_outcome(outcome: Any) -> metadata.Outcome | None:
+    """Build an outcome from a request; None stays None."""
+    if outcome is None:
+        return None
+    made = _build(metadata.Outcome, outcome, "outcome")
+    if made.result not in RESULTS:
+        raise ControlError(f"result {made.result!r} is unknown. Results: {', '.join(RESULTS)}.")
+    return made
+
+
+def _build(of_type: type[Record], values: Any, what: str) -> Record:
+    if not isinstance(values, dict):
+        raise ControlError(f"{what} must be a JSON object, got {values!r:.80}.")
+    known = {item.name: item for item in fields(of_type)}  # type: ignore[arg-type]
+    _only(values, what, set(known))
+    missing = [n for n, item in known.items() if item.default is MISSING and n not in values]
+    if missing:
+        raise ControlError(f"{what} needs {', '.join(missing)}.")
+    arguments = {}
+    for name, value in values.items():
+        wanted: Any = known[name].type
+        if get_origin(wanted) is tuple:
+            if not isinstance(value, list | tuple):
+                raise ControlError(f"{what}.{name} must be a list, got {value!r:.80}.")
+            arguments[name] = tuple(value)
+        elif (isinstance(value, bool) and wanted is not bool) or not isinstance(value, wanted):
+            raise ControlError(f"{what}.{name} has the wrong type: {value!r:.80}.")
+        else:
+            arguments[name] = value
+    return of_type(**arguments)

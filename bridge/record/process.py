@@ -1,0 +1,140 @@
+"""The recorder as a process: a zenoh router on this machine, a status line, a clean end."""
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.run import RunFolder
+from bridge.record.config import RecorderConfig
+from bridge.record.control import serve_control
+from bridge.record.recorder import Recorder
+from bridge.terminal import Output
+from bridge.wire.config import WireConfig
+from bridge.wire.errors import is_loopback
+from bridge.wire.session import WireSample, open_session
+
+STATUS_PERIOD_S = 5.0
+LIVE_PERIOD_S = 0.5
+CONTROL_PREFIX = "/rec/"
+
+
+def run_recorder(
+    run_path: Path,
+    *,
+    wire: WireConfig,
+    config: RecorderConfig,
+    stop: threading.Event,
+    output: Output,
+    episode: EpisodeInfo | None = None,
+    duration_s: float | None = None,
+) -> dict[str, Any] | None:
+    """Record until ``stop`` is set, the duration is over, or the disk fails.
+
+    Args:
+        run_path: The run folder; made where needed.
+        wire: Where to listen.
+        config: The recorder's settings.
+        stop: Set by a signal handler.
+        output: Where remarks go.
+        episode: Start this one at once instead of waiting for a command.
+        duration_s: With ``episode``, stop after this long [s].
+
+    Returns:
+        The answer to the last stop if this call stopped an episode, else None.
+
+    Raises:
+        DiskError: When the episode cannot be written.
+    """
+    run = RunFolder.create(run_path)
+    with open_session(wire) as session:
+        recorder = Recorder(run, now_ns=session.now_ns, config=config)
+        subscribers = [session.subscribe(key, _taker(recorder)) for key in config.topics]
+        serve_control(session, recorder)
+        _say_where(output, wire, recorder, run)
+        try:
+            if episode is not None:
+                recorder.start(episode)
+            _watch(recorder, stop, duration_s, output)
+        finally:
+            for subscriber in subscribers:
+                subscriber.close()
+            answer = recorder.close()
+        if recorder.error is not None:
+            raise recorder.error
+    return answer
+
+
+def _taker(recorder: Recorder) -> Callable[[WireSample], None]:
+    def take(sample: WireSample) -> None:
+        if not sample.topic.startswith(CONTROL_PREFIX):
+            recorder.receive(sample)
+
+    return take
+
+
+def _say_where(output: Output, wire: WireConfig, recorder: Recorder, run: RunFolder) -> None:
+    where = ", ".join(wire.listen)
+    output.say(f"recorder {recorder.config.recorder!r} listens on {where}, writes to {run.path}")
+    for endpoint in wire.listen:
+        if not is_loopback(endpoint):
+            output.say(
+                f"warning: {endpoint} can be reached from other machines; whoever reaches it can "
+                "publish and control. Use --config with access control, or 127.0.0.1."
+            )
+
+
+def _watch(
+    recorder: Recorder, stop: threading.Event, duration_s: float | None, output: Output
+) -> None:
+    end_s = None if duration_s is None else time.monotonic() + duration_s
+    with _status_line(output) as (show, period_s):
+        last_s = time.monotonic()
+        last_messages = 0
+        while not stop.wait(0.1) and not recorder.failed.is_set():
+            now_s = time.monotonic()
+            if end_s is not None and now_s >= end_s:
+                return
+            if now_s >= last_s + period_s:
+                status = recorder.status()
+                messages = status.get("messages", 0)
+                rate_hz = max(0, messages - last_messages) / (now_s - last_s)
+                last_messages, last_s = messages, now_s
+                show(describe_status(status, rate_hz))
+
+
+def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str:
+    """One line for people."""
+    free = f"{status['disk_free_bytes'] / 1e9:.1f} GB free"
+    if status["state"] == "failed":
+        return f"failed: {status['error']}"
+    if status["state"] == "idle":
+        return f"idle, {len(status['seen'])} topics seen, {free}"
+    rate = "" if rate_hz is None else f" ({rate_hz:.0f}/s)"
+    flags = "".join(
+        f", {status[name]} {name.replace('_', ' ')}"
+        for name in ("undecodable", "unknown_type")
+        if status[name]
+    )
+    return (
+        f"recording {status['episode']}: {status['duration_s']:.1f} s, "
+        f"{status['messages']} messages{rate}, {status['bytes'] / 1e6:.1f} MB, "
+        f"{status['lost']} lost{flags}, queue {status['queue_bytes'] / 1e6:.1f} MB, {free}"
+    )
+
+
+@contextmanager
+def _status_line(output: Output) -> Iterator[tuple[Callable[[str], None], float]]:
+    """A line that is rewritten on a terminal; otherwise a new line every few seconds."""
+    if output.quiet or not sys.stderr.isatty():
+        yield output.say, STATUS_PERIOD_S
+        return
+    from rich.console import Console  # noqa: PLC0415  # only for terminals
+    from rich.live import Live  # noqa: PLC0415
+
+    with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live:
+        yield (lambda text: live.update(text, refresh=True)), LIVE_PERIOD_S

@@ -1,0 +1,33 @@
+"""How an RGB-D folder is turned into messages. Imports nothing heavy."""
+
+import re
+from dataclasses import dataclass
+
+from bridge.errors import UsageError
+
+_NAME = re.compile(r"^[A-Za-z][A-Za-z0-9_]*$")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FolderConfig:
+    """How a folder is turned into messages."""
+
+    cell: str = "kitchen"
+    """Name of the cell in topics: /<cell>/cam/<camera>/color/image."""
+    camera: str = "kinect"
+    """Name of the camera in topics and frames."""
+    rate_hz: float = 30.0
+    """Frames per second; stamps are this far apart."""
+    max_frames: int | None = None
+    """Stop after so many frames."""
+
+    def __post_init__(self) -> None:
+        """Refuse names that cannot be part of a topic, and a rate that is none."""
+        for what, name in (("cell", self.cell), ("camera", self.camera)):
+            if not _NAME.match(name):
+                raise UsageError(
+                    f"{what} name {name!r} cannot be part of a topic. "
+                    "Use letters, digits and '_', starting with a letter."
+                )
+        if not 0 < self.rate_hz <= 1000:
+            raise UsageError(f"--rate-hz {self.rate_hz:g} is not between 0 and 1000.")
