@@ -1,9 +1,10 @@
 """Pair recorded and derived episodes, then let metrics and statistics speak.
 
-``compare_run`` reads a run folder, ``compare_trials`` a trials CSV, ``compare_rates`` a rates CSV.
+``compare_run`` reads a run folder, ``compare_csv`` a trials CSV or a rates CSV.
 """
 
-from evaluator.compare.rows import Comparison, TcpErrorSeries, TrialRow
+from evaluator.compare.rows import Comparison, RateCell, TcpErrorSeries, TrialRow
 from evaluator.compare.run import compare_run
+from evaluator.compare.spreadsheet import compare_csv
 
-__all__ = ["Comparison", "TcpErrorSeries", "TrialRow", "compare_run"]
+__all__ = ["Comparison", "RateCell", "TcpErrorSeries", "TrialRow", "compare_csv", "compare_run"]

@@ -1,7 +1,9 @@
 """What a comparison is made of: one row per recorded trial, with what the twin said of it."""
 
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -58,11 +60,37 @@ class TrialRow:
     executed_replay: str | None = None
     path: Path | None = None
     tcp_errors: tuple[TcpErrorSeries, ...] = ()
+    start_positions_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Where the objects were localised at the start, to judge pairs of starts."""
 
     @property
     def recorded_word(self) -> str:
         """``stand-in`` or ``real``: what the recorded side of this row is."""
         return "stand-in" if self.stand_in else "real"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RateCell:
+    """Success rates of one task, condition and policy, recorded and in the twin."""
+
+    task: str
+    condition: str
+    policy: str
+    unit: str
+    recorded: Measurement
+    """Over all trials with a known outcome."""
+    sim: Measurement
+    """Over all trials whose planned replay was decided."""
+    recorded_rate: Fraction | None
+    """Over the trials where both sides are known; these two enter r."""
+    sim_rate: Fraction | None
+    episodes: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """Task and condition in a reader's words."""
+        parts = (self.task, self.condition, self.policy)
+        return ", ".join(part.replace("_", " ") for part in parts if part)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,12 +102,18 @@ class Comparison:
     """run, trials or rates."""
     stand_in: bool | None
     rows: tuple[TrialRow, ...] = ()
+    cells: tuple[RateCell, ...] = ()
     measurements: tuple[Measurement, ...] = ()
     tables: tuple[Table, ...] = ()
     exclusions: tuple[Exclusion, ...] = ()
     missing: tuple[str, ...] = ()
-    inputs: dict[str, str] = field(default_factory=dict)
-    """File name to content hash of every input."""
+    provenance: dict[str, Any] = field(default_factory=dict)
+    """Software, settings, and the content hash of every input file."""
+
+    @property
+    def recorded_word(self) -> str:
+        """``stand-in``, ``real``, or ``recorded`` when the input does not say."""
+        return {True: "stand-in", False: "real", None: "recorded"}[self.stand_in]
 
     def results(self) -> Results:
         """Return what goes into ``results.json``."""
@@ -91,5 +125,5 @@ class Comparison:
             tables=self.tables,
             exclusions=self.exclusions,
             missing=self.missing,
-            provenance=dict(self.inputs),
+            provenance=self.provenance,
         )

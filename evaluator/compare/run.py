@@ -1,9 +1,157 @@
 """Read a run folder into a ``Comparison``."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from bridge.episode.provenance import software
+from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
-from evaluator.compare.rows import Comparison
+from bridge.errors import BridgeError
+from evaluator.compare.bands import compare_bands
+from evaluator.compare.pairing import START_LIMIT_M, agreement, pair_starts, paired_gain
+from evaluator.compare.replays import DerivedFile, read_derived
+from evaluator.compare.rows import Comparison, TrialRow
+from evaluator.compare.success import (
+    WITH,
+    WITHOUT,
+    cell_agreement,
+    rate_cells,
+    replanning_gains,
+    side_rates,
+)
+from evaluator.compare.tables import confusion_table, success_table, trials_table
+from evaluator.compare.tracking import tcp_measurements
+from evaluator.compare.trial import read_trial
+from evaluator.compare.views import compare_views
+from evaluator.result import Exclusion, Measurement, Table
 
 
 def compare_run(run: RunFolder) -> Comparison:
-    """Pair every recorded trial of a run with its replays and measure the agreement."""
-    return Comparison(run=run.path.name, source="run", stand_in=None)
+    """Pair every recorded trial of a run with its replays and measure the agreement.
+
+    A broken episode is left out and named; a missing part is listed, never guessed.
+
+    Raises:
+        PathNotFoundError: When the run folder is not there.
+    """
+    run = RunFolder.open(run.path)
+    recorded, left_out = _read_recorded(run)
+    files, broken = read_derived(run)
+    left_out += broken
+    rows = []
+    for episode in recorded:
+        if episode.info.kind != "trial":
+            continue
+        try:
+            row, lacking = read_trial(episode, files)
+        except BridgeError as error:
+            left_out.append(_broken(episode.info.id, error))
+            continue
+        rows.append(row)
+        left_out += lacking
+    views = compare_views(files, recorded)
+    bands = compare_bands(recorded, files)
+    base = compare_rows(
+        rows, run=run.path.resolve().name, source="run", stand_in=_stand_in(recorded, files)
+    )
+    missing = [] if rows else ["trials: the run holds no recorded trial"]
+    return replace(
+        base,
+        measurements=(*base.measurements, *views.measurements, *bands.measurements),
+        tables=(*base.tables, *views.tables, *bands.tables),
+        exclusions=(*left_out, *base.exclusions, *views.exclusions, *bands.exclusions),
+        missing=(*missing, *base.missing, *views.missing, *bands.missing),
+        provenance={
+            "software": software(),
+            "start_limit_m": START_LIMIT_M,
+            "episodes": [_name_of(episode.path, run) for episode in recorded],
+            "derived": {
+                _name_of(file.path, run): {
+                    "source_sha256": file.derived.source_sha256,
+                    "scene_hash": file.derived.scene_hash,
+                    "engine": file.derived.engine,
+                    "seed": file.derived.seed,
+                }
+                for file in files
+            },
+        },
+    )
+
+
+def compare_rows(
+    rows: Sequence[TrialRow], *, run: str, source: str, stand_in: bool | None
+) -> Comparison:
+    """Measure everything that follows from trial rows alone, wherever they came from."""
+    if not rows:
+        return Comparison(run=run, source=source, stand_in=stand_in)
+    word = Comparison(run=run, source=source, stand_in=stand_in).recorded_word
+    rates = side_rates(rows)
+    cells = rate_cells(rows, rates)
+    pairs, unpaired = pair_starts(rows)
+    measurements: list[Measurement] = [
+        *rates,
+        *agreement(rows),
+        *cell_agreement(cells),
+        *replanning_gains(cells),
+        *paired_gain(pairs),
+        *(tcp_measurements(rows) if any(row.tcp_errors for row in rows) else ()),
+    ]
+    tables: tuple[Table, ...] = (
+        success_table(cells, word),
+        confusion_table(rows, word),
+        trials_table(rows, word),
+    )
+    return Comparison(
+        run=run,
+        source=source,
+        stand_in=stand_in,
+        rows=tuple(rows),
+        cells=cells,
+        measurements=tuple(measurements),
+        tables=tables,
+        exclusions=tuple(unpaired),
+        missing=tuple(_missing(rows)),
+    )
+
+
+def _missing(rows: Sequence[TrialRow]) -> list[str]:
+    found = []
+    conditions = {row.condition for row in rows}
+    if not {WITH, WITHOUT} <= conditions:
+        there = ", ".join(sorted(name or "unnamed" for name in conditions))
+        found.append(f"replanning gain: it needs both conditions, there is only {there}")
+    for side, words in (
+        ("sim_planned", "a decided dynamic replay of the plan sent"),
+        ("verdict", "a verdict before motion"),
+        ("sim_executed", "a dynamic replay of the executed joints"),
+    ):
+        without = sum(getattr(row, side) is None for row in rows)
+        if without:
+            found.append(f"{side}: {without} of {len(rows)} trials have no {words[2:]}")
+    return found
+
+
+def _read_recorded(run: RunFolder) -> tuple[list[Episode], list[Exclusion]]:
+    episodes, left_out = [], []
+    for path in run.episodes():
+        try:
+            episodes.append(Episode.open(path))
+        except BridgeError as error:
+            left_out.append(_broken(path.name, error))
+    return episodes, left_out
+
+
+def _broken(name: str, error: BridgeError) -> Exclusion:
+    return Exclusion(episode=name, scope="everything", reason=str(error))
+
+
+def _stand_in(recorded: Sequence[Episode], files: Sequence[DerivedFile]) -> bool | None:
+    """True as soon as one episode is a stand-in's: mixed results are not called real."""
+    marks = [episode.info.stand_in for episode in recorded]
+    marks += [file.episode.info.stand_in for file in files]
+    return any(marks) if marks else None
+
+
+def _name_of(path: Path, run: RunFolder) -> str:
+    return path.relative_to(run.path).as_posix()

@@ -1,0 +1,74 @@
+"""Turn counts and statistics into ``Measurement`` records; what is undefined keeps its reason."""
+
+import re
+from collections.abc import Callable, Iterable
+
+from evaluator.errors import UndefinedStatisticError
+from evaluator.result import Interval, Measurement
+from evaluator.statistics.proportion import wilson
+
+Statistic = Callable[[], float | tuple[float, Interval | None]]
+
+
+def slug(text: str) -> str:
+    """Return text usable as one part of a measurement id."""
+    return re.sub(r"[^A-Za-z0-9_+-]+", "_", text) or "-"
+
+
+def measured(
+    measurement_id: str,
+    compute: Statistic,
+    *,
+    unit: str,
+    definition: str,
+    n: int | None = None,
+    counted: str | None = None,
+    reason_without_interval: str | None = None,
+    episodes: Iterable[str] = (),
+) -> Measurement:
+    """Compute one statistic; ``compute`` gives a value, or a value with its interval."""
+    value: float | None = None
+    interval: Interval | None = None
+    reason: str | None = None
+    try:
+        outcome = compute()
+        value, interval = outcome if isinstance(outcome, tuple) else (outcome, None)
+    except UndefinedStatisticError as error:
+        reason = error.reason
+    return Measurement(
+        id=measurement_id,
+        value=value,
+        unit=unit,
+        definition=definition,
+        interval=interval,
+        n=n,
+        counted=counted,
+        reason_if_undefined=reason,
+        reason_without_interval=reason_without_interval if interval is None else None,
+        episodes=tuple(episodes),
+    )
+
+
+def proportion(
+    measurement_id: str,
+    k: int,
+    n: int,
+    *,
+    definition: str,
+    counted: str,
+    reason_if_undefined: str,
+    episodes: Iterable[str] = (),
+) -> Measurement:
+    """Measure k/n with its Wilson interval; undefined for n = 0."""
+    return Measurement(
+        id=measurement_id,
+        value=k / n if n else None,
+        unit="1",
+        definition=definition,
+        interval=wilson(k, n) if n else None,
+        k=k,
+        n=n,
+        counted=counted,
+        reason_if_undefined=None if n else reason_if_undefined,
+        episodes=tuple(episodes),
+    )

@@ -1,0 +1,128 @@
+"""The tables of a report, as plain rows; rounding and colours are left to the report."""
+
+from collections.abc import Sequence
+
+from evaluator.compare.pairing import confusion_of
+from evaluator.compare.rows import RateCell, TrialRow
+from evaluator.result import Measurement, Table
+
+
+def shown_rate(measurement: Measurement) -> str:
+    """Write a rate with its count and interval: ``4/5 = 80.0 % [37.6, 96.4]``."""
+    if measurement.value is None:
+        return f"undefined: {measurement.reason_if_undefined}"
+    percent = f"{100 * measurement.value:.1f} %"
+    if measurement.k is None or measurement.n is None:
+        return f"{percent} (no n)"
+    text = f"{measurement.k}/{measurement.n} = {percent}"
+    if measurement.interval is not None:
+        low, high = 100 * measurement.interval.low, 100 * measurement.interval.high
+        text += f" [{low:.1f}, {high:.1f}]"
+    return text
+
+
+def success_table(cells: Sequence[RateCell], word: str) -> Table:
+    """Success without and with replanning, in the twin and recorded."""
+    rows = tuple(
+        (
+            cell.task,
+            cell.condition.replace("_", " "),
+            cell.policy,
+            cell.unit,
+            shown_rate(cell.sim),
+            shown_rate(cell.recorded),
+            _gap(cell),
+        )
+        for cell in cells
+    )
+    return Table(
+        id="success",
+        title="Success",
+        columns=("task", "condition", "policy", "unit", "sim", word, f"sim - {word} (pp)"),
+        rows=rows,
+        note="sim: planned-in-twin, dynamic, of the plan actually sent. Brackets: 95 % Wilson "
+        "intervals in percent.",
+    )
+
+
+def _gap(cell: RateCell) -> float | None:
+    if cell.sim.value is None or cell.recorded.value is None:
+        return None
+    return round(100 * (cell.sim.value - cell.recorded.value), 1)
+
+
+def trials_table(rows: Sequence[TrialRow], word: str) -> Table:
+    """One line per trial."""
+    return Table(
+        id="trials",
+        title="Trials",
+        columns=(
+            "episode",
+            "task",
+            "condition",
+            "policy",
+            "start",
+            word,
+            "sim planned",
+            "verdict before motion",
+            "sim executed",
+            "first failing",
+            "detail",
+        ),
+        rows=tuple(
+            (
+                row.episode,
+                row.task,
+                row.condition.replace("_", " "),
+                row.policy,
+                row.start_id,
+                _answer(row.recorded),
+                _answer(row.sim_planned),
+                _answer(row.verdict),
+                _answer(row.sim_executed),
+                row.first_failing,
+                row.failing_detail,
+            )
+            for row in rows
+        ),
+        note="sim executed is diagnosis only. Empty: unknown, undecided or not there; the "
+        "exclusions say which.",
+    )
+
+
+def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
+    """What the twin said against what happened, counted over trials."""
+    lines = []
+    for name, said in (
+        ("sim planned", lambda row: row.sim_planned),
+        ("verdict before motion", lambda row: row.verdict),
+        ("sim executed (diagnosis)", lambda row: row.sim_executed),
+    ):
+        counts = confusion_of(rows, said)
+        lines.append(
+            (
+                name,
+                counts.true_positive,
+                counts.false_positive,
+                counts.false_negative,
+                counts.true_negative,
+                counts.n,
+            )
+        )
+    return Table(
+        id="confusion",
+        title="What the twin said, and what happened",
+        columns=(
+            "twin",
+            f"said success, {word} success",
+            f"said success, {word} failure",
+            f"said failure, {word} success",
+            f"said failure, {word} failure",
+            "trials",
+        ),
+        rows=tuple(lines),
+    )
+
+
+def _answer(value: bool | None) -> str | None:
+    return None if value is None else ("success" if value else "failure")
