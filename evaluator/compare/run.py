@@ -7,7 +7,7 @@ from pathlib import Path
 from bridge.episode.provenance import software
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
-from bridge.errors import BridgeError
+from bridge.errors import BridgeError, GstError
 from evaluator.compare.bands import compare_bands
 from evaluator.compare.pairing import START_LIMIT_M, agreement, pair_starts, paired_gain
 from evaluator.compare.replays import DerivedFile, read_derived
@@ -20,7 +20,12 @@ from evaluator.compare.success import (
     replanning_gains,
     side_rates,
 )
-from evaluator.compare.tables import confusion_table, success_table, trials_table
+from evaluator.compare.tables import (
+    confusion_table,
+    gains_table,
+    success_table,
+    trials_table,
+)
 from evaluator.compare.tracking import tcp_measurements
 from evaluator.compare.trial import read_trial
 from evaluator.compare.views import compare_views
@@ -44,8 +49,8 @@ def compare_run(run: RunFolder) -> Comparison:
         if episode.info.kind != "trial":
             continue
         try:
-            row, lacking = read_trial(episode, files)
-        except BridgeError as error:
+            row, lacking = read_trial(run, episode, files)
+        except GstError as error:
             left_out.append(_broken(episode.info.id, error))
             continue
         rows.append(row)
@@ -88,17 +93,19 @@ def compare_rows(
     word = Comparison(run=run, source=source, stand_in=stand_in).recorded_word
     rates = side_rates(rows)
     cells = rate_cells(rows, rates)
+    gains = replanning_gains(cells)
     pairs, unpaired = pair_starts(rows)
     measurements: list[Measurement] = [
         *rates,
         *agreement(rows),
         *cell_agreement(cells),
-        *replanning_gains(cells),
+        *gains,
         *paired_gain(pairs),
         *(tcp_measurements(rows) if any(row.tcp_errors for row in rows) else ()),
     ]
     tables: tuple[Table, ...] = (
         success_table(cells, word),
+        *_there(gains_table(gains, word)),
         confusion_table(rows, word),
         trials_table(rows, word),
     )
@@ -113,6 +120,10 @@ def compare_rows(
         exclusions=tuple(unpaired),
         missing=tuple(_missing(rows)),
     )
+
+
+def _there(table: Table | None) -> tuple[Table, ...]:
+    return () if table is None else (table,)
 
 
 def _missing(rows: Sequence[TrialRow]) -> list[str]:
@@ -142,7 +153,7 @@ def _read_recorded(run: RunFolder) -> tuple[list[Episode], list[Exclusion]]:
     return episodes, left_out
 
 
-def _broken(name: str, error: BridgeError) -> Exclusion:
+def _broken(name: str, error: GstError) -> Exclusion:
     return Exclusion(episode=name, scope="everything", reason=str(error))
 
 

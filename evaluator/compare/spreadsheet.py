@@ -13,7 +13,7 @@ from evaluator.compare.measure import slug
 from evaluator.compare.rows import Comparison, RateCell, TrialRow
 from evaluator.compare.run import compare_rows
 from evaluator.compare.success import WITH, cell_agreement, replanning_gains
-from evaluator.compare.tables import success_table
+from evaluator.compare.tables import gains_table, success_table
 from evaluator.result import Exclusion, Measurement
 from evaluator.statistics.proportion import wilson
 
@@ -106,6 +106,10 @@ def compare_rates(path: Path) -> Comparison:
     records = read_rates(path)
     stand_in = any(record.side == "stand-in" for record in records)
     cells, left_out = _rate_cells(records)
+    word = "stand-in" if stand_in else "real"
+    gains = replanning_gains(cells)
+    table = gains_table(gains, word)
+    tables = (success_table(cells, word, "Rates as given."), *(() if table is None else (table,)))
     base = Comparison(
         run=path.stem,
         source="rates",
@@ -114,9 +118,9 @@ def compare_rates(path: Path) -> Comparison:
         measurements=(
             *(side for cell in cells for side in (cell.recorded, cell.sim)),
             *cell_agreement(cells),
-            *replanning_gains(cells),
+            *gains,
         ),
-        tables=(success_table(cells, "stand-in" if stand_in else "real"),),
+        tables=tables,
         missing=("trial-level agreement: a table of rates does not say which trial succeeded",),
     )
     return _with_source(base, path, left_out)

@@ -21,7 +21,10 @@ def shown_rate(measurement: Measurement) -> str:
     return text
 
 
-def success_table(cells: Sequence[RateCell], word: str) -> Table:
+SIM_NOTE = "sim: planned-in-twin, dynamic, of the plan actually sent."
+
+
+def success_table(cells: Sequence[RateCell], word: str, sim_note: str = SIM_NOTE) -> Table:
     """Success without and with replanning, in the twin and recorded."""
     rows = tuple(
         (
@@ -40,8 +43,7 @@ def success_table(cells: Sequence[RateCell], word: str) -> Table:
         title="Success",
         columns=("task", "condition", "policy", "unit", "sim", word, f"sim - {word} (pp)"),
         rows=rows,
-        note="sim: planned-in-twin, dynamic, of the plan actually sent. Brackets: 95 % Wilson "
-        "intervals in percent.",
+        note=f"{sim_note} Brackets: 95 % Wilson intervals in percent.",
     )
 
 
@@ -49,6 +51,48 @@ def _gap(cell: RateCell) -> float | None:
     if cell.sim.value is None or cell.recorded.value is None:
         return None
     return round(100 * (cell.sim.value - cell.recorded.value), 1)
+
+
+def gains_table(gains: Sequence[Measurement], word: str) -> Table | None:
+    """The replanning gain: percentage points and relative gain are two columns."""
+    points = [m for m in gains if m.id.startswith("gain.pp.")]
+    relative = {m.id: m for m in gains if m.id.startswith("gain.relative.")}
+    if not points:
+        return None
+    rows = []
+    for gain in points:
+        side, name = gain.id.split(".", 3)[2:]
+        rows.append(
+            (
+                "mean of tasks" if name == "average" else name.removesuffix(".-"),
+                word if side == "recorded" else "sim",
+                _points(gain),
+                _relative(relative[gain.id.replace("gain.pp.", "gain.relative.")]),
+            )
+        )
+    return Table(
+        id="gains",
+        title="Gain with replanning",
+        columns=("task", "side", "percentage points", "relative gain"),
+        rows=tuple(rows),
+        note="Two different numbers. Brackets: 95 % Newcombe intervals of unpaired groups; one "
+        "that reaches below 0 does not show a gain.",
+    )
+
+
+def _points(gain: Measurement) -> str:
+    if gain.value is None:
+        return f"undefined: {gain.reason_if_undefined}"
+    text = f"{gain.value:+.1f} pp"
+    if gain.interval is not None:
+        text += f" [{gain.interval.low:+.1f}, {gain.interval.high:+.1f}]"
+    return text
+
+
+def _relative(gain: Measurement) -> str:
+    if gain.value is None:
+        return f"undefined: {gain.reason_if_undefined}"
+    return f"{100 * gain.value:+.1f} %"
 
 
 def trials_table(rows: Sequence[TrialRow], word: str) -> Table:

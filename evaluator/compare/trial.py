@@ -7,9 +7,11 @@ import numpy as np
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
+from bridge.episode.catalogue import outcome_of
 from bridge.episode.metadata import Outcome
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
 from bridge.episode.streams import localisations, pose_track
 from bridge.errors import BridgeError
 from bridge.geometry.trajectory import PoseTrajectory
@@ -41,14 +43,18 @@ class _Log:
     label: Outcome | None = None
 
 
-def read_trial(episode: Episode, files: Sequence[DerivedFile]) -> tuple[TrialRow, list[Exclusion]]:
+def read_trial(
+    run: RunFolder, episode: Episode, files: Sequence[DerivedFile]
+) -> tuple[TrialRow, list[Exclusion]]:
     """Build the row of one recorded trial, and list what it lacks.
 
+    A label given after the fact (``robot-gst label``) overrides the one in the episode.
+
     Raises:
-        BridgeError: When the episode is damaged.
+        GstError: When the episode, or its label, is damaged.
     """
     log = _read_log(episode)
-    outcome = episode.outcome or log.label
+    outcome = outcome_of(run, episode) or log.label
     lacking = _unlabelled(outcome)
     planned = executed = Replay(file=None, verdict=None, reason=None)
     if not log.sent:

@@ -15,8 +15,8 @@ STYLE = """<style>
 .fig .soft{fill:var(--soft)}.fig .small{font-size:12px}
 .fig .line{stroke:var(--line);fill:none}.fig .axis{stroke:var(--soft);fill:none}
 .fig .ident{stroke:var(--soft);stroke-dasharray:4 4;fill:none}
-.fig .whisker{stroke:var(--soft);stroke-width:1.4;fill:none}
-.fig .sim{fill:var(--sim)}.fig .rec{fill:var(--rec)}.fig .bar{fill-opacity:.85}
+.fig .whisker{stroke:var(--ink);stroke-opacity:.75;stroke-width:1.3;fill:none}
+.fig .sim{fill:var(--sim)}.fig .rec{fill:var(--rec)}.fig .bar{fill-opacity:.7}
 .fig .with{fill:var(--sim);stroke:var(--sim)}
 .fig .without{fill:var(--paper);stroke:var(--sim);stroke-width:2}
 </style>"""

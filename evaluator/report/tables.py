@@ -2,6 +2,7 @@
 
 import csv
 import io
+import shutil
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -72,14 +73,22 @@ def latex(text: str) -> str:
     return "".join(_LATEX.get(character, character) for character in text)
 
 
-def as_text(table: Table, *, width: int = 100) -> str:
-    """Draw the table for a terminal."""
+def as_text(table: Table, *, width: int | None = None) -> str:
+    """Draw the table for a terminal, without the columns that are empty throughout."""
     drawn = RichTable(box=SIMPLE_HEAD, title=table.title, title_justify="left", padding=(0, 1))
-    for name in table.columns:
-        drawn.add_column(Text(name), overflow="fold")
+    used = [
+        index
+        for index in range(len(table.columns))
+        if any(row[index] not in ("", None) for row in table.rows)
+    ]
+        i for i in range(len(table.columns)) if any(row[i] not in ("", None) for row in table.rows)
+    ]
+    for index in used:
+        drawn.add_column(Text(table.columns[index]), overflow="fold")
     for row in table.rows:
-        drawn.add_row(*(Text(text) for text in texts(row)))
+        drawn.add_row(*(Text(texts(row)[index]) for index in used))
     stream = io.StringIO()
+    width = width or shutil.get_terminal_size(fallback=(140, 24)).columns
     Console(file=stream, width=width, no_color=True, highlight=False).print(drawn)
     text = "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
     return f"{text.rstrip()}\n{table.note}\n" if table.note else f"{text.rstrip()}\n"

@@ -60,7 +60,7 @@ def summary_text(results: Results, written: Written) -> str:
     banner = stand_in_sentence(results)
     if banner:
         parts.append(banner)
-    shown = [t for t in results.tables if t.id == "success" or t.id.startswith("bands_")]
+    shown = [t for t in results.tables if t.id in ("success", "gains") or t.id.startswith("bands_")]
     parts += [as_text(table) for table in shown]
     lines = [f"{label}: {text}" for label, text, _ in headlines(results)]
     parts.append("\n".join(lines) if lines else "Nothing could be measured.")
