@@ -81,8 +81,6 @@ def as_text(table: Table, *, width: int | None = None) -> str:
         for index in range(len(table.columns))
         if any(row[index] not in ("", None) for row in table.rows)
     ]
-        i for i in range(len(table.columns)) if any(row[i] not in ("", None) for row in table.rows)
-    ]
     for index in used:
         drawn.add_column(Text(table.columns[index]), overflow="fold")
     for row in table.rows:
