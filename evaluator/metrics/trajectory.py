@@ -11,6 +11,8 @@ from evaluator.errors import UndefinedStatisticError
 
 NORMALISED_SAMPLES = 101
 """Samples from start to end for runs without a common clock."""
+MOVING_THRESHOLD_M = 0.01
+"""A run waits while it is closer than this to where it started, or will stay."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +62,23 @@ def mean_curve(
 ) -> Float[np.ndarray, "num_samples 3"]:
     """Average the positions of several runs over normalised time [m]."""
     return np.asarray(_curves(runs, num_samples).mean(axis=0))
+
+
+def moving_part(run: PoseTrajectory, *, threshold_m: float = MOVING_THRESHOLD_M) -> PoseTrajectory:
+    """Cut the waiting at both ends: from leaving the start to staying at the end.
+
+    A run that never leaves its start is returned whole.
+    """
+    away_from_start = np.linalg.norm(run.p_m - run.p_m[0], axis=1) > threshold_m
+    away_from_end = np.linalg.norm(run.p_m - run.p_m[-1], axis=1) > threshold_m
+    if not away_from_start.any() or not away_from_end.any():
+        return run
+    first = max(0, int(np.argmax(away_from_start)) - 1)
+    last = min(len(run) - 1, int(np.flatnonzero(away_from_end)[-1]) + 1)
+    if last <= first:
+        return run
+    keep = slice(first, last + 1)
+    return PoseTrajectory(run.stamps_ns[keep], run.p_m[keep], run.q_wxyz[keep])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -51,6 +51,8 @@ def _cards(results: Results) -> str:
         f"<span>{escape(label)}</span><b>{escape(text)}</b></div>"
         for label, text, measurement in headlines(results)
     ]
+    if not cards and results.measurements:
+        return ""
     if not cards:
         return "<p>Nothing could be measured; what is missing is listed below.</p>"
     return f'<div class="cards">{"".join(cards)}</div>'

@@ -63,7 +63,8 @@ def summary_text(results: Results, written: Written) -> str:
     shown = [t for t in results.tables if t.id in ("success", "gains") or t.id.startswith("bands_")]
     parts += [as_text(table) for table in shown]
     lines = [f"{label}: {text}" for label, text, _ in headlines(results)]
-    parts.append("\n".join(lines) if lines else "Nothing could be measured.")
+    if lines or not results.measurements:
+        parts.append("\n".join(lines) if lines else "Nothing could be measured.")
     if results.exclusions:
         parts.append(
             "Left out:\n"
