@@ -1,1 +1,86 @@
 """Commands of the room ``twin``; imports stay late so that --help is quick."""
+
+from pathlib import Path
+
+from bridge.terminal import Output
+from twin.gate import GateConfig
+from twin.replay.config import ReplayRunConfig
+from twin.scene.settings import RebuildConfig, RenderConfig
+
+OUTPUT = Output()
+REPLAY = ReplayRunConfig()
+REBUILD = RebuildConfig()
+RENDER = RenderConfig()
+
+
+def replay(
+    run: Path,
+    /,
+    *,
+    config: ReplayRunConfig = REPLAY,
+    output: Output = OUTPUT,
+) -> int:
+    """Replay every plan and every execution of a run, and judge each: I(tau).
+
+    Example: robot-gst replay runs/today --workers 2
+    """
+    from bridge.episode.run import RunFolder
+    from twin.replay.run import describe_run, replay_run
+
+    summary = replay_run(RunFolder.open(run), config, output)
+    output.result(summary, describe_run(summary))
+    return 1 if any(row["error"] for row in summary["rows"]) else 0
+
+
+def gate(
+    run: Path,
+    /,
+    *,
+    config: GateConfig = GateConfig(),  # noqa: B008 (frozen)
+    output: Output = Output(),  # noqa: B008 (frozen)
+) -> int:
+    """Judge plans live over zenoh, before the robot moves; stop with Ctrl-C.
+
+    Example: robot-gst gate runs/today --cell standin --task cube_into_box --deadline 20s
+    """
+    from twin.gate import run_gate
+
+    return run_gate(run, config, output)
+
+
+def rebuild(
+    run: Path,
+    /,
+    *,
+    config: RebuildConfig = REBUILD,
+    output: Output = OUTPUT,
+) -> int:
+    """Rebuild the static scene as Gaussians, and render the held-out views.
+
+    Example: robot-gst rebuild runs/monday --budget 60s
+    """
+    from bridge.episode.run import RunFolder
+    from twin.scene.rebuild import describe_scene, rebuild as rebuild_scene
+
+    record = rebuild_scene(RunFolder.open(run), config, output)
+    output.result(record, describe_scene(record))
+    return 0
+
+
+def render(
+    run: Path,
+    /,
+    *,
+    config: RenderConfig = RENDER,
+    output: Output = OUTPUT,
+) -> int:
+    """Draw the rebuilt scene to a PNG, from a recorded or a given camera pose.
+
+    Example: robot-gst render runs/monday --camera wrist --at-s 3
+    """
+    from bridge.episode.run import RunFolder
+    from twin.scene.render import render as render_scene
+
+    drawn = render_scene(RunFolder.open(run), config)
+    output.result(drawn, "\n".join(drawn["files"]))
+    return 0

@@ -153,5 +153,3 @@ def test_adam_agrees_with_torch():
         parameter.grad = torch.tensor(gradient)
         optimiser.step()
     np.testing.assert_allclose(values, parameter.detach().numpy(), rtol=1e-4, atol=1e-6)
-
-

@@ -87,9 +87,7 @@ def choose_frames(sources: Sources, config: FrameConfig) -> list[FrameChoice]:
         NoFramesError: When nothing is left to learn from.
     """
     found = [
-        (episode, camera_id)
-        for episode in sources.episodes
-        for camera_id in _rgbd_cameras(episode)
+        (episode, camera_id) for episode in sources.episodes for camera_id in _rgbd_cameras(episode)
     ]
     train_share = max(1, config.max_train_frames // max(len(found), 1))
     holdout_share = max(1, config.max_holdout_frames // max(len(found), 1))

@@ -87,9 +87,7 @@ def _covered_by_finer(key: np.ndarray, kept: np.ndarray) -> np.ndarray:
     covered = np.zeros(len(key), dtype=bool)
     for finer in range(MAX_LEVEL):
         inside = (level == finer) & (kept | covered)
-        parents, counts = np.unique(
-            _pack(cell[inside] >> 1, level[inside] + 1), return_counts=True
-        )
+        parents, counts = np.unique(_pack(cell[inside] >> 1, level[inside] + 1), return_counts=True)
         covered |= np.isin(key, parents[counts >= 2])
     return covered
 

@@ -103,9 +103,7 @@ def _normals(
     return normals, ok
 
 
-def _seen(
-    uv: np.ndarray, z: np.ndarray, camera: Camera, in_front: np.ndarray
-) -> np.ndarray:
+def _seen(uv: np.ndarray, z: np.ndarray, camera: Camera, in_front: np.ndarray) -> np.ndarray:
     """Points inside the image and not behind a nearer one of the same 4-pixel cell."""
     inside = in_front & (uv[:, 0] >= 1) & (uv[:, 0] < camera.width - 1)
     inside &= (uv[:, 1] >= 1) & (uv[:, 1] < camera.height - 1)

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
@@ -99,3 +100,24 @@ class RebuildConfig:
     """How the Gaussians are fitted to the images."""
     force: bool = False
     """Redo work that is already done."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class RenderConfig:
+    """Which view of the rebuilt scene to draw."""
+
+    episode: str = ""
+    """Take camera and pose from this recorded episode; empty: the first of the scene."""
+    camera: str = ""
+    """Camera id; empty: the episode's first."""
+    at_s: float = 0.0
+    """Seconds after the episode's start."""
+    eye: tuple[float, float, float] | None = None
+    """Stand here instead, in metres in the scene's frame; needs --target."""
+    target: tuple[float, float, float] | None = None
+    """Look at this point, in metres in the scene's frame."""
+    depth: bool = False
+    """Write a second image with the depth, in millimetres."""
+    out: Path | None = None
+    """File to write; default: RUN/results/render.png."""

@@ -1,0 +1,89 @@
+"""The scene folder: ``scene.json`` and ``background.ply``, whole or not at all."""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bridge.episode.run import RunFolder
+from bridge.errors import PathNotFoundError
+from twin.errors import TwinError
+from twin.scene.gaussians import GaussianCloud
+from twin.scene.ply import read_ply
+
+SCENE_VERSION = 1
+BACKGROUND = "background.ply"
+SCENE_FILE = "scene.json"
+
+
+class UnreadableSceneError(TwinError):
+    """``scene.json`` is damaged or from a newer version."""
+
+    def __init__(self, *, path: Path, found: str) -> None:
+        """Remember the file."""
+        self.path = path
+        super().__init__(f"{path}: {found}. Make it again: robot-gst rebuild RUN --force.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """A rebuilt place: the static background and how it came to be."""
+
+    record: Mapping[str, Any]
+    """The content of ``scene.json``."""
+    background: GaussianCloud
+
+    @property
+    def scene_hash(self) -> str:
+        """Twelve hexadecimal digits of the SHA-256 of ``background.ply``."""
+        return str(self.record["scene_hash"])
+
+
+def read_record(run: RunFolder) -> dict[str, Any] | None:
+    """Return ``scene.json``, or None when there is no scene yet.
+
+    Raises:
+        UnreadableSceneError: When it cannot be understood.
+    """
+    path = run.scene_dir / SCENE_FILE
+    if not path.is_file():
+        return None
+    try:
+        record = json.loads(path.read_text())
+    except ValueError as error:
+        raise UnreadableSceneError(path=path, found=f"not JSON ({error})") from error
+    if not isinstance(record, dict) or record.get("schema_version") != SCENE_VERSION:
+        version = record.get("schema_version") if isinstance(record, dict) else None
+        found = f"schema version {version!r}, this program knows {SCENE_VERSION}"
+        raise UnreadableSceneError(path=path, found=found)
+    return record
+
+
+def read_scene(run: RunFolder) -> Scene:
+    """Load the rebuilt scene of a run.
+
+    Raises:
+        PathNotFoundError: When the run was not rebuilt yet.
+        UnreadableSceneError: When ``scene.json`` cannot be understood.
+    """
+    record = read_record(run)
+    if record is None:
+        raise PathNotFoundError(
+            path=run.scene_dir / SCENE_FILE, what="scene", hint="Make it: robot-gst rebuild RUN."
+        )
+    return Scene(record=record, background=read_ply(run.scene_dir / BACKGROUND))
+
+
+def write_record(run: RunFolder, record: Mapping[str, Any]) -> Path:
+    """Write ``scene.json`` last, by renaming: it vouches for everything else in the folder."""
+    path = run.scene_dir / SCENE_FILE
+    part = path.with_name(path.name + ".part")
+    with part.open("w") as stream:
+        json.dump(record, stream, indent=2)
+        stream.write("\n")
+        stream.flush()
+        os.fsync(stream.fileno())
+    part.replace(path)
+    return path
