@@ -120,6 +120,7 @@ class Recorder:
         if self._take is not None and self.error is None:
             answer = self.stop(reason=reason)
         self._closing = True
+        self._intake.put_command(Command(action=lambda stamp_ns: None, received_ns=0))  # wake up
         self._thread.join(timeout=self.config.command_timeout_s)
         return answer
 
@@ -151,7 +152,7 @@ class Recorder:
 
     def _work(self) -> None:
         while True:
-            entry = self._intake.get(POLL_S)
+            entry = self._intake.get(0.0 if self._closing else POLL_S)
             with self._state_lock:
                 try:
                     self._handle(entry)

@@ -260,6 +260,7 @@ def _zenoh_config(config: WireConfig) -> Any:
         "connect/exit_on_failure": True,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        "scouting/delay": 0,  # there is nobody to wait for without scouting
     }
     made = zenoh.Config() if config.config is None else _config_from_file(config)
     for key, value in settings.items():

@@ -1,0 +1,58 @@
+"""Samples and recorders for these tests."""
+
+import itertools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.clock import AnchoredClock
+from bridge.episode import schema
+from bridge.episode.records import JointSample
+from bridge.episode.run import RunFolder
+from bridge.record.recorder import Recorder
+from bridge.wire.session import WireSample
+
+MakeSample = Callable[..., WireSample]
+
+
+@pytest.fixture
+def make_sample() -> MakeSample:
+    counter = itertools.count()
+    clock = AnchoredClock()
+
+    def make(**changes: object) -> WireSample:
+        number = next(counter)
+        joint = JointSample(
+            stamp_ns=number,
+            names=("a",),
+            position=np.array([float(number)]),
+            velocity=np.zeros(0),
+            effort=np.zeros(0),
+        )
+        values: dict[str, object] = {
+            "topic": "/cell/joint_states",
+            "type_name": schema.JOINT_STATE,
+            "message_encoding": "cdr",
+            "data": joint.to_cdr(),
+            "source_ns": 1_000 + number,
+            "sequence": number,
+            "source_gid": b"g" * 16,
+            "received_ns": clock.now_ns(),
+        }
+        return WireSample(**{**values, **changes})  # type: ignore[arg-type]
+
+    return make
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    return RunFolder.create(tmp_path / "run")
+
+
+@pytest.fixture
+def recorder(run: RunFolder) -> Iterator[Recorder]:
+    made = Recorder(run, now_ns=AnchoredClock().now_ns)
+    yield made
+    made.close()

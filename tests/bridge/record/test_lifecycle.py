@@ -1,0 +1,237 @@
+"""The recorder without the wire: what goes in comes out, and every wrong command is refused."""
+
+import errno
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from bridge.clock import AnchoredClock
+from bridge.episode import schema
+from bridge.episode.metadata import EpisodeInfo, Outcome
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
+from bridge.episode.streams import events
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import BridgeError, UsageError
+from bridge.record.config import RecorderConfig
+from bridge.record.control import parse_info, parse_outcome
+from bridge.record.errors import ControlError, DiskError, LifecycleError
+from bridge.record.recorder import Recorder
+from bridge.wire.session import WireSample
+
+MakeSample = Callable[..., WireSample]
+INFO = EpisodeInfo(id="t1", kind="trial", cell="cell")
+
+
+def path_of(run: RunFolder, name: str = "t1") -> Path:
+    return run.episodes_dir / f"{name}.mcap"
+
+
+def test_messages_come_out_as_they_went_in(
+    recorder: Recorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    before = make_sample()
+    recorder.receive(before)
+    recorder.start(INFO)
+    sent = [make_sample() for _ in range(50)]
+    for sample in sent:
+        recorder.receive(sample)
+    answer = recorder.stop()
+    recorder.receive(make_sample())
+    assert answer["messages"] == 50
+    assert answer["lost"] == 0
+    with path_of(run).open("rb") as stream:
+        found = [
+            (m.data, m.publish_time, m.log_time, m.sequence)
+            for _, channel, m in make_reader(stream, validate_crcs=True).iter_messages()
+            if channel.topic == "/cell/joint_states"
+        ]
+    assert found == [(s.data, s.source_ns, s.received_ns, s.sequence) for s in sent]
+
+
+def test_log_times_never_run_backwards(
+    recorder: Recorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    recorder.start(INFO)
+    now_ns = make_sample().received_ns
+    for offset in (5, 3, 9, 1):
+        recorder.receive(make_sample(received_ns=now_ns + offset))
+    recorder.stop()
+    times = [m.log_time_ns for m in Episode.open(path_of(run)).messages(["/cell/joint_states"])]
+    assert times == sorted(times)
+    assert len(times) == 4
+
+
+def test_losses_are_in_the_ledger_and_the_totals(
+    recorder: Recorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    recorder.start(INFO)
+    for sequence in (0, 1, 5, 6, 9):
+        recorder.receive(make_sample(sequence=sequence, source_gid=b"n" * 16))
+    assert recorder.stop()["lost"] == 5
+    episode = Episode.open(path_of(run))
+    records = [json.loads(m.data) for m in episode.messages([schema.DROPS_TOPIC])]
+    assert sum(record["gaps"] for record in records) == 5
+    assert sum(record["received"] for record in records) == 5
+    assert episode.metadata_records["drops"]["gaps"] == 5
+    assert episode.metadata_records["drops"]["topics"]["/cell/joint_states"]["received"] == 5
+
+
+def test_unknown_and_broken_messages_are_recorded_and_counted(
+    recorder: Recorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    recorder.start(INFO)
+    odd = "/odd/ topic ä"
+    recorder.receive(make_sample(topic=odd, type_name="", message_encoding="", data=b"\x00raw"))
+    recorder.receive(make_sample(topic="/f", type_name="my_msgs/msg/Foo", data=b"foo"))
+    recorder.receive(make_sample(data=b"\x00\x01\x00\x00broken"))
+    recorder.receive(make_sample(data=b"", source_ns=-5, sequence=None, source_gid=None))
+    answer = recorder.stop()
+    assert (answer["messages"], answer["unknown_type"], answer["undecodable"]) == (4, 2, 2)
+    episode = Episode.open(path_of(run))
+    messages = {m.data: m for m in episode.messages() if m.topic != schema.DROPS_TOPIC}
+    assert set(messages) == {b"\x00raw", b"foo", b"\x00\x01\x00\x00broken", b""}
+    assert messages[b"\x00raw"].topic == odd
+    assert messages[b"foo"].type_name == "my_msgs/msg/Foo"
+    assert messages[b""].publish_time_ns == messages[b""].log_time_ns
+
+
+def test_latched_messages_open_every_episode(
+    recorder: Recorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    recorder.receive(make_sample(topic="/robot_description", type_name=schema.STRING, data=b"old"))
+    recorder.receive(make_sample(topic="/robot_description", type_name=schema.STRING, data=b"urdf"))
+    for name in ("a", "b"):
+        recorder.start(EpisodeInfo(id=name, kind="trial"))
+        recorder.receive(make_sample())
+        assert recorder.stop()["messages"] == 1
+        first = next(iter(Episode.open(path_of(run, name)).messages()))
+        assert (first.topic, first.data) == ("/robot_description", b"urdf")
+
+
+def test_marks_labels_and_outcome_are_in_the_episode(recorder: Recorder, run: RunFolder) -> None:
+    recorder.start(INFO)
+    recorder.mark("look here")
+    recorder.label(outcome=Outcome(result="failure", detail="slipped"))
+    recorder.stop()
+    episode = Episode.open(path_of(run))
+    assert [event["type"] for event in events(episode)] == ["mark", "label"]
+    assert "/cell/event" in episode.topics()
+    assert episode.outcome is not None
+    assert (episode.outcome.result, episode.outcome.detail) == ("failure", "slipped")
+    recorder.label(text="it held", outcome=Outcome(result="success"))
+    note = json.loads((run.notes_dir / "t1.outcome.json").read_text())
+    assert (note["result"], note["detail"]) == ("success", "it held")
+    assert Episode.open(path_of(run)).outcome == episode.outcome  # the file is not rewritten
+
+
+def test_a_discarded_take_leaves_nothing(recorder: Recorder, run: RunFolder) -> None:
+    recorder.start(INFO)
+    assert recorder.stop(discard=True)["discarded"]
+    assert list(run.episodes_dir.iterdir()) == []
+    recorder.start(INFO)  # the name is free again
+    assert recorder.status()["state"] == "recording"
+
+
+def test_commands_out_of_place_are_refused(recorder: Recorder, run: RunFolder) -> None:
+    with pytest.raises(LifecycleError, match="nothing is being recorded"):
+        recorder.stop()
+    with pytest.raises(LifecycleError, match="no episode to label"):
+        recorder.label(text="x")
+    recorder.start(INFO)
+    with pytest.raises(LifecycleError, match="'t1' is being recorded"):
+        recorder.start(EpisodeInfo(id="t2", kind="trial"))
+    recorder.stop()
+    with pytest.raises(UsageError, match="exists already"):
+        recorder.start(INFO)
+    with pytest.raises(UsageError, match=r"episode not found: .*Episodes here: t1"):
+        recorder.label(episode="t9", outcome=Outcome(result="success"))
+
+
+def test_a_take_that_was_cut_off_is_not_overwritten(recorder: Recorder, run: RunFolder) -> None:
+    part = run.episodes_dir / "t1.mcap.part"
+    part.write_bytes(b"precious")
+    with pytest.raises(UsageError, match="cut off"):
+        recorder.start(INFO)
+    assert part.read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize(
+    "episode_id", ["../evil", "/etc/x", "a/b", "", ".hidden", "a" * 200, "x\0"]
+)
+def test_an_id_cannot_leave_the_run_folder(recorder: Recorder, episode_id: str) -> None:
+    with pytest.raises(UsageError, match="not usable as a file name"):
+        recorder.start(EpisodeInfo(id=episode_id, kind="trial"))
+    with pytest.raises(UsageError, match="not usable as a file name"):
+        parse_info(episode_id, {})
+
+
+def test_a_folder_that_cannot_be_written_is_one_sentence(
+    recorder: Recorder, run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(self: Path, *args: object, **kwargs: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    # Tests may run as root, for whom no folder is read-only: refuse where the system would.
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(BridgeError, match=r"Permission denied\. Choose another folder"):
+        recorder.start(INFO)
+    monkeypatch.undo()
+    assert recorder.status()["state"] == "idle"
+
+
+def test_a_full_disk_stops_the_recorder_and_leaves_only_the_part(
+    run: RunFolder, make_sample: MakeSample, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = Recorder(run, now_ns=AnchoredClock().now_ns)
+    recorder.start(INFO)
+
+    def full(self: EpisodeWriter, *args: object, **kwargs: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(EpisodeWriter, "write_foreign", full)
+    recorder.receive(make_sample())
+    assert recorder.failed.wait(5.0)
+    status = recorder.status()
+    assert status["state"] == "failed"
+    assert "No space left on device" in status["error"]
+    with pytest.raises(DiskError, match="Free some space"):
+        recorder.stop()
+    recorder.close()
+    assert [path.name for path in run.episodes_dir.iterdir()] == ["t1.mcap.part"]
+
+
+def test_topics_without_end_are_dropped_and_counted(
+    run: RunFolder, make_sample: MakeSample
+) -> None:
+    config = RecorderConfig(max_topics=5)
+    recorder = Recorder(run, now_ns=AnchoredClock().now_ns, config=config)
+    recorder.start(INFO)
+    for number in range(9):
+        recorder.receive(make_sample(topic=f"/t{number}", source_gid=bytes([number]) * 16))
+    answer = recorder.stop()
+    recorder.close()
+    assert (answer["messages"], answer["lost"]) == (5, 4)
+
+
+def test_requests_are_checked_field_by_field() -> None:
+    info = parse_info("t1", {"kind": "scan", "tags": ["a"], "trial": 3, "stand_in": True})
+    assert (info.kind, info.tags, info.trial, info.stand_in) == ("scan", ("a",), 3, True)
+    for bad, match in (
+        ({"nonsense": 1}, "info does not know nonsense"),
+        ({"kind": "party"}, "Kinds: scan, trial"),
+        ({"task": 5}, "info.task has the wrong type"),
+        ({"trial": True}, "info.trial has the wrong type"),
+        ({"tags": "abc"}, "info.tags must be a list"),
+        ({"cell": "../x"}, "not usable"),
+    ):
+        with pytest.raises(UsageError, match=match):
+            parse_info("t1", bad)
+    with pytest.raises(ControlError, match="outcome needs result"):
+        parse_outcome({})
+    with pytest.raises(ControlError, match="Results: success"):
+        parse_outcome({"result": "maybe"})
+    assert parse_outcome(None) is None

@@ -1,0 +1,220 @@
+"""Recorder, publishers and commands as real processes on the loopback address."""
+
+import hashlib
+import json
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from bridge.errors import BridgeError
+from bridge.record.client import RecorderClient
+from bridge.wire.config import WireConfig
+from bridge.wire.session import open_session
+
+ROOT = Path(__file__).resolve().parents[3]
+CHILD = Path(__file__).with_name("publisher_child.py")
+WAIT_S = 30.0
+
+pytestmark = pytest.mark.slow
+
+
+def spawn(*arguments: str, **options: object) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [sys.executable, *arguments],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,  # type: ignore[call-overload]
+    )
+
+
+class Cell:
+    """One recorder process and everything that talks to it."""
+
+    def __init__(self, run_path: Path) -> None:
+        """Find a free port."""
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.run_path = run_path
+        self.children: list[subprocess.Popen[str]] = []
+
+    def record(self, *arguments: str, **options: object) -> "subprocess.Popen[str]":
+        command = ("robot_gst.py", "record", str(self.run_path), "--listen", self.endpoint)
+        child = spawn(*command, *arguments, **options)
+        self.children.append(child)
+        return child
+
+    def publish(self, account: Path, *arguments: str) -> "subprocess.Popen[str]":
+        child = spawn(str(CHILD), self.endpoint, str(account), *arguments)
+        self.children.append(child)
+        return child
+
+    def wait_until_ready(self) -> None:
+        end_s = time.monotonic() + WAIT_S
+        while True:
+            try:
+                self.status()
+                return
+            except BridgeError:
+                if time.monotonic() > end_s:
+                    raise
+                time.sleep(0.05)
+
+    def status(self) -> dict[str, object]:
+        with open_session(WireConfig(connect=(self.endpoint,), connect_timeout_s=0.5)) as session:
+            return RecorderClient(session, timeout_s=5.0).status()
+
+    def command(self, *arguments: str) -> "subprocess.CompletedProcess[str]":
+        child = spawn("robot_gst.py", *arguments, "--connect", self.endpoint)
+        self.children.append(child)
+        out, err = child.communicate(timeout=WAIT_S)
+        return subprocess.CompletedProcess(child.args, child.returncode, out, err)
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Iterator[Cell]:
+    made = Cell(tmp_path / "run")
+    yield made
+    for child in made.children:
+        if child.poll() is None:
+            child.kill()
+        child.communicate()
+
+
+def recorded(path: Path) -> dict[tuple[str, int], str]:
+    """Content hash by topic and sequence, read by the official reader with CRCs checked."""
+    with path.open("rb") as stream:
+        return {
+            (channel.topic, message.sequence): hashlib.sha256(message.data).hexdigest()
+            for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages()
+            if channel.topic.startswith("/child/")
+        }
+
+
+def sent(account: Path) -> dict[tuple[str, int], str]:
+    rows = [line.split() for line in account.read_text().splitlines()]
+    return {(topic, int(number)): digest for topic, number, digest in rows}
+
+
+def test_everything_a_publisher_sent_is_in_the_file(cell: Cell, tmp_path: Path) -> None:
+    recorder = cell.record()
+    cell.wait_until_ready()
+    publisher = cell.publish(tmp_path / "account", "300", "0.001", "t1")
+    _, err = publisher.communicate(timeout=WAIT_S)
+    assert publisher.returncode == 0, err
+    path = cell.run_path / "episodes" / "t1.mcap"
+    assert recorded(path) == sent(tmp_path / "account")
+    assert len(recorded(path)) == 900
+    recorder.send_signal(signal.SIGTERM)
+    assert recorder.wait(timeout=WAIT_S) == 0
+    checked = subprocess.run(
+        [str(Path(sys.executable).with_name("rerun")), "mcap", "check", "--full", str(path)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+    assert "PROBLEM" not in checked.stdout
+
+
+def test_a_publisher_killed_in_mid_flight_ends_nothing(cell: Cell, tmp_path: Path) -> None:
+    recorder = cell.record("--episode", "t1")
+    cell.wait_until_ready()
+    first = cell.publish(tmp_path / "first", "100000", "0.002")
+    while cell.status().get("messages", 0) < 150:  # type: ignore[operator]
+        time.sleep(0.02)
+    first.kill()
+    first.communicate()
+    second = cell.publish(tmp_path / "second", "20", "0.001")
+    assert second.wait(timeout=WAIT_S) == 0
+    recorder.send_signal(signal.SIGINT)
+    out, err = recorder.communicate(timeout=WAIT_S)
+    assert recorder.returncode == 0, err
+    assert "0 lost" in out
+    found, first_sent = recorded(cell.run_path / "episodes" / "t1.mcap"), sent(tmp_path / "first")
+    second_sent = sent(tmp_path / "second")
+    # The second publisher counts from 0 again: its 20 messages replace those in this mapping.
+    assert {key: found[key] for key in second_sent} == second_sent
+    rest = {key: digest for key, digest in found.items() if key not in second_sent}
+    assert rest.items() <= first_sent.items()
+    numbers = sorted(number for topic, number in rest if topic == "/child/joint_states")
+    assert numbers == list(range(20, numbers[-1] + 1))  # only the tail is missing
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_finishes_the_open_episode(
+    cell: Cell, tmp_path: Path, number: signal.Signals
+) -> None:
+    recorder = cell.record("--episode", "t1", "--kind", "scan", "--json")
+    cell.wait_until_ready()
+    assert cell.publish(tmp_path / "account", "10", "0").wait(timeout=WAIT_S) == 0
+    recorder.send_signal(number)
+    out, err = recorder.communicate(timeout=WAIT_S)
+    assert recorder.returncode == 0, err
+    answer = json.loads(out)
+    assert (answer["episode"], answer["messages"], answer["lost"]) == ("t1", 30, 0)
+    assert recorded(cell.run_path / "episodes" / "t1.mcap") == sent(tmp_path / "account")
+
+
+def test_the_duration_ends_the_recording(cell: Cell) -> None:
+    recorder = cell.record("--episode", "t1", "--duration", "0.5")
+    _, err = recorder.communicate(timeout=WAIT_S)
+    assert recorder.returncode == 0, err
+    assert (cell.run_path / "episodes" / "t1.mcap").is_file()
+
+
+def test_commands_control_a_recorder(cell: Cell) -> None:
+    cell.record()
+    cell.wait_until_ready()
+    assert cell.command("ctl", "start", "--id", "t1", "--task", "x").returncode == 0
+    assert "recording t1" in cell.command("ctl", "status").stdout
+    assert cell.command("ctl", "mark", "here").returncode == 0
+    stopped = cell.command("ctl", "stop", "--result", "failure", "--json")
+    assert json.loads(stopped.stdout)["episode"] == "t1"
+    refused = cell.command("ctl", "start", "--id", "../evil")
+    assert (refused.returncode, refused.stdout) == (1, "")
+    assert "not usable as a file name" in refused.stderr
+    unknown = cell.command("ctl", "status", "--recorder", "other")
+    assert unknown.returncode == 1
+    assert "nobody answered on rec/other/ctl/status" in unknown.stderr
+    assert [path.name for path in cell.run_path.parent.rglob("*.mcap*")] == ["t1.mcap"]
+
+
+def test_nobody_there_and_port_taken_are_one_sentence(cell: Cell) -> None:
+    alone = cell.command("ctl", "status")
+    assert alone.returncode == 1
+    assert alone.stderr.startswith(f"robot-gst: no zenoh peer at {cell.endpoint}; start")
+    assert alone.stderr.count("\n") == 1
+    cell.record()
+    cell.wait_until_ready()
+    second = cell.record()
+    _, err = second.communicate(timeout=WAIT_S)
+    assert second.returncode == 1
+    assert "in use by another process" in err
+
+
+def test_a_disk_that_refuses_more_ends_with_status_one(cell: Cell, tmp_path: Path) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, 500_000))
+
+    recorder = cell.record("--episode", "t1", preexec_fn=limit)
+    cell.wait_until_ready()
+    publisher = cell.publish(tmp_path / "account", "400", "0")
+    _, err = recorder.communicate(timeout=WAIT_S)
+    assert recorder.returncode == 1
+    assert "t1.mcap.part: File too large. The recorder stopped" in err
+    assert "Traceback" not in err
+    assert [p.name for p in (cell.run_path / "episodes").iterdir()] == ["t1.mcap.part"]
+    publisher.kill()

@@ -1,0 +1,135 @@
+"""Sessions over real TCP on the loopback address."""
+
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from bridge.episode import schema
+from bridge.errors import UsageError
+from bridge.wire.config import WireConfig
+from bridge.wire.errors import (
+    BadTopicError,
+    NoPeerError,
+    NoReplyError,
+    PortTakenError,
+    RemoteError,
+    WireConfigError,
+)
+from bridge.wire.session import WireSample, WireSession, open_session
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+@pytest.fixture
+def router(endpoint: str) -> Iterator[WireSession]:
+    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
+        yield session
+
+
+@pytest.fixture
+def client(router: WireSession, endpoint: str) -> Iterator[WireSession]:
+    with open_session(WireConfig(connect=(endpoint,))) as session:
+        yield session
+
+
+def test_samples_arrive_whole_and_in_order(router: WireSession, client: WireSession) -> None:
+    got: list[WireSample] = []
+    router.subscribe("cell/**", got.append)
+    done = router.serve("cell/done", lambda payload: str(len(got)).encode())
+    publisher = client.publisher("/cell/joint_states", schema.JOINT_STATE)
+    for number in range(200):
+        publisher.put(bytes([number]) * (number * 50), source_ns=1000 + number)
+    # The request was sent after the samples, so all of them are there when it is answered.
+    assert client.query("cell/done", b"", timeout_s=5.0) == b"200"
+    done.close()
+    assert [sample.sequence for sample in got] == list(range(200))
+    assert [sample.source_ns for sample in got] == [1000 + number for number in range(200)]
+    assert all(sample.data == bytes([n]) * (n * 50) for n, sample in enumerate(got))
+    assert {sample.source_gid for sample in got} == {publisher.gid}
+    assert {(sample.topic, sample.type_name, sample.message_encoding) for sample in got} == {
+        ("/cell/joint_states", schema.JOINT_STATE, "cdr")
+    }
+    received = [sample.received_ns for sample in got]
+    assert received == sorted(received)
+
+
+def test_a_refusal_carries_the_message(router: WireSession, client: WireSession) -> None:
+    def refuse(payload: bytes) -> bytes:
+        raise UsageError(f"cannot do {payload.decode()}")
+
+    router.serve("rec/x", refuse)
+    with pytest.raises(RemoteError, match="cannot do that"):
+        client.query("rec/x", b"that", timeout_s=5.0)
+
+
+def test_a_request_nobody_answers_is_reported(client: WireSession) -> None:
+    with pytest.raises(NoReplyError, match="nobody answered on rec/other"):
+        client.query("rec/other", b"", timeout_s=0.5)
+
+
+def test_a_slow_answer_is_no_reply_in_time(router: WireSession, client: WireSession) -> None:
+    release = threading.Event()
+
+    def wait(payload: bytes) -> bytes:
+        release.wait(5.0)
+        return b"late"
+
+    router.serve("rec/slow", wait)
+    with pytest.raises(NoReplyError):
+        client.query("rec/slow", b"", timeout_s=0.2)
+    release.set()
+
+
+def test_no_peer_is_one_sentence(endpoint: str) -> None:
+    config = WireConfig(connect=(endpoint,), connect_timeout_s=0.2)
+    with pytest.raises(NoPeerError, match=r"no zenoh peer at tcp/127.0.0.1:\d+; start robot-gst"):
+        open_session(config)
+
+
+def test_a_taken_port_is_one_sentence(router: WireSession, endpoint: str) -> None:
+    with pytest.raises(PortTakenError, match="in use by another process"):
+        open_session(WireConfig(mode="router", connect=(), listen=(endpoint,)))
+
+
+def test_a_bad_endpoint_is_wrong_use() -> None:
+    with pytest.raises(WireConfigError, match="An endpoint looks like"):
+        open_session(WireConfig(connect=("127.0.0.1:7447",)))
+
+
+def test_a_bad_configuration_file_is_wrong_use(tmp_path: Path) -> None:
+    path = tmp_path / "zenoh.json5"
+    with pytest.raises(WireConfigError, match="cannot be read"):
+        open_session(WireConfig(config=path))
+    path.write_text("{mode: 'nonsense'}")
+    with pytest.raises(WireConfigError, match="nonsense") as caught:
+        open_session(WireConfig(config=path))
+    assert ".rs:" not in str(caught.value)  # the library's own source paths help nobody
+
+
+def test_a_configuration_file_does_not_turn_scouting_on(tmp_path: Path, endpoint: str) -> None:
+    path = tmp_path / "zenoh.json5"
+    path.write_text("{scouting: {multicast: {enabled: true}}, listen: {endpoints: ['tcp/[::]:0']}}")
+    config = WireConfig(mode="router", connect=(), listen=(endpoint,), config=path)
+    from bridge.wire.session import _zenoh_config
+
+    made = _zenoh_config(config)
+    assert made.get_json("scouting/multicast/enabled") == "false"
+    assert endpoint in made.get_json("listen/endpoints")
+    assert "::" not in made.get_json("listen/endpoints")
+
+
+def test_a_bad_topic_is_refused_when_announced(client: WireSession) -> None:
+    with pytest.raises(BadTopicError):
+        client.publisher("/a//b", schema.STRING)
