@@ -191,14 +191,15 @@ def record(
 ) -> int:
     """Record episodes live; everything published to this recorder ends up in one.
 
-    Without --episode it waits for robot-gst ctl start. SIGINT or SIGTERM finish the open episode.
+    Without --episode it waits for robot-gst ctl start, or the keys s, x, m, y, n.
+    SIGINT or SIGTERM finish the open episode.
     Example: robot-gst record runs/monday --episode scan --duration 30
 
     Args:
         run: Run folder; made where needed.
         episode: Start this episode at once.
         duration_s: Stop after this long [s]; with --episode.
-        about: What is being recorded, with --episode.
+        about: What is being recorded, with --episode or the key s.
         config: The recorder's settings.
         listen: Where to listen; other processes connect here.
         connect: Other zenoh routers to join.
@@ -223,6 +224,7 @@ def record(
             output=output,
             episode=info,
             duration_s=duration_s,
+            about=about,
         )
     data = answer or {"ok": True, "episode": None}
     output.result(data, _describe_answer(data) if answer else "stopped; no episode was open")
@@ -274,9 +276,9 @@ def ctl(
         output: How to talk.
     """
     from bridge.errors import UsageError
-    from bridge.record.client import RecorderClient
     from bridge.record.process import describe_status
     from bridge.wire.config import WireConfig
+    from bridge.wire.recorder_client import RecorderClient
     from bridge.wire.session import open_session
 
     outcome = None
@@ -324,11 +326,11 @@ def publish_folder(
         zenoh_config: zenoh configuration (JSON5).
         output: How to talk.
     """
-    from bridge.record.client import RecorderClient
     from bridge.sources.folder import num_frames
     from bridge.sources.folder_index import read_index
     from bridge.sources.folder_publish import publish_folder_frames
     from bridge.wire.config import WireConfig
+    from bridge.wire.recorder_client import RecorderClient
     from bridge.wire.session import open_session
 
     index = read_index(folder)

@@ -9,15 +9,11 @@ from bridge.episode import metadata
 from bridge.episode.run import check_episode_id
 from bridge.record.errors import ControlError
 from bridge.record.recorder import Recorder
+from bridge.wire.recorder_client import control_key
 from bridge.wire.session import Service, WireSession
 
 RESULTS = ("success", "failure", "unknown")
 Record = TypeVar("Record")
-
-
-def control_key(recorder: str, verb: str) -> str:
-    """The key that one command is sent to."""
-    return f"rec/{recorder}/ctl/{verb}"
 
 
 def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:

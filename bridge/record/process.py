@@ -10,8 +10,9 @@ from typing import Any
 
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run import RunFolder
-from bridge.record.config import RecorderConfig
+from bridge.record.config import EpisodeAbout, RecorderConfig
 from bridge.record.control import serve_control
+from bridge.record.keyboard import HELP, Keys, single_keys
 from bridge.record.recorder import Recorder
 from bridge.terminal import Output
 from bridge.wire.config import WireConfig
@@ -32,6 +33,7 @@ def run_recorder(
     output: Output,
     episode: EpisodeInfo | None = None,
     duration_s: float | None = None,
+    about: EpisodeAbout | None = None,
 ) -> dict[str, Any] | None:
     """Record until ``stop`` is set, the duration is over, or the disk fails.
 
@@ -43,6 +45,7 @@ def run_recorder(
         output: Where remarks go.
         episode: Start this one at once instead of waiting for a command.
         duration_s: With ``episode``, stop after this long [s].
+        about: What episodes started from the keyboard are.
 
     Returns:
         The answer to the last stop if this call stopped an episode, else None.
@@ -59,7 +62,9 @@ def run_recorder(
         try:
             if episode is not None:
                 recorder.start(episode)
-            _watch(recorder, stop, duration_s, output)
+            with single_keys() as has_keys:
+                keys = Keys(recorder, run, about or EpisodeAbout()) if has_keys else None
+                _watch(recorder, stop, duration_s, output, keys)
         finally:
             for subscriber in subscribers:
                 subscriber.close()
@@ -89,13 +94,21 @@ def _say_where(output: Output, wire: WireConfig, recorder: Recorder, run: RunFol
 
 
 def _watch(
-    recorder: Recorder, stop: threading.Event, duration_s: float | None, output: Output
+    recorder: Recorder,
+    stop: threading.Event,
+    duration_s: float | None,
+    output: Output,
+    keys: Keys | None,
 ) -> None:
     end_s = None if duration_s is None else time.monotonic() + duration_s
+    if keys is not None:
+        output.say(HELP)
     with _status_line(output) as (show, period_s):
         last_s = time.monotonic()
         last_messages = 0
         while not stop.wait(0.1) and not recorder.failed.is_set():
+            if keys is not None and (said := keys.poll()):
+                output.say(said)
             now_s = time.monotonic()
             if end_s is not None and now_s >= end_s:
                 return

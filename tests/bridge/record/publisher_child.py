@@ -13,8 +13,8 @@ import numpy as np
 
 from bridge.episode import schema
 from bridge.episode.records import DepthImage, JointSample
-from bridge.record.client import RecorderClient
 from bridge.wire.config import WireConfig
+from bridge.wire.recorder_client import RecorderClient
 from bridge.wire.session import open_session
 
 

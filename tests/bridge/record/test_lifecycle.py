@@ -16,9 +16,10 @@ from bridge.episode.run import RunFolder
 from bridge.episode.streams import events
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import BridgeError, UsageError
-from bridge.record.config import RecorderConfig
+from bridge.record.config import EpisodeAbout, RecorderConfig
 from bridge.record.control import parse_info, parse_outcome
 from bridge.record.errors import ControlError, DiskError, LifecycleError
+from bridge.record.keyboard import Keys
 from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
 
@@ -235,3 +236,24 @@ def test_requests_are_checked_field_by_field() -> None:
     with pytest.raises(ControlError, match="Results: success"):
         parse_outcome({"result": "maybe"})
     assert parse_outcome(None) is None
+
+
+def test_keys_start_stop_mark_and_label(recorder: Recorder, run: RunFolder) -> None:
+    keys = Keys(recorder, run, EpisodeAbout(kind="probe", task="x"))
+    said = [keys.act(key) for key in "xsmyxsxn?"]
+    assert said == [
+        "nothing is being recorded. Start an episode first.",
+        "started probe_0001",
+        "marked probe_0001",
+        "probe_0001: success",
+        "probe_0001: 0 messages, 0 lost",
+        "started probe_0002",
+        "probe_0002: 0 messages, 0 lost",
+        "probe_0002: failure",
+        "",
+    ]
+    first = Episode.open(path_of(run, "probe_0001"))
+    assert (first.info.kind, first.info.task) == ("probe", "x")
+    assert first.outcome is not None
+    assert first.outcome.result == "success"
+    assert first.metadata_records["recorder"]["stopped_by"] == "keyboard"

@@ -14,7 +14,6 @@ from PIL import Image
 from bridge.episode import schema
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
-from bridge.record.client import RecorderClient
 from bridge.record.control import serve_control
 from bridge.record.process import describe_status
 from bridge.record.recorder import Recorder
@@ -23,6 +22,7 @@ from bridge.sources.folder_index import read_index
 from bridge.sources.folder_publish import publish_folder_frames
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import RemoteError
+from bridge.wire.recorder_client import RecorderClient
 from bridge.wire.session import WireSession, open_session
 
 

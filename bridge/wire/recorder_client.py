@@ -3,9 +3,13 @@
 import json
 from typing import Any
 
-from bridge.record.control import control_key
 from bridge.wire.errors import WireError
 from bridge.wire.session import WireSession
+
+
+def control_key(recorder: str, verb: str) -> str:
+    """The key that one command of a recorder is sent to."""
+    return f"rec/{recorder}/ctl/{verb}"
 
 
 class RecorderClient:
