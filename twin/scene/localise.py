@@ -116,10 +116,10 @@ def localise(
 ) -> Localisation:
     """Like ``localise_objects``, and keep what the table said of the cameras."""
     config = LocaliseConfig() if config is None else config
-    views = fuse_stills(frames, config.max_frames_per_camera)
+    views = fuse_stills(frames, config.max_frames_per_camera, task, config.points)
     views, tables = correct_for_table(views, task, config.table, config.points, config.colour)
     objects = {
-        object_id: _localise_one(views, model, task, config, tables)
+        object_id: _localise_one(views, model, config, tables)
         for object_id, model in task.objects.items()
     }
     return Localisation(objects=objects, tables=tables)
@@ -128,7 +128,6 @@ def localise(
 def _localise_one(
     views: Sequence[View],
     model: ObjectModel,
-    task: Task,
     config: LocaliseConfig,
     tables: Mapping[str, TableFit],
 ) -> LocalisedObject:
@@ -136,7 +135,7 @@ def _localise_one(
     cameras = sorted({view.camera_id for view in views})
     if not views:
         return _missing(model, stamp_ns, "no frames with colour, depth and a pose were given", {})
-    groups = object_points(views, model, task, config.points, config.colour)
+    groups = object_points(views, model, config.points, config.colour)
     seen = len(groups[0]) if groups else 0
     detail: dict[str, Any] = {
         "cameras": cameras,

@@ -51,12 +51,14 @@ class View:
     T_base_color: Float[np.ndarray, "4 4"]
     T_base_depth: Float[np.ndarray, "4 4"]
     p_base: Float[np.ndarray, "num_points 3"]
-    """Points with valid depth [m]."""
+    """Points with valid depth over the searched part of the table [m]."""
     color_linear: Float[np.ndarray, "num_points 3"]
     """Linear light of each point; 0 where the colour camera does not see it."""
 
 
-def fuse_stills(frames: Sequence[RgbdFrame], max_frames: int) -> list[View]:
+def fuse_stills(
+    frames: Sequence[RgbdFrame], max_frames: int, task: Task, config: PointConfig
+) -> list[View]:
     """Average the last frames of each camera that were taken from one pose.
 
     Frames of a camera that moved in between make separate views, newest kept. Depth is averaged
@@ -75,7 +77,7 @@ def fuse_stills(frames: Sequence[RgbdFrame], max_frames: int) -> list[View]:
     for group in groups:
         used = kept.get(group[0].camera_id, 0)
         if used < max_frames:
-            views.append(_view(group[: max_frames - used]))
+            views.append(_view(group[: max_frames - used], task, config))
             kept[group[0].camera_id] = used + len(group)
     return sorted(views, key=lambda view: (view.camera_id, view.stamp_ns))
 
@@ -88,7 +90,7 @@ def _same_pose(a: RgbdFrame, b: RgbdFrame) -> bool:
     return bool(near and se3.rotation_angle_rad(T_a_b[:3, :3]) < STILL_ANGLE_RAD)
 
 
-def _view(frames: Sequence[RgbdFrame]) -> View:
+def _view(frames: Sequence[RgbdFrame], task: Task, config: PointConfig) -> View:
     newest = frames[0]
     depths = np.stack([frame.depth_m for frame in frames]).astype(np.float64)
     measured = np.isfinite(depths) & (depths > 0)
@@ -97,6 +99,7 @@ def _view(frames: Sequence[RgbdFrame]) -> View:
     depth[2 * count < len(frames)] = 0.0
     image = np.mean([linear_from_srgb(frame.image_u8) for frame in frames], axis=0)
     p_base = se3.apply(newest.T_base_depth, newest.depth_camera.unproject(depth)[depth > 0])
+    p_base = p_base[_in_search_area(p_base, task, config)]
     return View(
         camera_id=newest.camera_id,
         stamp_ns=newest.stamp_ns,
@@ -141,16 +144,18 @@ def moved(view: View, T_new_old: Float[np.ndarray, "4 4"], depth_factor: float) 
     )
 
 
-def in_search_area(
-    p_base: Float[np.ndarray, "num_points 3"], task: Task, margin_m: float
+def _in_search_area(
+    p_base: Float[np.ndarray, "num_points 3"], task: Task, config: PointConfig
 ) -> Bool[np.ndarray, " num_points"]:
     """Points over the part of the table where any object of the task may be."""
+    wanted: Bool[np.ndarray, " num_points"] = np.abs(p_base[:, 2]) < config.max_height_m
     starts = task.start.values()
-    if not starts:
-        return np.ones(len(p_base), dtype=bool)
-    low = np.array([min(s.x_m[0] for s in starts), min(s.y_m[0] for s in starts)]) - margin_m
-    high = np.array([max(s.x_m[1] for s in starts), max(s.y_m[1] for s in starts)]) + margin_m
-    return np.asarray(np.all((p_base[:, :2] >= low) & (p_base[:, :2] <= high), axis=1))
+    for axis, limits in enumerate(([s.x_m for s in starts], [s.y_m for s in starts])):
+        if limits:
+            low = min(limit[0] for limit in limits) - config.margin_m
+            high = max(limit[1] for limit in limits) + config.margin_m
+            wanted &= (p_base[:, axis] >= low) & (p_base[:, axis] <= high)
+    return wanted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,18 +176,13 @@ class Cluster:
 
 
 def object_points(
-    views: Sequence[View],
-    model: ObjectModel,
-    task: Task,
-    config: PointConfig,
-    colour: ColourConfig,
+    views: Sequence[View], model: ObjectModel, config: PointConfig, colour: ColourConfig
 ) -> list[Cluster]:
     """Clusters of voxel-averaged points of an object's colour, largest first."""
     parts = []
     for view in views:
         p = view.p_base
-        wanted = (p[:, 2] > config.min_height_m) & (p[:, 2] < config.max_height_m)
-        wanted &= in_search_area(p, task, config.margin_m)
+        wanted = p[:, 2] > config.min_height_m
         p, color = p[wanted], view.color_linear[wanted]
         alike = likeness(color, model.color_srgb, colour) >= config.min_likeness
         parts.append(voxel_mean(p[alike], config.voxel_m))

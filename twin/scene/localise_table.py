@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from bridge.task.task_file import Task
 from twin.scene.localise_colour import ColourConfig, likeness
-from twin.scene.localise_points import PointConfig, View, in_search_area, moved
+from twin.scene.localise_points import PointConfig, View, moved
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,6 @@ def _table_points(
     view: View, task: Task, config: TableConfig, points: PointConfig, colour: ColourConfig
 ) -> Float[np.ndarray, "num_points 3"]:
     wanted = np.abs(view.p_base[:, 2]) < config.band_m
-    wanted &= in_search_area(view.p_base, task, points.margin_m)
     step = max(1, int(wanted.sum()) // config.max_points)
     ids = np.flatnonzero(wanted)[::step]
     for model in task.objects.values():
@@ -109,8 +108,10 @@ def fit_table(
     with Tukey weights and Gaussian priors. The rotation is about the camera.
     """
     d = p_base - p_base_camera
-    # z after the correction: p_z - s d_z + h + (rotation x d)_z
-    A = np.stack([-d[:, 2], np.ones(len(d)), d[:, 1], -d[:, 0]], axis=1)
+    # z after the correction: p_z - s d_z + h + (rotation x d)_z. On the table d_z is minus the
+    # camera height; the measured d_z would let s shrink the noise.
+    height = np.full(len(d), p_base_camera[2])
+    A = np.stack([height, np.ones(len(d)), d[:, 1], -d[:, 0]], axis=1)
     sigma = np.array(
         [config.depth_scale_sigma, config.height_sigma_m, *[config.tilt_sigma_rad] * 2]
     )

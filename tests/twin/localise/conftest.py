@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import open3d as o3d
 import pytest
+
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
@@ -34,6 +35,7 @@ class Stage:
     """Meshes with colours, and a camera that looks at them."""
 
     def __init__(self, task: Task, poses: dict[str, np.ndarray]) -> None:
+        """Put a table and the objects of a task in place."""
         self.scene = o3d.t.geometry.RaycastingScene()
         self.albedo: list[np.ndarray] = []
         self.add_box(np.array([0.45, 0, -0.02]), np.array([1.2, 1.4, 0.04]), TABLE_COLOR)
