@@ -103,12 +103,12 @@ def _watch(
     end_s = None if duration_s is None else time.monotonic() + duration_s
     if keys is not None:
         output.say(HELP)
-    with _status_line(output) as (show, period_s):
+    with _status_line(output) as (show, say, period_s):
         last_s = time.monotonic()
         last_messages = 0
         while not stop.wait(0.1) and not recorder.failed.is_set():
             if keys is not None and (said := keys.poll()):
-                output.say(said)
+                say(said)
             now_s = time.monotonic()
             if end_s is not None and now_s >= end_s:
                 return
@@ -141,13 +141,24 @@ def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str
 
 
 @contextmanager
-def _status_line(output: Output) -> Iterator[tuple[Callable[[str], None], float]]:
-    """A line that is rewritten on a terminal; otherwise a new line every few seconds."""
+def _status_line(
+    output: Output,
+) -> Iterator[tuple[Callable[[str], None], Callable[[str], None], float]]:
+    """Ways to show the status and to say something else, and how often to show it [s].
+
+    On a terminal the status is rewritten in place; otherwise it is a new line every few seconds.
+    """
     if output.quiet or not sys.stderr.isatty():
-        yield output.say, STATUS_PERIOD_S
+        yield output.say, output.say, STATUS_PERIOD_S
         return
     from rich.console import Console  # noqa: PLC0415  # only for terminals
     from rich.live import Live  # noqa: PLC0415
+    from rich.text import Text  # noqa: PLC0415
 
-    with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live:
-        yield (lambda text: live.update(text, refresh=True)), LIVE_PERIOD_S
+    console = Console(stderr=True, highlight=False, markup=False)
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+
+        def show(text: str) -> None:
+            live.update(Text(text), refresh=True)
+
+        yield show, console.print, LIVE_PERIOD_S

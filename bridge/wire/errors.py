@@ -65,7 +65,7 @@ class NoReplyError(WireError):
         self.key = key
         self.timeout_s = timeout_s
         super().__init__(
-            f"nobody answered on {key} within {timeout_s:g} s. "
+            f"nobody answered on {key} (waited at most {timeout_s:g} s). "
             "Is the other side running, and is its name spelled as it was started?"
         )
 
