@@ -1,0 +1,89 @@
+"""The whole loop, once, with every file checked by readers that are not ours."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from bridge.episode.reader import Episode
+
+pytestmark = pytest.mark.slow
+Gst = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory, gst: Gst) -> Path:
+    run = tmp_path_factory.mktemp("demo") / "run"
+    done = gst("demo", str(run), "--quick", "--no-serve", timeout_s=500)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "stand-in" in done.stdout
+    return run
+
+
+def all_files(run: Path) -> list[Path]:
+    return sorted((run / "episodes").glob("*.mcap")) + sorted((run / "derived").glob("*.mcap"))
+
+
+def test_the_demo_leaves_a_scan_trials_of_both_conditions_and_replays(demo: Path) -> None:
+    infos = [Episode.open(path).info for path in sorted((demo / "episodes").glob("*.mcap"))]
+    assert [info.kind for info in infos].count("scan") == 1
+    conditions = [info.condition for info in infos if info.kind == "trial"]
+    assert conditions.count("without_replanning") == conditions.count("with_replanning") == 2
+    assert all(info.stand_in for info in infos)
+    assert list((demo / "derived").glob("*.replay.planned.dynamic.*.mcap"))
+    assert list((demo / "derived").glob("*.replay.executed.*.mcap"))
+    assert not list(demo.rglob("*.part"))
+
+
+def test_the_official_reader_accepts_every_file_with_crcs_on(demo: Path) -> None:
+    for path in all_files(demo):
+        with path.open("rb") as stream:
+            reader = make_reader(stream, validate_crcs=True)
+            assert sum(1 for _ in reader.iter_messages()) > 0, path
+
+
+def test_our_check_finds_every_file_clean(demo: Path, gst: Gst) -> None:
+    done = gst("check", str(demo), "--json")
+    assert done.returncode == 0, done.stdout
+    assert len(json.loads(done.stdout)["episodes"]) == len(all_files(demo))
+
+
+def test_rerun_accepts_every_file(demo: Path) -> None:
+    rerun = Path(sys.executable).parent / "rerun"
+    for path in all_files(demo):
+        done = subprocess.run(
+            [str(rerun), "mcap", "check", "--full", str(path)],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert done.returncode == 0, f"{path.name}: {done.stdout[-2000:]}{done.stderr[-2000:]}"
+
+
+def test_results_are_labelled_stand_in_and_say_what_is_undefined(demo: Path) -> None:
+    results = json.loads((demo / "results" / "results.json").read_text())
+    assert results["schema_version"] == 1
+    assert results["stand_in"] is True
+    for measurement in results["measurements"]:
+        assert measurement["definition"]
+        if measurement["value"] is None:
+            assert measurement["reason_if_undefined"], measurement["id"]
+    assert "stand-in" in (demo / "results" / "report.html").read_text()
+
+
+def test_the_scene_opens_as_a_standard_splat_file(demo: Path) -> None:
+    header = (demo / "scene" / "background.ply").read_bytes()[:2000].split(b"end_header")[0]
+    for name in (b"f_dc_0", b"opacity", b"scale_0", b"rot_0"):
+        assert name in header
+
+
+def test_running_the_demo_again_keeps_the_episodes(demo: Path, gst: Gst) -> None:
+    before = {path: path.stat().st_mtime_ns for path in all_files(demo)}
+    done = gst("demo", str(demo), "--quick", "--no-serve")
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert {path: path.stat().st_mtime_ns for path in all_files(demo)} == before
