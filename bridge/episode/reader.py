@@ -183,7 +183,7 @@ class Episode:
             with self.path.open("rb") as stream:
                 reader: McapReader = make_reader(stream, validate_crcs=True)
                 for record, channel, message in reader.iter_messages(
-                    topics=wanted, start_time=start_ns, end_time=end_ns
+                    topics=wanted, starting_at=start_ns, ending_before=end_ns
                 ):
                     yield RawMessage(
                         topic=channel.topic,

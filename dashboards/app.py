@@ -1,0 +1,189 @@
+"""The application: addresses to pages. All state is in the address; nothing is ever written."""
+
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote, urlencode
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, HTMLResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from bridge.errors import GstError
+from dashboards import wording
+from dashboards.clock import PageClock
+from dashboards.comparison import judge
+from dashboards.episode_page import build_page
+from dashboards.errors import NotHereError
+from dashboards.frames import read_frame
+from dashboards.guard import Admission, Guard
+from dashboards.library import Library, derived_path, episode_path
+from dashboards.overview_page import Selection, build_overview, neighbours
+from dashboards.recording import read_recording
+from dashboards.twin_page import build_twin, view_image
+
+HERE = Path(__file__).parent
+
+
+def create_app(library: Library, admission: Admission | None = None) -> Starlette:
+    """Build the application over some run folders."""
+    pages = Pages(library)
+    routes = [
+        Route("/", pages.overview),
+        Route("/episode/{id}", pages.episode),
+        Route("/episode/{id}/frame/{camera}", pages.frame),
+        Route("/episode/{id}/file", pages.episode_file),
+        Route("/derived/{name}/file", pages.derived_file),
+        Route("/twin", pages.twin),
+        Route("/twin/{name}/{side}/{camera}", pages.twin_image),
+        Mount("/static", StaticFiles(directory=HERE / "static")),
+    ]
+    return Starlette(
+        routes=routes,
+        middleware=[Middleware(Guard, admission=admission or Admission())],
+        exception_handlers={
+            GstError: pages.failed,
+            HTTPException: pages.http_failed,
+        },
+    )
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("dashboards"),
+        autoescape=select_autoescape(default=True),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    for function in (
+        wording.outcome_word,
+        wording.verdict_word,
+        wording.factor_word,
+        wording.tone,
+        wording.measured,
+        wording.evidence,
+        wording.short_evidence,
+        wording.size_text,
+        wording.condition_word,
+        wording.image_title,
+        wording.percent,
+    ):
+        environment.filters[function.__name__] = function
+    environment.globals["link"] = link
+    return environment
+
+
+def link(path: str, **query: object) -> str:
+    """Build an address; empty values are left out of the query."""
+    kept = {key: value for key, value in query.items() if value not in (None, "")}
+    return quote(path) + (f"?{urlencode(kept)}" if kept else "")
+
+
+def _seconds(request: Request) -> float | None:
+    text = request.query_params.get("t")
+    try:
+        value = None if text is None else float(text)
+    except ValueError:
+        return None
+    return value if value is not None and abs(value) < 1e9 else None
+
+
+class Pages:
+    """Answers for one library of runs. Plain functions: Starlette runs them in threads."""
+
+    def __init__(self, library: Library) -> None:
+        """Remember the runs and load the templates."""
+        self._library = library
+        self._environment = _environment()
+
+    def _page(self, template: str, request: Request, status: int = 200, **values: Any) -> Response:
+        name = request.query_params.get("run", "")
+        named = name if name in self._library.runs else next(iter(self._library.runs))
+        several = len(self._library.runs) > 1
+        text = self._environment.get_template(template).render(
+            runs=list(self._library.runs),
+            run_name=named,
+            run_query=named if several else None,
+            run_path=self._library.runs[named].path,
+            **values,
+        )
+        return HTMLResponse(text, status_code=status)
+
+    def overview(self, request: Request) -> Response:
+        """``/``: how far twin and recording agree, and every trial."""
+        _, run = self._library.pick(request.query_params.get("run"))
+        selection = Selection.of(request.query_params)
+        return self._page("overview.html", request, page=build_overview(run, judge(run), selection))
+
+    def episode(self, request: Request) -> Response:
+        """``/episode/<id>``: one trial and its replays."""
+        _, run = self._library.pick(request.query_params.get("run"))
+        episode_id = request.path_params["id"]
+        judgement = judge(run)
+        page = build_page(run, episode_id, judgement.row(episode_id), _seconds(request))
+        selection = Selection.of(request.query_params)
+        before, after = neighbours(judgement, selection, episode_id)
+        return self._page(
+            "episode.html", request, page=page, selection=selection, before=before, after=after
+        )
+
+    def frame(self, request: Request) -> Response:
+        """``/episode/<id>/frame/<camera>?t=``: the nearest camera image, as recorded."""
+        _, run = self._library.pick(request.query_params.get("run"))
+        path = episode_path(run, request.path_params["id"])
+        clock = PageClock.of(read_recording(path))
+        stamp_ns = clock.stamp_ns(clock.clamp(_seconds(request) or 0.0))
+        data, media_type = read_frame(path, request.path_params["camera"], stamp_ns)
+        headers = {"Cache-Control": "private, max-age=600"}
+        return Response(data, media_type=media_type, headers=headers)
+
+    def episode_file(self, request: Request) -> Response:
+        """``/episode/<id>/file``: the recorded file itself."""
+        _, run = self._library.pick(request.query_params.get("run"))
+        path = episode_path(run, request.path_params["id"])
+        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+    def derived_file(self, request: Request) -> Response:
+        """``/derived/<file>/file``: a derived episode."""
+        _, run = self._library.pick(request.query_params.get("run"))
+        path = derived_path(run, request.path_params["name"])
+        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+    def twin(self, request: Request) -> Response:
+        """``/twin``: held-out views, recorded beside rendered."""
+        _, run = self._library.pick(request.query_params.get("run"))
+        return self._page("twin.html", request, page=build_twin(run, judge(run)))
+
+    def twin_image(self, request: Request) -> Response:
+        """``/twin/<file>/<side>/<camera>?stamp=``: one held-out image."""
+        _, run = self._library.pick(request.query_params.get("run"))
+        path = derived_path(run, request.path_params["name"])
+        stamp = request.query_params.get("stamp", "0")
+        if not stamp.isdigit() or len(stamp) > 19:
+            message = "stamp is a whole number of nanoseconds."
+            raise NotHereError(message)
+        data, media_type = view_image(
+            run, path, request.path_params["side"], request.path_params["camera"], int(stamp)
+        )
+        headers = {"Cache-Control": "private, max-age=600"}
+        return Response(data, media_type=media_type, headers=headers)
+
+    def failed(self, request: Request, error: Exception) -> Response:
+        """Show one of our errors as a page."""
+        missing = isinstance(error, NotHereError)
+        title = "Not here" if missing else "This cannot be read"
+        return self._page(
+            "error.html", request, 404 if missing else 500, title=title, message=str(error)
+        )
+
+    def http_failed(self, request: Request, error: Exception) -> Response:
+        """Show a wrong address as a page."""
+        status = error.status_code if isinstance(error, HTTPException) else 500
+        title = "Not here" if status == 404 else f"Request refused ({status})"
+        message = "The address does not lead to a page of this dashboard."
+        return self._page("error.html", request, status, title=title, message=message)

@@ -1,0 +1,287 @@
+"""Numbers to pixel positions: ticks, lines and bars as SVG geometry for the templates.
+
+Only the layout of a drawing is worked out here; every number that is shown comes from a file.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+
+MAX_POINTS = 400
+"""A line wider than the plot has pixels is thinned to this many points, extremes kept."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tick:
+    """One labelled place on an axis [px]."""
+
+    px: float
+    label: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Axis:
+    """A linear axis from data to pixels."""
+
+    low: float
+    high: float
+    px_low: float
+    px_high: float
+    ticks: tuple[Tick, ...] = ()
+
+    def px(self, value: float) -> float:
+        """Return the pixel of a value."""
+        share = (value - self.low) / (self.high - self.low)
+        return round(self.px_low + share * (self.px_high - self.px_low), 2)
+
+    def inside(self, value: float) -> bool:
+        """Say whether a value lies on the axis."""
+        return self.low <= value <= self.high
+
+
+@dataclass(frozen=True, kw_only=True)
+class Signal:
+    """One line to draw: values over seconds; NaN where it is missing."""
+
+    name: str
+    style: str
+    """CSS class that gives colour and dash."""
+    t_s: Float[np.ndarray, " num_samples"]
+    values: Float[np.ndarray, " num_samples"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """A drawn line: SVG point lists, one per stretch without a gap."""
+
+    name: str
+    style: str
+    pieces: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimePlot:
+    """Everything a template needs to draw signals over time."""
+
+    title: str
+    unit: str
+    width: int
+    height: int
+    x: Axis
+    y: Axis
+    lines: tuple[Line, ...]
+    level_px: float | None = None
+    level_label: str = ""
+    note: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Span:
+    """A labelled stretch of time."""
+
+    start_s: float
+    end_s: float
+    label: str
+    style: str
+    title: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bar:
+    """A drawn span [px]."""
+
+    x: float
+    width: float
+    label: str
+    style: str
+    title: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lane:
+    """A row of bars under one name."""
+
+    name: str
+    y: float
+    bars: tuple[Bar, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mark:
+    """One instant worth a line across the lanes."""
+
+    t_s: float
+    px: float
+    label: str
+    style: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageChart:
+    """Stages as bars in lanes over time, with marks."""
+
+    width: int
+    height: int
+    x: Axis
+    lanes: tuple[Lane, ...]
+    marks: tuple[Mark, ...] = field(default=())
+
+
+def nice_ticks(low: float, high: float, wanted: int = 5) -> list[float]:
+    """Return round numbers (1, 2, 5 times a power of ten) within a range."""
+    if not (math.isfinite(low) and math.isfinite(high)) or high <= low:
+        return []
+    rough = (high - low) / max(wanted, 1)
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(power * m for m in (1, 2, 5, 10) if power * m >= rough * 0.999)
+    first = math.ceil(low / step - 1e-9)
+    last = math.floor(high / step + 1e-9)
+    return [index * step for index in range(first, last + 1)]
+
+
+def _labels(values: Sequence[float]) -> list[str]:
+    step = values[1] - values[0] if len(values) > 1 else 1.0
+    digits = max(0, -math.floor(math.log10(step) + 1e-9))
+    return [
+        f"{abs(value) if value == 0 else value:.{digits}f}".replace("-", "−") for value in values
+    ]
+
+
+def axis(low: float, high: float, px_low: float, px_high: float, wanted: int = 5) -> Axis:
+    """Build an axis with round ticks; a single value gets room around it."""
+    if high - low < 1e-12:
+        room = max(abs(low) * 0.1, 1e-3)
+        low, high = low - room, high + room
+    bare = Axis(low=low, high=high, px_low=px_low, px_high=px_high)
+    values = nice_ticks(low, high, wanted)
+    ticks = tuple(
+        Tick(px=bare.px(value), label=label)
+        for value, label in zip(values, _labels(values), strict=True)
+    )
+    return Axis(low=low, high=high, px_low=px_low, px_high=px_high, ticks=ticks)
+
+
+def _thin(signal: Signal) -> tuple[np.ndarray, np.ndarray]:
+    """Keep each bucket's smallest and largest sample so that no spike disappears."""
+    t_s, values = np.asarray(signal.t_s, float), np.asarray(signal.values, float)
+    if len(t_s) <= MAX_POINTS:
+        return t_s, values
+    edges = np.linspace(0, len(t_s), MAX_POINTS // 2 + 1).astype(int)
+    keep: list[int] = []
+    for start, end in pairwise(edges.tolist()):
+        piece = values[start:end]
+        if np.isnan(piece).any():
+            keep.extend(range(start, end))
+        else:
+            keep.extend(sorted({start + int(piece.argmin()), start + int(piece.argmax())}))
+    return t_s[keep], values[keep]
+
+
+def _pieces(t_s: np.ndarray, values: np.ndarray, x: Axis, y: Axis) -> tuple[str, ...]:
+    pieces: list[str] = []
+    points: list[str] = []
+    for t, value in zip(t_s, values, strict=True):
+        if math.isfinite(value):
+            points.append(f"{x.px(t):g},{y.px(value):g}")
+        elif points:
+            pieces.append(" ".join(points))
+            points = []
+    if points:
+        pieces.append(" ".join(points))
+    return tuple(pieces)
+
+
+def time_plot(
+    title: str,
+    unit: str,
+    signals: Sequence[Signal],
+    *,
+    span_s: tuple[float, float],
+    level: float | None = None,
+    level_label: str = "",
+    note: str = "",
+    width: int = 560,
+    height: int = 190,
+) -> TimePlot | None:
+    """Lay out signals over a span of time; None when there is nothing to draw."""
+    finite = [signal.values[np.isfinite(signal.values)] for signal in signals]
+    finite = [values for values in finite if len(values)]
+    if not finite:
+        return None
+    low = min(float(values.min()) for values in finite)
+    high = max(float(values.max()) for values in finite)
+    if level is not None:
+        low, high = min(low, level), max(high, level)
+    room = (high - low) * 0.06
+    x = axis(span_s[0], span_s[1], 46, width - 8, wanted=7)
+    y = axis(low - room, high + room, height - 24, 10, wanted=4)
+    lines = tuple(
+        Line(name=signal.name, style=signal.style, pieces=_pieces(*_thin(signal), x, y))
+        for signal in signals
+    )
+    return TimePlot(
+        title=title,
+        unit=unit,
+        width=width,
+        height=height,
+        x=x,
+        y=y,
+        lines=lines,
+        level_px=None if level is None else y.px(level),
+        level_label=level_label,
+        note=note,
+    )
+
+
+LANE_HEIGHT = 30
+LANE_LABEL_WIDTH = 92
+
+
+def stage_chart(
+    lanes: Sequence[tuple[str, Sequence[Span]]],
+    marks: Sequence[tuple[float, str, str]],
+    *,
+    span_s: tuple[float, float],
+    width: int = 1130,
+) -> StageChart | None:
+    """Lay out stages in named lanes; None when no lane holds any."""
+    filled = [(name, spans) for name, spans in lanes if spans]
+    if not filled:
+        return None
+    x = axis(span_s[0], span_s[1], LANE_LABEL_WIDTH, width - 8, wanted=10)
+    drawn = tuple(
+        Lane(
+            name=name,
+            y=6 + row * LANE_HEIGHT,
+            bars=tuple(_bar(span, x) for span in spans),
+        )
+        for row, (name, spans) in enumerate(filled)
+    )
+    return StageChart(
+        width=width,
+        height=6 + len(filled) * LANE_HEIGHT + 22,
+        x=x,
+        lanes=drawn,
+        marks=tuple(
+            Mark(t_s=t_s, px=x.px(t_s), label=label, style=style)
+            for t_s, label, style in marks
+            if x.inside(t_s)
+        ),
+    )
+
+
+def _bar(span: Span, x: Axis) -> Bar:
+    start, end = x.px(max(span.start_s, x.low)), x.px(min(span.end_s, x.high))
+    width = max(round(end - start - 1.5, 2), 1.5)
+    fits = width > 7.2 * len(span.label) + 8
+    return Bar(
+        x=start,
+        width=width,
+        label=span.label if fits else "",
+        style=span.style,
+        title=span.title or f"{span.label}: {span.start_s:.2f} s to {span.end_s:.2f} s",
+    )

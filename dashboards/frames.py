@@ -1,0 +1,105 @@
+"""Camera frames of an episode: when they were taken, and their bytes as recorded."""
+
+import re
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from bridge.episode import schema
+from bridge.episode.reader import Episode
+from bridge.episode.records import CompressedColor
+from dashboards.errors import NotHereError
+
+RENDERED = "rendered:"
+"""Before a camera's id: its images as the twin renders them."""
+_RECORDED_TOPIC = re.compile(r"/cam/([^/]+)/(?:color|recorded)(?:/image)?$")
+_RENDERED_TOPIC = re.compile(r"/cam/([^/]+)/(?:color/)?(?:rendered|replayed)(?:/image)?$")
+MEDIA_TYPES = ((b"\xff\xd8", "image/jpeg"), (b"\x89PNG\r\n\x1a\n", "image/png"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraTrack:
+    """Where the colour frames of one camera lie in the file, ordered by source time."""
+
+    camera_id: str
+    topic: str
+    stamps_ns: tuple[int, ...]
+    log_times_ns: tuple[int, ...]
+
+    def nearest(self, stamp_ns: int) -> int:
+        """Return the index of the frame taken closest to an instant."""
+        after = bisect_left(self.stamps_ns, stamp_ns)
+        around = [index for index in (after - 1, after) if 0 <= index < len(self.stamps_ns)]
+        return min(around, key=lambda index: abs(self.stamps_ns[index] - stamp_ns))
+
+
+def camera_tracks(path: Path) -> dict[str, CameraTrack]:
+    """Index the colour frames of every camera in an episode file, by camera id.
+
+    Rendered images of camera ``wrist`` are found under ``rendered:wrist``.
+    """
+    status = path.stat()
+    return _tracks(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=64)
+def _tracks(path: Path, _mtime_ns: int, _size: int) -> dict[str, CameraTrack]:
+    episode = Episode.open(path)
+    names = {
+        topic: name
+        for topic in episode.topics_of_type(schema.COMPRESSED_IMAGE)
+        if (name := _camera_of(topic)) is not None
+    }
+    stamps: dict[str, list[tuple[int, int]]] = {topic: [] for topic in names}
+    for message in episode.messages(names):
+        stamps[message.topic].append((message.publish_time_ns, message.log_time_ns))
+    tracks = {}
+    for topic, pairs in stamps.items():
+        if not pairs:
+            continue
+        ordered: Sequence[tuple[int, int]] = sorted(pairs)
+        tracks[names[topic]] = CameraTrack(
+            camera_id=names[topic],
+            topic=topic,
+            stamps_ns=tuple(pair[0] for pair in ordered),
+            log_times_ns=tuple(pair[1] for pair in ordered),
+        )
+    return tracks
+
+
+def _camera_of(topic: str) -> str | None:
+    if match := _RECORDED_TOPIC.search(topic):
+        return match.group(1)
+    if match := _RENDERED_TOPIC.search(topic):
+        return RENDERED + match.group(1)
+    return None
+
+
+def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
+    """Return the image nearest to an instant, byte for byte as recorded, and its media type."""
+    tracks = camera_tracks(path)
+    if camera_id not in tracks:
+        found = ", ".join(tracks) or "none"
+        text = f"{path.name} has no frames of camera {camera_id!r}. Cameras: {found}."
+        raise NotHereError(text)
+    track = tracks[camera_id]
+    index = track.nearest(stamp_ns)
+    log_ns = track.log_times_ns[index]
+    episode = Episode.open(path)
+    for message in episode.messages([track.topic], start_ns=log_ns, end_ns=log_ns + 1):
+        if message.publish_time_ns == track.stamps_ns[index]:
+            data = CompressedColor.from_cdr(message.data).data
+            return data, media_type(data, path)
+    text = f"{path.name} changed while it was read; reload the page."
+    raise NotHereError(text)
+
+
+def media_type(data: bytes, path: Path) -> str:
+    """Name the image format by its first bytes; anything but JPEG and PNG is refused."""
+    for magic, name in MEDIA_TYPES:
+        if data.startswith(magic):
+            return name
+    message = f"a frame of {path.name} is neither JPEG nor PNG; the page cannot show it."
+    raise NotHereError(message)

@@ -1,0 +1,76 @@
+"""The runs being shown, and safe ways from a name in an address to a file inside a run."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bridge.episode.run import EPISODE_ID, RunFolder
+from dashboards.errors import NotHereError
+
+
+@dataclass(frozen=True)
+class Library:
+    """Run folders by short name, the first one shown by default."""
+
+    runs: dict[str, RunFolder]
+
+    @staticmethod
+    def open(paths: Sequence[Path]) -> "Library":
+        """Open every run folder; folders of the same name get a number."""
+        runs: dict[str, RunFolder] = {}
+        for path in paths:
+            run = RunFolder.open(path)
+            base = path.resolve().name or "run"
+            name, number = base, 2
+            while name in runs:
+                name, number = f"{base}-{number}", number + 1
+            runs[name] = run
+        return Library(runs)
+
+    def pick(self, name: str | None) -> tuple[str, RunFolder]:
+        """Return the named run, or the first one without a name."""
+        if not name:
+            return next(iter(self.runs.items()))
+        if name not in self.runs:
+            message = f"no run named {name!r} is being shown. Runs: {', '.join(self.runs)}."
+            raise NotHereError(message)
+        return name, self.runs[name]
+
+
+def episode_path(run: RunFolder, episode_id: str) -> Path:
+    """Return the file of a recorded episode; nothing outside the run folder is ever reached."""
+    if not EPISODE_ID.match(episode_id):
+        message = f"{episode_id!r} is not an episode id (letters, digits, '_' and '-')."
+        raise NotHereError(message)
+    return _inside(run, run.episodes_dir / f"{episode_id}.mcap", f"episode {episode_id!r}")
+
+
+def derived_paths(run: RunFolder, episode_id: str, kind: str) -> list[Path]:
+    """Return the derived episodes of one kind (replay, localised, views) of one episode."""
+    if not EPISODE_ID.match(episode_id):
+        return []
+    found = run.derived(f"{episode_id}.{kind}.*")
+    return [path for path in found if _is_inside(run, path)]
+
+
+def derived_path(run: RunFolder, name: str) -> Path:
+    """Return one derived episode by file name, among those that exist in the run."""
+    for path in run.derived():
+        if path.name == name:
+            return _inside(run, path, f"derived episode {name!r}")
+    message = f"no derived episode {name!r} in this run."
+    raise NotHereError(message)
+
+
+def _is_inside(run: RunFolder, path: Path) -> bool:
+    return path.resolve().is_relative_to(run.path.resolve())
+
+
+def _inside(run: RunFolder, path: Path, what: str) -> Path:
+    if not path.is_file():
+        message = f"no {what} in this run."
+        raise NotHereError(message)
+    if not _is_inside(run, path):
+        message = f"{what} points outside the run folder; it is not served."
+        raise NotHereError(message)
+    return path

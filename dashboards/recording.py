@@ -1,0 +1,142 @@
+"""What one episode file holds, read part by part so that a broken part does not hide the rest."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from bridge.episode import provenance, schema, streams
+from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
+from bridge.episode.reader import Episode
+from bridge.episode.streams import JointTrack
+from bridge.errors import GstError
+from bridge.geometry.trajectory import PoseTrajectory
+from bridge.task.plan import Plan
+from bridge.task.verdict import Verdict
+from dashboards.frames import CameraTrack, camera_tracks
+
+Part = TypeVar("Part")
+
+
+@dataclass
+class Problems:
+    """What could not be read, in words."""
+
+    texts: list[str] = field(default_factory=list)
+
+    def attempt(self, read: Callable[[], Part], otherwise: Part) -> Part:
+        """Return what ``read`` gives; on one of our errors, note it and return the fallback."""
+        try:
+            return read()
+        except GstError as error:
+            if str(error) not in self.texts:
+                self.texts.append(str(error))
+            return otherwise
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """One episode file, decoded for the page. Empty or None where the file has nothing."""
+
+    path: Path
+    sha256: str
+    size_bytes: int
+    info: EpisodeInfo
+    outcome: Outcome | None
+    derived: Derived | None
+    software: dict[str, Any]
+    duration_s: float
+    num_messages: int
+    topics: tuple[str, ...]
+    plans: tuple[tuple[int, Plan], ...]
+    verdicts: tuple[tuple[int, Verdict], ...]
+    events: tuple[dict[str, Any], ...]
+    joints: JointTrack | None
+    widths: JointTrack | None
+    clearance: JointTrack | None
+    tcp: PoseTrajectory | None
+    objects: dict[str, PoseTrajectory]
+    cameras: dict[str, CameraTrack]
+    problems: tuple[str, ...]
+
+    def first_stamp_ns(self) -> int | None:
+        """Earliest source time of robot, camera, tool or event; the page's zero."""
+        stamps = [int(track.stamps_ns[0]) for track in (self.joints, self.tcp) if track is not None]
+        stamps += [int(track.stamps_ns[0]) for track in self.objects.values()]
+        stamps += [track.stamps_ns[0] for track in self.cameras.values()]
+        stamps += [event["stamp_ns"] for event in self.events]
+        return min(stamps, default=None)
+
+    def last_stamp_ns(self) -> int | None:
+        """Latest source time of the same streams."""
+        stamps = [
+            int(track.stamps_ns[-1]) for track in (self.joints, self.tcp) if track is not None
+        ]
+        stamps += [int(track.stamps_ns[-1]) for track in self.objects.values()]
+        stamps += [track.stamps_ns[-1] for track in self.cameras.values()]
+        stamps += [event["stamp_ns"] for event in self.events]
+        return max(stamps, default=None)
+
+    def executed_ns(self, plan_id: str) -> tuple[int, int | None] | None:
+        """Source times at which a plan's execution started and, if it did, ended."""
+        start = None
+        for event in self.events:
+            if event.get("plan_id") != plan_id:
+                continue
+            if event["type"] == "execution_started":
+                start = int(event["stamp_ns"])
+            elif event["type"] == "execution_ended" and start is not None:
+                return start, int(event["stamp_ns"])
+        return None if start is None else (start, None)
+
+
+def read_recording(path: Path) -> Recording:
+    """Read an episode; kept in memory until the file changes.
+
+    Raises:
+        GstError: When the file cannot be opened at all.
+    """
+    status = path.stat()
+    return _read(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=32)
+def _read(path: Path, _mtime_ns: int, size: int) -> Recording:
+    episode = Episode.open(path)
+    problems = Problems()
+    topics = {name: topic for name, topic in episode.topics().items() if not schema.is_truth(name)}
+
+    def joints(ending: str) -> JointTrack | None:
+        if not any(topic.endswith(ending) for topic in topics):
+            return None
+        return problems.attempt(lambda: streams.joint_track(episode, ending), None)
+
+    def poses(topic: str | None) -> PoseTrajectory | None:
+        if topic is None or topics[topic].count == 0:
+            return None
+        return problems.attempt(lambda: streams.pose_track(episode, topic), None)
+
+    tracked = {name: poses(topic) for name, topic in streams.object_pose_topics(episode).items()}
+    return Recording(
+        path=path,
+        sha256=provenance.hash_file(path),
+        size_bytes=size,
+        info=episode.info,
+        outcome=episode.outcome,
+        derived=episode.derived,
+        software=episode.metadata_records.get("software", {}),
+        duration_s=episode.duration_s,
+        num_messages=sum(topic.count for topic in episode.topics().values()),
+        topics=tuple(topics),
+        plans=tuple(problems.attempt(lambda: streams.plans(episode), [])),
+        verdicts=tuple(problems.attempt(lambda: streams.verdicts(episode), [])),
+        events=tuple(problems.attempt(lambda: streams.events(episode), [])),
+        joints=joints("/joint_states"),
+        widths=joints("/gripper/state"),
+        clearance=joints("/replay/clearance"),
+        tcp=poses(next((topic for topic in topics if topic.endswith("/tcp/pose")), None)),
+        objects={name: track for name, track in tracked.items() if track is not None},
+        cameras=problems.attempt(lambda: camera_tracks(path), {}),
+        problems=tuple(problems.texts),
+    )

@@ -1,0 +1,115 @@
+"""Serve the review pages until stopped: address, token, signals."""
+
+import secrets
+import signal
+import socket
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+import uvicorn
+
+from bridge.terminal import Output
+from dashboards.app import create_app
+from dashboards.config import DashboardConfig
+from dashboards.errors import AddressTakenError
+from dashboards.guard import Admission, is_loopback
+from dashboards.library import Library
+
+
+@dataclass(frozen=True, kw_only=True)
+class Address:
+    """Where the pages are."""
+
+    host: str
+    port: int
+    token: str | None
+
+    @property
+    def url(self) -> str:
+        """The address to open."""
+        host = "127.0.0.1" if self.host in ("0.0.0.0", "::") else self.host
+        shown = f"[{host}]" if ":" in host else host
+        query = f"?token={self.token}" if self.token else ""
+        return f"http://{shown}:{self.port}/{query}"
+
+    @property
+    def ssh_line(self) -> str:
+        """The command that brings the pages to another computer."""
+        target = "127.0.0.1" if self.host in ("0.0.0.0", "::") else self.host
+        shown = f"[{target}]" if ":" in target else target
+        return f"ssh -L {self.port}:{shown}:{self.port} {socket.gethostname()}"
+
+
+def listen(config: DashboardConfig) -> socket.socket:
+    """Bind the address.
+
+    Raises:
+        AddressTakenError: When another program has it, or it is not ours to bind.
+    """
+    if not 0 <= config.port <= 65535:
+        raise AddressTakenError(
+            host=config.host, port=config.port, reason="a port is between 0 and 65535"
+        )
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            config.host, config.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        listener = socket.socket(family, kind, protocol)
+    except OSError as error:
+        raise AddressTakenError(
+            host=config.host, port=config.port, reason=error.strerror or str(error)
+        ) from error
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen(64)
+    except OSError as error:
+        listener.close()
+        raise AddressTakenError(
+            host=config.host, port=config.port, reason=error.strerror or str(error)
+        ) from error
+    return listener
+
+
+def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
+    """Show run folders until SIGINT or SIGTERM; prints the address first."""
+    library = Library.open(runs)
+    listener = listen(config)
+    token = None if is_loopback(config.host) else secrets.token_urlsafe(24)
+    address = Address(host=config.host, port=listener.getsockname()[1], token=token)
+    app = create_app(library, Admission(host=config.host, token=token))
+    server = uvicorn.Server(
+        uvicorn.Config(
+            app,
+            log_level="warning",
+            lifespan="off",
+            server_header=False,
+            timeout_graceful_shutdown=2,
+        )
+    )
+    text = f"Dashboard: {address.url}\nFrom another computer: {address.ssh_line}\nStop with Ctrl-C."
+    with listener, _ending_on_signals(server):
+        output.result({"url": address.url, "ssh": address.ssh_line, "runs": [*library.runs]}, text)
+        server.run(sockets=[listener])
+    return 0
+
+
+@contextmanager
+def _ending_on_signals(server: uvicorn.Server) -> Iterator[None]:
+    """Make SIGINT and SIGTERM an ordinary end, also before uvicorn listens for them itself.
+
+    uvicorn raises the signal it caught once more after it has stopped; that does nothing here.
+    """
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        server.should_exit = True
+
+    before = {kind: signal.signal(kind, stop) for kind in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for kind, handler in before.items():
+            signal.signal(kind, handler)

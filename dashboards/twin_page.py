@@ -1,0 +1,137 @@
+"""What the twin page shows: held-out views, recorded beside rendered."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
+from bridge.errors import GstError
+from dashboards.comparison import Judgement
+from dashboards.errors import NotHereError
+from dashboards.frames import RENDERED, camera_tracks, read_frame
+from dashboards.library import episode_path
+from evaluator.result import Cell, Measurement, Table
+
+VIEWS_TITLE = "Held-out views: "
+"""Before the file's name in the title of the table that rates its images."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldOutView:
+    """One recorded image with its rendering; the scores are the evaluator's."""
+
+    file: str
+    camera_id: str
+    stamp_ns: int
+    has_recorded: bool
+    psnr_db: float | None
+    ssim: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinPage:
+    """Everything the twin template needs."""
+
+    files: tuple[str, ...]
+    views: tuple[HeldOutView, ...]
+    rated: bool
+    measurements: tuple[Measurement, ...]
+    problems: tuple[str, ...]
+    next_command: str
+    stand_in: bool | None
+
+
+def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
+    """Gather the held-out views of a run, worst first where the results rate them."""
+    views: list[HeldOutView] = []
+    problems = []
+    paths = run.derived("*.views.*")
+    for path in paths:
+        try:
+            views += _views(run, path, _scores(judgement, path.stem))
+        except GstError as error:
+            problems.append(str(error))
+    views.sort(key=_badness)
+    return TwinPage(
+        files=tuple(path.name for path in paths),
+        views=tuple(views),
+        rated=any(view.psnr_db is not None for view in views),
+        measurements=tuple(m for m in judgement.measurements if m.id.startswith("views.")),
+        problems=tuple(problems),
+        next_command=f"robot-gst rebuild {run.path}",
+        stand_in=judgement.stand_in,
+    )
+
+
+def _views(
+    run: RunFolder, path: Path, scores: dict[tuple[Cell, Cell], dict[str, Cell]]
+) -> list[HeldOutView]:
+    tracks = camera_tracks(path)
+    source = _source_of(run, path)
+    recorded = {**(camera_tracks(source) if source else {}), **tracks}
+    views = []
+    for name, track in tracks.items():
+        if not name.startswith(RENDERED):
+            continue
+        camera_id = name.removeprefix(RENDERED)
+        known = set(recorded[camera_id].stamps_ns) if camera_id in recorded else set()
+        for stamp_ns in track.stamps_ns:
+            score = scores.get((camera_id, stamp_ns), {})
+            views.append(
+                HeldOutView(
+                    file=path.name,
+                    camera_id=camera_id,
+                    stamp_ns=stamp_ns,
+                    has_recorded=stamp_ns in known,
+                    psnr_db=_number(score.get("PSNR (dB)")),
+                    ssim=_number(score.get("SSIM")),
+                )
+            )
+    return views
+
+
+def _source_of(run: RunFolder, path: Path) -> Path | None:
+    """Return the recorded episode a views episode was made from, where it is still there."""
+    derived = Episode.open(path).derived
+    try:
+        return None if derived is None else episode_path(run, derived.source_episode)
+    except NotHereError:
+        return None
+
+
+def _scores(judgement: Judgement, stem: str) -> dict[tuple[Cell, Cell], dict[str, Cell]]:
+    """Map camera and stamp to the evaluator's row about that image."""
+    tables: tuple[Table, ...] = judgement.results.tables if judgement.results else ()
+    scores = {}
+    for table in tables:
+        if table.title == VIEWS_TITLE + stem:
+            for row in table.rows:
+                record = dict(zip(table.columns, row, strict=True))
+                scores[(record["camera"], record["stamp_ns"])] = record
+    return scores
+
+
+def _number(value: Cell) -> float | None:
+    return float(value) if isinstance(value, int | float) else None
+
+
+def _badness(view: HeldOutView) -> tuple[bool, float, int]:
+    return view.psnr_db is None, view.psnr_db or 0.0, view.stamp_ns
+
+
+def view_image(
+    run: RunFolder, path: Path, side: str, camera_id: str, stamp_ns: int
+) -> tuple[bytes, str]:
+    """Return the recorded or the rendered image of one held-out view."""
+    if side == "rendered":
+        return read_frame(path, RENDERED + camera_id, stamp_ns)
+    if side != "recorded":
+        message = f"side {side!r} is neither recorded nor rendered."
+        raise NotHereError(message)
+    holder: Path | None = path
+    if camera_id not in camera_tracks(path):
+        holder = _source_of(run, path)
+    if holder is None:
+        message = f"the recording that {path.name} was made from is not in this run."
+        raise NotHereError(message)
+    return read_frame(holder, camera_id, stamp_ns)

@@ -1,0 +1,135 @@
+"""Drawings put values where they belong."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dashboards.figures import Signal, Span, axis, nice_ticks, stage_chart, time_plot
+from dashboards.scatter import Cell, scatter
+from evaluator.result import Interval, Measurement
+
+
+def signal(values: np.ndarray) -> Signal:
+    return Signal(
+        name="a", style="recorded", t_s=np.linspace(0, 1, len(values)), values=np.asarray(values)
+    )
+
+
+@given(
+    st.floats(-1e6, 1e6, allow_nan=False),
+    st.floats(1e-6, 1e6),
+    st.integers(2, 10),
+)
+def test_ticks_are_inside_few_and_evenly_spaced(low: float, span: float, wanted: int) -> None:
+    high = low + span
+    ticks = nice_ticks(low, high, wanted)
+    assert len(ticks) <= wanted + 1
+    assert all(low - 1e-6 * span <= tick <= high + 1e-6 * span for tick in ticks)
+    if len(ticks) > 2:
+        steps = np.diff(ticks)
+        assert np.allclose(steps, steps[0], rtol=1e-6)
+
+
+def test_tick_labels_tell_neighbours_apart() -> None:
+    drawn = axis(-0.02, 0.05, 0, 100)
+    labels = [tick.label for tick in drawn.ticks]
+    assert len(set(labels)) == len(labels)
+    assert "−0.02" in labels
+    assert "0.00" in labels
+
+
+def test_an_axis_maps_its_ends_and_its_middle() -> None:
+    drawn = axis(0.0, 10.0, 40, 240)
+    assert [drawn.px(0), drawn.px(5), drawn.px(10)] == [40, 140, 240]
+
+
+def test_a_gap_in_a_signal_splits_its_line() -> None:
+    plot = time_plot("t", "m", [signal(np.array([0, 1, np.nan, 2, 3.0]))], span_s=(0, 1))
+    assert plot is not None
+    assert len(plot.lines[0].pieces) == 2
+
+
+def test_thinning_keeps_a_single_spike() -> None:
+    values = np.zeros(50_000)
+    values[31_234] = 7.0
+    plot = time_plot("t", "m", [signal(values)], span_s=(0, 1))
+    assert plot is not None
+    points = plot.lines[0].pieces[0].split()
+    assert len(points) < 1000
+    heights = [float(point.split(",")[1]) for point in points]
+    assert min(heights) == pytest.approx(plot.y.px(7.0), abs=0.02)
+
+
+def test_nothing_to_draw_is_none_and_not_an_empty_plot() -> None:
+    assert time_plot("t", "m", [], span_s=(0, 1)) is None
+    assert time_plot("t", "m", [signal(np.full(3, np.nan))], span_s=(0, 1)) is None
+    assert stage_chart([("planned", [])], [], span_s=(0, 1)) is None
+    assert scatter([]) is None
+
+
+def test_a_constant_signal_is_drawn_inside_the_plot() -> None:
+    plot = time_plot("t", "m", [signal(np.full(4, 2.0))], span_s=(0, 1))
+    assert plot is not None
+    heights = {float(point.split(",")[1]) for point in plot.lines[0].pieces[0].split()}
+    assert len(heights) == 1
+    assert 10 < heights.pop() < plot.height - 24
+
+
+def test_a_level_is_always_visible() -> None:
+    plot = time_plot("t", "mm", [signal(np.array([50.0, 60.0]))], span_s=(0, 1), level=2.0)
+    assert plot is not None
+    assert plot.level_px is not None
+    assert 10 <= plot.level_px <= plot.height - 24
+
+
+def test_stage_bars_keep_their_order_and_lose_labels_that_do_not_fit() -> None:
+    spans = [
+        Span(start_s=0, end_s=5, label="approach", style="stage-0"),
+        Span(start_s=5, end_s=5.05, label="grasp", style="stage-1"),
+    ]
+    chart = stage_chart([("planned", spans)], [(11.0, "late", "failure")], span_s=(0, 10))
+    assert chart is not None
+    first, second = chart.lanes[0].bars
+    assert first.x + first.width < second.x + second.width
+    assert (first.label, second.label) == ("approach", "")
+    assert "grasp" in second.title
+    assert chart.marks == ()
+
+
+def rate(value: float, side: str) -> Measurement:
+    interval = Interval(
+        low=max(0.0, value - 0.2), high=min(1.0, value + 0.2), level=0.95, method="w"
+    )
+    return Measurement(
+        id=f"rate.{side}.a.b.c", value=value, unit="1", definition="d", interval=interval, k=1, n=2
+    )
+
+
+def cell(replayed: float, recorded: float) -> Cell:
+    return Cell(
+        label="a",
+        group="a",
+        task="a",
+        condition="with_replanning",
+        policy="",
+        filled=True,
+        replayed=rate(replayed, "sim_planned"),
+        recorded=rate(recorded, "recorded"),
+    )
+
+
+def test_a_cell_in_agreement_lies_on_the_identity_line() -> None:
+    drawn = scatter([cell(0.7, 0.7)])
+    assert drawn is not None
+    point = drawn.points[0]
+    across = (point.x - drawn.axis_x.px(0)) / (drawn.axis_x.px(1) - drawn.axis_x.px(0))
+    upright = (point.y - drawn.axis_y.px(0)) / (drawn.axis_y.px(1) - drawn.axis_y.px(0))
+    assert across == pytest.approx(0.7, abs=1e-3)
+    assert across == pytest.approx(upright, abs=1e-3)
+
+
+def test_cells_that_coincide_are_drawn_apart() -> None:
+    drawn = scatter([cell(0.5, 0.5), cell(0.5, 0.5)])
+    assert drawn is not None
+    assert drawn.points[0].x != drawn.points[1].x

@@ -1,0 +1,349 @@
+"""The pages say what the evaluator said, survive what is missing, and refuse what is foreign."""
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from bridge.episode.run import RunFolder
+from dashboards.app import create_app
+from dashboards.errors import NotHereError
+from dashboards.guard import COOKIE, Admission
+from dashboards.library import Library, derived_path, episode_path
+from evaluator.compare import compare_run
+from evaluator.result import load_results, write_results
+
+
+def words(text: str) -> str:
+    """Reduce a page to the words a reader sees."""
+    visible = re.sub(r"<(svg|head).*?</\1>|<[^>]+>", " ", text, flags=re.DOTALL)
+    return re.sub(r"\s+", " ", visible.replace("&nbsp;", " ").replace("\u00a0", " "))
+
+
+def test_the_overview_shows_the_numbers_of_results_json(
+    browser: Any, shared_run: RunFolder
+) -> None:
+    agreement = load_results(shared_run.path).get("agreement.sim_planned.rate")
+    answer = browser.get("/")
+    assert answer.status_code == 200
+    text = words(answer.text)
+    assert f"{agreement.k} of {agreement.n}" in text
+    assert "2 cells; it needs at least 3" in text
+    assert "95 % Wilson" in text
+    assert "Stand-in cell" in text
+
+
+def test_a_changed_number_in_results_json_changes_the_page(
+    synthetic: ModuleType, tmp_path: Path
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    synthetic.write_trial(run, synthetic.TRIALS[1], images=False)
+    synthetic.write_replay(run, synthetic.TRIALS[1], "planned", False)
+    path = write_results(compare_run(run).results(), run.results_dir / "results.json")
+    browser = synthetic.browser_of(run)
+    assert "0 of 1" in words(browser.get("/").text)
+    record = json.loads(path.read_text())
+    for item in record["measurements"]:
+        if item["id"] == "agreement.sim_planned.rate":
+            item.update(value=0.875, k=7, n=8)
+    path.write_text(json.dumps(record))
+    assert "7 of 8" in words(browser.get("/").text)
+
+
+def test_disagreements_come_first_and_outcomes_have_words(browser: Any) -> None:
+    page = browser.get("/").text
+    ids = re.findall(r'href="/episode/(trial_\d+)', page)
+    assert ids == ["trial_0002", "trial_0004", "trial_0001", "trial_0003"]
+    for word in ("✓ success", "✗ failure", "≠ disagree", "= agree", "✗ refused"):
+        assert word in page
+
+
+def test_a_selection_in_the_address_filters_the_list_and_keeps_the_headline(
+    browser: Any,
+) -> None:
+    page = browser.get("/?show=disagree").text
+    assert re.findall(r'href="/episode/(trial_\d+)', page) == ["trial_0002"]
+    assert "2 of 3" in words(page)
+    none = words(browser.get("/?condition=nonsense").text)
+    assert "No trial matches this selection" in none
+
+
+def test_the_episode_page_shows_verdicts_causes_and_provenance(browser: Any) -> None:
+    text = words(browser.get("/episode/trial_0001").text)
+    for expected in (
+        "✗ refused",
+        "dropped",
+        "cube – table",
+        "the cube left the gripper during carry",
+        "at 3.80 s",  # 2.8 s into a plan that started 1 s after the first sample
+        "labelled by stand-in operator",
+        "bullet",
+        "✓ unchanged",
+        "Download MCAP",
+        "robot-gst replay",
+    ):
+        assert expected in text
+
+
+def test_the_time_in_the_address_moves_slider_and_frames(browser: Any) -> None:
+    page = browser.get("/episode/trial_0001?t=2.1").text
+    assert 'value="2.100"' in page
+    assert "/frame/side?t=2.0" in page
+    assert 'value="5.950"' in browser.get("/episode/trial_0001?t=99").text
+    for nonsense in ("nan", "soon", "1e400", ""):
+        assert browser.get(f"/episode/trial_0001?t={nonsense}").status_code == 200
+
+
+def test_a_replaced_plan_is_shown_as_not_sent(browser: Any) -> None:
+    text = words(browser.get("/episode/trial_0003").text)
+    assert "plan not sent" in text
+    assert "1 of 2 plans sent" in text
+    assert "2.80 s into the plan" in text
+
+
+def test_neighbours_follow_the_filtered_list(browser: Any) -> None:
+    page = browser.get("/episode/trial_0002").text
+    assert re.search(r'rel="next" href="/episode/trial_0004"', page)
+    page = browser.get("/episode/trial_0002?condition=without_replanning").text
+    assert re.search(r'rel="next" href="/episode/trial_0001\?condition=without_replanning"', page)
+
+
+def test_a_frame_is_the_recorded_bytes_nearest_to_the_time(
+    browser: Any, shared_run: RunFolder
+) -> None:
+    answer = browser.get("/episode/trial_0001/frame/side?t=2.1")
+    assert answer.headers["content-type"] == "image/jpeg"
+    assert answer.content[:2] == b"\xff\xd8"
+    assert answer.content == browser.get("/episode/trial_0001/frame/side?t=2.0").content
+    assert answer.content != browser.get("/episode/trial_0001/frame/side?t=4").content
+    missing = browser.get("/episode/trial_0001/frame/top?t=1")
+    assert missing.status_code == 404
+    assert "side, wrist" in words(missing.text)
+
+
+def test_downloads_are_the_files_themselves(browser: Any, shared_run: RunFolder) -> None:
+    answer = browser.get("/episode/trial_0002/file")
+    assert answer.content == (shared_run.episodes_dir / "trial_0002.mcap").read_bytes()
+    name = shared_run.derived("trial_0002.replay.planned.*")[0].name
+    answer = browser.get(f"/derived/{name}/file")
+    assert answer.content == (shared_run.derived_dir / name).read_bytes()
+
+
+def test_held_out_views_stand_worst_first_with_the_evaluators_scores(browser: Any) -> None:
+    page = browser.get("/twin").text
+    scores = [float(value) for value in re.findall(r"PSNR ([\d.]+) dB · SSIM", page)]
+    assert len(scores) == 3
+    assert scores == sorted(scores)
+    for source in re.findall(r'src="(/twin/[^"]+)"', page):
+        assert browser.get(source.replace("&amp;", "&")).content[:2] == b"\xff\xd8"
+
+
+def test_views_take_recorded_images_from_their_source(
+    synthetic: ModuleType, tmp_path: Path
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    synthetic.write_trial(run, synthetic.TRIALS[0])
+    views = synthetic.write_views(run, source=synthetic.TRIALS[0].id)
+    page = synthetic.browser_of(run).get("/twin").text
+    assert "3, never used for fitting" in words(page)
+    assert "PSNR missing" in words(page)
+    assert views.name in page
+
+
+@pytest.mark.parametrize(
+    ("part", "command"),
+    [
+        ("results", "robot-gst evaluate"),
+        ("derived", "robot-gst rebuild"),
+        ("episodes", "robot-gst record"),
+    ],
+)
+def test_a_missing_part_names_the_next_command(
+    synthetic: ModuleType, shared_run: RunFolder, tmp_path: Path, part: str, command: str
+) -> None:
+    run = RunFolder(shutil.copytree(shared_run.path, tmp_path / "run"))
+    for folder in ("results", "derived", "episodes"):
+        shutil.rmtree(run.path / folder)
+        if folder == part:
+            break
+    answer = synthetic.browser_of(run).get("/")
+    assert answer.status_code == 200
+    assert command in words(answer.text)
+    assert "missing no results yet" in words(answer.text)
+
+
+def test_a_trial_without_replay_and_results_still_has_a_page(
+    synthetic: ModuleType, own_run: RunFolder
+) -> None:
+    answer = synthetic.browser_of(own_run).get("/episode/trial_0001")
+    assert answer.status_code == 200
+    text = words(answer.text)
+    assert "no dynamic replay of the plan sent" in text
+    assert "Gate, before motion" in text
+
+
+def test_broken_files_are_named_and_the_rest_is_shown(
+    synthetic: ModuleType, own_run: RunFolder
+) -> None:
+    whole = (own_run.episodes_dir / "trial_0001.mcap").read_bytes()
+    (own_run.episodes_dir / "trial_0009.mcap").write_bytes(whole[: len(whole) // 2])
+    (own_run.episodes_dir / "trial_0010.mcap").write_bytes(b"not an episode")
+    (own_run.episodes_dir / "trial_0011.mcap.part").write_bytes(whole[:100])
+    browser = synthetic.browser_of(own_run)
+    text = words(browser.get("/").text)
+    assert "Files that cannot be read 3" in text
+    for name in ("trial_0009.mcap", "trial_0010.mcap", "trial_0011.mcap.part", "trial_0001"):
+        assert name in text
+    answer = browser.get("/episode/trial_0010")
+    assert answer.status_code == 500
+    assert "trial_0010.mcap: not a finished MCAP file" in words(answer.text)
+
+
+def test_damage_inside_a_file_is_named_on_its_page(
+    synthetic: ModuleType, own_run: RunFolder
+) -> None:
+    path = own_run.episodes_dir / "trial_0001.mcap"
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 3
+    data[middle : middle + 64] = bytes(64)
+    path.write_bytes(data)
+    browser = synthetic.browser_of(own_run)
+    answer = browser.get("/episode/trial_0001")
+    assert answer.status_code == 200
+    assert "Some parts could not be read" in words(answer.text)
+    assert "trial_0001.mcap" in words(answer.text)
+    assert browser.get("/").status_code == 200
+
+
+def test_results_that_do_not_fit_are_refused_in_words(
+    synthetic: ModuleType, own_run: RunFolder
+) -> None:
+    own_run.results_dir.mkdir()
+    (own_run.results_dir / "results.json").write_text('{"schema_version": 99}')
+    answer = synthetic.browser_of(own_run).get("/")
+    assert answer.status_code == 200
+    assert "The results cannot be shown" in words(answer.text)
+    assert "newer" in words(answer.text)
+
+
+def test_several_runs_are_switched_in_the_address(
+    synthetic: ModuleType, shared_run: RunFolder, own_run: RunFolder
+) -> None:
+    browser = synthetic.browser_of(shared_run, own_run)
+    assert "trial_0003" in browser.get("/").text
+    page = browser.get("/?run=own").text
+    assert "trial_0003" not in page
+    assert 'href="/episode/trial_0001?run=own"' in page
+    assert browser.get("/?run=other").status_code == 404
+
+
+def test_words_from_an_episode_cannot_become_markup(synthetic: ModuleType, tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    trial = replace(synthetic.TRIALS[0], start_id="<script>alert(1)</script>")
+    synthetic.write_trial(run, trial, images=False)
+    for address in ("/", "/episode/trial_0001"):
+        page = synthetic.browser_of(run).get(address).text
+        assert "<script>alert" not in page
+        assert "&lt;script&gt;alert" in page
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "/episode/..%2f..%2fetc%2fpasswd",
+        "/episode/../../../etc/passwd",
+        "/episode/%2e%2e/file",
+        "/episode/trial_0001%00",
+        "/episode/trial_9999",
+        "/episode/..%5c..%5csecret/file",
+        "/derived/..%2fepisodes%2ftrial_0001.mcap/file",
+        "/derived/..%2f..%2f..%2fetc%2fpasswd/file",
+        "/static/../app.py",
+        "/static/..%2fapp.py",
+        "/twin/nothing.mcap/recorded/side?stamp=1",
+        "/nowhere",
+    ],
+)
+def test_nothing_outside_the_run_is_served(browser: Any, address: str) -> None:
+    answer = browser.get(address)
+    assert answer.status_code == 404
+    assert "root:" not in answer.text
+    assert "def create_app" not in answer.text
+
+
+def test_a_link_out_of_the_run_is_not_followed(own_run: RunFolder, tmp_path: Path) -> None:
+    outside = tmp_path / "outside.mcap"
+    shutil.copy(own_run.episodes_dir / "trial_0001.mcap", outside)
+    (own_run.episodes_dir / "linked.mcap").symlink_to(outside)
+    (own_run.derived_dir).mkdir()
+    (own_run.derived_dir / "linked.views.x.mcap").symlink_to(outside)
+    with pytest.raises(NotHereError, match="outside the run folder"):
+        episode_path(own_run, "linked")
+    with pytest.raises(NotHereError, match="outside the run folder"):
+        derived_path(own_run, "linked.views.x.mcap")
+
+
+def test_every_answer_carries_the_strict_headers(browser: Any) -> None:
+    for address in ("/", "/nowhere", "/static/page.css", "/episode/trial_0001/frame/side"):
+        headers = browser.get(address).headers
+        policy = headers["content-security-policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy
+        assert headers["x-content-type-options"] == "nosniff"
+        assert headers["referrer-policy"] == "no-referrer"
+
+
+def test_pages_hold_nothing_the_policy_forbids_and_nothing_from_outside(browser: Any) -> None:
+    for address in ("/", "/episode/trial_0001", "/twin", "/nowhere"):
+        page = browser.get(address).text
+        assert not re.search(r"<script(?![^>]*\bsrc=)", page)
+        assert not re.search(r"\s(style|on\w+)=", page)
+        assert not re.search(r"(src|href|action)=\"(https?:)?//", page)
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("127.0.0.1:8600", 200),
+        ("localhost:1234", 200),
+        ("[::1]:8600", 200),
+        ("evil.example", 400),
+        ("127.0.0.1.evil.example:8600", 400),
+        ("192.168.1.5:8600", 400),
+        ("", 400),
+        ("[::1", 400),
+    ],
+)
+def test_a_foreign_host_name_is_refused(browser: Any, host: str, status: int) -> None:
+    assert browser.get("/", headers={"host": host}).status_code == status
+
+
+def test_an_open_address_asks_for_its_token(synthetic: ModuleType, shared_run: RunFolder) -> None:
+    admission = Admission(host="0.0.0.0", token="secret-token")
+    browser = synthetic.Browser(create_app(Library.open([shared_run.path]), admission))
+    host = {"host": "192.168.1.5:8600"}
+    assert browser.get("/", headers=host).status_code == 403
+    assert browser.get("/static/page.css", headers=host).status_code == 403
+    assert browser.get("/?token=wrong", headers=host).status_code == 403
+    entry = browser.get("/?token=secret-token&show=disagree", headers=host)
+    assert entry.status_code == 303
+    assert entry.headers["location"] == "/?show=disagree"
+    assert "HttpOnly" in entry.headers["set-cookie"]
+    assert "samesite=strict" in entry.headers["set-cookie"].lower()
+    with_cookie = {**host, "cookie": f"{COOKIE}=secret-token"}
+    assert browser.get("/", headers=with_cookie).status_code == 200
+    foreign = {"host": "evil.example", "cookie": f"{COOKIE}=secret-token"}
+    assert browser.get("/", headers=foreign).status_code == 400
+    away = browser.get("//evil.example/?token=secret-token", headers=host)
+    assert not away.headers.get("location", "/").startswith("//")
+
+
+def test_nothing_can_be_written(shared_run: RunFolder) -> None:
+    app = create_app(Library.open([shared_run.path]))
+    methods = {method for route in app.routes for method in getattr(route, "methods", None) or ()}
+    assert methods == {"GET", "HEAD"}

@@ -1,0 +1,196 @@
+"""The command listens where it should, says so, and ends when asked; a real browser sees it."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from bridge.episode.run import RunFolder
+from dashboards.config import DashboardConfig
+from dashboards.errors import AddressTakenError
+from dashboards.guard import Admission, host_name, is_loopback
+from dashboards.server import Address, listen
+
+ROOT = Path(__file__).parents[2]
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+
+
+def test_a_taken_port_is_one_clear_sentence() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(AddressTakenError, match=rf"port {port}: .*in use.*--port 0"):
+            listen(DashboardConfig(port=port))
+
+
+@pytest.mark.parametrize("config", [DashboardConfig(port=70_000), DashboardConfig(port=-1)])
+def test_a_port_that_cannot_be_is_refused(config: DashboardConfig) -> None:
+    with pytest.raises(AddressTakenError, match="between 0 and 65535"):
+        listen(config)
+
+
+def test_an_address_that_is_not_ours_is_refused() -> None:
+    with pytest.raises(AddressTakenError, match=r"cannot listen on 192\.0\.2\.1"):
+        listen(DashboardConfig(host="192.0.2.1", port=0))
+
+
+def test_by_default_only_this_machine_is_listened_to() -> None:
+    with listen(DashboardConfig(port=0)) as listener:
+        host, port = listener.getsockname()
+    assert host == "127.0.0.1"
+    assert port > 0
+
+
+def test_the_address_can_be_opened_and_tunnelled() -> None:
+    address = Address(host="127.0.0.1", port=8600, token=None)
+    assert address.url == "http://127.0.0.1:8600/"
+    assert address.ssh_line.startswith("ssh -L 8600:127.0.0.1:8600 ")
+    assert Address(host="::1", port=1, token=None).url == "http://[::1]:1/"
+    assert Address(host="0.0.0.0", port=1, token="t").url == "http://127.0.0.1:1/?token=t"
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [
+        ("127.0.0.1", True),
+        ("127.8.0.1", True),
+        ("::1", True),
+        ("localhost", True),
+        ("0.0.0.0", False),
+        ("192.168.1.5", False),
+        ("example.org", False),
+    ],
+)
+def test_loopback_is_told_from_the_rest(host: str, expected: bool) -> None:
+    assert is_loopback(host) is expected
+
+
+def test_host_headers_are_split_from_their_port() -> None:
+    assert host_name("LOCALHOST:80") == "localhost"
+    assert host_name("[::1]:80") == "::1"
+    assert host_name("a:b") == ""
+    assert not Admission().admits_host("")
+
+
+@contextmanager
+def dashboard(run: RunFolder) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Start the real command and wait for its address."""
+    command = [
+        sys.executable,
+        "-m",
+        "robot_gst",
+        "dashboard",
+        str(run.path),
+        "--port",
+        "0",
+        "--json",
+    ]
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    try:
+        text = ""
+        while not text.endswith("}\n"):
+            line = process.stdout.readline()
+            assert line, process.stderr.read()
+            text += line
+        yield process, json.loads(text)["url"]
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_command_with_zero(shared_run: RunFolder, kind: int) -> None:
+    with dashboard(shared_run) as (process, url):
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", url)
+        process.send_signal(kind)
+        _, errors = process.communicate(timeout=20)
+        assert process.returncode == 0
+        assert "Traceback" not in errors
+
+
+@pytest.mark.slow
+def test_a_taken_port_ends_the_command_with_one(shared_run: RunFolder) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = str(other.getsockname()[1])
+        done = subprocess.run(
+            [sys.executable, "-m", "robot_gst", "dashboard", str(shared_run.path), "--port", port],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine (Debian: chromium)")
+@pytest.mark.parametrize("page", ["", "episode/trial_0001?t=2.5", "twin"])
+def test_a_real_browser_draws_the_page_without_complaint(
+    shared_run: RunFolder, tmp_path: Path, page: str
+) -> None:
+    picture = tmp_path / "page.png"
+    with dashboard(shared_run) as (_, url):
+        done = _chromium(url + page, picture, tmp_path / "profile")
+        dom = subprocess.run(
+            [*_command(tmp_path / "profile2"), "--dump-dom", url + page],
+            capture_output=True,
+            text=True,
+            timeout=90,
+            check=False,
+        ).stdout
+    complaints = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    assert complaints == []
+    assert picture.stat().st_size > 20_000
+    if page.startswith("episode"):  # the script ran: legends hold values, the Go button is gone
+        assert re.search(r"<output data-value=\"0\">[\d.−]+</output>", dom)
+        assert re.search(r'id="go" hidden=""', dom)
+
+
+def _command(profile: Path) -> list[str]:
+    assert CHROMIUM is not None
+    return [
+        CHROMIUM,
+        *FLAGS,
+        f"--user-data-dir={profile}",
+        "--enable-logging=stderr",
+        "--virtual-time-budget=4000",
+        "--window-size=1280,1600",
+    ]
+
+
+def _chromium(url: str, picture: Path, profile: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*_command(profile), f"--screenshot={picture}", url],
+        capture_output=True,
+        text=True,
+        timeout=90,
+        check=False,
+        env={**os.environ, "HOME": str(profile.parent)},
+    )
