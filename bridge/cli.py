@@ -13,6 +13,7 @@ from cyclopts import Parameter
 from bridge.episode.message import StampedMessage
 from bridge.record.config import EpisodeAbout, RecorderConfig
 from bridge.sources.folder_config import FolderConfig
+from bridge.sources.standin.settings import SessionConfig
 from bridge.terminal import Output
 from bridge.wire.config import DEFAULT_ENDPOINT
 
@@ -20,6 +21,7 @@ OUTPUT = Output()
 ABOUT = EpisodeAbout()
 RECORDER = RecorderConfig()
 FOLDER = FolderConfig()
+STANDIN = SessionConfig()
 LOOPBACK = (DEFAULT_ENDPOINT,)
 
 
@@ -353,6 +355,37 @@ def publish_folder(
     if answer is not None:
         text += f"\n{_describe_answer(answer)}"
     output.result({"sent": sent, "recorded": answer}, text)
+    return 0
+
+
+def publish_standin(
+    *,
+    config: Annotated[SessionConfig, Parameter(name="*")] = STANDIN,
+    connect: tuple[str, ...] = LOOPBACK,
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Run the stand-in cell: a simulated laboratory that records a scan, then trials.
+
+    It needs a recorder (robot-gst record RUN) and, with replanning, a gate (robot-gst gate RUN).
+    SIGINT or SIGTERM finish the open episode.
+    Example: robot-gst publish standin --trials 3 --seed 1
+    Scan only: robot-gst publish standin --trials 0
+
+    Args:
+        config: What the session does.
+        connect: Where the recorder listens.
+        zenoh_config: zenoh configuration (JSON5).
+        output: How to talk.
+    """
+    from bridge.sources.standin.session import describe, run_session
+    from bridge.wire.config import WireConfig
+    from bridge.wire.session import open_session
+
+    wire = WireConfig(connect=connect, config=zenoh_config)
+    with _stop_on_signals() as stop, open_session(wire) as session:
+        summary = run_session(session, config, output, should_stop=stop.is_set)
+    output.result(summary, describe(summary))
     return 0
 
 

@@ -1,0 +1,247 @@
+"""The cell at work: physics, sensors and clock together, publishing as they go."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bridge.clock import ns_from_s
+from bridge.errors import BridgeError
+from bridge.sources.standin.cell_file import CellFile
+from bridge.sources.standin.hidden import HiddenParameters
+from bridge.sources.standin.kinematics import arm_kinematics, tool_down
+from bridge.sources.standin.links import robot_links
+from bridge.sources.standin.render import Renderer
+from bridge.sources.standin.sensor import measure_color, measure_depth
+from bridge.sources.standin.streams import Streams
+from bridge.sources.standin.surfaces import object_surfaces, robot_surfaces, room_surfaces
+from bridge.sources.standin.world import World
+from bridge.sources.standin.world_model import STEP_S
+from bridge.task.predicate import Rollout
+from bridge.task.robot import MAX_WIDTH_M, ur5_with_gripper_urdf
+from bridge.task.task_file import Task
+
+STEPS_PER_TICK = 4
+TICK_NS = ns_from_s(STEP_S * STEPS_PER_TICK)
+"""8 ms: the robot's 125 Hz."""
+GRIPPER_NS = ns_from_s(1 / 50)
+TRUTH_NS = ns_from_s(1 / 30)
+FINGER_SPEED_M_S = 0.15
+"""How fast the gripper's controller closes the opening."""
+HOME_SEED_RAD = (-0.263, -1.709, 1.365, -1.227, -1.571, 1.308)
+SENSOR_STREAM = 303
+
+
+class StoppedError(BridgeError):
+    """Somebody asked the session to end."""
+
+    def __init__(self) -> None:
+        """Say so."""
+        super().__init__("the session was stopped before its end; what was recorded is complete.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellConfig:
+    """How the cell runs; none of it changes its difficulty."""
+
+    rate_hz: float = 5.0
+    """Frames per second of each camera during trials; 0 takes none."""
+    scale: float = 1.0
+    """Resize the images of the cell file (320 x 240)."""
+    real_time: bool = False
+    """Keep pace with the wall clock instead of running as fast as possible."""
+
+
+@dataclass
+class TruthLog:
+    """What really happened since ``clear``, at 30 Hz; the operator looks at this."""
+
+    stamps_ns: list[int] = field(default_factory=list)
+    poses: dict[str, list[Float[np.ndarray, "4 4"]]] = field(default_factory=dict)
+    contact: dict[str, list[bool]] = field(default_factory=dict)
+
+    def clear(self) -> None:
+        """Forget."""
+        self.stamps_ns.clear()
+        self.poses.clear()
+        self.contact.clear()
+
+    def rollout(self) -> Rollout:
+        """Return the record in the form the predicates read."""
+        return Rollout(
+            stamps_ns=np.array(self.stamps_ns, dtype=np.int64),
+            Ts_base_object={key: np.array(rows) for key, rows in self.poses.items()},
+            finger_contact={key: np.array(rows, dtype=bool) for key, rows in self.contact.items()},
+        )
+
+
+class StandinCell:
+    """A laboratory with its own clock, which starts at ``start_ns`` and moves with the physics."""
+
+    def __init__(
+        self,
+        cell: CellFile,
+        task: Task,
+        hidden: HiddenParameters,
+        streams: Streams,
+        *,
+        config: CellConfig,
+        seed: int,
+        start_ns: int,
+        should_stop: Callable[[], bool] = lambda: False,
+        sleep: Callable[[float], None] = time.sleep,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Build the laboratory and wait at home."""
+        self.file, self.task, self.hidden, self.streams = cell, task, hidden, streams
+        self.config = config
+        self.world = World(task, hidden)
+        self.kinematics = arm_kinematics()
+        home = tool_down(np.array(cell.home_m), 0.0)
+        self.home_rad = self.kinematics.joints_for(home, np.array(HOME_SEED_RAD))
+        self.truth = TruthLog()
+        self.now_ns = start_ns
+        self._start_ns = start_ns
+        self._cameras = {
+            key: mount.camera.scaled(config.scale) for key, mount in cell.cameras.items()
+        }
+        self._renderer = Renderer(
+            [*robot_surfaces(robot_links()), *object_surfaces(task), *room_surfaces(seed)]
+        )
+        self._rng = np.random.default_rng([SENSOR_STREAM, seed])
+        self._should_stop = should_stop
+        self._sleep, self._monotonic = sleep, monotonic
+        self._wall_start_s = monotonic()
+        self._target_rad, self._width_m = self.home_rad, MAX_WIDTH_M
+        self._width_target_m = MAX_WIDTH_M
+        self._due = {"gripper": start_ns, "truth": start_ns, "camera": start_ns}
+        self.cameras_running = False
+
+    def reset(self, Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]) -> None:
+        """Bring the arm home with an open gripper and put the objects down."""
+        self._target_rad = self.home_rad
+        self._width_m = self._width_target_m = MAX_WIDTH_M
+        self.world.reset(self.home_rad - self.hidden.joint_offset_rad, Ts_base_object)
+        self.truth.clear()
+
+    def announce(self) -> None:
+        """Publish what a listener needs before anything else: URDF, calibration, frames."""
+        self.streams.description(ur5_with_gripper_urdf(), self.now_ns)
+        for camera_id, camera in self._cameras.items():
+            self.streams.camera_info(camera_id, camera, self.now_ns)
+        fixed = {
+            key: mount.T_parent_camera
+            for key, mount in self.file.cameras.items()
+            if not mount.moving
+        }
+        self.streams.camera_poses(fixed, self.now_ns, static=True)
+        self.streams.depth_frames(self.file.cameras, self.now_ns)
+        self.streams.truth_parameters(self.hidden.to_record(), self.now_ns)
+
+    def wait(self, duration_s: float) -> None:
+        """Hold still."""
+        for _ in range(round(ns_from_s(duration_s) / TICK_NS)):
+            self._tick()
+
+    def skip(self, duration_s: float) -> None:
+        """Let time pass in which nobody looks, for example between two trials."""
+        self.now_ns += ns_from_s(duration_s)
+
+    def follow(
+        self,
+        times_ns: Int[np.ndarray, " num_waypoints"],
+        joints_rad: Float[np.ndarray, "num_waypoints 6"],
+    ) -> None:
+        """Send joint targets, interpolated between waypoints; times count from now."""
+        count = round(int(times_ns[-1]) / TICK_NS)
+        ticks_ns = np.arange(1, count + 1) * TICK_NS
+        columns = [np.interp(ticks_ns, times_ns, joints_rad[:, joint]) for joint in range(6)]
+        for row in np.stack(columns, axis=1):
+            self._target_rad = row
+            self._tick()
+
+    def grip(self, width_m: float) -> None:
+        """Tell the gripper which opening to go to; it moves while time passes."""
+        self._width_target_m = width_m
+
+    @property
+    def target_rad(self) -> Float[np.ndarray, "6"]:
+        """Where the controller wants the arm, in encoder angles."""
+        return self._target_rad
+
+    def _tick(self) -> None:
+        if self._should_stop():
+            raise StoppedError
+        step = FINGER_SPEED_M_S * TICK_NS * 1e-9
+        self._width_m += float(np.clip(self._width_target_m - self._width_m, -step, step))
+        # The controller closes its loop on encoder readings, which are off by a constant.
+        true_target = self._target_rad - self.hidden.joint_offset_rad
+        self.world.command(true_target, self._width_m)
+        for _ in range(STEPS_PER_TICK):
+            self.world.step()
+        self.now_ns += TICK_NS
+        self._publish_robot()
+        if self._is_due("truth", TRUTH_NS):
+            self._publish_truth()
+        rate = self.config.rate_hz
+        if self.cameras_running and rate > 0 and self._is_due("camera", ns_from_s(1 / rate)):
+            self.capture()
+        if self.config.real_time:
+            ahead_s = (self.now_ns - self._start_ns) * 1e-9
+            self._sleep(max(ahead_s - (self._monotonic() - self._wall_start_s), 0.0))
+
+    def _is_due(self, name: str, period_ns: int) -> bool:
+        if self.now_ns < self._due[name]:
+            return False
+        self._due[name] = max(self._due[name] + period_ns, self.now_ns - period_ns // 2)
+        return True
+
+    def _encoders_rad(self) -> Float[np.ndarray, "6"]:
+        noise = self._rng.normal(0.0, self.file.sensors.encoder_noise_rad, 6)
+        return np.asarray(self.world.joints_rad + self.hidden.joint_offset_rad + noise)
+
+    def _publish_robot(self) -> None:
+        encoders = self._encoders_rad()
+        world, streams = self.world, self.streams
+        streams.joints(encoders, world.joint_speeds_rad_s, world.joint_efforts_Nm, self.now_ns)
+        streams.tcp(self.kinematics.T_base_tcp(encoders), self.now_ns)
+        streams.camera_poses(self._believed_moving(encoders), self.now_ns, static=False)
+        if self._is_due("gripper", GRIPPER_NS):
+            streams.gripper(world.width_m, self.now_ns)
+
+    def _believed_moving(
+        self, encoders_rad: Float[np.ndarray, "6"]
+    ) -> dict[str, Float[np.ndarray, "4 4"]]:
+        return {
+            key: self.kinematics.T_base_frame(encoders_rad, mount.parent) @ mount.T_parent_camera
+            for key, mount in self.file.cameras.items()
+            if mount.moving
+        }
+
+    def _publish_truth(self) -> None:
+        contact = self.world.finger_contact()
+        self.truth.stamps_ns.append(self.now_ns)
+        for object_id, T in self.world.Ts_base_object().items():
+            self.streams.truth_object(object_id, T, self.now_ns)
+            self.truth.poses.setdefault(object_id, []).append(T)
+            self.truth.contact.setdefault(object_id, []).append(contact[object_id])
+
+    def true_camera(self, camera_id: str) -> Float[np.ndarray, "4 4"]:
+        """Where a camera really is: true joints, true mounting."""
+        mount = self.file.cameras[camera_id]
+        T_base_parent = np.eye(4)
+        if mount.moving:
+            T_base_parent = self.world.T_base_body(mount.parent)
+        T_base_nominal = T_base_parent @ mount.T_parent_camera
+        return np.asarray(T_base_nominal @ self.hidden.camera_errors[camera_id])
+
+    def capture(self) -> None:
+        """Take and publish one frame of every camera, now."""
+        bodies = {**self.world.Ts_base_link(), **self.world.Ts_base_object()}
+        for camera_id, camera in self._cameras.items():
+            picture = self._renderer.render(camera, self.true_camera(camera_id), bodies)
+            depth = measure_depth(picture, self.file.sensors, self.hidden, self._rng)
+            color = measure_color(picture, self.file.sensors, self.hidden, self._rng)
+            self.streams.frame(camera_id, color, depth, self.now_ns)

@@ -1,0 +1,151 @@
+"""The cell file: what the laboratory publishes of itself, and the ranges of what it hides."""
+
+import tomllib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.errors import UsageError
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.task.data import dataset_file
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraMount:
+    """One camera as the laboratory believes it to be."""
+
+    id: str
+    camera: Camera
+    parent: str
+    """``tool0`` for the wrist camera, ``base_link`` for a fixed one."""
+    T_parent_camera: Float[np.ndarray, "4 4"]
+
+    @property
+    def moving(self) -> bool:
+        """Whether the robot carries it."""
+        return self.parent != "base_link"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorModel:
+    """Noise of cameras and encoders; see the cell file for sources and units."""
+
+    depth_noise_per_m: float
+    """Standard deviation at 1 m [m]; grows with the square of the distance."""
+    depth_min_m: float
+    depth_max_m: float
+    grazing_cosine: float
+    """No depth where the ray meets the surface at a flatter angle."""
+    image_noise: float
+    """Standard deviation in grey levels of 255."""
+    encoder_noise_rad: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannerNoise:
+    """How wrong the scripted planner is, standard deviations."""
+
+    perception_m: float
+    perception_rad: float
+    grasp_along_m: float
+    """Sideways along the pads (tool x), where the fingers can close on nothing."""
+    grasp_across_m: float
+    """In the closing direction (tool y), where a finger can land on the object."""
+    grasp_yaw_rad: float
+    grasp_height_m: float
+    release_m: float
+    reset_m: float
+    """The operator's, when objects are put back to the declared start."""
+    reset_rad: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellFile:
+    """One ``datasets/cells/*.toml``."""
+
+    name: str
+    home_m: tuple[float, float, float]
+    max_joint_speed_rad_s: float
+    cameras: dict[str, CameraMount]
+    uniform: dict[str, tuple[float, float]]
+    normal: dict[str, float]
+    sensors: SensorModel
+    planner: PlannerNoise
+    test_seeds: tuple[int, int]
+    development_seeds: tuple[int, int]
+
+
+def load_cell(name: str) -> CellFile:
+    """Load ``datasets/cells/<name>.toml`` or a TOML file by path.
+
+    Raises:
+        UsageError: Unknown name (lists those that exist), or a file that is no cell.
+    """
+    path = dataset_file("cells", name)
+    try:
+        return _cell_from(tomllib.loads(path.read_text()))
+    except tomllib.TOMLDecodeError as error:
+        message = f"{path} is not valid TOML: {error}."
+        raise UsageError(message) from error
+    except (KeyError, TypeError, ValueError) as error:
+        message = (
+            f"{path} is not a cell file: {type(error).__name__} {error}. "
+            "Compare it with datasets/cells/standin.toml."
+        )
+        raise UsageError(message) from error
+
+
+def _cell_from(table: dict[str, Any]) -> CellFile:
+    if table["schema_version"] > SCHEMA_VERSION:
+        message = f"schema_version {table['schema_version']} is newer than {SCHEMA_VERSION}"
+        raise ValueError(message)
+    x, y, z = table["robot"]["home_m"]
+    return CellFile(
+        name=table["name"],
+        home_m=(x, y, z),
+        max_joint_speed_rad_s=table["robot"]["max_joint_speed_rad_s"],
+        cameras={key: _mount_from(key, value) for key, value in table["cameras"].items()},
+        uniform={key: (low, high) for key, (low, high) in table["hidden"]["uniform"].items()},
+        normal=dict(table["hidden"]["normal"]),
+        sensors=SensorModel(**table["sensors"]),
+        planner=PlannerNoise(**table["planner"]),
+        test_seeds=_pair(table["seeds"]["test"]),
+        development_seeds=_pair(table["seeds"]["development"]),
+    )
+
+
+def _pair(values: list[int]) -> tuple[int, int]:
+    first, last = values
+    return first, last
+
+
+def _mount_from(camera_id: str, table: dict[str, Any]) -> CameraMount:
+    width, height = table["width"], table["height"]
+    camera = Camera(
+        width=width,
+        height=height,
+        fx=table["fx"],
+        fy=table["fy"],
+        cx=table.get("cx", width / 2),
+        cy=table.get("cy", height / 2),
+    )
+    return CameraMount(
+        id=camera_id, camera=camera, parent=table["parent"], T_parent_camera=_mount_pose(table)
+    )
+
+
+def _mount_pose(table: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
+    if "eye_m" in table:
+        up = np.array([0.0, 0.0, 1.0])
+        return se3.look_at(np.array(table["eye_m"]), np.array(table["target_m"]), up)
+    T = np.eye(4)
+    c, s = np.cos(table["tilt_rad"]), np.sin(table["tilt_rad"])
+    tilt = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    T[:3, :3] = np.array(table["R_columns"]).T @ tilt
+    T[:3, 3] = table["p_m"]
+    return T

@@ -1,0 +1,88 @@
+"""One session of the stand-in cell, from the files to the last episode."""
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from bridge.clock import AnchoredClock
+from bridge.sources.standin.cell import CellConfig, StandinCell, StoppedError
+from bridge.sources.standin.cell_file import load_cell
+from bridge.sources.standin.hidden import draw_hidden
+from bridge.sources.standin.operator import Operator
+from bridge.sources.standin.settings import SessionConfig
+from bridge.sources.standin.streams import Session, Streams
+from bridge.task.task_file import load_task
+from bridge.terminal import Output
+
+
+def run_session(
+    session: Session,
+    config: SessionConfig,
+    output: Output,
+    *,
+    should_stop: Callable[[], bool] = lambda: False,
+    start_ns: int | None = None,
+) -> dict[str, Any]:
+    """Record a scan and trials as the configuration says.
+
+    Args:
+        session: Where to publish, and where recorder and gate answer.
+        config: What to do.
+        output: How to talk.
+        should_stop: Asked every 8 ms of the cell's time; the open episode is then finished.
+        start_ns: The cell's time at the start; the wall clock's when not given.
+
+    Returns:
+        Per condition how many trials had which outcome, and whether the session was stopped.
+    """
+    file, task = load_cell(config.cell_file), load_task(config.task)
+    cell = StandinCell(
+        file,
+        task,
+        draw_hidden(file, config.seed),
+        Streams(session, config.cell),
+        config=CellConfig(
+            rate_hz=config.rate_hz, scale=config.image_scale, real_time=config.real_time
+        ),
+        seed=config.seed,
+        start_ns=AnchoredClock().now_ns() if start_ns is None else start_ns,
+        should_stop=should_stop,
+    )
+    operator = Operator(cell, session, config, output)
+    stopped = False
+    try:
+        if config.scan:
+            operator.scan()
+        operator.trials()
+    except StoppedError:
+        stopped = True
+    finally:
+        operator.abandon()
+    return _summary(operator, config, stopped=stopped)
+
+
+def _summary(operator: Operator, config: SessionConfig, *, stopped: bool) -> dict[str, Any]:
+    counts: dict[str, Counter[str]] = {}
+    for info, outcome in operator.results:
+        counts.setdefault(info.condition, Counter())[outcome.result] += 1
+    return {
+        "stand_in": True,
+        "cell": config.cell,
+        "task": config.task,
+        "seed": config.seed,
+        "scan": operator.scanned,
+        "outcomes": {condition: dict(counter) for condition, counter in counts.items()},
+        "stopped": stopped,
+    }
+
+
+def describe(summary: dict[str, Any]) -> str:
+    """A few lines for a person."""
+    lines = [f"stand-in cell {summary['cell']}: scan {'recorded' if summary['scan'] else 'none'}"]
+    for condition, counts in summary["outcomes"].items():
+        total = sum(counts.values())
+        listed = ", ".join(f"{count} {result}" for result, count in sorted(counts.items()))
+        lines.append(f"  {condition}: {total} trials, {listed}")
+    if summary["stopped"]:
+        lines.append("  stopped before the end")
+    return "\n".join(lines)

@@ -1,0 +1,45 @@
+"""What a session does; imports nothing heavy, so that the command can show its flags."""
+
+from dataclasses import dataclass
+
+CONDITIONS = ("without_replanning", "with_replanning")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SessionConfig:
+    """What the stand-in cell's operator does in one session."""
+
+    cell: str = "standin"
+    """Name of the cell in topics."""
+    cell_file: str = "standin"
+    """Cell file: a name in datasets/cells or a path."""
+    task: str = "cube_into_box"
+    """Task file: a name in datasets/tasks or a path."""
+    seed: int = 0
+    """Draws the hidden laboratory and the starts; same seed, same session."""
+    scan: bool = True
+    """Record a scan first."""
+    scan_id: str = "scan_0001"
+    """Name of the scan's episode."""
+    trials: int = 3
+    """Starts to try, each once per condition; 0 records the scan only."""
+    conditions: tuple[str, ...] = CONDITIONS
+    """without_replanning, with_replanning or both."""
+    first_trial: int = 1
+    """Number of the first trial's episode."""
+    rounds: int = 5
+    """Plans the gate may see per trial."""
+    gate_cell: str = ""
+    """Cell name the gate was started with; empty: the same."""
+    gate_timeout_s: float = 120.0
+    """How long to wait for a verdict."""
+    execute_unverified: bool = False
+    """With replanning, execute also when no verdict comes; the record says so."""
+    recorder: str = "main"
+    """Which recorder to start and stop."""
+    rate_hz: float = 5.0
+    """Frames per second of each camera during trials."""
+    image_scale: float = 1.0
+    """Resize the images of the cell file (320 x 240)."""
+    real_time: bool = False
+    """Keep pace with the wall clock instead of running as fast as possible."""

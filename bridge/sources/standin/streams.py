@@ -1,0 +1,209 @@
+"""The topics of the cell on the wire, with their types; knows nothing of physics."""
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float, UInt8, UInt16
+
+from bridge.clock import split_ns
+from bridge.episode import schema
+from bridge.episode.records import (
+    CameraInfo,
+    CompressedColor,
+    DepthImage,
+    FrameTransform,
+    JointSample,
+    PoseSample,
+    joint_trajectory_to_cdr,
+    string_to_cdr,
+    transforms_to_cdr,
+)
+from bridge.geometry.camera import Camera
+from bridge.media.color import encode_jpeg
+from bridge.task.plan import Plan
+from bridge.task.record import check_record
+from bridge.task.robot import ARM_JOINTS, BASE_FRAME
+from bridge.task.verdict import Verdict
+
+GRIPPER_JOINT = "gripper_width"
+TRUTH_PARAMETERS = f"{schema.TRUTH_PREFIX}parameters"
+
+
+class Publisher(Protocol):
+    """What a topic is written to."""
+
+    def put(self, data: bytes, *, source_ns: int) -> None:
+        """Send one message."""
+
+
+class Session(Protocol):
+    """The part of ``bridge.wire.session.WireSession`` that the cell uses."""
+
+    def publisher(self, topic: str, type_name: str, *, block: bool = True) -> Publisher:
+        """Announce a topic."""
+
+    def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
+        """Ask and wait."""
+
+
+def color_frame(camera_id: str) -> str:
+    """Frame in which colour images are taken."""
+    return f"{camera_id}_color_optical"
+
+
+def depth_frame(camera_id: str) -> str:
+    """Frame in which depth images are taken."""
+    return f"{camera_id}_depth_optical"
+
+
+class Streams:
+    """One method per kind of message; a topic is announced when it is first used."""
+
+    def __init__(self, session: Session, cell: str) -> None:
+        """Publish under ``/<cell>/``."""
+        self._session = session
+        self._cell = cell
+        self._publishers: dict[str, Publisher] = {}
+
+    def _put(self, topic: str, data: bytes, stamp_ns: int, type_name: str | None = None) -> None:
+        publisher = self._publishers.get(topic)
+        if publisher is None:
+            known = type_name or schema.type_of_topic(topic)
+            publisher = self._session.publisher(topic, known or schema.STRING, block=True)
+            self._publishers[topic] = publisher
+        publisher.put(data, source_ns=stamp_ns)
+
+    def description(self, urdf: str, stamp_ns: int) -> None:
+        """Publish the robot's URDF."""
+        self._put("/robot_description", string_to_cdr(urdf), stamp_ns)
+
+    def camera_poses(
+        self, poses: Mapping[str, Float[np.ndarray, "4 4"]], stamp_ns: int, *, static: bool
+    ) -> None:
+        """Publish where the colour cameras are believed to be in ``base_link``."""
+        items = [
+            FrameTransform(
+                stamp_ns=stamp_ns, parent=BASE_FRAME, child=color_frame(camera_id), T_parent_child=T
+            )
+            for camera_id, T in poses.items()
+        ]
+        if items:
+            self._put("/tf_static" if static else "/tf", transforms_to_cdr(items), stamp_ns)
+
+    def depth_frames(self, camera_ids: Iterable[str], stamp_ns: int) -> None:
+        """Publish that depth is aligned: each depth frame coincides with its colour frame."""
+        items = [
+            FrameTransform(
+                stamp_ns=stamp_ns,
+                parent=color_frame(camera_id),
+                child=depth_frame(camera_id),
+                T_parent_child=np.eye(4),
+            )
+            for camera_id in camera_ids
+        ]
+        self._put("/tf_static", transforms_to_cdr(items), stamp_ns)
+
+    def camera_info(self, camera_id: str, camera: Camera, stamp_ns: int) -> None:
+        """Publish the intrinsics of colour and (aligned) depth."""
+        for stream, frame in (("color", color_frame(camera_id)), ("depth", depth_frame(camera_id))):
+            info = CameraInfo(stamp_ns=stamp_ns, frame_id=frame, camera=camera)
+            self._put(f"/{self._cell}/cam/{camera_id}/{stream}/info", info.to_cdr(), stamp_ns)
+
+    def frame(
+        self,
+        camera_id: str,
+        image_u8: UInt8[np.ndarray, "height width 3"],
+        depth_mm: UInt16[np.ndarray, "height width"],
+        stamp_ns: int,
+    ) -> None:
+        """Publish colour and depth of one instant."""
+        color = CompressedColor(
+            stamp_ns=stamp_ns,
+            frame_id=color_frame(camera_id),
+            format="jpeg",
+            data=encode_jpeg(image_u8),
+        )
+        depth = DepthImage(stamp_ns=stamp_ns, frame_id=depth_frame(camera_id), depth_mm=depth_mm)
+        prefix = f"/{self._cell}/cam/{camera_id}"
+        self._put(f"{prefix}/color/image", color.to_cdr(), stamp_ns)
+        self._put(f"{prefix}/depth/image", depth.to_cdr(), stamp_ns)
+
+    def joints(
+        self,
+        position: Float[np.ndarray, "6"],
+        velocity: Float[np.ndarray, "6"],
+        effort: Float[np.ndarray, "6"],
+        stamp_ns: int,
+    ) -> None:
+        """Publish what the encoders say."""
+        sample = JointSample(
+            stamp_ns=stamp_ns,
+            names=ARM_JOINTS,
+            position=position,
+            velocity=velocity,
+            effort=effort,
+        )
+        self._put(f"/{self._cell}/joint_states", sample.to_cdr(), stamp_ns)
+
+    def gripper(self, width_m: float, stamp_ns: int) -> None:
+        """Publish the distance between the pads."""
+        sample = JointSample(
+            stamp_ns=stamp_ns,
+            names=(GRIPPER_JOINT,),
+            position=np.array([width_m]),
+            velocity=np.zeros(0),
+            effort=np.zeros(0),
+        )
+        self._put(f"/{self._cell}/gripper/state", sample.to_cdr(), stamp_ns)
+
+    def tcp(self, T_base_tcp: Float[np.ndarray, "4 4"], stamp_ns: int) -> None:
+        """Publish the controller's own forward kinematics."""
+        sample = PoseSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=T_base_tcp)
+        self._put(f"/{self._cell}/tcp/pose", sample.to_cdr(), stamp_ns, schema.POSE_STAMPED)
+
+    def truth_object(
+        self, object_id: str, T_base_object: Float[np.ndarray, "4 4"], stamp_ns: int
+    ) -> None:
+        """Publish a true pose, for tests and the evaluator's perception metrics only."""
+        sample = PoseSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=T_base_object)
+        topic = f"{schema.TRUTH_PREFIX}object/{object_id}/pose"
+        self._put(topic, sample.to_cdr(), stamp_ns)
+
+    def truth_parameters(self, record: Mapping[str, Any], stamp_ns: int) -> None:
+        """Publish the hidden parameters as JSON text, under truth only."""
+        self._put(TRUTH_PARAMETERS, string_to_cdr(json.dumps(record)), stamp_ns, schema.STRING)
+
+    def plan(self, plan: Plan, stamp_ns: int) -> None:
+        """Publish a plan: the authority, and two forms of it for viewers."""
+        self._put(f"/{self._cell}/plan", plan.to_json(), stamp_ns)
+        times = [waypoint.t_ns for waypoint in plan.tau]
+        joints = np.array([waypoint.joints_rad for waypoint in plan.tau], dtype=np.float64)
+        trajectory = joint_trajectory_to_cdr(
+            stamp_ns=stamp_ns, names=plan.joint_names, times_ns=times, positions_rad=joints
+        )
+        self._put(f"/{self._cell}/plan/trajectory", trajectory, stamp_ns)
+        self._put(f"/{self._cell}/plan/path", _path_json(plan, stamp_ns), stamp_ns)
+
+    def verdict(self, verdict: Verdict, stamp_ns: int) -> None:
+        """Publish what the gate answered."""
+        self._put(f"/{self._cell}/verdict", verdict.to_json(), stamp_ns)
+
+    def event(self, kind: str, stamp_ns: int, **fields: Any) -> None:
+        """Publish one event; the schema lists the kinds and the fields."""
+        record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, **fields}
+        check_record(record, name="event", package="bridge.episode")
+        self._put(f"/{self._cell}/event", json.dumps(record).encode(), stamp_ns)
+
+
+def _path_json(plan: Plan, stamp_ns: int) -> bytes:
+    sec, nsec = split_ns(stamp_ns)
+    poses = []
+    for waypoint in plan.tau:
+        position = dict(zip("xyz", waypoint.p_m, strict=True))
+        orientation = dict(zip("wxyz", waypoint.q_wxyz, strict=True))
+        poses.append({"position": position, "orientation": orientation})
+    record = {"timestamp": {"sec": sec, "nsec": nsec}, "frame_id": plan.frame, "poses": poses}
+    check_record(record, name="poses_in_frame", package="bridge.episode")
+    return json.dumps(record, separators=(",", ":")).encode()

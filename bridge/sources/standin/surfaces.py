@@ -1,0 +1,170 @@
+"""What the cameras can see: triangles, smooth normals and colours of every body."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import open3d
+from jaxtyping import Float, Int
+
+from bridge.geometry import se3
+from bridge.sources.standin.links import LinkModel, LinkShape
+from bridge.sources.standin.textures import Texture, room_texture, table_texture
+from bridge.sources.standin.world_model import TABLE_CENTRE_M, TABLE_SIZE_M
+from bridge.task.robot import FINGER_LINKS
+from bridge.task.task_file import Task
+
+CREASE_COSINE = 0.8
+"""Faces that meet at a sharper angle keep an edge."""
+FLOOR_Z_M = -0.72
+ROOM_MIN_M = (-1.3, -1.7)
+ROOM_MAX_M = (2.0, 1.7)
+ROOM_HEIGHT_M = 2.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """One coloured body; vertices are in the frame ``body``, which moves (``""``: the room)."""
+
+    body: str
+    vertices_m: Float[np.ndarray, "num_vertices 3"]
+    triangles: Int[np.ndarray, "num_triangles 3"]
+    corner_normals: Float[np.ndarray, "num_triangles 3 3"]
+    color: tuple[float, float, float]
+    texture: Texture | None = None
+    texture_axes: tuple[int, int] = (0, 1)
+    """Which coordinates of the body lie along the texture's columns and rows."""
+    texture_shift_m: tuple[float, float] = (0.0, 0.0)
+
+
+def box_surface(
+    body: str,
+    centre_m: Float[np.ndarray, "3"],
+    size_m: Float[np.ndarray, "3"],
+    color: tuple[float, float, float],
+) -> Surface:
+    """A box with hard edges."""
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    faces = np.array(
+        [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    )
+    triangles = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+    return make_surface(body, corners * size_m + centre_m, triangles, color)
+
+
+def make_surface(
+    body: str,
+    vertices_m: Float[np.ndarray, "num_vertices 3"],
+    triangles: Int[np.ndarray, "num_triangles 3"],
+    color: tuple[float, float, float],
+) -> Surface:
+    """Attach normals that are smooth within a crease and broken across it."""
+    a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
+    weighted = np.cross(b - a, c - a)
+    length = np.linalg.norm(weighted, axis=1, keepdims=True)
+    flat = weighted / np.maximum(length, 1e-12)
+    corner = np.zeros((len(triangles), 3, 3))
+    around: list[list[int]] = [[] for _ in range(len(vertices_m))]
+    for index, triangle in enumerate(triangles):
+        for vertex in triangle:
+            around[vertex].append(index)
+    for index, triangle in enumerate(triangles):
+        for k, vertex in enumerate(triangle):
+            near = np.array(around[vertex])
+            smooth = near[flat[near] @ flat[index] > CREASE_COSINE]
+            total = weighted[smooth].sum(axis=0) if len(smooth) else flat[index]
+            corner[index, k] = total / max(float(np.linalg.norm(total)), 1e-12)
+    return Surface(
+        body=body,
+        vertices_m=vertices_m.astype(np.float32),
+        triangles=triangles.astype(np.uint32),
+        corner_normals=corner.astype(np.float32),
+        color=color,
+    )
+
+
+def robot_surfaces(links: list[LinkModel]) -> list[Surface]:
+    """The arm in light grey with blue caps at its joints' housings, the gripper dark."""
+    surfaces = []
+    for link in links:
+        for shape in link.shapes:
+            color = _LINK_COLORS.get(link.name, (0.72, 0.73, 0.75))
+            if link.name in FINGER_LINKS:
+                color = (0.20, 0.20, 0.22)
+            surfaces.append(_shape_surface(link.name, shape, color))
+    return surfaces
+
+
+_LINK_COLORS = {
+    "base_link": (0.45, 0.46, 0.48),
+    "shoulder_link": (0.50, 0.62, 0.72),
+    "wrist_1_link": (0.50, 0.62, 0.72),
+    "wrist_3_link": (0.60, 0.61, 0.63),
+    "gripper_base": (0.32, 0.33, 0.36),
+}
+
+
+def _shape_surface(body: str, shape: LinkShape, color: tuple[float, float, float]) -> Surface:
+    if shape.box_m is not None:
+        return box_surface(body, shape.T_link_shape[:3, 3], np.array(shape.box_m), color)
+    mesh = open3d.io.read_triangle_mesh(Path(str(shape.mesh)))
+    mesh.merge_close_vertices(1e-6)
+    vertices = se3.apply(shape.T_link_shape, np.asarray(mesh.vertices))
+    return make_surface(body, vertices, np.asarray(mesh.triangles).astype(np.int64), color)
+
+
+def object_surfaces(task: Task) -> list[Surface]:
+    """The task's objects in their declared colours."""
+    surfaces = []
+    for object_id, model in task.objects.items():
+        red, green, blue = (channel / 255 for channel in model.color_srgb)
+        for centre, size in model.panels():
+            surfaces.append(box_surface(object_id, centre, size, (red, green, blue)))
+    return surfaces
+
+
+def room_surfaces(seed: int) -> list[Surface]:
+    """Table top with its texture, floor and four walls."""
+    x, y, z = TABLE_SIZE_M
+    texture = table_texture((x, y), TABLE_CENTRE_M, seed)
+    top = box_surface(
+        "", np.array([*TABLE_CENTRE_M, -z / 2]), np.array(TABLE_SIZE_M), (0.7, 0.56, 0.4)
+    )
+    return [_textured(top, texture, (0, 1), (0.0, 0.0)), *_room_shell(seed)]
+
+
+def _room_shell(seed: int) -> list[Surface]:
+    (x0, y0), (x1, y1) = ROOM_MIN_M, ROOM_MAX_M
+    z0, height = FLOOR_Z_M, ROOM_HEIGHT_M
+    mid = (z0 + height) / 2
+    walls = (
+        (np.array([(x0 + x1) / 2, (y0 + y1) / 2, z0 - 0.01]), (x1 - x0, y1 - y0, 0.02), (0, 1)),
+        (np.array([x0, (y0 + y1) / 2, mid]), (0.02, y1 - y0, height - z0), (1, 2)),
+        (np.array([x1, (y0 + y1) / 2, mid]), (0.02, y1 - y0, height - z0), (1, 2)),
+        (np.array([(x0 + x1) / 2, y0, mid]), (x1 - x0, 0.02, height - z0), (0, 2)),
+        (np.array([(x0 + x1) / 2, y1, mid]), (x1 - x0, 0.02, height - z0), (0, 2)),
+    )
+    colors = ((0.50, 0.52, 0.53), *((0.78, 0.79, 0.76),) * 4)
+    surfaces = []
+    for index, ((centre, size, axes), color) in enumerate(zip(walls, colors, strict=True)):
+        extents = np.array(size)
+        texture = room_texture((size[axes[0]], size[axes[1]]), color, seed + index)
+        corner = centre - extents / 2
+        surface = box_surface("", centre, extents, color)
+        surfaces.append(_textured(surface, texture, axes, (corner[axes[0]], corner[axes[1]])))
+    return surfaces
+
+
+def _textured(
+    surface: Surface, texture: Texture, axes: tuple[int, int], shift_m: tuple[float, float]
+) -> Surface:
+    return Surface(
+        body=surface.body,
+        vertices_m=surface.vertices_m,
+        triangles=surface.triangles,
+        corner_normals=surface.corner_normals,
+        color=surface.color,
+        texture=texture,
+        texture_axes=axes,
+        texture_shift_m=(float(shift_m[0]), float(shift_m[1])),
+    )
