@@ -43,7 +43,7 @@ def fuse(points: list[PointSet], config: InitialiseConfig) -> GaussianCloud:
         inverse, kept, sizes = _voxels(p, level, base * growth)
         if kept.sum() <= config.max_splats:
             break
-        growth *= 1.02 * float(np.sqrt(kept.sum() / config.max_splats))
+        growth *= 1.05 * float(np.sqrt(kept.sum() / config.max_splats))
     if not kept.any():
         raise NoSurfaceError(_no_surface(len(p)))
     count = np.bincount(inverse, minlength=len(kept))[kept]

@@ -10,6 +10,10 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 
 NEAR_M = 0.05
+NORMAL_REACH_PX = 2
+"""Normals come from the pixels this far to each side."""
+OCCLUSION_CELL_PX = 4
+"""Size of the cells in which the nearest point hides those behind it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,126 +28,143 @@ class PointSet:
     """Size of a colour pixel at the point, z/f."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class DepthLimits:
+    """Which depth measurements are trusted."""
+
+    max_depth_m: float
+    """Depth beyond is left out."""
+    flying_fraction: float
+    """A pixel flies when its depth differs from a neighbour's by more than this share."""
+
+
 def trusted_depth_mask(
-    depth_m: Float[np.ndarray, "height width"], *, flying_fraction: float, max_depth_m: float
+    depth_m: Float[np.ndarray, "height width"], limits: DepthLimits
 ) -> Bool[np.ndarray, "height width"]:
     """Mark measurements that exist, are near enough, and do not fly between two surfaces.
 
-    0 is "no measurement" and never passes. A pixel flies when its depth differs from that of a
-    neighbour by more than ``flying_fraction``.
+    0 is "no measurement" and never passes, and neither do its neighbours.
     """
-    valid = (depth_m > NEAR_M) & (depth_m < max_depth_m)
-    flying = np.zeros_like(valid)
-    for axis in (0, 1):
-        step = np.abs(np.diff(depth_m, axis=axis))
-        near = np.minimum(
-            np.take(depth_m, range(depth_m.shape[axis] - 1), axis=axis),
-            np.take(depth_m, range(1, depth_m.shape[axis]), axis=axis),
+    trusted = (depth_m > NEAR_M) & (depth_m < limits.max_depth_m)
+    for before, after in (
+        ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
+        ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
+    ):
+        near, far = depth_m[before], depth_m[after]
+        jump = np.abs(near - far) > limits.flying_fraction * np.minimum(near, far)
+        trusted[before] &= ~jump
+        trusted[after] &= ~jump
+    return trusted
+
+
+class FrameSurface:
+    """The trusted surface points of one frame; what initialisation and fit both start from."""
+
+    def __init__(self, frame: RgbdFrame, limits: DepthLimits) -> None:
+        """Find the trusted pixels and carry them to the colour camera."""
+        self.frame = frame
+        depth = frame.depth_m.astype(np.float32, copy=False)
+        self.trusted = trusted_depth_mask(depth, limits)
+        camera = frame.depth_camera
+        column = ((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx).astype(np.float32)
+        row = ((np.arange(camera.height) + 0.5 - camera.cy) / camera.fy).astype(np.float32)
+        self._p_depth = np.stack([depth * column, depth * row[:, None], depth])
+
+    def points(self, stride: int = 1) -> PointSet:
+        """Every ``stride``-th pixel of every ``stride``-th row as an oriented, coloured point.
+
+        Depth and colour cameras may differ; points outside the colour image, or hidden from the
+        colour camera by a nearer surface, are left out.
+        """
+        row, column = self._interior(stride)
+        normals = self._normals(row, column)
+        p_depth = self._p_depth[:, row, column]
+        p_color = _carry(self._T_color_depth(), p_depth)
+        u, v = _pixels(self.frame.color_camera, p_color)
+        seen = _seen(u, v, p_color[2], self.frame.color_camera)
+        T = self.frame.T_base_depth
+        return PointSet(
+            p_m=np.ascontiguousarray(_carry(T, p_depth[:, seen]).T),
+            normals=np.ascontiguousarray(_turn(T, normals[:, seen]).T),
+            colors=_sample(self.frame.image_u8, u[seen], v[seen]),
+            footprint_m=p_color[2, seen] / np.float32(self.frame.color_camera.fx),
         )
-        jump = step > flying_fraction * near
-        before = [slice(None)] * 2
-        after = [slice(None)] * 2
-        before[axis], after[axis] = slice(None, -1), slice(1, None)
-        flying[tuple(before)] |= jump
-        flying[tuple(after)] |= jump
-    return valid & ~flying
+
+    def depth_in_color_camera(self) -> Float32[np.ndarray, "height width"]:
+        """Depth along the colour camera's axis at its size; 0 where unknown.
+
+        Of several measurements in one pixel the nearest counts.
+        """
+        camera = self.frame.color_camera
+        p = _carry(self._T_color_depth(), self._p_depth[:, self.trusted])
+        u, v = _pixels(camera, p)
+        inside = (p[2] > NEAR_M) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        index = v[inside].astype(np.int32) * camera.width + u[inside].astype(np.int32)
+        nearest = np.full(camera.width * camera.height, np.inf, dtype=np.float32)
+        np.minimum.at(nearest, index, p[2, inside])
+        nearest[~np.isfinite(nearest)] = 0.0
+        return nearest.reshape(camera.height, camera.width)
+
+    def _T_color_depth(self) -> Float[np.ndarray, "4 4"]:
+        return se3.invert(self.frame.T_base_color) @ self.frame.T_base_depth
+
+    def _interior(self, stride: int) -> tuple[np.ndarray, np.ndarray]:
+        """Trusted pixels on the grid whose neighbours at the normal's reach are trusted too."""
+        inner = self.trusted[NORMAL_REACH_PX:-NORMAL_REACH_PX, NORMAL_REACH_PX:-NORMAL_REACH_PX]
+        row, column = np.nonzero(inner[::stride, ::stride])
+        row, column = row * stride + NORMAL_REACH_PX, column * stride + NORMAL_REACH_PX
+        ok = np.ones(len(row), dtype=bool)
+        for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+            ok &= self.trusted[row + down * NORMAL_REACH_PX, column + right * NORMAL_REACH_PX]
+        return row[ok], column[ok]
+
+    def _normals(self, row: np.ndarray, column: np.ndarray) -> Float32[np.ndarray, "3 num_points"]:
+        """Cross product of central differences, unit length, facing the depth camera."""
+        p, reach = self._p_depth, NORMAL_REACH_PX
+        ax, ay, az = p[:, row, column + reach] - p[:, row, column - reach]
+        bx, by, bz = p[:, row + reach, column] - p[:, row - reach, column]
+        n = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+        n /= np.maximum(np.sqrt(np.square(n).sum(axis=0)), np.float32(1e-12))
+        away = (n * p[:, row, column]).sum(axis=0) > 0
+        return np.where(away, -n, n)
 
 
-def frame_points(
-    frame: RgbdFrame, *, flying_fraction: float, max_depth_m: float, stride: int = 1
-) -> PointSet:
-    """Back-project the depth image and look each point up in the colour image.
-
-    Depth and colour cameras may differ; points outside the colour image, or hidden from the
-    colour camera by a nearer surface, are left out.
-    """
-    trusted = trusted_depth_mask(
-        frame.depth_m, flying_fraction=flying_fraction, max_depth_m=max_depth_m
-    )
-    p_depth = frame.depth_camera.unproject(frame.depth_m)
-    normals, has_normal = _normals(p_depth, trusted)
-    chosen = np.zeros_like(trusted)
-    chosen[::stride, ::stride] = True
-    chosen &= has_normal
-    p_base = se3.apply(frame.T_base_depth, p_depth[chosen])
-    p_color = se3.apply(se3.invert(frame.T_base_color), p_base)
-    uv, z = frame.color_camera.project(np.where(p_color[:, 2:] > NEAR_M, p_color, 1.0))
-    seen = _seen(uv, z, frame.color_camera, p_color[:, 2] > NEAR_M)
-    return PointSet(
-        p_m=p_base[seen].astype(np.float32),
-        normals=(normals[chosen][seen] @ frame.T_base_depth[:3, :3].T).astype(np.float32),
-        colors=_sample(frame.image_u8, uv[seen]),
-        footprint_m=(z[seen] / frame.color_camera.fx).astype(np.float32),
-    )
+def _turn(T: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Rotate vectors given as three rows (fast in float32, unlike a 3x3 matrix product)."""
+    R = T[:3, :3].astype(np.float32)
+    return np.stack([R[i, 0] * v[0] + R[i, 1] * v[1] + R[i, 2] * v[2] for i in range(3)])
 
 
-def _normals(
-    p: Float[np.ndarray, "height width 3"], trusted: Bool[np.ndarray, "height width"]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Cross product of central differences over 5 pixels; facing the camera."""
-    reach = 2
-    normals = np.zeros_like(p)
-    ok = np.zeros_like(trusted)
-    inner = (slice(reach, -reach), slice(reach, -reach))
-    left, right = p[reach:-reach, : -2 * reach], p[reach:-reach, 2 * reach :]
-    up, down = p[: -2 * reach, reach:-reach], p[2 * reach :, reach:-reach]
-    across = np.cross(down - up, right - left)
-    length = np.linalg.norm(across, axis=-1, keepdims=True)
-    across = across / np.maximum(length, 1e-12)
-    facing = np.sum(across * p[inner], axis=-1, keepdims=True) < 0
-    normals[inner] = np.where(facing, across, -across)
-    ok[inner] = (
-        trusted[inner]
-        & trusted[reach:-reach, : -2 * reach]
-        & trusted[reach:-reach, 2 * reach :]
-        & trusted[: -2 * reach, reach:-reach]
-        & trusted[2 * reach :, reach:-reach]
-        & (length[..., 0] > 1e-12)
-    )
-    return normals, ok
+def _carry(T: np.ndarray, p: np.ndarray) -> np.ndarray:
+    moved: np.ndarray = _turn(T, p) + T[:3, 3:].astype(np.float32)
+    return moved
 
 
-def _seen(uv: np.ndarray, z: np.ndarray, camera: Camera, in_front: np.ndarray) -> np.ndarray:
+def _pixels(camera: Camera, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    inverse = 1.0 / np.maximum(p[2], np.float32(NEAR_M))
+    u = np.float32(camera.fx) * p[0] * inverse + np.float32(camera.cx)
+    v = np.float32(camera.fy) * p[1] * inverse + np.float32(camera.cy)
+    return u, v
+
+
+def _seen(u: np.ndarray, v: np.ndarray, z: np.ndarray, camera: Camera) -> np.ndarray:
     """Points inside the image and not behind a nearer one of the same 4-pixel cell."""
-    inside = in_front & (uv[:, 0] >= 1) & (uv[:, 0] < camera.width - 1)
-    inside &= (uv[:, 1] >= 1) & (uv[:, 1] < camera.height - 1)
-    cell = 4
-    columns = camera.width // cell + 1
-    index = (uv[inside, 1] // cell).astype(int) * columns + (uv[inside, 0] // cell).astype(int)
-    nearest = np.full(columns * (camera.height // cell + 1), np.inf)
-    np.minimum.at(nearest, index, z[inside])
-    seen: np.ndarray = inside.copy()
-    seen[inside] = z[inside] < nearest[index] * 1.05 + 0.02
+    seen: np.ndarray = (z > NEAR_M) & (u >= 1) & (u < camera.width - 1)
+    seen &= (v >= 1) & (v < camera.height - 1)
+    columns = camera.width // OCCLUSION_CELL_PX + 1
+    index = (v[seen] / OCCLUSION_CELL_PX).astype(np.int32) * columns
+    index += (u[seen] / OCCLUSION_CELL_PX).astype(np.int32)
+    nearest = np.full(columns * (camera.height // OCCLUSION_CELL_PX + 1), np.inf, np.float32)
+    np.minimum.at(nearest, index, z[seen])
+    seen[seen] = z[seen] < nearest[index] * 1.05 + 0.02
     return seen
 
 
-def _sample(image_u8: np.ndarray, uv: np.ndarray) -> np.ndarray:
+def _sample(image_u8: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Bilinear lookup; pixel centres at +0.5."""
-    x, y = uv[:, 0] - 0.5, uv[:, 1] - 0.5
-    x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
+    x, y = u - np.float32(0.5), v - np.float32(0.5)
+    x0, y0 = x.astype(np.int32), y.astype(np.int32)
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
     top = image_u8[y0, x0] * (1 - fx) + image_u8[y0, x0 + 1] * fx
     bottom = image_u8[y0 + 1, x0] * (1 - fx) + image_u8[y0 + 1, x0 + 1] * fx
-    return ((top * (1 - fy) + bottom * fy) / 255.0).astype(np.float32)
-
-
-def depth_in_color_camera(
-    frame: RgbdFrame, camera: Camera, *, flying_fraction: float, max_depth_m: float
-) -> Float32[np.ndarray, "height width"]:
-    """Depth along the colour camera's axis at the size of ``camera``; 0 where unknown.
-
-    ``camera`` is the frame's colour camera, possibly resized. Of several measurements in one
-    pixel the nearest counts.
-    """
-    trusted = trusted_depth_mask(
-        frame.depth_m, flying_fraction=flying_fraction, max_depth_m=max_depth_m
-    )
-    p_depth = frame.depth_camera.unproject(frame.depth_m)[trusted]
-    T_color_depth = se3.invert(frame.T_base_color) @ frame.T_base_depth
-    uv, z = camera.project(se3.apply(T_color_depth, p_depth))
-    inside = (z > NEAR_M) & (uv[:, 0] >= 0) & (uv[:, 0] < camera.width)
-    inside &= (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
-    column, row = uv[inside, 0].astype(int), uv[inside, 1].astype(int)
-    nearest = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
-    np.minimum.at(nearest, (row, column), z[inside].astype(np.float32))
-    return np.where(np.isfinite(nearest), nearest, np.float32(0.0))
+    return ((top * (1 - fy) + bottom * fy) * np.float32(1 / 255)).astype(np.float32)

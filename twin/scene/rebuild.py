@@ -15,7 +15,7 @@ from twin.scene.frames import FrameChoice, Sources, choose_frames, find_sources,
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.initialise import fuse
 from twin.scene.ply import write_ply
-from twin.scene.points import PointSet, frame_points
+from twin.scene.points import DepthLimits, FrameSurface, PointSet
 from twin.scene.raster import RasterConfig, load_native
 from twin.scene.settings import RebuildConfig
 from twin.scene.store import BACKGROUND, SCENE_VERSION, read_record, write_record
@@ -87,16 +87,15 @@ def _already_done(run: RunFolder, sources: Sources, key: str) -> dict[str, Any] 
 def _learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output) -> _Learnt:
     total = sum(len(choice.train_ns) for choice in choices)
     learnt = _Learnt(points=[], views=[])
+    limits = DepthLimits(
+        max_depth_m=config.frames.max_depth_m, flying_fraction=config.initialise.flying_fraction
+    )
     with output.progress("read frames", total) as advance:
         for choice in choices:
             for frame in load(choice, choice.train_ns):
-                stride = _stride(total, frame.depth_m.size)
-                limits = {
-                    "flying_fraction": config.initialise.flying_fraction,
-                    "max_depth_m": config.frames.max_depth_m,
-                }
-                learnt.points.append(frame_points(frame, stride=stride, **limits))
-                learnt.views.append(training_view(frame, **limits))
+                surface = FrameSurface(frame, limits)
+                learnt.points.append(surface.points(_stride(total, frame.depth_m.size)))
+                learnt.views.append(training_view(surface))
                 advance(len(learnt.views), f"camera {frame.camera_id}")
     return learnt
 

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from bridge.episode.streams import RgbdFrame
 from bridge.geometry.camera import Camera
-from twin.scene.points import depth_in_color_camera
+from twin.scene.points import FrameSurface
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,32 +34,40 @@ class TrainingView:
     full: Target
 
 
-def training_view(frame: RgbdFrame, *, flying_fraction: float, max_depth_m: float) -> TrainingView:
+def training_view(surface: FrameSurface) -> TrainingView:
     """Prepare one frame; the half-size image is the mean of 2 x 2 pixels."""
-    targets = []
-    for factor in (0.5, 1.0):
-        camera = frame.color_camera.scaled(factor)
-        image = frame.image_u8 if factor == 1.0 else _halved(frame.image_u8, camera)
-        depth = depth_in_color_camera(
-            frame, camera, flying_fraction=flying_fraction, max_depth_m=max_depth_m
-        )
-        planes = np.ascontiguousarray(np.moveaxis(image, -1, 0))
-        targets.append(Target(camera=camera, planes_u8=planes, depth_m=depth))
+    frame = surface.frame
+    depth_m = surface.depth_in_color_camera()
+    half = frame.color_camera.scaled(0.5)
     return TrainingView(
         camera_id=frame.camera_id,
         stamp_ns=frame.stamp_ns,
         T_base_color=frame.T_base_color,
-        half=targets[0],
-        full=targets[1],
+        half=_target(half, _halved_image(frame.image_u8, half), _halved_depth(depth_m, half)),
+        full=_target(frame.color_camera, frame.image_u8, depth_m),
     )
 
 
-def _halved(image_u8: np.ndarray, camera: Camera) -> np.ndarray:
+def _target(camera: Camera, image_u8: np.ndarray, depth_m: np.ndarray) -> Target:
+    planes = np.ascontiguousarray(np.moveaxis(image_u8, -1, 0))
+    return Target(camera=camera, planes_u8=planes, depth_m=depth_m)
+
+
+def _blocks(rows: np.ndarray, camera: Camera) -> np.ndarray:
+    """Group 2 x 2 pixels: (height, 2, width, 2, ...); an odd edge is repeated or cut."""
     height, width = camera.height * 2, camera.width * 2
-    padded = np.pad(
-        image_u8,
-        ((0, max(0, height - len(image_u8))), (0, max(0, width - image_u8.shape[1])), (0, 0)),
-        mode="edge",
-    )[:height, :width]
-    blocks = padded.reshape(camera.height, 2, camera.width, 2, 3)
-    return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
+    missing = ((0, max(0, height - len(rows))), (0, max(0, width - rows.shape[1])))
+    padded = np.pad(rows, missing + ((0, 0),) * (rows.ndim - 2), mode="edge")
+    return padded[:height, :width].reshape(camera.height, 2, camera.width, 2, *rows.shape[2:])
+
+
+def _halved_image(image_u8: np.ndarray, camera: Camera) -> np.ndarray:
+    total = _blocks(image_u8, camera).sum(axis=(1, 3), dtype=np.uint16)
+    return ((total + 2) // 4).astype(np.uint8)
+
+
+def _halved_depth(depth_m: np.ndarray, camera: Camera) -> np.ndarray:
+    """Nearest measurement of each block; blocks without one stay 0."""
+    known = np.where(depth_m > 0, depth_m, np.float32(np.inf))
+    nearest = _blocks(known, camera).min(axis=(1, 3))
+    return np.where(np.isfinite(nearest), nearest, np.float32(0.0))

@@ -100,11 +100,10 @@ struct alignas(64) GradientTile {
     float behind[kPixels];           // dL/dplane . (contributions not yet passed)
 };
 
-void pull_gaussian(const Projected& g, const TileJob& job, float log2_cut, GradientTile* tile,
-                   float* out) {
+void pull_gaussian(const Projected& g, const TileJob& job, float log2_cut, float log2_max,
+                   GradientTile* tile, float* out) {
     const Reach reach = reach_of(g, job);
     const Floats x = columns();
-    const float log2_max = std::log2(kMaxAlpha);
     Floats e0{}, ex{}, ey{}, exx{}, exy{}, eyy{}, red{}, green{}, blue{}, depth{};
     for (int y = reach.y0; y < reach.y1; ++y) {
         const float dy = job.y0 + y + 0.5f - g.v;
@@ -184,9 +183,9 @@ void draw_tile_gradients(const Projected* projected, const TileJob& job, const C
             tile.behind[in_tile] += plane_gradients[at] * planes[at];
         }
     });
-    const float log2_cut = std::log2(settings.alpha_cut);
+    const float log2_cut = std::log2(settings.alpha_cut), log2_max = std::log2(kMaxAlpha);
     for (int i = 0; i < job.count; ++i)
-        pull_gaussian(projected[job.ids[i]], job, log2_cut, &tile,
+        pull_gaussian(projected[job.ids[i]], job, log2_cut, log2_max, &tile,
                       pair_gradients + static_cast<std::int64_t>(i) * kPairGradients);
 }
 

@@ -5,6 +5,12 @@
 
 namespace splat {
 
+constexpr int kBlurRadius = 5;
+
+static constexpr std::int64_t blur_scratch(int width, int height) {
+    return static_cast<std::int64_t>(width) * height + 2 * width + 2 * kBlurRadius;
+}
+
 struct AdamRates {
     float rate, beta1, beta2, epsilon;
     float correction1, correction2;  // 1 - beta^step
@@ -21,7 +27,8 @@ struct Kernels {
     void (*draw_tile_gradients)(const Projected*, const TileJob&, const Camera&, const Settings&,
                                 const float* planes, const float* plane_gradients,
                                 float* pair_gradients);
-    // Separable 11-tap Gaussian window over one plane, zero outside; ``scratch`` is as large.
+    // Separable 11-tap Gaussian window over one plane, zero outside.
+    // ``scratch`` holds blur_scratch(width, height) floats.
     void (*blur)(const float* in, float* out, float* scratch, int width, int height);
     // Structural similarity of two planes: returns its sum and fills the three gradient maps.
     double (*similarity)(const float* mean_x, const float* mean_y, const float* mean_xx,

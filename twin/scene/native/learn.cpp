@@ -1,5 +1,6 @@
 // Structural similarity with its gradient, and Adam: the loops of fitting besides drawing.
 #include <cmath>
+#include <cstdint>
 
 #include "kernels_isa.hpp"
 
@@ -7,43 +8,54 @@ namespace splat::SPLAT_ISA {
 
 namespace {
 
-constexpr int kRadius = 5;  // Wang et al. 2004: an 11 x 11 Gaussian window, sigma 1.5 px
+constexpr int kRadius = kBlurRadius;  // Wang et al. 2004: an 11 x 11 Gaussian window, sigma 1.5 px
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 
 struct Window {
-    float tap[2 * kRadius + 1];
+    float tap[kRadius + 1];  // centre and one side
     Window() {
         float total = 0;
-        for (int i = -kRadius; i <= kRadius; ++i)
-            total += tap[i + kRadius] = std::exp(-i * i / (2 * 1.5f * 1.5f));
+        for (int i = 0; i <= kRadius; ++i) {
+            tap[i] = std::exp(-i * i / (2 * 1.5f * 1.5f));
+            total += i == 0 ? tap[i] : 2 * tap[i];
+        }
         for (float& value : tap) value /= total;
     }
 };
 
-void blur_row(const float* in, float* out, int width, const Window& window) {
-    for (int x = 0; x < width; ++x) out[x] = window.tap[kRadius] * in[x];
-    for (int k = 1; k <= kRadius && k < width; ++k) {
-        const float tap = window.tap[kRadius + k];
-        for (int x = 0; x < width - k; ++x) out[x] += tap * in[x + k];
-        for (int x = k; x < width; ++x) out[x] += tap * in[x - k];
-    }
+// out[x] = sum_k tap_k (rows[k][x] + rows[-k][x]); ``rows`` points at the middle of 11 pointers.
+void weigh(const float* const* rows, float* __restrict out, int width, const Window& window) {
+    const float *r0 = rows[0], *a1 = rows[1], *b1 = rows[-1], *a2 = rows[2], *b2 = rows[-2];
+    const float *a3 = rows[3], *b3 = rows[-3], *a4 = rows[4], *b4 = rows[-4];
+    const float *a5 = rows[5], *b5 = rows[-5];
+    const float t0 = window.tap[0], t1 = window.tap[1], t2 = window.tap[2];
+    const float t3 = window.tap[3], t4 = window.tap[4], t5 = window.tap[5];
+    for (int x = 0; x < width; ++x)
+        out[x] = t0 * r0[x] + t1 * (a1[x] + b1[x]) + t2 * (a2[x] + b2[x]) +
+                 t3 * (a3[x] + b3[x]) + t4 * (a4[x] + b4[x]) + t5 * (a5[x] + b5[x]);
 }
 
 }  // namespace
 
 void blur(const float* in, float* out, float* scratch, int width, int height) {
     static const Window window;
-    for (int y = 0; y < height; ++y)
-        blur_row(in + y * width, scratch + y * width, width, window);
+    const std::int64_t size = static_cast<std::int64_t>(width) * height;
+    float* zeros = scratch + size;     // a row outside the image
+    float* padded = zeros + width;     // one row with five zeros on each side
+    __builtin_memset(zeros, 0, sizeof(float) * (2 * width + 2 * kRadius));
+    const float* rows[2 * kRadius + 1];
+    for (int k = 0; k < 2 * kRadius + 1; ++k) rows[k] = padded + k;
     for (int y = 0; y < height; ++y) {
-        float* row = out + y * width;
-        for (int x = 0; x < width; ++x) row[x] = 0;
+        const std::int64_t at = static_cast<std::int64_t>(y) * width;
+        __builtin_memcpy(padded + kRadius, in + at, sizeof(float) * width);
+        weigh(rows + kRadius, scratch + at, width, window);
+    }
+    for (int y = 0; y < height; ++y) {
         for (int k = -kRadius; k <= kRadius; ++k) {
-            if (y + k < 0 || y + k >= height) continue;
-            const float* from = scratch + (y + k) * width;
-            const float tap = window.tap[k + kRadius];
-            for (int x = 0; x < width; ++x) row[x] += tap * from[x];
+            const bool outside = y + k < 0 || y + k >= height;
+            rows[k + kRadius] = outside ? zeros : scratch + static_cast<std::int64_t>(y + k) * width;
         }
+        weigh(rows + kRadius, out + static_cast<std::int64_t>(y) * width, width, window);
     }
 }
 
@@ -84,10 +96,6 @@ void adam(float* values, const float* gradients, float* first, float* second,
         values[i] -= scale * first[i] / (std::sqrt(second[i] * inverse2) + rates.epsilon);
     }
 }
-
-}  // namespace splat::SPLAT_ISA
-
-namespace splat::SPLAT_ISA {
 
 #define SPLAT_TEXT_OF(name) #name
 #define SPLAT_TEXT(name) SPLAT_TEXT_OF(name)

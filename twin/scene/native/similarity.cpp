@@ -16,12 +16,13 @@ double Similarity::mean(const float* rendered, const float* target, float* gradi
                         int height) {
     const std::int64_t size = static_cast<std::int64_t>(width) * height;
     const int tasks = kChannels * 5;
-    maps_.resize(size * (kChannels * kMaps + 2 * tasks));
+    const std::int64_t room = blur_scratch(width, height);
+    maps_.resize(size * kChannels * kMaps + 2 * room * tasks);
     const auto map = [&](int channel, int which) {
         return maps_.data() + size * (channel * kMaps + which);
     };
     const auto scratch = [&](int task, int which) {
-        return maps_.data() + size * (kChannels * kMaps + 2 * task + which);
+        return maps_.data() + size * kChannels * kMaps + room * (2 * task + which);
     };
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads_)
     for (int task = 0; task < tasks; ++task) {

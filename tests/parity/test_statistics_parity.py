@@ -1,0 +1,93 @@
+"""Our statistics against SciPy's, and against numbers printed in papers."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from evaluator.statistics import correlation
+from evaluator.statistics.agreement import mcnemar
+from evaluator.statistics.proportion import clopper_pearson, wilson
+
+pytestmark = pytest.mark.parity
+
+COUNTS = [(0, 10), (10, 10), (1, 1), (23, 50), (4, 10), (8, 10), (81, 263)]
+
+
+@pytest.mark.parametrize(("k", "n"), COUNTS)
+@pytest.mark.parametrize("level", [0.9, 0.95, 0.99])
+def test_intervals_agree_with_scipy(k: int, n: int, level: float) -> None:
+    for ours, method in ((wilson, "wilson"), (clopper_pearson, "exact")):
+        theirs = stats.binomtest(k, n).proportion_ci(level, method=method)
+        mine = ours(k, n, level=level)
+        assert mine.low == pytest.approx(theirs.low, abs=1e-9)
+        assert mine.high == pytest.approx(theirs.high, abs=1e-9)
+
+
+def test_wilson_is_the_published_example() -> None:
+    # Newcombe (1998), Statistics in Medicine 17:857-872, table I, method 3:
+    # 81/263 gives 0.2553 to 0.3662, 15/148 gives 0.0624 to 0.1605.
+    for (k, n), (low, high) in {(81, 263): (0.2553, 0.3662), (15, 148): (0.0624, 0.1605)}.items():
+        interval = wilson(k, n)
+        assert interval.low == pytest.approx(low, abs=5e-5)
+        assert interval.high == pytest.approx(high, abs=5e-5)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_correlations_agree_with_scipy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(4, 12))
+    # Few distinct values, so that ties are common.
+    recorded, sim = rng.integers(0, 6, n) / 5, rng.integers(0, 6, n) / 5
+    if len(set(recorded)) == 1 or len(set(sim)) == 1:
+        pytest.skip("a constant side has no correlation")
+    x, y = recorded.tolist(), sim.tolist()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", stats.NearConstantInputWarning)
+        assert correlation.pearson(x, y) == pytest.approx(stats.pearsonr(x, y)[0], abs=1e-12)
+        assert correlation.spearman(x, y) == pytest.approx(stats.spearmanr(x, y)[0], abs=1e-12)
+        theirs = stats.pearsonr(x, y).confidence_interval(0.95)
+    r = correlation.pearson(x, y)
+    if abs(r) < 1:
+        mine = correlation.fisher_interval(r, n)
+        assert mine.low == pytest.approx(theirs.low, abs=1e-9)
+        assert mine.high == pytest.approx(theirs.high, abs=1e-9)
+
+
+@pytest.mark.parametrize(("improved", "worsened"), [(4, 0), (7, 2), (3, 3), (1, 9), (12, 5)])
+def test_mcnemar_is_the_binomial_test_of_the_discordant_pairs(improved: int, worsened: int) -> None:
+    pairs = [(False, True)] * improved + [(True, False)] * worsened + [(True, True)] * 3
+    found = mcnemar(pairs)
+    total = improved + worsened
+    assert found.p_exact == pytest.approx(stats.binomtest(improved, total).pvalue)
+    # Mid-p by its definition: half the mass of the observed table counts.
+    smaller = min(improved, worsened)
+    mid = 2 * (stats.binom.cdf(smaller, total, 0.5) - 0.5 * stats.binom.pmf(smaller, total, 0.5))
+    assert found.p_mid == pytest.approx(mid)
+
+
+def test_mid_p_is_the_published_example() -> None:
+    # Fagerland, Lydersen, Laake (2013), BMC Med Res Methodol 13:91, table 1 (Bentur et al.):
+    # 1 and 7 discordant pairs of 21; exact p 0.070, mid-p 0.039.
+    found = mcnemar([(False, True)] * 7 + [(True, False)] * 1 + [(True, True)] * 13)
+    assert found.p_exact == pytest.approx(0.070, abs=5e-4)
+    assert found.p_mid == pytest.approx(0.039, abs=5e-4)
+
+
+def mmrv_plain(recorded: list[float], sim: list[float]) -> float:
+    """Equation 1, written out once more with arrays."""
+    R, S = np.array(recorded), np.array(sim)
+    gap = np.abs(R[:, None] - R[None, :])
+    wrong = (S[:, None] > S[None, :]) != (R[:, None] > R[None, :])
+    return float(np.mean(np.max(gap * wrong, axis=1)))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_mmrv_agrees_with_equation_1(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    recorded, sim = (rng.integers(0, 8, 6) / 8).tolist(), (rng.integers(0, 8, 6) / 8).tolist()
+    mine = correlation.mmrv(recorded=recorded, sim=sim)
+    assert mine == pytest.approx(mmrv_plain(recorded, sim))
+    swapped = correlation.mmrv(recorded=recorded, sim=sim, gap="sim")
+    assert swapped == pytest.approx(mmrv_plain(sim, recorded))
