@@ -56,11 +56,13 @@ def image_from_u8(
 
 def psnr_db(
     recorded: Float[np.ndarray, "height width channels"],
-    replayed: Float[np.ndarray, "height width channels"],
+    replayed: Float[np.ndarray, "replayed_height replayed_width channels"],
     *,
     mask: Bool[np.ndarray, "height width"] | None = None,
 ) -> float:
     """Return the peak signal-to-noise ratio [dB]; with a mask, of its pixels only.
+
+    The replayed axes carry their own names, so that a wrong size gets our message.
 
     Range: 0 dB and up for images in 0..1, higher is better. Undefined when: the images are equal.
 
@@ -82,7 +84,7 @@ def psnr_db(
 
 def ssim(
     recorded: Float[np.ndarray, "height width channels"],
-    replayed: Float[np.ndarray, "height width channels"],
+    replayed: Float[np.ndarray, "replayed_height replayed_width channels"],
     *,
     mask: Bool[np.ndarray, "height width"] | None = None,
 ) -> float:
@@ -121,7 +123,7 @@ def ssim(
 
 def score_image(
     recorded_u8: UInt8[np.ndarray, "height width 3"],
-    replayed_u8: UInt8[np.ndarray, "height width 3"],
+    replayed_u8: UInt8[np.ndarray, "replayed_height replayed_width 3"],
     *,
     mask: Bool[np.ndarray, "height width"] | None = None,
 ) -> ImageScore:

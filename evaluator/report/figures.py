@@ -21,9 +21,9 @@ STYLE = """<style>
 .fig .without{fill:var(--paper);stroke:var(--sim);stroke-width:2}
 </style>"""
 
-SIDE = 340
+SIDE = 340.0
 """Side of the scatter's square [px]."""
-LEFT, TOP = 64, 16
+LEFT, TOP = 64.0, 16.0
 
 
 def scatter_svg(cells: Sequence[RateCell], word: str) -> str | None:
@@ -59,13 +59,15 @@ def _frame(word: str) -> str:
     parts = []
     for step in range(0, 101, 20):
         x, y = _x(step / 100), _y(step / 100)
-        parts.append(f'<path class="line" d="M{x} {_y(0)}V{_y(1)}M{_x(0)} {y}H{_x(1)}"/>')
         parts.append(
-            f'<text class="soft small" x="{x}" y="{_y(0) + 18}" text-anchor="middle">{step}</text>'
-            f'<text class="soft small" x="{_x(0) - 8}" y="{y + 4}" text-anchor="end">{step}</text>'
+            f'<path class="line" d="M{x:g} {_y(0.0):g}V{_y(1.0):g}M{_x(0.0):g} {y:g}H{_x(1.0):g}"/>'
         )
-    parts.append(f'<path class="ident" d="M{_x(0)} {_y(0)}L{_x(1)} {_y(1)}"/>')
-    parts.append(f'<path class="axis" d="M{_x(0)} {_y(1)}V{_y(0)}H{_x(1)}"/>')
+        parts.append(
+            f'<text class="soft small" x="{x}" y="{_y(0.0) + 18}" text-anchor="middle">{step}</text>'
+            f'<text class="soft small" x="{_x(0.0) - 8}" y="{y + 4}" text-anchor="end">{step}</text>'
+        )
+    parts.append(f'<path class="ident" d="M{_x(0.0)} {_y(0.0)}L{_x(1.0)} {_y(1.0)}"/>')
+    parts.append(f'<path class="axis" d="M{_x(0.0)} {_y(1.0)}V{_y(0.0)}H{_x(1.0)}"/>')
     middle = TOP + SIDE / 2
     parts.append(
         f'<text x="{LEFT + SIDE / 2}" y="{TOP + SIDE + 38}" text-anchor="middle">'
@@ -106,7 +108,7 @@ def success_svg(cells: Sequence[RateCell], word: str) -> str | None:
     """Draw the success rate of every cell as two bars with Wilson whiskers."""
     if not cells:
         return None
-    labels, bar, row = 250, 360, 54
+    labels, bar, row = 250.0, 360.0, 54.0
     width = labels + bar + 130
     parts = []
     bottom = 34 + row * len(cells)

@@ -112,9 +112,6 @@ def mcnemar(pairs: Iterable[tuple[bool, bool]]) -> McNemar:
         )
     smaller = min(improved, worsened)
     masses = [math.comb(discordant, i) / 2**discordant for i in range(smaller + 1)]
-    if improved == worsened:
-        p_exact, p_mid = 1.0, 1.0 - masses[-1]
-    else:
-        p_exact = min(1.0, 2 * sum(masses))
-        p_mid = p_exact - masses[-1]
+    doubled = 2 * sum(masses)
+    p_exact, p_mid = min(1.0, doubled), min(1.0, doubled - masses[-1])
     return McNemar(improved=improved, worsened=worsened, p_exact=p_exact, p_mid=p_mid)

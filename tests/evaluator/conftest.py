@@ -1,0 +1,235 @@
+"""Small invented run folders, written with the same writer the recorder uses."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.episode import schema
+from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
+from bridge.episode.provenance import hash_file
+from bridge.episode.records import PoseSample
+from bridge.episode.run import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.task.plan import Plan, Stage, Waypoint
+from bridge.task.verdict import Factor, Verdict
+
+START_NS = 10_000_000_000
+STEP_NS = 100_000_000
+NUM_POSES = 11
+
+
+def verdict_of(accepted: bool | None, *, plan_id: str, trajectory: str = "planned") -> Verdict:
+    """Build a verdict that says this, failing on clearance where it fails."""
+    clearance = Factor(value=True)
+    terminal = Factor(value=True)
+    if accepted is False:
+        clearance = Factor(
+            value=False, first_t_ns=1_500_000_000, cause="collision", bodies=("gripper", "box")
+        )
+    if accepted is None:
+        terminal = Factor(value=None)
+    return Verdict(
+        plan_id=plan_id,
+        trajectory=trajectory,
+        mode="dynamic",
+        ik=Factor(value=True),
+        clearance=clearance,
+        terminal=terminal,
+        engine="test",
+        seed=1,
+    )
+
+
+def plan_of(plan_id: str) -> Plan:
+    """Build the smallest plan the schema accepts."""
+    return Plan(
+        id=plan_id,
+        planner="test",
+        policy="scripted",
+        condition="without_replanning",
+        robot="ur5",
+        frame="base_link",
+        instruction="Put the cube into the box.",
+        stages=(Stage(id="grasp", text="Grasp."),),
+        tau=(
+            Waypoint(t_ns=0, p_m=(0.4, 0.0, 0.2), q_wxyz=(1.0, 0.0, 0.0, 0.0), g=0),
+            Waypoint(t_ns=STEP_NS, p_m=(0.5, 0.0, 0.2), q_wxyz=(1.0, 0.0, 0.0, 0.0), g=1),
+        ),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunMaker:
+    """Write trials and replays into one run folder."""
+
+    run: RunFolder
+
+    def trial(
+        self,
+        name: str,
+        *,
+        recorded: str | None = "success",
+        condition: str = "without_replanning",
+        start_id: str | None = "s1",
+        gate: bool | str | None = "none",
+        late_gate: bool | str | None = "none",
+        sent: bool = True,
+        stand_in: bool = True,
+        kind: str = "trial",
+        offset_m: float = 0.0,
+        tags: tuple[str, ...] = (),
+        localised_m: float | None = None,
+    ) -> str:
+        """Write one recorded trial; the plan is named after it. Returns the plan's id."""
+        info = EpisodeInfo(
+            id=name,
+            kind=kind,
+            task="cube_into_box",
+            condition=condition,
+            policy="scripted",
+            start_id=start_id,
+            cell="standin",
+            stand_in=stand_in,
+            tags=tags,
+        )
+        outcome = None if recorded is None else Outcome(result=recorded, k=recorded == "success")
+        plan_id = f"plan_{name}"
+        with EpisodeWriter(self.run.episodes_dir / f"{name}.mcap") as writer:
+            writer.describe(info, outcome=outcome)
+            log = _Log(writer)
+            if localised_m is not None:
+                pose = {"p_m": [localised_m, 0.0, 0.02], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}
+                log.json(
+                    "/standin/localisation",
+                    schema.LOCALISATION,
+                    {
+                        "schema_version": 1,
+                        "stamp_ns": START_NS - 5 * STEP_NS,
+                        "object": "cube",
+                        "found": True,
+                        "T_base_object": pose,
+                        "method": "test",
+                    },
+                    START_NS - 5 * STEP_NS,
+                )
+            plan = plan_of(plan_id)
+            log.raw("/standin/plan", schema.PLAN, plan.to_json(), START_NS - 2 * STEP_NS)
+            never_sent = plan_of(f"{plan_id}_unsent")
+            log.raw("/standin/plan", schema.PLAN, never_sent.to_json(), START_NS - 2 * STEP_NS)
+            if gate != "none":
+                assert not isinstance(gate, str)
+                said = verdict_of(gate, plan_id=plan_id).to_json()
+                log.raw("/standin/verdict", schema.VERDICT, said, START_NS - STEP_NS)
+            if sent:
+                log.event("execution_started", plan_id, START_NS)
+            if late_gate != "none":
+                assert not isinstance(late_gate, str)
+                said = verdict_of(late_gate, plan_id=plan_id).to_json()
+                log.raw("/standin/verdict", schema.VERDICT, said, START_NS + STEP_NS)
+            log.poses("/standin/tcp/pose", START_NS, offset_m)
+            if sent:
+                log.event("execution_ended", plan_id, START_NS + NUM_POSES * STEP_NS)
+        return plan_id
+
+    def replay(
+        self,
+        name: str,
+        *,
+        accepted: bool | None = True,
+        trajectory: str = "planned",
+        mode: str = "dynamic",
+        offset_m: float = 0.0,
+        start_ns: int = 0,
+        plan_id: str | None = None,
+        source_sha256: str | None = None,
+        tag: str = "a",
+    ) -> Path:
+        """Write one derived replay of a trial."""
+        source = self.run.episodes_dir / f"{name}.mcap"
+        plan_id = plan_id or f"plan_{name}"
+        derived = Derived(
+            kind="replay",
+            source_episode=name,
+            source_sha256=source_sha256 or hash_file(source),
+            plan_id=plan_id,
+            trajectory=trajectory,
+            mode=mode,
+            engine="test",
+            seed=1,
+        )
+        stem = f"{name}.replay.{trajectory}.{mode}.{plan_id}.test.{tag}"
+        path = self.run.derived_dir / f"{stem}.mcap"
+        info = EpisodeInfo(id=stem.replace(".", "-"), kind="trial", stand_in=True)
+        with EpisodeWriter(path) as writer:
+            writer.describe(info, derived=derived)
+            log = _Log(writer)
+            said = verdict_of(accepted, plan_id=plan_id, trajectory=trajectory)
+            log.raw("/standin/verdict", schema.VERDICT, said.to_json(), start_ns)
+            log.poses("/standin/tcp/pose", start_ns, offset_m)
+        return path
+
+
+@dataclass(frozen=True)
+class _Log:
+    writer: EpisodeWriter
+
+    def raw(self, topic: str, type_name: str, data: bytes, stamp_ns: int) -> None:
+        self.writer.write(topic, data, type_name=type_name, log_time_ns=stamp_ns)
+
+    def json(self, topic: str, type_name: str, record: dict[str, object], stamp_ns: int) -> None:
+        self.writer.write_json(topic, record, type_name=type_name, log_time_ns=stamp_ns)
+
+    def event(self, kind: str, plan_id: str, stamp_ns: int) -> None:
+        record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, "plan_id": plan_id}
+        self.json("/standin/event", schema.EVENT, record, stamp_ns)
+
+    def poses(self, topic: str, start_ns: int, offset_m: float) -> None:
+        for index in range(NUM_POSES):
+            T = np.eye(4)
+            T[:3, 3] = 0.4 + 0.01 * index, offset_m, 0.2
+            stamp_ns = start_ns + index * STEP_NS
+            pose = PoseSample(stamp_ns=stamp_ns, frame_id="base_link", T_frame_body=T)
+            self.raw(topic, schema.POSE_STAMPED, pose.to_cdr(), stamp_ns)
+
+
+@pytest.fixture
+def maker(tmp_path: Path) -> RunMaker:
+    """Start an empty run."""
+    return RunMaker(run=RunFolder.create(tmp_path / "monday"))
+
+
+@pytest.fixture
+def six_trials(maker: RunMaker) -> RunMaker:
+    """Three starts without and with replanning; the twin is wrong about one of six.
+
+    Recorded: S F F without, S S F with. Twin: S F S without, S S F with.
+    """
+    table: tuple[tuple[str, str, str, bool], ...] = (
+        ("a1", "without_replanning", "success", True),
+        ("a2", "without_replanning", "failure", False),
+        ("a3", "without_replanning", "failure", True),
+        ("b1", "with_replanning", "success", True),
+        ("b2", "with_replanning", "success", True),
+        ("b3", "with_replanning", "failure", False),
+    )
+    for name, condition, recorded, said in table:
+        gate = said if condition == "with_replanning" else "none"
+        maker.trial(name, recorded=recorded, condition=condition, start_id=f"s{name[1]}", gate=gate)
+        maker.replay(name, accepted=said, offset_m=0.01)
+        maker.replay(name, accepted=recorded == "success", trajectory="executed", offset_m=0.002)
+    return maker
+
+
+@pytest.fixture
+def write_table(tmp_path: Path) -> Callable[[str], Path]:
+    """Write a CSV file from text."""
+
+    def write(text: str) -> Path:
+        path = tmp_path / "table.csv"
+        path.write_text(text)
+        return path
+
+    return write

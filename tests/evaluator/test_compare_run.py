@@ -1,0 +1,321 @@
+"""``compare_run``: pairing, headline sim, and everything that must be left out with a reason."""
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.episode import schema
+from bridge.episode.catalogue import label_episode
+from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
+from bridge.episode.records import CompressedColor
+from bridge.episode.run import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import PathNotFoundError
+from bridge.media.color import encode_jpeg
+from evaluator.compare import Comparison, TrialRow, compare_run
+
+
+def row_of(comparison: Comparison, name: str) -> TrialRow:
+    return next(row for row in comparison.rows if row.episode == name)
+
+
+def reasons(comparison: Comparison, name: str) -> str:
+    return " | ".join(e.reason for e in comparison.exclusions if e.episode == name)
+
+
+def test_the_twin_agrees_with_five_of_six_trials(six_trials: Any) -> None:
+    comparison = compare_run(six_trials.run)
+    results = comparison.results()
+    agreed = results.get("agreement.sim_planned.rate")
+    assert (agreed.k, agreed.n, agreed.counted) == (5, 6, "trial")
+    assert agreed.interval is not None
+    assert agreed.interval.method == "wilson"
+    # tp 3, fp 1, fn 0, tn 2: phi = 6 / sqrt(4 * 3 * 3 * 2)
+    assert results.get("agreement.sim_planned.phi").value == pytest.approx(6 / np.sqrt(72))
+    ppv = results.get("agreement.sim_planned.ppv")
+    assert (ppv.k, ppv.n) == (3, 4)
+    assert results.get("agreement.sim_planned.npv").k == 2
+    assert comparison.stand_in is True
+
+
+def test_success_rates_are_counted_per_cell_and_side(six_trials: Any) -> None:
+    results = compare_run(six_trials.run).results()
+    without = results.get("rate.recorded.cube_into_box.without_replanning.scripted")
+    assert (without.k, without.n) == (1, 3)
+    assert without.episodes == ("a1", "a2", "a3")
+    sim = results.get("rate.sim_planned.cube_into_box.without_replanning.scripted")
+    assert (sim.k, sim.n) == (2, 3)
+
+
+def test_r_of_two_cells_is_undefined_with_its_reason(six_trials: Any) -> None:
+    r = compare_run(six_trials.run).results().get("agreement.pearson_r")
+    assert r.value is None
+    assert r.reason_if_undefined == "2 cells; it needs at least 3"
+
+
+def test_starts_are_paired_across_conditions(six_trials: Any) -> None:
+    results = compare_run(six_trials.run).results()
+    p = results.get("paired.mcnemar_p_exact.recorded")
+    assert p.n == 3
+    assert p.value == 1.0  # one discordant pair can show nothing
+    assert "1 improved, 0 worsened of 3" in p.definition
+
+
+def test_gain_is_given_in_points_and_relative(six_trials: Any) -> None:
+    results = compare_run(six_trials.run).results()
+    points = results.get("gain.pp.recorded.cube_into_box.scripted")
+    assert points.value == pytest.approx(100 / 3)
+    assert points.unit == "pp"
+    assert results.get("gain.relative.recorded.cube_into_box.scripted").value == pytest.approx(1.0)
+
+
+def test_executed_in_twin_never_enters_the_headline(maker: Any) -> None:
+    maker.trial("t1", recorded="failure")
+    maker.replay("t1", accepted=True, trajectory="executed")
+    row = row_of(compare_run(maker.run), "t1")
+    assert row.sim_executed is True
+    assert row.sim_planned is None
+
+
+def test_a_kinematic_replay_is_no_headline_sim(maker: Any) -> None:
+    maker.trial("t1")
+    maker.replay("t1", mode="kinematic")
+    comparison = compare_run(maker.run)
+    assert row_of(comparison, "t1").sim_planned is None
+    assert "no dynamic replay of the planned trajectory" in reasons(comparison, "t1")
+
+
+def test_only_the_plan_that_was_sent_counts(maker: Any) -> None:
+    maker.trial("t1")
+    maker.replay("t1", plan_id="plan_t1_unsent", accepted=False)
+    maker.replay("t1", accepted=True)
+    row = row_of(compare_run(maker.run), "t1")
+    assert row.plan_id == "plan_t1"
+    assert row.sim_planned is True
+    assert (row.num_plans, row.num_plans_sent) == (2, 1)
+
+
+def test_a_verdict_after_the_motion_started_is_not_before_motion(maker: Any) -> None:
+    maker.trial("t1", gate=True, late_gate=False)
+    maker.trial("t2", late_gate=False)
+    comparison = compare_run(maker.run)
+    assert row_of(comparison, "t1").verdict is True
+    assert row_of(comparison, "t2").verdict is None
+
+
+def test_every_gap_has_its_reason(maker: Any) -> None:
+    maker.trial("unlabelled", recorded=None)
+    maker.trial("unknown", recorded="unknown")
+    maker.trial("unsent", sent=False)
+    maker.trial("undecided")
+    maker.replay("undecided", accepted=None)
+    maker.trial("stale")
+    maker.replay("stale", source_sha256="0" * 64)
+    comparison = compare_run(maker.run)
+    assert "not labelled" in reasons(comparison, "unlabelled")
+    assert "labelled unknown" in reasons(comparison, "unknown")
+    assert "no plan was sent" in reasons(comparison, "unsent")
+    assert "terminal undecided" in reasons(comparison, "undecided")
+    assert "another version of the episode" in reasons(comparison, "stale")
+    rate = comparison.results().get("agreement.sim_planned.rate")
+    assert rate.value is None
+    assert rate.n == 0
+
+
+def test_the_first_failing_factor_is_named(maker: Any) -> None:
+    maker.trial("t1", recorded="failure")
+    maker.replay("t1", accepted=False)
+    row = row_of(compare_run(maker.run), "t1")
+    assert row.first_failing == "clearance"
+    assert row.failing_detail == "collision, gripper and box, at 1.50 s"
+
+
+def test_a_label_given_afterwards_overrides_the_recorded_one(maker: Any) -> None:
+    maker.trial("t1", recorded="success")
+    label_episode(maker.run, "t1", Outcome(result="failure", k=0, n=1, by="reviewer"))
+    assert row_of(compare_run(maker.run), "t1").recorded is False
+
+
+@pytest.mark.parametrize("start_ns", [0, 10_000_000_000])
+def test_tool_error_is_measured_at_matching_instants(maker: Any, start_ns: int) -> None:
+    maker.trial("t1")
+    maker.replay("t1", offset_m=0.01, start_ns=start_ns)
+    series = row_of(compare_run(maker.run), "t1").tcp_errors
+    assert [item.against for item in series] == ["planned"]
+    np.testing.assert_allclose(series[0].position_m, 0.01, atol=1e-9)
+    np.testing.assert_allclose(series[0].rotation_rad, 0.0, atol=1e-9)
+    assert series[0].t_s[0] == 0.0
+    assert series[0].t_s[-1] == pytest.approx(1.0)
+
+
+def test_starts_localised_far_apart_are_not_paired(maker: Any) -> None:
+    for name, condition, x_m in (
+        ("a", "without_replanning", 0.4),
+        ("b", "with_replanning", 0.45),
+    ):
+        maker.trial(name, condition=condition, localised_m=x_m)
+        maker.replay(name)
+    comparison = compare_run(maker.run)
+    assert "50 mm apart, limit 30 mm" in reasons(comparison, "a")
+    assert comparison.results().get("paired.mcnemar_p_mid.recorded").n == 0
+
+
+def test_a_start_used_twice_in_one_condition_is_not_paired(maker: Any) -> None:
+    for name in ("a", "b"):
+        maker.trial(name)
+        maker.replay(name)
+    maker.trial("c", condition="with_replanning")
+    maker.replay("c")
+    assert "has 2 without and 1 with" in reasons(compare_run(maker.run), "a")
+
+
+def test_a_broken_file_is_left_out_and_named(six_trials: Any) -> None:
+    (six_trials.run.episodes_dir / "broken.mcap").write_bytes(b"\x89MCAP0\r\nnot really")
+    (six_trials.run.derived_dir / "broken.replay.mcap").write_bytes(b"")
+    comparison = compare_run(six_trials.run)
+    assert len(comparison.rows) == 6
+    assert "not a finished MCAP" in reasons(comparison, "broken.mcap")
+    assert reasons(comparison, "broken.replay.mcap")
+
+
+def test_an_empty_run_says_what_is_missing(tmp_path: Path) -> None:
+    comparison = compare_run(RunFolder.create(tmp_path / "empty"))
+    assert comparison.rows == ()
+    assert comparison.stand_in is None
+    assert any(text.startswith("trials:") for text in comparison.missing)
+    assert any(text.startswith("views:") for text in comparison.missing)
+    comparison.results().to_record()
+
+
+def test_a_run_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(PathNotFoundError, match="robot-gst record"):
+        compare_run(RunFolder(tmp_path / "nowhere"))
+
+
+def test_comparing_twice_gives_the_same_record(six_trials: Any) -> None:
+    first = compare_run(six_trials.run).results().to_record()
+    second = compare_run(six_trials.run).results().to_record()
+    assert first == second
+
+
+def image_u8(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.kron(rng.integers(0, 255, (4, 5, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+
+
+def write_views(run: RunFolder, *, with_recorded: bool) -> None:
+    info = EpisodeInfo(id="scan-views-x", kind="scan")
+    derived = Derived(kind="views", source_episode="scan", source_sha256="")
+    scan = run.episodes_dir / "scan.mcap"
+    views = run.derived_dir / "scan.views.x.mcap"
+    with EpisodeWriter(scan) as original, EpisodeWriter(views) as rendered:
+        original.describe(EpisodeInfo(id="scan", kind="scan"))
+        rendered.describe(info, derived=derived)
+        for index in range(3):
+            recorded = encode_jpeg(image_u8(index), 95)
+            again = encode_jpeg(
+                np.clip(image_u8(index).astype(int) + 6, 0, 255).astype(np.uint8), 95
+            )
+            targets = [(original, "color", recorded), (rendered, "rendered", again)]
+            if with_recorded:
+                targets.append((rendered, "color", recorded))
+            for writer, name, data in targets:
+                color = CompressedColor(
+                    stamp_ns=1000 + index, frame_id="wrist_color_optical", format="jpeg", data=data
+                )
+                writer.write(
+                    f"/standin/cam/wrist/{name}/image",
+                    color.to_cdr(),
+                    type_name=schema.COMPRESSED_IMAGE,
+                    log_time_ns=1000 + index,
+                )
+
+
+@pytest.mark.parametrize("with_recorded", [True, False])
+def test_a_run_with_only_views_gets_image_scores(maker: Any, with_recorded: bool) -> None:
+    write_views(maker.run, with_recorded=with_recorded)
+    comparison = compare_run(maker.run)
+    psnr = comparison.results().get("views.all.psnr_db")
+    assert psnr.n == 3
+    assert psnr.value is not None
+    assert 28 < psnr.value < 40
+    assert "JPEG" in psnr.definition
+    lpips = comparison.results().get("views.all.lpips")
+    assert lpips.value is None
+    assert "no backbone" in str(lpips.reason_if_undefined)
+    table = next(table for table in comparison.tables if table.id == "views_0")
+    assert len(table.rows) == 3
+
+
+def test_a_rendered_view_without_its_recorded_image_is_left_out(maker: Any) -> None:
+    write_views(maker.run, with_recorded=False)
+    (maker.run.episodes_dir / "scan.mcap").unlink()
+    comparison = compare_run(maker.run)
+    assert comparison.results().get("views.all.psnr_db").value is None
+    assert any("no recorded image" in e.reason for e in comparison.exclusions)
+
+
+def test_imported_runs_are_compared_band_against_band(maker: Any) -> None:
+    for index, offset_m in enumerate((-0.001, 0.001)):
+        maker.trial(f"real_{index}", kind="imported", offset_m=offset_m, stand_in=False)
+    maker.trial("sim_0", kind="imported", offset_m=0.03, tags=("engine:toy",), stand_in=False)
+    comparison = compare_run(maker.run)
+    results = comparison.results()
+    distance = results.get("bands.cube_into_box.toy.between_mean_curves_m")
+    assert distance.value == pytest.approx(0.03)
+    spread = results.get("repeatability.cube_into_box.recorded.mean_m")
+    assert spread.value == pytest.approx(np.sqrt(2) * 0.001)
+    assert results.get("repeatability.cube_into_box.toy.mean_m").value is None
+    assert comparison.rows == ()
+    assert results.stand_in is False
+
+
+@pytest.mark.slow
+def test_kinova_runs_lie_near_their_simulators(tmp_path: Path) -> None:
+    import os
+
+    default = Path(__file__).resolve().parents[3] / "shared/data"
+    root = Path(os.environ.get("GST_SHARED_DATA", default))
+    folder = root / "robot_realitygap_kinova_real_vs_sim"
+    if not folder.is_dir():
+        pytest.skip("shared data not here: robot_realitygap_kinova_real_vs_sim")
+    from bridge.exchange.kinova import import_runs
+
+    few = tmp_path / "few"
+    for pattern in ("real/*/Single000[1-3]_6D.tsv", "sim/*/*_[01].csv"):
+        for path in folder.glob(pattern):
+            place = few / path.relative_to(folder)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_bytes(path.read_bytes())
+    run = RunFolder.create(tmp_path / "kinova")
+    for _ in import_runs(few, run):
+        pass
+    results = compare_run(run).results()
+    for engine in ("pybullet", "mujoco"):
+        end = results.get(f"bands.single.{engine}.end_point_over_pairs_m")
+        assert end.n == 6
+        assert end.value is not None
+        assert 0.003 < end.value < 0.03
+    assert results.get("repeatability.single.recorded.mean_m").n == 3
+
+
+def test_the_evaluator_loads_nothing_heavy() -> None:
+    import subprocess
+
+    code = (
+        "import sys, evaluator.compare, evaluator.report.write;"
+        "print([n for n in ('torch','zenoh','mujoco','pybullet','open3d','pandas','twin')"
+        " if n in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_rows_can_be_turned_into_plain_records(six_trials: Any) -> None:
+    row = compare_run(six_trials.run).rows[0]
+    assert asdict(row)["episode"] == "a1"
+    assert row.recorded_word == "stand-in"

@@ -1,0 +1,161 @@
+"""Image and trajectory metrics: laws, and data that has no answer."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.geometry.trajectory import PoseTrajectory
+from evaluator.errors import UndefinedStatisticError
+from evaluator.metrics.image import ImageShapeError, psnr_db, score_image, ssim
+from evaluator.metrics.trajectory import (
+    band_distance,
+    mean_curve,
+    moving_part,
+    pose_errors,
+    repeatability,
+)
+
+
+def picture(seed: int = 0, size: tuple[int, int] = (24, 32)) -> np.ndarray:
+    image = np.random.default_rng(seed).random((*size, 3))
+    image.flags.writeable = False
+    return image
+
+
+def track(p_m: np.ndarray, start_ns: int = 0, step_ns: int = 1_000_000) -> PoseTrajectory:
+    stamps = start_ns + step_ns * np.arange(len(p_m), dtype=np.int64)
+    return PoseTrajectory(stamps, p_m, np.tile([1.0, 0.0, 0.0, 0.0], (len(p_m), 1)))
+
+
+def line(offset_m: float = 0.0, num: int = 21) -> np.ndarray:
+    p = np.zeros((num, 3))
+    p[:, 0] = np.linspace(0, 1, num)
+    p[:, 1] = offset_m
+    return p
+
+
+def test_a_constant_offset_has_the_textbook_psnr() -> None:
+    image = np.full((16, 16, 3), 0.5)
+    assert psnr_db(image, image + 0.1) == pytest.approx(20.0)
+
+
+def test_identical_images_have_ssim_one_and_no_psnr() -> None:
+    image = picture()
+    assert ssim(image, image) == pytest.approx(1.0)
+    with pytest.raises(UndefinedStatisticError, match="identical"):
+        psnr_db(image, image)
+
+
+def test_more_noise_never_looks_better() -> None:
+    image, noise = picture(1), np.random.default_rng(2).normal(size=(24, 32, 3))
+    scores = [
+        (psnr_db(image, image + s * noise), ssim(image, image + s * noise))
+        for s in (0.01, 0.05, 0.2)
+    ]
+    assert scores == sorted(scores, reverse=True)
+
+
+def test_scores_are_symmetric() -> None:
+    first, second = picture(1), picture(2)
+    assert psnr_db(first, second) == pytest.approx(psnr_db(second, first))
+    assert ssim(first, second) == pytest.approx(ssim(second, first))
+
+
+def test_a_mask_counts_only_its_pixels() -> None:
+    image = picture()
+    other = image.copy()
+    other[:, 16:] += 0.1
+    mask = np.zeros((24, 32), dtype=bool)
+    mask[:, 16:] = True
+    assert psnr_db(image, other, mask=mask) == pytest.approx(20.0)
+    assert psnr_db(image, other) == pytest.approx(20.0 + 10 * np.log10(2))
+    with pytest.raises(UndefinedStatisticError, match="no pixel"):
+        psnr_db(image, other, mask=np.zeros((24, 32), dtype=bool))
+
+
+def test_images_of_different_size_are_refused() -> None:
+    with pytest.raises(ImageShapeError, match=r"\(24, 32, 3\).*\(24, 30, 3\)"):
+        psnr_db(picture(), picture(size=(24, 30)))
+
+
+def test_an_image_smaller_than_the_window_has_no_ssim() -> None:
+    small = (picture(size=(8, 8)) * 255).astype(np.uint8)
+    score = score_image(small, small)
+    assert score.ssim is None
+    assert score.psnr_db is None
+
+
+@given(st.floats(0.001, 0.5))
+def test_a_shift_is_found_again(offset_m: float) -> None:
+    errors = pose_errors(track(line()), track(line(offset_m)))
+    np.testing.assert_allclose(errors.position_m, offset_m, rtol=1e-9)
+    np.testing.assert_allclose(errors.rotation_rad, 0.0, atol=1e-12)
+
+
+def test_a_delay_shows_as_speed_times_delay() -> None:
+    # 1 m in 20 steps; one step late is 0.05 m behind at every common instant.
+    errors = pose_errors(track(line()), track(line(), start_ns=1_000_000))
+    np.testing.assert_allclose(errors.position_m, 0.05, rtol=1e-9)
+    assert len(errors.position_m) == 20
+
+
+def test_a_quarter_turn_is_ninety_degrees_and_its_sign_does_not_matter() -> None:
+    first = track(line(num=2))
+    half = np.sqrt(0.5)
+    for sign in (1, -1):
+        turned = PoseTrajectory(
+            first.stamps_ns, first.p_m, np.tile([sign * half, 0, 0, sign * half], (2, 1))
+        )
+        np.testing.assert_allclose(pose_errors(first, turned).rotation_rad, np.pi / 2)
+
+
+def test_motions_that_share_no_instant_are_refused() -> None:
+    with pytest.raises(UndefinedStatisticError, match="do not overlap"):
+        pose_errors(track(line()), track(line(), start_ns=10**12))
+
+
+def test_normalised_time_ignores_the_clock() -> None:
+    slow = track(line(), start_ns=5, step_ns=7_000_000)
+    distance = band_distance([track(line())], [slow])
+    assert distance.mean_over_pairs_m == pytest.approx(0.0, abs=1e-6)
+
+
+def test_bands_by_hand() -> None:
+    recorded = [track(line(-0.01)), track(line(0.01))]
+    distance = band_distance(recorded, [track(line(0.03))])
+    assert distance.mean_over_pairs_m == pytest.approx((0.04 + 0.02) / 2)
+    assert distance.between_mean_curves_m == pytest.approx(0.03)
+    assert distance.end_point_between_means_m == pytest.approx(0.03)
+    assert repeatability(recorded).mean_m == pytest.approx(np.sqrt(2 * 0.01**2))
+    np.testing.assert_allclose(mean_curve(recorded)[:, 1], 0.0, atol=1e-12)
+
+
+def test_a_common_rigid_motion_changes_no_band() -> None:
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    sides = [line(-0.01), line(0.02)], [line(0.05)]
+    plain = band_distance([track(p) for p in sides[0]], [track(p) for p in sides[1]])
+    moved = band_distance(
+        [track(p @ turn.T + 3) for p in sides[0]], [track(p @ turn.T + 3) for p in sides[1]]
+    )
+    assert moved.mean_over_pairs_m == pytest.approx(plain.mean_over_pairs_m)
+
+
+def test_one_run_has_no_repeatability_and_no_run_no_band() -> None:
+    with pytest.raises(UndefinedStatisticError, match="1 run"):
+        repeatability([track(line())])
+    with pytest.raises(UndefinedStatisticError, match="no replayed run"):
+        band_distance([track(line())], [])
+
+
+def test_waiting_at_the_ends_is_cut() -> None:
+    waiting = np.concatenate([np.repeat(line()[:1], 30, 0), line(), np.repeat(line()[-1:], 50, 0)])
+    whole = band_distance([track(line())], [track(waiting)])
+    cut = band_distance([moving_part(track(line()))], [moving_part(track(waiting))])
+    assert whole.mean_over_pairs_m > 0.1
+    assert cut.mean_over_pairs_m == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_run_that_stands_still_is_kept_whole() -> None:
+    still = track(np.zeros((5, 3)))
+    assert len(moving_part(still)) == 5

@@ -1,0 +1,181 @@
+"""Tables, figures and the page: complete, escaped, self-contained, and honest about stand-ins."""
+
+import csv
+import io
+import json
+import re
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bridge.errors import UsageError
+from bridge.terminal import Output
+from evaluator.cli import evaluate
+from evaluator.compare import compare_csv, compare_run
+from evaluator.report.figures import scatter_svg, success_svg
+from evaluator.report.page import page
+from evaluator.report.tables import as_csv, as_latex, as_markdown, as_text
+from evaluator.report.write import write_report
+from evaluator.result import Measurement, Results, Table, load_results
+
+PAPER = Path(__file__).resolve().parents[2] / "docs" / "examples" / "paper_table_rates.csv"
+HOSTILE = "<script>alert('&\"')</script>"
+TABLE = Table(
+    id="t",
+    title="T_1 & co",
+    columns=("task", "50 %"),
+    rows=(("a|b_{c}", 1.5), (HOSTILE, None)),
+    note="n",
+)
+
+
+class Tags(HTMLParser):
+    """Collect tags and every address the page names."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        super().__init__()
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.addresses += [v or "" for k, v in attrs if k in ("src", "href", "action", "data")]
+
+
+def test_the_page_asks_for_nothing_outside_and_runs_nothing(six_trials: Any) -> None:
+    comparison = compare_run(six_trials.run)
+    figures = [scatter_svg(comparison.cells, "stand-in"), success_svg(comparison.cells, "stand-in")]
+    text = page(comparison.results(), [figure for figure in figures if figure])
+    parsed = Tags()
+    parsed.feed(text)
+    assert parsed.addresses == []
+    assert "script" not in parsed.tags
+    assert "@import" not in text
+    assert "url(" not in text
+
+
+def test_what_a_stranger_wrote_is_escaped_everywhere() -> None:
+    results = Results(
+        run=HOSTILE,
+        source="run",
+        stand_in=False,
+        measurements=(
+            Measurement(
+                id="x", value=None, unit="1", definition=HOSTILE, reason_if_undefined=HOSTILE
+            ),
+        ),
+        tables=(TABLE,),
+        missing=(HOSTILE,),
+        provenance={"x": HOSTILE},
+    )
+    parsed = Tags()
+    text = page(results, [])
+    parsed.feed(text)
+    assert "script" not in parsed.tags
+    assert text.count("&lt;script&gt;") >= 6
+
+
+def test_stand_in_results_carry_the_banner_and_never_the_word_real(six_trials: Any) -> None:
+    comparison = compare_run(six_trials.run)
+    text = page(comparison.results(), [success_svg(comparison.cells, "stand-in") or ""])
+    assert 'class="banner"' in text
+    body = re.sub(r"not from a real robot", "", text)
+    assert not re.search(r"\breal\b", body)
+
+
+def test_results_of_a_real_cell_carry_no_banner() -> None:
+    assert 'class="banner"' not in page(compare_csv(PAPER).results(), [])
+
+
+def test_figures_are_well_formed_and_show_every_cell() -> None:
+    cells = compare_csv(PAPER).cells
+    for svg in (scatter_svg(cells, "real"), success_svg(cells, "<real>")):
+        root = ET.fromstring(svg or "")
+        assert root.tag.endswith("svg")
+    scatter = scatter_svg(cells, "real") or ""
+    assert scatter.count("<g><title>") == 6
+    bars = ET.fromstring(success_svg(cells, "real") or "")
+    namespace = "{http://www.w3.org/2000/svg}"
+    widths = [float(rect.get("width", "0")) for rect in bars.iter(f"{namespace}rect")]
+    assert widths == pytest.approx(
+        [3.6 * v for v in (80, 80, 100, 90, 60, 40, 100, 80, 60, 46, 80, 70)]
+    )
+
+
+def test_there_is_no_figure_without_cells() -> None:
+    assert scatter_svg([], "real") is None
+    assert success_svg([], "real") is None
+
+
+def test_a_table_is_the_same_in_every_form() -> None:
+    rows = list(csv.reader(io.StringIO(as_csv(TABLE))))
+    assert rows == [["task", "50 %"], ["a|b_{c}", "1.5"], [HOSTILE, ""]]
+    assert r"a\|b_{c}" in as_markdown(TABLE)
+    latex = as_latex(TABLE)
+    assert r"a|b\_\{c\} & 1.5 \\" in latex
+    assert r"50 \%" in latex
+    assert latex.count(r"\begin") == latex.count(r"\end") == 2
+    assert "a|b_{c}" in as_text(TABLE)
+    assert "–" in as_text(TABLE)
+
+
+def test_evaluate_writes_everything_and_says_where(
+    six_trials: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = six_trials.run
+    assert evaluate(run.path) == 0
+    shown = capsys.readouterr().out
+    assert "5/6 = 83.3 %" in shown
+    assert "undefined: 2 cells; it needs at least 3" in shown
+    assert "Stand-in:" in shown
+    assert load_results(run.path).get("agreement.sim_planned.rate").k == 5
+    for name in ("report.html", "trials.csv", "figures/success.svg", "tables/success.tex"):
+        assert (run.results_dir / name).is_file()
+    assert not list(run.results_dir.rglob("*.part"))
+
+
+def test_evaluate_prints_json_that_is_the_results_file(
+    six_trials: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert evaluate(six_trials.run.path, output=Output(json=True)) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record == json.loads((six_trials.run.results_dir / "results.json").read_text())
+
+
+@pytest.mark.parametrize(("threshold", "code"), [(0.8, 0), (0.9, 3)])
+def test_agreement_below_the_threshold_ends_with_three(
+    six_trials: Any, capsys: pytest.CaptureFixture[str], threshold: float, code: int
+) -> None:
+    assert evaluate(six_trials.run.path, fail_under=threshold) == code
+    assert ("the threshold is 0.9" in capsys.readouterr().err) == (code == 3)
+
+
+def test_undefined_agreement_never_passes_a_threshold(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert evaluate(PAPER, out=tmp_path / "out", fail_under=0.0) == 3
+    assert "undefined" in capsys.readouterr().err
+
+
+def test_a_threshold_in_percent_is_refused(six_trials: Any) -> None:
+    with pytest.raises(UsageError, match="fraction from 0 to 1"):
+        evaluate(six_trials.run.path, fail_under=80.0)
+
+
+def test_an_empty_run_still_gets_a_report(maker: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    assert evaluate(maker.run.path) == 0
+    assert "the run holds no recorded trial" in capsys.readouterr().out
+    assert "no recorded trial" in (maker.run.results_dir / "report.html").read_text()
+
+
+def test_writing_twice_replaces_the_first(six_trials: Any) -> None:
+    comparison = compare_run(six_trials.run)
+    folder = six_trials.run.results_dir
+    first = write_report(comparison, folder)
+    before = {path: path.read_bytes() for path in first.files}
+    second = write_report(compare_run(six_trials.run), folder)
+    assert {path: path.read_bytes() for path in second.files} == before

@@ -1,0 +1,168 @@
+"""Laws and known answers of the statistics; undefined is raised with its reason."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evaluator.errors import UndefinedStatisticError
+from evaluator.statistics import correlation
+from evaluator.statistics.agreement import Confusion, mcnemar, phi
+from evaluator.statistics.proportion import (
+    ImpossibleCountError,
+    clopper_pearson,
+    newcombe_difference,
+    relative_gain,
+    wilson,
+)
+
+counts = st.integers(1, 200).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
+rates = st.lists(st.fractions(0, 1, max_denominator=20), min_size=3, max_size=8)
+
+
+@given(counts)
+def test_an_interval_holds_its_rate_and_mirrors(count: tuple[int, int]) -> None:
+    k, n = count
+    for method in (wilson, clopper_pearson):
+        interval = method(k, n)
+        assert 0 <= interval.low <= k / n <= interval.high <= 1
+        assert interval.high > interval.low  # never of zero width, also at 0/n and n/n
+        mirrored = method(n - k, n)
+        assert mirrored.low == pytest.approx(1 - interval.high, abs=1e-9)
+
+
+@given(counts)
+def test_clopper_pearson_is_never_narrower_at_the_ends_than_it_guarantees(
+    count: tuple[int, int],
+) -> None:
+    k, n = count
+    narrow, wide = clopper_pearson(k, n, level=0.9), clopper_pearson(k, n, level=0.99)
+    assert wide.low <= narrow.low
+    assert wide.high >= narrow.high
+
+
+def test_rates_of_nothing_and_impossible_counts_are_refused() -> None:
+    with pytest.raises(UndefinedStatisticError, match="no trials"):
+        wilson(0, 0)
+    with pytest.raises(ImpossibleCountError, match="11 successes of 10"):
+        wilson(11, 10)
+
+
+def test_newcombe_is_the_published_example() -> None:
+    # Newcombe (1998), Statistics in Medicine 17:873-890, table II, example (a), method 10:
+    # 56/70 - 48/80 = 0.20 with 95 % interval 0.0524 to 0.3339.
+    interval = newcombe_difference(48, 80, 56, 70)
+    assert interval.low == pytest.approx(0.0524, abs=5e-5)
+    assert interval.high == pytest.approx(0.3339, abs=5e-5)
+
+
+def test_a_relative_gain_from_zero_is_undefined() -> None:
+    assert relative_gain(0.4, 0.8) == pytest.approx(1.0)
+    with pytest.raises(UndefinedStatisticError, match="the rate before is 0"):
+        relative_gain(0.0, 0.8)
+
+
+def test_confusion_counts_said_against_happened() -> None:
+    pairs = [(True, True), (True, False), (True, False), (False, True), (False, False)]
+    found = Confusion.count(pairs)
+    assert (found.true_positive, found.false_positive) == (1, 2)
+    assert (found.false_negative, found.true_negative) == (1, 1)
+    assert (found.n, found.agreed, found.said_success, found.said_failure) == (5, 2, 3, 2)
+
+
+@given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=2, max_size=40))
+def test_phi_is_pearsons_r_of_the_two_columns(pairs: list[tuple[bool, bool]]) -> None:
+    said, happened = np.array(pairs, dtype=float).T
+    table = Confusion.count(pairs)
+    if said.std() == 0 or happened.std() == 0:
+        with pytest.raises(UndefinedStatisticError, match="side is the same in all"):
+            phi(table)
+    else:
+        assert phi(table) == pytest.approx(np.corrcoef(said, happened)[0, 1], abs=1e-12)
+
+
+def test_mcnemar_of_four_improved_pairs() -> None:
+    pairs = [(False, True)] * 4 + [(True, True)] * 6
+    found = mcnemar(pairs)
+    assert (found.improved, found.worsened) == (4, 0)
+    assert found.p_exact == pytest.approx(0.125)  # 2 / 2^4
+    assert found.p_mid == pytest.approx(0.0625)
+
+
+def test_mcnemar_without_a_discordant_pair_is_undefined() -> None:
+    with pytest.raises(UndefinedStatisticError, match="none of the 2 pairs differ"):
+        mcnemar([(True, True), (False, False)])
+
+
+@given(rates, st.data())
+def test_r_does_not_care_about_order_or_scale(
+    recorded: list[Fraction], data: st.DataObject
+) -> None:
+    sim = data.draw(st.permutations(recorded))
+    try:
+        r = correlation.pearson(recorded, sim)
+    except UndefinedStatisticError:
+        assert len(set(recorded)) == 1
+        return
+    assert -1 <= r <= 1
+    assert correlation.pearson(sim, recorded) == pytest.approx(r, abs=1e-9)
+    assert correlation.pearson(recorded, [v / 2 for v in sim]) == pytest.approx(r, abs=1e-9)
+
+
+def test_r_of_two_points_and_of_a_constant_side_is_refused() -> None:
+    with pytest.raises(UndefinedStatisticError, match="2 cells; it needs at least 3"):
+        correlation.pearson([0.1, 0.2], [0.3, 0.4])
+    with pytest.raises(UndefinedStatisticError, match=r"twin side is constant \(1 in all 3"):
+        correlation.pearson([0.1, 0.2, 0.3], [1, 1, 1])
+
+
+def test_r_of_three_cells_has_no_interval() -> None:
+    with pytest.raises(UndefinedStatisticError, match="3 cells; it needs at least 4"):
+        correlation.fisher_interval(0.9, 3)
+
+
+@given(rates)
+def test_a_perfect_twin_violates_no_rank(recorded: list[Fraction]) -> None:
+    assert correlation.mmrv(recorded=recorded, sim=recorded) == 0
+    assert correlation.bias(recorded=recorded, sim=recorded) == 0
+
+
+def test_mmrv_by_hand_in_both_conventions() -> None:
+    # Cells 1 and 2 are swapped: gaps 0.2 on the recorded side, 0.5 on the twin's; cell 3 is right.
+    recorded, sim = [0.2, 0.4, 0.9], [0.6, 0.1, 0.95]
+    assert correlation.mmrv(recorded=recorded, sim=sim) == pytest.approx(0.4 / 3)
+    assert correlation.mmrv(recorded=recorded, sim=sim, gap="sim") == pytest.approx(1.0 / 3)
+
+
+def test_a_tie_on_one_side_only_counts_from_one_side() -> None:
+    # Equation 1 compares S_i > S_j with R_i > R_j: only the better recorded cell sees the tie.
+    assert correlation.mmrv(recorded=[0.2, 0.6], sim=[0.5, 0.5]) == pytest.approx(0.4 / 2)
+
+
+def test_mmrv_arguments_cannot_be_swapped_by_position() -> None:
+    with pytest.raises(TypeError):
+        correlation.mmrv([0.1, 0.2], [0.1, 0.2])  # type: ignore[misc]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [0.1, 0.5, 0.9])
+def test_wilson_covers_about_ninety_five_percent(rate: float) -> None:
+    rng = np.random.default_rng(7)
+    hits = []
+    for k in rng.binomial(20, rate, size=4000):
+        interval = wilson(int(k), 20)
+        hits.append(interval.low <= rate <= interval.high)
+    # Wilson oscillates around its level with n; at n = 20 exact coverage is 0.956, 0.959, 0.956.
+    assert 0.93 < np.mean(hits) < 0.98
+
+
+@pytest.mark.slow
+def test_newcombe_covers_about_ninety_five_percent() -> None:
+    rng = np.random.default_rng(8)
+    hits = []
+    for first, second in zip(rng.binomial(15, 0.4, 3000), rng.binomial(15, 0.8, 3000), strict=True):
+        interval = newcombe_difference(int(first), 15, int(second), 15)
+        hits.append(interval.low <= 0.4 <= interval.high)
+    assert 0.93 < np.mean(hits) < 0.98

@@ -1,0 +1,200 @@
+"""Trials CSV and rates CSV: what is read, and what is refused with its row."""
+
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.errors import PathNotFoundError, UsageError
+from bridge.exchange.trials_csv import TableError, TrialRecord, read_trials, write_trials
+from bridge.exchange.trials_rates import read_rates
+from evaluator.compare import compare_csv, compare_run
+from evaluator.compare.spreadsheet import record_from_row, row_from_record
+
+PAPER = Path(__file__).resolve().parents[2] / "docs" / "examples" / "paper_table_rates.csv"
+
+names = st.text('abcdefghij_-, "é=', min_size=1, max_size=12).map(str.strip).filter(bool)
+answers = st.sampled_from([None, True, False])
+
+
+@st.composite
+def trial_records(draw: st.DrawFn) -> list[TrialRecord]:
+    ids = draw(st.lists(st.integers(0, 999), unique=True, min_size=1, max_size=6))
+    records = []
+    for number in ids:
+        recorded = draw(answers)
+        records.append(
+            TrialRecord(
+                trial_id=f"t{number}",
+                task=draw(names),
+                condition=draw(names),
+                policy=draw(names),
+                start_id=draw(st.none() | names),
+                k=None if recorded is None else int(recorded),
+                n=None if recorded is None else 1,
+                recorded=recorded,
+                sim_planned=draw(answers),
+                sim_executed=draw(answers),
+                verdict=draw(answers),
+                p_success=draw(st.none() | st.floats(0, 1)),
+                stand_in=draw(st.booleans()),
+            )
+        )
+    return records
+
+
+@given(trial_records())
+def test_trials_survive_writing_and_reading(
+    tmp_path_factory: pytest.TempPathFactory, records: list[TrialRecord]
+) -> None:
+    path = tmp_path_factory.mktemp("trials") / "trials.csv"
+    assert read_trials(write_trials(path, records)) == records
+
+
+def test_a_run_exported_as_trials_gives_the_same_numbers(six_trials: Any, tmp_path: Path) -> None:
+    comparison = compare_run(six_trials.run)
+    path = write_trials(tmp_path / "out.csv", map(record_from_row, comparison.rows))
+    again = compare_csv(path)
+    for name in (
+        "agreement.sim_planned.rate",
+        "agreement.sim_planned.phi",
+        "agreement.verdict.ppv",
+    ):
+        mine, theirs = comparison.results().get(name), again.results().get(name)
+        assert (mine.value, mine.k, mine.n) == (theirs.value, theirs.k, theirs.n)
+    assert again.stand_in is True
+
+
+def test_unknown_stays_unknown(write_table: Callable[[str], Path]) -> None:
+    path = write_table("trial_id,task,recorded,sim_planned\na,cube,,success\nb,cube,unknown,\n")
+    rows = [row_from_record(record) for record in read_trials(path)]
+    assert [row.recorded for row in rows] == [None, None]
+    assert compare_csv(path).results().get("agreement.sim_planned.rate").value is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("trial_id,task\na,cube\nb,cube\na,cube\n", r"row 4: trial_id 'a' stands in row 2"),
+        ("trial_id,task,unit\na,cube,trial\nb,cube,object\n", r"row 3: unit 'object'.*row 2"),
+        ("trial_id,task,recorded\na,cube,maybe\n", r"row 2: recorded is 'maybe'"),
+        ("trial_id,task,k,n\na,cube,2,1\n", r"2 of 1 is not a possible count"),
+        ("trial_id,task,k,n\na,cube,0.5,1\n", r"k is '0.5'"),
+        ("trial_id,task,k,n,recorded\na,cube,0,1,success\n", r"success but k is 0"),
+        ("trial_id,task,k,n\na,cube,4,5\n", r"one trial counts 5 trials"),
+        ("trial_id,task,p_success\na,cube,1.5\n", r"p_success is '1.5'"),
+        ("trial_id,task\na,cube,more\n", r"3 fields where the header has 2"),
+        ("trial_id,tsk\na,cube\n", r"no column 'task'"),
+        ("trial_id,task,mood\na,cube,good\n", r"unknown column 'mood'"),
+        ("trial_id,task\n", r"a header without rows"),
+        ("trial_id,task\n,cube\n", r"trial_id is empty"),
+    ],
+)
+def test_a_trial_that_cannot_be_is_refused_with_its_row(
+    write_table: Callable[[str], Path], text: str, message: str
+) -> None:
+    with pytest.raises(TableError, match=message):
+        read_trials(write_table(text))
+
+
+def test_46_percent_of_ten_trials_is_refused(write_table: Callable[[str], Path]) -> None:
+    path = write_table("task,side,unit,n,rate_percent\nducks,real,trial,10,46.0\n")
+    with pytest.raises(
+        TableError, match=r"row 2: 0.46 x 10 = 4.6 .*4/10.*5/10.*23 of 50"
+    ) as caught:
+        read_rates(path)
+    assert caught.value.row == 2
+
+
+@pytest.mark.parametrize(
+    ("row", "count"),
+    [("3,66.7", Fraction(2, 3)), ("50,46.0", Fraction(23, 50)), ("7,57.1", Fraction(4, 7))],
+)
+def test_a_rounded_rate_finds_its_count(
+    write_table: Callable[[str], Path], row: str, count: Any
+) -> None:
+    path = write_table(f"task,side,n,rate_percent\ncube,real,{row}\n")
+    assert read_rates(path)[0].rate == count
+
+
+@given(st.integers(1, 60), st.data())
+def test_every_real_count_printed_with_enough_digits_is_found_again(
+    tmp_path_factory: pytest.TempPathFactory, n: int, data: st.DataObject
+) -> None:
+    k = data.draw(st.integers(0, n))
+    path = tmp_path_factory.mktemp("rates") / "rates.csv"
+    path.write_text(f"task,side,n,rate\ncube,sim,{n},{k / n:.4f}\n")
+    record = read_rates(path)[0]
+    assert (record.k, record.n) == (k, n)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("task,side,n,rate\ncube,real,10,80\n", r"rate is '80'.*rate_percent"),
+        ("task,side,n,rate\ncube,left,10,0.8\n", r"side is 'left'"),
+        ("task,side,n,rate\ncube,real,1000,0.5\n", None),
+        ("task,side,n,rate\ncube,real,1000,0.33\n", None),
+        ("task,side,n,rate\ncube,real,997,0.33\n", r"counts of 997 round to 0.33.*Give k"),
+        ("task,side,k,n,rate\ncube,real,7,10,0.8\n", r"0.8 is not 7/10"),
+        ("task,side,n\ncube,real,10\n", r"neither a rate nor"),
+        ("task,side,rate,rate_percent\ncube,real,0.8,80\n", r"both rate and rate_percent"),
+        ("task,side,rate\ncube,real,0.8\ncube,real,0.9\n", r"row 3: real of 'cube'.*row 2"),
+        (
+            "task,condition,side,unit,n,rate\nd,a,sim,trial,10,0.6\nd,a,real,object,50,0.46\n",
+            r"row 3: unit 'object'.*row 2 says 'trial'",
+        ),
+        ("task,side,rate\ncube,real,nan\n", r"rate is 'nan'"),
+    ],
+)
+def test_rates_that_cannot_be_are_refused(
+    write_table: Callable[[str], Path], text: str, message: str | None
+) -> None:
+    path = write_table(text)
+    if message is None:
+        assert read_rates(path)
+        return
+    with pytest.raises(TableError, match=message):
+        read_rates(path)
+
+
+def test_the_paper_table_gives_its_known_numbers() -> None:
+    results = compare_csv(PAPER).results()
+    r = results.get("agreement.pearson_r")
+    # By hand from 80/80, 100/90, 60/40, 100/80, 60/46, 80/70.
+    assert r.value == pytest.approx(0.92914, abs=1e-5)
+    assert r.interval is None
+    assert "share tasks" in str(r.reason_without_interval)
+    assert results.get("agreement.bias_pp").value == pytest.approx(12.3333, abs=1e-4)
+    points = results.get("gain.pp.recorded.average")
+    assert points.value == pytest.approx(24.6667, abs=1e-4)
+    relative = results.get("gain.relative.recorded.average")
+    assert relative.value == pytest.approx(0.44578, abs=1e-5)
+    ducks = results.get("rate.recorded.ducks_into_basket.without_replanning.-")
+    assert (ducks.k, ducks.n, ducks.counted) == (23, 50, "object")
+
+
+def test_rates_without_n_have_no_interval(write_table: Callable[[str], Path]) -> None:
+    path = write_table("task,side,rate\na,sim,0.5\na,real,0.4\n")
+    results = compare_csv(path).results()
+    rate = results.get("rate.recorded.a.-.-")
+    assert rate.interval is None
+    assert rate.reason_without_interval == "no n"
+    assert results.get("agreement.pearson_r").reason_if_undefined == "1 cell; it needs at least 3"
+
+
+def test_a_table_that_is_neither_is_refused(
+    write_table: Callable[[str], Path], tmp_path: Path
+) -> None:
+    with pytest.raises(UsageError, match="neither a trials CSV"):
+        compare_csv(write_table("a,b\n1,2\n"))
+    with pytest.raises(PathNotFoundError):
+        compare_csv(tmp_path / "nowhere.csv")
+    binary = tmp_path / "binary.csv"
+    binary.write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(TableError, match="not a CSV"):
+        compare_csv(binary)
