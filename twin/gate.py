@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
 from cyclopts import Parameter
@@ -78,6 +78,7 @@ class UndecidedError(TwinError):
     """There is no basis for a verdict; the message says what is missing."""
 
 
+@runtime_checkable
 class Eyes(Protocol):
     """What the gate sees of the cell: ``twin.scene.live.LiveView``, or a fake."""
 

@@ -195,8 +195,11 @@ def _frames_of(
     ]
     if not pairs:
         raise NoFramesError("no colour and depth pair taken at rest since the last motion")
+    oldest_ns = pairs[-1][0].stamp_ns - MAX_SPAN_NS
     return [
-        _frame(camera_id, camera.infos, tree, color, depth) for color, depth in pairs[-max_frames:]
+        _frame(camera_id, camera.infos, tree, color, depth)
+        for color, depth in pairs[-max_frames:]
+        if color.stamp_ns >= oldest_ns
     ]
 
 

@@ -37,8 +37,10 @@ class LocaliseConfig:
     """How far the seen table may correct the cameras."""
     fit: FitConfig = field(default_factory=FitConfig)
     """How a known shape is laid onto points and outlines."""
-    max_frames_per_camera: int = 3
-    """Frames of one camera that are averaged before anything moves."""
+    max_frames: int = 3
+    """Frames of one camera pose that are averaged."""
+    max_views: int = 8
+    """Poses of one camera that are used, for example of a wrist camera during a scan."""
     min_explained: float = 0.6
     """Share of an object's points that its shape must explain."""
     rest_tolerance_m: float = 0.006
@@ -116,7 +118,7 @@ def localise(
 ) -> Localisation:
     """Like ``localise_objects``, and keep what the table said of the cameras."""
     config = LocaliseConfig() if config is None else config
-    views = fuse_stills(frames, config.max_frames_per_camera, task, config.points)
+    views = fuse_stills(frames, config.max_frames, config.max_views, task, config.points)
     views, tables = correct_for_table(views, task, config.table, config.points, config.colour)
     objects = {
         object_id: _localise_one(views, model, config, tables)

@@ -23,7 +23,7 @@ from bridge.task.task_file import Task
 from twin.scene.localise import LocaliseConfig, LocalisedObject, localise_objects
 
 NO_SCENE = "noscene"
-STILL_WINDOW_NS = 100_000_000
+STILL_WINDOW_NS = 40_000_000
 """A camera is still when its pose is the same this long before and after an image."""
 STILL_DISTANCE_M = 1e-3
 STILL_ANGLE_RAD = 3e-3
@@ -50,8 +50,8 @@ def localise_episode(
 ) -> dict[str, LocalisedObject]:
     """Localise from the last still frames before the first execution started.
 
-    Without an execution the still frames of the whole episode are used. Stand-in truth is never
-    read.
+    Without an execution, as in a scan, still frames spread over the whole episode are used.
+    Stand-in truth is never read.
 
     Args:
         episode: Recorded, with posed colour and depth.
@@ -63,7 +63,10 @@ def localise_episode(
     config = LocaliseConfig() if config is None else config
     if after_ns is None and before_ns is None:
         before_ns = first_execution_ns(episode)
-    frames = still_frames(episode, config.max_frames_per_camera, after_ns, before_ns)
+    if after_ns is None and before_ns is None:
+        frames = still_frames(episode, config.max_views, spread=True)
+    else:
+        frames = still_frames(episode, config.max_frames, after_ns, before_ns)
     return localise_objects(frames, task, config)
 
 
@@ -99,18 +102,35 @@ def quiet_phases(episode: Episode) -> list[Phase]:
 
 
 def still_frames(
-    episode: Episode, max_per_camera: int, after_ns: int | None, before_ns: int | None
+    episode: Episode,
+    max_per_camera: int,
+    after_ns: int | None = None,
+    before_ns: int | None = None,
+    *,
+    spread: bool = False,
 ) -> list[RgbdFrame]:
-    """The last frames of each camera in an interval during which that camera did not move."""
+    """Frames of each camera taken in an interval while that camera did not move.
+
+    Args:
+        episode: Recorded, with posed colour and depth.
+        max_per_camera: At most so many.
+        after_ns: Only frames later than this source time.
+        before_ns: Only frames earlier than this source time.
+        spread: Spread them evenly over the interval instead of taking the last ones.
+    """
     tree = streams.transform_tree(episode)
     frames: list[RgbdFrame] = []
     for camera_id in rgbd_camera_ids(episode):
         frame_id = streams.camera_info(episode, camera_id, "color").frame_id
-        newest: deque[RgbdFrame] = deque(maxlen=max_per_camera)
+        kept: deque[RgbdFrame] = deque(maxlen=None if spread else max_per_camera)
         for frame in _between(streams.rgbd_frames(episode, camera_id, tree), after_ns, before_ns):
             if is_still(tree, frame_id, frame.stamp_ns, before_ns):
-                newest.append(frame)
-        frames.extend(newest)
+                kept.append(frame)
+        if spread and len(kept) > max_per_camera:
+            ids = np.linspace(0, len(kept) - 1, max_per_camera).round().astype(int)
+            frames.extend(kept[index] for index in ids)
+        else:
+            frames.extend(kept)
     return frames
 
 

@@ -57,12 +57,12 @@ class View:
 
 
 def fuse_stills(
-    frames: Sequence[RgbdFrame], max_frames: int, task: Task, config: PointConfig
+    frames: Sequence[RgbdFrame], max_frames: int, max_views: int, task: Task, config: PointConfig
 ) -> list[View]:
     """Average the last frames of each camera that were taken from one pose.
 
-    Frames of a camera that moved in between make separate views, newest kept. Depth is averaged
-    over the frames that measured a pixel, if at least half of them did.
+    Frames of a camera that moved in between make separate views, the newest are kept. Depth is
+    averaged over the frames that measured a pixel, if at least half of them did.
     """
     groups: list[list[RgbdFrame]] = []
     for frame in sorted(frames, key=lambda item: -item.stamp_ns):
@@ -72,13 +72,10 @@ def fuse_stills(
                 break
         else:
             groups.append([frame])
-    kept: dict[str, int] = {}
-    views = []
+    views: list[View] = []
     for group in groups:
-        used = kept.get(group[0].camera_id, 0)
-        if used < max_frames:
-            views.append(_view(group[: max_frames - used], task, config))
-            kept[group[0].camera_id] = used + len(group)
+        if sum(view.camera_id == group[0].camera_id for view in views) < max_views:
+            views.append(_view(group[:max_frames], task, config))
     return sorted(views, key=lambda view: (view.camera_id, view.stamp_ns))
 
 

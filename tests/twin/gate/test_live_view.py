@@ -1,0 +1,176 @@
+"""What the gate remembers of a live cell: bounded, at rest, with a reason when it is nothing."""
+
+import json
+
+import numpy as np
+import pytest
+
+from bridge.episode.records import (
+    CameraInfo,
+    CompressedColor,
+    DepthImage,
+    FrameTransform,
+    PoseSample,
+    string_to_cdr,
+    transforms_to_cdr,
+)
+from bridge.geometry.camera import Camera
+from bridge.media.color import encode_jpeg
+from twin.scene.live import KEPT_IMAGES, LiveFrames, LiveView
+
+S = 1_000_000_000
+CAMERA = Camera(width=8, height=6, fx=10.0, fy=10.0, cx=4.0, cy=3.0)
+IMAGE = encode_jpeg(np.full((6, 8, 3), 128, dtype=np.uint8))
+
+
+def look(view: LiveView, now_ns: int = 0, most: int = 3) -> LiveFrames:
+    return view.frames(now_ns=now_ns, max_age_ns=5 * S, max_per_camera=most)
+
+
+def calibrate(view: LiveView) -> None:
+    for stream in ("color", "depth"):
+        info = CameraInfo(stamp_ns=0, frame_id=f"side_{stream}_optical", camera=CAMERA)
+        view.take(f"/standin/cam/side/{stream}/info", info.to_cdr(), 0)
+
+
+def place(view: LiveView, stamp_ns: int = 0, x_m: float = 0.0, topic: str = "/tf_static") -> None:
+    T = np.eye(4)
+    T[0, 3] = x_m
+    items = [
+        FrameTransform(
+            stamp_ns=stamp_ns, parent="base_link", child=f"side_{name}_optical", T_parent_child=T
+        )
+        for name in ("color", "depth")
+    ]
+    view.take(topic, transforms_to_cdr(items), 0)
+
+
+def shoot(view: LiveView, stamp_ns: int, *, received_ns: int = 0, depth_lag_ns: int = 0) -> None:
+    color = CompressedColor(stamp_ns=stamp_ns, frame_id="c", format="jpeg", data=IMAGE)
+    depth = DepthImage(
+        stamp_ns=stamp_ns + depth_lag_ns,
+        frame_id="d",
+        depth_mm=np.full((6, 8), 500, dtype=np.uint16),
+    )
+    view.take("/standin/cam/side/color/image", color.to_cdr(), received_ns)
+    view.take("/standin/cam/side/depth/image", depth.to_cdr(), received_ns)
+
+
+def event(view: LiveView, kind: str, stamp_ns: int) -> None:
+    record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, "plan_id": "plan_1"}
+    view.take("/standin/event", json.dumps(record).encode(), 0)
+
+
+def ready() -> LiveView:
+    view = LiveView("standin")
+    calibrate(view)
+    place(view)
+    return view
+
+
+def test_the_newest_frames_are_given_in_metres() -> None:
+    view = ready()
+    for tenth in range(5):
+        shoot(view, S + tenth * S // 10)
+    live = look(view)
+    assert [frame.stamp_ns for frame in live.frames] == [S + k * S // 10 for k in (2, 3, 4)]
+    assert live.frames[0].depth_m.max() == pytest.approx(0.5)
+    assert live.reasons == []
+    assert view.newest_ns() == S + 4 * S // 10
+
+
+def test_memory_is_bounded() -> None:
+    view = ready()
+    for k in range(50):
+        shoot(view, S + k)
+    assert len(look(view, most=100).frames) == KEPT_IMAGES
+    for k in range(50):
+        view.take(f"/standin/cam/camera_{k}/color/image", b"junk", 0)
+    assert len(view._cameras) <= 16
+
+
+def test_each_missing_part_has_its_reason() -> None:
+    view = LiveView("standin")
+    assert look(view).reasons == ["no images on /standin/cam/**"]
+    shoot(view, S)
+    assert "no calibration on color/info and depth/info" in look(view).reasons[0]
+    calibrate(view)
+    assert "no transform to side_color_optical" in look(view).reasons[0]
+    place(view)
+    assert look(view).frames
+
+
+def test_frames_from_before_the_end_of_an_execution_do_not_count() -> None:
+    view = ready()
+    shoot(view, S)
+    event(view, "execution_started", 2 * S)
+    assert view.executing() == "plan_1"
+    event(view, "execution_ended", 3 * S)
+    assert view.executing() is None
+    assert "at rest since the last motion" in look(view).reasons[0]
+    shoot(view, 3 * S + S // 5)
+    assert [frame.stamp_ns for frame in look(view).frames] == [3 * S + S // 5]
+
+
+def test_a_moving_camera_gives_nothing() -> None:
+    view = LiveView("standin")
+    calibrate(view)
+    for k in range(11):
+        place(view, S + k * S // 50, x_m=0.01 * k, topic="/tf")
+    shoot(view, S + S // 10)
+    assert "at rest" in look(view).reasons[0]
+
+
+def test_a_silent_camera_and_frames_of_long_ago_are_not_trusted() -> None:
+    view = ready()
+    shoot(view, S)
+    assert "silent for 6.0 s" in look(view, now_ns=6 * S).reasons[0]
+    shoot(view, 4 * S, received_ns=6 * S)
+    assert [frame.stamp_ns for frame in look(view, now_ns=6 * S).frames] == [4 * S]
+
+
+def test_colour_without_depth_of_the_same_time_is_no_frame() -> None:
+    view = ready()
+    shoot(view, S, depth_lag_ns=S // 10)
+    assert look(view).frames == []
+
+
+def test_messages_that_cannot_be_read_are_counted() -> None:
+    view = ready()
+    for topic in (
+        "/tf",
+        "/tf_static",
+        "/robot_description",
+        "/standin/event",
+        "/standin/cam/side/color/image",
+        "/standin/cam/side/depth/image",
+        "/standin/cam/side/color/info",
+    ):
+        view.take(topic, b"\x00\x01\x00\x00\xff\xff\xff\xff", 0)
+    assert view.malformed == 7
+    shoot(view, S)
+    assert look(view).frames
+
+
+def test_an_unreadable_image_is_a_reason() -> None:
+    view = ready()
+    shoot(view, S)
+    bad = CompressedColor(stamp_ns=S + 1, frame_id="c", format="jpeg", data=b"no image")
+    view.take("/standin/cam/side/color/image", bad.to_cdr(), 0)
+    assert "unreadable image" in look(view).reasons[0]
+
+
+def test_stand_in_truth_is_passed_over() -> None:
+    view = LiveView("standin/truth")
+    lie = PoseSample(stamp_ns=9, frame_id="base_link", T_frame_body=np.eye(4))
+    view.take("/standin/truth/object/cube/pose", lie.to_cdr(), 0)
+    view.take("/standin/truth/cam/side/color/image", b"", 0)
+    assert view._cameras == {}
+    assert view.malformed == 0
+
+
+def test_the_robot_description_is_remembered() -> None:
+    view = LiveView("standin")
+    assert view.urdf() is None
+    view.take("/robot_description", string_to_cdr("<robot/>"), 0)
+    assert view.urdf() == "<robot/>"
