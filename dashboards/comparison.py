@@ -2,11 +2,14 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from threading import Lock
 
 from bridge.episode.run import RunFolder
 from bridge.errors import GstError, PathNotFoundError
 from evaluator.compare import Comparison, TrialRow, compare_run
 from evaluator.result import Measurement, Results, load_results
+
+_ASKING = Lock()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +57,8 @@ def agrees(row: TrialRow) -> bool | None:
 
 def judge(run: RunFolder) -> Judgement:
     """Ask the evaluator about a run; asked again only when a file of the run changed."""
-    return _judge(run, _state_of(run))
+    with _ASKING:  # two pages opened at once wait for one answer instead of asking twice
+        return _judge(run, _state_of(run))
 
 
 def _state_of(run: RunFolder) -> tuple[tuple[str, int, int], ...]:

@@ -13,6 +13,8 @@ from evaluator.compare import TrialRow
 
 RECORDED, PLANNED = "recorded", "planned"
 REPLAY_STYLES = {"planned": "twin-planned", "executed": "twin-executed"}
+LEAST_SPAN = {"m": 0.02, "mm": 5.0, "rad": 0.05}
+"""A value axis covers at least this much of its unit."""
 MARGIN_SETTING = "eps_col_m"
 """The replay setting that holds the safety distance."""
 
@@ -131,6 +133,7 @@ def _error_plot(row: TrialRow | None, clock: PageClock) -> TimePlot | None:
         signals,
         span_s=clock.span_s,
         level=0.0,
+        least_span=LEAST_SPAN["mm"],
         note="computed by the evaluator",
     )
 
@@ -319,6 +322,7 @@ def _plot(
         span_s=clock.span_s,
         level=level,
         level_label=level_label,
+        least_span=LEAST_SPAN[unit],
         width=width,
         height=height,
     )

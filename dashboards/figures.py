@@ -203,11 +203,15 @@ def time_plot(
     span_s: tuple[float, float],
     level: float | None = None,
     level_label: str = "",
+    least_span: float = 0.0,
     note: str = "",
     width: int = 560,
     height: int = 190,
 ) -> TimePlot | None:
-    """Lay out signals over a span of time; None when there is nothing to draw."""
+    """Lay out signals over a span of time; None when there is nothing to draw.
+
+    The value axis covers ``least_span`` at least, so that noise is not blown up to a motion.
+    """
     finite = [signal.values[np.isfinite(signal.values)] for signal in signals]
     finite = [values for values in finite if len(values)]
     if not finite:
@@ -216,7 +220,7 @@ def time_plot(
     high = max(float(values.max()) for values in finite)
     if level is not None:
         low, high = min(low, level), max(high, level)
-    room = (high - low) * 0.06
+    room = max((high - low) * 0.06, (least_span - (high - low)) / 2)
     x = axis(span_s[0], span_s[1], 46, width - 8, wanted=7)
     y = axis(low - room, high + room, height - 24, 10, wanted=4)
     lines = tuple(

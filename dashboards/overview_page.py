@@ -96,6 +96,8 @@ class Overview:
     selection: Selection
     stand_in: bool | None
     cards: tuple[Card, ...]
+    has_headline: bool
+    """At least one card has something to say."""
     scatter: Scatter | None
     rates: RateTable | None
     gains: tuple[GainRow, ...]
@@ -140,6 +142,7 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         selection=selection,
         stand_in=judgement.stand_in,
         cards=cards,
+        has_headline=any(card.state != "missing" for card in cards),
         scatter=scatter(cells),
         rates=headline.rate_table(judgement.measurements),
         gains=gains,

@@ -7,12 +7,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Thread
 from types import FrameType
 
 import uvicorn
 
 from bridge.terminal import Output
 from dashboards.app import create_app
+from dashboards.comparison import judge
 from dashboards.config import DashboardConfig
 from dashboards.errors import AddressTakenError
 from dashboards.guard import Admission, is_loopback
@@ -91,10 +93,17 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
         )
     )
     text = f"Dashboard: {address.url}\nFrom another computer: {address.ssh_line}\nStop with Ctrl-C."
+    Thread(target=_ask_ahead, args=(library,), daemon=True).start()
     with listener, _ending_on_signals(server):
         output.result({"url": address.url, "ssh": address.ssh_line, "runs": [*library.runs]}, text)
         server.run(sockets=[listener])
     return 0
+
+
+def _ask_ahead(library: Library) -> None:
+    """Let the evaluator read the first run while the reader is still opening the page."""
+    _, run = library.pick(None)
+    judge(run)
 
 
 @contextmanager

@@ -138,7 +138,7 @@ def short_evidence(measurement: Measurement | None) -> str:
         parts.append(f"n = {counted(measurement)}")
     if measurement.interval is not None:
         parts.append(bounds(measurement.interval, shown_unit(measurement)))
-    return " · ".join(parts)
+    return ", ".join(parts)
 
 
 def size_text(num_bytes: int) -> str:

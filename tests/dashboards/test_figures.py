@@ -76,6 +76,14 @@ def test_a_constant_signal_is_drawn_inside_the_plot() -> None:
     assert 10 < heights.pop() < plot.height - 24
 
 
+def test_noise_is_not_blown_up_to_a_motion() -> None:
+    noise = signal(np.array([1.0, 1.0001, 1.0]))
+    plot = time_plot("t", "rad", [noise], span_s=(0, 1), least_span=0.05)
+    assert plot is not None
+    assert plot.y.high - plot.y.low >= 0.05
+    assert plot.y.low < 1.0 < plot.y.high
+
+
 def test_a_level_is_always_visible() -> None:
     plot = time_plot("t", "mm", [signal(np.array([50.0, 60.0]))], span_s=(0, 1), level=2.0)
     assert plot is not None
