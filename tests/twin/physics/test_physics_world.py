@@ -1,0 +1,96 @@
+"""The physics world: things fall, rest, are gripped, and do the same on every run."""
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from bridge.geometry import se3
+from bridge.task.robot import ur5_with_gripper_urdf
+from twin.physics.config import PhysicsConfig
+from twin.physics.world import PhysicsError, World
+from twin.robot.description import with_absolute_meshes
+
+HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
+SIZE = np.array([0.04, 0.04, 0.04])
+
+
+@pytest.fixture(scope="module")
+def urdf() -> str:
+    return with_absolute_meshes(ur5_with_gripper_urdf())
+
+
+def at(x: float, y: float, z: float) -> np.ndarray:
+    return se3.transform_from(np.array([1.0, 0, 0, 0]), np.array([x, y, z]))
+
+
+def dropped(urdf: str, steps: int = 120) -> tuple[np.ndarray, str]:
+    """Drop two cubes onto the table; the last pose, and a hash of all of them."""
+    digest = hashlib.sha256()
+    with World(urdf, {}, PhysicsConfig()) as world:
+        world.add_table(0.0)
+        world.add_free("low", SIZE, 0.05, at(0.5, 0.0, 0.05))
+        world.add_free("high", SIZE, 0.05, at(0.51, 0.01, 0.12))
+        world.reset_robot(HOME, 0.08)
+        for _ in range(steps):
+            world.command(HOME, np.zeros(6), 0.08)
+            world.step()
+            digest.update(world.T_base_object("low").tobytes())
+            digest.update(world.T_base_object("high").tobytes())
+            digest.update(world.joints_rad().tobytes())
+        return world.T_base_object("low"), digest.hexdigest()
+
+
+def test_a_dropped_cube_comes_to_rest_on_the_table(urdf: str) -> None:
+    T, _ = dropped(urdf)
+    assert T[2, 3] == pytest.approx(0.02, abs=1e-3)
+
+
+def test_every_run_gives_the_same_bits(urdf: str) -> None:
+    assert dropped(urdf, 60)[1] == dropped(urdf, 60)[1]
+
+
+def test_a_free_fall_follows_newton(urdf: str) -> None:
+    with World(urdf, {}, PhysicsConfig()) as world:
+        world.add_free("cube", SIZE, 0.05, at(0.6, 0.3, 1.0))
+        for _ in range(48):
+            world.step()
+        # Semi-implicit Euler: the sum 1..n of g dt^2, with the engine's 4 % linear damping per s.
+        fallen = 9.81 * (1 / 240) ** 2 * 48 * 49 / 2
+        assert 1.0 - world.T_base_object("cube")[2, 3] == pytest.approx(fallen, rel=0.01)
+
+
+def test_fingers_stop_at_the_cube_and_stay_symmetric(urdf: str) -> None:
+    with World(urdf, {}, PhysicsConfig()) as world:
+        world.reset_robot(HOME, 0.041)
+        T_tcp = world.T_base_link("tcp")
+        world.add_free("cube", SIZE, 0.05, T_tcp)
+        for _ in range(240):
+            world.command(HOME, np.zeros(6), 0.0)
+            world.step()
+        left, right = (
+            np.linalg.norm(world.T_base_link(f"gripper_{side}_finger")[:3, 3] - T_tcp[:3, 3])
+            for side in ("left", "right")
+        )
+        assert world.width_m() == pytest.approx(0.04, abs=2e-3)
+        assert abs(left - right) < 1e-3
+        assert world.finger_touches("cube")
+        drift = world.T_base_object("cube")[:3, 3] - T_tcp[:3, 3]
+        assert np.linalg.norm(drift) < 4e-3, "the grasp does not hold against gravity"
+
+
+def test_open_fingers_hold_nothing(urdf: str) -> None:
+    with World(urdf, {}, PhysicsConfig()) as world:
+        world.reset_robot(HOME, 0.08)
+        T_tcp = world.T_base_link("tcp")
+        world.add_free("cube", SIZE, 0.05, T_tcp)
+        for _ in range(60):
+            world.command(HOME, np.zeros(6), 0.08)
+            world.step()
+        assert not world.finger_touches("cube")
+        assert world.T_base_object("cube")[2, 3] < T_tcp[2, 3] - 0.2
+
+
+def test_a_description_without_fingers_is_refused_by_name(urdf: str) -> None:
+    with pytest.raises(PhysicsError, match="gripper_left_finger_joint"):
+        World(urdf.replace("gripper_left_finger_joint", "thumb_joint"), {}, PhysicsConfig())

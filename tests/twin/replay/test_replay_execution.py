@@ -1,0 +1,57 @@
+"""Recorded finger distances become commands that press."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bridge.episode.streams import JointTrack
+from bridge.task.robot import ARM_JOINTS
+from twin.replay.config import ReplayConfig
+from twin.replay.execution import closed_mask, path_of_execution
+
+OPEN_M, HELD_M = 0.085, 0.040
+
+
+def recorded_grasp(lag_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Open, close onto a 40 mm cube at 1.1 s, open at 4.2 s (the scripted plan at pace 2)."""
+    t = np.arange(0.0, 5.5, 0.008)
+    knots = [0.0, 1.1 + lag_s, 1.4 + lag_s, 4.2 + lag_s, 4.5 + lag_s, 6.0]
+    width = np.interp(t, knots, [OPEN_M, OPEN_M, HELD_M, HELD_M, OPEN_M, OPEN_M])
+    noise = np.random.default_rng(0).normal(0, 2e-4, len(t))
+    return (t * 1e9).astype(np.int64), width + noise
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.3, 0.8])
+def test_the_grasp_is_found_also_when_it_comes_late(script: SimpleNamespace, lag_s: float) -> None:
+    times, width = recorded_grasp(lag_s)
+    closed = closed_mask(times, width, script.plan(script.scene()))
+    found = times[closed] * 1e-9
+    assert found[0] == pytest.approx(1.4 + lag_s, abs=0.03)
+    assert found[-1] == pytest.approx(4.2 + lag_s, abs=0.03)
+    assert np.all(np.diff(np.flatnonzero(closed)) == 1)
+
+
+def test_the_command_presses_only_while_something_is_held(script: SimpleNamespace) -> None:
+    times, width = recorded_grasp(0.2)
+    track = JointTrack(names=ARM_JOINTS, stamps_ns=times, position=np.zeros((len(times), 6)))
+    widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
+    path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig())
+    at = {t: float(path.width_at(np.array([round(t * 1e9)]))[0]) for t in (0.5, 3.0, 5.2)}
+    assert at[0.5] == pytest.approx(OPEN_M, abs=1e-3)
+    assert at[3.0] == pytest.approx(HELD_M - 0.01, abs=1e-3)
+    assert at[5.2] == pytest.approx(OPEN_M, abs=1e-3)
+    assert path.first_close_ns is not None
+    assert path.first_close_ns * 1e-9 == pytest.approx(1.3, abs=0.05)
+
+
+def test_stamps_count_from_the_first_one_and_repeats_are_dropped(script: SimpleNamespace) -> None:
+    times, width = recorded_grasp(0.0)
+    stamps = np.concatenate([times, times[-1:]]) + 1_700_000_000_000_000_000
+    width = np.append(width, width[-1])
+    track = JointTrack(names=ARM_JOINTS, stamps_ns=stamps, position=np.zeros((len(stamps), 6)))
+    widths = JointTrack(names=("gripper_width",), stamps_ns=stamps, position=width[:, None])
+    path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig())
+    assert path.times_ns[0] == 0
+    assert np.all(np.diff(path.times_ns) > 0)
+    assert path.end_ns() == times[-1]

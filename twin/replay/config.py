@@ -1,0 +1,72 @@
+"""Settings of a replay; imports nothing heavy."""
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from bridge.errors import UsageError
+from twin.physics.config import PhysicsConfig
+from twin.robot.config import IkConfig
+
+Mode = Literal["kinematic", "dynamic"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayConfig:
+    """How one trajectory is re-lived and when it is accepted."""
+
+    mode: Mode = "dynamic"
+    """kinematic follows the joints exactly; dynamic lets physics answer."""
+    eps_col_m: float = 0.002
+    """Smallest distance between bodies that may not touch, the paper's epsilon_col [m]."""
+    max_contact_depth_m: float = 0.005
+    """Bodies that may touch may not lie deeper in each other than this [m]."""
+    pre_grasp_depth_m: float = 0.002
+    """Deepest overlap with an object before the first grasp that localisation may explain [m]."""
+    moved_m: float = 0.005
+    """An object counts as carried or pushed once it is this far from its start [m]."""
+    path_step_s: float = 0.04
+    """Spacing at which the path between waypoints is checked [s]."""
+    max_joint_step_rad: float = 0.3
+    """Largest change of a joint within one path step; more is a jump [rad]."""
+    sample_rate_hz: int = 60
+    """States per second that a replay keeps; divides the physics rate."""
+    settle_before_s: float = 0.25
+    """Objects come to rest for this long before the trajectory starts [s]."""
+    settle_after_s: float = 1.0
+    """The robot holds still for this long before the terminal predicate is read [s]."""
+    squeeze_m: float = 0.01
+    """How far below the recorded width an executed grasp is commanded, so that it presses [m]."""
+    seed: int = 0
+    """Seed of the replay; nominal replays draw nothing, so it only labels them."""
+    ik: IkConfig = field(default_factory=IkConfig)
+    """When a pose counts as reached."""
+    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    """Nominal physics."""
+
+    def __post_init__(self) -> None:
+        """Refuse rates that do not fit together."""
+        if self.sample_rate_hz < 1 or self.physics.rate_hz % self.sample_rate_hz:
+            message = (
+                f"sample_rate_hz {self.sample_rate_hz} does not divide the physics rate "
+                f"{self.physics.rate_hz} Hz. Choose a divisor, for example 60."
+            )
+            raise UsageError(message)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ReplayRunConfig:
+    """What ``robot-gst replay`` replays."""
+
+    episode: tuple[str, ...] = ()
+    """Ids of the trial episodes to replay; all of them when none is given."""
+    workers: int = 1
+    """Processes that replay side by side."""
+    force: bool = False
+    """Redo replays that are there already."""
+    relocalise: bool = False
+    """Redo the localisation of objects that is there already."""
+    replay: Annotated[ReplayConfig, Parameter(name="replay")] = field(default_factory=ReplayConfig)
+    """How each trajectory is re-lived."""

@@ -1,0 +1,99 @@
+"""From recorded joints and finger distances to the path that an executed replay follows."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bridge.episode.streams import JointTrack
+from bridge.task.plan import Plan
+from bridge.task.robot import ARM_JOINTS
+from twin.replay.config import ReplayConfig
+from twin.replay.path import JointPath, UnusablePlanError
+
+_PLATEAU_M = 0.002
+"""A finger distance this close to the smallest one of a grasp belongs to the grasp."""
+_LATENESS_NS = 2_000_000_000
+"""An execution may lag behind its plan by up to this long."""
+
+
+def path_of_execution(
+    track: JointTrack, widths: JointTrack, plan: Plan, config: ReplayConfig
+) -> JointPath:
+    """Turn recorded tracks into a path that starts at time 0.
+
+    A recorded grasp stops at the object's width. Commanding that width would touch without
+    pressing, so while the plan wants the gripper closed and the fingers have stopped, the command
+    is ``squeeze_m`` narrower and the force limit holds the object.
+
+    Raises:
+        UnusablePlanError: When a track is empty or names other joints.
+    """
+    if len(track.stamps_ns) == 0 or len(widths.stamps_ns) == 0:
+        raise UnusablePlanError(
+            plan_id=plan.id,
+            found="was executed without recorded joints or gripper",
+            hint="Record /joint_states and /gripper/state over the whole execution.",
+        )
+    missing = [name for name in ARM_JOINTS if name not in track.names]
+    if missing:
+        raise UnusablePlanError(
+            plan_id=plan.id,
+            found=f"was recorded without the joints {', '.join(missing)}",
+            hint=f"The recording has {', '.join(track.names)}.",
+        )
+    order = [track.names.index(name) for name in ARM_JOINTS]
+    first_ns = int(track.stamps_ns[0])
+    times, keep = np.unique(track.stamps_ns - first_ns, return_index=True)
+    width_times, width_keep = np.unique(widths.stamps_ns - first_ns, return_index=True)
+    width = widths.position[width_keep, 0].astype(np.float64)
+    closed = closed_mask(width_times, width, plan)
+    return JointPath(
+        times_ns=times,
+        joints_rad=track.position[keep][:, order].astype(np.float64),
+        width_times_ns=width_times,
+        width_m=np.where(closed, np.maximum(width - config.squeeze_m, 0.0), width),
+        first_close_ns=_first_close(width_times, width),
+    )
+
+
+def closed_mask(
+    times_ns: Int[np.ndarray, " num_samples"],
+    width_m: Float[np.ndarray, " num_samples"],
+    plan: Plan,
+) -> np.ndarray:
+    """Say when the fingers were closed on something, from the plan's wish and their own motion."""
+    closed = np.zeros(len(times_ns), dtype=bool)
+    for start_ns, end_ns in _closed_intervals(plan):
+        window = (times_ns >= start_ns) & (times_ns <= end_ns + _LATENESS_NS)
+        wanted = (times_ns >= start_ns) & (times_ns < end_ns)
+        if not np.any(wanted):
+            continue
+        plateau = float(width_m[wanted].min()) + _PLATEAU_M
+        inside = np.flatnonzero(window & (width_m <= plateau))
+        if len(inside):
+            # One stretch: from the first sample on the plateau to where it is left for good.
+            left = np.flatnonzero((np.arange(len(width_m)) > inside[0]) & (width_m > plateau))
+            last = left[0] if len(left) else inside[-1] + 1
+            closed[inside[0] : last] = True
+    return closed
+
+
+def _closed_intervals(plan: Plan) -> list[tuple[int, int]]:
+    intervals = []
+    start = None
+    for waypoint in plan.tau:
+        if waypoint.g == 1 and start is None:
+            start = waypoint.t_ns
+        elif waypoint.g == 0 and start is not None:
+            intervals.append((start, waypoint.t_ns))
+            start = None
+    if start is not None:
+        intervals.append((start, plan.tau[-1].t_ns + 1))
+    return intervals
+
+
+def _first_close(
+    times_ns: Int[np.ndarray, " num_samples"], width_m: Float[np.ndarray, " num_samples"]
+) -> int | None:
+    """When the fingers first begin to close."""
+    closing = np.flatnonzero(width_m < np.maximum.accumulate(width_m) - _PLATEAU_M)
+    return int(times_ns[closing[0]]) if len(closing) else None

@@ -1,0 +1,122 @@
+"""A replay as a derived episode, in the schema a recording has."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode import schema
+from bridge.episode.metadata import Derived, EpisodeInfo
+from bridge.episode.records import JointSample, PoseSample, string_to_cdr
+from bridge.episode.writer import EpisodeWriter
+from bridge.task.plan import Plan
+from bridge.task.robot import ARM_JOINTS, BASE_FRAME
+from twin.replay.result import ReplayResult
+
+GRIPPER_WIDTH = "gripper_width"
+MIN_CLEARANCE = "min_clearance_m"
+
+
+@dataclass(frozen=True)
+class _Message:
+    stamp_ns: int
+    topic: str
+    type_name: str
+    data: bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayOrigin:
+    """Where a replay comes from and when its time 0 is."""
+
+    info: EpisodeInfo
+    """Of the recorded episode."""
+    derived: Derived
+    cell: str
+    start_ns: int
+    """Source time of the recorded execution's start, or of the plan when it was never executed."""
+    urdf: str
+
+
+def write_replay(path: Path, result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Path:
+    """Write one replay; a stale part file of an interrupted run is replaced.
+
+    Raises:
+        UsageError: When the file exists.
+    """
+    path.with_name(path.name + ".part").unlink(missing_ok=True)
+    messages = [*_messages(result, plan, origin), *_events(result, plan, origin)]
+    with EpisodeWriter(path) as writer:
+        writer.describe(origin.info, derived=origin.derived)
+        for message in sorted(messages, key=lambda message: message.stamp_ns):
+            writer.write(
+                message.topic,
+                message.data,
+                type_name=message.type_name,
+                log_time_ns=message.stamp_ns,
+            )
+    return path
+
+
+def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterator[_Message]:
+    prefix, start = f"/{origin.cell}", origin.start_ns
+    yield _Message(start, "/robot_description", schema.STRING, string_to_cdr(origin.urdf))
+    yield _Message(start, f"{prefix}/plan", schema.PLAN, plan.to_json())
+    for index, t_ns in enumerate(result.stamps_ns):
+        stamp = start + int(t_ns)
+        for topic, names, values in (
+            ("joint_states", ARM_JOINTS, result.joints_rad[index]),
+            ("gripper/state", (GRIPPER_WIDTH,), result.width_m[index : index + 1]),
+            ("replay/clearance", (MIN_CLEARANCE,), result.clearance_m[index : index + 1]),
+        ):
+            yield _joint_message(stamp, f"{prefix}/{topic}", names, values)
+        yield _pose_message(stamp, f"{prefix}/tcp/pose", result.Ts_base_tcp[index])
+        for name, Ts in result.Ts_base_object.items():
+            yield _pose_message(stamp, f"{prefix}/object/{name}/pose", Ts[index])
+    end = start + int(result.stamps_ns[-1])
+    yield _Message(end, f"{prefix}/verdict", schema.VERDICT, result.verdict.to_json())
+
+
+def _joint_message(
+    stamp_ns: int, topic: str, names: tuple[str, ...], values: Float[np.ndarray, " num_values"]
+) -> _Message:
+    sample = JointSample(
+        stamp_ns=stamp_ns, names=names, position=values, velocity=np.zeros(0), effort=np.zeros(0)
+    )
+    return _Message(stamp_ns, topic, schema.JOINT_STATE, sample.to_cdr())
+
+
+def _pose_message(stamp_ns: int, topic: str, T_base_body: Float[np.ndarray, "4 4"]) -> _Message:
+    sample = PoseSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=T_base_body)
+    return _Message(stamp_ns, topic, schema.POSE_STAMPED, sample.to_cdr())
+
+
+def _events(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterator[_Message]:
+    """Events: execution, stages, gripper, contacts that were not allowed."""
+    topic = f"/{origin.cell}/event"
+    end_ns = int(result.stamps_ns[-1])
+    events: list[tuple[int, dict[str, object]]] = [(0, {"type": "execution_started"})]
+    for stage in plan.stages:
+        if stage.t_start_ns <= end_ns:
+            events.append((stage.t_start_ns, {"type": "stage_started", "stage_id": stage.id}))
+        if stage.t_end_ns <= end_ns:
+            events.append((stage.t_end_ns, {"type": "stage_ended", "stage_id": stage.id}))
+    closed = 0
+    for waypoint in plan.tau:
+        if waypoint.g != closed and waypoint.t_ns <= end_ns:
+            closed = waypoint.g
+            text = "close" if closed else "open"
+            events.append((waypoint.t_ns, {"type": "gripper", "text": text}))
+    for contact in result.contacts:
+        if not contact.allowed:
+            body, other = contact.bodies
+            text = f"{body} within {contact.min_distance_m * 1e3:.1f} mm of {other}"
+            events.append((contact.start_ns, {"type": "note", "text": text}))
+    events.append((min(end_ns, plan.tau[-1].t_ns), {"type": "execution_ended"}))
+    for t_ns, fields in sorted(events, key=lambda event: event[0]):
+        stamp = origin.start_ns + t_ns
+        record = {"schema_version": 1, "stamp_ns": stamp, "plan_id": plan.id, **fields}
+        yield _Message(stamp, topic, schema.EVENT, json.dumps(record).encode())

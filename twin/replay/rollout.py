@@ -1,0 +1,202 @@
+"""Replay one trajectory, planned or executed, and judge it: I(tau) = ik x clearance x terminal."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bridge.episode.streams import JointTrack
+from bridge.task.plan import Plan
+from bridge.task.predicate import all_hold, already_true_at_start, evaluate_success
+from bridge.task.verdict import Factor, Verdict
+from twin.physics.engine import ENGINE_VERSION
+from twin.replay.clearance import ClearanceMonitor
+from twin.replay.config import ReplayConfig
+from twin.replay.dynamics import States, simulate
+from twin.replay.execution import path_of_execution
+from twin.replay.failure import Failure, factor_from
+from twin.replay.path import JointPath, check_path, path_of_plan
+from twin.replay.result import ReplayResult
+from twin.replay.scene import ReplayScene
+from twin.robot.collision import hulls_of
+from twin.robot.model import load_robot
+
+KINEMATIC_ENGINE = "pinocchio"
+
+
+def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> ReplayResult:
+    """Replay what a plan commands: waypoints, inverse kinematics, motors, objects.
+
+    Raises:
+        UnusablePlanError: When the plan has no usable waypoints.
+    """
+    robot = load_robot(scene.urdf)
+    path, failures, unreachable_ns = path_of_plan(plan, robot, config)
+    return _replay(path, failures, unreachable_ns, plan, scene, config, trajectory="planned")
+
+
+def replay_joints(
+    track: JointTrack,
+    widths: JointTrack,
+    scene: ReplayScene,
+    config: ReplayConfig,
+    *,
+    plan: Plan,
+) -> ReplayResult:
+    """Replay what the joint encoders and the gripper said during an execution.
+
+    Args:
+        track: Recorded arm joints, cut to the execution; its first stamp becomes time 0.
+        widths: Recorded distance between the finger pads over the same stamps.
+        scene: Where it happens.
+        config: How it is replayed.
+        plan: The plan that was executed: its stages and when it wanted the gripper closed.
+
+    Raises:
+        UnusablePlanError: When a track is empty or names other joints.
+    """
+    path = path_of_execution(track, widths, plan, config)
+    return _replay(path, [], None, plan, scene, config, trajectory="executed")
+
+
+def _replay(
+    path: JointPath,
+    failures: list[Failure],
+    unreachable_ns: int | None,
+    plan: Plan,
+    scene: ReplayScene,
+    config: ReplayConfig,
+    *,
+    trajectory: str,
+) -> ReplayResult:
+    robot = load_robot(scene.urdf)
+    hulls = hulls_of(robot)
+    failures = failures + check_path(path, robot, hulls, config)
+    dynamic = config.mode == "dynamic"
+    states = simulate(path, scene, hulls, config) if dynamic else follow(path, scene, config)
+    monitor = ClearanceMonitor(scene, plan, hulls, config)
+    _pre_grasp(monitor, path, config)
+    movable = scene.movable()
+    known = {name: Ts for name, Ts in states.Ts_base_object.items() if name in movable}
+    clearance = [
+        monitor.measure(
+            int(t_ns),
+            states.joints_rad[index],
+            float(states.width_m[index]),
+            {name: Ts[index] for name, Ts in known.items()},
+        )
+        for index, t_ns in enumerate(states.stamps_ns)
+    ]
+    result = ReplayResult(
+        verdict=_undecided(plan, trajectory, config, scene),
+        stamps_ns=states.stamps_ns,
+        joints_rad=states.joints_rad,
+        width_m=states.width_m,
+        Ts_base_tcp=robot.Ts_base_tcp(states.joints_rad),
+        Ts_base_object=states.Ts_base_object,
+        finger_contact=states.finger_contact,
+        clearance_m=np.array(clearance),
+        contacts=monitor.contacts(),
+    )
+    terminal = _terminal(result, scene, config, unreachable_ns)
+    verdict = replace(
+        result.verdict,
+        ik=factor_from(failures),
+        clearance=factor_from(
+            monitor.failures, undecided=_clearance_undecided(scene, config, unreachable_ns)
+        ),
+        terminal=terminal,
+    )
+    return replace(result, verdict=replace(verdict, reason=_reason(verdict, scene, result)))
+
+
+def follow(path: JointPath, scene: ReplayScene, config: ReplayConfig) -> States:
+    """Follow the joints exactly; no physics, so nothing is known of objects that can move."""
+    count = int(np.ceil(path.end_ns() * 1e-9 * config.sample_rate_hz)) + 1
+    stamps: Int[np.ndarray, " num_steps"] = (
+        np.linspace(0, path.end_ns(), count).round().astype(np.int64)
+    )
+    still: dict[str, Float[np.ndarray, "num_steps 4 4"]] = {
+        name: np.repeat(T[None], count, axis=0) for name, T in scene.containers().items()
+    }
+    return States(
+        stamps_ns=stamps,
+        joints_rad=path.joints_at(stamps),
+        width_m=path.width_at(stamps),
+        Ts_base_object=still,
+        finger_contact={},
+    )
+
+
+def _pre_grasp(monitor: ClearanceMonitor, path: JointPath, config: ReplayConfig) -> None:
+    times = path.dense_times_ns(config.path_step_s)
+    if path.first_close_ns is not None:
+        times = times[times < path.first_close_ns]
+    for t_ns, joints, width in zip(times, path.joints_at(times), path.width_at(times), strict=True):
+        monitor.check_pre_grasp(int(t_ns), joints, float(width))
+
+
+def _undecided(plan: Plan, trajectory: str, config: ReplayConfig, scene: ReplayScene) -> Verdict:
+    open_factor = Factor(value=None)
+    return Verdict(
+        plan_id=plan.id,
+        trajectory=trajectory,
+        mode=config.mode,
+        ik=open_factor,
+        clearance=open_factor,
+        terminal=open_factor,
+        engine=ENGINE_VERSION if config.mode == "dynamic" else KINEMATIC_ENGINE,
+        seed=config.seed,
+        scene_hash=scene.scene_hash,
+    )
+
+
+def _clearance_undecided(
+    scene: ReplayScene, config: ReplayConfig, unreachable_ns: int | None
+) -> str | None:
+    if unreachable_ns is not None:
+        return f"known only up to the unreachable pose at {unreachable_ns * 1e-9:.2f} s"
+    if scene.missing():
+        return f"not localised: {scene.describe_missing()}"
+    return None
+
+
+def _terminal(
+    result: ReplayResult, scene: ReplayScene, config: ReplayConfig, unreachable_ns: int | None
+) -> Factor:
+    if config.mode == "kinematic":
+        return Factor(value=None, detail="a kinematic replay does not move objects")
+    if unreachable_ns is not None:
+        detail = f"the trajectory cannot be executed beyond {unreachable_ns * 1e-9:.2f} s"
+        return Factor(value=None, detail=detail)
+    findings = evaluate_success(scene.task, result.rollout())
+    detail = "; ".join(finding.detail for finding in findings)
+    value = all_hold(findings)
+    if value is not False:
+        return Factor(value=value, detail=detail)
+    index = next(i for i, finding in enumerate(findings) if finding.value is False)
+    spec = scene.task.success[index]
+    return Factor(
+        value=False,
+        first_t_ns=int(result.stamps_ns[-1]),
+        cause=findings[index].kind,
+        bodies=tuple(spec[key] for key in ("object", "container") if key in spec),
+        detail=detail,
+    )
+
+
+def _reason(verdict: Verdict, scene: ReplayScene, result: ReplayResult) -> str | None:
+    name = verdict.first_failing
+    if name is not None:
+        factor: Factor = getattr(verdict, name)
+        return f"{name}: {factor.cause}: {factor.detail}"
+    if verdict.accepted is None:
+        undecided = [
+            f"{name}: {getattr(verdict, name).detail}"
+            for name in ("ik", "clearance", "terminal")
+            if getattr(verdict, name).value is None
+        ]
+        return "undecided: " + "; ".join(undecided)
+    if already_true_at_start(scene.task, result.rollout()):
+        return "the goal held before anything moved"
+    return None

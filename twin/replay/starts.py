@@ -1,0 +1,82 @@
+"""Where the objects were when a plan began, read from the localised episode."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode import streams
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
+from bridge.errors import GstError
+from bridge.geometry import se3
+from bridge.task.task_file import Task
+from twin.scene.localise_episode import Phase, quiet_phases, write_localised
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartState:
+    """Object poses at one start, and why others are missing."""
+
+    Ts_base_object: dict[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
+
+
+class StartStates:
+    """The quiet phases of one episode with the poses localised in each."""
+
+    def __init__(self, task: Task, phases: list[Phase], states: list[StartState]) -> None:
+        """Use ``localised_starts``, or state them directly in a test."""
+        self._task = task
+        self._phases = phases
+        self._states = states
+
+    def at(self, stamp_ns: int) -> StartState:
+        """The state a plan found that began, or was made, at a source time [ns]."""
+        chosen = None
+        for phase, state in zip(self._phases, self._states, strict=True):
+            if phase.after_ns is None or phase.after_ns < stamp_ns:
+                chosen = (phase, state)
+        if chosen is None:
+            return self._nothing("no quiet frames before it")
+        phase, state = chosen
+        if phase.before_ns is not None and stamp_ns > phase.before_ns:
+            return self._nothing("the plan was made while another one was being executed")
+        return state
+
+    def _nothing(self, reason: str) -> StartState:
+        return StartState(reasons=dict.fromkeys(self._task.objects, reason))
+
+
+def localised_starts(
+    run: RunFolder, episode: Episode, task: Task, *, scene_hash: str | None, force: bool
+) -> StartStates:
+    """Localise an episode's objects once, keep the answer as a derived episode, and read it.
+
+    An episode that cannot be localised gives states without poses, with the reason.
+    """
+    phases = quiet_phases(episode)
+    try:
+        path = write_localised(run, episode, task, scene_hash=scene_hash, force=force)
+        records = streams.localisations(Episode.open(path))
+    except GstError as error:
+        nothing = StartState(reasons=dict.fromkeys(task.objects, str(error)))
+        return StartStates(task, phases, [nothing] * len(phases))
+    return StartStates(task, phases, [_state_of(phase, task, records) for phase in phases])
+
+
+def _state_of(phase: Phase, task: Task, records: list[dict[str, object]]) -> StartState:
+    poses: dict[str, Float[np.ndarray, "4 4"]] = {}
+    reasons = dict.fromkeys(task.objects, "no localisation record")
+    for record in records:
+        if (record.get("phase"), record.get("plan_id")) != (phase.name, phase.plan_id):
+            continue
+        name, pose = str(record["object"]), record.get("T_base_object")
+        if name not in task.objects:
+            continue
+        if record["found"] and isinstance(pose, dict):
+            poses[name] = se3.transform_from(np.array(pose["q_wxyz"]), np.array(pose["p_m"]))
+            reasons.pop(name, None)
+        else:
+            reasons[name] = str(record.get("reason") or "not found")
+    return StartState(Ts_base_object=poses, reasons=reasons)

@@ -1,0 +1,108 @@
+"""Signed distances between the robot's own links (coal, convex against convex)."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import coal
+import numpy as np
+import pinocchio as pin
+from jaxtyping import Float
+
+from bridge.task.robot import FINGER_LINKS
+from twin.robot.hulls import LinkHull, link_hulls
+from twin.robot.model import RobotModel
+
+_SAMPLES = 60
+_ALWAYS = 0.95
+"""Pairs that overlap in this share of random postures overlap by construction of their hulls."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelfDistance:
+    """The closest pair of links that should stay apart."""
+
+    distance_m: float
+    links: tuple[str, str]
+
+
+def signed_distance(
+    first: coal.CollisionGeometry,
+    T_first: coal.Transform3s,
+    second: coal.CollisionGeometry,
+    T_second: coal.Transform3s,
+) -> float:
+    """Distance between two convex shapes [m], negative by the depth when they overlap."""
+    request = coal.DistanceRequest()
+    request.enable_signed_distance = True
+    result = coal.DistanceResult()
+    return float(coal.distance(first, T_first, second, T_second, request, result))
+
+
+class RobotHulls:
+    """The hulls of a robot, placed for one posture at a time."""
+
+    def __init__(self, robot: RobotModel) -> None:
+        """Build the hulls and choose the pairs of links that must stay apart."""
+        self.robot = robot
+        self.hulls: list[LinkHull] = link_hulls(robot)
+        self._frame_ids = [robot.model.getFrameId(hull.link) for hull in self.hulls]
+        self.placements: list[coal.Transform3s] = [coal.Transform3s() for _ in self.hulls]
+        self.pairs = self._pairs()
+
+    def place(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
+        """Move all hulls to a posture."""
+        robot = self.robot
+        pin.framesForwardKinematics(
+            robot.model, robot.data, robot.configuration(joints_rad, width_m)
+        )
+        for index, frame_id in enumerate(self._frame_ids):
+            T = robot.data.oMf[frame_id]
+            self.placements[index] = coal.Transform3s(T.rotation, T.translation)
+
+    def self_distance(self) -> SelfDistance:
+        """Closest pair at the placed posture; infinite when there is no pair to check."""
+        best, links = np.inf, ("", "")
+        for first, second in self.pairs:
+            distance = self._pair_distance(first, second)
+            if distance < best:
+                best, links = distance, (self.hulls[first].link, self.hulls[second].link)
+        return SelfDistance(distance_m=float(best), links=links)
+
+    def _pair_distance(self, first: int, second: int) -> float:
+        return signed_distance(
+            self.hulls[first].shape,
+            self.placements[first],
+            self.hulls[second].shape,
+            self.placements[second],
+        )
+
+    def _pairs(self) -> list[tuple[int, int]]:
+        """All pairs but neighbours, the two fingers, and hulls that overlap in every posture."""
+        joints = [self.robot.model.frames[frame_id].parentJoint for frame_id in self._frame_ids]
+        candidates = [
+            (first, second)
+            for first in range(len(self.hulls))
+            for second in range(first + 1, len(self.hulls))
+            if not self._neighbours(joints[first], joints[second])
+            and not {self.hulls[first].link, self.hulls[second].link} <= set(FINGER_LINKS)
+        ]
+        rng = np.random.default_rng(0)
+        overlaps = np.zeros(len(candidates))
+        for _ in range(_SAMPLES):
+            self.place(rng.uniform(-np.pi, np.pi, len(self.robot.arm_ids)), 0.04)
+            overlaps += [self._pair_distance(*pair) <= 0 for pair in candidates]
+        return [
+            pair
+            for pair, count in zip(candidates, overlaps, strict=True)
+            if count < _ALWAYS * _SAMPLES
+        ]
+
+    def _neighbours(self, first: int, second: int) -> bool:
+        parents = self.robot.model.parents
+        return first == second or parents[second] == first or parents[first] == second
+
+
+@lru_cache(maxsize=4)
+def hulls_of(robot: RobotModel) -> RobotHulls:
+    """Return the hulls of a robot, built once."""
+    return RobotHulls(robot)

@@ -1,0 +1,107 @@
+"""The robot as pinocchio sees it: joint limits, forward kinematics of the arm and its gripper.
+
+One arm of revolute joints and, where the description has them, two prismatic fingers that open by
+half of the gripper width each. A model keeps scratch memory: use it from one thread at a time.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+import pinocchio as pin
+from jaxtyping import Float
+
+from bridge.task.robot import ARM_JOINTS, FINGER_JOINTS, TCP_FRAME
+from twin.robot.description import RobotDescriptionError, with_absolute_meshes
+
+
+class RobotModel:
+    """Kinematics of one robot, joints in the order of ``ARM_JOINTS``."""
+
+    def __init__(self, urdf: str) -> None:
+        """Build from a URDF text; use ``load_robot``, which remembers.
+
+        Raises:
+            RobotDescriptionError: When joints or the frame ``tcp`` are missing.
+        """
+        self.urdf = with_absolute_meshes(urdf)
+        try:
+            self.model = pin.buildModelFromXML(self.urdf)
+        except (ValueError, RuntimeError) as error:
+            raise RobotDescriptionError(
+                found=f"is refused by pinocchio ({str(error)[:200]})", hint="Check it."
+            ) from error
+        self._check_names()
+        self.data = self.model.createData()
+        self.arm_ids = np.array([self._q_id(name) for name in ARM_JOINTS])
+        self.finger_ids = np.array(
+            [self._q_id(name) for name in FINGER_JOINTS if self.model.existJointName(name)],
+            dtype=np.int64,
+        )
+        self.tcp_id = int(self.model.getFrameId(TCP_FRAME))
+        self.lower_rad: Float[np.ndarray, " num_joints"] = self._arm(self.model.lowerPositionLimit)
+        self.upper_rad: Float[np.ndarray, " num_joints"] = self._arm(self.model.upperPositionLimit)
+        self.velocity_limit_rad_s: Float[np.ndarray, " num_joints"] = self._arm(
+            self.model.velocityLimit
+        )
+
+    def _check_names(self) -> None:
+        missing = [name for name in ARM_JOINTS if not self.model.existJointName(name)]
+        if missing:
+            raise RobotDescriptionError(
+                found=f"lacks the joints {', '.join(missing)}",
+                hint=f"It has: {', '.join(list(self.model.names)[1:])}.",
+            )
+        if not self.model.existFrame(TCP_FRAME):
+            raise RobotDescriptionError(
+                found=f"lacks the frame {TCP_FRAME!r}",
+                hint="Add a link of that name where plans put the tool centre point.",
+            )
+
+    def _q_id(self, name: str) -> int:
+        return int(self.model.joints[self.model.getJointId(name)].idx_q)
+
+    def _arm(self, values: Float[np.ndarray, " num_values"]) -> Float[np.ndarray, " num_joints"]:
+        picked: Float[np.ndarray, " num_joints"] = np.asarray(values)[self.arm_ids]
+        return picked
+
+    def configuration(
+        self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float = 0.0
+    ) -> Float[np.ndarray, " num_values"]:
+        """Put arm joints and half the gripper width per finger into pinocchio's order."""
+        q: Float[np.ndarray, " num_values"] = pin.neutral(self.model)
+        q[self.arm_ids] = joints_rad
+        q[self.finger_ids] = width_m / 2
+        return q
+
+    def T_base_tcp(self, joints_rad: Float[np.ndarray, " num_joints"]) -> Float[np.ndarray, "4 4"]:
+        """Forward kinematics of the tool centre point."""
+        pin.forwardKinematics(self.model, self.data, self.configuration(joints_rad))
+        T = pin.updateFramePlacement(self.model, self.data, self.tcp_id)
+        return np.array(T.homogeneous)
+
+    def Ts_base_tcp(
+        self, joints_rad: Float[np.ndarray, "num_steps num_joints"]
+    ) -> Float[np.ndarray, "num_steps 4 4"]:
+        """Forward kinematics along a joint path."""
+        return np.stack([self.T_base_tcp(row) for row in joints_rad])
+
+    def T_base_link(
+        self, link: str, joints_rad: Float[np.ndarray, " num_joints"], width_m: float = 0.0
+    ) -> Float[np.ndarray, "4 4"]:
+        """Pose of any link or frame.
+
+        Raises:
+            RobotDescriptionError: Listing the frames that exist.
+        """
+        if not self.model.existFrame(link):
+            names = ", ".join(frame.name for frame in self.model.frames)
+            raise RobotDescriptionError(found=f"lacks {link!r}", hint=f"It has: {names}.")
+        pin.forwardKinematics(self.model, self.data, self.configuration(joints_rad, width_m))
+        T = pin.updateFramePlacement(self.model, self.data, self.model.getFrameId(link))
+        return np.array(T.homogeneous)
+
+
+@lru_cache(maxsize=4)
+def load_robot(urdf: str) -> RobotModel:
+    """Return the model of a URDF text, built once per text and process."""
+    return RobotModel(urdf)
