@@ -13,7 +13,7 @@ from bridge.sources.standin.cell_file import CellFile
 from bridge.sources.standin.hidden import HiddenParameters
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.links import robot_links
-from bridge.sources.standin.render import Renderer
+from bridge.sources.standin.render import Layer, Renderer
 from bridge.sources.standin.sensor import measure_color, measure_depth
 from bridge.sources.standin.streams import Streams
 from bridge.sources.standin.surfaces import object_surfaces, robot_surfaces, room_surfaces
@@ -27,6 +27,8 @@ STEPS_PER_TICK = 4
 TICK_NS = ns_from_s(STEP_S * STEPS_PER_TICK)
 """8 ms: the robot's 125 Hz."""
 GRIPPER_NS = ns_from_s(1 / 50)
+FRAMES_NS = ns_from_s(1 / 60)
+"""Of ``/tf``; the wrist camera moves less than a millimetre off a straight line in between."""
 TRUTH_NS = ns_from_s(1 / 30)
 FINGER_SPEED_M_S = 0.15
 """How fast the gripper's controller closes the opening."""
@@ -110,13 +112,14 @@ class StandinCell:
         self._renderer = Renderer(
             [*robot_surfaces(robot_links()), *object_surfaces(task), *room_surfaces(seed)]
         )
+        self._backdrops: dict[str, Layer] = {}
         self._rng = np.random.default_rng([SENSOR_STREAM, seed])
         self._should_stop = should_stop
         self._sleep, self._monotonic = sleep, monotonic
         self._wall_start_s = monotonic()
         self._target_rad, self._width_m = self.home_rad, MAX_WIDTH_M
         self._width_target_m = MAX_WIDTH_M
-        self._due = {"gripper": start_ns, "truth": start_ns, "camera": start_ns}
+        self._due = dict.fromkeys(("gripper", "truth", "camera", "frames"), start_ns)
         self.cameras_running = False
 
     def reset(self, Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]) -> None:
@@ -207,7 +210,8 @@ class StandinCell:
         world, streams = self.world, self.streams
         streams.joints(encoders, world.joint_speeds_rad_s, world.joint_efforts_Nm, self.now_ns)
         streams.tcp(self.kinematics.T_base_tcp(encoders), self.now_ns)
-        streams.camera_poses(self._believed_moving(encoders), self.now_ns, static=False)
+        if self._is_due("frames", FRAMES_NS):
+            streams.camera_poses(self._believed_moving(encoders), self.now_ns, static=False)
         if self._is_due("gripper", GRIPPER_NS):
             streams.gripper(world.width_m, self.now_ns)
 
@@ -241,7 +245,14 @@ class StandinCell:
         """Take and publish one frame of every camera, now."""
         bodies = {**self.world.Ts_base_link(), **self.world.Ts_base_object()}
         for camera_id, camera in self._cameras.items():
-            picture = self._renderer.render(camera, self.true_camera(camera_id), bodies)
+            T_base_camera = self.true_camera(camera_id)
+            backdrop = None
+            if not self.file.cameras[camera_id].moving:
+                backdrop = self._backdrops.get(camera_id)
+                if backdrop is None:
+                    backdrop = self._renderer.backdrop(camera, T_base_camera)
+                    self._backdrops[camera_id] = backdrop
+            picture = self._renderer.render(camera, T_base_camera, bodies, backdrop)
             depth = measure_depth(picture, self.file.sensors, self.hidden, self._rng)
             color = measure_color(picture, self.file.sensors, self.hidden, self._rng)
             self.streams.frame(camera_id, color, depth, self.now_ns)

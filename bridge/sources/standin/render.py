@@ -1,7 +1,7 @@
 """Colour and depth of the laboratory by ray casting on the CPU: no GL, no display."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,16 +37,7 @@ class Picture:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Posed:
-    """The scene of one instant."""
-
-    scene: Any
-    corner_normals: Float[np.ndarray, "num_triangles 3 3"]
-    eye_m: Float[np.ndarray, "3"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Seen:
+class Layer:
     """What a list of rays met."""
 
     colors: Float[np.ndarray, "num_rays 3"]
@@ -55,86 +46,129 @@ class _Seen:
     surface_ids: Int[np.ndarray, " num_rays"]
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Posed:
+    """Some of the surfaces at one instant."""
+
+    scene: Any
+    indices: Int[np.ndarray, " num_surfaces"]
+    first: Int[np.ndarray, " num_surfaces"]
+    """Number of each surface's first triangle."""
+    corner_normals: Float[np.ndarray, "num_triangles 3 3"]
+    eye_m: Float[np.ndarray, "3"]
+
+
 class Renderer:
     """Casts one ray through each pixel centre, and four more where outlines cross a pixel.
 
     The scene is built anew for each picture (bodies move): with six thousand triangles this costs
-    less than casting the rays once per body and merging.
+    less than casting the rays once per body and merging. A camera that stands still may keep the
+    room as a backdrop; then only the rays that meet a moving body are shaded.
     """
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
-        """Concatenate the surfaces once; only poses change afterwards."""
+        """Keep the surfaces; only poses change afterwards."""
         self._surfaces = list(surfaces)
-        counts = [len(item.triangles) for item in surfaces]
-        self._first = np.concatenate([[0], np.cumsum(counts)[:-1]])
         self._colors = np.array([item.color for item in surfaces], dtype=np.float32)
+        self._room = [k for k, item in enumerate(surfaces) if item.body == ""]
+        self._moving = [k for k, item in enumerate(surfaces) if item.body != ""]
+
+    def backdrop(self, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]) -> Layer:
+        """See the room without the bodies in it, for ``render`` from the same place."""
+        posed = self._pose(T_base_camera, {}, self._room)
+        seen = self._look(posed, _rays(camera, T_base_camera))
+        return replace(seen, colors=self._smooth_edges(posed, seen, camera, T_base_camera))
 
     def render(
         self,
         camera: Camera,
         T_base_camera: Float[np.ndarray, "4 4"],
         Ts_base_body: Mapping[str, Float[np.ndarray, "4 4"]],
+        backdrop: Layer | None = None,
     ) -> Picture:
         """Take a picture of the bodies where they are."""
-        posed = self._pose(T_base_camera, Ts_base_body)
-        # z = 1 in the camera's frame, so that the distance along a ray is the depth.
-        local = camera.rays().reshape(-1, 3)
-        seen = self._look(posed, (local @ T_base_camera[:3, :3].T).astype(np.float32))
+        which = self._moving if backdrop is not None else [*self._room, *self._moving]
+        posed = self._pose(T_base_camera, Ts_base_body, which)
+        seen = self._look(posed, _rays(camera, T_base_camera))
+        if backdrop is not None:
+            seen = _nearer(seen, backdrop)
+        colors = self._smooth_edges(posed, seen, camera, T_base_camera, backdrop)
         shape = (camera.height, camera.width)
-        colors = seen.colors
-        edge = np.flatnonzero(_outline(seen.surface_ids.reshape(shape)))
-        if len(edge):
-            shifts = np.array([[du / camera.fx, dv / camera.fy, 0.0] for du, dv in SUBPIXELS])
-            moved = (local[edge][None] + shifts[:, None]) @ T_base_camera[:3, :3].T
-            extra = self._look(posed, moved.reshape(-1, 3).astype(np.float32)).colors
-            colors[edge] = extra.reshape(len(SUBPIXELS), -1, 3).mean(axis=0)
         return Picture(
             image=colors.reshape(*shape, 3),
             depth_m=seen.depth_m.reshape(shape),
             cosine=seen.cosine.reshape(shape),
         )
 
+    def _smooth_edges(
+        self,
+        posed: _Posed,
+        seen: Layer,
+        camera: Camera,
+        T_base_camera: Float[np.ndarray, "4 4"],
+        backdrop: Layer | None = None,
+    ) -> Float[np.ndarray, "num_rays 3"]:
+        colors = seen.colors.copy()
+        edge = np.flatnonzero(_outline(seen.surface_ids.reshape(camera.height, camera.width)))
+        if len(edge):
+            shifts = np.array([[du / camera.fx, dv / camera.fy, 0.0] for du, dv in SUBPIXELS])
+            rays = _rays(camera, T_base_camera)[edge]
+            moved = rays[None] + (shifts @ T_base_camera[:3, :3].T)[:, None]
+            extra = self._look(posed, moved.reshape(-1, 3).astype(np.float32))
+            if backdrop is not None:
+                # The backdrop has no subpixels; its colour at the pixel's centre stands for them.
+                extra = _nearer(extra, _repeat(backdrop, edge, len(SUBPIXELS)))
+            colors[edge] = extra.colors.reshape(len(SUBPIXELS), -1, 3).mean(axis=0)
+        return colors
+
     def _pose(
         self,
         T_base_camera: Float[np.ndarray, "4 4"],
         Ts_base_body: Mapping[str, Float[np.ndarray, "4 4"]],
+        which: list[int],
     ) -> _Posed:
         scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-        normals = []
-        for item in self._surfaces:
+        normals, counts = [], [0]
+        for index in which:
+            item = self._surfaces[index]
             T = (np.eye(4) if item.body == "" else Ts_base_body[item.body]).astype(np.float32)
             vertices = np.ascontiguousarray(item.vertices_m @ T[:3, :3].T + T[:3, 3])
             scene.add_triangles(_tensor(vertices), _tensor(item.triangles))
             normals.append(item.corner_normals @ T[:3, :3].T)
+            counts.append(len(item.triangles))
         return _Posed(
             scene=scene,
+            indices=np.array(which),
+            first=np.cumsum(counts)[:-1],
             corner_normals=np.concatenate(normals),
             eye_m=T_base_camera[:3, 3].astype(np.float32),
         )
 
-    def _look(self, posed: _Posed, rays: Float[np.ndarray, "num_rays 3"]) -> _Seen:
+    def _look(self, posed: _Posed, rays: Float[np.ndarray, "num_rays 3"]) -> Layer:
+        count = len(rays)
         origins = np.broadcast_to(posed.eye_m, rays.shape)
-        both = np.concatenate([origins, rays], axis=1)
-        hits = posed.scene.cast_rays(_tensor(both), nthreads=1)
+        hits = posed.scene.cast_rays(_tensor(np.concatenate([origins, rays], axis=1)), nthreads=1)
         depth = hits["t_hit"].numpy()
-        hit = np.isfinite(depth)
-        surface_ids = np.where(hit, hits["geometry_ids"].numpy(), 0).astype(np.intp)
-        triangles = self._first[surface_ids] + np.where(hit, hits["primitive_ids"].numpy(), 0)
-        uvs = hits["primitive_uvs"].numpy()
-        normals = _interpolate(posed.corner_normals[triangles], uvs)
-        facing = -np.einsum("ij,ij->i", normals, rays)
+        hit = np.flatnonzero(np.isfinite(depth))
+        local_ids = hits["geometry_ids"].numpy()[hit].astype(np.intp)
+        triangles = posed.first[local_ids] + hits["primitive_ids"].numpy()[hit]
+        normals = _interpolate(posed.corner_normals[triangles], hits["primitive_uvs"].numpy()[hit])
+        near = rays[hit]
+        facing = -np.einsum("ij,ij->i", normals, near)
         normals[facing < 0] *= -1.0
-        cosine = np.abs(facing) / np.sqrt(np.einsum("ij,ij->i", rays, rays))
-        points = posed.eye_m + rays * np.where(hit, depth, 0.0)[:, None]
-        colors = self._albedo(surface_ids, points) * _shade(normals)[:, None]
-        np.clip(colors, 0.0, 1.0, out=colors)
-        colors[~hit] = NOTHING
-        return _Seen(
-            colors=colors,
+        points = posed.eye_m + near * depth[hit][:, None]
+        surface_ids = posed.indices[local_ids]
+        shaded = self._albedo(surface_ids, points) * _shade(normals)[:, None]
+        layer = Layer(
+            colors=np.tile(NOTHING, (count, 1)),
             depth_m=depth,
-            cosine=np.where(hit, cosine, 0.0).astype(np.float32),
-            surface_ids=np.where(hit, surface_ids, -1),
+            cosine=np.zeros(count, dtype=np.float32),
+            surface_ids=np.full(count, -1),
         )
+        layer.colors[hit] = np.clip(shaded, 0.0, 1.0)
+        layer.cosine[hit] = np.abs(facing) / np.sqrt(np.einsum("ij,ij->i", near, near))
+        layer.surface_ids[hit] = surface_ids
+        return layer
 
     def _albedo(
         self, surface_ids: Int[np.ndarray, " num_rays"], points: Float[np.ndarray, "num_rays 3"]
@@ -150,6 +184,34 @@ class Renderer:
                 where = points[mine][:, [u, v]] - np.array(item.texture_shift_m, dtype=np.float32)
                 colors[mine] = item.texture.sample(where)
         return np.asarray(colors)
+
+
+def _rays(
+    camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "num_rays 3"]:
+    """Directions with z = 1 in the camera's frame, so that the distance along one is the depth."""
+    return np.asarray(camera.rays().reshape(-1, 3) @ T_base_camera[:3, :3].T, dtype=np.float32)
+
+
+def _nearer(front: Layer, back: Layer) -> Layer:
+    """Put one layer over another, pixel by pixel the nearer one."""
+    take = front.depth_m < back.depth_m
+    return Layer(
+        colors=np.where(take[:, None], front.colors, back.colors),
+        depth_m=np.where(take, front.depth_m, back.depth_m),
+        cosine=np.where(take, front.cosine, back.cosine),
+        surface_ids=np.where(take, front.surface_ids, back.surface_ids),
+    )
+
+
+def _repeat(layer: Layer, where: Int[np.ndarray, " num_pixels"], times: int) -> Layer:
+    index = np.tile(where, times)
+    return Layer(
+        colors=layer.colors[index],
+        depth_m=layer.depth_m[index],
+        cosine=layer.cosine[index],
+        surface_ids=layer.surface_ids[index],
+    )
 
 
 def _tensor(array: np.ndarray) -> Any:
