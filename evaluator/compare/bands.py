@@ -79,9 +79,9 @@ def compare_bands(recorded: Sequence[Episode], files: Sequence[DerivedFile]) -> 
         and file.derived.kind == "replay"
         and file.derived.plan_id is None
     ]
-    if not imported:
-        return BandReport()
     runs, left_out = _runs(imported)
+    if not runs:  # nothing imported, or imported without a robot, as an RGB-D folder
+        return BandReport()
     measurements: list[Measurement] = []
     tables: list[Table] = []
     missing: list[str] = []

@@ -64,7 +64,9 @@ def gains_table(gains: Sequence[Measurement], word: str) -> Table | None:
         side, name = gain.id.split(".", 3)[2:]
         rows.append(
             (
-                "mean of tasks" if name == "average" else name.removesuffix(".-"),
+                "mean of tasks"
+                if name == "average"
+                else name.removesuffix(".-").replace(".", ", "),
                 word if side == "recorded" else "sim",
                 _points(gain),
                 _relative(relative[gain.id.replace("gain.pp.", "gain.relative.")]),

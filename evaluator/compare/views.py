@@ -1,8 +1,8 @@
 """Score rendered views against the held-out recorded images they stand for.
 
-A ``views`` episode carries rendered images on ``.../cam/<id>/rendered/image`` and, beside them or
-in its source episode, the recorded ones on ``.../cam/<id>/color/image``; equal stamps belong
-together.
+A ``views`` episode carries rendered images on ``.../cam/<id>/rendered/image`` and, beside them,
+the recorded ones on ``.../cam/<id>/recorded/image`` (or, in its source episode,
+``.../color/image``); equal stamps belong together.
 """
 
 import re
@@ -63,27 +63,45 @@ class _Images:
 
 def compare_views(files: Sequence[DerivedFile], recorded: Sequence[Episode] = ()) -> ViewReport:
     """Compute PSNR and SSIM of every rendered view, per image and mean."""
-    views = [file for file in files if file.derived.kind == "views"]
+    views, left_out = _newest([file for file in files if file.derived.kind == "views"])
     if not views:
         return ViewReport(missing=("views: no rendered views (robot-gst rebuild makes them)",))
     sources = {episode.info.id: episode for episode in recorded}
-    measurements: list[Measurement] = []
     tables: list[Table] = []
-    left_out: list[Exclusion] = []
+    found: dict[str, list[ViewScore]] = {}
     for file in views:
         name = file.path.stem
+        source = file.derived.source_episode
         try:
-            scores, reasons = _scores(file, sources.get(file.derived.source_episode))
+            scores, reasons = _scores(file, sources.get(source))
         except GstError as error:
             left_out.append(Exclusion(episode=file.path.name, scope="views", reason=str(error)))
             continue
         left_out += [Exclusion(episode=name, scope="views", reason=reason) for reason in reasons]
-        part = slug(file.derived.source_episode) if len(views) > 1 else "all"
-        measurements += _measure(part, file.derived.source_episode, scores)
+        found[source] = scores
         tables.append(_table(f"views_{len(tables)}", name, scores))
+    everything = [score for scores in found.values() for score in scores]
+    measurements = _measure("all", list(found), everything)
+    for source, scores in found.items() if len(found) > 1 else ():
+        measurements += _measure(slug(source), [source], scores)
     return ViewReport(
         measurements=tuple(measurements), tables=tuple(tables), exclusions=tuple(left_out)
     )
+
+
+def _newest(views: Sequence[DerivedFile]) -> tuple[list[DerivedFile], list[Exclusion]]:
+    """Keep the newest views of each recorded episode; older scenes are named and left out."""
+    newest: dict[str, DerivedFile] = {}
+    for file in sorted(views, key=lambda item: (item.path.stat().st_mtime_ns, item.path.name)):
+        newest[file.derived.source_episode] = file
+    kept = [file for file in views if file is newest[file.derived.source_episode]]
+    reason = "views of an older scene; there are newer ones of the same episode"
+    left_out = [
+        Exclusion(episode=file.path.name, scope="views", reason=reason)
+        for file in views
+        if file not in kept
+    ]
+    return kept, left_out
 
 
 def _scores(file: DerivedFile, source: Episode | None) -> tuple[list[ViewScore], list[str]]:
@@ -131,7 +149,7 @@ def _collect(episode: Episode, images: _Images, wanted: set[int] | None = None) 
             target[(camera_id, image.stamp_ns)] = image.data
 
 
-def _measure(part: str, episode: str, scores: Sequence[ViewScore]) -> list[Measurement]:
+def _measure(part: str, episodes: Sequence[str], scores: Sequence[ViewScore]) -> list[Measurement]:
     psnr = [s.score.psnr_db for s in scores if s.score.psnr_db is not None]
     ssim = [s.score.ssim for s in scores if s.score.ssim is not None]
     stored = "rendered images stored as JPEG" if any(s.jpeg for s in scores) else "stored lossless"
@@ -146,7 +164,7 @@ def _measure(part: str, episode: str, scores: Sequence[ViewScore]) -> list[Measu
             n=len(psnr),
             counted="image",
             reason_without_interval=spread,
-            episodes=[episode],
+            episodes=episodes,
         ),
         measured(
             f"views.{part}.ssim",
@@ -156,7 +174,7 @@ def _measure(part: str, episode: str, scores: Sequence[ViewScore]) -> list[Measu
             n=len(ssim),
             counted="image",
             reason_without_interval=spread,
-            episodes=[episode],
+            episodes=episodes,
         ),
         Measurement(
             id=f"views.{part}.lpips",
@@ -164,7 +182,7 @@ def _measure(part: str, episode: str, scores: Sequence[ViewScore]) -> list[Measu
             unit="1",
             definition="learned perceptual image patch similarity",
             reason_if_undefined=LPIPS_NOT_COMPUTED,
-            episodes=(episode,),
+            episodes=tuple(episodes),
         ),
     ]
 

@@ -59,13 +59,21 @@ def _cards(results: Results) -> str:
 
 
 def _table(table: Table) -> str:
-    head = "".join(f"<th>{escape(name)}</th>" for name in table.columns)
+    head = "".join(
+        f'<th class="{"number" if _is_number(table, index) else "text"}">{escape(name)}</th>'
+        for index, name in enumerate(table.columns)
+    )
     body = "".join(f"<tr>{''.join(_td(cell) for cell in row)}</tr>" for row in table.rows)
     note = f'<p class="soft">{escape(table.note)}</p>' if table.note else ""
     return (
         f'<h2 id="{escape(table.id)}">{escape(table.title)}</h2><div class="scroll"><table>'
         f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>{note}"
     )
+
+
+def _is_number(table: Table, index: int) -> bool:
+    cells = [row[index] for row in table.rows if row[index] is not None]
+    return bool(cells) and all(isinstance(cell, int | float) for cell in cells)
 
 
 def _td(cell: Cell) -> str:
