@@ -49,7 +49,10 @@ def number(value: float, unit: str) -> str:
 
 def _figure(value: float, unit: str) -> tuple[str, str]:
     form, factor, shown = FORMS.get(unit, ("{:.3g}", 1, unit))
-    return form.format(factor * value).replace("-", "−"), shown
+    text = form.format(factor * value)
+    if value != 0 and float(text) == 0:
+        text = f"{factor * value:.1g}"  # small is not nothing
+    return text.replace("-", "−"), shown
 
 
 def shown_unit(measurement: Measurement) -> str:
@@ -91,11 +94,16 @@ def method(interval: Interval) -> str:
 
 
 def counted(measurement: Measurement) -> str:
-    """Print what a value was counted over: "3 trials"."""
+    """Print what a value was counted over: "3 trials", "4 pairs of runs"."""
     if measurement.n is None:
         return ""
-    plural = "" if measurement.n == 1 else "s"
-    return f"{measurement.n} {measurement.counted or 'item'}{plural}"
+    name = measurement.counted or "item"
+    return f"{measurement.n} {name if measurement.n == 1 else _plural(name)}"
+
+
+def _plural(name: str) -> str:
+    first, *rest = name.split(" ")
+    return " ".join([f"{first}s", *rest])
 
 
 def evidence(measurement: Measurement | None) -> str:
@@ -123,7 +131,7 @@ def headline_evidence(measurement: Measurement) -> str:
         return evidence(measurement)
     interval = measurement.interval
     ends = bounds(interval, shown_unit(measurement))
-    kind = f"{measurement.counted or 'item'}s"
+    kind = _plural(measurement.counted or "item")
     return f"{measured(measurement)} of {kind}, {ends} ({method(interval)})"
 
 
