@@ -1,0 +1,288 @@
+"""Objects as parts of their own: their Gaussians taken out of the scene, and their mesh.
+
+The scene is the background plus objects in their own frames, so an object can be put anywhere.
+Gaussians are cut where the localised shape is; the mesh is the known shape itself.
+"""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bridge.episode import provenance
+from bridge.geometry import se3
+from bridge.task.task_file import ObjectModel, Task
+from twin.scene.gaussians import GaussianCloud, as_float32, concatenate
+from twin.scene.localise import LocalisedObject
+from twin.scene.localise_colour import ColourConfig, likeness, linear_from_srgb
+from twin.scene.localise_fit import FitConfig, refine_on_points
+from twin.scene.localise_shape import surface_distances
+from twin.scene.ply import write_ply
+
+OBJECT_VERSION = 1
+MIN_SPLATS_TO_REFINE = 50
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitConfig:
+    """Which Gaussians belong to an object."""
+
+    search_m: float = 0.012
+    """Around the localised surface, coloured Gaussians are looked for to refine the pose."""
+    margin_m: float = 0.006
+    """Gaussians whose centre is nearer than this to the refined surface may belong to it."""
+    min_likeness: float = 0.35
+    """Near the table a Gaussian must also have the object's colour, see ``likeness``."""
+    max_scale_m: float = 0.05
+    """Larger Gaussians are background that happens to pass through."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectSplats:
+    """One object's Gaussians in its own frame."""
+
+    cloud: GaussianCloud
+    T_base_object: Float[np.ndarray, "4 4"]
+    """Where they were in the scene: the localised pose laid onto the Gaussians themselves."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneParts:
+    """A scene taken apart."""
+
+    background: GaussianCloud
+    objects: dict[str, ObjectSplats]
+
+
+def split_objects(
+    cloud: GaussianCloud,
+    localised: Mapping[str, LocalisedObject],
+    task: Task,
+    config: SplitConfig | None = None,
+) -> SceneParts:
+    """Take the Gaussians of each localised object out of a scene.
+
+    A Gaussian goes to the object whose surface is nearest, if it is near enough; close to the
+    table only if it has the object's colour. Every Gaussian ends up in exactly one part. Objects
+    that were not found stay in the background.
+
+    Args:
+        cloud: The whole scene in ``base_link``.
+        localised: Where the objects were while it was scanned.
+        task: Their shapes and colours.
+        config: Settings; the defaults when None.
+    """
+    config = SplitConfig() if config is None else config
+    found = {key: item for key, item in localised.items() if item.T_base_object is not None}
+    poses = {
+        key: _refined(cloud, task.objects[key], item.T_base_object, config)
+        for key, item in found.items()
+        if item.T_base_object is not None
+    }
+    owner = _owners(cloud, poses, task, config)
+    objects = {}
+    for index, (key, T) in enumerate(poses.items()):
+        part = moved_cloud(cloud.take(owner == index), se3.invert(T))
+        objects[key] = ObjectSplats(cloud=part, T_base_object=T)
+    return SceneParts(background=cloud.take(owner < 0), objects=objects)
+
+
+def compose(parts: SceneParts, Ts_base_object: Mapping[str, np.ndarray]) -> GaussianCloud:
+    """Put objects into the background again, each where the mapping says; others are left out."""
+    placed = [
+        moved_cloud(item.cloud, Ts_base_object[key])
+        for key, item in parts.objects.items()
+        if key in Ts_base_object
+    ]
+    return concatenate([parts.background, *placed])
+
+
+def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> GaussianCloud:
+    """The same Gaussians after a rigid motion; colours do not depend on direction."""
+    q, _ = se3.split(T_new_old)
+    w, x, y, z = q
+    w2, x2, y2, z2 = cloud.quats_wxyz.astype(np.float64).T
+    quats = np.stack(
+        [
+            w * w2 - x * x2 - y * y2 - z * z2,
+            w * x2 + x * w2 + y * z2 - z * y2,
+            w * y2 - x * z2 + y * w2 + z * x2,
+            w * z2 + x * y2 - y * x2 + z * w2,
+        ],
+        axis=1,
+    )
+    return GaussianCloud(
+        means_m=as_float32(se3.apply(T_new_old, cloud.means_m.astype(np.float64))),
+        quats_wxyz=as_float32(quats),
+        scales_log=cloud.scales_log,
+        opacities_logit=cloud.opacities_logit,
+        colors=cloud.colors,
+    )
+
+
+def _alike(
+    cloud: GaussianCloud, model: ObjectModel, config: SplitConfig
+) -> Bool[np.ndarray, " num_splats"]:
+    color_u8 = np.clip(np.rint(cloud.colors * 255), 0, 255).astype(np.uint8)
+    linear = linear_from_srgb(color_u8[None])[0]
+    like = likeness(linear, model.color_srgb, ColourConfig())
+    return np.asarray(like >= config.min_likeness)
+
+
+def _refined(
+    cloud: GaussianCloud,
+    model: ObjectModel,
+    T_base_object: Float[np.ndarray, "4 4"],
+    config: SplitConfig,
+) -> Float[np.ndarray, "4 4"]:
+    """The scene's own errors shift what it shows by millimetres: follow the Gaussians."""
+    ids = _near_ids(cloud, model, T_base_object, config.search_m)
+    ids = ids[_alike(cloud.take(ids), model, config)]
+    if len(ids) < MIN_SPLATS_TO_REFINE:
+        return T_base_object
+    points = cloud.means_m[ids].astype(np.float64)
+    return refine_on_points(points, model, T_base_object, FitConfig())
+
+
+def _near_ids(
+    cloud: GaussianCloud, model: ObjectModel, T: Float[np.ndarray, "4 4"], margin_m: float
+) -> Int[np.ndarray, " num_near"]:
+    """Ids of Gaussians within a margin of the surface or inside the material."""
+    reach = float(np.linalg.norm(model.size_m)) + margin_m
+    around = np.linalg.norm(cloud.means_m - T[:3, 3].astype(np.float32), axis=1) < reach
+    ids = np.flatnonzero(around)
+    distance, _ = surface_distances(cloud.means_m[ids].astype(np.float64), model, T)
+    return np.asarray(ids[distance < margin_m])
+
+
+def _owners(
+    cloud: GaussianCloud,
+    poses: Mapping[str, Float[np.ndarray, "4 4"]],
+    task: Task,
+    config: SplitConfig,
+) -> Int[np.ndarray, " num_splats"]:
+    """Index of the object each Gaussian belongs to, -1 for the background."""
+    owner = np.full(len(cloud), -1, dtype=np.int64)
+    nearest = np.full(len(cloud), np.inf)
+    small = np.exp(cloud.scales_log.max(axis=1)) < config.max_scale_m if len(cloud) else owner > 0
+    for index, (key, T) in enumerate(poses.items()):
+        model = task.objects[key]
+        ids = _near_ids(cloud, model, T, config.margin_m)
+        ids = ids[small[ids]]
+        part = cloud.take(ids)
+        distance, _ = surface_distances(part.means_m.astype(np.float64), model, T)
+        above = part.means_m[:, 2] > config.margin_m
+        # Of two surfaces that touch, the one of the Gaussian's own colour wins.
+        alike = _alike(part, model, config)
+        distance = np.abs(distance) + np.where(alike, 0.0, config.margin_m)
+        wins = (above | alike) & (distance < nearest[ids])
+        owner[ids[wins]] = index
+        nearest[ids[wins]] = distance[wins]
+    return owner
+
+
+def shape_mesh(
+    model: ObjectModel,
+) -> tuple[Float[np.ndarray, "num_vertices 3"], Int[np.ndarray, "num_faces 3"]]:
+    """Triangles of the known shape in the object frame, one closed box per panel [m]."""
+    vertices, faces = [], []
+    corner = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    # Counter-clockwise seen from outside.
+    quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    for index, (centre, extents) in enumerate(model.panels()):
+        vertices.append(centre + corner * extents / 2)
+        faces.append(triangles + 8 * index)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def write_objects(
+    folder: Path,
+    parts: SceneParts,
+    localised: Mapping[str, LocalisedObject],
+    task: Task,
+) -> dict[str, Any]:
+    """Write ``objects/<id>/{object.json, mesh.ply, gaussians.ply}`` below a scene folder.
+
+    Returns:
+        What ``scene.json`` says about the objects: files with their SHA-256, poses, counts.
+    """
+    record = {}
+    for key, item in parts.objects.items():
+        model, place = task.objects[key], folder / "objects" / key
+        place.mkdir(parents=True, exist_ok=True)
+        write_ply(place / "gaussians.ply", item.cloud)
+        _write_whole(place / "mesh.ply", _mesh_ply(*shape_mesh(model)))
+        about = _object_record(model, item, localised[key])
+        about["files"] = {
+            name: provenance.hash_file(place / name) for name in ("gaussians.ply", "mesh.ply")
+        }
+        _write_whole(place / "object.json", (json.dumps(about, indent=2) + "\n").encode())
+        record[key] = {
+            "folder": f"objects/{key}",
+            "num_splats": len(item.cloud),
+            "T_base_object": about["T_base_object"],
+            "files": {
+                **about["files"],
+                "object.json": provenance.hash_file(place / "object.json"),
+            },
+        }
+    return record
+
+
+def _object_record(
+    model: ObjectModel, item: ObjectSplats, localised: LocalisedObject
+) -> dict[str, Any]:
+    return {
+        "schema_version": OBJECT_VERSION,
+        "id": model.id,
+        "shape": model.shape,
+        "size_m": list(model.size_m),
+        "wall_m": model.wall_m,
+        "color_srgb": list(model.color_srgb),
+        "symmetry": model.symmetry,
+        "fixed": model.fixed,
+        "shape_source": "task file",
+        "frame": "gaussians.ply and mesh.ply are in the object frame",
+        "num_splats": len(item.cloud),
+        "T_base_object": _pose_record(item.T_base_object),
+        "localisation": localised.to_record(),
+    }
+
+
+def _pose_record(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
+    q, p = se3.split(T)
+    return {"p_m": p.tolist(), "q_wxyz": q.tolist()}
+
+
+def _mesh_ply(
+    vertices: Float[np.ndarray, "num_vertices 3"], faces: Int[np.ndarray, "num_faces 3"]
+) -> bytes:
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property float {axis}" for axis in "xyz"),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+        "",
+    ]
+    rows = np.zeros(len(faces), dtype=[("count", "u1"), ("ids", "<i4", 3)])
+    rows["count"], rows["ids"] = 3, faces
+    return "\n".join(header).encode() + vertices.astype("<f4").tobytes() + rows.tobytes()
+
+
+def _write_whole(path: Path, data: bytes) -> None:
+    """The file appears under its name only when it is complete."""
+    part = path.with_name(path.name + ".part")
+    with part.open("wb") as stream:
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())
+    part.replace(path)
