@@ -43,14 +43,15 @@ def success_table(cells: Sequence[RateCell], word: str, sim_note: str = SIM_NOTE
         title="Success",
         columns=("task", "condition", "policy", "unit", "sim", word, f"sim - {word} (pp)"),
         rows=rows,
-        note=f"{sim_note} Brackets: 95 % Wilson intervals in percent.",
+        note=f"{sim_note} Brackets: 95 % Wilson intervals in percent. The difference is over "
+        "trials where both sides are known.",
     )
 
 
 def _gap(cell: RateCell) -> float | None:
-    if cell.sim.value is None or cell.recorded.value is None:
+    if cell.sim_rate is None or cell.recorded_rate is None:
         return None
-    return round(100 * (cell.sim.value - cell.recorded.value), 1)
+    return round(float(100 * (cell.sim_rate - cell.recorded_rate)), 1)
 
 
 def gains_table(gains: Sequence[Measurement], word: str) -> Table | None:

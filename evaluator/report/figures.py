@@ -63,8 +63,9 @@ def _frame(word: str) -> str:
             f'<path class="line" d="M{x:g} {_y(0.0):g}V{_y(1.0):g}M{_x(0.0):g} {y:g}H{_x(1.0):g}"/>'
         )
         parts.append(
-            f'<text class="soft small" x="{x}" y="{_y(0.0) + 18}" text-anchor="middle">{step}</text>'
-            f'<text class="soft small" x="{_x(0.0) - 8}" y="{y + 4}" text-anchor="end">{step}</text>'
+            f'<text class="soft small" x="{x:g}" y="{_y(0.0) + 18:g}" text-anchor="middle">'
+            f'{step}</text><text class="soft small" x="{_x(0.0) - 8:g}" y="{y + 4:g}" '
+            f'text-anchor="end">{step}</text>'
         )
     parts.append(f'<path class="ident" d="M{_x(0.0)} {_y(0.0)}L{_x(1.0)} {_y(1.0)}"/>')
     parts.append(f'<path class="axis" d="M{_x(0.0)} {_y(1.0)}V{_y(0.0)}H{_x(1.0)}"/>')

@@ -1,5 +1,6 @@
 """Small invented run folders, written with the same writer the recorder uses."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -201,12 +202,13 @@ def maker(tmp_path: Path) -> RunMaker:
     return RunMaker(run=RunFolder.create(tmp_path / "monday"))
 
 
-@pytest.fixture
-def six_trials(maker: RunMaker) -> RunMaker:
+@pytest.fixture(scope="session")
+def six_trials_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three starts without and with replanning; the twin is wrong about one of six.
 
     Recorded: S F F without, S S F with. Twin: S F S without, S S F with.
     """
+    maker = RunMaker(run=RunFolder.create(tmp_path_factory.mktemp("six") / "monday"))
     table: tuple[tuple[str, str, str, bool], ...] = (
         ("a1", "without_replanning", "success", True),
         ("a2", "without_replanning", "failure", False),
@@ -220,7 +222,13 @@ def six_trials(maker: RunMaker) -> RunMaker:
         maker.trial(name, recorded=recorded, condition=condition, start_id=f"s{name[1]}", gate=gate)
         maker.replay(name, accepted=said, offset_m=0.01)
         maker.replay(name, accepted=recorded == "success", trajectory="executed", offset_m=0.002)
-    return maker
+    return maker.run.path
+
+
+@pytest.fixture
+def six_trials(six_trials_once: Path, tmp_path: Path) -> RunMaker:
+    """A fresh copy of the six trials, for the test to spoil."""
+    return RunMaker(run=RunFolder(shutil.copytree(six_trials_once, tmp_path / "monday")))
 
 
 @pytest.fixture

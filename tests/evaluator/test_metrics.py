@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.geometry.trajectory import PoseTrajectory
@@ -86,6 +86,7 @@ def test_an_image_smaller_than_the_window_has_no_ssim() -> None:
     assert score.psnr_db is None
 
 
+@settings(max_examples=40, deadline=None)
 @given(st.floats(0.001, 0.5))
 def test_a_shift_is_found_again(offset_m: float) -> None:
     errors = pose_errors(track(line()), track(line(offset_m)))

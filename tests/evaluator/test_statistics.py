@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluator.errors import UndefinedStatisticError
@@ -22,6 +22,7 @@ counts = st.integers(1, 200).flatmap(lambda n: st.tuples(st.integers(0, n), st.j
 rates = st.lists(st.fractions(0, 1, max_denominator=20), min_size=3, max_size=8)
 
 
+@settings(max_examples=40, deadline=None)
 @given(counts)
 def test_an_interval_holds_its_rate_and_mirrors(count: tuple[int, int]) -> None:
     k, n = count
@@ -33,6 +34,7 @@ def test_an_interval_holds_its_rate_and_mirrors(count: tuple[int, int]) -> None:
         assert mirrored.low == pytest.approx(1 - interval.high, abs=1e-9)
 
 
+@settings(max_examples=40, deadline=None)
 @given(counts)
 def test_clopper_pearson_is_never_narrower_at_the_ends_than_it_guarantees(
     count: tuple[int, int],
@@ -72,6 +74,7 @@ def test_confusion_counts_said_against_happened() -> None:
     assert (found.n, found.agreed, found.said_success, found.said_failure) == (5, 2, 3, 2)
 
 
+@settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=2, max_size=40))
 def test_phi_is_pearsons_r_of_the_two_columns(pairs: list[tuple[bool, bool]]) -> None:
     said, happened = np.array(pairs, dtype=float).T
@@ -96,6 +99,7 @@ def test_mcnemar_without_a_discordant_pair_is_undefined() -> None:
         mcnemar([(True, True), (False, False)])
 
 
+@settings(max_examples=40, deadline=None)
 @given(rates, st.data())
 def test_r_does_not_care_about_order_or_scale(
     recorded: list[Fraction], data: st.DataObject
@@ -123,6 +127,7 @@ def test_r_of_three_cells_has_no_interval() -> None:
         correlation.fisher_interval(0.9, 3)
 
 
+@settings(max_examples=40, deadline=None)
 @given(rates)
 def test_a_perfect_twin_violates_no_rank(recorded: list[Fraction]) -> None:
     assert correlation.mmrv(recorded=recorded, sim=recorded) == 0

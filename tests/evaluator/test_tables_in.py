@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.errors import PathNotFoundError, UsageError
@@ -47,6 +47,7 @@ def trial_records(draw: st.DrawFn) -> list[TrialRecord]:
     return records
 
 
+@settings(max_examples=40, deadline=None)
 @given(trial_records())
 def test_trials_survive_writing_and_reading(
     tmp_path_factory: pytest.TempPathFactory, records: list[TrialRecord]
@@ -121,6 +122,7 @@ def test_a_rounded_rate_finds_its_count(
     assert read_rates(path)[0].rate == count
 
 
+@settings(max_examples=40, deadline=None)
 @given(st.integers(1, 60), st.data())
 def test_every_real_count_printed_with_enough_digits_is_found_again(
     tmp_path_factory: pytest.TempPathFactory, n: int, data: st.DataObject
