@@ -6,13 +6,15 @@ Every pixel meets every Gaussian; no tiles, no early stop. Written from the same
 import numpy as np
 import torch
 
+from bridge.geometry.camera import Camera
+
 MIP_VARIANCE_PX2 = 0.1
 MAX_ALPHA = 0.999
 MIN_MIP_RATIO = 2.5e-5
 NEAR_M = 0.02
 
 
-def rotation(quats):
+def rotation(quats: torch.Tensor) -> torch.Tensor:
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
     return torch.stack(
         [
@@ -24,7 +26,7 @@ def rotation(quats):
     )
 
 
-def _jacobian(camera, p):
+def _jacobian(camera: Camera, p: torch.Tensor) -> torch.Tensor:
     x, y, z = p.unbind(1)
     margin_x, margin_y = 0.3 * camera.width, 0.3 * camera.height
     tx = (x / z).clamp(
@@ -39,7 +41,16 @@ def _jacobian(camera, p):
     return torch.stack([row_x, row_y], 1)
 
 
-def draw(means, quats, scales_log, opacities_logit, colors, camera, T_camera_base, alpha_cut):
+def draw(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales_log: torch.Tensor,
+    opacities_logit: torch.Tensor,
+    colors: torch.Tensor,
+    camera: Camera,
+    T_camera_base: np.ndarray,
+    alpha_cut: float,
+) -> torch.Tensor:
     """Return planes (5, height, width): rgb, weighted depth, alpha."""
     T = torch.as_tensor(np.asarray(T_camera_base), dtype=means.dtype)
     p = means @ T[:3, :3].T + T[:3, 3]

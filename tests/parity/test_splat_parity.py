@@ -2,6 +2,7 @@
 
 import importlib.util
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ CAMERA = Camera(width=45, height=37, fx=50.0, fy=48.0, cx=21.3, cy=19.1)
 FINE = RasterConfig(alpha_cut=2.0**-24, transmittance_stop=0.0, threads=1)
 
 
-def random_cloud(rng, count):
+def random_cloud(rng: np.random.Generator, count: int) -> GaussianCloud:
     means = rng.uniform([-0.6, -0.5, 0.8], [0.6, 0.5, 2.5], size=(count, 3))
     return GaussianCloud(
         means_m=as_float32(means),
@@ -35,23 +36,24 @@ def random_cloud(rng, count):
     )
 
 
-def tilted_pose():
+def tilted_pose() -> np.ndarray:
     return se3.look_at(
         np.array([0.2, -0.1, -0.3]), np.array([0.0, 0.0, 1.6]), np.array([0.1, -1.0, 0.0])
     )
 
 
-def reference_planes(cloud, T_base_camera, alpha_cut, dtype=None):
+def reference_planes(
+    cloud: GaussianCloud, T_base_camera: np.ndarray, alpha_cut: float
+) -> tuple[list[Any], Any]:
     tensors = [
-        torch.tensor(rows, dtype=dtype or torch.float64, requires_grad=True)
-        for _, rows in arrays(cloud)
+        torch.tensor(rows, dtype=torch.float64, requires_grad=True) for _, rows in arrays(cloud)
     ]
     T_camera_base = as_float32(se3.invert(T_base_camera))
     return tensors, splat_reference.draw(*tensors, CAMERA, T_camera_base, alpha_cut)
 
 
 @pytest.mark.parametrize("isa", ["base", "auto"])
-def test_images_agree_with_the_reference(isa):
+def test_images_agree_with_the_reference(isa: str) -> None:
     cloud = random_cloud(np.random.default_rng(1), 60)
     config = RasterConfig(alpha_cut=1 / 255, transmittance_stop=0.0, threads=1, isa=isa)
     planes = Rasteriser(config).draw_planes(cloud, CAMERA, tilted_pose())
@@ -64,7 +66,7 @@ def test_images_agree_with_the_reference(isa):
 
 
 @pytest.mark.parametrize("isa", ["base", "auto"])
-def test_gradients_agree_with_autograd(isa):
+def test_gradients_agree_with_autograd(isa: str) -> None:
     rng = np.random.default_rng(2)
     cloud = random_cloud(rng, 60)
     rasteriser = Rasteriser(
@@ -83,7 +85,7 @@ def test_gradients_agree_with_autograd(isa):
         assert relative < 5e-4, name
 
 
-def test_gradients_agree_with_finite_differences():
+def test_gradients_agree_with_finite_differences() -> None:
     rng = np.random.default_rng(3)
     cloud = random_cloud(rng, 12)
     rasteriser = Rasteriser(FINE)
@@ -105,7 +107,7 @@ def test_gradients_agree_with_finite_differences():
         assert numeric == pytest.approx(analytic, rel=2e-2, abs=2e-2), name
 
 
-def test_the_two_instruction_sets_agree():
+def test_the_two_instruction_sets_agree() -> None:
     cloud = random_cloud(np.random.default_rng(4), 200)
     pose = tilted_pose()
     base = Rasteriser(RasterConfig(isa="base", threads=1)).draw_planes(cloud, CAMERA, pose)
@@ -113,7 +115,7 @@ def test_the_two_instruction_sets_agree():
     assert np.quantile(np.abs(base - best), 0.99) < 1e-4
 
 
-def test_ssim_agrees_with_a_torch_convolution():
+def test_ssim_agrees_with_a_torch_convolution() -> None:
     from twin.scene.raster import load_native
 
     rng = np.random.default_rng(5)
@@ -125,7 +127,7 @@ def test_ssim_agrees_with_a_torch_convolution():
     tap = torch.exp(-(offsets**2) / (2 * 1.5**2))
     window = torch.outer(tap, tap)[None, None] / tap.sum() ** 2
 
-    def blur(planes):
+    def blur(planes: Any) -> Any:
         return torch.nn.functional.conv2d(planes[:, None], window, padding=5)[:, 0]
 
     a = torch.tensor(x, dtype=torch.float64, requires_grad=True)
@@ -139,7 +141,7 @@ def test_ssim_agrees_with_a_torch_convolution():
     assert np.linalg.norm(gradient - a.grad.numpy()) < 1e-3 * np.linalg.norm(a.grad.numpy())
 
 
-def test_adam_agrees_with_torch():
+def test_adam_agrees_with_torch() -> None:
     from twin.scene.raster import load_native
 
     rng = np.random.default_rng(6)

@@ -117,7 +117,7 @@ def spread(values: np.ndarray, count: int) -> np.ndarray:
     """Pick at most ``count`` values at even distances, both ends included."""
     if len(values) <= count:
         return values
-    return values[np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))]
+    return np.asarray(values[np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))])
 
 
 def _stamps(episode: Episode, camera_id: str) -> tuple[np.ndarray, bool]:

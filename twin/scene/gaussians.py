@@ -36,7 +36,7 @@ class GaussianCloud:
 
     def opacities(self) -> Float32[np.ndarray, " num_splats"]:
         """Opacity of each Gaussian at its centre, 0..1."""
-        return (1.0 / (1.0 + np.exp(-self.opacities_logit))).astype(np.float32)
+        return as_float32(1.0 / (1.0 + np.exp(-self.opacities_logit)))
 
 
 def arrays(cloud: GaussianCloud) -> list[tuple[str, np.ndarray]]:

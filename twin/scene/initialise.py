@@ -38,12 +38,10 @@ def fuse(points: list[PointSet], config: InitialiseConfig) -> GaussianCloud:
     wanted = config.footprint_factor * np.concatenate([item.footprint_m for item in points])
     base = float(np.quantile(wanted, 0.05))
     level = np.clip(np.rint(np.log2(wanted / base)), 0, MAX_LEVEL).astype(np.int64)
-    growth = 1.0
-    for _ in range(8):
-        inverse, kept, sizes = _voxels(p, level, base * growth)
-        if kept.sum() <= config.max_splats:
-            break
-        growth *= 1.05 * float(np.sqrt(kept.sum() / config.max_splats))
+    inverse, kept, sizes = _voxels(p, level, base)
+    while kept.sum() > config.max_splats:
+        base *= 1.05 * float(np.sqrt(kept.sum() / config.max_splats))
+        inverse, kept, sizes = _voxels(p, level, base)
     if not kept.any():
         raise NoSurfaceError(_no_surface(len(p)))
     count = np.bincount(inverse, minlength=len(kept))[kept]
@@ -96,7 +94,7 @@ def _average(
     values: np.ndarray, inverse: np.ndarray, kept: np.ndarray, count: np.ndarray
 ) -> np.ndarray:
     sums = [np.bincount(inverse, weights=column, minlength=len(kept))[kept] for column in values.T]
-    return np.stack(sums, axis=1) / count[:, None]
+    return np.asarray(np.stack(sums, axis=1) / count[:, None])
 
 
 def _flat_gaussians(

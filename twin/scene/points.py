@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Float32
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from twin.scene.gaussians import as_float32
 
 NEAR_M = 0.05
 NORMAL_REACH_PX = 2
@@ -103,7 +104,7 @@ class FrameSurface:
         nearest = np.full(camera.width * camera.height, np.inf, dtype=np.float32)
         np.minimum.at(nearest, index, p[2, inside])
         nearest[~np.isfinite(nearest)] = 0.0
-        return nearest.reshape(camera.height, camera.width)
+        return np.asarray(nearest.reshape(camera.height, camera.width))
 
     def _T_color_depth(self) -> Float[np.ndarray, "4 4"]:
         return se3.invert(self.frame.T_base_color) @ self.frame.T_base_depth
@@ -126,7 +127,7 @@ class FrameSurface:
         n = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
         n /= np.maximum(np.sqrt(np.square(n).sum(axis=0)), np.float32(1e-12))
         away = (n * p[:, row, column]).sum(axis=0) > 0
-        return np.where(away, -n, n)
+        return np.asarray(np.where(away, -n, n))
 
 
 def _turn(T: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -167,4 +168,4 @@ def _sample(image_u8: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
     top = image_u8[y0, x0] * (1 - fx) + image_u8[y0, x0 + 1] * fx
     bottom = image_u8[y0 + 1, x0] * (1 - fx) + image_u8[y0 + 1, x0 + 1] * fx
-    return ((top * (1 - fy) + bottom * fy) * np.float32(1 / 255)).astype(np.float32)
+    return as_float32((top * (1 - fy) + bottom * fy) * (1 / 255))

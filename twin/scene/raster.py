@@ -3,6 +3,7 @@
 The slow readable twin of this module is ``tests/parity/splat_reference.py``.
 """
 
+import importlib
 import os
 from dataclasses import dataclass
 from types import ModuleType
@@ -39,10 +40,9 @@ def load_native() -> ModuleType:
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read once, when libgomp is loaded
     try:
-        from twin.scene import _splat  # noqa: PLC0415  # after the environment is set
+        return importlib.import_module("twin.scene._splat")
     except ImportError as error:
         raise SplatExtensionMissingError(reason=str(error)[:160]) from error
-    return _splat
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,7 @@ class View:
 
     def image_u8(self) -> np.ndarray:
         """Colour as 8-bit sRGB."""
-        return np.rint(np.clip(self.image, 0.0, 1.0) * 255.0).astype(np.uint8)
+        return np.asarray(np.rint(np.clip(self.image, 0.0, 1.0) * 255.0), dtype=np.uint8)
 
 
 class Rasteriser:

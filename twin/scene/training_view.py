@@ -58,12 +58,13 @@ def _blocks(rows: np.ndarray, camera: Camera) -> np.ndarray:
     height, width = camera.height * 2, camera.width * 2
     missing = ((0, max(0, height - len(rows))), (0, max(0, width - rows.shape[1])))
     padded = np.pad(rows, missing + ((0, 0),) * (rows.ndim - 2), mode="edge")
-    return padded[:height, :width].reshape(camera.height, 2, camera.width, 2, *rows.shape[2:])
+    shape = (camera.height, 2, camera.width, 2, *rows.shape[2:])
+    return np.asarray(padded[:height, :width].reshape(shape))
 
 
 def _halved_image(image_u8: np.ndarray, camera: Camera) -> np.ndarray:
     total = _blocks(image_u8, camera).sum(axis=(1, 3), dtype=np.uint16)
-    return ((total + 2) // 4).astype(np.uint8)
+    return np.asarray((total + 2) // 4, dtype=np.uint8)
 
 
 def _halved_depth(depth_m: np.ndarray, camera: Camera) -> np.ndarray:

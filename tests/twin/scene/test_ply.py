@@ -1,3 +1,6 @@
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -6,7 +9,7 @@ from twin.scene.gaussians import SH_DC, GaussianCloud, arrays, as_float32
 from twin.scene.ply import COLUMNS, UnreadablePlyError, read_ply, write_ply
 
 
-def some_cloud(count=7):
+def some_cloud(count: int = 7) -> GaussianCloud:
     rng = np.random.default_rng(3)
     quats = rng.normal(size=(count, 4))
     return GaussianCloud(
@@ -18,7 +21,7 @@ def some_cloud(count=7):
     )
 
 
-def test_what_is_written_is_read_back(tmp_path):
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     cloud = some_cloud()
     write_ply(tmp_path / "a.ply", cloud)
     again = read_ply(tmp_path / "a.ply")
@@ -27,7 +30,7 @@ def test_what_is_written_is_read_back(tmp_path):
     assert list(tmp_path.iterdir()) == [tmp_path / "a.ply"]
 
 
-def test_the_header_and_first_row_are_those_other_viewers_expect(tmp_path):
+def test_the_header_and_first_row_are_those_other_viewers_expect(tmp_path: Path) -> None:
     cloud = some_cloud(2)
     write_ply(tmp_path / "a.ply", cloud)
     head, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
@@ -40,7 +43,7 @@ def test_the_header_and_first_row_are_those_other_viewers_expect(tmp_path):
     np.testing.assert_array_equal(row[10:13], cloud.scales_log[0])
 
 
-def test_further_columns_are_ignored(tmp_path):
+def test_further_columns_are_ignored(tmp_path: Path) -> None:
     cloud = some_cloud(3)
     write_ply(tmp_path / "a.ply", cloud)
     head, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
@@ -63,7 +66,9 @@ def test_further_columns_are_ignored(tmp_path):
         (lambda data: data[:-4] + b"\x00\x00\xc0\x7f", "not finite"),
     ],
 )
-def test_a_damaged_file_is_refused(tmp_path, change, found):
+def test_a_damaged_file_is_refused(
+    tmp_path: Path, change: Callable[[bytes], bytes], found: str
+) -> None:
     path = tmp_path / "a.ply"
     write_ply(path, some_cloud())
     path.write_bytes(change(path.read_bytes()))
@@ -71,6 +76,6 @@ def test_a_damaged_file_is_refused(tmp_path, change, found):
         read_ply(path)
 
 
-def test_a_missing_file_says_what_makes_it(tmp_path):
+def test_a_missing_file_says_what_makes_it(tmp_path: Path) -> None:
     with pytest.raises(PathNotFoundError, match="robot-gst rebuild"):
         read_ply(tmp_path / "none.ply")

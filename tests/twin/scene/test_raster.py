@@ -10,7 +10,14 @@ CAMERA = Camera(width=40, height=33, fx=60.0, fy=60.0, cx=20.0, cy=16.5)
 IDENTITY = np.eye(4)
 
 
-def one_gaussian(*, x_px, y_px, depth_m=1.0, sigma_m=0.02, opacity_logit=3.0):
+def one_gaussian(
+    *,
+    x_px: float,
+    y_px: float,
+    depth_m: float = 1.0,
+    sigma_m: float = 0.02,
+    opacity_logit: float = 3.0,
+) -> GaussianCloud:
     """A round Gaussian whose centre projects to one place of the image."""
     mean = [(x_px - CAMERA.cx) / CAMERA.fx * depth_m, (y_px - CAMERA.cy) / CAMERA.fy * depth_m]
     return GaussianCloud(
@@ -22,7 +29,7 @@ def one_gaussian(*, x_px, y_px, depth_m=1.0, sigma_m=0.02, opacity_logit=3.0):
     )
 
 
-def many_gaussians(count=3000, seed=7):
+def many_gaussians(count: int = 3000, seed: int = 7) -> GaussianCloud:
     rng = np.random.default_rng(seed)
     return GaussianCloud(
         means_m=as_float32(rng.uniform([-0.5, -0.4, 0.5], [0.5, 0.4, 3.0], size=(count, 3))),
@@ -33,11 +40,11 @@ def many_gaussians(count=3000, seed=7):
     )
 
 
-def draw(cloud, config=None):
+def draw(cloud: GaussianCloud, config: RasterConfig | None = None) -> np.ndarray:
     return Rasteriser(config or RasterConfig(threads=1)).draw_planes(cloud, CAMERA, IDENTITY)
 
 
-def test_a_single_gaussian_lands_on_its_pixel():
+def test_a_single_gaussian_lands_on_its_pixel() -> None:
     planes = draw(one_gaussian(x_px=12.5, y_px=7.5))
     row, column = np.unravel_index(np.argmax(planes[4]), planes[4].shape)
     assert (row, column) == (7, 12)
@@ -46,12 +53,12 @@ def test_a_single_gaussian_lands_on_its_pixel():
     assert planes[4, 6, 12] == pytest.approx(planes[4, 8, 12], rel=1e-5)
 
 
-def test_a_gaussian_between_two_pixels_shows_in_both_alike():
+def test_a_gaussian_between_two_pixels_shows_in_both_alike() -> None:
     planes = draw(one_gaussian(x_px=12.0, y_px=7.5))
     assert planes[4, 7, 11] == pytest.approx(planes[4, 7, 12], rel=1e-5)
 
 
-def test_alpha_of_a_single_gaussian_is_the_closed_form():
+def test_alpha_of_a_single_gaussian_is_the_closed_form() -> None:
     planes = draw(one_gaussian(x_px=12.5, y_px=7.5, sigma_m=0.05, opacity_logit=1.0))
     variance = (CAMERA.fx * 0.05) ** 2
     # Slightly off the axis the affine approximation stretches the ellipse by a few per cent.
@@ -62,7 +69,7 @@ def test_alpha_of_a_single_gaussian_is_the_closed_form():
     )
 
 
-def test_colour_and_depth_are_weighted_by_alpha():
+def test_colour_and_depth_are_weighted_by_alpha() -> None:
     planes = draw(one_gaussian(x_px=20.0, y_px=16.5, depth_m=1.5))
     alpha = planes[4, 16, 20]
     assert alpha > 0.3
@@ -70,7 +77,7 @@ def test_colour_and_depth_are_weighted_by_alpha():
     assert planes[3, 16, 20] == pytest.approx(1.5 * alpha, rel=1e-5)
 
 
-def test_the_nearer_gaussian_hides_the_farther_whatever_their_order():
+def test_the_nearer_gaussian_hides_the_farther_whatever_their_order() -> None:
     near = one_gaussian(x_px=20.5, y_px=16.5, depth_m=1.0, sigma_m=0.1, opacity_logit=8.0)
     far = one_gaussian(x_px=20.5, y_px=16.5, depth_m=2.0, sigma_m=0.2, opacity_logit=8.0)
     images = []
@@ -84,7 +91,7 @@ def test_the_nearer_gaussian_hides_the_farther_whatever_their_order():
     assert images[0][3, 16, 20] / images[0][4, 16, 20] == pytest.approx(1.0, abs=0.02)
 
 
-def test_any_number_of_threads_gives_the_same_bits():
+def test_any_number_of_threads_gives_the_same_bits() -> None:
     cloud = many_gaussians()
     upstream = np.random.default_rng(1).normal(size=(5, 33, 40)).astype(np.float32)
     results = []
@@ -99,7 +106,7 @@ def test_any_number_of_threads_gives_the_same_bits():
             np.testing.assert_array_equal(first, second)
 
 
-def test_a_gaussian_behind_the_camera_is_not_drawn():
+def test_a_gaussian_behind_the_camera_is_not_drawn() -> None:
     cloud = one_gaussian(x_px=20.0, y_px=16.5)
     behind = GaussianCloud(**(dict(arrays(cloud)) | {"means_m": -cloud.means_m}))
     assert draw(cloud)[4].max() > 0.3
@@ -108,7 +115,7 @@ def test_a_gaussian_behind_the_camera_is_not_drawn():
 
 @pytest.mark.parametrize("broken", ["means_m", "scales_log", "opacities_logit", "colors"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
-def test_a_broken_gaussian_does_not_spoil_the_others(broken, value):
+def test_a_broken_gaussian_does_not_spoil_the_others(broken: str, value: float) -> None:
     cloud = many_gaussians(50)
     spoiled = {name: rows.copy() for name, rows in arrays(cloud)}
     spoiled[broken][10] = value
@@ -122,7 +129,7 @@ def test_a_broken_gaussian_does_not_spoil_the_others(broken, value):
         assert all(np.isfinite(getattr(gradient, n)[others]).all() for n, _ in arrays(cloud))
 
 
-def test_a_zero_quaternion_is_left_out():
+def test_a_zero_quaternion_is_left_out() -> None:
     cloud = many_gaussians(50)
     cloud.quats_wxyz[3] = 0.0
     rasteriser = Rasteriser(RasterConfig(threads=1))
@@ -130,18 +137,18 @@ def test_a_zero_quaternion_is_left_out():
     assert not rasteriser.visible_mask()[3]
 
 
-def test_a_transparent_gaussian_changes_nothing():
+def test_a_transparent_gaussian_changes_nothing() -> None:
     planes = draw(one_gaussian(x_px=20.0, y_px=16.5, opacity_logit=-20.0))
     assert planes.max() == 0.0
 
 
-def test_an_empty_cloud_draws_black():
+def test_an_empty_cloud_draws_black() -> None:
     planes = draw(many_gaussians(1).take(np.zeros(0, dtype=int)))
     assert planes.shape == (5, 33, 40)
     assert planes.max() == 0.0
 
 
-def test_tables_of_different_length_are_refused():
+def test_tables_of_different_length_are_refused() -> None:
     cloud = many_gaussians(5)
     native = raster.load_native().Rasteriser(1, "auto")
     pose = np.eye(4, dtype=np.float32)[:3].copy()
@@ -150,7 +157,7 @@ def test_tables_of_different_length_are_refused():
         native.draw(*tables, cloud.colors[:3], pose, (40, 33, 60.0, 60.0, 20.0, 16.5), 0.01, 0.0)
 
 
-def test_double_precision_is_refused_instead_of_copied():
+def test_double_precision_is_refused_instead_of_copied() -> None:
     cloud = many_gaussians(5)
     native = raster.load_native().Rasteriser(1, "auto")
     pose = np.eye(4, dtype=np.float32)[:3].copy()
@@ -159,12 +166,12 @@ def test_double_precision_is_refused_instead_of_copied():
         native.draw(*tables, pose, (40, 33, 60.0, 60.0, 20.0, 16.5), 0.01, 0.0)
 
 
-def test_an_unknown_instruction_set_is_refused():
+def test_an_unknown_instruction_set_is_refused() -> None:
     with pytest.raises(ValueError, match="'auto', 'base' or 'v3'"):
         Rasteriser(RasterConfig(isa="sparc"))
 
 
-def test_the_view_gives_depth_only_where_the_image_is_solid():
+def test_the_view_gives_depth_only_where_the_image_is_solid() -> None:
     view = Rasteriser(RasterConfig(threads=1)).view(
         one_gaussian(x_px=20.5, y_px=16.5, depth_m=1.25, sigma_m=0.05), CAMERA, IDENTITY
     )
@@ -173,7 +180,7 @@ def test_the_view_gives_depth_only_where_the_image_is_solid():
     assert view.image_u8().dtype == np.uint8
 
 
-def test_a_missing_extension_says_how_to_build_it(monkeypatch):
+def test_a_missing_extension_says_how_to_build_it(monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 
     import twin.scene

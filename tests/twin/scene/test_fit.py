@@ -1,0 +1,109 @@
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+import textured_room
+
+from twin.scene.fit import fit
+from twin.scene.gaussians import GaussianCloud, arrays
+from twin.scene.initialise import fuse
+from twin.scene.losses import Loss, psnr_db
+from twin.scene.points import DepthLimits, FrameSurface
+from twin.scene.settings import FitConfig, InitialiseConfig
+from twin.scene.training_view import TrainingView, training_view
+
+LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
+Kind = Literal["3dgs", "paper"]
+
+
+@pytest.mark.parametrize("kind", ["3dgs", "paper"])
+def test_the_gradient_of_the_loss_agrees_with_finite_differences(kind: Kind) -> None:
+    rng = np.random.default_rng(0)
+    planes = rng.uniform(0.1, 0.9, size=(5, 12, 14)).astype(np.float32)
+    target = rng.uniform(size=(3, 12, 14)).astype(np.float32)
+    depth = rng.uniform(0.5, 2.0, size=(12, 14)).astype(np.float32)
+    depth[:4] = 0.0
+    loss = Loss(kind, depth_weight=0.3, threads=1)
+    direction = rng.normal(size=planes.shape).astype(np.float32)
+    # |x| has a kink: keep every difference at least ten steps away from it.
+    step = np.float32(1e-4)
+    target += 0.01 * np.sign(target - planes[:3])
+    gradient = loss(planes, target, depth)[2]
+    ahead, behind = (loss(planes + s * step * direction, target, depth)[0] for s in (1, -1))
+    assert (ahead - behind) / (2 * step) == pytest.approx(
+        float((gradient * direction).sum()), rel=0.03, abs=3e-3
+    )
+
+
+def test_unmeasured_depth_does_not_count() -> None:
+    rng = np.random.default_rng(0)
+    planes = rng.uniform(size=(5, 8, 8)).astype(np.float32)
+    _, _, gradient = Loss("paper", depth_weight=1.0, threads=1)(
+        planes, planes[:3].copy(), np.zeros((8, 8), dtype=np.float32)
+    )
+    assert np.abs(gradient).max() == 0.0
+
+
+def test_the_paper_loss_is_the_squared_error_plus_weighted_depth() -> None:
+    rng = np.random.default_rng(0)
+    planes = rng.uniform(size=(5, 8, 8)).astype(np.float32)
+    target = rng.uniform(size=(3, 8, 8)).astype(np.float32)
+    depth = np.full((8, 8), 2.0, dtype=np.float32)
+    value, mse, _ = Loss("paper", depth_weight=0.5, threads=1)(planes, target, depth)
+    assert mse == pytest.approx(float(np.mean((planes[:3] - target) ** 2)), rel=1e-5)
+    relative = np.abs(planes[3] - planes[4] * 2.0) / 2.0
+    assert value == pytest.approx(mse + 0.5 * float(relative.mean()), rel=1e-5)
+
+
+@pytest.fixture(scope="module")
+def room() -> tuple[GaussianCloud, list[TrainingView]]:
+    surfaces = [FrameSurface(textured_room.frame(i, 4), LIMITS) for i in range(4)]
+    start = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=1000))
+    return start, [training_view(surface) for surface in surfaces]
+
+
+@pytest.mark.parametrize("kind", ["3dgs", "paper"])
+def test_fitting_improves_the_images(
+    room: tuple[GaussianCloud, list[TrainingView]], kind: Kind
+) -> None:
+    seen: list[str] = []
+    config = FitConfig(iterations=40, loss=kind, threads=1)
+    fitted = fit(*room, config, lambda done, note: seen.append(note))
+    barely = fit(*room, replace(config, iterations=4), lambda *_: None)
+    assert fitted.iterations == 40
+    assert fitted.coarse_iterations == 24
+    assert fitted.train_psnr_db > barely.train_psnr_db + 1.0
+    assert "PSNR" in seen[-1]
+
+
+def test_a_number_of_images_repeats_bit_for_bit_with_any_threads(
+    room: tuple[GaussianCloud, list[TrainingView]],
+) -> None:
+    results = [
+        fit(*room, FitConfig(iterations=6, threads=threads), lambda *_: None).cloud
+        for threads in (1, 2)
+    ]
+    for name, rows in arrays(results[0]):
+        np.testing.assert_array_equal(rows, getattr(results[1], name))
+
+
+def test_another_seed_gives_another_result(
+    room: tuple[GaussianCloud, list[TrainingView]],
+) -> None:
+    first, second = (
+        fit(*room, FitConfig(iterations=3, threads=1, seed=seed), lambda *_: None).cloud
+        for seed in (0, 1)
+    )
+    assert not np.array_equal(first.colors, second.colors)
+
+
+def test_a_time_budget_is_kept(room: tuple[GaussianCloud, list[TrainingView]]) -> None:
+    result = fit(*room, FitConfig(budget_s=0.2, threads=1), lambda *_: None)
+    assert result.iterations >= 1
+    assert result.seconds >= 0.2
+
+
+def test_psnr_of_a_known_error() -> None:
+    assert psnr_db(0.01) == pytest.approx(20.0)
+    assert psnr_db(0.0) == float("inf")
