@@ -26,7 +26,7 @@ def evaluate(
     Args:
         source: A run folder, a trials CSV (one row per trial) or a rates CSV (task, condition,
             side, unit, n, rate).
-        out: Folder for the results; RUN/results, or <name>_results beside a CSV, without it.
+        out: Folder for the results; RUN/results, or NAME_results beside a CSV NAME.csv, without it.
         fail_under: Exit with 3 when sim and outcome agree in a smaller fraction of trials (0..1).
         output: How to talk.
     """
