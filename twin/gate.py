@@ -65,7 +65,10 @@ class GateConfig:
     frame_wait_s: float = 2.0
     """Wait this long for fresh frames before giving up."""
     max_frame_age_s: float = 5.0
-    """A camera that has been silent for longer is not trusted."""
+    """A camera that has been silent for longer, on the cell's clock, is not trusted."""
+    max_silence_s: float = 30.0
+    """When nothing at all arrived for this long, not counting the time spent on a verdict, the
+    cell is not trusted to be as it was last seen."""
     replay: Annotated[ReplayConfig, Parameter(name="replay")] = field(default_factory=ReplayConfig)
     """How each plan is re-lived."""
 
@@ -91,7 +94,10 @@ class Eyes(Protocol):
     def newest_ns(self) -> int:
         """The latest time on the cell's own clock."""
 
-    def frames(self, *, now_ns: int, max_age_ns: int, max_per_camera: int) -> Any:
+    def heard_ns(self) -> int:
+        """When the last message arrived."""
+
+    def frames(self, *, max_age_ns: int, max_per_camera: int) -> Any:
         """The latest frames at rest."""
 
 
@@ -122,6 +128,7 @@ class Gate:
         self._turn = threading.Lock()
         self._counting = threading.Lock()
         self._inside = 0
+        self._contact_ns = 0
 
     def judge(self, payload: bytes) -> Verdict:
         """Judge one plan.
@@ -162,9 +169,17 @@ class Gate:
             return no_verdict(plan, f"the replay was not done at {limit}")
 
     def _decide(self, plan: Plan) -> Verdict:
+        silent_ns = self._now_ns() - max(self._eyes.heard_ns(), self._contact_ns)
         try:
             urdf = self._check(plan)
-            return self._replay(plan, self._find_objects(), urdf)
+            if silent_ns > self._config.max_silence_s * 1e9:
+                raise UndecidedError(
+                    f"nothing has arrived from the cell for {silent_ns * 1e-9:.0f} s"
+                )
+            verdict = self._replay(plan, self._find_objects(), urdf)
+            # A cell that waits for the verdict may stand still meanwhile: not counted as silence.
+            self._contact_ns = self._now_ns() - silent_ns
+            return verdict
         except GstError as error:
             return no_verdict(plan, str(error))
         except Exception as error:  # noqa: BLE001  # a bug must not become a yes, nor silence
@@ -207,7 +222,6 @@ class Gate:
         ends = time.monotonic() + self._config.frame_wait_s
         while True:
             live = self._eyes.frames(
-                now_ns=self._now_ns(),
                 max_age_ns=round(self._config.max_frame_age_s * 1e9),
                 max_per_camera=self._config.frames,
             )
@@ -241,11 +255,11 @@ def robot_name(urdf: str) -> str:
 
 
 def scene_hash_of(run: RunFolder) -> str | None:
-    """Content hash of the run's rebuilt scene, None when there is none."""
-    from bridge.episode.provenance import hash_file  # noqa: PLC0415
+    """Hash of the run's rebuilt scene, None when there is none."""
+    from twin.scene.store import read_record  # noqa: PLC0415
 
-    path = run.scene_dir / "scene.json"
-    return hash_file(path) if path.is_file() else None
+    record = read_record(run)
+    return None if record is None else str(record["scene_hash"])
 
 
 def make_gate(run: RunFolder, config: GateConfig, eyes: Eyes, now_ns: Callable[[], int]) -> Gate:

@@ -41,7 +41,6 @@ class _Camera:
     infos: dict[str, CameraInfo] = field(default_factory=dict)
     colors: deque[CompressedColor] = field(default_factory=lambda: deque(maxlen=KEPT_IMAGES))
     depths: deque[DepthImage] = field(default_factory=lambda: deque(maxlen=KEPT_IMAGES))
-    received_ns: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +65,7 @@ class LiveView:
         self._executing: str | None = None
         self._quiet_since_ns = 0
         self._newest_ns = 0
+        self._heard_ns = 0
         self.malformed = 0
 
     def take(self, topic: str, data: bytes, received_ns: int) -> None:
@@ -74,11 +74,12 @@ class LiveView:
             return
         try:
             with self._lock:
-                self._take(topic, data, received_ns)
+                self._take(topic, data)
+                self._heard_ns = max(self._heard_ns, received_ns)
         except (GstError, cdr.MalformedMessageError, ValueError):
             self.malformed += 1
 
-    def _take(self, topic: str, data: bytes, received_ns: int) -> None:
+    def _take(self, topic: str, data: bytes) -> None:
         if topic == "/tf":
             items = transforms_from_cdr(data)
             self._moving.extend(items)
@@ -92,7 +93,7 @@ class LiveView:
         elif topic == f"/{self._cell}/event":
             self._take_event(data)
         elif topic.startswith(f"/{self._cell}/cam/"):
-            self._take_image(topic, data, received_ns)
+            self._take_image(topic, data)
 
     def _take_event(self, data: bytes) -> None:
         event = parse_record(data, name="event", package="bridge.episode")
@@ -103,7 +104,7 @@ class LiveView:
             self._executing = None
             self._quiet_since_ns = max(self._quiet_since_ns, int(event["stamp_ns"]))
 
-    def _take_image(self, topic: str, data: bytes, received_ns: int) -> None:
+    def _take_image(self, topic: str, data: bytes) -> None:
         parts = topic.split("/")
         if len(parts) != 6:
             return
@@ -115,7 +116,6 @@ class LiveView:
             camera.infos[stream] = CameraInfo.from_cdr(data)
         elif kind == "image" and stream == "color":
             camera.colors.append(CompressedColor.from_cdr(data))
-            camera.received_ns = received_ns
             self._newest_ns = max(self._newest_ns, camera.colors[-1].stamp_ns)
         elif kind == "image" and stream == "depth":
             camera.depths.append(DepthImage.from_cdr(data))
@@ -130,17 +130,22 @@ class LiveView:
         with self._lock:
             return self._newest_ns
 
+    def heard_ns(self) -> int:
+        """When the last message arrived, on the receiver's clock; 0 before the first."""
+        with self._lock:
+            return self._heard_ns
+
     def executing(self) -> str | None:
         """Id of the plan that is being executed right now, None at rest."""
         with self._lock:
             return self._executing
 
-    def frames(self, *, now_ns: int, max_age_ns: int, max_per_camera: int) -> LiveFrames:
+    def frames(self, *, max_age_ns: int, max_per_camera: int) -> LiveFrames:
         """The newest frames of each camera since the last execution ended.
 
         Args:
-            now_ns: On the clock of ``received_ns``.
-            max_age_ns: A camera that has been silent for longer gives nothing.
+            max_age_ns: A camera gives nothing when its last image is older than this, on the
+                cell's own clock: the cell went on talking and the camera did not.
             max_per_camera: At most so many frames of one camera.
         """
         with self._lock:  # copy only: decoding must not hold up the network
@@ -149,21 +154,20 @@ class LiveView:
                     infos=dict(camera.infos),
                     colors=camera.colors.copy(),
                     depths=camera.depths.copy(),
-                    received_ns=camera.received_ns,
                 )
                 for camera_id, camera in sorted(self._cameras.items())
             }
             transforms = [*self._static.values(), *self._moving]
-            quiet_since_ns = self._quiet_since_ns
+            quiet_since_ns, newest_ns = self._quiet_since_ns, self._newest_ns
         if not cameras:
             return LiveFrames(frames=[], reasons=[f"no images on /{self._cell}/cam/**"])
         tree = TransformTree(transforms)
         frames: list[RgbdFrame] = []
         reasons: list[str] = []
         for camera_id, camera in cameras.items():
-            age_ns = now_ns - camera.received_ns
-            if camera.colors and age_ns > max_age_ns:
-                reasons.append(f"{camera_id}: silent for {age_ns * 1e-9:.1f} s")
+            age_ns = newest_ns - max((image.stamp_ns for image in camera.colors), default=newest_ns)
+            if age_ns > max_age_ns:
+                reasons.append(f"{camera_id}: silent for {age_ns * 1e-9:.1f} s of the cell's time")
                 continue
             try:
                 frames += _frames_of(camera_id, camera, tree, quiet_since_ns, max_per_camera)

@@ -51,6 +51,7 @@ PLAN = Plan(
 class FakeEyes:
     description: str | None = URDF
     running: str | None = None
+    heard: int = 1
     seen: list[Any] = field(default_factory=lambda: ["a frame"])
     reasons: list[str] = field(default_factory=lambda: ["side: silent for 9.0 s"])
 
@@ -62,6 +63,9 @@ class FakeEyes:
 
     def newest_ns(self) -> int:
         return 42
+
+    def heard_ns(self) -> int:
+        return self.heard
 
     def frames(self, **_: Any) -> Any:
         return SimpleNamespace(frames=self.seen, reasons=self.reasons)
@@ -94,6 +98,7 @@ def gate_with(
     eyes: FakeEyes | None = None,
     localise: Callable[..., Any] = lambda frames, task: found(),
     replay: Callable[..., Verdict] = accept,
+    now_ns: Callable[[], int] = lambda: 0,
     **settings: Any,
 ) -> Gate:
     config = GateConfig(**{"deadline_s": 5.0, "frame_wait_s": 0.0, **settings})
@@ -103,7 +108,7 @@ def gate_with(
         eyes=eyes or FakeEyes(),
         localise=localise,
         replay=replay,
-        now_ns=lambda: 0,
+        now_ns=now_ns,
     )
 
 
@@ -158,6 +163,23 @@ def test_what_cannot_be_decided_is_null_with_a_reason(
     assert verdict.plan_id == plan.id
     assert reason in str(verdict.reason)
     assert Verdict.from_json(verdict.to_json()) == verdict
+
+
+def test_a_cell_not_heard_for_long_is_not_judged_from_memory_however_often_one_asks() -> None:
+    gate = gate_with(now_ns=lambda: 100_000_000_000)
+    for _ in range(3):
+        verdict = gate.judge(PLAN.to_json())
+        assert verdict.accepted is None
+        assert "nothing has arrived from the cell for 100 s" in str(verdict.reason)
+
+
+def test_a_cell_that_stands_still_while_it_waits_for_a_verdict_is_not_silent() -> None:
+    """Each verdict takes 60 s, the cell asks again 1 s later: 1 s of silence, then 2."""
+    clock = iter([1_000_000_000, 61_000_000_000, 62_000_000_000, 122_000_000_000, 200_000_000_000])
+    gate = gate_with(FakeEyes(heard=0), now_ns=lambda: next(clock))
+    assert gate.judge(PLAN.to_json()).accepted is True
+    assert gate.judge(PLAN.to_json()).accepted is True
+    assert "for 80 s" in str(gate.judge(PLAN.to_json()).reason)
 
 
 def test_a_bug_in_the_replay_is_null_and_not_silence(capsys: pytest.CaptureFixture[str]) -> None:

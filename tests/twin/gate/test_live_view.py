@@ -23,8 +23,8 @@ CAMERA = Camera(width=8, height=6, fx=10.0, fy=10.0, cx=4.0, cy=3.0)
 IMAGE = encode_jpeg(np.full((6, 8, 3), 128, dtype=np.uint8))
 
 
-def look(view: LiveView, now_ns: int = 0, most: int = 3) -> LiveFrames:
-    return view.frames(now_ns=now_ns, max_age_ns=5 * S, max_per_camera=most)
+def look(view: LiveView, most: int = 3) -> LiveFrames:
+    return view.frames(max_age_ns=5 * S, max_per_camera=most)
 
 
 def calibrate(view: LiveView) -> None:
@@ -45,15 +45,15 @@ def place(view: LiveView, stamp_ns: int = 0, x_m: float = 0.0, topic: str = "/tf
     view.take(topic, transforms_to_cdr(items), 0)
 
 
-def shoot(view: LiveView, stamp_ns: int, *, received_ns: int = 0, depth_lag_ns: int = 0) -> None:
+def shoot(view: LiveView, stamp_ns: int, *, depth_lag_ns: int = 0) -> None:
     color = CompressedColor(stamp_ns=stamp_ns, frame_id="c", format="jpeg", data=IMAGE)
     depth = DepthImage(
         stamp_ns=stamp_ns + depth_lag_ns,
         frame_id="d",
         depth_mm=np.full((6, 8), 500, dtype=np.uint16),
     )
-    view.take("/standin/cam/side/color/image", color.to_cdr(), received_ns)
-    view.take("/standin/cam/side/depth/image", depth.to_cdr(), received_ns)
+    view.take("/standin/cam/side/color/image", color.to_cdr(), 0)
+    view.take("/standin/cam/side/depth/image", depth.to_cdr(), 0)
 
 
 def event(view: LiveView, kind: str, stamp_ns: int) -> None:
@@ -121,12 +121,21 @@ def test_a_moving_camera_gives_nothing() -> None:
     assert "at rest" in look(view).reasons[0]
 
 
-def test_a_silent_camera_and_frames_of_long_ago_are_not_trusted() -> None:
+def test_a_camera_that_fell_silent_while_the_cell_went_on_is_not_trusted() -> None:
     view = ready()
     shoot(view, S)
-    assert "silent for 6.0 s" in look(view, now_ns=6 * S).reasons[0]
-    shoot(view, 4 * S, received_ns=6 * S)
-    assert [frame.stamp_ns for frame in look(view, now_ns=6 * S).frames] == [4 * S]
+    place(view, 7 * S, topic="/tf")
+    assert "silent for 6.0 s of the cell's time" in look(view).reasons[0]
+    shoot(view, 7 * S)
+    assert [frame.stamp_ns for frame in look(view).frames] == [7 * S]  # the old one is too old
+
+
+def test_a_cell_that_stands_still_keeps_its_frames_and_says_when_it_was_heard() -> None:
+    view = ready()
+    shoot(view, S)
+    view.take("/robot_description", string_to_cdr("<robot/>"), 77)
+    assert view.heard_ns() == 77
+    assert look(view).frames
 
 
 def test_colour_without_depth_of_the_same_time_is_no_frame() -> None:
