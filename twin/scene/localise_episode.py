@@ -194,11 +194,11 @@ def write_localised(
         episode: The recorded source.
         task: Whose objects are looked for.
         config: Settings; the defaults when None.
-        scene_hash: The scene the poses are meant for; its first eight digits name the file.
+        scene_hash: The scene the poses are meant for; its first twelve digits name the file.
         force: Write again even when it is there.
     """
     config = LocaliseConfig() if config is None else config
-    scene = scene_hash[:8] if scene_hash else NO_SCENE
+    scene = scene_hash[:12] if scene_hash else NO_SCENE
     path = run.derived_dir / f"{episode.path.stem}.localised.{scene}.mcap"
     derived = Derived(
         kind="localised",

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from bridge.episode import provenance
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task
+from twin.scene.fill import fill_footprint
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate
 from twin.scene.localise import LocalisedObject
 from twin.scene.localise_colour import ColourConfig, likeness, linear_from_srgb
@@ -57,6 +58,8 @@ class SceneParts:
 
     background: GaussianCloud
     objects: dict[str, ObjectSplats]
+    filling: GaussianCloud
+    """Table under the objects that nobody saw; a guess, see ``twin.scene.fill``."""
 
 
 def split_objects(
@@ -68,8 +71,8 @@ def split_objects(
     """Take the Gaussians of each localised object out of a scene.
 
     A Gaussian goes to the object whose surface is nearest, if it is near enough; close to the
-    table only if it has the object's colour. Every Gaussian ends up in exactly one part. Objects
-    that were not found stay in the background.
+    table only if it has the object's colour. Every Gaussian ends up in exactly one part, the
+    filling comes on top. Objects that were not found stay in the background.
 
     Args:
         cloud: The whole scene in ``base_link``.
@@ -89,7 +92,12 @@ def split_objects(
     for index, (key, T) in enumerate(poses.items()):
         part = moved_cloud(cloud.take(owner == index), se3.invert(T))
         objects[key] = ObjectSplats(cloud=part, T_base_object=T)
-    return SceneParts(background=cloud.take(owner < 0), objects=objects)
+    background = cloud.take(owner < 0)
+    nothing = cloud.take(np.zeros(0, dtype=np.int64))
+    filling = [fill_footprint(background, task.objects[key], T) for key, T in poses.items()]
+    return SceneParts(
+        background=background, objects=objects, filling=concatenate([nothing, *filling])
+    )
 
 
 def compose(parts: SceneParts, Ts_base_object: Mapping[str, np.ndarray]) -> GaussianCloud:
@@ -99,7 +107,7 @@ def compose(parts: SceneParts, Ts_base_object: Mapping[str, np.ndarray]) -> Gaus
         for key, item in parts.objects.items()
         if key in Ts_base_object
     ]
-    return concatenate([parts.background, *placed])
+    return concatenate([parts.background, parts.filling, *placed])
 
 
 def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> GaussianCloud:

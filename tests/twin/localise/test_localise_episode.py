@@ -166,7 +166,7 @@ def test_the_derived_episode_holds_start_and_end_with_provenance(
 ) -> None:
     run = RunFolder(episode.path.parents[1])
     path = write_localised(run, episode, task, scene_hash="0123456789abcdef")
-    assert path.name == "trial_1.localised.01234567.mcap"
+    assert path.name == "trial_1.localised.0123456789ab.mcap"
     derived = Episode.open(path)
     assert derived.derived is not None
     assert derived.derived.kind == "localised"

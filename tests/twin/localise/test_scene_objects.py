@@ -1,6 +1,7 @@
 """Objects taken out of a scene: every Gaussian in one part, each part where it belongs."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from bridge.episode.provenance import hash_file
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
+from twin.scene.fill import fill_footprint
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32, concatenate
 from twin.scene.localise import LocalisedObject
 from twin.scene.localise_shape import pose_of
@@ -103,14 +105,15 @@ def test_objects_come_in_their_own_frame_and_compose_back(
     parts = split_objects(cloud, localised(**POSES), TASK)
     half = np.array(TASK.objects["cube"].size_m) / 2
     assert np.all(np.abs(parts.objects["cube"].cloud.means_m) < half + 0.002)
-    again = compose(parts, {key: item.T_base_object for key, item in parts.objects.items()})
+    poses = {key: item.T_base_object for key, item in parts.objects.items()}
+    again = compose(replace(parts, filling=parts.filling.take(np.zeros(0, dtype=int))), poses)
     for rows in (cloud.means_m, again.means_m):
         assert rows.shape == (len(cloud), 3)
     ours = again.means_m[np.lexsort(again.means_m.round(4).T)]
     theirs = cloud.means_m[np.lexsort(cloud.means_m.round(4).T)]
     np.testing.assert_allclose(ours.mean(axis=0), theirs.mean(axis=0), atol=1e-6)
     np.testing.assert_allclose(ours.std(axis=0), theirs.std(axis=0), atol=1e-6)
-    assert len(compose(parts, {})) == len(parts.background)
+    assert len(compose(parts, {})) == len(parts.background) + len(parts.filling)
 
 
 def test_a_localisation_that_is_4_mm_off_follows_the_gaussians(
@@ -163,6 +166,25 @@ def test_an_empty_scene_gives_empty_parts() -> None:
     parts = split_objects(cloud_of(np.zeros((0, 3)), (0, 0, 0)), localised(**POSES), TASK)
     assert len(parts.background) == 0
     assert [len(item.cloud) for item in parts.objects.values()] == [0, 0]
+
+
+def test_the_hole_under_an_object_is_filled_with_the_table_around_and_only_there() -> None:
+    grid = np.stack(np.meshgrid(np.arange(0.4, 0.6, 0.003), np.arange(-0.25, -0.05, 0.003)), -1)
+    xy = grid.reshape(-1, 2)
+    half = np.array(TASK.objects["cube"].size_m[:2]) / 2
+    under = se3.apply(se3.invert(POSES["cube"]), np.column_stack([xy, np.zeros(len(xy))]))[:, :2]
+    seen = np.any(np.abs(under) > half, axis=1)
+    table = cloud_of(np.column_stack([xy[seen], np.full(seen.sum(), 0.001)]), (150, 140, 128))
+    filling = fill_footprint(table, TASK.objects["cube"], POSES["cube"])
+    local = se3.apply(se3.invert(POSES["cube"]), filling.means_m.astype(np.float64))
+    assert np.all(np.abs(local[:, :2]) < half + 0.001)
+    assert len(filling) == pytest.approx(0.04**2 / 0.004**2, rel=0.3)
+    np.testing.assert_allclose(filling.means_m[:, 2], 0.001, atol=1e-6)
+    np.testing.assert_allclose(
+        filling.colors, np.tile(table.colors[0], (len(filling), 1)), atol=1e-6
+    )
+    whole = cloud_of(np.column_stack([xy, np.zeros(len(xy))]), (150, 140, 128))
+    assert len(fill_footprint(whole, TASK.objects["cube"], POSES["cube"])) == 0
 
 
 def test_moving_a_cloud_moves_covariances_like_points() -> None:
