@@ -16,8 +16,9 @@ Mode = Literal["kinematic", "dynamic"]
 class ReplayConfig:
     """How one trajectory is re-lived and when it is accepted."""
 
-    mode: Mode = "dynamic"
-    """kinematic follows the joints exactly; dynamic lets physics answer."""
+    mode: Annotated[Mode, Parameter(parse=False)] = "dynamic"
+    """kinematic follows the joints exactly; dynamic lets physics answer. No flag: the commands
+    choose it for each trajectory."""
     eps_col_m: float = 0.002
     """Smallest distance between bodies that may not touch, the paper's epsilon_col [m]."""
     max_contact_depth_m: float = 0.005

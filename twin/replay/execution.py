@@ -1,10 +1,14 @@
 """From recorded joints and finger distances to the path that an executed replay follows."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from bridge.episode.streams import JointTrack
-from bridge.task.plan import Plan
+from bridge.task.plan import Plan, Stage
 from bridge.task.robot import ARM_JOINTS
 from twin.replay.config import ReplayConfig
 from twin.replay.path import JointPath, UnusablePlanError
@@ -22,7 +26,8 @@ def path_of_execution(
 
     A recorded grasp stops at the object's width. Commanding that width would touch without
     pressing, so while the plan wants the gripper closed and the fingers have stopped, the command
-    is ``squeeze_m`` narrower and the force limit holds the object.
+    is ``squeeze_m`` narrower and the force limit holds the object. A kinematic replay shows the
+    recorded width.
 
     Raises:
         UnusablePlanError: When a track is empty or names other joints.
@@ -46,12 +51,38 @@ def path_of_execution(
     width_times, width_keep = np.unique(widths.stamps_ns - first_ns, return_index=True)
     width = widths.position[width_keep, 0].astype(np.float64)
     closed = closed_mask(width_times, width, plan)
+    squeeze_m = config.squeeze_m if config.mode == "dynamic" else 0.0
     return JointPath(
         times_ns=times,
         joints_rad=track.position[keep][:, order].astype(np.float64),
         width_times_ns=width_times,
-        width_m=np.where(closed, np.maximum(width - config.squeeze_m, 0.0), width),
+        width_m=np.where(closed, np.maximum(width - squeeze_m, 0.0), width),
         first_close_ns=_first_close(width_times, width),
+    )
+
+
+def stages_as_executed(
+    plan: Plan, events: Sequence[Mapping[str, Any]], start_ns: int
+) -> tuple[Stage, ...]:
+    """The plan's stages at the times at which the recording says they began and ended.
+
+    Args:
+        plan: What was executed.
+        events: Recorded gst events, any plan's.
+        start_ns: Source time of the execution's start, which becomes time 0.
+    """
+    spans: dict[tuple[str, str], int] = {}
+    for event in events:
+        if event.get("plan_id") == plan.id and event["type"] in ("stage_started", "stage_ended"):
+            key = (str(event["type"]), str(event.get("stage_id")))
+            spans[key] = int(event["stamp_ns"]) - start_ns
+    return tuple(
+        replace(
+            stage,
+            t_start_ns=spans.get(("stage_started", stage.id), stage.t_start_ns),
+            t_end_ns=spans.get(("stage_ended", stage.id), stage.t_end_ns),
+        )
+        for stage in plan.stages
     )
 
 
@@ -59,7 +90,7 @@ def closed_mask(
     times_ns: Int[np.ndarray, " num_samples"],
     width_m: Float[np.ndarray, " num_samples"],
     plan: Plan,
-) -> np.ndarray:
+) -> Bool[np.ndarray, " num_samples"]:
     """Say when the fingers were closed on something, from the plan's wish and their own motion."""
     closed = np.zeros(len(times_ns), dtype=bool)
     for start_ns, end_ns in _closed_intervals(plan):

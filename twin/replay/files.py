@@ -12,7 +12,7 @@ from bridge.episode import schema
 from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.records import JointSample, PoseSample, string_to_cdr
 from bridge.episode.writer import EpisodeWriter
-from bridge.task.plan import Plan
+from bridge.task.plan import Plan, Stage
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME
 from twin.replay.result import ReplayResult
 
@@ -39,6 +39,12 @@ class ReplayOrigin:
     start_ns: int
     """Source time of the recorded execution's start, or of the plan when it was never executed."""
     urdf: str
+    stages: tuple[Stage, ...]
+    """With the times at which they were lived through: the plan's, or the execution's."""
+    gripper: tuple[tuple[int, str], ...]
+    """When, from time 0, the gripper was told to close or open."""
+    end_ns: int
+    """When, from time 0, the trajectory ended and settling began."""
 
 
 def write_replay(path: Path, result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Path:
@@ -99,23 +105,20 @@ def _events(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterator[
     topic = f"/{origin.cell}/event"
     end_ns = int(result.stamps_ns[-1])
     events: list[tuple[int, dict[str, object]]] = [(0, {"type": "execution_started"})]
-    for stage in plan.stages:
+    for stage in origin.stages:
         if stage.t_start_ns <= end_ns:
             events.append((stage.t_start_ns, {"type": "stage_started", "stage_id": stage.id}))
         if stage.t_end_ns <= end_ns:
             events.append((stage.t_end_ns, {"type": "stage_ended", "stage_id": stage.id}))
-    closed = 0
-    for waypoint in plan.tau:
-        if waypoint.g != closed and waypoint.t_ns <= end_ns:
-            closed = waypoint.g
-            text = "close" if closed else "open"
-            events.append((waypoint.t_ns, {"type": "gripper", "text": text}))
+    for t_ns, text in origin.gripper:
+        if t_ns <= end_ns:
+            events.append((t_ns, {"type": "gripper", "text": text}))
     for contact in result.contacts:
         if not contact.allowed:
             body, other = contact.bodies
             text = f"{body} within {contact.min_distance_m * 1e3:.1f} mm of {other}"
             events.append((contact.start_ns, {"type": "note", "text": text}))
-    events.append((min(end_ns, plan.tau[-1].t_ns), {"type": "execution_ended"}))
+    events.append((min(end_ns, origin.end_ns), {"type": "execution_ended"}))
     for t_ns, fields in sorted(events, key=lambda event: event[0]):
         stamp = origin.start_ns + t_ns
         record = {"schema_version": 1, "stamp_ns": stamp, "plan_id": plan.id, **fields}

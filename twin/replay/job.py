@@ -1,7 +1,7 @@
 """One replay of one trajectory, as a process of the pool runs it."""
 
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from bridge.task.task_file import load_task
 from bridge.task.verdict import Verdict
 from twin.physics.engine import ENGINE, ENGINE_VERSION
 from twin.replay.config import ReplayConfig
+from twin.replay.execution import stages_as_executed
 from twin.replay.files import ReplayOrigin, write_replay
 from twin.replay.result import ReplayResult
 from twin.replay.rollout import KINEMATIC_ENGINE, replay_joints, replay_plan
@@ -62,6 +63,10 @@ class ReplayJob:
             "mcap",
         )
         return self.folder / ".".join(parts)
+
+    def length_ns(self) -> int:
+        """How long the recorded execution took; 0 for a plan that was never executed."""
+        return 0 if self.end_ns is None else self.end_ns - self.start_ns
 
     def settings(self) -> dict[str, Any]:
         """What the settings hash covers: settings, inputs, engine and code version."""
@@ -141,7 +146,10 @@ def _replay(job: ReplayJob) -> Verdict:
         urdf=urdf,
         scene_hash=job.scene_hash,
     )
-    result = _run(job, episode, plan, scene)
+    executed = job.trajectory == "executed" and job.end_ns is not None
+    events = streams.events(episode) if executed else []
+    lived = replace(plan, stages=stages_as_executed(plan, events, job.start_ns))
+    result = _run(job, episode, lived, scene)
     derived = Derived(
         kind="replay",
         source_episode=episode.info.id,
@@ -160,6 +168,9 @@ def _replay(job: ReplayJob) -> Verdict:
         cell=cell_of(episode),
         start_ns=job.start_ns,
         urdf=urdf,
+        stages=lived.stages,
+        gripper=_recorded_grips(plan, events, job.start_ns) if executed else _planned_grips(plan),
+        end_ns=job.length_ns() if executed else plan.tau[-1].t_ns,
     )
     path = job.path()
     path.unlink(missing_ok=True)
@@ -173,6 +184,26 @@ def _run(job: ReplayJob, episode: Episode, plan: Plan, scene: ReplayScene) -> Re
     arm = _cut(streams.joint_track(episode), job.start_ns, job.end_ns)
     widths = _cut(streams.joint_track(episode, "/gripper/state"), job.start_ns, job.end_ns)
     return replay_joints(arm, widths, scene, job.config, plan=plan)
+
+
+def _planned_grips(plan: Plan) -> tuple[tuple[int, str], ...]:
+    """When the plan changes its mind about the gripper; it starts open."""
+    before = [0, *(waypoint.g for waypoint in plan.tau)]
+    return tuple(
+        (waypoint.t_ns, "close" if waypoint.g else "open")
+        for waypoint, g in zip(plan.tau, before, strict=False)
+        if waypoint.g != g
+    )
+
+
+def _recorded_grips(
+    plan: Plan, events: list[dict[str, Any]], start_ns: int
+) -> tuple[tuple[int, str], ...]:
+    return tuple(
+        (int(event["stamp_ns"]) - start_ns, str(event.get("text") or ""))
+        for event in events
+        if event["type"] == "gripper" and event.get("plan_id") == plan.id
+    )
 
 
 def _cut(track: JointTrack, start_ns: int, end_ns: int) -> JointTrack:

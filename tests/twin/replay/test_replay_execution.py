@@ -8,7 +8,7 @@ import pytest
 from bridge.episode.streams import JointTrack
 from bridge.task.robot import ARM_JOINTS
 from twin.replay.config import ReplayConfig
-from twin.replay.execution import closed_mask, path_of_execution
+from twin.replay.execution import closed_mask, path_of_execution, stages_as_executed
 
 OPEN_M, HELD_M = 0.085, 0.040
 
@@ -55,3 +55,27 @@ def test_stamps_count_from_the_first_one_and_repeats_are_dropped(script: SimpleN
     assert path.times_ns[0] == 0
     assert np.all(np.diff(path.times_ns) > 0)
     assert path.end_ns() == times[-1]
+
+
+def test_a_kinematic_path_keeps_the_recorded_width(script: SimpleNamespace) -> None:
+    times, width = recorded_grasp(0.2)
+    track = JointTrack(names=ARM_JOINTS, stamps_ns=times, position=np.zeros((len(times), 6)))
+    widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
+    config = ReplayConfig(mode="kinematic")
+    path = path_of_execution(track, widths, script.plan(script.scene()), config)
+    assert np.array_equal(path.width_m, width)
+
+
+def test_stages_take_the_times_the_recording_gives_them(script: SimpleNamespace) -> None:
+    plan = script.plan(script.scene())
+    start = 1_000_000_000_000
+    events = [
+        {"type": "stage_started", "plan_id": plan.id, "stage_id": "place", "stamp_ns": start + 7},
+        {"type": "stage_ended", "plan_id": plan.id, "stage_id": "grasp", "stamp_ns": start + 6},
+        {"type": "stage_started", "plan_id": "other", "stage_id": "grasp", "stamp_ns": start + 99},
+        {"type": "mark", "plan_id": plan.id, "stamp_ns": start},
+    ]
+    grasp, place = stages_as_executed(plan, events, start)
+    assert (grasp.t_start_ns, grasp.t_end_ns) == (0, 6)
+    assert (place.t_start_ns, place.t_end_ns) == (7, plan.stages[1].t_end_ns)
+    assert stages_as_executed(plan, [], start) == plan.stages
