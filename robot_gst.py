@@ -18,16 +18,28 @@ HELP = (
     "execution, and say how far the twin can be trusted."
 )
 
+EPISODES, LIVE, IMPORTS = "bridge.cli.episodes", "bridge.cli.live", "bridge.cli.imports"
+
 COMMANDS: tuple[tuple[str, str, str, str], ...] = (
     ("demo", "dashboards.cli:demo", "The whole loop on a stand-in cell, in minutes.", "runs/demo"),
-    ("record", "bridge.cli:record", "Record episodes live over zenoh.", "runs/monday"),
-    ("ctl", "bridge.cli:ctl", "Start, stop, mark or label from anywhere.", "start --id trial_1"),
-    ("info", "bridge.cli:info", "What an episode holds.", "runs/demo/episodes/scan.mcap"),
-    ("check", "bridge.cli:check", "Whether an episode is whole, and what it lost.", "runs/demo"),
-    ("ls", "bridge.cli:ls", "List the episodes of a run.", "runs/demo"),
+    ("record", f"{LIVE}:record", "Record episodes live over zenoh.", "runs/monday"),
+    (
+        "ctl",
+        f"{LIVE}:ctl",
+        "Start, stop, mark or label from anywhere.",
+        "start --id trial_1",
+    ),
+    ("info", f"{EPISODES}:info", "What an episode holds.", "runs/demo/episodes/scan.mcap"),
+    (
+        "check",
+        f"{EPISODES}:check",
+        "Whether an episode is whole, and what it lost.",
+        "runs/demo",
+    ),
+    ("ls", f"{EPISODES}:ls", "List the episodes of a run.", "runs/demo"),
     (
         "label",
-        "bridge.cli:label",
+        f"{EPISODES}:label",
         "Say after the fact how an episode ended.",
         "runs/demo trial_1 --result failure",
     ),
@@ -57,7 +69,12 @@ COMMANDS: tuple[tuple[str, str, str, str], ...] = (
         "Review pages on the loopback address.",
         "runs/monday",
     ),
-    ("doctor", "bridge.cli:doctor", "What is installed, what is missing, how to get it.", "--json"),
+    (
+        "doctor",
+        f"{EPISODES}:doctor",
+        "What is installed, what is missing, how to get it.",
+        "--json",
+    ),
 )
 
 GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
@@ -66,13 +83,13 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
         (
             (
                 "folder",
-                "bridge.cli:publish_folder",
+                f"{LIVE}:publish_folder",
                 "Play an RGB-D folder as a live camera.",
                 "DIR --episode scan",
             ),
             (
                 "standin",
-                "bridge.cli:publish_standin",
+                f"{LIVE}:publish_standin",
                 "The stand-in cell: a simulated laboratory.",
                 "--trials 3 --seed 1",
             ),
@@ -81,8 +98,18 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
     "import": (
         "Bring other people's recordings into a run.",
         (
-            ("rgbd", "bridge.cli:import_rgbd", "An RGB-D folder with a scene.json.", "DIR runs/x"),
-            ("kinova", "bridge.cli:import_kinova", "The Kinova reality-gap runs.", "DIR runs/x"),
+            (
+                "rgbd",
+                f"{IMPORTS}:import_rgbd",
+                "An RGB-D folder with a scene.json.",
+                "DIR runs/x",
+            ),
+            (
+                "kinova",
+                f"{IMPORTS}:import_kinova",
+                "The Kinova reality-gap runs.",
+                "DIR runs/x",
+            ),
         ),
     ),
 }

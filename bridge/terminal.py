@@ -1,7 +1,9 @@
 """What the commands print: data on stdout, progress and remarks on stderr."""
 
 import json
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -88,3 +90,18 @@ def _plain(label: str, total: int) -> Iterator[Advance]:
             sys.stderr.flush()
 
     yield advance
+
+
+@contextmanager
+def stop_signals() -> Iterator[threading.Event]:
+    """Set the event on SIGINT or SIGTERM instead of ending the process."""
+    stopped = threading.Event()
+    before = {
+        number: signal.signal(number, lambda *_: stopped.set())
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield stopped
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

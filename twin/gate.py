@@ -6,12 +6,10 @@ decided is answered with ``accepted: null`` and a reason; nothing is ever accept
 
 import queue
 import re
-import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Protocol, runtime_checkable
@@ -27,7 +25,7 @@ from bridge.task.plan import Plan
 from bridge.task.robot import BASE_FRAME
 from bridge.task.task_file import Task, load_task
 from bridge.task.verdict import Factor, Verdict
-from bridge.terminal import Output
+from bridge.terminal import Output, stop_signals
 from bridge.wire.config import DEFAULT_ENDPOINT, WireConfig
 from twin.errors import TwinError
 from twin.replay.config import ReplayConfig
@@ -338,18 +336,3 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
             pass
     output.say("gate stopped")
     return 0
-
-
-@contextmanager
-def stop_signals() -> Iterator[threading.Event]:
-    """Set an event on SIGINT and SIGTERM, and restore the handlers afterwards."""
-    stopped = threading.Event()
-    before = {
-        number: signal.signal(number, lambda _number, _frame: stopped.set())
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield stopped
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -27,7 +27,6 @@ from twin.gate import (
     robot_name,
     run_gate,
     serve_gate,
-    stop_signals,
     watch_cell,
 )
 

@@ -1,0 +1,90 @@
+"""Commands that bring other people's recordings into a run."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from bridge.episode.message import StampedMessage
+from bridge.sources.folder_config import FolderConfig
+from bridge.terminal import Output
+
+OUTPUT = Output()
+FOLDER = FolderConfig()
+
+
+def import_rgbd(
+    folder: Path,
+    run: Path,
+    /,
+    *,
+    episode: str = "scan",
+    config: Annotated[FolderConfig, Parameter(name="*")] = FOLDER,
+    output: Output = OUTPUT,
+) -> int:
+    """Turn an RGB-D folder (with a scene.json) into a scan episode.
+
+    Example: robot-gst import rgbd data/kitchen runs/kitchen --cell kitchen --camera kinect
+
+    Args:
+        folder: Folder with scene.json, colour and depth images.
+        run: Run folder; made where needed.
+        episode: Id of the new episode.
+        config: Names and rate.
+        output: How to talk.
+    """
+    from bridge.episode.metadata import EpisodeInfo
+    from bridge.episode.provenance import hash_file
+    from bridge.episode.run import RunFolder
+    from bridge.exchange.rgbd import write_scan
+    from bridge.sources.folder import folder_messages, num_frames
+    from bridge.sources.folder_index import read_index
+
+    index = read_index(folder)
+    info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
+    source = {
+        "folder": index.name,
+        "index_sha256": hash_file(index.path),
+        "depth_unit_m": index.depth_unit_m,
+        "depth_rounded_to_m": 1e-3,
+        "frames_left_out_without_pose": index.num_unposed,
+        "times": f"nominal, {config.rate_hz:g} Hz from 0; the folder has none",
+    }
+    total = num_frames(index, config)
+
+    with output.progress("import", total) as advance:
+
+        def messages() -> Iterator[StampedMessage]:
+            for done, frame in enumerate(folder_messages(index, config, 0), start=1):
+                yield from frame
+                advance(done, "")
+
+        path = write_scan(RunFolder.create(run), info, messages(), source=source)
+    data = {"file": str(path), "frames": total, "frames_left_out": index.num_unposed}
+    output.result(data, f"{path}: {total} frames")
+    return 0
+
+
+def import_kinova(folder: Path, run: Path, /, *, output: Output = OUTPUT) -> int:
+    """Turn the Kinova reality-gap runs into episodes: real ones recorded, simulated ones derived.
+
+    Example: robot-gst import kinova data/kinova runs/kinova
+
+    Args:
+        folder: Folder with real/Experiment1/*.tsv and sim/Experiment1/*.csv.
+        run: Run folder; made where needed.
+        output: How to talk.
+    """
+    from bridge.episode.run import RunFolder
+    from bridge.exchange.kinova import find_runs, import_runs
+
+    real, simulated = find_runs(folder)
+    files = []
+    with output.progress("import", len(real) + len(simulated)) as advance:
+        for path, _ in import_runs(folder, RunFolder.create(run)):
+            files.append(str(path))
+            advance(len(files), path.name)
+    data = {"real": len(real), "simulated": len(simulated), "files": files}
+    output.result(data, f"{len(real)} real and {len(simulated)} simulated runs in {run}")
+    return 0
