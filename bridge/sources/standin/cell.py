@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,7 +13,6 @@ from bridge.errors import BridgeError
 from bridge.sources.standin.cell_file import CellFile
 from bridge.sources.standin.hidden import HiddenParameters
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down
-from bridge.sources.standin.links import robot_links
 from bridge.sources.standin.render import Layer, Renderer
 from bridge.sources.standin.sensor import measure_color, measure_depth
 from bridge.sources.standin.streams import Streams
@@ -109,9 +109,7 @@ class StandinCell:
         self._cameras = {
             key: mount.camera.scaled(config.scale) for key, mount in cell.cameras.items()
         }
-        self._renderer = Renderer(
-            [*robot_surfaces(robot_links()), *object_surfaces(task), *room_surfaces(seed)]
-        )
+        self._seed = seed
         self._backdrops: dict[str, Layer] = {}
         self._rng = np.random.default_rng([SENSOR_STREAM, seed])
         self._should_stop = should_stop
@@ -121,6 +119,12 @@ class StandinCell:
         self._width_target_m = MAX_WIDTH_M
         self._due = dict.fromkeys(("gripper", "truth", "camera", "frames"), start_ns)
         self.cameras_running = False
+
+    @cached_property
+    def _renderer(self) -> Renderer:
+        """Made with the first picture; a cell that takes none saves a second."""
+        room = room_surfaces(self._seed)
+        return Renderer([*robot_surfaces(), *object_surfaces(self.task), *room])
 
     def reset(self, Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]) -> None:
         """Bring the arm home with an open gripper and put the objects down."""

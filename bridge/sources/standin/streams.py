@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
@@ -31,6 +31,7 @@ GRIPPER_JOINT = "gripper_width"
 TRUTH_PARAMETERS = f"{schema.TRUTH_PREFIX}parameters"
 
 
+@runtime_checkable
 class Publisher(Protocol):
     """What a topic is written to."""
 
@@ -38,6 +39,7 @@ class Publisher(Protocol):
         """Send one message."""
 
 
+@runtime_checkable
 class Session(Protocol):
     """The part of ``bridge.wire.session.WireSession`` that the cell uses."""
 

@@ -1,14 +1,15 @@
 """What the cameras can see: triangles, smooth normals and colours of every body."""
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import open3d
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt32
 
 from bridge.geometry import se3
-from bridge.sources.standin.links import LinkModel, LinkShape
+from bridge.sources.standin.links import LinkShape, robot_links
 from bridge.sources.standin.textures import Texture, room_texture, table_texture
 from bridge.sources.standin.world_model import TABLE_CENTRE_M, TABLE_SIZE_M
 from bridge.task.robot import FINGER_LINKS
@@ -28,7 +29,7 @@ class Surface:
 
     body: str
     vertices_m: Float[np.ndarray, "num_vertices 3"]
-    triangles: Int[np.ndarray, "num_triangles 3"]
+    triangles: UInt32[np.ndarray, "num_triangles 3"]
     corner_normals: Float[np.ndarray, "num_triangles 3 3"]
     color: tuple[float, float, float]
     texture: Texture | None = None
@@ -83,16 +84,17 @@ def make_surface(
     )
 
 
-def robot_surfaces(links: list[LinkModel]) -> list[Surface]:
+@cache
+def robot_surfaces() -> tuple[Surface, ...]:
     """The arm in light grey with blue caps at its joints' housings, the gripper dark."""
     surfaces = []
-    for link in links:
+    for link in robot_links():
         for shape in link.shapes:
             color = _LINK_COLORS.get(link.name, (0.72, 0.73, 0.75))
             if link.name in FINGER_LINKS:
                 color = (0.20, 0.20, 0.22)
             surfaces.append(_shape_surface(link.name, shape, color))
-    return surfaces
+    return tuple(surfaces)
 
 
 _LINK_COLORS = {

@@ -1,0 +1,120 @@
+"""The controller's kinematics against MuJoCo, which builds the arm on its own."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.geometry import se3
+from bridge.sources.standin.cell_file import CellFile
+from bridge.sources.standin.hidden import HiddenParameters
+from bridge.sources.standin.kinematics import (
+    UnreachablePoseError,
+    arm_kinematics,
+    tool_down,
+    yaw_of,
+)
+from bridge.sources.standin.planner import (
+    NO_ERROR,
+    GraspError,
+    draw_error,
+    perceive,
+    plan_pick_and_place,
+)
+from bridge.sources.standin.world import World
+from bridge.task.plan import Plan
+from bridge.task.task_file import Task
+
+HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
+
+
+@pytest.fixture(scope="module")
+def world(task: Task, nominal: HiddenParameters) -> World:
+    return World(task, nominal)
+
+
+@pytest.fixture
+def plan_of(task: Task, starts: dict[str, np.ndarray], cell_file: CellFile) -> Callable[..., Plan]:
+    def plan(error: GraspError = NO_ERROR, **more: Any) -> Plan:
+        return plan_pick_and_place(
+            task,
+            starts,
+            error,
+            kinematics=arm_kinematics(),
+            joints_start_rad=HOME,
+            max_joint_speed_rad_s=cell_file.max_joint_speed_rad_s,
+            plan_id="plan_0",
+            condition="without_replanning",
+            start_id="cube_into_box/9000000",
+            **more,
+        )
+
+    return plan
+
+
+def test_forward_kinematics_agree_with_mujoco(world: World, starts: dict[str, np.ndarray]) -> None:
+    rng = np.random.default_rng(9_000_000)
+    for joints in rng.uniform(-np.pi, np.pi, (20, 6)):
+        world.reset(joints, starts)
+        difference = world.T_base_body("tcp") - arm_kinematics().T_base_tcp(joints)
+        assert np.abs(difference).max() < 1e-9
+
+
+def test_every_waypoint_reaches_its_commanded_pose(
+    plan_of: Callable[..., Plan], world: World, starts: dict[str, np.ndarray]
+) -> None:
+    plan = plan_of()
+    commanded = se3.transform_from(plan.quaternions_wxyz(), plan.positions_m())
+    for waypoint, T in list(zip(plan.tau, commanded, strict=True))[::5]:
+        world.reset(np.array(waypoint.joints_rad), starts)
+        reached = world.T_base_body("tcp")
+        assert np.linalg.norm(reached[:3, 3] - T[:3, 3]) < 0.0005
+        assert se3.rotation_angle_rad(reached[:3, :3].T @ T[:3, :3]) < 0.001
+
+
+def test_no_joint_moves_faster_than_the_cell_allows(
+    plan_of: Callable[..., Plan], cell_file: CellFile
+) -> None:
+    plan = plan_of()
+    joints = np.array([waypoint.joints_rad for waypoint in plan.tau])
+    speed = np.abs(np.diff(joints, axis=0)) / (np.diff(plan.times_ns())[:, None] * 1e-9)
+    assert speed.max() <= cell_file.max_joint_speed_rad_s + 1e-9
+
+
+def test_the_stages_of_a_plan_are_those_of_the_task_and_cover_it(
+    plan_of: Callable[..., Plan], task: Task
+) -> None:
+    plan = plan_of()
+    assert [stage.id for stage in plan.stages] == [stage["id"] for stage in task.stages]
+    assert plan.stages[0].t_start_ns == 0
+    assert plan.stages[0].t_end_ns == plan.stages[1].t_start_ns
+    assert plan.stages[1].t_end_ns == plan.tau[-1].t_ns
+
+
+def test_a_grasp_is_never_turned_more_than_an_eighth_from_the_cube(
+    plan_of: Callable[..., Plan], starts: dict[str, np.ndarray]
+) -> None:
+    closed = next(waypoint for waypoint in plan_of().tau if waypoint.g == 1)
+    T = se3.transform_from(np.array(closed.q_wxyz), np.array(closed.p_m))
+    # Tool x at yaw 0 points along -x of the base.
+    turn = (yaw_of(T) - np.pi - yaw_of(starts["cube"])) % (np.pi / 2)
+    assert min(turn, np.pi / 2 - turn) < 1e-6
+
+
+def test_the_error_of_a_candidate_depends_on_start_and_round_only(
+    cell_file: CellFile, starts: dict[str, np.ndarray]
+) -> None:
+    noise = cell_file.planner
+    first = draw_error(noise, start_seed=9_000_001, round_=0)
+    assert first == draw_error(noise, start_seed=9_000_001, round_=0)
+    assert first != draw_error(noise, start_seed=9_000_001, round_=1)
+    seen = [perceive(starts, noise, start_seed=9_000_001)["cube"] for _ in range(2)]
+    np.testing.assert_array_equal(*seen)
+    assert not np.array_equal(seen[0], starts["cube"])
+
+
+def test_a_pose_out_of_reach_is_refused_with_its_position() -> None:
+    far = tool_down(np.array([1.4, 0.0, 0.2]), 0.0)
+    with pytest.raises(UnreachablePoseError, match=r"cannot reach \(1.400, 0.000, 0.200\)"):
+        arm_kinematics().joints_for(far, HOME)

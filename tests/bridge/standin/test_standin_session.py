@@ -1,0 +1,268 @@
+"""Sessions on a wire in memory: what is published, when, and what is kept back."""
+
+import json
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.episode import schema
+from bridge.episode.records import (
+    CameraInfo,
+    CompressedColor,
+    DepthImage,
+    PoseSample,
+    string_from_cdr,
+    transforms_from_cdr,
+)
+from bridge.errors import UsageError
+from bridge.media.color import decode_color
+from bridge.sources.standin.cell import StandinCell
+from bridge.sources.standin.operator import Operator
+from bridge.sources.standin.session import run_session
+from bridge.sources.standin.settings import SessionConfig
+from bridge.sources.standin.streams import TRUTH_PARAMETERS
+from bridge.task.plan import Plan
+from bridge.task.predicate import Rollout, evaluate_success
+from bridge.task.task_file import Task
+from bridge.task.verdict import Factor, Verdict
+from bridge.terminal import Output
+
+QUIET = Output(quiet=True)
+
+
+def verdict_record(plan: dict, accepted: bool | None) -> dict:
+    verdict = Verdict(
+        plan_id=plan["id"],
+        trajectory="planned",
+        mode="dynamic",
+        ik=Factor(value=True),
+        clearance=Factor(value=True),
+        terminal=Factor(value=accepted, cause="dropped"),
+        engine="test",
+        seed=0,
+    )
+    return json.loads(verdict.to_json())
+
+
+def settings(**more: Any) -> SessionConfig:
+    values = {"seed": 9000, "trials": 1, "rate_hz": 0.0, "image_scale": 0.25, "scan": False}
+    return SessionConfig(**{**values, **more})
+
+
+def with_replanning(
+    make_session: Callable[..., Any], gate: Callable[[dict], dict] | None, **more: Any
+) -> tuple[Any, dict[str, Any]]:
+    session = make_session(gate=gate)
+    config = settings(conditions=("with_replanning",), **more)
+    summary = run_session(session, config, QUIET, start_ns=1_700_000_000_000_000_000)
+    return session, summary
+
+
+@pytest.fixture(scope="module")
+def looked_at(
+    make_session: Callable[..., Any],
+    make_cell: Callable[..., StandinCell],
+    starts: dict[str, np.ndarray],
+) -> tuple[Any, StandinCell]:
+    """A cell that was announced and looked around for a moment, without moving."""
+    session = make_session()
+    cell = make_cell(session, rate_hz=10.0)
+    cell.reset(starts)
+    cell.announce()
+    cell.cameras_running = True
+    cell.wait(0.25)
+    return session, cell
+
+
+def test_every_topic_carries_the_type_the_format_names(looked_at: tuple[Any, StandinCell]) -> None:
+    session, _ = looked_at
+    for item in session.sent:
+        named = schema.type_of_topic(item.topic)
+        assert named in (item.type_name, None), item.topic
+    untyped = {item.topic for item in session.sent if schema.type_of_topic(item.topic) is None}
+    assert untyped == {"/standin/tcp/pose", TRUTH_PARAMETERS}
+
+
+def test_stamps_never_run_backwards_and_rates_are_kept(looked_at: tuple[Any, StandinCell]) -> None:
+    session, _ = looked_at
+    stamps: dict[str, list[int]] = {}
+    for item in session.sent:
+        stamps.setdefault(item.topic, []).append(item.source_ns)
+    for topic, series in stamps.items():
+        assert series == sorted(series), topic
+    assert np.diff(stamps["/standin/joint_states"]).tolist() == [8_000_000] * 30
+    assert len(stamps["/standin/gripper/state"]) in (12, 13)
+    assert len(stamps["/standin/cam/side/color/image"]) == 3
+
+
+def test_frames_decode_and_their_calibration_fits_them(looked_at: tuple[Any, StandinCell]) -> None:
+    session, _ = looked_at
+    color = CompressedColor.from_cdr(session.of("/cam/wrist/color/image")[0].data)
+    depth = DepthImage.from_cdr(session.of("/cam/wrist/depth/image")[0].data)
+    info = CameraInfo.from_cdr(session.of("/cam/wrist/color/info")[0].data)
+    assert decode_color(color.data).shape[:2] == depth.depth_mm.shape
+    assert (info.camera.height, info.camera.width) == depth.depth_mm.shape
+    assert color.stamp_ns == depth.stamp_ns
+    assert info.frame_id == color.frame_id == "wrist_color_optical"
+    # From home the wrist camera looks down at the table from about half a metre.
+    assert np.median(depth.depth_mm) == pytest.approx(540, abs=30)
+
+
+def test_camera_poses_are_the_believed_ones_not_the_true_ones(
+    looked_at: tuple[Any, StandinCell],
+) -> None:
+    session, cell = looked_at
+    static = [t for item in session.of("/tf_static") for t in transforms_from_cdr(item.data)]
+    side = next(item for item in static if item.child == "side_color_optical")
+    nominal = cell.file.cameras["side"].T_parent_camera
+    np.testing.assert_allclose(side.T_parent_child, nominal, atol=1e-9)
+    assert np.abs(cell.true_camera("side") - nominal).max() > 1e-4
+
+
+def test_hidden_parameters_appear_under_truth_only(looked_at: tuple[Any, StandinCell]) -> None:
+    session, cell = looked_at
+    hidden = cell.hidden.to_record()
+    numbers = [value for value in hidden.values() if isinstance(value, float)]
+    numbers += hidden["joint_offset_rad"]
+    numbers += [x for T in hidden["camera_errors"].values() for row in T for x in row]
+    numbers = [value for value in numbers if value not in (0.0, 1.0)]
+    assert len(numbers) > 30
+    for item in session.sent:
+        if schema.is_truth(item.topic):
+            continue
+        for value in numbers:
+            assert struct.pack("<d", value) not in item.data, item.topic
+            assert repr(value).encode() not in item.data, item.topic
+    truth = [item for item in session.sent if item.topic == TRUTH_PARAMETERS]
+    assert json.loads(string_from_cdr(truth[0].data)) == hidden
+
+
+def test_plans_refused_in_every_round_are_recorded_and_nothing_is_executed(
+    make_session: Callable[..., Any],
+) -> None:
+    session, summary = with_replanning(make_session, lambda p: verdict_record(p, False), rounds=3)
+    plans = [Plan.from_json(item.data) for item in session.of("/plan")]
+    assert [plan.round for plan in plans] == [0, 1, 2]
+    assert [plan.parent_id for plan in plans] == [None, plans[0].id, plans[1].id]
+    assert len({plan.tau[40].p_m for plan in plans}) == 3
+    assert len(session.of("/verdict")) == 3
+    kinds = [event["type"] for event in session.events()]
+    assert kinds == ["replan", "replan", "note", "label"]
+    assert summary["outcomes"] == {"with_replanning": {"failure": 1}}
+    verb, request = session.control[-1]
+    assert verb == "stop"
+    assert "refused 3 plans" in request["outcome"]["detail"]
+
+
+def test_without_a_verdict_nothing_is_executed_and_the_trial_is_void(
+    make_session: Callable[..., Any],
+) -> None:
+    session, summary = with_replanning(make_session, None)
+    assert len(session.of("/plan")) == 1
+    assert summary["outcomes"] == {"with_replanning": {"unknown": 1}}
+    assert not [event for event in session.events() if event["type"] == "execution_started"]
+    assert "nobody answered" in session.events()[0]["text"]
+
+
+def test_an_undecided_verdict_is_no_permission(make_session: Callable[..., Any]) -> None:
+    session, summary = with_replanning(make_session, lambda plan: verdict_record(plan, None))
+    assert summary["outcomes"] == {"with_replanning": {"unknown": 1}}
+    assert len(session.of("/verdict")) == 1
+
+
+def test_a_verdict_on_another_plan_is_no_permission(make_session: Callable[..., Any]) -> None:
+    def confused(plan: dict) -> dict:
+        return verdict_record({"id": "somebody_else"}, True)
+
+    session, summary = with_replanning(make_session, confused)
+    assert summary["outcomes"] == {"with_replanning": {"unknown": 1}}
+    assert "instead of" in session.events()[0]["text"]
+
+
+def test_both_conditions_share_start_ids_but_not_the_exact_poses(
+    make_session: Callable[..., Any], make_cell: Callable[..., StandinCell]
+) -> None:
+    session = make_session()
+    operator = Operator(make_cell(session), session, settings(trials=2))
+    assert operator.start_seeds() == [9_000_000, 9_000_001]
+    without = operator.start_poses(9_000_000, "without_replanning")["cube"]
+    with_ = operator.start_poses(9_000_000, "with_replanning")["cube"]
+    assert 0 < np.linalg.norm(without[:3, 3] - with_[:3, 3]) < 0.01
+
+
+def test_an_unknown_condition_is_refused(
+    make_session: Callable[..., Any], make_cell: Callable[..., StandinCell]
+) -> None:
+    session = make_session()
+    with pytest.raises(UsageError, match="without_replanning, with_replanning"):
+        Operator(make_cell(session), session, settings(conditions=("sometimes",)))
+
+
+def test_a_stopped_session_finishes_its_episode(make_session: Callable[..., Any]) -> None:
+    session = make_session()
+    summary = run_session(session, settings(), QUIET, should_stop=lambda: len(session.sent) > 100)
+    assert summary["stopped"]
+    assert [verb for verb, _ in session.control] == ["start", "stop"]
+    assert session.control[-1][1]["outcome"]["result"] == "unknown"
+
+
+@pytest.mark.slow
+def test_a_whole_session_records_scan_and_trials_and_labels_by_the_predicate(
+    make_session: Callable[..., Any], task: Task
+) -> None:
+    session = make_session(gate=lambda plan: verdict_record(plan, plan["round"] == 1))
+    summary = run_session(session, settings(scan=True), QUIET)
+    starts = [request for verb, request in session.control if verb == "start"]
+    assert [request["id"] for request in starts] == ["scan_0001", "trial_0001", "trial_0002"]
+    assert {request["info"]["stand_in"] for request in starts} == {True}
+    assert starts[1]["info"]["start_id"] == starts[2]["info"]["start_id"]
+    assert summary["scan"]
+    frames = [i for i in session.of("/cam/wrist/color/image") if i.episode == "scan_0001"]
+    assert len(frames) >= 30
+    for episode, last_plan in (("trial_0001", 0), ("trial_0002", 1)):
+        mine = [item for item in session.sent if item.episode == episode]
+        order = [i.topic for i in mine if i.topic.endswith(("/plan", "/event"))]
+        assert order[0] == "/standin/plan", "the plan is published before motion"
+        events = [json.loads(i.data) for i in mine if i.topic.endswith("/event")]
+        started = next(event for event in events if event["type"] == "execution_started")
+        assert started["plan_id"] == f"{episode}.plan_{last_plan}"
+        kinds = [event["type"] for event in events]
+        assert kinds.count("stage_started") == kinds.count("stage_ended") == 2
+        assert kinds[-1] == "label"
+        rollout = truth_rollout(mine)
+        findings = evaluate_success(task, rollout)
+        inside = next(finding for finding in findings if finding.kind == "inside").value
+        assert (events[-1]["outcome"]["result"] == "success") == inside
+    # At rest at the end, so what the last second of joint states says is where the arm waits.
+    stamps = [item.source_ns for item in session.of("/joint_states")]
+    assert stamps == sorted(stamps)
+
+
+def truth_rollout(sent: list[Any]) -> Rollout:
+    poses: dict[str, list[np.ndarray]] = {}
+    stamps = []
+    for item in sent:
+        if schema.is_truth(item.topic) and item.topic.endswith("/pose"):
+            object_id = item.topic.split("/")[-2]
+            poses.setdefault(object_id, []).append(PoseSample.from_cdr(item.data).T_frame_body)
+            if object_id == "cube":
+                stamps.append(item.source_ns)
+    return Rollout(
+        stamps_ns=np.array(stamps),
+        Ts_base_object={key: np.array(rows) for key, rows in poses.items()},
+        finger_contact={},
+    )
+
+
+def test_importing_the_room_and_the_settings_loads_no_physics() -> None:
+    code = (
+        "import sys, bridge.sources, bridge.sources.standin.settings;"
+        "print([m for m in ('mujoco', 'open3d', 'pinocchio', 'zenoh') if m in sys.modules])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"

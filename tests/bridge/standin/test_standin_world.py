@@ -1,0 +1,190 @@
+"""What the physics of the stand-in cell must get right, and what it must keep apart."""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.episode.metadata import Outcome
+from bridge.episode.records import JointSample
+from bridge.errors import UsageError
+from bridge.sources.standin.cell import StandinCell
+from bridge.sources.standin.cell_file import CellFile, load_cell
+from bridge.sources.standin.execution import execute_plan
+from bridge.sources.standin.hidden import HiddenParameters, draw_hidden
+from bridge.sources.standin.label import label_trial
+from bridge.sources.standin.planner import NO_ERROR, GraspError, plan_pick_and_place
+from bridge.sources.standin.world import World
+from bridge.sources.standin.world_model import STEP_S
+from bridge.task.task_file import Task
+
+
+@pytest.fixture
+def attempt(
+    make_session: Callable[..., Any],
+    make_cell: Callable[..., StandinCell],
+    starts: dict[str, np.ndarray],
+    task: Task,
+    cell_file: CellFile,
+) -> Callable[..., tuple[Outcome, Any]]:
+    def run(error: GraspError, seed: int = 9_000_000) -> tuple[Outcome, Any]:
+        session = make_session()
+        cell = make_cell(session, seed=seed)
+        cell.reset(starts)
+        plan = plan_pick_and_place(
+            task,
+            starts,
+            error,
+            kinematics=cell.kinematics,
+            joints_start_rad=cell.home_rad,
+            max_joint_speed_rad_s=cell_file.max_joint_speed_rad_s,
+            plan_id="plan_0",
+            condition="without_replanning",
+            start_id="cube_into_box/9000000",
+        )
+        execute_plan(cell, plan)
+        return label_trial(task, cell.truth, executed=True), session
+
+    return run
+
+
+@pytest.mark.slow
+def test_a_good_grasp_puts_the_cube_into_the_box(
+    attempt: Callable[..., tuple[Outcome, Any]],
+) -> None:
+    outcome, _ = attempt(NO_ERROR)
+    assert outcome.result == "success"
+    assert {stage["result"] for stage in outcome.stages} == {"success"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axis", ["along_m", "across_m"])
+def test_a_grasp_six_centimetres_off_fails(
+    attempt: Callable[..., tuple[Outcome, Any]], axis: str
+) -> None:
+    outcome, _ = attempt(replace(NO_ERROR, **{axis: 0.06}))
+    assert outcome.result == "failure"
+    assert outcome.stages[0]["result"] == "failure"
+
+
+@pytest.mark.slow
+def test_a_release_beside_the_box_fails_although_the_grasp_held(
+    attempt: Callable[..., tuple[Outcome, Any]],
+) -> None:
+    outcome, _ = attempt(replace(NO_ERROR, release_m=(0.16, 0.0)))
+    assert outcome.stages[0]["result"] == "success"
+    assert outcome.result == "failure"
+
+
+def test_the_same_seed_gives_the_same_joint_log_and_another_seed_another(
+    make_session: Callable[..., Any],
+    make_cell: Callable[..., StandinCell],
+    starts: dict[str, np.ndarray],
+) -> None:
+    def joint_log(seed: int) -> str:
+        session = make_session()
+        cell = make_cell(session, seed=seed)
+        cell.reset(starts)
+        target = cell.home_rad + np.array([0.3, 0, 0, 0, 0, 0.2])
+        cell.grip(0.0)
+        cell.follow(np.array([0, 400_000_000]), np.stack([cell.home_rad, target]))
+        log = b"".join(item.data for item in session.of("/joint_states"))
+        assert len(session.of("/joint_states")) == 50
+        return hashlib.sha256(log).hexdigest()
+
+    assert joint_log(9_000_001) == joint_log(9_000_001)
+    assert joint_log(9_000_001) != joint_log(9_000_002)
+
+
+def test_encoders_are_off_by_the_hidden_offset(
+    make_session: Callable[..., Any],
+    make_cell: Callable[..., StandinCell],
+    nominal: HiddenParameters,
+    starts: dict[str, np.ndarray],
+) -> None:
+    offset = np.array([0.01, -0.01, 0.02, 0.0, 0.005, -0.02])
+    session = make_session()
+    cell = make_cell(session, hidden=replace(nominal, joint_offset_rad=offset))
+    cell.reset(starts)
+    cell.wait(0.4)
+    said = np.mean([JointSample.from_cdr(i.data).position for i in session.of("/joint_states")], 0)
+    # The servos sag less than a milliradian; encoder noise is twenty times smaller.
+    np.testing.assert_allclose(said - cell.world.joints_rad, offset, atol=1e-3)
+    np.testing.assert_allclose(said, cell.home_rad, atol=1e-3)
+
+
+def test_a_command_acts_after_the_latency_and_not_before(
+    task: Task, nominal: HiddenParameters, starts: dict[str, np.ndarray], cell_file: CellFile
+) -> None:
+    latency_s = 0.06
+    world = World(task, replace(nominal, latency_s=latency_s))
+    home = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
+    world.reset(home, starts)
+    for _ in range(100):
+        world.step()
+    before = world.joints_rad
+    world.command(home + np.array([0.2, 0, 0, 0, 0, 0]), 0.085)
+    moved_at = None
+    for step in range(1, 101):
+        world.step()
+        if moved_at is None and abs(world.joints_rad[0] - before[0]) > 1e-5:
+            moved_at = step * STEP_S
+    assert moved_at == pytest.approx(latency_s, abs=3 * STEP_S)
+
+
+def test_the_gripper_pushes_with_its_hidden_force(
+    task: Task, nominal: HiddenParameters, starts: dict[str, np.ndarray]
+) -> None:
+    def width_error(grip_N: float) -> float:
+        world = World(task, replace(nominal, grip_N=grip_N, latency_s=0.0))
+        world.reset(np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308]), starts)
+        world.command(np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308]), 0.0)
+        for _ in range(20):
+            world.step()
+        return world.width_m
+
+    assert width_error(22.0) < width_error(4.0)
+
+
+def test_objects_stand_still_where_they_are_put(
+    task: Task, nominal: HiddenParameters, starts: dict[str, np.ndarray]
+) -> None:
+    world = World(task, nominal)
+    world.reset(np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308]), starts)
+    for _ in range(200):
+        world.step()
+    for object_id, T in world.Ts_base_object().items():
+        assert np.abs(T - starts[object_id]).max() < 0.001
+    assert world.finger_contact() == {"cube": False, "box": False}
+
+
+def test_a_seed_draws_one_laboratory_within_the_ranges_of_the_cell_file(
+    cell_file: CellFile,
+) -> None:
+    drawn = draw_hidden(cell_file, 9_000_003)
+    assert drawn.to_record() == draw_hidden(cell_file, 9_000_003).to_record()
+    assert drawn.to_record() != draw_hidden(cell_file, 9_000_004).to_record()
+    for name, (low, high) in cell_file.uniform.items():
+        assert low <= getattr(drawn, name) <= high
+
+
+def test_test_seeds_and_development_seeds_never_meet(cell_file: CellFile) -> None:
+    low, high = cell_file.development_seeds
+    first, last = cell_file.test_seeds
+    assert low <= high < first <= last
+
+
+def test_an_unknown_cell_lists_those_that_exist() -> None:
+    with pytest.raises(UsageError, match="standin"):
+        load_cell("no_such_cell")
+
+
+def test_a_cell_file_without_cameras_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "broken.toml"
+    path.write_text('schema_version = 1\nname = "x"\n')
+    with pytest.raises(UsageError, match="is not a cell file"):
+        load_cell(str(path))
