@@ -17,7 +17,7 @@ from bridge.errors import InvalidRecordError
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
-from bridge.terminal import Output
+from bridge.terminal import Output, stop_signals
 from twin.errors import TwinError
 from twin.gate import (
     Gate,
