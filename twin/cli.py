@@ -60,8 +60,8 @@ def rebuild(
     Example: robot-gst rebuild runs/monday --budget 60s
     """
     from bridge.episode.run import RunFolder
-    from twin.scene.rebuild import describe_scene
     from twin.scene.rebuild import rebuild as rebuild_scene
+    from twin.scene.record import describe_scene
 
     record = rebuild_scene(RunFolder.open(run), config, output)
     output.result(record, describe_scene(record))

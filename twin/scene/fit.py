@@ -14,14 +14,14 @@ from twin.scene.settings import FitConfig
 from twin.scene.training_view import Target, TrainingView
 
 RATES = {
-    "means_m": 0.06,  # in units of the median Gaussian's size
-    "quats_wxyz": 4e-3,
-    "scales_log": 1.5e-2,
-    "opacities_logit": 4e-2,
-    "colors": 8e-3,
+    "means_m": 0.18,  # in units of the median Gaussian's size
+    "quats_wxyz": 1.2e-2,
+    "scales_log": 4.5e-2,
+    "opacities_logit": 0.12,
+    "colors": 2.4e-2,
 }
-"""Adam's step sizes at the start; they decay to a tenth."""
-DECAY = 0.1
+"""Adam's step sizes at the start; they decay by the factor below."""
+DECAY = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,6 +134,8 @@ def _step(
     target: Target,
 ) -> float:
     planes = rasteriser.draw_planes(adam.cloud, target.camera, view.T_base_color)
-    _, mse, gradient = loss(planes, target.image(), target.depth_m)
+    # Where something moving stood, the image is compared with itself: no error, no gradient.
+    wanted = np.where(target.static_mask, target.image(), planes[:3])
+    _, mse, gradient = loss(planes, wanted, target.depth_m)
     adam.update(rasteriser.pull_back(planes, gradient), at)
     return mse

@@ -107,7 +107,7 @@ class FrameSurface:
         return np.asarray(nearest.reshape(camera.height, camera.width))
 
     def _T_color_depth(self) -> Float[np.ndarray, "4 4"]:
-        return se3.invert(self.frame.T_base_color) @ self.frame.T_base_depth
+        return np.asarray(se3.invert(self.frame.T_base_color) @ self.frame.T_base_depth)
 
     def _interior(self, stride: int) -> tuple[np.ndarray, np.ndarray]:
         """Trusted pixels on the grid whose neighbours at the normal's reach are trusted too."""

@@ -7,22 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from bridge.episode import provenance, streams
+from bridge.episode import provenance
 from bridge.episode.run import RunFolder
-from bridge.terminal import Advance, Output
-from twin.scene.fit import FitResult, fit
+from bridge.terminal import Output
+from twin.scene.fit import fit
 from twin.scene.frames import FrameChoice, Sources, choose_frames, find_sources, load
-from twin.scene.gaussians import GaussianCloud
 from twin.scene.initialise import fuse
+from twin.scene.moving import MovingVoxels, find_moving
 from twin.scene.ply import write_ply
 from twin.scene.points import DepthLimits, FrameSurface, PointSet
 from twin.scene.raster import RasterConfig, load_native
+from twin.scene.record import make_record, summarise_views
 from twin.scene.settings import RebuildConfig
-from twin.scene.store import BACKGROUND, SCENE_VERSION, read_record, write_record
+from twin.scene.store import BACKGROUND, HASH_DIGITS, SCENE_FILE, read_record, write_record
 from twin.scene.training_view import TrainingView, training_view
-from twin.scene.views import ViewNumbers, views_path, write_views
+from twin.scene.views import ViewsJob, views_path, write_views
 
-METHOD_VERSION = 1
+METHOD_VERSION = 2
 """Counts changes of method that make older scenes out of date."""
 MAX_POINTS = 3_000_000
 """Depth points to fuse; more change nothing but the time."""
@@ -34,6 +35,7 @@ class _Learnt:
 
     points: list[PointSet]
     views: list[TrainingView]
+    moving: MovingVoxels
 
 
 def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, Any]:
@@ -50,18 +52,45 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     if sources.remark:
         output.say(sources.remark)
     key = _key(sources, config)
-    done = None if config.force else _already_done(run, sources, key)
+    done = None if config.force else _already_done(run, key)
     if done is not None:
         output.say("the scene is up to date (same episodes, same settings); --force redoes it")
         return done
     start = time.monotonic()
     choices = choose_frames(sources, config.frames)
     learnt = _learn(choices, config, output)
+    output.detail(f"{len(learnt.moving.keys)} voxels hold something that moved")
     first = fuse(learnt.points, config.initialise)
     output.say(f"{len(first)} Gaussians from {len(learnt.views)} training frames")
     with output.progress("fit", 100) as advance:
-        result = fit(first, learnt.views, config.fit, advance)
-    return _store(run, sources, choices, config, output, key, result, start)
+        fitted = fit(first, learnt.views, config.fit, advance)
+    run.scene_dir.mkdir(parents=True, exist_ok=True)
+    (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
+    write_ply(run.scene_dir / BACKGROUND, fitted.cloud)
+    scene_hash = provenance.hash_file(run.scene_dir / BACKGROUND)[:HASH_DIGITS]
+    job = ViewsJob(
+        scene_hash=scene_hash,
+        cloud=fitted.cloud,
+        moving=learnt.moving,
+        limits=_limits(config),
+        holdout_every=config.frames.holdout_every,
+        raster=RasterConfig(threads=config.fit.threads),
+    )
+    with output.progress("render held-out views", _num_holdout(choices)) as advance:
+        numbers = write_views(run, choices, job, advance)
+    files = _remove_stale_views(run, choices, scene_hash)
+    record = make_record(
+        key=key,
+        scene_hash=scene_hash,
+        sources=sources,
+        choices=choices,
+        config=config,
+        fitted=fitted,
+        views=summarise_views(numbers, files),
+        seconds=time.monotonic() - start,
+    )
+    write_record(run, record)
+    return record
 
 
 def _key(sources: Sources, config: RebuildConfig) -> str:
@@ -74,7 +103,7 @@ def _key(sources: Sources, config: RebuildConfig) -> str:
     )
 
 
-def _already_done(run: RunFolder, sources: Sources, key: str) -> dict[str, Any] | None:
+def _already_done(run: RunFolder, key: str) -> dict[str, Any] | None:
     record = read_record(run)
     if record is None or record.get("key") != key:
         return None
@@ -86,18 +115,21 @@ def _already_done(run: RunFolder, sources: Sources, key: str) -> dict[str, Any] 
 
 def _learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output) -> _Learnt:
     total = sum(len(choice.train_ns) for choice in choices)
-    learnt = _Learnt(points=[], views=[])
-    limits = DepthLimits(
-        max_depth_m=config.frames.max_depth_m, flying_fraction=config.initialise.flying_fraction
-    )
+    points: list[PointSet] = []
+    views: list[TrainingView] = []
     with output.progress("read frames", total) as advance:
         for choice in choices:
             for frame in load(choice, choice.train_ns):
-                surface = FrameSurface(frame, limits)
-                learnt.points.append(surface.points(_stride(total, frame.depth_m.size)))
-                learnt.views.append(training_view(surface))
-                advance(len(learnt.views), f"camera {frame.camera_id}")
-    return learnt
+                surface = FrameSurface(frame, _limits(config))
+                points.append(surface.points(_stride(total, frame.depth_m.size)))
+                views.append(training_view(surface))
+                advance(len(views), f"camera {frame.camera_id}")
+    moving = find_moving(points, views)
+    return _Learnt(
+        points=[moving.drop_from(item) for item in points],
+        views=[moving.mask_in(view) for view in views],
+        moving=moving,
+    )
 
 
 def _stride(num_frames: int, num_pixels: int) -> int:
@@ -105,143 +137,22 @@ def _stride(num_frames: int, num_pixels: int) -> int:
     return max(1, round(float(np.sqrt(num_frames * num_pixels / MAX_POINTS))))
 
 
-def _store(
-    run: RunFolder,
-    sources: Sources,
-    choices: Sequence[FrameChoice],
-    config: RebuildConfig,
-    output: Output,
-    key: str,
-    result: FitResult,
-    start: float,
-) -> dict[str, Any]:
-    run.scene_dir.mkdir(parents=True, exist_ok=True)
-    write_ply(run.scene_dir / BACKGROUND, result.cloud)
-    scene_hash = provenance.hash_file(run.scene_dir / BACKGROUND)[:12]
-    settings = asdict(config)
-    total = sum(len(choice.holdout_ns) for choice in choices)
-    with output.progress("render held-out views", total) as advance:
-        numbers = _write_views(run, choices, result.cloud, scene_hash, config, advance)
-    files = sorted({views_path(run, c.episode, scene_hash).name for c in choices if c.holdout_ns})
-    _remove_stale_views(run, files, choices)
-    record = {
-        "schema_version": SCENE_VERSION,
-        "key": key,
-        "scene_hash": scene_hash,
-        "frame": _root_frame(choices),
-        "units": {"length": "m", "colour": "sRGB", "quaternion": "wxyz"},
-        "remark": sources.remark,
-        "stand_in": any(episode.info.stand_in for episode in sources.episodes),
-        "sources": [
-            {"id": e.info.id, "kind": e.info.kind, "sha256": provenance.hash_file(e.path)}
-            for e in sources.episodes
-        ],
-        "cameras": [_camera_record(choice) for choice in choices],
-        "settings": settings,
-        "background": {"file": BACKGROUND, "num_splats": len(result.cloud)},
-        "fit": {
-            "iterations": result.iterations,
-            "coarse_iterations": result.coarse_iterations,
-            "seconds": round(result.seconds, 2),
-            "cpu_seconds": round(result.cpu_seconds, 2),
-            "train_psnr_db": round(result.train_psnr_db, 3),
-        },
-        "views": {"files": files, **_quality(numbers)},
-        "seconds": round(time.monotonic() - start, 2),
-        "software": provenance.software(),
-    }
-    write_record(run, record)
-    return record
-
-
-def _write_views(
-    run: RunFolder,
-    choices: Sequence[FrameChoice],
-    cloud: GaussianCloud,
-    scene_hash: str,
-    config: RebuildConfig,
-    advance: Advance,
-) -> list[ViewNumbers]:
-    return write_views(
-        run,
-        choices,
-        cloud,
-        scene_hash=scene_hash,
-        settings={
-            "holdout": f"every {config.frames.holdout_every}th frame of each camera",
-            "resolution": "native colour camera",
-            "masks": "none",
-        },
-        config=RasterConfig(threads=config.fit.threads),
-        advance=advance,
+def _limits(config: RebuildConfig) -> DepthLimits:
+    return DepthLimits(
+        max_depth_m=config.frames.max_depth_m, flying_fraction=config.initialise.flying_fraction
     )
 
 
-def _remove_stale_views(run: RunFolder, keep: list[str], choices: Sequence[FrameChoice]) -> None:
-    """Views of an earlier scene show a place that is no longer stored."""
-    for choice in choices:
-        for path in run.derived_dir.glob(f"{choice.episode.path.stem}.views.*.mcap"):
-            if path.name not in keep:
-                path.unlink()
+def _num_holdout(choices: Sequence[FrameChoice]) -> int:
+    return sum(len(choice.holdout_ns) for choice in choices)
 
 
-def _root_frame(choices: Sequence[FrameChoice]) -> str:
-    choice = choices[0]
-    info = streams.camera_info(choice.episode, choice.camera_id)
-    return streams.transform_tree(choice.episode).root_of(info.frame_id)
-
-
-def _camera_record(choice: FrameChoice) -> dict[str, Any]:
-    camera = streams.camera_info(choice.episode, choice.camera_id).camera
-    return {
-        "episode": choice.episode.info.id,
-        "id": choice.camera_id,
-        "still": choice.still,
-        "train_frames": len(choice.train_ns),
-        "holdout_frames": len(choice.holdout_ns),
-        "color": asdict(camera),
-    }
-
-
-def _quality(numbers: list[ViewNumbers]) -> dict[str, Any]:
-    moving = [item for item in numbers if not item.still_camera]
-    still = [item for item in numbers if item.still_camera]
-    return {
-        "note": "held out from initialisation and fit; PSNR is the mean of the images' values, "
-        "native resolution, no masks, no colour alignment; the evaluator computes the official "
-        "numbers from the views episode",
-        "psnr_db": _mean([item.psnr_db for item in moving]),
-        "psnr_db_still_cameras": _mean([item.psnr_db for item in still]),
-        "depth_mean_abs_m": _mean(
-            [item.depth_mean_abs_m for item in numbers if item.depth_mean_abs_m is not None]
-        ),
-        "images": [asdict(item) for item in numbers],
-    }
-
-
-def _mean(values: list[float]) -> float | None:
-    return round(float(np.mean(values)), 4) if values else None
-
-
-def describe_scene(record: dict[str, Any]) -> str:
-    """Say in a few lines what was rebuilt and how well."""
-    views, fitted = record["views"], record["fit"]
-    lines = [
-        f"scene {record['scene_hash']}: {record['background']['num_splats']} Gaussians"
-        + (" (stand-in)" if record["stand_in"] else ""),
-        f"fit: {fitted['iterations']} images in {fitted['seconds']:.1f} s, "
-        f"training PSNR {fitted['train_psnr_db']:.2f} dB",
-    ]
-    held = len(views["images"])
-    if views["psnr_db"] is not None:
-        lines.append(f"held-out views of moving cameras: PSNR {views['psnr_db']:.2f} dB")
-    if views["psnr_db_still_cameras"] is not None:
-        lines.append(
-            "later images of cameras that stand still (no new viewpoint): "
-            f"PSNR {views['psnr_db_still_cameras']:.2f} dB"
-        )
-    if held == 0:
-        lines.append("no frame could be held out: too few frames")
-    if record["remark"]:
-        lines.append(record["remark"])
-    return "\n".join(lines)
+def _remove_stale_views(
+    run: RunFolder, choices: Sequence[FrameChoice], scene_hash: str
+) -> list[str]:
+    """Remove the views of earlier scenes, which are no longer stored; return the present ones."""
+    present = {views_path(run, c.episode, scene_hash).name for c in choices if c.holdout_ns}
+    for path in run.derived("*.views.*"):
+        if path.name not in present:
+            path.unlink()
+    return sorted(present)

@@ -16,6 +16,8 @@ from twin.scene.ply import read_ply
 SCENE_VERSION = 1
 BACKGROUND = "background.ply"
 SCENE_FILE = "scene.json"
+HASH_DIGITS = 12
+"""Hexadecimal digits of the SHA-256 of ``background.ply`` that name a scene."""
 
 
 class UnreadableSceneError(TwinError):

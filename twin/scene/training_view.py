@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from bridge.geometry.camera import Camera
 from twin.scene.points import FrameSurface
@@ -17,6 +17,8 @@ class Target:
     planes_u8: UInt8[np.ndarray, "3 height width"]
     depth_m: Float32[np.ndarray, "height width"]
     """Along the colour camera's axis; 0 where it was not measured."""
+    static_mask: Bool[np.ndarray, "height width"]
+    """False where something moving stood in the way; the fit passes these pixels over."""
 
     def image(self) -> Float32[np.ndarray, "3 height width"]:
         """Colour planes, 0..1."""
@@ -50,7 +52,8 @@ def training_view(surface: FrameSurface) -> TrainingView:
 
 def _target(camera: Camera, image_u8: np.ndarray, depth_m: np.ndarray) -> Target:
     planes = np.ascontiguousarray(np.moveaxis(image_u8, -1, 0))
-    return Target(camera=camera, planes_u8=planes, depth_m=depth_m)
+    everywhere = np.ones(depth_m.shape, dtype=bool)
+    return Target(camera=camera, planes_u8=planes, depth_m=depth_m, static_mask=everywhere)
 
 
 def _blocks(rows: np.ndarray, camera: Camera) -> np.ndarray:

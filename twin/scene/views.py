@@ -23,7 +23,10 @@ from bridge.terminal import Advance
 from twin.scene.frames import FrameChoice, load
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.losses import psnr_db
+from twin.scene.moving import MovingVoxels
+from twin.scene.points import DepthLimits, FrameSurface
 from twin.scene.raster import RasterConfig, Rasteriser, View
+from twin.scene.training_view import training_view
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +39,11 @@ class ViewNumbers:
     still_camera: bool
     """The camera does not move, so training frames show the same view."""
     psnr_db: float
+    """Over the whole image, as recorded: a robot in view counts as error."""
+    static_psnr_db: float | None
+    """Over the pixels that show nothing that moved; None when there are none."""
+    static_fraction: float
+    """Share of those pixels."""
     depth_mean_abs_m: float | None
     """Against the recorded depth, where both exist and the cameras coincide."""
     coverage_fraction: float
@@ -47,22 +55,36 @@ def views_path(run: RunFolder, episode: Episode, scene_hash: str) -> Path:
     return run.derived_dir / f"{episode.path.stem}.views.{scene_hash}.mcap"
 
 
+@dataclass(frozen=True, kw_only=True)
+class ViewsJob:
+    """What to render held-out frames of, and what to say about it."""
+
+    scene_hash: str
+    cloud: GaussianCloud
+    moving: MovingVoxels
+    limits: DepthLimits
+    holdout_every: int
+    raster: RasterConfig
+
+    def settings(self) -> dict[str, object]:
+        """What the derived episode records about how its views were made."""
+        return {
+            "holdout": f"every {self.holdout_every}th frame of each camera",
+            "resolution": "native colour camera",
+            "masks": "none",
+            "alpha_cut": self.raster.alpha_cut,
+        }
+
+
 def write_views(
-    run: RunFolder,
-    choices: Sequence[FrameChoice],
-    cloud: GaussianCloud,
-    *,
-    scene_hash: str,
-    settings: dict[str, object],
-    config: RasterConfig,
-    advance: Advance,
+    run: RunFolder, choices: Sequence[FrameChoice], job: ViewsJob, advance: Advance
 ) -> list[ViewNumbers]:
     """Render every held-out frame; one derived episode per recorded one, replaced if present."""
-    rasteriser = Rasteriser(config)
+    rasteriser = Rasteriser(job.raster)
     numbers: list[ViewNumbers] = []
     episodes = {choice.episode.path: choice.episode for choice in choices if choice.holdout_ns}
     for path, episode in episodes.items():
-        target = views_path(run, episode, scene_hash)
+        target = views_path(run, episode, job.scene_hash)
         target.unlink(missing_ok=True)
         own = [choice for choice in choices if choice.episode.path == path]
         with EpisodeWriter(target) as writer:
@@ -72,15 +94,16 @@ def write_views(
                     kind="views",
                     source_episode=episode.info.id,
                     source_sha256=provenance.hash_file(path),
-                    scene_hash=scene_hash,
+                    scene_hash=job.scene_hash,
                     engine="robot-gst splat",
-                    settings=settings,
+                    settings=job.settings(),
                 ),
             )
             for choice in own:
-                for frame, view in _rendered(choice, rasteriser, cloud):
+                for frame, view in _rendered(choice, rasteriser, job.cloud):
                     _write_view(writer, choice, frame, view)
-                    numbers.append(_numbers(choice, frame, view))
+                    seen = job.moving.mask_in(training_view(FrameSurface(frame, job.limits)))
+                    numbers.append(_numbers(choice, frame, view, seen.full.static_mask))
                     advance(len(numbers), f"{numbers[-1].psnr_db:.1f} dB")
     return numbers
 
@@ -128,8 +151,10 @@ def _write_view(writer: EpisodeWriter, choice: FrameChoice, frame: RgbdFrame, vi
         put("recorded/depth", depth(frame.depth_m), schema.IMAGE)
 
 
-def _numbers(choice: FrameChoice, frame: RgbdFrame, view: View) -> ViewNumbers:
-    difference = view.image_u8().astype(np.float64) - frame.image_u8
+def _numbers(
+    choice: FrameChoice, frame: RgbdFrame, view: View, static_mask: np.ndarray
+) -> ViewNumbers:
+    squared = np.square((view.image_u8().astype(np.float64) - frame.image_u8) / 255.0)
     depth_error = None
     if one_camera(frame):
         both = (frame.depth_m > 0) & (view.depth_m > 0)
@@ -140,7 +165,9 @@ def _numbers(choice: FrameChoice, frame: RgbdFrame, view: View) -> ViewNumbers:
         camera_id=frame.camera_id,
         stamp_ns=frame.stamp_ns,
         still_camera=choice.still,
-        psnr_db=psnr_db(float(np.square(difference / 255.0).mean())),
+        psnr_db=psnr_db(float(squared.mean())),
+        static_psnr_db=psnr_db(float(squared[static_mask].mean())) if static_mask.any() else None,
+        static_fraction=float(static_mask.mean()),
         depth_mean_abs_m=depth_error,
         coverage_fraction=float(view.alpha.mean()),
     )

@@ -14,7 +14,8 @@ from bridge.errors import PathNotFoundError, UsageError
 from bridge.media.color import decode_color
 from bridge.terminal import Output
 from twin.scene.frames import NoFramesError, choose_frames, find_sources
-from twin.scene.rebuild import describe_scene, rebuild
+from twin.scene.rebuild import rebuild
+from twin.scene.record import describe_scene
 from twin.scene.render import render
 from twin.scene.settings import (
     FitConfig,

@@ -1,0 +1,129 @@
+"""What moved during the recording: surfaces that other frames look through.
+
+The scene folder holds the static place. A robot, a hand or an object that was carried shows up as
+a surface in a few frames, while other frames measure something farther behind it. No model of the
+robot is needed. A thing that never moves, such as the robot's base, is static and stays.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
+
+from bridge.geometry import se3
+from twin.scene.points import PointSet
+from twin.scene.training_view import Target, TrainingView
+
+VOXEL_M = 0.02
+"""Points are judged in groups of this size."""
+MARGIN_M = 0.03
+MARGIN_FRACTION = 0.02
+"""A measurement must lie this much behind a point to have passed it."""
+MAX_WITNESSES = 40
+"""Frames that are asked; more only cost time."""
+MIN_THROUGH = 2
+GROW_PX = 2
+"""Masks grow by this much at half size, because depth fails along outlines."""
+INDEX_BITS = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class MovingVoxels:
+    """Where something was that is not part of the static place."""
+
+    keys: Int64[np.ndarray, " num_voxels"]
+
+    def contains(self, p_m: Float32[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
+        """Say which points (root frame, metres) belong to something that moved."""
+        return np.isin(_keys(p_m), self.keys)
+
+    def drop_from(self, points: PointSet) -> PointSet:
+        """Return the static points only."""
+        kept = ~self.contains(points.p_m)
+        return PointSet(
+            p_m=points.p_m[kept],
+            normals=points.normals[kept],
+            colors=points.colors[kept],
+            footprint_m=points.footprint_m[kept],
+        )
+
+    def mask_in(self, view: TrainingView) -> TrainingView:
+        """Mark the pixels that show something moving, so that the fit passes them over."""
+        if not len(self.keys):
+            return view
+        half, full = view.half, view.full
+        known = half.depth_m > 0
+        p_camera = half.camera.unproject(half.depth_m)[known]
+        hit = np.zeros_like(known)
+        hit[known] = self.contains(se3.apply(view.T_base_color, p_camera).astype(np.float32))
+        static = ~_grown(hit)
+        doubled = np.repeat(np.repeat(static, 2, axis=0), 2, axis=1)
+        missing = [
+            (0, max(0, n - m)) for n, m in zip(full.depth_m.shape, doubled.shape, strict=True)
+        ]
+        height, width = full.depth_m.shape
+        doubled = np.pad(doubled, missing, mode="edge")[:height, :width]
+        return replace(view, half=_masked(half, static), full=_masked(full, doubled))
+
+
+def _masked(target: Target, static_mask: np.ndarray) -> Target:
+    return replace(
+        target,
+        static_mask=static_mask,
+        depth_m=np.where(static_mask, target.depth_m, np.float32(0.0)),
+    )
+
+
+def find_moving(points: Sequence[PointSet], views: Sequence[TrainingView]) -> MovingVoxels:
+    """Find voxels that more frames look through than confirm.
+
+    Args:
+        points: Surface points of all training frames.
+        views: The same frames; their depth images are the witnesses.
+    """
+    p = np.concatenate([item.p_m for item in points])
+    keys, inverse, counts = np.unique(_keys(p), return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(inverse, weights=c) / counts for c in p.T], axis=1)
+    through = np.zeros(len(keys), dtype=np.int32)
+    confirmed = np.zeros(len(keys), dtype=np.int32)
+    step = max(1, -(-len(views) // MAX_WITNESSES))
+    for view in views[::step]:
+        passed, met = _testify(view, means)
+        through += passed
+        confirmed += met
+    return MovingVoxels(keys=keys[(through >= MIN_THROUGH) & (through > confirmed)])
+
+
+def _testify(view: TrainingView, p_base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which points one frame looks through, and which it sees where they should be."""
+    camera = view.half.camera
+    p_camera = se3.apply(se3.invert(view.T_base_color), p_base)
+    front = p_camera[:, 2] > MARGIN_M
+    uv, z = camera.project(np.where(front[:, None], p_camera, 1.0))
+    column, row = np.floor(uv[:, 0]).astype(int), np.floor(uv[:, 1]).astype(int)
+    inside = front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    measured = np.zeros(len(p_base))
+    measured[inside] = view.half.depth_m[row[inside], column[inside]]
+    margin = MARGIN_M + MARGIN_FRACTION * z
+    known = measured > 0
+    return known & (measured > z + margin), known & (np.abs(measured - z) <= margin)
+
+
+def _keys(p_m: np.ndarray) -> np.ndarray:
+    cell = np.floor(p_m / VOXEL_M).astype(np.int64) + (1 << (INDEX_BITS - 1))
+    cell = np.clip(cell, 0, (1 << INDEX_BITS) - 1)
+    packed = (cell[:, 0] << (2 * INDEX_BITS)) | (cell[:, 1] << INDEX_BITS) | cell[:, 2]
+    return np.asarray(packed)
+
+
+def _grown(mask: np.ndarray) -> np.ndarray:
+    grown: np.ndarray = mask.copy()
+    for axis in (0, 1):
+        once = grown.copy()
+        for shift in range(1, GROW_PX + 1):
+            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
+            ahead[axis], behind[axis] = slice(shift, None), slice(None, -shift)
+            grown[tuple(ahead)] |= once[tuple(behind)]
+            grown[tuple(behind)] |= once[tuple(ahead)]
+    return grown
