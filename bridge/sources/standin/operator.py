@@ -33,7 +33,8 @@ SEEDS_PER_SESSION = 1000
 """Session 7 starts at start seed 7000; sessions never share a start."""
 LOOK_S = 0.9
 """The arm waits at home before a plan, so that the start is seen at rest."""
-BETWEEN_S = 2.0
+BETWEEN_S = 8.0
+"""Putting the objects back takes a person about this long; nothing is published meanwhile."""
 STILL_S = 0.16
 """The arm rests this long at a viewpoint before the picture."""
 CONTROL_TIMEOUT_S = 60.0

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -190,7 +191,12 @@ def _rays(
     camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "num_rays 3"]:
     """Directions with z = 1 in the camera's frame, so that the distance along one is the depth."""
-    return np.asarray(camera.rays().reshape(-1, 3) @ T_base_camera[:3, :3].T, dtype=np.float32)
+    return np.asarray(_local_rays(camera) @ T_base_camera[:3, :3].T.astype(np.float32))
+
+
+@cache
+def _local_rays(camera: Camera) -> Float[np.ndarray, "num_rays 3"]:
+    return camera.rays().reshape(-1, 3).astype(np.float32)
 
 
 def _nearer(front: Layer, back: Layer) -> Layer:
