@@ -23,6 +23,8 @@ MARGIN_FRACTION = 0.02
 MAX_WITNESSES = 40
 """Frames that are asked; more only cost time."""
 MIN_THROUGH = 2
+OUTLINE_PX = 3
+"""Poses and depth are noisy: closer to a nearer surface than this, at half size, nobody knows."""
 GROW_PX = 2
 """Masks grow by this much at half size, because depth fails along outlines."""
 INDEX_BITS = 20
@@ -103,11 +105,25 @@ def _testify(view: TrainingView, p_base: np.ndarray) -> tuple[np.ndarray, np.nda
     uv, z = camera.project(np.where(front[:, None], p_camera, 1.0))
     column, row = np.floor(uv[:, 0]).astype(int), np.floor(uv[:, 1]).astype(int)
     inside = front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    measured = np.zeros(len(p_base))
+    measured, nearest = np.zeros(len(p_base)), np.zeros(len(p_base))
     measured[inside] = view.half.depth_m[row[inside], column[inside]]
+    nearest[inside] = _nearest_around(view.half.depth_m)[row[inside], column[inside]]
     margin = MARGIN_M + MARGIN_FRACTION * z
     known = measured > 0
-    return known & (measured > z + margin), known & (np.abs(measured - z) <= margin)
+    return known & (nearest > z + margin), known & (np.abs(measured - z) <= margin)
+
+
+def _nearest_around(depth_m: np.ndarray) -> np.ndarray:
+    """Smallest measurement within a few pixels: beside an outline nothing counts as passed."""
+    nearest = np.where(depth_m > 0, depth_m, np.float32(np.inf))
+    for axis in (0, 1):
+        once = nearest.copy()
+        for shift in range(1, OUTLINE_PX + 1):
+            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
+            ahead[axis], behind[axis] = slice(shift, None), slice(None, -shift)
+            for to, source in ((tuple(ahead), tuple(behind)), (tuple(behind), tuple(ahead))):
+                nearest[to] = np.minimum(nearest[to], once[source])
+    return np.asarray(nearest)
 
 
 def _keys(p_m: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from twin.scene.store import BACKGROUND, HASH_DIGITS, SCENE_FILE, read_record, w
 from twin.scene.training_view import TrainingView, training_view
 from twin.scene.views import ViewsJob, views_path, write_views
 
-METHOD_VERSION = 2
+METHOD_VERSION = 3
 """Counts changes of method that make older scenes out of date."""
 MAX_POINTS = 3_000_000
 """Depth points to fuse; more change nothing but the time."""
