@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 
 from bridge.geometry import se3
 from twin.scene.points import PointSet
@@ -77,40 +77,58 @@ def _masked(target: Target, static_mask: np.ndarray) -> Target:
     )
 
 
-def find_moving(points: Sequence[PointSet], views: Sequence[TrainingView]) -> MovingVoxels:
+@dataclass(frozen=True, kw_only=True)
+class Witness:
+    """What one training frame can say about other frames' points."""
+
+    view: TrainingView
+    nearest_m: Float32[np.ndarray, "height width"]
+
+    def testify(
+        self, p_base: Float[np.ndarray, "num_points 3"]
+    ) -> tuple[Bool[np.ndarray, " num_points"], Bool[np.ndarray, " num_points"]]:
+        """Say which points it looks through, and which it sees where they should be."""
+        target = self.view.half
+        camera = target.camera
+        p_camera = se3.apply(se3.invert(self.view.T_base_color), p_base)
+        front = p_camera[:, 2] > MARGIN_M
+        uv, z = camera.project(np.where(front[:, None], p_camera, 1.0))
+        column, row = np.floor(uv[:, 0]).astype(int), np.floor(uv[:, 1]).astype(int)
+        inside = front & (column >= 0) & (column < camera.width)
+        inside &= (row >= 0) & (row < camera.height)
+        measured, nearest = np.zeros(len(p_base)), np.zeros(len(p_base))
+        measured[inside] = target.depth_m[row[inside], column[inside]]
+        nearest[inside] = self.nearest_m[row[inside], column[inside]]
+        margin = MARGIN_M + MARGIN_FRACTION * z
+        known = measured > 0
+        return known & (nearest > z + margin), known & (np.abs(measured - z) <= margin)
+
+
+def choose_witnesses(views: Sequence[TrainingView]) -> list[Witness]:
+    """Take training frames spread evenly; their depth images are the witnesses."""
+    step = max(1, -(-len(views) // MAX_WITNESSES))
+    return [
+        Witness(view=view, nearest_m=_nearest_around(view.half.depth_m)) for view in views[::step]
+    ]
+
+
+def find_moving(points: Sequence[PointSet], witnesses: Sequence[Witness]) -> MovingVoxels:
     """Find voxels that more frames look through than confirm.
 
     Args:
-        points: Surface points of all training frames.
-        views: The same frames; their depth images are the witnesses.
+        points: Surface points of all training frames, or of one held-out frame.
+        witnesses: Training frames.
     """
     p = np.concatenate([item.p_m for item in points])
     keys, inverse, counts = np.unique(_keys(p), return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(inverse, weights=c) / counts for c in p.T], axis=1)
     through = np.zeros(len(keys), dtype=np.int32)
     confirmed = np.zeros(len(keys), dtype=np.int32)
-    step = max(1, -(-len(views) // MAX_WITNESSES))
-    for view in views[::step]:
-        passed, met = _testify(view, means)
+    for witness in witnesses:
+        passed, met = witness.testify(means)
         through += passed
         confirmed += met
     return MovingVoxels(keys=keys[(through >= MIN_THROUGH) & (through > confirmed)])
-
-
-def _testify(view: TrainingView, p_base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which points one frame looks through, and which it sees where they should be."""
-    camera = view.half.camera
-    p_camera = se3.apply(se3.invert(view.T_base_color), p_base)
-    front = p_camera[:, 2] > MARGIN_M
-    uv, z = camera.project(np.where(front[:, None], p_camera, 1.0))
-    column, row = np.floor(uv[:, 0]).astype(int), np.floor(uv[:, 1]).astype(int)
-    inside = front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    measured, nearest = np.zeros(len(p_base)), np.zeros(len(p_base))
-    measured[inside] = view.half.depth_m[row[inside], column[inside]]
-    nearest[inside] = _nearest_around(view.half.depth_m)[row[inside], column[inside]]
-    margin = MARGIN_M + MARGIN_FRACTION * z
-    known = measured > 0
-    return known & (nearest > z + margin), known & (np.abs(measured - z) <= margin)
 
 
 def _nearest_around(depth_m: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from bridge.terminal import Output
 from twin.scene.fit import fit
 from twin.scene.frames import FrameChoice, Sources, choose_frames, find_sources, load
 from twin.scene.initialise import fuse
-from twin.scene.moving import MovingVoxels, find_moving
+from twin.scene.moving import MovingVoxels, Witness, choose_witnesses, find_moving
 from twin.scene.ply import write_ply
 from twin.scene.points import DepthLimits, FrameSurface, PointSet
 from twin.scene.raster import RasterConfig, load_native
@@ -23,7 +23,7 @@ from twin.scene.store import BACKGROUND, HASH_DIGITS, SCENE_FILE, read_record, w
 from twin.scene.training_view import TrainingView, training_view
 from twin.scene.views import ViewsJob, views_path, write_views
 
-METHOD_VERSION = 3
+METHOD_VERSION = 4
 """Counts changes of method that make older scenes out of date."""
 MAX_POINTS = 3_000_000
 """Depth points to fuse; more change nothing but the time."""
@@ -36,6 +36,7 @@ class _Learnt:
     points: list[PointSet]
     views: list[TrainingView]
     moving: MovingVoxels
+    witnesses: list[Witness]
 
 
 def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, Any]:
@@ -71,7 +72,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     job = ViewsJob(
         scene_hash=scene_hash,
         cloud=fitted.cloud,
-        moving=learnt.moving,
+        witnesses=learnt.witnesses,
         limits=_limits(config),
         holdout_every=config.frames.holdout_every,
         raster=RasterConfig(threads=config.fit.threads),
@@ -124,11 +125,13 @@ def _learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output
                 points.append(surface.points(_stride(total, frame.depth_m.size)))
                 views.append(training_view(surface))
                 advance(len(views), f"camera {frame.camera_id}")
-    moving = find_moving(points, views)
+    witnesses = choose_witnesses(views)
+    moving = find_moving(points, witnesses)
     return _Learnt(
         points=[moving.drop_from(item) for item in points],
         views=[moving.mask_in(view) for view in views],
         moving=moving,
+        witnesses=witnesses,
     )
 
 

@@ -23,7 +23,7 @@ from bridge.terminal import Advance
 from twin.scene.frames import FrameChoice, load
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.losses import psnr_db
-from twin.scene.moving import MovingVoxels
+from twin.scene.moving import Witness, find_moving
 from twin.scene.points import DepthLimits, FrameSurface
 from twin.scene.raster import RasterConfig, Rasteriser, View
 from twin.scene.training_view import training_view
@@ -61,7 +61,7 @@ class ViewsJob:
 
     scene_hash: str
     cloud: GaussianCloud
-    moving: MovingVoxels
+    witnesses: Sequence[Witness]
     limits: DepthLimits
     holdout_every: int
     raster: RasterConfig
@@ -102,8 +102,7 @@ def write_views(
             for choice in own:
                 for frame, view in _rendered(choice, rasteriser, job.cloud):
                     _write_view(writer, choice, frame, view)
-                    seen = job.moving.mask_in(training_view(FrameSurface(frame, job.limits)))
-                    numbers.append(_numbers(choice, frame, view, seen.full.static_mask))
+                    numbers.append(_numbers(choice, frame, view, _static_mask(frame, job)))
                     advance(len(numbers), f"{numbers[-1].psnr_db:.1f} dB")
     return numbers
 
@@ -113,6 +112,13 @@ def _rendered(
 ) -> Iterator[tuple[RgbdFrame, View]]:
     for frame in load(choice, choice.holdout_ns):
         yield frame, rasteriser.view(cloud, frame.color_camera, frame.T_base_color)
+
+
+def _static_mask(frame: RgbdFrame, job: ViewsJob) -> np.ndarray:
+    """Pixels of a held-out frame that no training frame looks through."""
+    surface = FrameSurface(frame, job.limits)
+    moving = find_moving([surface.points()], job.witnesses)
+    return moving.mask_in(training_view(surface)).full.static_mask
 
 
 def one_camera(frame: RgbdFrame) -> bool:

@@ -7,7 +7,7 @@ import textured_room
 from bridge.episode.streams import RgbdFrame
 from twin.scene.fit import fit
 from twin.scene.initialise import fuse
-from twin.scene.moving import MovingVoxels, find_moving
+from twin.scene.moving import MovingVoxels, choose_witnesses, find_moving
 from twin.scene.points import DepthLimits, FrameSurface, PointSet
 from twin.scene.settings import FitConfig, InitialiseConfig
 from twin.scene.training_view import TrainingView, training_view
@@ -36,7 +36,7 @@ def test_a_visitor_is_found_and_the_room_is_left_alone(
     learnt: tuple[list[PointSet], list[TrainingView]],
 ) -> None:
     points, views = learnt
-    moving = find_moving(points, views)
+    moving = find_moving(points, choose_witnesses(views))
     kept = moving.drop_from(points[3])
     near = np.linalg.norm(points[3].p_m - views[3].T_base_color[:3, 3], axis=1) < 0.42
     assert near.sum() > 500
@@ -52,7 +52,7 @@ def test_the_pixels_of_a_visitor_are_masked(
     learnt: tuple[list[PointSet], list[TrainingView]],
 ) -> None:
     points, views = learnt
-    moving = find_moving(points, views)
+    moving = find_moving(points, choose_witnesses(views))
     masked = moving.mask_in(views[3])
     magenta = (views[3].full.planes_u8 == VISITOR_COLOR[:, None, None]).all(axis=0)
     assert (~masked.full.static_mask)[magenta].mean() > 0.9
@@ -66,7 +66,7 @@ def test_a_visitor_leaves_no_trace_in_the_fitted_scene(
     learnt: tuple[list[PointSet], list[TrainingView]],
 ) -> None:
     points, views = learnt
-    moving = find_moving(points, views)
+    moving = find_moving(points, choose_witnesses(views))
     start = fuse([moving.drop_from(p) for p in points], InitialiseConfig(max_splats=1000))
     fitted = fit(
         start,
@@ -81,7 +81,8 @@ def test_a_visitor_leaves_no_trace_in_the_fitted_scene(
 def test_a_still_room_has_nothing_moving() -> None:
     surfaces = [FrameSurface(textured_room.frame(index, 8), LIMITS) for index in range(8)]
     points = [surface.points() for surface in surfaces]
-    moving = find_moving(points, [training_view(surface) for surface in surfaces])
+    views = [training_view(surface) for surface in surfaces]
+    moving = find_moving(points, choose_witnesses(views))
     assert sum(moving.contains(item.p_m).sum() for item in points) < 0.005 * sum(
         len(item.p_m) for item in points
     )
@@ -92,3 +93,12 @@ def test_without_moving_voxels_a_view_passes_unchanged(
 ) -> None:
     nothing = MovingVoxels(keys=np.zeros(0, dtype=np.int64))
     assert nothing.mask_in(learnt[1][0]) is learnt[1][0]
+
+
+def test_a_visitor_in_a_held_out_frame_is_found_by_the_training_frames(
+    learnt: tuple[list[PointSet], list[TrainingView]],
+) -> None:
+    witnesses = choose_witnesses([view for i, view in enumerate(learnt[1]) if i != 3])
+    moving = find_moving([learnt[0][3]], witnesses)
+    masked = moving.mask_in(learnt[1][3])
+    assert 0.3 < (~masked.full.static_mask).mean() < 0.6
