@@ -25,7 +25,7 @@ $(READY): pyproject.toml constraints.txt CMakeLists.txt $(NATIVE)
 	@test -x $(BIN)/python || { echo "Making .venv with $(PYTHON)"; $(PYTHON) -m venv .venv; }
 	@echo "Installing packages into .venv (about 5 GB the first time)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
-		"scikit-build-core>=0.11" nanobind cmake ninja torch==2.13.0
+		"scikit-build-core>=1.0" nanobind cmake ninja torch==2.13.0
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
 		--no-build-isolation -e '.[all,dev]'
 	@touch $@

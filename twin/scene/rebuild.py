@@ -14,6 +14,7 @@ from twin.scene.fit import fit
 from twin.scene.frames import FrameChoice, Sources, choose_frames, find_sources, load
 from twin.scene.initialise import fuse
 from twin.scene.moving import MovingVoxels, Witness, choose_witnesses, find_moving
+from twin.scene.parts import take_apart
 from twin.scene.ply import write_ply
 from twin.scene.points import DepthLimits, FrameSurface, PointSet
 from twin.scene.raster import RasterConfig, load_native
@@ -23,7 +24,7 @@ from twin.scene.store import BACKGROUND, HASH_DIGITS, SCENE_FILE, read_record, w
 from twin.scene.training_view import TrainingView, training_view
 from twin.scene.views import ViewsJob, views_path, write_views
 
-METHOD_VERSION = 4
+METHOD_VERSION = 5
 """Counts changes of method that make older scenes out of date."""
 MAX_POINTS = 3_000_000
 """Depth points to fuse; more change nothing but the time."""
@@ -67,7 +68,10 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         fitted = fit(first, learnt.views, config.fit, advance)
     run.scene_dir.mkdir(parents=True, exist_ok=True)
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
-    write_ply(run.scene_dir / BACKGROUND, fitted.cloud)
+    apart = take_apart(sources, fitted.cloud)
+    if apart.remark:
+        output.say(apart.remark)
+    write_ply(run.scene_dir / BACKGROUND, apart.background)
     scene_hash = provenance.hash_file(run.scene_dir / BACKGROUND)[:HASH_DIGITS]
     job = ViewsJob(
         scene_hash=scene_hash,
@@ -88,8 +92,10 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         config=config,
         fitted=fitted,
         views=summarise_views(numbers, files),
+        num_background=len(apart.background),
         seconds=time.monotonic() - start,
     )
+    record |= apart.write(run)
     write_record(run, record)
     return record
 

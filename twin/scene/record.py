@@ -29,6 +29,7 @@ def make_record(
     config: RebuildConfig,
     fitted: FitResult,
     views: Mapping[str, Any],
+    num_background: int,
     seconds: float,
 ) -> dict[str, Any]:
     """Put together the content of ``scene.json``."""
@@ -48,7 +49,7 @@ def make_record(
         ],
         "cameras": [_camera_record(choice) for choice in choices],
         "settings": settings,
-        "background": {"file": BACKGROUND, "num_splats": len(fitted.cloud)},
+        "background": {"file": BACKGROUND, "num_splats": num_background},
         "fit": {
             "iterations": fitted.iterations,
             "coarse_iterations": fitted.coarse_iterations,

@@ -11,6 +11,7 @@ from bridge.episode.run import RunFolder
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from twin.scene.parts import put_together, read_objects
 from twin.scene.raster import Rasteriser
 from twin.scene.settings import RenderConfig
 from twin.scene.store import Scene, read_scene
@@ -30,7 +31,8 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     episode = _episode(run, scene, config.episode)
     camera_id = _camera_id(episode, config.camera)
     camera, T_base_camera = _view_of(episode, camera_id, config)
-    view = Rasteriser().view(scene.background, camera, T_base_camera)
+    cloud = put_together(scene.background, read_objects(run, scene.record))
+    view = Rasteriser().view(cloud, camera, T_base_camera)
     path = config.out or run.results_dir / "render.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encode_png(view.image_u8()))

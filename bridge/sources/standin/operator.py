@@ -168,6 +168,8 @@ class Operator:
             plan = self._candidate(info, start_seed, round_, parent)
             self._cell.streams.plan(plan, self._cell.now_ns)
             if info.condition != "with_replanning":
+                if self._config.ask_always:
+                    self._ask_gate(plan)  # the gate publishes its verdict; nobody obeys it
                 return Decision(plan=plan, void=False, remark="")
             verdict, reason = self._ask_gate(plan)
             accepted = None if verdict is None else verdict.accepted
@@ -227,7 +229,6 @@ class Operator:
             verdict = Verdict.from_json(answer)
         except BridgeError as error:
             return None, str(error)
-        self._cell.streams.verdict(verdict, self._cell.now_ns)
         if verdict.plan_id != plan.id:
             return None, f"the gate judged {verdict.plan_id!r} instead of {plan.id!r}"
         return verdict, _reason(verdict)

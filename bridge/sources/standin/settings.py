@@ -33,6 +33,9 @@ class SessionConfig:
     """Cell name the gate was started with; empty: the same."""
     gate_timeout_s: float = 120.0
     """How long to wait for a verdict."""
+    ask_always: bool = False
+    """Ask the gate without replanning too; its verdict is recorded and not obeyed, so that the
+    gate's refusals meet an outcome as well."""
     execute_unverified: bool = False
     """With replanning, execute also when no verdict comes; the record says so."""
     recorder: str = "main"

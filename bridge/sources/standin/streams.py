@@ -25,7 +25,6 @@ from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan
 from bridge.task.record import check_record
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME
-from bridge.task.verdict import Verdict
 
 GRIPPER_JOINT = "gripper_width"
 TRUTH_PARAMETERS = f"{schema.TRUTH_PREFIX}parameters"
@@ -187,10 +186,6 @@ class Streams:
         )
         self._put(f"/{self._cell}/plan/trajectory", trajectory, stamp_ns)
         self._put(f"/{self._cell}/plan/path", _path_json(plan, stamp_ns), stamp_ns)
-
-    def verdict(self, verdict: Verdict, stamp_ns: int) -> None:
-        """Publish what the gate answered."""
-        self._put(f"/{self._cell}/verdict", verdict.to_json(), stamp_ns)
 
     def event(self, kind: str, stamp_ns: int, **fields: Any) -> None:
         """Publish one event; the schema lists the kinds and the fields."""

@@ -33,6 +33,7 @@ class FakeSession:
     gate: Callable[[dict], dict] | None = None
     sent: list[Sent] = field(default_factory=list)
     control: list[tuple[str, dict]] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
     episode: str | None = None
 
     def publisher(self, topic: str, type_name: str, *, block: bool = True) -> "FakePublisher":
@@ -46,6 +47,7 @@ class FakeSession:
             self.episode = request["id"] if verb == "start" else None
             return b'{"ok": true}'
         if key == "standin/gate/verdict" and self.gate is not None:
+            self.asked.append(request["id"])
             return json.dumps(self.gate(request)).encode()
         raise NoReplyError(key=key, timeout_s=timeout_s)
 

@@ -150,7 +150,7 @@ def test_plans_refused_in_every_round_are_recorded_and_nothing_is_executed(
     assert [plan.round for plan in plans] == [0, 1, 2]
     assert [plan.parent_id for plan in plans] == [None, plans[0].id, plans[1].id]
     assert len({plan.tau[40].p_m for plan in plans}) == 3
-    assert len(session.of("/verdict")) == 3
+    assert session.asked == [plan.id for plan in plans]
     kinds = [event["type"] for event in session.events()]
     assert kinds == ["replan", "replan", "note", "label"]
     assert summary["outcomes"] == {"with_replanning": {"failure": 1}}
@@ -172,7 +172,17 @@ def test_without_a_verdict_nothing_is_executed_and_the_trial_is_void(
 def test_an_undecided_verdict_is_no_permission(make_session: Callable[..., Any]) -> None:
     session, summary = with_replanning(make_session, lambda plan: verdict_record(plan, None))
     assert summary["outcomes"] == {"with_replanning": {"unknown": 1}}
-    assert len(session.of("/verdict")) == 1
+    assert len(session.asked) == 1
+
+
+def test_without_replanning_the_gate_may_be_asked_but_is_not_obeyed(
+    make_session: Callable[..., Any],
+) -> None:
+    session = make_session(gate=lambda plan: verdict_record(plan, False))
+    config = settings(conditions=("without_replanning",), ask_always=True)
+    run_session(session, config, QUIET, start_ns=1_700_000_000_000_000_000)
+    assert len(session.asked) == len(session.of("/plan")) == 1
+    assert [e["type"] for e in session.events()].count("execution_started") == 1
 
 
 def test_a_verdict_on_another_plan_is_no_permission(make_session: Callable[..., Any]) -> None:
