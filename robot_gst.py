@@ -70,6 +70,12 @@ COMMANDS: tuple[tuple[str, str, str, str], ...] = (
         "runs/monday",
     ),
     (
+        "view",
+        "dashboards.cli:view",
+        "An episode and its replays in Rerun's 3D viewer.",
+        "runs/monday",
+    ),
+    (
         "doctor",
         f"{EPISODES}:doctor",
         "What is installed, what is missing, how to get it.",
@@ -109,6 +115,17 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
                 f"{IMPORTS}:import_kinova",
                 "The Kinova reality-gap runs.",
                 "DIR runs/x",
+            ),
+        ),
+    ),
+    "export": (
+        "Write an episode for other people's programs.",
+        (
+            (
+                "rrd",
+                "dashboards.cli:export_rrd",
+                "An episode with its replays as a Rerun file.",
+                "EPISODE --out FILE.rrd",
             ),
         ),
     ),

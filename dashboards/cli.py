@@ -58,3 +58,68 @@ def demo(run: Path, /, *, config: DemoConfig = DEMO, output: Output = OUTPUT) ->
     from dashboards.demo import run_demo
 
     return run_demo(run, config, output)
+
+
+def export_rrd(episode: Path, /, *, out: Path, output: Output = OUTPUT) -> int:
+    """Write an episode with its replays as a Rerun file.
+
+    Example: robot-gst export rrd runs/monday/episodes/trial_0001.mcap --out trial_0001.rrd
+
+    Args:
+        episode: An episode file; of one inside a run, the replays and the rebuilt place come along.
+        out: The .rrd file to write; an older one is replaced.
+        output: How to talk.
+    """
+    _export(episode, out, output)
+    return 0
+
+
+def view(target: Path, /, *, out: Path | None = None, output: Output = OUTPUT) -> int:
+    """Look at an episode with its replays in Rerun's own window, or say how to where none opens.
+
+    Example: robot-gst view runs/monday
+
+    Args:
+        target: An episode file, or a run folder for its newest trial.
+        out: The .rrd file to write; beside the run's derived episodes without it.
+        output: How to talk.
+    """
+    from dashboards import rerun_viewer as viewer
+
+    episode = viewer.episode_of(target)
+    if target.is_dir():
+        output.say(f"Showing {episode.stem}, the newest of {target}; name a file for another.")
+    path = _export(episode, out or viewer.default_out(episode), output)
+    if viewer.has_display():
+        output.say(f"Opened it in Rerun's window, process {viewer.open_window(path)}.")
+    else:
+        output.say(f"No display here. On a machine with one: {viewer.how_to_open(path)}")
+    return 0
+
+
+def _export(episode: Path, out: Path, output: Output) -> Path:
+    from bridge.errors import MissingDependencyError
+
+    try:
+        from dashboards.rerun_view import export_rrd as export
+        from dashboards.rerun_view import run_of
+    except ModuleNotFoundError as error:
+        if error.name not in ("rerun", "rerun_bindings"):
+            raise
+        raise MissingDependencyError(
+            package="rerun-sdk", extra="dashboard", purpose="the Rerun view"
+        ) from error
+    done = export(episode, out, run_of(episode))
+    for note in done.notes:
+        output.say(f"Not shown: {note}")
+    text = f"{done.path}: {done.size_bytes / 1e6:.1f} MB, {', '.join(done.sides)}"
+    data = {
+        "path": str(done.path),
+        "episode": done.episode,
+        "size_bytes": done.size_bytes,
+        "sides": done.sides,
+        "cameras": done.cameras,
+        "not_shown": done.notes,
+    }
+    output.result(data, text)
+    return done.path

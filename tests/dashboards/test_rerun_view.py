@@ -182,9 +182,8 @@ def read_back(path: Path) -> dict[str, dict[str, list[object]]]:
         entity = found.setdefault(str(chunk.entity_path), {})
         batch = chunk.to_record_batch()
         for name, column in zip(batch.schema.names, batch.columns, strict=True):
-            if name == "source_time":
-                column = column.cast("int64")
-            entity.setdefault(name, []).extend(column.to_pylist())
+            values = column.cast("int64") if name == "source_time" else column
+            entity.setdefault(name, []).extend(values.to_pylist())
     return found
 
 

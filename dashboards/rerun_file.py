@@ -1,0 +1,104 @@
+"""One Rerun recording being written to a file: its only timeline is the cell's source time."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from jaxtyping import Float, Int
+
+from bridge.errors import UsageError
+from bridge.geometry.trajectory import PoseTrajectory
+from dashboards.errors import DashboardError
+
+APPLICATION = "robot-gst"
+TIMELINE = "source_time"
+FLUSH_S = 60.0
+
+
+class RerunFile:
+    """Rows go in by column, nothing is logged at wall-clock time; ``notes`` says what is not in it.
+
+    Written as ``FILE.part`` and renamed when complete.
+    """
+
+    def __init__(self, path: Path, *, recording_id: str, name: str) -> None:
+        """Open ``<path>.part``, replacing what an interrupted export left."""
+        if path.is_dir():
+            message = f"{path} is a folder. Name a file: --out {path / 'episode.rrd'}."
+            raise UsageError(message)
+        self.path = path
+        self.notes: list[str] = []
+        self._part = path.with_name(path.name + ".part")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._part.write_bytes(b"")  # say now, in one sentence, if it cannot be written
+        except OSError as error:
+            message = f"cannot write {self._part}: {error.strerror}. Choose another with --out."
+            raise DashboardError(message) from error
+        self.stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+        self.stream.save(self._part)
+        self.stream.send_recording_name(name)
+
+    def note(self, text: str) -> None:
+        """Remember something that is not shown, once."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def rows(
+        self,
+        entity: str,
+        stamps_ns: Int[np.ndarray, " num_rows"],
+        columns: Iterable[Any],
+    ) -> None:
+        """Send component columns, one row per stamp of source time [ns]."""
+        times = np.asarray(stamps_ns, dtype=np.int64).astype("datetime64[ns]")
+        index = rr.TimeColumn(TIMELINE, timestamp=times)
+        self.stream.send_columns(entity, [index], columns, strict=True)
+
+    def always(self, entity: str, *archetypes: Any) -> None:
+        """Log something that holds at all times."""
+        for archetype in archetypes:
+            self.stream.log(entity, archetype, static=True, strict=True)
+
+    def scalars(
+        self,
+        entity: str,
+        stamps_ns: Int[np.ndarray, " num_rows"],
+        values: Float[np.ndarray, " num_rows"],
+        *,
+        name: str,
+        color: tuple[int, int, int],
+        width: float,
+    ) -> None:
+        """Send one number over time, with its name in the legend."""
+        self.always(entity, rr.SeriesLines(names=[name], colors=[color], widths=[width]))
+        values = np.asarray(values, dtype=np.float64)
+        self.rows(entity, stamps_ns, rr.Scalars.columns(scalars=values))
+
+    def poses(self, entity: str, track: PoseTrajectory) -> None:
+        """Send ``T_base_entity`` over time."""
+        columns = rr.Transform3D.columns(
+            translation=track.p_m, quaternion=np.roll(track.q_wxyz, -1, axis=1)
+        )
+        self.rows(entity, track.stamps_ns, columns)
+
+    def __enter__(self) -> "RerunFile":
+        """Write inside the block."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Finish the file and give it its name; after an error remove what there is."""
+        self.stream.flush(timeout_sec=FLUSH_S)
+        self.stream.disconnect()
+        if kind is None:
+            self._part.replace(self.path)
+        else:
+            self._part.unlink(missing_ok=True)
