@@ -1,9 +1,10 @@
-"""Put one comparison on disk: results.json, tables, figures, report.html, trials.csv."""
+"""Put one comparison on disk: results.json, tables, figures, report.html, trials.csv, Parquet."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.exchange.trials_csv import write_trials
+from bridge.exchange.trials_csv import TrialRecord, write_trials
 from evaluator.compare.rows import Comparison
 from evaluator.compare.spreadsheet import record_from_row
 from evaluator.errors import EvaluatorError
@@ -13,6 +14,8 @@ from evaluator.report.tables import as_csv, as_latex, as_markdown, as_text
 from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
 
+PARQUET_PACKAGES = ("pandas", "pyarrow")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Written:
@@ -21,6 +24,8 @@ class Written:
     results: Path
     report: Path
     files: tuple[Path, ...]
+    not_written: str | None = None
+    """Why there is no Parquet beside the CSV, or None."""
 
 
 def write_report(comparison: Comparison, folder: Path) -> Written:
@@ -48,10 +53,36 @@ def write_report(comparison: Comparison, folder: Path) -> Written:
             place.write_text(text, encoding="utf-8")
         trials = [record_from_row(row) for row in comparison.rows]
         extra = [write_trials(folder / "trials.csv", trials)] if trials else []
+        parquet, reason = _write_parquet(folder, trials, results)
     except OSError as error:
         message = f"cannot write into {folder}: {error.strerror}. Choose another with --out."
         raise EvaluatorError(message) from error
-    return Written(results=path, report=folder / "report.html", files=(*texts, *extra))
+    return Written(
+        results=path,
+        report=folder / "report.html",
+        files=(*texts, *extra, *parquet),
+        not_written=reason,
+    )
+
+
+def _write_parquet(
+    folder: Path, trials: Sequence[TrialRecord], results: Results
+) -> tuple[list[Path], str | None]:
+    """Write the Parquet files, or say why not; pandas is heavy and may be missing."""
+    try:
+        from evaluator.report import parquet  # noqa: PLC0415  # loads pandas only when writing
+    except ModuleNotFoundError as error:
+        if error.name not in PARQUET_PACKAGES:
+            raise
+        reason = (
+            f"trials.parquet, measurements.parquet not written: {error.name} is not installed "
+            "(pip install 'robot-gst[report]')"
+        )
+        return [], reason
+    written = [parquet.write_measurements(folder / "measurements.parquet", results.measurements)]
+    if trials:
+        written.append(parquet.write_trials(folder / "trials.parquet", trials))
+    return written, None
 
 
 def summary_text(results: Results, written: Written) -> str:
@@ -74,5 +105,6 @@ def summary_text(results: Results, written: Written) -> str:
             parts.append(f"  and {len(results.exclusions) - 12} more in the report")
     if results.missing:
         parts.append("Missing:\n" + "\n".join(f"  {text}" for text in results.missing))
-    parts.append(f"Report: {written.report}\nNumbers: {written.results}")
+    places = f"Report: {written.report}\nNumbers: {written.results}"
+    parts.append(places if written.not_written is None else f"{places}\n{written.not_written}")
     return "\n\n".join(parts)

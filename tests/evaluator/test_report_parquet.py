@@ -1,0 +1,109 @@
+"""Parquet says what CSV and JSON say, with types; without pandas the report is still written."""
+
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from bridge.exchange.trials_csv import TrialRecord, read_trials
+from evaluator.compare import compare_run
+from evaluator.report.parquet import MEASUREMENT_TYPES, TRIAL_TYPES, write_trials
+from evaluator.report.write import summary_text, write_report
+from evaluator.result import load_results
+
+ROOT = Path(__file__).parents[2]
+
+
+def plain(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """Rows as Python values; null becomes None."""
+    rows = frame.astype(object).where(frame.notna(), None).to_dict("records")
+    return [{str(name): value for name, value in row.items()} for row in rows]
+
+
+def test_trials_read_back_are_the_trials_of_the_csv(six_trials: Any) -> None:
+    folder = six_trials.run.results_dir
+    written = write_report(compare_run(six_trials.run), folder)
+    assert folder / "trials.parquet" in written.files
+    frame = pd.read_parquet(folder / "trials.parquet", dtype_backend="numpy_nullable")
+    assert [TrialRecord(**row) for row in plain(frame)] == read_trials(folder / "trials.csv")
+    assert len(frame) == 6
+    assert frame["recorded"].dtype == "boolean"
+
+
+def test_an_unknown_answer_stays_unknown(tmp_path: Path) -> None:
+    trials = [
+        TrialRecord(trial_id="a", task="t", recorded=True, k=1, n=1, p_success=0.25),
+        TrialRecord(trial_id="b", task="t,'\n", recorded=False),
+        TrialRecord(trial_id="c", task="t", stand_in=True),
+    ]
+    frame = pd.read_parquet(
+        write_trials(tmp_path / "t.parquet", trials), dtype_backend="numpy_nullable"
+    )
+    assert [TrialRecord(**row) for row in plain(frame)] == trials
+    assert frame["recorded"].isna().tolist() == [False, False, True]
+
+
+def test_measurements_read_back_are_those_of_the_results_file(six_trials: Any) -> None:
+    folder = six_trials.run.results_dir
+    write_report(compare_run(six_trials.run), folder)
+    rows = plain(pd.read_parquet(folder / "measurements.parquet", dtype_backend="numpy_nullable"))
+    expected = load_results(six_trials.run.path).measurements
+    assert len(rows) == len(expected) > 5
+    for row, measurement in zip(rows, expected, strict=True):
+        interval = measurement.interval
+        for name in ("low", "high", "level", "method"):
+            assert row.pop(name) == (None if interval is None else getattr(interval, name))
+        assert tuple(row.pop("episodes").split()) == measurement.episodes
+        assert row == {name: getattr(measurement, name) for name in row}
+    assert any(row["value"] is None and row["reason_if_undefined"] for row in rows)
+
+
+def test_every_field_has_a_column() -> None:
+    assert list(TRIAL_TYPES) == [field.name for field in fields(TrialRecord)]
+    assert len(MEASUREMENT_TYPES) == 14
+
+
+@pytest.mark.parametrize("package", ["pandas", "pyarrow"])
+def test_without_the_package_the_report_is_written_and_says_so(
+    six_trials: Any, monkeypatch: pytest.MonkeyPatch, package: str
+) -> None:
+    for name in [name for name in sys.modules if name.startswith("evaluator.report.parquet")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delattr("evaluator.report.parquet", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Missing(package), *sys.meta_path])
+    for name in [name for name in sys.modules if name.split(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    comparison = compare_run(six_trials.run)
+    written = write_report(comparison, six_trials.run.results_dir)
+    text = summary_text(comparison.results(), written)
+    assert f"not written: {package} is not installed" in text
+    assert (six_trials.run.results_dir / "trials.csv").is_file()
+    assert not list(six_trials.run.results_dir.glob("*.parquet"))
+
+
+class Missing:
+    """An import finder that claims one package is not installed."""
+
+    def __init__(self, package: str) -> None:
+        """Remember the package."""
+        self._package = package
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> None:
+        if name.split(".")[0] == self._package:
+            message = f"No module named {name!r}"
+            raise ModuleNotFoundError(message, name=name)
+
+
+def test_pandas_is_not_loaded_before_something_is_written() -> None:
+    code = (
+        "import sys, evaluator.report.write, evaluator.compare; "
+        "print([n for n in ('pandas', 'pyarrow') if n in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stdout.strip() == "[]"
