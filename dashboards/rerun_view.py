@@ -224,7 +224,7 @@ def _camera_entities(episode: Episode, prefix: str, cameras: list[str]) -> Itera
 
 def _outcome(file: RerunFile, episode: Episode, run: RunFolder | None) -> Outcome | None:
     """Return how the episode ended; a label given after the fact counts."""
-    if run is None:
+    if run is None or episode.derived is not None:
         return episode.outcome
     try:
         return outcome_of(run, episode)

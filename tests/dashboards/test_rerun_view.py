@@ -323,6 +323,7 @@ def test_a_replay_can_be_looked_at_alone(cell_run: RunFolder, tmp_path: Path) ->
     path = cell_run.derived("*.replay.executed.*")[0]
     done = export_rrd(path, tmp_path / "replay.rrd", run_of(path))
     assert done.sides == ("replayed/executed/dynamic",)
+    assert not [note for note in done.notes if "label" in note]
 
 
 def test_a_failed_export_leaves_no_file(
