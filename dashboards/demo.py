@@ -106,7 +106,9 @@ def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
         )
     else:
         _record(run, config, output)
-    _step(output, "5/6 replaying every plan and execution in PyBullet", ["replay", str(path)])
+    workers = str(min(4, os.cpu_count() or 1))
+    replay = ["replay", str(path), "--workers", workers]
+    _step(output, "5/6 replaying every plan and execution in PyBullet", replay)
     _step(output, "6/6 evaluating", ["evaluate", str(path)], show_result=True)
     seconds = time.monotonic() - started
     _close(run, config, output, seconds)
@@ -144,6 +146,7 @@ def _command(arguments: list[str]) -> list[str]:
 
 def _step(output: Output, label: str, arguments: list[str], *, show_result: bool = False) -> None:
     output.say(label)
+    started = time.monotonic()
     quiet = ["--quiet"] if output.quiet else []
     stdout = None if show_result and not output.json else subprocess.DEVNULL
     done = subprocess.run(_command([*arguments, *quiet]), stdout=stdout, check=False)
@@ -151,6 +154,7 @@ def _step(output: Output, label: str, arguments: list[str], *, show_result: bool
         raise StepFailedError(
             command=f"robot-gst {' '.join(arguments)}", code=done.returncode, log=None
         )
+    output.say(f"    {time.monotonic() - started:.0f} s: robot-gst {' '.join(arguments)}")
 
 
 def _start(arguments: list[str], log: Path) -> Background:
