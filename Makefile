@@ -34,10 +34,10 @@ demo: $(READY)
 	@$(BIN)/robot-gst demo $(RUN) $(DEMO)
 
 test: $(READY)
-	@$(BIN)/python -m pytest -q -m "not gpu and not hardware and not network" $(TEST)
+	@$(BIN)/python -m pytest -q -n 2 --dist loadfile -m "not gpu and not hardware and not network" $(TEST)
 
 fast: $(READY)
-	@$(BIN)/python -m pytest -q $(TEST)
+	@$(BIN)/python -m pytest -q -n 2 --dist loadfile $(TEST)
 
 check: $(READY)
 	@$(BIN)/ruff check .
