@@ -22,7 +22,8 @@ from bridge.exchange.kinova import (
 )
 from bridge.geometry import se3
 
-DATA = Path(os.environ.get("GST_SHARED_DATA", "/work/shared/data"))
+BESIDE = Path(__file__).parents[4] / "shared" / "data"
+DATA = Path(os.environ.get("GST_SHARED_DATA", BESIDE))
 FOLDER = DATA / "robot_realitygap_kinova_real_vs_sim"
 needs_data = pytest.mark.skipif(
     not FOLDER.is_dir(), reason=f"{FOLDER} is not on this machine (set GST_SHARED_DATA)"

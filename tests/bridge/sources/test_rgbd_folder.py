@@ -32,7 +32,8 @@ from bridge.sources.folder import folder_messages
 from bridge.sources.folder_config import FolderConfig
 from bridge.sources.folder_index import read_index
 
-DATA = Path(os.environ.get("GST_SHARED_DATA", "/work/shared/data"))
+BESIDE = Path(__file__).parents[4] / "shared" / "data"
+DATA = Path(os.environ.get("GST_SHARED_DATA", BESIDE))
 KITCHEN = DATA / "rgbd_7scenes_redkitchen_a"
 SHELF = DATA / "rgbd_apc_shelf_wristcam"
 WIDTH, HEIGHT = 8, 6

@@ -86,7 +86,7 @@ def task() -> Task:
 
 
 @pytest.fixture(scope="session")
-def test_seed(cell_file: CellFile) -> int:
+def reserved_seed(cell_file: CellFile) -> int:
     return cell_file.test_seeds[0]
 
 
@@ -96,20 +96,20 @@ def nominal(cell_file: CellFile) -> HiddenParameters:
 
 
 @pytest.fixture(scope="session")
-def starts(task: Task, test_seed: int) -> dict[str, np.ndarray]:
-    poses = task.draw_start(np.random.default_rng(test_seed))
+def starts(task: Task, reserved_seed: int) -> dict[str, np.ndarray]:
+    poses = task.draw_start(np.random.default_rng(reserved_seed))
     for T in poses.values():
         T.flags.writeable = False
     return poses
 
 
 @pytest.fixture(scope="session")
-def make_cell(cell_file: CellFile, task: Task, test_seed: int) -> Callable[..., StandinCell]:
+def make_cell(cell_file: CellFile, task: Task, reserved_seed: int) -> Callable[..., StandinCell]:
     def make(
         session: FakeSession,
         *,
         hidden: HiddenParameters | None = None,
-        seed: int = test_seed,
+        seed: int = reserved_seed,
         rate_hz: float = 0.0,
         **more: object,
     ) -> StandinCell:
