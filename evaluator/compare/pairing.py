@@ -2,12 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from evaluator.compare.measure import measured, proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import WITH, WITHOUT
+from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Exclusion, Measurement
 from evaluator.statistics.agreement import Confusion, mcnemar, phi
 
@@ -21,14 +24,26 @@ def agreement(rows: Sequence[TrialRow]) -> list[Measurement]:
     for name, said, words in (
         ("sim_planned", lambda row: row.sim_planned, "planned-in-twin (dynamic, of the sent plan)"),
         ("verdict", lambda row: row.verdict, "the verdict before motion"),
-        (
-            "sim_executed",
-            lambda row: row.sim_executed,
-            "executed-in-twin (diagnosis only)",
-        ),
+        ("sim_executed", lambda row: row.sim_executed, "executed-in-twin (diagnosis only)"),
     ):
         measurements.extend(_agreement_of(rows, name, said, words))
+    if any(unheeded_verdict(row) is not None for row in rows):
+        words = "the verdict before motion, recorded and not obeyed (without replanning)"
+        measurements.extend(_agreement_of(rows, "verdict_unheeded", unheeded_verdict, words))
     return measurements
+
+
+def unheeded_verdict(row: TrialRow) -> bool | None:
+    """The gate's verdict where it decided nothing: a refused plan was executed all the same.
+
+    Only these trials can show a false refusal, and only they are not selected by the gate.
+    """
+    return row.verdict if row.condition == WITHOUT else None
+
+
+def heeded_verdict(row: TrialRow) -> bool | None:
+    """The gate's verdict where it selected the plan: refused plans were never executed."""
+    return row.verdict if row.condition == WITH else None
 
 
 def _agreement_of(
@@ -150,6 +165,36 @@ def start_distance_m(first: TrialRow, second: TrialRow) -> float | None:
         )
         for name in shared
     )
+
+
+def start_distances(pairs: Sequence[StartPair]) -> list[Measurement]:
+    """Measure how far apart paired starts were, where both were localised."""
+    known = [pair for pair in pairs if pair.start_distance_m is not None]
+    distances = [pair.start_distance_m for pair in known if pair.start_distance_m is not None]
+    unknown = len(pairs) - len(known)
+    return [
+        measured(
+            f"paired.start_distance_{name}_m",
+            partial(_summary_m, summary, distances),
+            unit="m",
+            definition=f"{name} over paired starts of the largest distance between the localised "
+            f"objects of both trials; pairs beyond {START_LIMIT_M * 1000:.0f} mm are excluded, "
+            f"{unknown} of {len(pairs)} pairs were not localised and are kept",
+            n=len(known),
+            counted="pair",
+            reason_without_interval="the limit is what counts",
+            episodes=[r.episode for pair in known for r in (pair.before, pair.after)],
+        )
+        for name, summary in (("mean", np.mean), ("max", np.max))
+    ]
+
+
+def _summary_m(summary: Callable[..., np.floating[Any]], distances: Sequence[float]) -> float:
+    if not distances:
+        raise UndefinedStatisticError(
+            statistic="start distance", reason="no pair of starts was localised in both trials"
+        )
+    return float(summary(distances))
 
 
 def paired_gain(pairs: Sequence[StartPair]) -> list[Measurement]:

@@ -80,7 +80,7 @@ def find_replay(
             "differs); replay it again"
         )
         return Replay(file=None, verdict=None, reason=reason)
-    file = max(current, key=lambda item: (item.path.stat().st_mtime_ns, item.path.name))
+    file = max(current, key=_age)
     try:
         said = verdicts(file.episode)
     except BridgeError as error:
@@ -93,6 +93,22 @@ def find_replay(
         why = mine[-1].reason or _undecided(mine[-1])
         undecided = f"the twin could not decide the {trajectory} replay: {why}"
     return Replay(file=file, verdict=mine[-1], reason=undecided)
+
+
+def localised_of(files: Sequence[DerivedFile], *, source: str, source_sha256: str) -> list[Episode]:
+    """The newest localisation of a recorded episode, in a list; empty when there is none."""
+    made = [
+        file
+        for file in files
+        if file.derived.kind == "localised"
+        and file.derived.source_episode == source
+        and file.derived.source_sha256 in ("", source_sha256)
+    ]
+    return [max(made, key=_age).episode] if made else []
+
+
+def _age(file: DerivedFile) -> tuple[int, str]:
+    return file.path.stat().st_mtime_ns, file.path.name
 
 
 def _undecided(verdict: Verdict) -> str:

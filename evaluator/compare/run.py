@@ -4,18 +4,25 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from bridge.episode.provenance import software
+from bridge.episode.provenance import hash_file, software
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.errors import BridgeError, GstError
 from evaluator.compare.bands import compare_bands
-from evaluator.compare.pairing import START_LIMIT_M, agreement, pair_starts, paired_gain
+from evaluator.compare.pairing import (
+    START_LIMIT_M,
+    agreement,
+    pair_starts,
+    paired_gain,
+    start_distances,
+)
 from evaluator.compare.replays import DerivedFile, read_derived
 from evaluator.compare.rows import Comparison, TrialRow
 from evaluator.compare.success import (
     WITH,
     WITHOUT,
     cell_agreement,
+    never_sent,
     rate_cells,
     replanning_gains,
     side_rates,
@@ -44,12 +51,13 @@ def compare_run(run: RunFolder) -> Comparison:
     recorded, left_out = _read_recorded(run)
     files, broken = read_derived(run)
     left_out += broken
+    hashes = {episode.path: hash_file(episode.path) for episode in recorded}
     rows = []
     for episode in recorded:
         if episode.info.kind != "trial":
             continue
         try:
-            row, lacking = read_trial(run, episode, files)
+            row, lacking = read_trial(run, episode, files, sha256=hashes[episode.path])
         except GstError as error:
             left_out.append(_broken(episode.info.id, error))
             continue
@@ -70,9 +78,10 @@ def compare_run(run: RunFolder) -> Comparison:
         provenance={
             "software": software(),
             "start_limit_m": START_LIMIT_M,
-            "episodes": [_name_of(episode.path, run) for episode in recorded],
+            "episodes": {_name_of(path, run): sha256 for path, sha256 in hashes.items()},
             "derived": {
                 _name_of(file.path, run): {
+                    "sha256": hash_file(file.path),
                     "source_sha256": file.derived.source_sha256,
                     "scene_hash": file.derived.scene_hash,
                     "engine": file.derived.engine,
@@ -101,6 +110,8 @@ def compare_rows(
         *cell_agreement(cells),
         *gains,
         *paired_gain(pairs),
+        *start_distances(pairs),
+        *never_sent(rows),
         *(tcp_measurements(rows) if any(row.tcp_errors for row in rows) else ()),
     ]
     tables: tuple[Table, ...] = (

@@ -15,7 +15,8 @@ WITHOUT = "without_replanning"
 WITH = "with_replanning"
 
 SIM_DEFINITION = (
-    "successes / trials in the twin: the plan actually sent, planned trajectory, dynamic replay"
+    "successes / trials in the twin: the plan actually sent, planned trajectory, dynamic replay; "
+    "with replanning the twin itself selected these plans"
 )
 EXECUTED_DEFINITION = (
     "successes / trials in the twin: the executed joints re-lived dynamically; diagnosis only, "
@@ -23,7 +24,7 @@ EXECUTED_DEFINITION = (
 )
 VERDICT_DEFINITION = (
     "plans accepted / plans judged: the gate's verdict on the plan actually sent, before motion; "
-    "with replanning the twin itself selected these plans"
+    "without replanning it was recorded and not obeyed, with replanning it selected these plans"
 )
 
 SIDES: tuple[tuple[str, Callable[[TrialRow], bool | None], str], ...] = (
@@ -80,6 +81,27 @@ def _object_rate(key: tuple[str, str, str], members: Sequence[TrialRow]) -> list
             counted=unit,
             reason_if_undefined="no counts",
             episodes=[row.episode for row in counted],
+        )
+    ]
+
+
+def never_sent(rows: Sequence[TrialRow]) -> list[Measurement]:
+    """Count the plans that were published and never executed; a trials CSV does not say."""
+    planned = [row for row in rows if row.num_plans]
+    if not planned:
+        return []
+    made = sum(row.num_plans for row in planned)
+    return [
+        measured(
+            "plans.never_sent",
+            lambda: float(made - sum(row.num_plans_sent for row in planned)),
+            unit="count",
+            definition="plans that were published and never executed, of all plans published; "
+            "they are part of no rate",
+            n=made,
+            counted="plan",
+            reason_without_interval="a count",
+            episodes=[row.episode for row in planned],
         )
     ]
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from evaluator.compare.pairing import confusion_of
+from evaluator.compare.pairing import confusion_of, heeded_verdict, unheeded_verdict
 from evaluator.compare.rows import RateCell, TrialRow
 from evaluator.result import Measurement, Table
 
@@ -21,7 +21,13 @@ def shown_rate(measurement: Measurement) -> str:
     return text
 
 
-SIM_NOTE = "sim: planned-in-twin, dynamic, of the plan actually sent."
+SIM_NOTE = (
+    "sim: planned-in-twin, dynamic, of the plan actually sent, replayed from the start localised "
+    "again in the recording. With replanning the twin selected the accepted plans, so their sim is "
+    "optimistic by that selection: the replay has the gate's engine and nominal physics and draws "
+    "nothing new; an estimate with fresh seeds is not made yet. A trial in which no plan was sent "
+    "has an outcome and no sim."
+)
 
 
 def success_table(cells: Sequence[RateCell], word: str, sim_note: str = SIM_NOTE) -> Table:
@@ -143,6 +149,8 @@ def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
     for name, said in (
         ("sim planned", lambda row: row.sim_planned),
         ("verdict before motion", lambda row: row.verdict),
+        ("- not obeyed (without replanning)", unheeded_verdict),
+        ("- obeyed (with replanning)", heeded_verdict),
         ("sim executed (diagnosis)", lambda row: row.sim_executed),
     ):
         counts = confusion_of(rows, said)
@@ -168,6 +176,10 @@ def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
             "trials",
         ),
         rows=tuple(lines),
+        note="Trials with a known outcome in which a plan was executed. Said failure by a verdict "
+        "before motion: the gate refused the plan and it was executed anyway, because its answer "
+        "was only recorded. With replanning refused plans are not executed, so the gate's misses "
+        "there show and its false refusals cannot.",
     )
 
 

@@ -43,7 +43,7 @@ def tcp_measurements(rows: Sequence[TrialRow]) -> list[Measurement]:
                     f"same instants ({meaning}): {words}, mean over trials",
                     n=len(found),
                     counted="trial",
-                    reason_without_interval="spread over trials is in the trial rows",
+                    reason_without_interval="not computed: trials share one calibration",
                     episodes=[episode for episode, _ in found],
                 )
             )

@@ -1,7 +1,7 @@
 """Read one recorded trial: which plan was sent, what the gate had said, how it ended."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -9,7 +9,6 @@ from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.metadata import Outcome
-from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.episode.streams import localisations, pose_track
@@ -18,14 +17,12 @@ from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan
 from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
-from evaluator.compare.replays import DerivedFile, Replay, find_replay
+from evaluator.compare.replays import DerivedFile, Replay, find_replay, localised_of
 from evaluator.compare.rows import TcpErrorSeries, TrialRow
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.trajectory import pose_errors
 from evaluator.result import Exclusion
 
-SERIES_SAMPLES = 400
-"""A stored error series is thinned to about this many samples."""
 SAME_CLOCK_NS = 2 * NS_PER_S
 """A replay whose stamps start this close to the execution uses the cell's clock."""
 
@@ -38,17 +35,25 @@ class _Log:
     sent: list[str] = field(default_factory=list)
     started_ns: int | None = None
     ended_ns: int | None = None
+    first_start_ns: dict[str, int] = field(default_factory=dict)
+    """When each plan's first execution started, on the cell's clock."""
     verdicts: dict[str, Verdict] = field(default_factory=dict)
-    """The last verdict on each plan that arrived before its execution started."""
+    """The last verdict on each plan that was made before its execution started."""
     label: Outcome | None = None
 
 
 def read_trial(
-    run: RunFolder, episode: Episode, files: Sequence[DerivedFile]
+    run: RunFolder, episode: Episode, files: Sequence[DerivedFile], *, sha256: str
 ) -> tuple[TrialRow, list[Exclusion]]:
     """Build the row of one recorded trial, and list what it lacks.
 
     A label given after the fact (``robot-gst label``) overrides the one in the episode.
+
+    Args:
+        run: Where labels given afterwards lie.
+        episode: The recorded trial.
+        files: Every derived episode of the run.
+        sha256: Content hash of the recorded episode; what was made from other bytes is stale.
 
     Raises:
         GstError: When the episode, or its label, is damaged.
@@ -60,9 +65,20 @@ def read_trial(
     if not log.sent:
         lacking.append("no execution_started event: no plan was sent")
     else:
-        planned, executed = _replays(episode, files, log.sent[-1])
+        planned, executed = (
+            find_replay(
+                files,
+                source=episode.info.id,
+                source_sha256=sha256,
+                plan_id=log.sent[-1],
+                trajectory=trajectory,
+            )
+            for trajectory in ("planned", "executed")
+        )
         lacking += [] if planned.reason is None else [planned.reason]
     row = _row(episode, log, outcome, planned, executed)
+    starts = [episode, *localised_of(files, source=episode.info.id, source_sha256=sha256)]
+    row = replace(row, start_positions_m=_start_positions(starts, log.started_ns))
     return row, [
         Exclusion(episode=row.episode, scope="agreement", reason=reason) for reason in lacking
     ]
@@ -75,21 +91,6 @@ def _unlabelled(outcome: Outcome | None) -> list[str]:
         why = f": {outcome.detail}" if outcome.detail else ""
         return [f"the outcome is labelled unknown{why}"]
     return []
-
-
-def _replays(episode: Episode, files: Sequence[DerivedFile], plan_id: str) -> tuple[Replay, Replay]:
-    sha = hash_file(episode.path)
-    planned, executed = (
-        find_replay(
-            files,
-            source=episode.info.id,
-            source_sha256=sha,
-            plan_id=plan_id,
-            trajectory=trajectory,
-        )
-        for trajectory in ("planned", "executed")
-    )
-    return planned, executed
 
 
 def _row(
@@ -125,7 +126,6 @@ def _row(
         executed_replay=None if executed.file is None else executed.file.path.name,
         path=episode.path,
         tcp_errors=_tcp_errors(episode, log, planned, executed),
-        start_positions_m=_start_positions(episode, log.started_ns),
     )
 
 
@@ -141,7 +141,10 @@ def _read_log(episode: Episode) -> _Log:
             log.plan_ids.append(Plan.from_json(message.data).id)
         elif message.type_name == schema.VERDICT:
             said = Verdict.from_json(message.data)
-            if said.plan_id not in log.sent and said.trajectory == "planned":
+            # It may arrive late over its own connection; its stamp is the cell's time.
+            started_ns = log.first_start_ns.get(said.plan_id)
+            in_time = started_ns is None or message.publish_time_ns < started_ns
+            if in_time and said.trajectory == "planned":
                 log.verdicts[said.plan_id] = said
         else:
             _note_event(log, parse_record(message.data, name="event", package="bridge.episode"))
@@ -153,6 +156,7 @@ def _note_event(log: _Log, event: dict[str, object]) -> None:
     if event["type"] == "execution_started" and isinstance(plan_id, str):
         log.sent.append(plan_id)
         log.started_ns, log.ended_ns = int(str(stamp_ns)), None
+        log.first_start_ns.setdefault(plan_id, log.started_ns)
     elif event["type"] == "execution_ended" and log.sent and plan_id == log.sent[-1]:
         log.ended_ns = int(str(stamp_ns))
     elif event["type"] == "label":
@@ -181,10 +185,11 @@ def _failing_detail(verdict: Verdict | None) -> str | None:
 
 
 def _start_positions(
-    episode: Episode, started_ns: int | None
+    episodes: Sequence[Episode], started_ns: int | None
 ) -> dict[str, tuple[float, float, float]]:
+    """Where objects were last localised before the start; later episodes overrule earlier ones."""
     found: dict[str, tuple[float, float, float]] = {}
-    for record in localisations(episode):
+    for record in (record for episode in episodes for record in localisations(episode)):
         pose = record.get("T_base_object")
         if not record["found"] or pose is None:
             continue
@@ -228,13 +233,12 @@ def _tcp_errors(
             errors = pose_errors(recorded, track)
         except UndefinedStatisticError:
             continue
-        step = max(1, len(errors.stamps_ns) // SERIES_SAMPLES)
         series.append(
             TcpErrorSeries(
                 against=against,
-                t_s=(errors.stamps_ns[::step] - log.started_ns) / NS_PER_S,
-                position_m=errors.position_m[::step],
-                rotation_rad=errors.rotation_rad[::step],
+                t_s=(errors.stamps_ns - log.started_ns) / NS_PER_S,
+                position_m=errors.position_m,
+                rotation_rad=errors.rotation_rad,
             )
         )
     return tuple(series)

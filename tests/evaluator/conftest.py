@@ -77,12 +77,14 @@ class RunMaker:
         start_id: str | None = "s1",
         gate: bool | str | None = "none",
         late_gate: bool | str | None = "none",
+        late_gate_made_ns: int | None = None,
         sent: bool = True,
         stand_in: bool = True,
         kind: str = "trial",
         offset_m: float = 0.0,
         tags: tuple[str, ...] = (),
         localised_m: float | None = None,
+        num_poses: int = NUM_POSES,
     ) -> str:
         """Write one recorded trial; the plan is named after it. Returns the plan's id."""
         info = EpisodeInfo(
@@ -102,20 +104,7 @@ class RunMaker:
             writer.describe(info, outcome=outcome)
             log = _Log(writer)
             if localised_m is not None:
-                pose = {"p_m": [localised_m, 0.0, 0.02], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}
-                log.json(
-                    "/standin/localisation",
-                    schema.LOCALISATION,
-                    {
-                        "schema_version": 1,
-                        "stamp_ns": START_NS - 5 * STEP_NS,
-                        "object": "cube",
-                        "found": True,
-                        "T_base_object": pose,
-                        "method": "test",
-                    },
-                    START_NS - 5 * STEP_NS,
-                )
+                log.localised(localised_m)
             plan = plan_of(plan_id)
             log.raw("/standin/plan", schema.PLAN, plan.to_json(), START_NS - 2 * STEP_NS)
             never_sent = plan_of(f"{plan_id}_unsent")
@@ -129,11 +118,31 @@ class RunMaker:
             if late_gate != "none":
                 assert not isinstance(late_gate, str)
                 said = verdict_of(late_gate, plan_id=plan_id).to_json()
-                log.raw("/standin/verdict", schema.VERDICT, said, START_NS + STEP_NS)
-            log.poses("/standin/tcp/pose", START_NS, offset_m)
+                writer.write(
+                    "/standin/verdict",
+                    said,
+                    type_name=schema.VERDICT,
+                    log_time_ns=START_NS + STEP_NS,
+                    publish_time_ns=late_gate_made_ns or START_NS + STEP_NS,
+                )
+            log.poses("/standin/tcp/pose", START_NS, offset_m, num_poses)
             if sent:
-                log.event("execution_ended", plan_id, START_NS + NUM_POSES * STEP_NS)
+                log.event("execution_ended", plan_id, START_NS + num_poses * STEP_NS)
         return plan_id
+
+    def localised(self, name: str, x_m: float, *, source_sha256: str | None = None) -> Path:
+        """Write what the twin localised in a trial before its execution."""
+        source = self.run.episodes_dir / f"{name}.mcap"
+        path = self.run.derived_dir / f"{name}.localised.noscene.mcap"
+        derived = Derived(
+            kind="localised",
+            source_episode=name,
+            source_sha256=source_sha256 or hash_file(source),
+        )
+        with EpisodeWriter(path) as writer:
+            writer.describe(EpisodeInfo(id=name, kind="trial"), derived=derived)
+            _Log(writer).localised(x_m)
+        return path
 
     def replay(
         self,
@@ -147,6 +156,8 @@ class RunMaker:
         plan_id: str | None = None,
         source_sha256: str | None = None,
         tag: str = "a",
+        num_poses: int = NUM_POSES,
+        astray: int | None = None,
     ) -> Path:
         """Write one derived replay of a trial."""
         source = self.run.episodes_dir / f"{name}.mcap"
@@ -169,7 +180,7 @@ class RunMaker:
             log = _Log(writer)
             said = verdict_of(accepted, plan_id=plan_id, trajectory=trajectory)
             log.raw("/standin/verdict", schema.VERDICT, said.to_json(), start_ns)
-            log.poses("/standin/tcp/pose", start_ns, offset_m)
+            log.poses("/standin/tcp/pose", start_ns, offset_m, num_poses, astray)
         return path
 
 
@@ -187,10 +198,24 @@ class _Log:
         record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, "plan_id": plan_id}
         self.json("/standin/event", schema.EVENT, record, stamp_ns)
 
-    def poses(self, topic: str, start_ns: int, offset_m: float) -> None:
-        for index in range(NUM_POSES):
+    def localised(self, x_m: float) -> None:
+        stamp_ns = START_NS - 5 * STEP_NS
+        record = {
+            "schema_version": 1,
+            "stamp_ns": stamp_ns,
+            "object": "cube",
+            "found": True,
+            "T_base_object": {"p_m": [x_m, 0.0, 0.02], "q_wxyz": [1.0, 0.0, 0.0, 0.0]},
+            "method": "test",
+        }
+        self.json("/standin/localisation", schema.LOCALISATION, record, stamp_ns)
+
+    def poses(
+        self, topic: str, start_ns: int, offset_m: float, count: int, astray: int | None = None
+    ) -> None:
+        for index in range(count):
             T = np.eye(4)
-            T[:3, 3] = 0.4 + 0.01 * index, offset_m, 0.2
+            T[:3, 3] = 0.4 + 0.01 * index, 1.0 if index == astray else offset_m, 0.2
             stamp_ns = start_ns + index * STEP_NS
             pose = PoseSample(stamp_ns=stamp_ns, frame_id="base_link", T_frame_body=T)
             self.raw(topic, schema.POSE_STAMPED, pose.to_cdr(), stamp_ns)

@@ -152,27 +152,6 @@ def test_tool_error_is_measured_at_matching_instants(maker: Any, start_ns: int) 
     assert series[0].t_s[-1] == pytest.approx(1.0)
 
 
-def test_starts_localised_far_apart_are_not_paired(maker: Any) -> None:
-    for name, condition, x_m in (
-        ("a", "without_replanning", 0.4),
-        ("b", "with_replanning", 0.45),
-    ):
-        maker.trial(name, condition=condition, localised_m=x_m)
-        maker.replay(name)
-    comparison = compare_run(maker.run)
-    assert "50 mm apart, limit 30 mm" in reasons(comparison, "a")
-    assert comparison.results().get("paired.mcnemar_p_mid.recorded").n == 0
-
-
-def test_a_start_used_twice_in_one_condition_is_not_paired(maker: Any) -> None:
-    for name in ("a", "b"):
-        maker.trial(name)
-        maker.replay(name)
-    maker.trial("c", condition="with_replanning")
-    maker.replay("c")
-    assert "has 2 without and 1 with" in reasons(compare_run(maker.run), "a")
-
-
 def test_a_broken_file_is_left_out_and_named(six_trials: Any) -> None:
     (six_trials.run.episodes_dir / "broken.mcap").write_bytes(b"\x89MCAP0\r\nnot really")
     (six_trials.run.derived_dir / "broken.replay.mcap").write_bytes(b"")
