@@ -9,7 +9,7 @@ import re
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Protocol, runtime_checkable
@@ -29,18 +29,11 @@ from bridge.terminal import Output, stop_signals
 from bridge.wire.config import DEFAULT_ENDPOINT, WireConfig
 from twin.errors import TwinError
 from twin.replay.config import ReplayConfig
-from twin.scene.settings import parse_duration_s
+from twin.scene.settings import convert_duration
 
 ENGINE_NONE = "none"
 CELL_NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
 POLL_S = 0.05
-
-
-def _convert_duration(_type: Any, tokens: Sequence[Any]) -> float:
-    try:
-        return parse_duration_s(tokens[0].value)
-    except GstError as error:
-        raise ValueError(str(error)) from error
 
 
 @Parameter(name="*")
@@ -54,7 +47,7 @@ class GateConfig:
     """Whose plans are judged: topics and the service are below this name."""
     task: str = "cube_into_box"
     """The task whose objects and success predicate count."""
-    deadline_s: Annotated[float, Parameter(name="--deadline", converter=_convert_duration)] = 20.0
+    deadline_s: Annotated[float, Parameter(name="--deadline", converter=convert_duration)] = 20.0
     """Answer after this long at the latest: 20s, 1min or plain seconds."""
     waiting: int = 4
     """Plans that may wait while one is judged; more are turned away at once."""
@@ -160,7 +153,12 @@ class Gate:
 
         # A replay cannot be interrupted: past the deadline it finishes unheard, and until then
         # holds the turn. A daemon thread does not keep the process from ending.
-        threading.Thread(target=work, name=f"judge {plan.id}", daemon=True).start()
+        worker = threading.Thread(target=work, name=f"judge {plan.id}", daemon=True)
+        try:
+            worker.start()
+        except RuntimeError as error:
+            self._turn.release()
+            return no_verdict(plan, f"no thread to judge it in: {error}")
         try:
             return answers.get(timeout=max(0.0, ends - time.monotonic()))
         except queue.Empty:
@@ -252,19 +250,12 @@ def robot_name(urdf: str) -> str:
     return found[1] if found else ""
 
 
-def scene_hash_of(run: RunFolder) -> str | None:
-    """Hash of the run's rebuilt scene, None when there is none."""
-    from twin.scene.store import read_record  # noqa: PLC0415
-
-    record = read_record(run)
-    return None if record is None else str(record["scene_hash"])
-
-
 def make_gate(run: RunFolder, config: GateConfig, eyes: Eyes, now_ns: Callable[[], int]) -> Gate:
     """Put the real localisation and replay behind the gate; imports what is heavy."""
     from twin.replay.rollout import replay_plan  # noqa: PLC0415  # seconds of imports
     from twin.replay.scene import ReplayScene  # noqa: PLC0415
     from twin.scene.localise import localise_objects  # noqa: PLC0415
+    from twin.scene.store import scene_hash_of  # noqa: PLC0415
 
     task = load_task(config.task)
 

@@ -17,6 +17,8 @@ _PLATEAU_M = 0.002
 """A finger distance this close to the smallest one of a grasp belongs to the grasp."""
 _LATENESS_NS = 2_000_000_000
 """An execution may lag behind its plan by up to this long."""
+_LARGEST_GAP_NS = 500_000_000
+"""Joints that were not recorded for longer than this are not made up."""
 
 
 def path_of_execution(
@@ -30,7 +32,7 @@ def path_of_execution(
     recorded width.
 
     Raises:
-        UnusablePlanError: When a track is empty or names other joints.
+        UnusablePlanError: When a track is empty, has gaps or names other joints.
     """
     if len(track.stamps_ns) == 0 or len(widths.stamps_ns) == 0:
         raise UnusablePlanError(
@@ -38,6 +40,7 @@ def path_of_execution(
             found="was executed without recorded joints or gripper",
             hint="Record /joint_states and /gripper/state over the whole execution.",
         )
+    _check_gaps(track, plan)
     missing = [name for name in ARM_JOINTS if name not in track.names]
     if missing:
         raise UnusablePlanError(
@@ -58,6 +61,45 @@ def path_of_execution(
         width_times_ns=width_times,
         width_m=np.where(closed, np.maximum(width - squeeze_m, 0.0), width),
         first_close_ns=_first_close(width_times, width),
+    )
+
+
+def cut_track(track: JointTrack, start_ns: int, end_ns: int) -> JointTrack:
+    """The samples of an interval, with the track's value at its very start put first.
+
+    A sample at the end is not made up: where the recording stops early, so does the track.
+    """
+    inside = (track.stamps_ns > start_ns) & (track.stamps_ns <= end_ns)
+    return JointTrack(
+        names=track.names,
+        stamps_ns=np.concatenate([[start_ns], track.stamps_ns[inside]]),
+        position=np.concatenate([track.at(np.array([start_ns])), track.position[inside]]),
+    )
+
+
+def check_covers(track: JointTrack, end_ns: int, plan: Plan) -> None:
+    """Refuse a track that stops well before the execution ended.
+
+    Raises:
+        UnusablePlanError: Saying how much is missing.
+    """
+    missing_ns = end_ns - int(track.stamps_ns[-1])
+    if missing_ns > _LARGEST_GAP_NS:
+        raise _not_recorded(plan, missing_ns, "at its end")
+
+
+def _check_gaps(track: JointTrack, plan: Plan) -> None:
+    gaps_ns = np.diff(track.stamps_ns)
+    if len(gaps_ns) and int(gaps_ns.max()) > _LARGEST_GAP_NS:
+        at_s = int(track.stamps_ns[int(gaps_ns.argmax())] - track.stamps_ns[0]) * 1e-9
+        raise _not_recorded(plan, int(gaps_ns.max()), f"from {at_s:.1f} s on")
+
+
+def _not_recorded(plan: Plan, missing_ns: int, where: str) -> UnusablePlanError:
+    return UnusablePlanError(
+        plan_id=plan.id,
+        found=f"was executed while no joints were recorded for {missing_ns * 1e-9:.1f} s {where}",
+        hint="Record /joint_states without gaps over the whole execution.",
     )
 
 

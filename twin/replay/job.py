@@ -5,27 +5,24 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bridge.episode import schema, streams
 from bridge.episode.metadata import Derived
 from bridge.episode.provenance import hash_settings
 from bridge.episode.reader import Episode
-from bridge.episode.streams import JointTrack
 from bridge.errors import EpisodeError, GstError
 from bridge.task.plan import Plan
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Verdict
 from twin.physics.engine import ENGINE, ENGINE_VERSION
 from twin.replay.config import ReplayConfig
-from twin.replay.execution import stages_as_executed
+from twin.replay.execution import check_covers, cut_track, stages_as_executed
 from twin.replay.files import ReplayOrigin, write_replay
 from twin.replay.result import ReplayResult
 from twin.replay.rollout import KINEMATIC_ENGINE, replay_joints, replay_plan
 from twin.replay.scene import ReplayScene
 from twin.replay.starts import StartState
 
-REPLAY_VERSION = 1
+REPLAY_VERSION = 2
 """Raise it when the same inputs give another replay, so that old files are redone."""
 
 
@@ -77,7 +74,7 @@ class ReplayJob:
             "plan_index": self.plan_index,
             "start_ns": self.start_ns,
             "scene_hash": self.scene_hash,
-            "task": self.task,
+            "task": asdict(load_task(self.task)),
             "Ts_base_object": {name: T.tolist() for name, T in self.start.Ts_base_object.items()},
             "config": asdict(self.config),
         }
@@ -181,8 +178,9 @@ def _replay(job: ReplayJob) -> Verdict:
 def _run(job: ReplayJob, episode: Episode, plan: Plan, scene: ReplayScene) -> ReplayResult:
     if job.trajectory == "planned" or job.end_ns is None:
         return replay_plan(plan, scene, job.config)
-    arm = _cut(streams.joint_track(episode), job.start_ns, job.end_ns)
-    widths = _cut(streams.joint_track(episode, "/gripper/state"), job.start_ns, job.end_ns)
+    arm = cut_track(streams.joint_track(episode), job.start_ns, job.end_ns)
+    check_covers(arm, job.end_ns, plan)
+    widths = cut_track(streams.joint_track(episode, "/gripper/state"), job.start_ns, job.end_ns)
     return replay_joints(arm, widths, scene, job.config, plan=plan)
 
 
@@ -203,16 +201,6 @@ def _recorded_grips(
         (int(event["stamp_ns"]) - start_ns, str(event.get("text") or ""))
         for event in events
         if event["type"] == "gripper" and event.get("plan_id") == plan.id
-    )
-
-
-def _cut(track: JointTrack, start_ns: int, end_ns: int) -> JointTrack:
-    """The samples of an interval, with the track's value at its very start put first."""
-    inside = (track.stamps_ns > start_ns) & (track.stamps_ns <= end_ns)
-    return JointTrack(
-        names=track.names,
-        stamps_ns=np.concatenate([[start_ns], track.stamps_ns[inside]]),
-        position=np.concatenate([track.at(np.array([start_ns])), track.position[inside]]),
     )
 
 

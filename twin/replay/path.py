@@ -142,6 +142,13 @@ def _check_usable(plan: Plan) -> None:
             found="has poses that are not finite, or quaternions that are zero",
             hint="Send p_m in metres and q_wxyz of unit length.",
         )
+    commands = [value for w in plan.tau for value in (w.width_m, *(w.joints_rad or ()))]
+    if not np.all(np.isfinite([value for value in commands if value is not None])):
+        raise UnusablePlanError(
+            plan_id=plan.id,
+            found="has joints or gripper widths that are not finite",
+            hint="Send joints_rad and width_m as numbers, or leave them out.",
+        )
     if plan.frame != BASE_FRAME:
         raise UnusablePlanError(
             plan_id=plan.id,
@@ -162,7 +169,9 @@ Target = tuple[int, Float[np.ndarray, "4 4"], Float[np.ndarray, " num_joints"] |
 def _targets(plan: Plan, config: ReplayConfig) -> list[Target]:
     """Waypoints, and where joints are not given the poses on the straight line between them."""
     times = plan.times_ns()
-    poses = PoseTrajectory(times, plan.positions_m(), plan.quaternions_wxyz())
+    quats = plan.quaternions_wxyz()
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)  # slerp needs unit length
+    poses = PoseTrajectory(times, plan.positions_m(), quats)
     order = (
         [list(plan.joint_names).index(name) for name in ARM_JOINTS] if plan.joint_names else None
     )

@@ -17,6 +17,7 @@ from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
 from twin.replay.job import ReplayJob, row_of_existing, run_job
 from twin.replay.starts import localised_starts
+from twin.scene.store import scene_hash_of
 
 
 def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[str, Any]:
@@ -59,14 +60,13 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
 
 
 def _scene_hash(run: RunFolder, output: Output) -> str | None:
-    path = run.scene_dir / "scene.json"
-    if path.is_file():
-        return hash_file(path)
-    output.say(
-        "No scene has been rebuilt (scene/scene.json is missing): replays use the task's shapes "
-        "and the table plane, and carry no scene hash."
-    )
-    return None
+    scene_hash = scene_hash_of(run)
+    if scene_hash is None:
+        output.say(
+            "No scene has been rebuilt (scene/scene.json is missing): replays use the task's "
+            "shapes and the table plane, and carry no scene hash."
+        )
+    return scene_hash
 
 
 def _chosen(run: RunFolder, config: ReplayRunConfig) -> list[str]:

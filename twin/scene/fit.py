@@ -33,8 +33,9 @@ class FitResult:
     coarse_iterations: int
     seconds: float
     cpu_seconds: float
-    train_psnr_db: float
-    """Mean over the last images seen, at the size they were fitted at."""
+    train_psnr_db: float | None
+    """Over the static pixels of the last images seen, at the size they were fitted at; None when
+    there were none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,17 +113,23 @@ def fit(
         half = at.fraction < config.coarse_fraction
         coarse += half
         target = view.half if half else view.full
-        errors.append(_step(adam, at, rasteriser, loss, view, target))
-        recent = psnr_db(float(np.mean(errors[-len(views) :])))
-        advance(round(100 * at.fraction), f"image {at.step}, training PSNR {recent:.2f} dB")
+        error = _step(adam, at, rasteriser, loss, view, target)
+        errors += [] if error is None else [error]
+        recent = _recent_psnr_db(errors, len(views))
+        said = "" if recent is None else f", training PSNR {recent:.2f} dB"
+        advance(round(100 * at.fraction), f"image {at.step}{said}")
     return FitResult(
         cloud=adam.cloud,
         iterations=at.step,
         coarse_iterations=coarse,
         seconds=time.monotonic() - start,
         cpu_seconds=time.process_time() - cpu_start,
-        train_psnr_db=psnr_db(float(np.mean(errors[-len(views) :]))) if errors else float("nan"),
+        train_psnr_db=_recent_psnr_db(errors, len(views)),
     )
+
+
+def _recent_psnr_db(errors: list[float], num_views: int) -> float | None:
+    return psnr_db(float(np.mean(errors[-num_views:]))) if errors else None
 
 
 def _step(
@@ -132,10 +139,12 @@ def _step(
     loss: Loss,
     view: TrainingView,
     target: Target,
-) -> float:
+) -> float | None:
+    """Draw one image and follow its gradient; returns the mean squared error where it counts."""
     planes = rasteriser.draw_planes(adam.cloud, target.camera, view.T_base_color)
     # Where something moving stood, the image is compared with itself: no error, no gradient.
     wanted = np.where(target.static_mask, target.image(), planes[:3])
     _, mse, gradient = loss(planes, wanted, target.depth_m)
     adam.update(rasteriser.pull_back(planes, gradient), at)
-    return mse
+    static = float(target.static_mask.mean())
+    return mse / static if static > 0 else None

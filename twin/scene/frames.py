@@ -7,6 +7,7 @@ import numpy as np
 
 from bridge.episode import schema, streams
 from bridge.episode.reader import Episode
+from bridge.episode.records import CompressedColor, DepthImage
 from bridge.episode.run import RunFolder
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
@@ -34,6 +35,7 @@ class FrameChoice:
     still: bool
     train_ns: frozenset[int]
     holdout_ns: frozenset[int]
+    """Nothing is learnt from these, the objects' places included."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +53,7 @@ def find_sources(run: RunFolder) -> Sources:
     Raises:
         NoFramesError: When no episode has a camera with colour, depth and intrinsics.
     """
-    usable = [episode for path in run.episodes() if _has_rgbd(episode := Episode.open(path))]
+    usable = [e for path in run.episodes() if rgbd_camera_ids(e := Episode.open(path))]
     scans = [episode for episode in usable if episode.info.kind == "scan"]
     if scans:
         return Sources(episodes=tuple(scans), remark="")
@@ -66,18 +68,14 @@ def find_sources(run: RunFolder) -> Sources:
     return Sources(episodes=tuple(usable), remark=remark)
 
 
-def _has_rgbd(episode: Episode) -> bool:
-    return bool(_rgbd_cameras(episode))
-
-
-def _rgbd_cameras(episode: Episode) -> list[str]:
-    topics = [topic for topic in episode.topics() if not schema.is_truth(topic)]
-    needed = ("color/image", "depth/image", "color/info", "depth/info")
-    return [
-        camera_id
-        for camera_id in streams.camera_ids(episode)
-        if all(any(t.endswith(f"/cam/{camera_id}/{tail}") for t in topics) for tail in needed)
-    ]
+def rgbd_camera_ids(episode: Episode) -> list[str]:
+    """Cameras with colour and depth, both with intrinsics; never those of stand-in truth."""
+    topics = {topic for topic in episode.topics() if not schema.is_truth(topic)}
+    tails = ("color/image", "color/info", "depth/image", "depth/info")
+    stems = {topic.removesuffix(tails[0]) for topic in topics if topic.endswith("/" + tails[0])}
+    return sorted(
+        stem.split("/")[-2] for stem in stems if all(stem + tail in topics for tail in tails)
+    )
 
 
 def choose_frames(sources: Sources, config: FrameConfig) -> list[FrameChoice]:
@@ -87,7 +85,9 @@ def choose_frames(sources: Sources, config: FrameConfig) -> list[FrameChoice]:
         NoFramesError: When nothing is left to learn from.
     """
     found = [
-        (episode, camera_id) for episode in sources.episodes for camera_id in _rgbd_cameras(episode)
+        (episode, camera_id)
+        for episode in sources.episodes
+        for camera_id in rgbd_camera_ids(episode)
     ]
     train_share = max(1, config.max_train_frames // max(len(found), 1))
     holdout_share = max(1, config.max_holdout_frames // max(len(found), 1))
@@ -122,7 +122,7 @@ def spread(values: np.ndarray, count: int) -> np.ndarray:
 
 def _stamps(episode: Episode, camera_id: str) -> tuple[np.ndarray, bool]:
     """Source stamps of the frames that have both images, and whether the camera stands still."""
-    stamps = np.array([frame_ns for frame_ns, _ in _paired_stamps(episode, camera_id)], dtype=int)
+    stamps = np.array(list(_paired_stamps(episode, camera_id)), dtype=np.int64)
     tree = streams.transform_tree(episode)
     frame_id = streams.camera_info(episode, camera_id).frame_id
     poses = [tree.T_root_frame(frame_id, int(stamp)) for stamp in spread(stamps, 40)]
@@ -134,19 +134,24 @@ def _stamps(episode: Episode, camera_id: str) -> tuple[np.ndarray, bool]:
     return stamps, still and len(stamps) > 1
 
 
-def _paired_stamps(episode: Episode, camera_id: str) -> Iterator[tuple[int, int]]:
+def _paired_stamps(episode: Episode, camera_id: str) -> Iterator[int]:
+    """Header stamps of colour images with a depth image nearby, as ``load`` will see them."""
     ending = f"/cam/{camera_id}/"
-    topics = [t for t in episode.topics() if ending in t and t.endswith("/image")]
     colors, depths = (
-        np.array([m.publish_time_ns for m in episode.messages([t])], dtype=np.int64)
-        for t in sorted(t for t in topics if not schema.is_truth(t))[:2]
+        np.array(
+            [
+                record.from_cdr(message.data).stamp_ns
+                for topic in episode.topics()
+                if topic.endswith(f"{ending}{stream}/image") and not schema.is_truth(topic)
+                for message in episode.messages([topic])
+            ],
+            dtype=np.int64,
+        )
+        for stream, record in (("color", CompressedColor), ("depth", DepthImage))
     )
-    if not len(depths):
-        return
-    for stamp in np.unique(colors):
-        nearest = int(depths[np.argmin(np.abs(depths - stamp))])
-        if abs(nearest - int(stamp)) <= streams.PAIRING_TOLERANCE_NS:
-            yield int(stamp), nearest
+    for stamp in np.unique(colors).tolist() if len(depths) else ():
+        if np.abs(depths - stamp).min() <= streams.PAIRING_TOLERANCE_NS:
+            yield stamp
 
 
 def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:

@@ -1,7 +1,7 @@
 """Localise the objects of a recorded episode, and keep the answer as a derived episode."""
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from bridge.errors import EpisodeError
 from bridge.geometry import se3
 from bridge.task.robot import BASE_FRAME
 from bridge.task.task_file import Task
+from twin.scene.frames import rgbd_camera_ids
 from twin.scene.localise import LocaliseConfig, LocalisedObject, localise_objects
 
 NO_SCENE = "noscene"
@@ -27,6 +28,9 @@ STILL_WINDOW_NS = 40_000_000
 """A camera is still when its pose is the same this long before and after an image."""
 STILL_DISTANCE_M = 1e-3
 STILL_ANGLE_RAD = 3e-3
+
+HeldOut = Mapping[str, Collection[int]]
+"""Stamps of frames to leave out, by camera id."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +51,7 @@ def localise_episode(
     *,
     after_ns: int | None = None,
     before_ns: int | None = None,
+    held_out_ns: HeldOut | None = None,
 ) -> dict[str, LocalisedObject]:
     """Localise from the last still frames before the first execution started.
 
@@ -59,14 +64,17 @@ def localise_episode(
         config: Settings; the defaults when None.
         after_ns: Only frames later than this source time; then ``before_ns`` counts alone.
         before_ns: Only frames earlier than this source time.
+        held_out_ns: Frames that must not be looked at.
     """
     config = LocaliseConfig() if config is None else config
     if after_ns is None and before_ns is None:
         before_ns = first_execution_ns(episode)
     if after_ns is None and before_ns is None:
-        frames = still_frames(episode, config.max_views, spread=True)
+        frames = still_frames(episode, config.max_views, spread=True, held_out_ns=held_out_ns)
     else:
-        frames = still_frames(episode, config.max_frames, after_ns, before_ns)
+        frames = still_frames(
+            episode, config.max_frames, after_ns, before_ns, held_out_ns=held_out_ns
+        )
     return localise_objects(frames, task, config)
 
 
@@ -108,6 +116,7 @@ def still_frames(
     before_ns: int | None = None,
     *,
     spread: bool = False,
+    held_out_ns: HeldOut | None = None,
 ) -> list[RgbdFrame]:
     """Frames of each camera taken in an interval while that camera did not move.
 
@@ -117,14 +126,17 @@ def still_frames(
         after_ns: Only frames later than this source time.
         before_ns: Only frames earlier than this source time.
         spread: Spread them evenly over the interval instead of taking the last ones.
+        held_out_ns: Frames that must not be looked at.
     """
+    hidden = held_out_ns or {}
     tree = streams.transform_tree(episode)
     frames: list[RgbdFrame] = []
     for camera_id in rgbd_camera_ids(episode):
         frame_id = streams.camera_info(episode, camera_id, "color").frame_id
         kept: deque[RgbdFrame] = deque(maxlen=None if spread else max_per_camera)
         for frame in _between(streams.rgbd_frames(episode, camera_id, tree), after_ns, before_ns):
-            if is_still(tree, frame_id, frame.stamp_ns, before_ns):
+            seen = frame.stamp_ns not in hidden.get(camera_id, ())
+            if seen and is_still(tree, frame_id, frame.stamp_ns, before_ns):
                 kept.append(frame)
         if spread and len(kept) > max_per_camera:
             ids = np.linspace(0, len(kept) - 1, max_per_camera).round().astype(int)
@@ -132,16 +144,6 @@ def still_frames(
         else:
             frames.extend(kept)
     return frames
-
-
-def rgbd_camera_ids(episode: Episode) -> list[str]:
-    """Cameras with colour and depth, both with intrinsics; never those of stand-in truth."""
-    topics = {topic for topic in episode.topics() if not schema.is_truth(topic)}
-    tails = ("color/image", "color/info", "depth/image", "depth/info")
-    stems = {topic.removesuffix(tails[0]) for topic in topics if topic.endswith("/" + tails[0])}
-    return sorted(
-        stem.split("/")[-2] for stem in stems if all(stem + tail in topics for tail in tails)
-    )
 
 
 def _between(
@@ -206,7 +208,7 @@ def write_localised(
         source_sha256=provenance.hash_file(episode.path),
         scene_hash=scene_hash,
         engine="colour_shape_fit",
-        settings={"task": task.name, **asdict(config)},
+        settings={"task": asdict(task), **asdict(config)},
     )
     if path.exists() and not force and _made_from(path, derived):
         return path

@@ -60,12 +60,8 @@ class MovingVoxels:
         hit = np.zeros_like(known)
         hit[known] = self.contains(se3.apply(view.T_base_color, p_camera).astype(np.float32))
         static = ~_grown(hit)
-        doubled = np.repeat(np.repeat(static, 2, axis=0), 2, axis=1)
-        missing = [
-            (0, max(0, n - m)) for n, m in zip(full.depth_m.shape, doubled.shape, strict=True)
-        ]
         height, width = full.depth_m.shape
-        doubled = np.pad(doubled, missing, mode="edge")[:height, :width]
+        doubled = np.repeat(np.repeat(static, 2, axis=0), 2, axis=1)[:height, :width]
         return replace(view, half=_masked(half, static), full=_masked(full, doubled))
 
 

@@ -1,17 +1,20 @@
 """Take a fitted scene apart into background and objects, and put it together again."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
+from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder, check_episode_id
 from bridge.errors import BridgeError, UsageError
 from bridge.geometry import se3
 from bridge.task.task_file import Task, load_task
-from twin.scene.frames import Sources
+from twin.scene.frames import FrameChoice, Sources
 from twin.scene.gaussians import GaussianCloud, concatenate
 from twin.scene.localise import LocalisedObject
 from twin.scene.localise_episode import localise_episode
@@ -23,6 +26,7 @@ from twin.scene.objects import (
     write_objects,
 )
 from twin.scene.ply import read_ply
+from twin.scene.store import UnreadableSceneError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,15 +52,32 @@ class TakenApart:
         }
 
 
-def take_apart(sources: Sources, cloud: GaussianCloud) -> TakenApart:
-    """Cut the task's objects out of the scene where the first scan shows them."""
-    named = [episode for episode in sources.episodes if episode.info.task]
-    if not named:
+def episode_of_task(sources: Sources) -> Episode | None:
+    """The episode whose task and whose objects count: the first that names a task."""
+    return next((episode for episode in sources.episodes if episode.info.task), None)
+
+
+def take_apart(
+    sources: Sources, cloud: GaussianCloud, choices: Sequence[FrameChoice]
+) -> TakenApart:
+    """Cut the task's objects out of the scene where the first episode of a task shows them.
+
+    Args:
+        sources: The episodes the scene was made from.
+        cloud: The whole fitted scene.
+        choices: Which frames are held out: the objects are not looked for in them.
+    """
+    episode = episode_of_task(sources)
+    if episode is None:
         return TakenApart(background=cloud, remark="no episode names a task: objects not known")
-    episode = named[0]
     try:
         task = load_task(episode.info.task)
-        localised = localise_episode(episode, task)
+        held_out = {
+            choice.camera_id: choice.holdout_ns
+            for choice in choices
+            if choice.episode.path == episode.path
+        }
+        localised = localise_episode(episode, task, held_out_ns=held_out)
     except (BridgeError, UsageError) as error:
         return TakenApart(background=cloud, remark=f"objects not taken out: {error}")
     parts = split_objects(cloud, localised, task)
@@ -72,15 +93,32 @@ def take_apart(sources: Sources, cloud: GaussianCloud) -> TakenApart:
 
 
 def read_objects(run: RunFolder, record: Mapping[str, Any]) -> dict[str, ObjectSplats]:
-    """Load the objects that ``scene.json`` lists, each in its own frame."""
+    """Load the objects that ``scene.json`` lists, each in its own frame.
+
+    Raises:
+        PathNotFoundError: When a splat file is gone.
+        UnreadablePlyError: When one is damaged.
+        UnreadableSceneError: When ``scene.json`` or ``object.json`` cannot be understood.
+    """
     objects = {}
     for key in record.get("objects", {}):
         folder = run.scene_dir / "objects" / check_episode_id(key)
-        about = json.loads((folder / "object.json").read_text())
-        pose = about["T_base_object"]
-        T = se3.transform_from(np.array(pose["q_wxyz"]), np.array(pose["p_m"]))
-        objects[key] = ObjectSplats(cloud=read_ply(folder / "gaussians.ply"), T_base_object=T)
+        objects[key] = ObjectSplats(
+            cloud=read_ply(folder / "gaussians.ply"),
+            T_base_object=_read_pose(folder / "object.json"),
+        )
     return objects
+
+
+def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
+    try:
+        pose = json.loads(path.read_text())["T_base_object"]
+        q, p = np.array(pose["q_wxyz"], dtype=np.float64), np.array(pose["p_m"], dtype=np.float64)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UnreadableSceneError(path=path, found=f"no pose ({error!r})") from error
+    if q.shape != (4,) or p.shape != (3,) or not np.isfinite([*q, *p]).all() or not q.any():
+        raise UnreadableSceneError(path=path, found=f"a pose that is none: {pose}")
+    return se3.transform_from(q, p)
 
 
 def put_together(

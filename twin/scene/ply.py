@@ -81,6 +81,8 @@ def read_ply(path: Path) -> GaussianCloud:
     table = np.frombuffer(body, dtype="<f4").reshape(count, len(names))
     if not np.isfinite(table).all():
         raise UnreadablePlyError(path=path, found="values that are not finite")
+    if not table[:, [names.index(f"rot_{i}") for i in range(4)]].any(axis=1).all():
+        raise UnreadablePlyError(path=path, found="rotations of length zero")
 
     def columns(*wanted: str) -> np.ndarray:
         return as_float32(table[:, [names.index(name) for name in wanted]])

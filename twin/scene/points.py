@@ -64,7 +64,7 @@ class FrameSurface:
     def __init__(self, frame: RgbdFrame, limits: DepthLimits) -> None:
         """Find the trusted pixels and carry them to the colour camera."""
         self.frame = frame
-        depth = frame.depth_m.astype(np.float32, copy=False)
+        depth = np.where(np.isfinite(frame.depth_m), frame.depth_m, 0.0).astype(np.float32)
         self.trusted = trusted_depth_mask(depth, limits)
         camera = frame.depth_camera
         column = ((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx).astype(np.float32)

@@ -9,12 +9,21 @@ import numpy as np
 
 from bridge.episode import provenance
 from bridge.episode.run import RunFolder
+from bridge.errors import UsageError
+from bridge.task.task_file import load_task
 from bridge.terminal import Output
 from twin.scene.fit import fit
-from twin.scene.frames import FrameChoice, Sources, choose_frames, find_sources, load
+from twin.scene.frames import (
+    FrameChoice,
+    NoFramesError,
+    Sources,
+    choose_frames,
+    find_sources,
+    load,
+)
 from twin.scene.initialise import fuse
 from twin.scene.moving import MovingVoxels, Witness, choose_witnesses, find_moving
-from twin.scene.parts import take_apart
+from twin.scene.parts import episode_of_task, take_apart
 from twin.scene.ply import write_ply
 from twin.scene.points import DepthLimits, FrameSurface, PointSet
 from twin.scene.raster import RasterConfig, load_native
@@ -24,7 +33,7 @@ from twin.scene.store import BACKGROUND, HASH_DIGITS, SCENE_FILE, read_record, w
 from twin.scene.training_view import TrainingView, training_view
 from twin.scene.views import ViewsJob, views_path, write_views
 
-METHOD_VERSION = 5
+METHOD_VERSION = 6
 """Counts changes of method that make older scenes out of date."""
 MAX_POINTS = 3_000_000
 """Depth points to fuse; more change nothing but the time."""
@@ -68,7 +77,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         fitted = fit(first, learnt.views, config.fit, advance)
     run.scene_dir.mkdir(parents=True, exist_ok=True)
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
-    apart = take_apart(sources, fitted.cloud)
+    apart = take_apart(sources, fitted.cloud, choices)
     if apart.remark:
         output.say(apart.remark)
     write_ply(run.scene_dir / BACKGROUND, apart.background)
@@ -106,18 +115,36 @@ def _key(sources: Sources, config: RebuildConfig) -> str:
     settings["fit"].pop("threads")
     hashes = {str(e.path.name): provenance.hash_file(e.path) for e in sources.episodes}
     return provenance.hash_settings(
-        {"method": METHOD_VERSION, "episodes": hashes, "settings": settings}
+        {
+            "method": METHOD_VERSION,
+            "episodes": hashes,
+            "settings": settings,
+            "task": _task_content(sources),
+        }
     )
+
+
+def _task_content(sources: Sources) -> dict[str, Any] | None:
+    """Shapes and colours decide the objects; a task that cannot be read gives none."""
+    episode = episode_of_task(sources)
+    try:
+        return None if episode is None else asdict(load_task(episode.info.task))
+    except UsageError:
+        return None
 
 
 def _already_done(run: RunFolder, key: str) -> dict[str, Any] | None:
     record = read_record(run)
     if record is None or record.get("key") != key:
         return None
-    complete = (run.scene_dir / BACKGROUND).is_file() and all(
-        (run.derived_dir / name).is_file() for name in record["views"]["files"]
-    )
-    return record if complete else None
+    needed = [run.scene_dir / BACKGROUND]
+    needed += [run.derived_dir / name for name in record["views"]["files"]]
+    needed += [
+        run.scene_dir / item["folder"] / name
+        for item in record.get("objects", {}).values()
+        for name in item["files"]
+    ]
+    return record if all(path.is_file() for path in needed) else None
 
 
 def _learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output) -> _Learnt:
@@ -131,6 +158,9 @@ def _learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output
                 points.append(surface.points(_stride(total, frame.depth_m.size)))
                 views.append(training_view(surface))
                 advance(len(views), f"camera {frame.camera_id}")
+    if not views:
+        message = "no frame of this run has colour, depth and a pose together. Record it again."
+        raise NoFramesError(message)
     witnesses = choose_witnesses(views)
     moving = find_moving(points, witnesses)
     return _Learnt(

@@ -55,7 +55,9 @@ def make_record(
             "coarse_iterations": fitted.coarse_iterations,
             "seconds": round(fitted.seconds, 2),
             "cpu_seconds": round(fitted.cpu_seconds, 2),
-            "train_psnr_db": round(fitted.train_psnr_db, 3),
+            "train_psnr_db": None
+            if fitted.train_psnr_db is None
+            else round(fitted.train_psnr_db, 3),
         },
         "views": dict(views),
         "seconds": round(seconds, 2),
@@ -108,8 +110,12 @@ def describe_scene(record: Mapping[str, Any]) -> str:
     lines = [
         f"scene {record['scene_hash']}: {record['background']['num_splats']} Gaussians"
         + (" (stand-in)" if record["stand_in"] else ""),
-        f"fit: {fitted['iterations']} images in {fitted['seconds']:.1f} s, "
-        f"training PSNR {fitted['train_psnr_db']:.2f} dB",
+        f"fit: {fitted['iterations']} images in {fitted['seconds']:.1f} s"
+        + (
+            ""
+            if fitted["train_psnr_db"] is None
+            else f", training PSNR {fitted['train_psnr_db']:.2f} dB where nothing moved"
+        ),
     ]
     for ending, what in (
         ("", "held-out views of moving cameras"),

@@ -27,11 +27,20 @@ def parse_duration_s(text: str) -> float:
     return float(match[1]) * _SECONDS[match[2]]
 
 
-def _convert_duration(_type: Any, tokens: Sequence[Any]) -> float:
+def convert_duration(_type: Any, tokens: Sequence[Any]) -> float:
+    """Let a command-line option take a duration."""
     try:
         return parse_duration_s(tokens[0].value)
     except UsageError as error:
         raise ValueError(str(error)) from error
+
+
+def _refuse_below(least: int, **options: int) -> None:
+    """Refuse settings that nothing can be made with."""
+    for name, value in options.items():
+        if value < least:
+            message = f"--{name.replace('_', '-')} {value} is too small: at least {least}."
+            raise UsageError(message)
 
 
 @Parameter(name="*", group="Frames")
@@ -47,6 +56,12 @@ class FrameConfig:
     """Held-out frames to render, spread evenly."""
     max_depth_m: float = 5.0
     """Depth beyond is not trusted."""
+
+    def __post_init__(self) -> None:
+        """Refuse to hold out every frame, or to learn from none."""
+        _refuse_below(2, holdout_every=self.holdout_every)
+        _refuse_below(1, max_train_frames=self.max_train_frames)
+        _refuse_below(1, max_holdout_frames=self.max_holdout_frames)
 
 
 @Parameter(name="*", group="Initialisation")
@@ -65,13 +80,20 @@ class InitialiseConfig:
     flying_fraction: float = 0.03
     """A pixel whose depth differs from a neighbour's by more than this share is dropped."""
 
+    def __post_init__(self) -> None:
+        """Refuse an empty budget and an opacity without a logit."""
+        _refuse_below(1, max_splats=self.max_splats)
+        if not 0 < self.opacity < 1:
+            message = f"--opacity {self.opacity:g} does not lie between 0 and 1."
+            raise UsageError(message)
+
 
 @Parameter(name="*", group="Fit")
 @dataclass(frozen=True, kw_only=True)
 class FitConfig:
     """How the Gaussians are fitted to the images."""
 
-    budget_s: Annotated[float, Parameter(name="--budget", converter=_convert_duration)] = 60.0
+    budget_s: Annotated[float, Parameter(name="--budget", converter=convert_duration)] = 60.0
     """Wall time for the fit: 60s, 2min or plain seconds."""
     iterations: int = 0
     """Fit exactly this many images instead of a time; the result is then reproducible."""
@@ -85,6 +107,13 @@ class FitConfig:
     """Order of the frames."""
     threads: int = 0
     """0: all cores. The result does not depend on it."""
+
+    def __post_init__(self) -> None:
+        """Refuse a fit that never ends, or never begins."""
+        _refuse_below(0, iterations=self.iterations)
+        if self.iterations == 0 and not self.budget_s > 0:
+            message = f"--budget {self.budget_s:g} s leaves no time to fit; give more than 0."
+            raise UsageError(message)
 
 
 @Parameter(name="*")

@@ -16,6 +16,8 @@ from twin.scene.ply import read_ply
 SCENE_VERSION = 1
 BACKGROUND = "background.ply"
 SCENE_FILE = "scene.json"
+NEEDED = ("key", "scene_hash", "background", "sources", "views")
+"""What every reader of ``scene.json`` relies on."""
 HASH_DIGITS = 12
 """Hexadecimal digits of the SHA-256 of ``background.ply`` that name a scene."""
 
@@ -60,7 +62,20 @@ def read_record(run: RunFolder) -> dict[str, Any] | None:
         version = record.get("schema_version") if isinstance(record, dict) else None
         found = f"schema version {version!r}, this program knows {SCENE_VERSION}"
         raise UnreadableSceneError(path=path, found=found)
+    missing = [name for name in NEEDED if name not in record]
+    if missing:
+        raise UnreadableSceneError(path=path, found=f"without {', '.join(missing)}")
     return record
+
+
+def scene_hash_of(run: RunFolder) -> str | None:
+    """The hash that verdicts, replays, localisations and views name a run's scene by.
+
+    Raises:
+        UnreadableSceneError: When ``scene.json`` cannot be understood.
+    """
+    record = read_record(run)
+    return None if record is None else str(record["scene_hash"])
 
 
 def read_scene(run: RunFolder) -> Scene:

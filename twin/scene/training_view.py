@@ -1,6 +1,6 @@
 """One training image in memory, at half and at full size."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -40,7 +40,7 @@ def training_view(surface: FrameSurface) -> TrainingView:
     """Prepare one frame; the half-size image is the mean of 2 x 2 pixels."""
     frame = surface.frame
     depth_m = surface.depth_in_color_camera()
-    half = frame.color_camera.scaled(0.5)
+    half = _halved_camera(frame.color_camera)
     return TrainingView(
         camera_id=frame.camera_id,
         stamp_ns=frame.stamp_ns,
@@ -56,13 +56,26 @@ def _target(camera: Camera, image_u8: np.ndarray, depth_m: np.ndarray) -> Target
     return Target(camera=camera, planes_u8=planes, depth_m=depth_m, static_mask=everywhere)
 
 
+def _halved_camera(camera: Camera) -> Camera:
+    """The camera whose pixels are blocks of 2 x 2, exactly: an odd edge makes a whole block."""
+    return replace(
+        camera,
+        width=-(-camera.width // 2),
+        height=-(-camera.height // 2),
+        fx=camera.fx / 2,
+        fy=camera.fy / 2,
+        cx=camera.cx / 2,
+        cy=camera.cy / 2,
+    )
+
+
 def _blocks(rows: np.ndarray, camera: Camera) -> np.ndarray:
-    """Group 2 x 2 pixels: (height, 2, width, 2, ...); an odd edge is repeated or cut."""
+    """Group 2 x 2 pixels: (height, 2, width, 2, ...); an odd edge is repeated."""
     height, width = camera.height * 2, camera.width * 2
-    missing = ((0, max(0, height - len(rows))), (0, max(0, width - rows.shape[1])))
+    missing = ((0, height - len(rows)), (0, width - rows.shape[1]))
     padded = np.pad(rows, missing + ((0, 0),) * (rows.ndim - 2), mode="edge")
     shape = (camera.height, 2, camera.width, 2, *rows.shape[2:])
-    return np.asarray(padded[:height, :width].reshape(shape))
+    return np.asarray(padded.reshape(shape))
 
 
 def _halved_image(image_u8: np.ndarray, camera: Camera) -> np.ndarray:

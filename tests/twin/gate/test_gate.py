@@ -248,6 +248,45 @@ def test_more_plans_than_may_wait_are_turned_away_at_once() -> None:
     assert [verdict.accepted for verdict in answers] == [True, True]
 
 
+def test_no_two_replays_ever_run_side_by_side() -> None:
+    """Robot models are shared and keep scratch memory; late replays go on and hold the turn."""
+    counting, running, most, done = threading.Lock(), 0, 0, 0
+
+    def slow(plan: Plan, poses: dict[str, Any], urdf: str) -> Verdict:
+        nonlocal running, most, done
+        with counting:
+            running += 1
+            most = max(most, running)
+        time.sleep(0.06)
+        with counting:
+            running -= 1
+            done += 1
+        return accept(plan, poses, urdf)
+
+    gate = gate_with(replay=slow, deadline_s=0.04, waiting=8)
+    threads = [threading.Thread(target=gate.judge, args=(PLAN.to_json(),)) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+        time.sleep(0.02)
+    for thread in threads:
+        thread.join(5)
+    assert gate._turn.acquire(timeout=5)
+    assert done >= 2
+    assert most == 1
+
+
+def test_a_thread_that_cannot_be_started_does_not_block_the_next_plan(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gate = gate_with()
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", raising(RuntimeError("can't start new thread")))
+        refused = gate.judge(PLAN.to_json())
+    assert refused.accepted is None
+    assert "no thread" in str(refused.reason)
+    assert gate.judge(PLAN.to_json()).accepted is True
+
+
 @dataclass
 class FakeSession:
     published: list[tuple[str, bytes, int]] = field(default_factory=list)

@@ -25,10 +25,10 @@ from bridge.episode.streams import RgbdFrame
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.color import encode_jpeg
 from bridge.task.task_file import Task
+from twin.scene.frames import rgbd_camera_ids
 from twin.scene.localise_episode import (
     localise_episode,
     quiet_phases,
-    rgbd_camera_ids,
     still_frames,
     write_localised,
 )
@@ -147,6 +147,11 @@ def test_only_frames_before_the_execution_count(episode: Episode, task: Task) ->
     assert found["cube"].stamp_ns == 3 * S
     distance = np.linalg.norm(found["cube"].T_base_object[:3, 3] - START["cube"][:3, 3])
     assert distance < 0.003
+
+
+def test_held_out_frames_are_not_looked_at(episode: Episode, task: Task) -> None:
+    found = localise_episode(episode, task, held_out_ns={"side": {3 * S}})
+    assert found["cube"].stamp_ns == 2 * S
 
 
 def test_truth_cameras_and_truth_poses_are_never_read(episode: Episode) -> None:

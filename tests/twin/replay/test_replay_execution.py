@@ -8,7 +8,14 @@ import pytest
 from bridge.episode.streams import JointTrack
 from bridge.task.robot import ARM_JOINTS
 from twin.replay.config import ReplayConfig
-from twin.replay.execution import closed_mask, path_of_execution, stages_as_executed
+from twin.replay.execution import (
+    check_covers,
+    closed_mask,
+    cut_track,
+    path_of_execution,
+    stages_as_executed,
+)
+from twin.replay.path import UnusablePlanError
 
 OPEN_M, HELD_M = 0.085, 0.040
 
@@ -79,3 +86,28 @@ def test_stages_take_the_times_the_recording_gives_them(script: SimpleNamespace)
     assert (grasp.t_start_ns, grasp.t_end_ns) == (0, 6)
     assert (place.t_start_ns, place.t_end_ns) == (7, plan.stages[1].t_end_ns)
     assert stages_as_executed(plan, [], start) == plan.stages
+
+
+def test_joints_that_were_not_recorded_are_not_made_up(script: SimpleNamespace) -> None:
+    times, width = recorded_grasp(0.0)
+    plan = script.plan(script.scene())
+    widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
+    there = (times < 2_000_000_000) | (times > 3_000_000_000)
+    track = JointTrack(
+        names=ARM_JOINTS, stamps_ns=times[there], position=np.zeros((int(there.sum()), 6))
+    )
+    with pytest.raises(UnusablePlanError, match=r"for 1\.0 s from 2\.0 s on"):
+        path_of_execution(track, widths, plan, ReplayConfig())
+
+
+def test_a_recording_that_stops_early_or_starts_late_is_refused(script: SimpleNamespace) -> None:
+    stamps = np.arange(2_000_000_000, 4_000_000_000, 8_000_000)
+    track = JointTrack(names=ARM_JOINTS, stamps_ns=stamps, position=np.zeros((len(stamps), 6)))
+    plan = script.plan(script.scene())
+    cut = cut_track(track, 2_000_000_000, 5_000_000_000)
+    check_covers(cut, 4_400_000_000, plan)
+    with pytest.raises(UnusablePlanError, match=r"for 1\.0 s at its end"):
+        check_covers(cut, 5_000_000_000, plan)
+    late = cut_track(track, 1_000_000_000, 3_000_000_000)
+    with pytest.raises(UnusablePlanError, match=r"for 1\.0 s from 0\.0 s on"):
+        path_of_execution(late, late, plan, ReplayConfig())

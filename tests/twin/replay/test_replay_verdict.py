@@ -284,6 +284,35 @@ def test_a_pose_that_is_not_a_number_is_refused(script: SimpleNamespace) -> None
         replay_plan(replace(plan, tau=tau), scene, KINEMATIC)
 
 
+@pytest.mark.parametrize("change", [{"width_m": float("nan")}, {"joints_rad": (float("inf"),) * 6}])
+def test_a_command_that_is_not_a_number_is_refused(
+    script: SimpleNamespace, change: dict[str, object]
+) -> None:
+    scene = script.scene()
+    plan = script.plan(scene)
+    tau = (*plan.tau[:-1], replace(plan.tau[-1], **change))
+    with pytest.raises(UnusablePlanError, match="not finite"):
+        replay_plan(replace(plan, tau=tau), scene, KINEMATIC)
+
+
+def test_a_plan_of_one_waypoint_stands_still(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.plan(scene)
+    result = replay_plan(replace(plan, tau=plan.tau[:1]), scene, ReplayConfig(settle_after_s=0.3))
+    assert result.verdict.ik.value is True
+    assert result.verdict.terminal.value is not True
+    assert result.verdict.accepted is not True
+
+
+def test_quaternions_of_another_length_mean_the_same_path(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.plan(scene)
+    longer = tuple(replace(w, q_wxyz=tuple(2.0 * q for q in w.q_wxyz)) for w in plan.tau)
+    one = replay_plan(plan, scene, KINEMATIC)
+    two = replay_plan(replace(plan, tau=longer), scene, KINEMATIC)
+    np.testing.assert_allclose(two.joints_rad, one.joints_rad, atol=1e-6)
+
+
 def test_a_sample_rate_that_does_not_divide_the_physics_rate_is_refused() -> None:
     with pytest.raises(UsageError, match="does not divide"):
         ReplayConfig(sample_rate_hz=50)

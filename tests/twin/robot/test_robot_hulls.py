@@ -1,5 +1,8 @@
 """Hulls must never stand further from an obstacle than the mesh they replace."""
 
+import re
+from pathlib import Path
+
 import coal
 import numpy as np
 import pinocchio as pin
@@ -7,6 +10,7 @@ import pytest
 
 from bridge.task.robot import ur5_with_gripper_urdf
 from twin.robot.collision import RobotHulls, hulls_of, signed_distance
+from twin.robot.description import RobotDescriptionError
 from twin.robot.model import load_robot
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
@@ -73,3 +77,14 @@ def test_penetration_depth_of_boxes_is_the_overlap() -> None:
     box = coal.Box(0.1, 0.1, 0.1)
     T = coal.Transform3s(np.eye(3), np.array([0.08, 0.0, 0.0]))
     assert signed_distance(box, coal.Transform3s(), box, T) == pytest.approx(-0.02, abs=1e-6)
+
+
+def test_a_collision_mesh_that_is_no_mesh_is_named(tmp_path: Path) -> None:
+    mesh = tmp_path / "broken.stl"
+    mesh.write_bytes(b"not a mesh")
+    urdf = ur5_with_gripper_urdf()
+    first = re.search(r'<collision>.*?filename="([^"]+)"', urdf, flags=re.DOTALL)
+    assert first is not None
+    broken = urdf.replace(first[1], str(mesh))
+    with pytest.raises(RobotDescriptionError, match="cannot be read"):
+        RobotHulls(load_robot(broken))

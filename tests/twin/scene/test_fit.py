@@ -107,3 +107,43 @@ def test_a_time_budget_is_kept(room: tuple[GaussianCloud, list[TrainingView]]) -
 def test_psnr_of_a_known_error() -> None:
     assert psnr_db(0.01) == pytest.approx(20.0)
     assert psnr_db(0.0) == float("inf")
+
+
+def test_pixels_that_are_passed_over_do_not_make_the_fit_look_better(
+    room: tuple[GaussianCloud, list[TrainingView]],
+) -> None:
+    start, views = room
+    config = FitConfig(iterations=1, coarse_fraction=0.0, threads=1)
+
+    def masked(view: TrainingView, shown: slice) -> TrainingView:
+        mask = np.zeros_like(view.full.static_mask)
+        mask[:, shown] = True
+        return replace(view, full=replace(view.full, static_mask=mask))
+
+    halves = [
+        fit(start, [masked(views[0], side)], config, lambda *_: None).train_psnr_db
+        for side in (slice(None, 32), slice(32, None))
+    ]
+    whole = fit(start, views[:1], config, lambda *_: None).train_psnr_db
+    nothing = fit(start, [masked(views[0], slice(0, 0))], config, lambda *_: None)
+    mse = np.mean([10 ** (-half / 10) for half in halves])
+    assert whole == pytest.approx(psnr_db(float(mse)), abs=1e-3)
+    assert nothing.train_psnr_db is None
+
+
+def test_half_an_odd_image_keeps_every_pixel_in_its_place() -> None:
+    """A block of 2 x 2 pixels is one pixel of the half-size camera, also at the far edge."""
+    item = textured_room.frame(1, 4)
+    odd = replace(
+        item,
+        image_u8=item.image_u8[:47, :63],
+        color_camera=replace(item.color_camera, width=63, height=47),
+    )
+    view = training_view(FrameSurface(odd, LIMITS))
+    camera = view.half.camera
+    assert (camera.width, camera.height) == (32, 24)
+    assert view.half.planes_u8.shape == (3, 24, 32)
+    p_camera = np.array([[0.3, 0.2, 1.0]])
+    np.testing.assert_allclose(
+        camera.project(p_camera)[0] * 2, odd.color_camera.project(p_camera)[0], rtol=1e-12
+    )

@@ -98,3 +98,25 @@ def test_frames_without_depth_are_refused() -> None:
     empty = replace(item, depth_m=np.zeros_like(item.depth_m))
     with pytest.raises(NoSurfaceError, match="0 usable points"):
         fuse([FrameSurface(empty, LIMITS).points()], InitialiseConfig())
+
+
+@pytest.mark.parametrize("nothing", [np.nan, np.inf])
+def test_depth_that_is_no_number_is_no_measurement(nothing: float) -> None:
+    """Neither it nor its neighbours are trusted, as with 0."""
+    item = textured_room.frame(2, 6)
+    depth = item.depth_m.copy()
+    depth[10, 10] = nothing
+    surface = FrameSurface(replace(item, depth_m=depth), LIMITS)
+    zero = depth.copy()
+    zero[10, 10] = 0.0
+    np.testing.assert_array_equal(
+        surface.trusted, FrameSurface(replace(item, depth_m=zero), LIMITS).trusted
+    )
+    assert np.isfinite(surface.depth_in_color_camera()).all()
+
+
+def test_a_frame_without_any_depth_has_no_points() -> None:
+    item = textured_room.frame(2, 6)
+    surface = FrameSurface(replace(item, depth_m=np.zeros_like(item.depth_m)), LIMITS)
+    assert len(surface.points().p_m) == 0
+    assert not surface.depth_in_color_camera().any()

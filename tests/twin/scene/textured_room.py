@@ -73,8 +73,15 @@ def frame(index: int, count: int) -> RgbdFrame:
     )
 
 
-def write_episode(path: Path, *, num_frames: int, kind: str = "scan", still: bool = False) -> None:
-    """Write an episode as a recorder would."""
+def write_episode(
+    path: Path,
+    *,
+    num_frames: int,
+    kind: str = "scan",
+    still: bool = False,
+    sent_late_ns: int = 0,
+) -> None:
+    """Write an episode as a recorder would; one that knows only when images were sent is late."""
     names = ("wrist_color_optical", "wrist_depth_optical")
     with EpisodeWriter(path) as writer:
         writer.describe(EpisodeInfo(id=path.stem, kind=kind, cell="room", stand_in=True))
@@ -118,5 +125,9 @@ def write_episode(path: Path, *, num_frames: int, kind: str = "scan", still: boo
                 ]
             for topic, data, type_name in messages:
                 writer.write(
-                    topic, data, type_name=type_name, log_time_ns=stamp, publish_time_ns=stamp
+                    topic,
+                    data,
+                    type_name=type_name,
+                    log_time_ns=stamp + sent_late_ns,
+                    publish_time_ns=stamp + sent_late_ns,
                 )
