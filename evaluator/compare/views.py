@@ -8,6 +8,7 @@ the recorded ones on ``.../cam/<id>/recorded/image`` (or, in its source episode,
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -154,27 +155,22 @@ def _measure(part: str, episodes: Sequence[str], scores: Sequence[ViewScore]) ->
     ssim = [s.score.ssim for s in scores if s.score.ssim is not None]
     stored = "rendered images stored as JPEG" if any(s.jpeg for s in scores) else "stored lossless"
     stamp = f"full frame, no mask, no colour alignment, {stored}; mean of per-image values"
-    spread = "the per-image list is in the table"
     return [
-        measured(
-            f"views.{part}.psnr_db",
-            lambda: _mean("PSNR", psnr),
-            unit="dB",
-            definition=f"{PSNR_PROTOCOL}; {stamp}",
-            n=len(psnr),
-            counted="image",
-            reason_without_interval=spread,
-            episodes=episodes,
-        ),
-        measured(
-            f"views.{part}.ssim",
-            lambda: _mean("SSIM", ssim),
-            unit="1",
-            definition=f"{SSIM_PROTOCOL}; {stamp}",
-            n=len(ssim),
-            counted="image",
-            reason_without_interval=spread,
-            episodes=episodes,
+        *(
+            measured(
+                f"views.{part}.{name}",
+                partial(_mean, statistic, values),
+                unit=unit,
+                definition=f"{protocol}; {stamp}",
+                n=len(values),
+                counted="image",
+                reason_without_interval="the per-image list is in the table",
+                episodes=episodes,
+            )
+            for name, statistic, unit, protocol, values in (
+                ("psnr_db", "PSNR", "dB", PSNR_PROTOCOL, psnr),
+                ("ssim", "SSIM", "1", SSIM_PROTOCOL, ssim),
+            )
         ),
         Measurement(
             id=f"views.{part}.lpips",

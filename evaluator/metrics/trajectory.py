@@ -57,13 +57,6 @@ def _angles_rad(
     return np.asarray(4.0 * np.arctan2(np.minimum(near, far), np.maximum(near, far)))
 
 
-def mean_curve(
-    runs: Sequence[PoseTrajectory], num_samples: int = NORMALISED_SAMPLES
-) -> Float[np.ndarray, "num_samples 3"]:
-    """Average the positions of several runs over normalised time [m]."""
-    return np.asarray(_curves(runs, num_samples).mean(axis=0))
-
-
 def moving_part(run: PoseTrajectory, *, threshold_m: float = MOVING_THRESHOLD_M) -> PoseTrajectory:
     """Cut the waiting at both ends: from leaving the start to staying at the end.
 

@@ -10,7 +10,6 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.image import ImageShapeError, psnr_db, score_image, ssim
 from evaluator.metrics.trajectory import (
     band_distance,
-    mean_curve,
     moving_part,
     pose_errors,
     repeatability,
@@ -129,7 +128,6 @@ def test_bands_by_hand() -> None:
     assert distance.between_mean_curves_m == pytest.approx(0.03)
     assert distance.end_point_between_means_m == pytest.approx(0.03)
     assert repeatability(recorded).mean_m == pytest.approx(np.sqrt(2 * 0.01**2))
-    np.testing.assert_allclose(mean_curve(recorded)[:, 1], 0.0, atol=1e-12)
 
 
 def test_a_common_rigid_motion_changes_no_band() -> None:

@@ -5,7 +5,6 @@ Gaussians are cut where the localised shape is; the mesh is the known shape itse
 """
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ from twin.scene.localise import LocalisedObject
 from twin.scene.localise_colour import ColourConfig, likeness, linear_from_srgb
 from twin.scene.localise_fit import FitConfig, refine_on_points
 from twin.scene.localise_shape import surface_distances
-from twin.scene.ply import write_ply
+from twin.scene.ply import write_ply, write_whole
 
 OBJECT_VERSION = 1
 MIN_SPLATS_TO_REFINE = 50
@@ -98,16 +97,6 @@ def split_objects(
     return SceneParts(
         background=background, objects=objects, filling=concatenate([nothing, *filling])
     )
-
-
-def compose(parts: SceneParts, Ts_base_object: Mapping[str, np.ndarray]) -> GaussianCloud:
-    """Put objects into the background again, each where the mapping says; others are left out."""
-    placed = [
-        moved_cloud(item.cloud, Ts_base_object[key])
-        for key, item in parts.objects.items()
-        if key in Ts_base_object
-    ]
-    return concatenate([parts.background, parts.filling, *placed])
 
 
 def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> GaussianCloud:
@@ -225,12 +214,12 @@ def write_objects(
         model, place = task.objects[key], folder / "objects" / key
         place.mkdir(parents=True, exist_ok=True)
         write_ply(place / "gaussians.ply", item.cloud)
-        _write_whole(place / "mesh.ply", _mesh_ply(*shape_mesh(model)))
+        write_whole(place / "mesh.ply", _mesh_ply(*shape_mesh(model)))
         about = _object_record(model, item, localised[key])
         about["files"] = {
             name: provenance.hash_file(place / name) for name in ("gaussians.ply", "mesh.ply")
         }
-        _write_whole(place / "object.json", (json.dumps(about, indent=2) + "\n").encode())
+        write_whole(place / "object.json", (json.dumps(about, indent=2) + "\n").encode())
         record[key] = {
             "folder": f"objects/{key}",
             "num_splats": len(item.cloud),
@@ -284,13 +273,3 @@ def _mesh_ply(
     rows = np.zeros(len(faces), dtype=[("count", "u1"), ("ids", "<i4", 3)])
     rows["count"], rows["ids"] = 3, faces
     return "\n".join(header).encode() + vertices.astype("<f4").tobytes() + rows.tobytes()
-
-
-def _write_whole(path: Path, data: bytes) -> None:
-    """The file appears under its name only when it is complete."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-    part.replace(path)

@@ -50,10 +50,14 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
     ).astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
     header += [f"property float {name}" for name in COLUMNS]
+    write_whole(path, "\n".join([*header, "end_header", ""]).encode() + table.tobytes())
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file that appears under its name only when it is complete."""
     part = path.with_name(path.name + ".part")
     with part.open("wb") as stream:
-        stream.write("\n".join([*header, "end_header", ""]).encode())
-        stream.write(table.tobytes())
+        stream.write(data)
         stream.flush()
         os.fsync(stream.fileno())
     part.replace(path)

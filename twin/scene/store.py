@@ -1,7 +1,6 @@
 """The scene folder: ``scene.json`` and ``background.ply``, whole or not at all."""
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from bridge.episode.run import RunFolder
 from bridge.errors import PathNotFoundError
 from twin.errors import TwinError
 from twin.scene.gaussians import GaussianCloud
-from twin.scene.ply import read_ply
+from twin.scene.ply import read_ply, write_whole
 
 SCENE_VERSION = 1
 BACKGROUND = "background.ply"
@@ -96,11 +95,5 @@ def read_scene(run: RunFolder) -> Scene:
 def write_record(run: RunFolder, record: Mapping[str, Any]) -> Path:
     """Write ``scene.json`` last, by renaming: it vouches for everything else in the folder."""
     path = run.scene_dir / SCENE_FILE
-    part = path.with_name(path.name + ".part")
-    with part.open("w") as stream:
-        json.dump(record, stream, indent=2)
-        stream.write("\n")
-        stream.flush()
-        os.fsync(stream.fileno())
-    part.replace(path)
+    write_whole(path, (json.dumps(record, indent=2) + "\n").encode())
     return path

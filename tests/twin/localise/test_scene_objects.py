@@ -1,7 +1,6 @@
 """Objects taken out of a scene: every Gaussian in one part, each part where it belongs."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +16,12 @@ from twin.scene.localise import LocalisedObject
 from twin.scene.localise_shape import pose_of
 from twin.scene.objects import (
     SplitConfig,
-    compose,
     moved_cloud,
     shape_mesh,
     split_objects,
     write_objects,
 )
+from twin.scene.parts import put_together
 from twin.scene.ply import read_ply
 
 TASK = load_task("cube_into_box")
@@ -105,15 +104,13 @@ def test_objects_come_in_their_own_frame_and_compose_back(
     parts = split_objects(cloud, localised(**POSES), TASK)
     half = np.array(TASK.objects["cube"].size_m) / 2
     assert np.all(np.abs(parts.objects["cube"].cloud.means_m) < half + 0.002)
-    poses = {key: item.T_base_object for key, item in parts.objects.items()}
-    again = compose(replace(parts, filling=parts.filling.take(np.zeros(0, dtype=int))), poses)
+    again = put_together(parts.background, parts.objects)
     for rows in (cloud.means_m, again.means_m):
         assert rows.shape == (len(cloud), 3)
     ours = again.means_m[np.lexsort(again.means_m.round(4).T)]
     theirs = cloud.means_m[np.lexsort(cloud.means_m.round(4).T)]
     np.testing.assert_allclose(ours.mean(axis=0), theirs.mean(axis=0), atol=1e-6)
     np.testing.assert_allclose(ours.std(axis=0), theirs.std(axis=0), atol=1e-6)
-    assert len(compose(parts, {})) == len(parts.background) + len(parts.filling)
 
 
 def test_a_localisation_that_is_4_mm_off_follows_the_gaussians(
