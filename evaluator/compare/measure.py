@@ -1,5 +1,6 @@
 """Turn counts and statistics into ``Measurement`` records; what is undefined keeps its reason."""
 
+import math
 import re
 from collections.abc import Callable, Iterable
 
@@ -26,7 +27,10 @@ def measured(
     reason_without_interval: str | None = None,
     episodes: Iterable[str] = (),
 ) -> Measurement:
-    """Compute one statistic; ``compute`` gives a value, or a value with its interval."""
+    """Compute one statistic; ``compute`` gives a value, or a value with its interval.
+
+    What is not finite is undefined and says so: one broken pose must not end an evaluation.
+    """
     value: float | None = None
     interval: Interval | None = None
     reason: str | None = None
@@ -35,6 +39,9 @@ def measured(
         value, interval = outcome if isinstance(outcome, tuple) else (outcome, None)
     except UndefinedStatisticError as error:
         reason = error.reason
+    if value is not None and not math.isfinite(value):
+        value, interval = None, None
+        reason = "the recorded or replayed data hold values that are not finite"
     return Measurement(
         id=measurement_id,
         value=value,

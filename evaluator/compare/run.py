@@ -63,7 +63,7 @@ def compare_run(run: RunFolder) -> Comparison:
             continue
         rows.append(row)
         left_out += lacking
-    views = compare_views(files, recorded)
+    views = compare_views(files, recorded, hashes)
     bands = compare_bands(recorded, files)
     base = compare_rows(
         rows, run=run.path.resolve().name, source="run", stand_in=_stand_in(recorded, files)

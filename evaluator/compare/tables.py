@@ -149,8 +149,8 @@ def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
     for name, said in (
         ("sim planned", lambda row: row.sim_planned),
         ("verdict before motion", lambda row: row.verdict),
-        ("- not obeyed (without replanning)", unheeded_verdict),
-        ("- obeyed (with replanning)", heeded_verdict),
+        ("verdict, not obeyed (without replanning)", unheeded_verdict),
+        ("verdict, obeyed (with replanning)", heeded_verdict),
         ("sim executed (diagnosis)", lambda row: row.sim_executed),
     ):
         counts = confusion_of(rows, said)

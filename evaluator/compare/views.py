@@ -6,9 +6,10 @@ the recorded ones on ``.../cam/<id>/recorded/image`` (or, in its source episode,
 """
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -62,11 +63,25 @@ class _Images:
     recorded: dict[tuple[str, int], bytes] = field(default_factory=dict)
 
 
-def compare_views(files: Sequence[DerivedFile], recorded: Sequence[Episode] = ()) -> ViewReport:
-    """Compute PSNR and SSIM of every rendered view, per image and mean."""
-    views, left_out = _newest([file for file in files if file.derived.kind == "views"])
+def compare_views(
+    files: Sequence[DerivedFile], recorded: Sequence[Episode], hashes: Mapping[Path, str]
+) -> ViewReport:
+    """Compute PSNR and SSIM of every rendered view, per image and mean.
+
+    Args:
+        files: Every derived episode of the run.
+        recorded: Every recorded episode.
+        hashes: Content hash of each; views made from other bytes are stale and left out.
+    """
+    now = {episode.info.id: hashes[episode.path] for episode in recorded}
+    views, stale = _current([file for file in files if file.derived.kind == "views"], now)
+    views, left_out = _newest(views)
+    left_out += stale
     if not views:
-        return ViewReport(missing=("views: no rendered views (robot-gst rebuild makes them)",))
+        return ViewReport(
+            missing=("views: no rendered views (robot-gst rebuild makes them)",),
+            exclusions=tuple(left_out),
+        )
     sources = {episode.info.id: episode for episode in recorded}
     tables: list[Table] = []
     found: dict[str, list[ViewScore]] = {}
@@ -88,6 +103,21 @@ def compare_views(files: Sequence[DerivedFile], recorded: Sequence[Episode] = ()
     return ViewReport(
         measurements=tuple(measurements), tables=tuple(tables), exclusions=tuple(left_out)
     )
+
+
+def _current(
+    views: Sequence[DerivedFile], now: Mapping[str, str]
+) -> tuple[list[DerivedFile], list[Exclusion]]:
+    """Leave out views that were made from another version of their recorded episode."""
+    stale = [
+        file
+        for file in views
+        if file.derived.source_sha256 not in ("", now.get(file.derived.source_episode, ""))
+        and file.derived.source_episode in now
+    ]
+    reason = "made from another version of the episode (its hash differs); rebuild again"
+    left_out = [Exclusion(episode=f.path.name, scope="views", reason=reason) for f in stale]
+    return [file for file in views if file not in stale], left_out
 
 
 def _newest(views: Sequence[DerivedFile]) -> tuple[list[DerivedFile], list[Exclusion]]:

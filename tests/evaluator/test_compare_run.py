@@ -186,9 +186,9 @@ def image_u8(seed: int) -> np.ndarray:
     return np.kron(rng.integers(0, 255, (4, 5, 3)), np.ones((8, 8, 1))).astype(np.uint8)
 
 
-def write_views(run: RunFolder, *, with_recorded: bool) -> None:
+def write_views(run: RunFolder, *, with_recorded: bool, source_sha256: str = "") -> None:
     info = EpisodeInfo(id="scan-views-x", kind="scan")
-    derived = Derived(kind="views", source_episode="scan", source_sha256="")
+    derived = Derived(kind="views", source_episode="scan", source_sha256=source_sha256)
     scan = run.episodes_dir / "scan.mcap"
     views = run.derived_dir / "scan.views.x.mcap"
     with EpisodeWriter(scan) as original, EpisodeWriter(views) as rendered:
@@ -228,6 +228,13 @@ def test_a_run_with_only_views_gets_image_scores(maker: Any, with_recorded: bool
     assert "no backbone" in str(lpips.reason_if_undefined)
     table = next(table for table in comparison.tables if table.id == "views_0")
     assert len(table.rows) == 3
+
+
+def test_views_of_another_version_of_the_episode_are_left_out(maker: Any) -> None:
+    write_views(maker.run, with_recorded=True, source_sha256="0" * 64)
+    comparison = compare_run(maker.run)
+    assert not any(m.id.startswith("views.") for m in comparison.measurements)
+    assert "another version of the episode" in reasons(comparison, "scan.views.x.mcap")
 
 
 def test_a_rendered_view_without_its_recorded_image_is_left_out(maker: Any) -> None:

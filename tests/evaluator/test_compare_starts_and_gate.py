@@ -73,8 +73,8 @@ def test_a_plan_refused_but_executed_anyway_is_named_as_such(maker: Any) -> None
     table = next(table for table in comparison.tables if table.id == "confusion")
     counts = {row[0]: row[1:] for row in table.rows}
     assert counts["verdict before motion"] == (1, 1, 1, 1, 4)
-    assert counts["- not obeyed (without replanning)"] == (1, 0, 1, 1, 3)
-    assert counts["- obeyed (with replanning)"] == (0, 1, 0, 0, 1)
+    assert counts["verdict, not obeyed (without replanning)"] == (1, 0, 1, 1, 3)
+    assert counts["verdict, obeyed (with replanning)"] == (0, 1, 0, 0, 1)
     assert "executed anyway" in table.note
 
 
@@ -94,6 +94,16 @@ def test_the_largest_tool_error_is_not_lost_between_samples(maker: Any) -> None:
     maker.replay("t1", num_poses=900, astray=301)
     largest = compare_run(maker.run).results().get("tcp.planned.position_max_m")
     assert largest.value == pytest.approx(1.0)
+
+
+def test_a_pose_that_is_not_a_number_leaves_the_tool_error_undefined(maker: Any) -> None:
+    maker.trial("t1")
+    maker.replay("t1", offset_m=float("nan"))
+    results = compare_run(maker.run).results()
+    error = results.get("tcp.planned.position_mean_m")
+    assert error.value is None
+    assert "not finite" in str(error.reason_if_undefined)
+    assert results.get("agreement.sim_planned.rate").k == 1
 
 
 def test_every_input_file_is_named_with_its_hash(six_trials: Any) -> None:

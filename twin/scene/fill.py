@@ -29,7 +29,7 @@ def fill_footprint(
     Args:
         background: The scene without the object.
         model: Its footprint.
-        T_base_object: Where it stood; an object that does not stand on the table leaves no hole.
+        T_base_object: Where it stood.
 
     Returns:
         The filling alone; empty where the table was seen, or where none is around.

@@ -29,7 +29,13 @@ from twin.scene.points import DepthLimits, FrameSurface, PointSet
 from twin.scene.raster import RasterConfig, load_native
 from twin.scene.record import make_record, summarise_views
 from twin.scene.settings import RebuildConfig
-from twin.scene.store import BACKGROUND, HASH_DIGITS, SCENE_FILE, read_record, write_record
+from twin.scene.store import (
+    BACKGROUND,
+    SCENE_FILE,
+    background_hash,
+    read_record,
+    write_record,
+)
 from twin.scene.training_view import TrainingView, training_view
 from twin.scene.views import ViewsJob, views_path, write_views
 
@@ -81,7 +87,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     if apart.remark:
         output.say(apart.remark)
     write_ply(run.scene_dir / BACKGROUND, apart.background)
-    scene_hash = provenance.hash_file(run.scene_dir / BACKGROUND)[:HASH_DIGITS]
+    scene_hash = background_hash(run)
     job = ViewsJob(
         scene_hash=scene_hash,
         cloud=fitted.cloud,
@@ -144,7 +150,8 @@ def _already_done(run: RunFolder, key: str) -> dict[str, Any] | None:
         for item in record.get("objects", {}).values()
         for name in item["files"]
     ]
-    return record if all(path.is_file() for path in needed) else None
+    whole = all(path.is_file() for path in needed)
+    return record if whole and background_hash(run) == record["scene_hash"] else None
 
 
 def _learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output) -> _Learnt:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bridge.episode import provenance
 from bridge.episode.run import RunFolder
 from bridge.errors import PathNotFoundError
 from twin.errors import TwinError
@@ -77,19 +78,30 @@ def scene_hash_of(run: RunFolder) -> str | None:
     return None if record is None else str(record["scene_hash"])
 
 
+def background_hash(run: RunFolder) -> str:
+    """Name of the scene whose background lies in the folder now."""
+    return provenance.hash_file(run.scene_dir / BACKGROUND)[:HASH_DIGITS]
+
+
 def read_scene(run: RunFolder) -> Scene:
     """Load the rebuilt scene of a run.
 
     Raises:
         PathNotFoundError: When the run was not rebuilt yet.
-        UnreadableSceneError: When ``scene.json`` cannot be understood.
+        UnreadableSceneError: When ``scene.json`` cannot be understood, or describes another
+            background than the one that lies beside it.
+        UnreadablePlyError: When the background is damaged.
     """
     record = read_record(run)
     if record is None:
         raise PathNotFoundError(
             path=run.scene_dir / SCENE_FILE, what="scene", hint="Make it: robot-gst rebuild RUN."
         )
-    return Scene(record=record, background=read_ply(run.scene_dir / BACKGROUND))
+    scene = Scene(record=record, background=read_ply(run.scene_dir / BACKGROUND))
+    if background_hash(run) != scene.scene_hash:
+        found = f"describes scene {scene.scene_hash}, {BACKGROUND} is {background_hash(run)}"
+        raise UnreadableSceneError(path=run.scene_dir / SCENE_FILE, found=found)
+    return scene
 
 
 def write_record(run: RunFolder, record: Mapping[str, Any]) -> Path:

@@ -25,7 +25,7 @@ from twin.scene.parts import read_objects, take_apart
 from twin.scene.points import DepthLimits, FrameSurface
 from twin.scene.rebuild import rebuild
 from twin.scene.settings import FitConfig, FrameConfig, InitialiseConfig, RebuildConfig
-from twin.scene.store import UnreadableSceneError, read_record, scene_hash_of
+from twin.scene.store import UnreadableSceneError, read_record, read_scene, scene_hash_of
 
 QUIET = Output(quiet=True)
 CONFIG = RebuildConfig(
@@ -69,6 +69,19 @@ def test_a_scene_file_without_what_its_readers_need_is_refused(room: RunFolder, 
     change_record(room, lambda record: record.pop(lost))
     with pytest.raises(UnreadableSceneError, match=f"without {lost}"):
         read_record(room)
+
+
+def test_a_background_that_is_not_the_described_one_is_refused_and_made_again(
+    room: RunFolder,
+) -> None:
+    path = room.scene_dir / "background.ply"
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(UnreadableSceneError, match="describes scene"):
+        read_scene(room)
+    rebuild(room, CONFIG, QUIET)
+    assert len(read_scene(room).background) > 0
 
 
 def test_a_lost_object_file_is_made_again(room: RunFolder) -> None:
