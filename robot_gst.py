@@ -3,6 +3,7 @@
 Everything is lazy: a command's module is imported when the command runs.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -168,6 +169,17 @@ def run(arguments: Sequence[str]) -> int:
     except GstError as error:
         sys.stderr.write(f"robot-gst: {error}\n")
         return error.exit_code
+    except BrokenPipeError:  # whoever read our output, for example head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        where = f" {error.filename}" if error.filename else ""
+        cause = error.strerror or str(error)
+        sys.stderr.write(
+            f"robot-gst: cannot read or write{where}: {cause}. "
+            "Check the path, its permissions and the free space, then run the command again.\n"
+        )
+        return 1
     except KeyboardInterrupt:
         sys.stderr.write("robot-gst: interrupted\n")
         return 130
@@ -194,7 +206,7 @@ def _take_config(tokens: list[str]) -> tuple[list[str], Path | None]:
                 value, rest = rest[0], rest[1:]
             path = Path(value)
             if path.suffix != ".toml":  # zenoh's own configuration keeps its name and place
-                return tokens, None
+                continue
             if not path.is_file():
                 raise PathNotFoundError(path=path, what="settings file", hint="Check the path.")
             return tokens[:index] + rest, path

@@ -23,6 +23,11 @@ def replay(
     """Replay every plan and every execution of a run, and judge each: I(tau).
 
     Example: robot-gst replay runs/today --workers 2
+
+    Args:
+        run: Run folder.
+        config: Settings.
+        output: How to talk.
     """
     from bridge.episode.run import RunFolder
     from twin.replay.run import describe_run, replay_run
@@ -42,6 +47,11 @@ def gate(
     """Judge plans live over zenoh, before the robot moves; stop with Ctrl-C.
 
     Example: robot-gst gate runs/today --cell standin --task cube_into_box --deadline 20s
+
+    Args:
+        run: Run folder with the rebuilt scene.
+        config: Settings.
+        output: How to talk.
     """
     from twin.gate import run_gate
 
@@ -58,6 +68,11 @@ def rebuild(
     """Rebuild the static scene as Gaussians, and render the held-out views.
 
     Example: robot-gst rebuild runs/monday --budget 60s
+
+    Args:
+        run: Run folder.
+        config: Settings.
+        output: How to talk.
     """
     from bridge.episode.run import RunFolder
     from twin.scene.rebuild import rebuild as rebuild_scene
@@ -78,6 +93,11 @@ def render(
     """Draw the rebuilt scene to a PNG, from a recorded or a given camera pose.
 
     Example: robot-gst render runs/monday --camera wrist --at-s 3
+
+    Args:
+        run: Run folder.
+        config: Settings.
+        output: How to talk.
     """
     from bridge.episode.run import RunFolder
     from twin.scene.render import render as render_scene

@@ -2,9 +2,7 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
+from typing import Literal
 
 from bridge.terminal import Output
 
@@ -15,6 +13,10 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
     """Show what an episode holds.
 
     Example: robot-gst info runs/demo/episodes/trial_0001.mcap
+
+    Args:
+        episode: An episode file, recorded or derived.
+        output: How to talk.
     """
     from bridge.episode.reader import Episode
 
@@ -56,12 +58,22 @@ def check(episodes: list[Path], /, *, output: Output = OUTPUT) -> int:
     """Check that episodes are whole: CRCs, decoding, counts, and losses they declare.
 
     Exit code 0 clean, 3 declared losses, 1 broken. Example: robot-gst check runs/demo
+
+    Args:
+        episodes: Episode files, or folders to search for them.
+        output: How to talk.
     """
     from bridge.episode.check import check_episode
+    from bridge.errors import UsageError
 
     files: list[Path] = []
     for path in episodes:
         files.extend(sorted(path.rglob("*.mcap")) if path.is_dir() else [path])
+        for part in sorted(path.rglob("*.mcap.part")) if path.is_dir() else []:
+            output.say(f"{part} is not finished: still being written, or its writer was killed")
+    if not files:
+        listed = ", ".join(map(str, episodes)) or "no path"
+        raise UsageError(f"no episodes in {listed}. Record some: robot-gst record RUN.")
     reports = [check_episode(path) for path in files]
     lines = []
     for report in reports:
@@ -82,15 +94,19 @@ def check(episodes: list[Path], /, *, output: Output = OUTPUT) -> int:
             for report in reports
         ]
     }
-    output.result(data, "\n".join(lines) or "no episodes found")
+    output.result(data, "\n".join(lines))
     codes = {report.exit_code for report in reports}
-    return 1 if 1 in codes or not reports else max(codes)
+    return 1 if 1 in codes else max(codes)
 
 
 def ls(run: Path, /, *, output: Output = OUTPUT) -> int:
     """List the episodes of a run.
 
     Example: robot-gst ls runs/demo
+
+    Args:
+        run: Run folder.
+        output: How to talk.
     """
     from bridge.episode.catalogue import list_episodes
     from bridge.episode.run import RunFolder
@@ -114,7 +130,7 @@ def label(
     episode: str,
     /,
     *,
-    result: Annotated[str, Parameter(help="success, failure or unknown.")],
+    result: Literal["success", "failure", "unknown"],
     by: str = "operator",
     detail: str | None = None,
     output: Output = OUTPUT,
@@ -122,6 +138,14 @@ def label(
     """Say after the fact how an episode ended; kept in notes/, the episode is not rewritten.
 
     Example: robot-gst label runs/monday trial_0003 --result failure --detail "slipped"
+
+    Args:
+        run: Run folder.
+        episode: Id of the episode: its file name without .mcap.
+        result: success, failure or unknown.
+        by: Who says so.
+        detail: What happened, in words.
+        output: How to talk.
     """
     from bridge.episode.catalogue import label_episode
     from bridge.episode.metadata import Outcome
@@ -137,6 +161,9 @@ def doctor(*, output: Output = OUTPUT) -> int:
     """Say what is installed, what is missing, and how to get it.
 
     Example: robot-gst doctor
+
+    Args:
+        output: How to talk.
     """
     from bridge.doctor import examine
 

@@ -3,12 +3,11 @@
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
-from bridge.episode.metadata import Outcome
+from bridge.episode.metadata import Outcome, build
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder, check_episode_id
-from bridge.errors import BridgeError, PathNotFoundError
+from bridge.episode.run import EPISODE_ID, RunFolder, check_episode_id
+from bridge.errors import GstError, PathNotFoundError
 from bridge.task.record import check_record, parse_record
 
 
@@ -36,16 +35,15 @@ def list_episodes(run: RunFolder) -> list[Entry]:
 
 
 def _entry(run: RunFolder, path: Path) -> Entry:
-    size = path.stat().st_size
+    size = path.stat().st_size if path.is_file() else 0
     try:
         episode = Episode.open(path)
-        outcome = outcome_of(run, episode)
-    except BridgeError as error:
+        info, outcome = episode.info, outcome_of(run, episode)
+    except GstError as error:
         return Entry(file=path.name, id=path.stem, size_bytes=size, error=str(error))
-    info = episode.info
     return Entry(
         file=path.name,
-        id=info.id,
+        id=path.stem,
         kind=info.kind,
         task=info.task,
         condition=info.condition,
@@ -64,18 +62,12 @@ def _sidecar(run: RunFolder, episode_id: str) -> Path:
 
 def outcome_of(run: RunFolder, episode: Episode) -> Outcome | None:
     """Return the label given after the fact if there is one, else what the episode says."""
-    path = _sidecar(run, episode.info.id)
+    if not EPISODE_ID.fullmatch(episode.path.stem):
+        return episode.outcome  # a file of another program; it cannot have been labelled here
+    path = _sidecar(run, episode.path.stem)
     if not path.is_file():
         return episode.outcome
-    record = parse_record(path.read_bytes(), name="outcome")
-    return outcome_from(record)
-
-
-def outcome_from(record: dict[str, Any]) -> Outcome:
-    """Build an ``Outcome`` from a checked record."""
-    known = {name: record[name] for name in Outcome.__dataclass_fields__ if name in record}
-    known["stages"] = tuple(known.get("stages", ()))
-    return Outcome(**known)
+    return build(Outcome, parse_record(path.read_bytes(), name="outcome"))
 
 
 def label_episode(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:

@@ -63,6 +63,8 @@ def check_episode(path: Path) -> CheckReport:
     report = CheckReport(path=path)
     try:
         episode = Episode.open(path)
+        kind = episode.info.kind
+        _ = episode.outcome, episode.derived  # raises when they cannot be read
         declared = {topic: item.count for topic, item in episode.topics().items()}
         for message in episode.messages():
             _check_message(report, message)
@@ -70,7 +72,7 @@ def check_episode(path: Path) -> CheckReport:
         report.faults.append(str(error))
         return report
     _check_counts(report, declared)
-    if episode.info.kind != "imported":
+    if kind != "imported":
         _check_contract(report, episode)
     _add_ledger(report, episode)
     return report

@@ -5,8 +5,10 @@ survive the round trip.
 """
 
 import json
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, dataclass, field, fields
+from types import UnionType
+from typing import Any, TypeVar, get_origin
 
 SCHEMA_VERSION = 1
 KINDS = ("scan", "trial", "probe", "imported")
@@ -70,10 +72,39 @@ class Derived:
     settings: dict[str, Any] = field(default_factory=dict)
 
 
+Record = TypeVar("Record")
+
+
 def to_strings(record: object) -> dict[str, str]:
     """Turn one of the records above into an MCAP metadata map."""
     values = asdict(record)  # type: ignore[call-overload]
     return {name: json.dumps(value) for name, value in values.items()}
+
+
+def build(of_type: type[Record], record: Mapping[str, Any]) -> Record:
+    """Make one of the records above from parsed values; fields of later versions are left out.
+
+    Raises:
+        TypeError: When a field is missing, or is a list, text or number and should not be.
+    """
+    values = {}
+    for item in fields(of_type):  # type: ignore[arg-type]
+        if item.name not in record:
+            if item.default is MISSING and item.default_factory is MISSING:
+                message = f"{item.name} is missing"
+                raise TypeError(message)
+            continue
+        wanted: Any = item.type
+        value = record[item.name]
+        if isinstance(value, list) and get_origin(wanted) is tuple:
+            value = tuple(value)
+        origin = get_origin(wanted)
+        kind = wanted if origin in (None, UnionType) else origin
+        if not isinstance(value, kind):
+            message = f"{item.name} is {value!r:.60}"
+            raise TypeError(message)
+        values[item.name] = value
+    return of_type(**values)
 
 
 def from_strings(values: dict[str, str]) -> dict[str, Any]:
@@ -82,6 +113,6 @@ def from_strings(values: dict[str, str]) -> dict[str, Any]:
     for name, text in values.items():
         try:
             record[name] = json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             record[name] = text
     return record

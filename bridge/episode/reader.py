@@ -4,7 +4,7 @@ import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import zstandard
 from mcap.exceptions import McapError
@@ -24,8 +24,12 @@ DAMAGE = (
     IndexError,
     OverflowError,
     OSError,
+    MemoryError,  # a damaged length asks for terabytes
+    RuntimeError,  # lz4's own
 )
 """What the ``mcap`` package raises on bytes that are not what they claim to be."""
+
+Record = TypeVar("Record", metadata.EpisodeInfo, metadata.Outcome, metadata.Derived)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,28 +102,30 @@ class Episode:
     @property
     def info(self) -> metadata.EpisodeInfo:
         """Who, what and when; a foreign MCAP file counts as imported."""
-        record = self._records.get("episode")
-        if record is None:
-            return metadata.EpisodeInfo(id=self.path.stem, kind="imported")
-        known = _known(record, metadata.EpisodeInfo)
-        known["tags"] = tuple(known.get("tags", ()))
-        return metadata.EpisodeInfo(**known)
+        found = self._metadata("episode", metadata.EpisodeInfo)
+        return found or metadata.EpisodeInfo(id=self.path.stem, kind="imported")
 
     @property
     def outcome(self) -> metadata.Outcome | None:
         """What the operator said at the end, if anything."""
-        record = self._records.get("outcome")
-        if record is None:
-            return None
-        known = _known(record, metadata.Outcome)
-        known["stages"] = tuple(known.get("stages", ()))
-        return metadata.Outcome(**known)
+        return self._metadata("outcome", metadata.Outcome)
 
     @property
     def derived(self) -> metadata.Derived | None:
         """What this episode was made from, or None for a recorded one."""
-        record = self._records.get("derived")
-        return None if record is None else metadata.Derived(**_known(record, metadata.Derived))
+        return self._metadata("derived", metadata.Derived)
+
+    def _metadata(self, name: str, of_type: type[Record]) -> Record | None:
+        if name not in self._records:
+            return None
+        try:
+            return metadata.build(of_type, self._records[name])
+        except (TypeError, ValueError) as error:
+            raise EpisodeError(
+                path=self.path,
+                found=f"its metadata record {name!r} cannot be read ({error})",
+                hint="docs/episode_format.md lists the fields; another program wrote them.",
+            ) from error
 
     @property
     def metadata_records(self) -> dict[str, dict[str, Any]]:
@@ -194,21 +200,22 @@ class Episode:
                         data=message.data,
                     )
         except DAMAGE as error:
-            raise EpisodeError(
-                path=self.path,
-                found=f"damaged ({type(error).__name__}: {str(error)[:120]})",
-                hint="Run robot-gst check on it.",
-            ) from error
+            raise self._damaged(error) from error
+
+    def _damaged(self, error: BaseException) -> EpisodeError:
+        return EpisodeError(
+            path=self.path,
+            found=f"damaged ({type(error).__name__}: {str(error)[:120]})",
+            hint="Run robot-gst check on it.",
+        )
 
     def attachment(self, name: str) -> bytes | None:
         """Return the bytes of an attachment, or None."""
-        with self.path.open("rb") as stream:
-            for item in make_reader(stream).iter_attachments():
-                if item.name == name:
-                    return item.data
+        try:
+            with self.path.open("rb") as stream:
+                for item in make_reader(stream).iter_attachments():
+                    if item.name == name:
+                        return item.data
+        except DAMAGE as error:
+            raise self._damaged(error) from error
         return None
-
-
-def _known(record: dict[str, Any], of_type: type) -> dict[str, Any]:
-    names = of_type.__dataclass_fields__  # type: ignore[attr-defined]
-    return {name: value for name, value in record.items() if name in names}

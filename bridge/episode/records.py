@@ -51,6 +51,9 @@ class JointSample:
     def from_cdr(data: bytes) -> "JointSample":
         """Read a sensor_msgs/JointState."""
         message = cdr.decode(schema.JOINT_STATE, data)
+        if len(message["position"]) not in (0, len(message["name"])):
+            found = f"{len(message['position'])} positions of {len(message['name'])} joints"
+            raise cdr.MalformedMessageError(type_name=schema.JOINT_STATE, found=found)
         return JointSample(
             stamp_ns=stamp_of(message),
             names=tuple(message["name"]),
@@ -206,9 +209,11 @@ def _pose_fields(
 
 
 def _transform_of(
-    position: dict[str, float], rotation: dict[str, float]
+    position: dict[str, float], rotation: dict[str, float], *, type_name: str
 ) -> Float[np.ndarray, "4 4"]:
     q = np.array([rotation[axis] for axis in "wxyz"])
+    if not 1e-6 < np.linalg.norm(q) < 1e6:
+        raise cdr.MalformedMessageError(type_name=type_name, found=f"{q} (wxyz) is no rotation")
     return se3.transform_from(q, np.array([position[axis] for axis in "xyz"]))
 
 
@@ -233,7 +238,9 @@ def transforms_from_cdr(data: bytes) -> list[FrameTransform]:
             parent=item["header"]["frame_id"],
             child=item["child_frame_id"],
             T_parent_child=_transform_of(
-                item["transform"]["translation"], item["transform"]["rotation"]
+                item["transform"]["translation"],
+                item["transform"]["rotation"],
+                type_name=schema.TF_MESSAGE,
             ),
         )
         for item in cdr.decode(schema.TF_MESSAGE, data)["transforms"]
@@ -264,7 +271,9 @@ class PoseSample:
         return PoseSample(
             stamp_ns=stamp_of(message),
             frame_id=message["header"]["frame_id"],
-            T_frame_body=_transform_of(pose["position"], pose["orientation"]),
+            T_frame_body=_transform_of(
+                pose["position"], pose["orientation"], type_name=schema.POSE_STAMPED
+            ),
         )
 
 

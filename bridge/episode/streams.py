@@ -1,6 +1,7 @@
 """Decode what an episode holds: joints, plans, events, cameras, poses."""
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +29,7 @@ from bridge.task.plan import Plan
 from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
 
+_COLOR_TOPIC = re.compile(r"/cam/([^/]+)/color/image$")
 PAIRING_TOLERANCE_NS = 20_000_000
 """Colour and depth of one frame lie at most this far apart."""
 
@@ -73,19 +75,24 @@ def transform_tree(episode: Episode) -> TransformTree:
 
 def camera_ids(episode: Episode) -> list[str]:
     """Cameras that have colour images: the ``<id>`` of ``.../cam/<id>/color/image``."""
-    return sorted(
-        topic.split("/")[-3] for topic in episode.topics() if topic.endswith("/color/image")
-    )
+    found = (_COLOR_TOPIC.search(topic) for topic in episode.topics() if not schema.is_truth(topic))
+    return sorted({match[1] for match in found if match is not None})
+
+
+def find_camera_topic(episode: Episode, camera_id: str, tail: str) -> str | None:
+    """Return a camera's topic by its end (``depth/image``); stand-in truth is never found."""
+    ending = f"/cam/{camera_id}/{tail}"
+    found = (t for t in episode.topics() if t.endswith(ending) and not schema.is_truth(t))
+    return next(found, None)
 
 
 def _camera_topic(episode: Episode, camera_id: str, tail: str) -> str:
-    ending = f"/cam/{camera_id}/{tail}"
-    for topic in episode.topics():
-        if topic.endswith(ending) and not schema.is_truth(topic):
-            return topic
+    topic = find_camera_topic(episode, camera_id, tail)
+    if topic is not None:
+        return topic
     raise EpisodeError(
         path=episode.path,
-        found=f"no topic ends with {ending}",
+        found=f"no topic ends with /cam/{camera_id}/{tail}",
         hint=f"Cameras here: {', '.join(camera_ids(episode)) or 'none'}.",
     )
 
@@ -141,11 +148,16 @@ def _pop_pair(
 
 
 def joint_track(episode: Episode, ending: str = "/joint_states") -> JointTrack:
-    """Collect the joint states of the topic with this ending, ordered by source time."""
+    """Collect the joint states of the topic with this ending, ordered by source time.
+
+    ROS lets several nodes publish on one topic, each its own joints in its own order: those who
+    know the most joints are taken, in the order of the first of them.
+    """
     topics = [
         topic for topic in episode.topics_of_type(schema.JOINT_STATE) if topic.endswith(ending)
     ]
     samples = [JointSample.from_cdr(message.data) for message in episode.messages(topics)]
+    samples = [sample for sample in samples if len(sample.position)]
     if not samples:
         raise EpisodeError(
             path=episode.path,
@@ -153,11 +165,19 @@ def joint_track(episode: Episode, ending: str = "/joint_states") -> JointTrack:
             hint="Record the robot's joint states; robot-gst info lists the topics.",
         )
     samples.sort(key=lambda sample: sample.stamp_ns)
+    names = max((sample.names for sample in samples), key=len)
+    complete = [sample for sample in samples if set(names) <= set(sample.names)]
     return JointTrack(
-        names=samples[0].names,
-        stamps_ns=np.array([sample.stamp_ns for sample in samples], dtype=np.int64),
-        position=np.stack([sample.position for sample in samples]),
+        names=names,
+        stamps_ns=np.array([sample.stamp_ns for sample in complete], dtype=np.int64),
+        position=np.stack([_in_order(sample, names) for sample in complete]),
     )
+
+
+def _in_order(sample: JointSample, names: tuple[str, ...]) -> Float[np.ndarray, " num_joints"]:
+    if sample.names == names:
+        return sample.position
+    return sample.position[[sample.names.index(name) for name in names]]
 
 
 def plans(episode: Episode) -> list[tuple[int, Plan]]:
@@ -190,15 +210,23 @@ def localisations(episode: Episode) -> list[dict[str, Any]]:
 
 def executed_interval_ns(episode: Episode, plan_id: str) -> tuple[int, int] | None:
     """Source times between which a plan was executed, or None if it never was."""
-    start = None
-    for event in events(episode):
+    start, end = execution_ns(events(episode), plan_id)
+    return None if start is None or end is None else (start, end)
+
+
+def execution_ns(
+    records: Iterable[Mapping[str, Any]], plan_id: str
+) -> tuple[int | None, int | None]:
+    """Source times [ns] at which a plan's execution started and ended, as far as events say."""
+    start: int | None = None
+    for event in records:
         if event.get("plan_id") != plan_id:
             continue
         if event["type"] == "execution_started":
-            start = event["stamp_ns"]
+            start = int(event["stamp_ns"])
         elif event["type"] == "execution_ended" and start is not None:
-            return start, event["stamp_ns"]
-    return None
+            return start, int(event["stamp_ns"])
+    return start, None
 
 
 def pose_track(episode: Episode, topic: str) -> PoseTrajectory:

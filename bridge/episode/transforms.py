@@ -19,15 +19,32 @@ class FrameNotFoundError(BridgeError):
         super().__init__(f"no transform for frame {frame!r}. Frames in this episode: {listed}.")
 
 
+class AmbiguousFrameError(BridgeError):
+    """A frame has several parents, or is its own ancestor."""
+
+    def __init__(self, *, frame: str, parents: list[str]) -> None:
+        """Remember the frame and who claims it."""
+        self.frame = frame
+        super().__init__(
+            f"frame {frame!r} hangs on {' and '.join(map(repr, parents))}; where it is cannot be "
+            "said. Two publishers of /tf disagree: record again with one of them."
+        )
+
+
 class TransformTree:
     """Answers ``T_root_frame`` at any stamp, interpolating moving frames."""
 
     def __init__(self, transforms: list[FrameTransform]) -> None:
         """Collect transforms in any order; static ones are those seen once."""
         collected: dict[str, tuple[str, dict[int, Float[np.ndarray, "4 4"]]]] = {}
+        claims: dict[str, set[str]] = {}
         for item in transforms:
+            claims.setdefault(item.child, set()).add(item.parent)
             _, samples = collected.setdefault(item.child, (item.parent, {}))
             samples[item.stamp_ns] = item.T_parent_child
+        self._disputed = {
+            child: sorted(parents) for child, parents in claims.items() if len(parents) > 1
+        }
         self._parents = {child: parent for child, (parent, _) in collected.items()}
         self._tracks: dict[str, PoseTrajectory] = {}
         for child, (_, samples) in collected.items():
@@ -40,12 +57,21 @@ class TransformTree:
         return sorted(set(self._parents) | set(self._parents.values()))
 
     def root_of(self, frame: str) -> str:
-        """Follow parents up to the frame that has none."""
+        """Follow parents up to the frame that has none.
+
+        Raises:
+            FrameNotFoundError: When no transform names the frame.
+            AmbiguousFrameError: When transforms lead to several places.
+        """
         if frame not in self._parents and frame not in self._parents.values():
             raise FrameNotFoundError(frame=frame, known=self.frames())
-        seen = set()
-        while frame in self._parents and frame not in seen:
-            seen.add(frame)
+        seen: list[str] = []
+        while frame in self._parents:
+            if frame in self._disputed:
+                raise AmbiguousFrameError(frame=frame, parents=self._disputed[frame])
+            if frame in seen:
+                raise AmbiguousFrameError(frame=frame, parents=["itself", *seen])
+            seen.append(frame)
             frame = self._parents[frame]
         return frame
 
@@ -54,6 +80,7 @@ class TransformTree:
 
         Raises:
             FrameNotFoundError: When no transform names the frame; lists those that exist.
+            AmbiguousFrameError: When transforms lead to several places.
         """
         root = self.root_of(frame)
         T = np.eye(4)

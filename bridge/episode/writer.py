@@ -42,10 +42,9 @@ class EpisodeWriter:
             raise BridgeError(message) from error
         self._writer = Writer(self._stream, compression=CompressionType.ZSTD, use_statistics=True)
         self._writer.start(profile=PROFILE, library=LIBRARY)
-        self._schema_ids: dict[str, int] = {}
-        self._channel_ids: dict[tuple[str, str], int] = {}
+        self._schema_ids: dict[tuple[str, str], int] = {}
+        self._channel_ids: dict[tuple[str, str, str], int] = {}
         self._sequences: dict[int, int] = {}
-        self._last_log_ns = 0
         self._open = True
 
     def write(
@@ -88,7 +87,6 @@ class EpisodeWriter:
         if sequence is None:
             sequence = self._sequences.get(channel_id, 0)
         self._sequences[channel_id] = sequence + 1
-        self._last_log_ns = max(self._last_log_ns, log_time_ns)
         self._writer.add_message(
             channel_id=channel_id,
             log_time=log_time_ns,
@@ -98,24 +96,22 @@ class EpisodeWriter:
         )
 
     def _channel(self, topic: str, record: schema.Schema | None, message_encoding: str) -> int:
-        key = (topic, record.name if record else message_encoding)
+        key = (topic, record.name if record else "", _encoding(record, message_encoding))
         if key not in self._channel_ids:
-            schema_id = 0
-            encoding = message_encoding
-            if record is not None:
-                schema_id = self._schema(record)
-                encoding = record.message_encoding
             self._channel_ids[key] = self._writer.register_channel(
-                topic=topic, message_encoding=encoding, schema_id=schema_id
+                topic=topic,
+                message_encoding=_encoding(record, message_encoding),
+                schema_id=0 if record is None else self._schema(record),
             )
         return self._channel_ids[key]
 
     def _schema(self, record: schema.Schema) -> int:
-        if record.name not in self._schema_ids:
-            self._schema_ids[record.name] = self._writer.register_schema(
+        key = (record.name, record.schema_encoding)
+        if key not in self._schema_ids:
+            self._schema_ids[key] = self._writer.register_schema(
                 name=record.name, encoding=record.schema_encoding, data=record.data
             )
-        return self._schema_ids[record.name]
+        return self._schema_ids[key]
 
     def write_json(
         self,
@@ -203,6 +199,10 @@ class EpisodeWriter:
             self.close()
         else:
             self.abandon()
+
+
+def _encoding(record: schema.Schema | None, message_encoding: str) -> str:
+    return message_encoding if record is None else record.message_encoding
 
 
 def _sync_folder(folder: Path) -> None:

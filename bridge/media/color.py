@@ -1,11 +1,20 @@
 """JPEG and PNG colour images."""
 
 import io
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import UInt8
 
 from bridge.errors import BridgeError, MissingDependencyError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 JPEG_QUALITY = 90
 JPEG_MAGIC = b"\xff\xd8"
@@ -38,15 +47,32 @@ def decode_color(data: bytes) -> UInt8[np.ndarray, "height width 3"]:
     """Decode JPEG or PNG bytes to an sRGB image."""
     if data[:2] == JPEG_MAGIC:
         return _decode_jpeg(data)
-    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415  # heavy, only for PNG
+    with open_image(data) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+@contextmanager
+def open_image(data: bytes) -> Iterator["Image"]:
+    """Open an image of limited size with Pillow; whatever it says of broken bytes is one error.
+
+    Raises:
+        UnreadableImageError: When the image is too large, or turns out broken inside the block.
+    """
+    from PIL import Image as pillow  # noqa: PLC0415  # heavy, only for PNG
 
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", pillow.DecompressionBombWarning)
+            image = pillow.open(io.BytesIO(data))
+        with image:
             if image.width * image.height > MAX_PIXELS:
                 raise UnreadableImageError(found=f"{image.width} x {image.height} pixels")
-            return np.asarray(image.convert("RGB"))
-    except (UnidentifiedImageError, OSError, ValueError) as error:
+            yield image
+    # Pillow's PNG reader also lets these out of truncated or forged chunks.
+    except (OSError, ValueError, SyntaxError, EOFError, struct.error, zlib.error) as error:
         raise UnreadableImageError(found=str(error)[:120]) from error
+    except pillow.DecompressionBombError as error:
+        raise UnreadableImageError(found="more pixels than a camera has") from error
 
 
 def _decode_jpeg(data: bytes) -> UInt8[np.ndarray, "height width 3"]:

@@ -1,12 +1,11 @@
 """16-bit depth PNG files and the rules that turn stored numbers into millimetres."""
 
-import io
 from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import UInt16
 
-from bridge.media.color import UnreadableImageError
+from bridge.media.color import UnreadableImageError, open_image
 
 ROTATED_ENCODING = "rotated3"
 """The bits of each value are rotated right by three (APC 2016 files)."""
@@ -14,15 +13,10 @@ ROTATED_ENCODING = "rotated3"
 
 def decode_depth_png(data: bytes) -> UInt16[np.ndarray, "height width"]:
     """Decode a 16-bit greyscale PNG to its stored numbers."""
-    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415  # heavy, only for folders
-
-    try:
-        with Image.open(io.BytesIO(data)) as image:
-            if not image.mode.startswith("I"):
-                raise UnreadableImageError(found=f"depth image has mode {image.mode}, need 16 bit")
-            return np.asarray(image).astype(np.uint16)
-    except (UnidentifiedImageError, OSError, ValueError) as error:
-        raise UnreadableImageError(found=str(error)[:120]) from error
+    with open_image(data) as image:
+        if not image.mode.startswith("I"):
+            raise UnreadableImageError(found=f"depth image has mode {image.mode}, need 16 bit")
+        return np.asarray(image).astype(np.uint16)
 
 
 def undo_rotation(stored: UInt16[np.ndarray, "height width"]) -> UInt16[np.ndarray, "height width"]:

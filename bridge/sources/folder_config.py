@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from bridge.errors import UsageError
 
-_NAME = re.compile(r"^[A-Za-z][A-Za-z0-9_]*$")
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class FolderConfig:
     def __post_init__(self) -> None:
         """Refuse names that cannot be part of a topic, and a rate that is none."""
         for what, name in (("cell", self.cell), ("camera", self.camera)):
-            if not _NAME.match(name):
+            if not _NAME.fullmatch(name):
                 raise UsageError(
                     f"{what} name {name!r} cannot be part of a topic. "
                     "Use letters, digits and '_', starting with a letter."

@@ -1,6 +1,7 @@
 """JSON records checked against their schema: plan, verdict, localisation, outcome, event, drops."""
 
 import json
+import math
 from collections.abc import Mapping
 from functools import cache
 from importlib import resources
@@ -42,11 +43,21 @@ def check_record(
     return record
 
 
+def _refuse(text: str) -> float:
+    message = f"{text} is not a number in JSON"
+    raise ValueError(message)
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    return number if math.isfinite(number) else _refuse(text)
+
+
 def parse_record(data: bytes, *, name: str, package: str = "bridge.task") -> dict[str, Any]:
     """Parse JSON bytes and check them."""
     try:
-        record = json.loads(data)
-    except (ValueError, UnicodeDecodeError) as error:
+        record = json.loads(data, parse_constant=_refuse, parse_float=_finite)
+    except (ValueError, RecursionError) as error:
         raise InvalidRecordError(name=name, where="", found=f"not JSON ({error})") from error
     if not isinstance(record, dict):
         raise InvalidRecordError(name=name, where="", found="not a JSON object")

@@ -95,13 +95,10 @@ def load_task(name: str) -> Task:
         UsageError: Unknown name (lists those that exist), or a file that is no task.
     """
     path = dataset_file("tasks", name)
+    table = read_tables(path)
     try:
-        table = tomllib.loads(path.read_text())
         return _task_from(table)
-    except tomllib.TOMLDecodeError as error:
-        message = f"{path} is not valid TOML: {error}."
-        raise UsageError(message) from error
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         message = f"{path} is not a task file: {type(error).__name__} {error}. See docs/tasks.md."
         raise UsageError(message) from error
 
@@ -110,7 +107,7 @@ def read_tables(path: Path) -> dict[str, Any]:
     """Parse a TOML file, with one clear sentence when it is broken."""
     try:
         return tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, OSError) as error:
+    except (ValueError, OSError) as error:  # not TOML, not text, not readable
         message = f"{path} cannot be read as TOML: {error}."
         raise UsageError(message) from error
 

@@ -64,7 +64,7 @@ def test_a_label_given_later_wins_and_leaves_the_episode_untouched(run_path: Pat
 def test_a_label_that_is_no_outcome_is_refused(
     run_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert robot_gst.run(["label", str(run_path), "t1", "--result", "maybe"]) == 1
+    assert robot_gst.run(["label", str(run_path), "t1", "--result", "maybe"]) == 2
     assert "maybe" in capsys.readouterr().err
 
 

@@ -1,6 +1,5 @@
 """The cell file: what the laboratory publishes of itself, and the ranges of what it hides."""
 
-import tomllib
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +10,7 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.data import dataset_file
+from bridge.task.task_file import read_tables
 
 SCHEMA_VERSION = 1
 
@@ -87,12 +87,10 @@ def load_cell(name: str) -> CellFile:
         UsageError: Unknown name (lists those that exist), or a file that is no cell.
     """
     path = dataset_file("cells", name)
+    table = read_tables(path)
     try:
-        return _cell_from(tomllib.loads(path.read_text()))
-    except tomllib.TOMLDecodeError as error:
-        message = f"{path} is not valid TOML: {error}."
-        raise UsageError(message) from error
-    except (KeyError, TypeError, ValueError) as error:
+        return _cell_from(table)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         message = (
             f"{path} is not a cell file: {type(error).__name__} {error}. "
             "Compare it with datasets/cells/standin.toml."

@@ -1,0 +1,301 @@
+"""Files and records made by other programs, or on purpose: one sentence, never a traceback."""
+
+import contextlib
+import os
+import struct
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+import robot_gst
+from bridge.episode import schema, streams
+from bridge.episode.catalogue import label_episode, list_episodes
+from bridge.episode.cdr import MalformedMessageError
+from bridge.episode.check import check_episode
+from bridge.episode.metadata import EpisodeInfo, Outcome
+from bridge.episode.reader import Episode
+from bridge.episode.records import (
+    FrameTransform,
+    JointSample,
+    transforms_from_cdr,
+    transforms_to_cdr,
+)
+from bridge.episode.run import RunFolder
+from bridge.episode.transforms import AmbiguousFrameError, TransformTree
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import EpisodeError, InvalidRecordError, UsageError
+from bridge.media.color import UnreadableImageError, decode_color
+from bridge.media.depth import decode_depth_png
+from bridge.sources.standin.cell_file import load_cell
+from bridge.task.record import parse_record
+from bridge.task.task_file import load_task
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def foreign_file(path: Path, metadata: dict[str, dict[str, str]]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for name, values in metadata.items():
+            writer.add_metadata(name, values)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("episode", {"who": "me"}),
+        ("episode", {"id": "7", "kind": '"trial"'}),
+        ("episode", {"id": '"a"', "kind": '"trial"', "tags": "null"}),
+        ("episode", {"id": '"a"', "kind": "[" * 100_000}),
+        ("outcome", {"k": "1"}),
+        ("derived", {"kind": '"replay"'}),
+    ],
+)
+def test_metadata_of_another_program_is_one_sentence(
+    tmp_path: Path, name: str, values: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = foreign_file(tmp_path / "run" / "episodes" / "x.mcap", {name: values})
+    episode = Episode.open(path)
+    if name == "episode" and values["kind" if "kind" in values else "who"].startswith("["):
+        assert episode.info.kind.startswith("[[")  # text that is not JSON stays text
+        return
+    found = f"metadata record '{name}' cannot be read .[a-z_]+ is "
+    with pytest.raises(EpisodeError, match=found):
+        getattr(episode, "info" if name == "episode" else name)
+    assert check_episode(path).exit_code == 1
+    assert robot_gst.run(["info", str(path)]) == 1
+    assert "cannot be read" in capsys.readouterr().err
+    if name != "derived":
+        assert list_episodes(RunFolder.open(tmp_path / "run"))[0].error
+
+
+def test_one_foreign_file_does_not_hide_the_others(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    with EpisodeWriter(run.episodes_dir / "t1.mcap") as writer:
+        writer.describe(EpisodeInfo(id="t1", kind="trial"))
+    foreign_file(run.episodes_dir / "rosbag 2024.05.01.mcap", {})
+    (run.episodes_dir / "gone.mcap").symlink_to(tmp_path / "nowhere")
+    errors = {entry.file: entry.error for entry in list_episodes(run)}
+    assert errors["t1.mcap"] == ""
+    assert errors["rosbag 2024.05.01.mcap"] == ""
+    assert "not found" in errors["gone.mcap"]
+
+
+def test_a_label_goes_by_the_file_name(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    with EpisodeWriter(run.episodes_dir / "renamed.mcap") as writer:
+        writer.describe(EpisodeInfo(id="trial_0001", kind="trial"))
+    label_episode(run, "renamed", Outcome(result="failure"))
+    assert [(entry.id, entry.outcome) for entry in list_episodes(run)] == [("renamed", "failure")]
+
+
+@pytest.mark.parametrize(
+    "text", [b"[" * 200_000, b'{"p": NaN}', b'{"p": -Infinity}', b'{"p": 1e999}']
+)
+def test_json_that_is_none_is_refused(text: bytes) -> None:
+    with pytest.raises(InvalidRecordError, match="not JSON"):
+        parse_record(text, name="plan")
+
+
+def png(width: int, height: int, body: bytes = b"") -> bytes:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        crc = struct.pack(">I", zlib.crc32(kind + data))
+        return struct.pack(">I", len(data)) + kind + data + crc
+
+    head = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + body + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("size", [(60_000, 60_000), (12_000, 12_000), (9_000, 9_000)])
+def test_an_image_that_claims_gigabytes_is_refused(size: tuple[int, int]) -> None:
+    for decode in (decode_color, decode_depth_png):
+        with pytest.raises(UnreadableImageError, match="pixels"):
+            decode(png(*size))
+
+
+@pytest.mark.parametrize("body", [b"", struct.pack(">I4s", 9, b"IDAT"), b"\0\0\0\1pHYs\0\0\0\0\0"])
+def test_a_png_without_its_pixels_is_refused(body: bytes) -> None:
+    for decode in (decode_color, decode_depth_png):
+        with pytest.raises(UnreadableImageError):
+            decode(png(4, 4, body))
+
+
+def sample(stamp_ns: int, names: tuple[str, ...], position: list[float]) -> bytes:
+    return JointSample(
+        stamp_ns=stamp_ns,
+        names=names,
+        position=np.array(position),
+        velocity=np.zeros(0),
+        effort=np.zeros(0),
+    ).to_cdr()
+
+
+def test_joints_of_several_publishers_are_put_in_one_order(tmp_path: Path) -> None:
+    path = tmp_path / "e.mcap"
+    messages = [
+        sample(1, ("a", "b"), [1.0, 2.0]),
+        sample(2, ("finger",), [9.0]),
+        sample(3, ("b", "a"), [4.0, 3.0]),
+        sample(4, ("a", "b"), []),
+    ]
+    with EpisodeWriter(path) as writer:
+        for index, data in enumerate(messages):
+            writer.write("/c/joint_states", data, type_name=schema.JOINT_STATE, log_time_ns=index)
+    track = streams.joint_track(Episode.open(path))
+    assert track.names == ("a", "b")
+    assert track.stamps_ns.tolist() == [1, 3]
+    assert track.position.tolist() == [[1.0, 2.0], [3.0, 4.0]]
+
+
+def test_positions_that_do_not_match_their_names_are_found_by_the_check(tmp_path: Path) -> None:
+    path = tmp_path / "e.mcap"
+    with EpisodeWriter(path) as writer:
+        data = sample(1, ("a", "b"), [1.0])
+        writer.write("/c/joint_states", data, type_name=schema.JOINT_STATE, log_time_ns=1)
+    assert "1 positions of 2 joints" in check_episode(path).faults[0]
+
+
+def test_only_cameras_of_ours_are_cameras(tmp_path: Path) -> None:
+    path = tmp_path / "e.mcap"
+    topics = ("/c/cam/side/color/image", "/standin/truth/cam/x/color/image", "/color/image")
+    with EpisodeWriter(path) as writer:
+        for topic in topics:
+            writer.write(topic, b"", type_name=schema.COMPRESSED_IMAGE, log_time_ns=1)
+    assert streams.camera_ids(Episode.open(path)) == ["side"]
+
+
+def transform(parent: str, child: str, stamp_ns: int = 0) -> FrameTransform:
+    return FrameTransform(stamp_ns=stamp_ns, parent=parent, child=child, T_parent_child=np.eye(4))
+
+
+def test_a_rotation_of_zeros_is_refused_when_read() -> None:
+    data = bytearray(transforms_to_cdr([transform("world", "cam")]))
+    data[-32:] = bytes(32)  # x y z w are the last fields
+    with pytest.raises(MalformedMessageError, match="is no rotation"):
+        transforms_from_cdr(bytes(data))
+
+
+@pytest.mark.parametrize(
+    "transforms",
+    [
+        [transform("a", "b"), transform("b", "a")],
+        [transform("a", "c"), transform("b", "c", 1), transform("x", "b"), transform("x", "a")],
+    ],
+)
+def test_frames_that_hang_together_in_no_single_way_are_refused(
+    transforms: list[FrameTransform],
+) -> None:
+    tree = TransformTree([*transforms, transform("world", "fine")])
+    with pytest.raises(AmbiguousFrameError, match=r"frame '[abc]'"):
+        tree.T_root_frame(transforms[-1].child if len(transforms) == 2 else "c", 0)
+    assert np.array_equal(tree.T_root_frame("fine", 0), np.eye(4))
+
+
+def test_two_encodings_of_one_type_keep_their_own_schemas(tmp_path: Path) -> None:
+    path = tmp_path / "e.mcap"
+    named = schema.Schema(
+        name=schema.JOINT_STATE, schema_encoding="", message_encoding="json", data=b""
+    )
+    with EpisodeWriter(path) as writer:
+        writer.write("/a", sample(1, (), []), type_name=schema.JOINT_STATE, log_time_ns=1)
+        writer.write_foreign("/b", b"{}", schema_record=named, log_time_ns=2)
+        writer.write_foreign("/a", b"{}", schema_record=named, log_time_ns=3)
+    summary = Episode.open(path)._summary
+    found = {
+        (channel.topic, channel.message_encoding, summary.schemas[channel.schema_id].encoding)
+        for channel in summary.channels.values()
+    }
+    assert found == {("/a", "cdr", "ros2msg"), ("/b", "json", ""), ("/a", "json", "")}
+
+
+@pytest.mark.parametrize("text", [b"objects = 3\nschema_version = 1", b"\xff\xfe", b"[", b""])
+def test_a_file_that_is_no_task_or_cell_is_one_sentence(tmp_path: Path, text: bytes) -> None:
+    path = tmp_path / "strange.toml"
+    path.write_bytes(text)
+    for load in (load_task, load_cell):
+        with pytest.raises(UsageError, match=r"strange\.toml"):
+            load(str(path))
+
+
+def test_tables_that_should_be_tables_are_checked(tmp_path: Path) -> None:
+    path = tmp_path / "strange.toml"
+    path.write_text('schema_version = 1\nname = "x"\ninstruction = "x"\nobjects = []\n')
+    with pytest.raises(UsageError, match="not a task file"):
+        load_task(str(path))
+
+
+@pytest.mark.parametrize("position", range(40, 1400, 17))
+def test_a_flipped_byte_is_an_episode_error_or_harmless(tmp_path: Path, position: int) -> None:
+    path = tmp_path / "e.mcap"
+    with EpisodeWriter(path) as writer:
+        writer.describe(EpisodeInfo(id="e", kind="trial"), outcome=Outcome(result="success"))
+        data = sample(1, ("a",), [1.0])
+        writer.write("/c/joint_states", data, type_name=schema.JOINT_STATE, log_time_ns=1)
+        writer.attach("robot.urdf", b"<robot/>", media_type="text/xml", log_time_ns=1)
+    whole = bytearray(path.read_bytes())
+    whole[position % len(whole)] ^= 0xFF
+    path.write_bytes(whole)
+    check_episode(path)  # finds a fault or not, but never raises
+    with contextlib.suppress(EpisodeError):
+        Episode.open(path).attachment("robot.urdf")
+
+
+def test_a_disk_that_refuses_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    with EpisodeWriter(run.episodes_dir / "t1.mcap") as writer:
+        writer.describe(EpisodeInfo(id="t1", kind="trial"))
+    run.notes_dir.write_text("in the way")
+    assert robot_gst.run(["label", str(run.path), "t1", "--result", "failure"]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("robot-gst: cannot read or write")
+    assert "notes" in said
+
+
+def test_a_reader_that_has_seen_enough_is_no_traceback(tmp_path: Path) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "robot_gst", "doctor", "--json"]
+    done = subprocess.run(command, cwd=ROOT, stdout=write, stderr=subprocess.PIPE, check=False)
+    os.close(write)
+    assert done.stderr == b""
+
+
+def test_zenoh_and_settings_files_may_come_in_any_order(tmp_path: Path) -> None:
+    settings = tmp_path / "settings.toml"
+    settings.write_text("")
+    tokens = ["record", "run", "--config", "zenoh.json5", "--config", str(settings)]
+    assert robot_gst._take_config(tokens) == (tokens[:4], settings)
+
+
+def test_checking_nothing_is_wrong_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert robot_gst.run(["check", str(tmp_path)]) == 2
+    assert "no episodes in" in capsys.readouterr().err
+
+
+def test_every_parameter_of_every_command_is_explained() -> None:
+    silent = []
+    for name, command in _commands(robot_gst.build_app()):
+        for argument in command.assemble_argument_collection(parse_docstring=True):
+            if argument.show and not argument.parameter.help:
+                silent.append(f"{name} {argument.name}")
+    assert silent == []
+
+
+def _commands(app: robot_gst.App, prefix: str = "") -> list[tuple[str, robot_gst.App]]:
+    found = []
+    for name in app:
+        if not name.startswith("-"):
+            below = _commands(app[name], f"{prefix}{name} ")
+            found += below or [(prefix + name, app[name])]
+    return found
