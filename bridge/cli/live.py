@@ -1,5 +1,6 @@
 """Commands that speak zenoh: recording, control, and sources."""
 
+import contextlib
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -170,6 +171,7 @@ def publish_folder(
         zenoh_config: zenoh configuration (JSON5).
         output: How to talk.
     """
+    from bridge.errors import GstError
     from bridge.sources.folder import num_frames
     from bridge.sources.folder_index import read_index
     from bridge.sources.folder_publish import publish_folder_frames
@@ -190,9 +192,13 @@ def publish_folder(
                 sent = publish_folder_frames(
                     session, index, config, fast=fast, should_stop=stop.is_set, advance=advance
                 )
-        finally:
-            if episode is not None:
-                answer = client.stop()
+        except GstError:
+            if episode is not None:  # a part of a folder is no scan
+                with contextlib.suppress(GstError):  # the first error is the one to show
+                    client.stop(discard=True)
+            raise
+        if episode is not None:
+            answer = client.stop()
     text = f"{sent['frames']} of {sent['of']} frames, {sent['messages']} messages sent"
     if answer is not None:
         text += f"\n{_describe_answer(answer)}"

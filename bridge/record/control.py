@@ -2,13 +2,14 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, asdict, fields
 from typing import Any, TypeVar, get_origin
 
 from bridge.episode import metadata
 from bridge.episode.run import check_episode_id
 from bridge.record.errors import ControlError
 from bridge.record.recorder import Recorder
+from bridge.task.record import check_record
 from bridge.wire.recorder_client import control_key
 from bridge.wire.session import Service, WireSession
 
@@ -21,7 +22,7 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
 
     def start(request: dict[str, Any]) -> dict[str, Any]:
         _only(request, "start", {"id", "info"})
-        return recorder.start(parse_info(request.get("id"), request.get("info") or {}))
+        return recorder.start(parse_info(request.get("id"), request.get("info", {})))
 
     def stop(request: dict[str, Any]) -> dict[str, Any]:
         _only(request, "stop", {"outcome", "discard"})
@@ -84,13 +85,20 @@ def _text(request: dict[str, Any]) -> str:
     return text
 
 
-def parse_info(episode_id: Any, info: dict[str, Any]) -> metadata.EpisodeInfo:
+def parse_info(episode_id: Any, info: Any) -> metadata.EpisodeInfo:
     """Build the episode's description from a request; unknown fields are refused."""
     if not isinstance(episode_id, str):
         raise ControlError(f"start needs an episode id as a string, got {episode_id!r:.80}.")
     check_episode_id(episode_id)
+    if not isinstance(info, dict):
+        raise ControlError(f"info must be a JSON object, got {info!r:.80}.")
     values = {"kind": "trial", **info, "id": episode_id}
     made = _build(metadata.EpisodeInfo, values, "info")
+    if made.schema_version != metadata.SCHEMA_VERSION:
+        raise ControlError(
+            f"info.schema_version {made.schema_version} is not the {metadata.SCHEMA_VERSION} "
+            "that this recorder writes. Leave it out."
+        )
     if made.kind not in metadata.KINDS:
         raise ControlError(f"kind {made.kind!r} is unknown. Kinds: {', '.join(metadata.KINDS)}.")
     if made.cell:
@@ -105,6 +113,7 @@ def parse_outcome(outcome: Any) -> metadata.Outcome | None:
     made = _build(metadata.Outcome, outcome, "outcome")
     if made.result not in RESULTS:
         raise ControlError(f"result {made.result!r} is unknown. Results: {', '.join(RESULTS)}.")
+    check_record(json.loads(json.dumps(asdict(made))), name="outcome")
     return made
 
 

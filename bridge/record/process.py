@@ -57,7 +57,7 @@ def run_recorder(
     with open_session(wire) as session:
         recorder = Recorder(run, now_ns=session.now_ns, config=config)
         subscribers = [session.subscribe(key, _taker(recorder)) for key in config.topics]
-        serve_control(session, recorder)
+        services = serve_control(session, recorder)
         _say_where(output, wire, recorder, run)
         try:
             if episode is not None:
@@ -66,6 +66,8 @@ def run_recorder(
                 keys = Keys(recorder, run, about or EpisodeAbout()) if has_keys else None
                 _watch(recorder, stop, duration_s, output, keys)
         finally:
+            for service in services:
+                service.close()
             for subscriber in subscribers:
                 subscriber.close()
             answer = recorder.close()

@@ -3,8 +3,10 @@
 One writer thread does everything that touches the disk, in the order things arrived.
 """
 
+import contextlib
 import shutil
 import threading
+import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import asdict, replace
@@ -48,6 +50,7 @@ class Recorder:
         self._intake = Intake(self.config)
         self._latched = LatchedMessages()
         self._seen: dict[str, int] = {}
+        self._unwritable: set[str] = set()
         self._take: Take | None = None
         self._state_lock = threading.Lock()
         self._closing = False
@@ -118,7 +121,8 @@ class Recorder:
         """Finish the open episode, if any, and end the writer thread."""
         answer = None
         if self._take is not None and self.error is None:
-            answer = self.stop(reason=reason)
+            with contextlib.suppress(LifecycleError):  # somebody stopped it at this moment
+                answer = self.stop(reason=reason)
         self._closing = True
         self._intake.put_command(Command(action=lambda stamp_ns: None, received_ns=0))  # wake up
         self._thread.join(timeout=self.config.command_timeout_s)
@@ -165,7 +169,7 @@ class Recorder:
         if isinstance(entry, Received):
             self._notice(entry.sample)
             if self._take is not None:
-                self._take.write(entry)
+                self._write(self._take, entry)
         elif isinstance(entry, Dropped):
             if self._take is not None:
                 self._take.count_dropped(entry)
@@ -174,12 +178,26 @@ class Recorder:
         if self._take is not None:
             self._take.tick(self._now_ns())
 
+    def _write(self, take: Take, entry: Received) -> None:
+        """One message that cannot be written is counted as lost; recording goes on."""
+        try:
+            take.write(entry)
+        except OSError:
+            raise
+        except Exception:  # noqa: BLE001  # a bug, or a message nobody thought of
+            if entry.sample.topic not in self._unwritable:
+                self._unwritable.add(entry.sample.topic)
+                traceback.print_exc()
+            take.ledger.count_refused(entry)
+
     def _notice(self, sample: WireSample) -> None:
         self._latched.remember(sample)
         if sample.topic in self._seen or len(self._seen) < self.config.max_topics:
             self._seen[sample.topic] = self._seen.get(sample.topic, 0) + 1
 
     def _start(self, info: metadata.EpisodeInfo, stamp_ns: int) -> Answer:
+        if self._closing:
+            raise LifecycleError("the recorder is ending. Start it again for another episode.")
         if self._take is not None:
             raise LifecycleError(
                 f"episode {self._take.info.id!r} is being recorded. Stop it before {info.id!r}."

@@ -64,8 +64,8 @@ class Take:
             self.ledger.count_refused(entry)
             return
         self._channels.add(channel)
-        self._append(sample, self._log_ns(sample.received_ns))
         finding = inspect(type_name, sample.message_encoding, sample.data)
+        self._append(sample, self._log_ns(sample.received_ns))
         self.ledger.count_received(entry, finding)
 
     def _append(self, sample: WireSample, log_time_ns: int) -> None:

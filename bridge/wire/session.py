@@ -39,6 +39,9 @@ except ImportError as import_error:  # pragma: no cover  # needs an environment 
         package="eclipse-zenoh", extra="record", purpose="talking to a cell"
     ) from import_error
 
+MAX_WAITING = 32
+"""Requests that wait for one service; each may hold a whole plan."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class WireSample:
@@ -96,13 +99,25 @@ class WirePublisher:
 class Service:
     """Answers requests on one key, one after another, on its own thread."""
 
-    def __init__(self, key: str, handler: Callable[[bytes], bytes]) -> None:
+    def __init__(self, key: str, handler: Callable[[bytes], bytes], max_waiting: int) -> None:
         """Use ``WireSession.serve``."""
         self._handler = handler
+        self._max_waiting = max_waiting
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._inner: Any = None
         self._thread = threading.Thread(target=self._work, name=f"serve {key}", daemon=True)
         self._thread.start()
+
+    def _take(self, query: Any) -> None:
+        """Queue a request, on the network thread; one too many is refused at once."""
+        if self._requests.qsize() < self._max_waiting:
+            self._requests.put(query)
+            return
+        with query, contextlib.suppress(zenoh.ZError):
+            query.reply_err(
+                f"busy: {self._max_waiting} requests on {query.key_expr} wait already. "
+                "Ask again later, or start another one under its own name."
+            )
 
     def _work(self) -> None:
         while (query := self._requests.get()) is not None:
@@ -173,10 +188,18 @@ class WireSession:
             message = f"cannot subscribe to {key_expression!r}: {cause_of(error)}."
             raise WireConfigError(message) from error
 
-    def serve(self, key: str, handler: Callable[[bytes], bytes]) -> Service:
-        """Answer requests on a key; a ``GstError`` of the handler goes back as the answer."""
-        service = Service(key, handler)
-        callback = zenoh.handlers.Callback(service._requests.put, indirect=False)
+    def serve(
+        self, key: str, handler: Callable[[bytes], bytes], *, max_waiting: int = MAX_WAITING
+    ) -> Service:
+        """Answer requests on a key; a ``GstError`` of the handler goes back as the answer.
+
+        Args:
+            key: Without a leading slash.
+            handler: Called with one request after another.
+            max_waiting: Requests that may wait for their turn; further ones are refused.
+        """
+        service = Service(key, handler, max_waiting)
+        callback = zenoh.handlers.Callback(service._take, indirect=False)
         try:
             service._inner = self._inner.declare_queryable(key, callback)
         except zenoh.ZError as error:

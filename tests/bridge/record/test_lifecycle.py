@@ -218,6 +218,39 @@ def test_topics_without_end_are_dropped_and_counted(
     assert (answer["messages"], answer["lost"]) == (5, 4)
 
 
+def test_a_message_nobody_thought_of_ends_nothing(
+    recorder: Recorder,
+    run: RunFolder,
+    make_sample: Callable[..., WireSample],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def inspect_badly(*_: object) -> None:
+        message = "a bug"
+        raise ZeroDivisionError(message)
+
+    recorder.start(EpisodeInfo(id="t1", kind="trial"))
+    with monkeypatch.context() as patch:
+        patch.setattr("bridge.record.take.inspect", inspect_badly)
+        recorder.receive(make_sample())
+        recorder.receive(make_sample())
+        recorder.mark("behind both")
+    recorder.receive(make_sample())
+    answer = recorder.stop()
+    assert (answer["messages"], answer["lost"]) == (1, 2)
+    assert capsys.readouterr().err.count("ZeroDivisionError: a bug") == 1
+
+
+def test_an_ending_recorder_starts_nothing_and_forgives_a_stop_at_the_same_moment(
+    recorder: Recorder, run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder.start(EpisodeInfo(id="t1", kind="trial"))
+    stop = recorder.stop
+    monkeypatch.setattr(recorder, "stop", lambda **options: (stop(), stop(**options))[1])
+    assert recorder.close() is None
+    assert [path.name for path in run.episodes_dir.iterdir()] == ["t1.mcap"]
+
+
 def test_requests_are_checked_field_by_field() -> None:
     info = parse_info("t1", {"kind": "scan", "tags": ["a"], "trial": 3, "stand_in": True})
     assert (info.kind, info.tags, info.trial, info.stand_in) == ("scan", ("a",), 3, True)

@@ -1,6 +1,5 @@
 """Recorder, control keys and the folder source joined by real sessions, in one process."""
 
-import io
 import json
 import socket
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import robot_gst
 from bridge.episode import schema
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
@@ -29,6 +29,7 @@ from bridge.wire.session import WireSession, open_session
 class Joined(NamedTuple):
     run: RunFolder
     client: WireSession
+    endpoint: str
 
 
 @pytest.fixture
@@ -41,7 +42,7 @@ def joined(run: RunFolder) -> Iterator[Joined]:
         session.subscribe("**", recorder.receive)
         serve_control(session, recorder)
         with open_session(WireConfig(connect=(endpoint,))) as client:
-            yield Joined(run, client)
+            yield Joined(run, client, endpoint)
         recorder.close()
 
 
@@ -73,6 +74,9 @@ def test_a_stop_comes_after_everything_sent_before_it(joined: Joined) -> None:
         ("start", {"id": "a", "info": {"kind": "trial", "x": 1}}, "info does not know x"),
         ("start", {}, "needs an episode id"),
         ("stop", {"discord": True}, "stop does not know discord. It knows: discard, outcome"),
+        ("start", {"id": "a", "info": [1]}, "info must be a JSON object"),
+        ("start", {"id": "a", "info": {"schema_version": 9}}, "schema_version 9 is not the 1"),
+        ("stop", {"outcome": {"result": "success", "k": -1}}, "outcome is invalid at k"),
         ("stop", {}, "nothing is being recorded"),
         ("mark", {"text": 7}, "text must be a string"),
     ],
@@ -92,15 +96,32 @@ def test_requests_that_are_no_objects_are_refused(joined: Joined, payload: bytes
     assert RecorderClient(joined.client).status()["ok"]
 
 
-def test_a_folder_is_recorded_as_a_camera(joined: Joined, tmp_path: Path) -> None:
-    stream = io.BytesIO()
-    Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(stream, "JPEG")
-    (tmp_path / "c.jpg").write_bytes(stream.getvalue())
-    Image.fromarray(np.full((6, 8), 700, np.uint16)).save(tmp_path / "d.png")
-    frame = {"color": "c.jpg", "depth": "d.png", "T_world_cam": np.eye(4).tolist()}
+def write_folder(folder: Path, *, frames: int) -> None:
+    """Write a tiny RGB-D folder, each frame with files of its own."""
+    listed = []
+    for number in range(frames):
+        names = {"color": f"c{number}.jpg", "depth": f"d{number}.png"}
+        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(folder / names["color"])
+        Image.fromarray(np.full((6, 8), 700, np.uint16)).save(folder / names["depth"])
+        listed.append({**names, "T_world_cam": np.eye(4).tolist()})
     camera = {"fx": 9.0, "fy": 9.0, "cx": 4.0, "cy": 3.0, "width": 8, "height": 6}
-    record = {"depth_unit_m": 0.001, "depth_intrinsics": camera, "frames": [frame] * 5}
-    (tmp_path / "scene.json").write_text(json.dumps(record))
+    record = {"depth_unit_m": 0.001, "depth_intrinsics": camera, "frames": listed}
+    (folder / "scene.json").write_text(json.dumps(record))
+
+
+def test_a_folder_with_an_unreadable_image_leaves_no_episode(
+    joined: Joined, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_folder(tmp_path, frames=3)
+    (tmp_path / "c2.jpg").write_bytes(b"not an image")
+    arguments = ["--fast", "--episode", "scan", "--connect", joined.endpoint, "--quiet"]
+    assert robot_gst.run(["publish", "folder", str(tmp_path), *arguments]) == 2
+    assert "c2.jpg: unreadable image" in capsys.readouterr().err
+    assert list(joined.run.episodes_dir.iterdir()) == []
+
+
+def test_a_folder_is_recorded_as_a_camera(joined: Joined, tmp_path: Path) -> None:
+    write_folder(tmp_path, frames=5)
     client = RecorderClient(joined.client, timeout_s=10.0)
     client.start("scan", {"kind": "scan"})
     progress: list[int] = []

@@ -1,5 +1,6 @@
 """Sessions over real TCP on the loopback address."""
 
+import queue
 import socket
 import threading
 from collections.abc import Iterator
@@ -72,6 +73,39 @@ def test_a_refusal_carries_the_message(router: WireSession, client: WireSession)
     router.serve("rec/x", refuse)
     with pytest.raises(RemoteError, match="cannot do that"):
         client.query("rec/x", b"that", timeout_s=5.0)
+
+
+def test_more_requests_than_may_wait_are_refused_at_once(
+    router: WireSession, client: WireSession
+) -> None:
+    working, release = threading.Event(), threading.Event()
+
+    def slow(payload: bytes) -> bytes:
+        working.set()
+        release.wait(10.0)
+        return payload
+
+    router.serve("cell/slow", slow, max_waiting=1)
+    answers: list[bytes] = []
+    refusals: queue.Queue[str] = queue.Queue()
+
+    def ask() -> None:
+        try:
+            answers.append(client.query("cell/slow", b"plan", timeout_s=20.0))
+        except RemoteError as error:
+            refusals.put(str(error))
+
+    asking = [threading.Thread(target=ask) for _ in range(4)]
+    asking[0].start()
+    assert working.wait(5.0)
+    for thread in asking[1:]:
+        thread.start()
+    for _ in range(2):  # one is in work, one waits: two are refused while it works
+        assert "1 requests on cell/slow wait already" in refusals.get(timeout=5.0)
+    release.set()
+    for thread in asking:
+        thread.join(10.0)
+    assert answers == [b"plan", b"plan"]
 
 
 def test_a_request_nobody_answers_is_reported(client: WireSession) -> None:
