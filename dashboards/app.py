@@ -164,7 +164,7 @@ class Pages:
         _, run = self._library.pick(request.query_params.get("run"))
         path = derived_path(run, request.path_params["name"])
         stamp = request.query_params.get("stamp", "0")
-        if not stamp.isdigit() or len(stamp) > 19:
+        if not stamp.isascii() or not stamp.isdigit() or len(stamp) > 19:
             message = "stamp is a whole number of nanoseconds."
             raise NotHereError(message)
         data, media_type = view_image(

@@ -5,12 +5,14 @@ exactly as a user would start them. Nothing here computes a result.
 """
 
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -104,8 +106,11 @@ def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
             f"{path} holds {len(run.episodes())} episodes already: they are kept and used. "
             "For a fresh recording choose another folder."
         )
+        if not (run.scene_dir / "scene.json").is_file():  # an earlier demo was cut off
+            _step(output, "3/6 rebuilding the scene", ["rebuild", str(path)])
     else:
-        _record(run, config, output)
+        with _ending_on_sigterm():
+            _record(run, config, output)
     workers = str(min(4, os.cpu_count() or 1))
     replay = ["replay", str(path), "--workers", workers]
     _step(output, "5/6 replaying every plan and execution in PyBullet", replay)
@@ -113,6 +118,16 @@ def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
     seconds = time.monotonic() - started
     _close(run, config, output, seconds)
     return 0
+
+
+@contextmanager
+def _ending_on_sigterm() -> Iterator[None]:
+    """Make SIGTERM end the demo as Ctrl-C does, so that recorder and gate end with it."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _record(run: RunFolder, config: DemoConfig, output: Output) -> None:
@@ -138,6 +153,13 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> None:
         if gate is not None:
             gate.stop()
         recorder.stop()
+
+
+def _program() -> str:
+    """The command as this shell finds it: with the environment's folder where it is not active."""
+    if shutil.which("robot-gst"):
+        return "robot-gst"
+    return os.path.relpath(Path(sys.executable).parent / "robot-gst")
 
 
 def _command(arguments: list[str]) -> list[str]:
@@ -188,7 +210,7 @@ def _free_port() -> int:
 
 
 def _close(run: RunFolder, config: DemoConfig, output: Output, seconds: float) -> None:
-    path = run.path
+    path, program = run.path, _program()
     summary = {
         "run": str(path),
         "seconds": round(seconds, 1),
@@ -200,10 +222,10 @@ def _close(run: RunFolder, config: DemoConfig, output: Output, seconds: float) -
         f"\nDone in {seconds:.0f} s: {summary['episodes']} episodes, {summary['replays']} replays. "
         "All of it is from the stand-in cell, none of it is a real robot.\n"
         "Look at next:\n"
-        f"  robot-gst ls {path}                 what was recorded\n"
-        f"  {summary['report']}    success table and agreement in one file\n"
-        f"  rerun {path}/scene/background.ply   the rebuilt scene\n"
-        f"  robot-gst dashboard {path}          review pages"
+        f"  {summary['report']}   success table and agreement in one file\n"
+        f"  {program} ls {path}          what was recorded\n"
+        f"  {program} view {path}        the newest trial and the rebuilt scene in Rerun\n"
+        f"  {program} dashboard {path}   review pages"
     )
     output.result(summary, text)
     serve = sys.stdout.isatty() if config.serve is None else config.serve

@@ -2,9 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from glob import escape
 from pathlib import Path
 
-from bridge.episode.run import EPISODE_ID, RunFolder
+from bridge.episode.run import RunFolder
 from dashboards.errors import NotHereError
 
 
@@ -39,17 +40,17 @@ class Library:
 
 def episode_path(run: RunFolder, episode_id: str) -> Path:
     """Return the file of a recorded episode; nothing outside the run folder is ever reached."""
-    if not EPISODE_ID.match(episode_id):
-        message = f"{episode_id!r} is not an episode id (letters, digits, '_' and '-')."
-        raise NotHereError(message)
-    return _inside(run, run.episodes_dir / f"{episode_id}.mcap", f"episode {episode_id!r}")
+    what = f"episode {episode_id!r}"
+    for path in run.episodes():
+        if path.stem == episode_id:
+            return _inside(run, path, what)
+    message = f"no {what} in this run."
+    raise NotHereError(message)
 
 
 def derived_paths(run: RunFolder, episode_id: str, kind: str) -> list[Path]:
     """Return the derived episodes of one kind (replay, localised, views) of one episode."""
-    if not EPISODE_ID.match(episode_id):
-        return []
-    found = run.derived(f"{episode_id}.{kind}.*")
+    found = run.derived(f"{escape(episode_id)}.{kind}.*")
     return [path for path in found if _is_inside(run, path)]
 
 

@@ -62,33 +62,23 @@ class Recording:
 
     def first_stamp_ns(self) -> int | None:
         """Earliest source time of robot, camera, tool or event; the page's zero."""
-        stamps = [int(track.stamps_ns[0]) for track in (self.joints, self.tcp) if track is not None]
-        stamps += [int(track.stamps_ns[0]) for track in self.objects.values()]
-        stamps += [track.stamps_ns[0] for track in self.cameras.values()]
-        stamps += [event["stamp_ns"] for event in self.events]
-        return min(stamps, default=None)
+        return min(self._stamps_at(0), default=None)
 
     def last_stamp_ns(self) -> int | None:
         """Latest source time of the same streams."""
-        stamps = [
-            int(track.stamps_ns[-1]) for track in (self.joints, self.tcp) if track is not None
+        return max(self._stamps_at(-1), default=None)
+
+    def _stamps_at(self, index: int) -> list[int]:
+        robot = [track for track in (self.joints, self.tcp) if track is not None]
+        tracks = [*robot, *self.objects.values(), *self.cameras.values()]
+        return [int(track.stamps_ns[index]) for track in tracks] + [
+            int(event["stamp_ns"]) for event in self.events
         ]
-        stamps += [int(track.stamps_ns[-1]) for track in self.objects.values()]
-        stamps += [track.stamps_ns[-1] for track in self.cameras.values()]
-        stamps += [event["stamp_ns"] for event in self.events]
-        return max(stamps, default=None)
 
     def executed_ns(self, plan_id: str) -> tuple[int, int | None] | None:
         """Source times at which a plan's execution started and, if it did, ended."""
-        start = None
-        for event in self.events:
-            if event.get("plan_id") != plan_id:
-                continue
-            if event["type"] == "execution_started":
-                start = int(event["stamp_ns"])
-            elif event["type"] == "execution_ended" and start is not None:
-                return start, int(event["stamp_ns"])
-        return None if start is None else (start, None)
+        start, end = streams.execution_ns(self.events, plan_id)
+        return None if start is None else (start, end)
 
 
 def read_recording(path: Path) -> Recording:

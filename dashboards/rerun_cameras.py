@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 import rerun as rr
 
-from bridge.episode import schema, streams
+from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.records import CameraInfo, CompressedColor, DepthImage
 from bridge.episode.transforms import TransformTree
@@ -32,16 +32,24 @@ def log_cameras(file: RerunFile, episode: Episode, prefix: str, start_ns: int) -
     A camera has the pose of its first frame from ``start_ns`` on. What is missing (intrinsics,
     transforms, images that are no JPEG or PNG) is noted and the rest is shown.
     """
-    tree = streams.transform_tree(episode)
+    try:
+        tree = streams.transform_tree(episode)
+    except GstError as error:
+        file.note(f"transforms are not shown: {error}")
+        tree = TransformTree([])
     ids = streams.camera_ids(episode)
     for camera_id in ids:
         for kind in ("color", "depth"):
-            topic = _image_topic(episode, camera_id, kind)
+            topic = streams.find_camera_topic(episode, camera_id, f"{kind}/image")
             if topic is None:
                 continue
             entity = f"{prefix}/cameras/{camera_id}/{kind}"
             send = _send_color if kind == "color" else _send_depth
-            stamps = send(file, episode, topic, entity)
+            try:
+                stamps = send(file, episode, topic, entity)
+            except GstError as error:
+                file.note(f"{entity} is not shown further: {error}")
+                continue
             try:
                 info = streams.camera_info(episode, camera_id, kind)
                 _log_pinhole(file, info, entity)
@@ -49,12 +57,6 @@ def log_cameras(file: RerunFile, episode: Episode, prefix: str, start_ns: int) -
             except GstError as error:
                 file.note(f"{entity} has no place in 3D: {error}")
     return ids
-
-
-def _image_topic(episode: Episode, camera_id: str, kind: str) -> str | None:
-    ending = f"/cam/{camera_id}/{kind}/image"
-    found = (t for t in episode.topics() if t.endswith(ending) and not schema.is_truth(t))
-    return next(found, None)
 
 
 def _batches(items: Iterator[Item]) -> Iterator[list[Item]]:

@@ -14,7 +14,7 @@ import numpy as np
 import rerun as rr
 from jaxtyping import Int
 
-from bridge.episode import schema, streams
+from bridge.episode import streams
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.metadata import Outcome
 from bridge.episode.reader import Episode
@@ -215,10 +215,9 @@ def _localised(
 
 
 def _camera_entities(episode: Episode, prefix: str, cameras: list[str]) -> Iterator[str]:
-    topics = [topic for topic in episode.topics() if not schema.is_truth(topic)]
     for kind in ("color", "depth"):
         for camera_id in cameras:
-            if any(topic.endswith(f"/cam/{camera_id}/{kind}/image") for topic in topics):
+            if streams.find_camera_topic(episode, camera_id, f"{kind}/image") is not None:
                 yield f"{prefix}/cameras/{camera_id}/{kind}"
 
 

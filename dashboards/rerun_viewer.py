@@ -34,9 +34,9 @@ def _rank(path: Path) -> tuple[bool, int]:
     """Trials above scans, then later above earlier; what cannot be read comes last."""
     try:
         episode = Episode.open(path)
+        return episode.info.kind == "trial", episode.start_ns
     except GstError:
         return False, -1
-    return episode.info.kind == "trial", episode.start_ns
 
 
 def default_out(episode: Path) -> Path:

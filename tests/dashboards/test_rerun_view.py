@@ -192,6 +192,15 @@ def content(exported: Exported) -> dict[str, dict[str, list[object]]]:
     return read_back(exported.path)
 
 
+def test_the_newest_trial_is_found_beside_files_of_other_programs(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    with EpisodeWriter(run.episodes_dir / "a_trial.mcap") as writer:
+        writer.describe(EpisodeInfo(id="a_trial", kind="trial"))
+    with EpisodeWriter(run.episodes_dir / "foreign.mcap") as writer:
+        writer.add_metadata("episode", {"who": "another program"})
+    assert rerun_viewer.episode_of(run.path).stem == "a_trial"
+
+
 def test_rerun_verifies_the_file(exported: Exported) -> None:
     command = [sys.executable, "-m", "rerun", "rrd", "verify", str(exported.path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)

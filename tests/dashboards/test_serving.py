@@ -14,10 +14,13 @@ from pathlib import Path
 
 import pytest
 
+from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run import RunFolder
+from bridge.episode.writer import EpisodeWriter
 from dashboards.config import DashboardConfig
-from dashboards.errors import AddressTakenError
+from dashboards.errors import AddressTakenError, NotHereError
 from dashboards.guard import Admission, host_name, is_loopback
+from dashboards.library import derived_paths, episode_path
 from dashboards.server import Address, listen
 
 ROOT = Path(__file__).parents[2]
@@ -81,6 +84,22 @@ def test_the_address_can_be_opened_and_tunnelled() -> None:
 )
 def test_loopback_is_told_from_the_rest(host: str, expected: bool) -> None:
     assert is_loopback(host) is expected
+
+
+def test_every_listed_file_has_a_page_and_nothing_else_has(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    for name in ("t1", "rosbag 2024.05 [a]"):
+        with EpisodeWriter(run.episodes_dir / f"{name}.mcap") as writer:
+            writer.describe(EpisodeInfo(id="x", kind="trial"))
+    with EpisodeWriter(run.derived_dir / "t1.replay.x.mcap"):
+        pass
+    for path in run.episodes():
+        assert episode_path(run, path.stem) == path
+    for name in ("t2", "t1/../../derived/t1.replay.x", "t1.replay.x", "", "*"):
+        with pytest.raises(NotHereError):
+            episode_path(run, name)
+    assert derived_paths(run, "*", "replay") == []
+    assert [path.name for path in derived_paths(run, "t1", "replay")] == ["t1.replay.x.mcap"]
 
 
 def test_host_headers_are_split_from_their_port() -> None:
