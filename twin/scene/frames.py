@@ -10,9 +10,9 @@ from bridge.episode.reader import Episode
 from bridge.episode.records import CompressedColor, DepthImage
 from bridge.episode.run import RunFolder
 from bridge.episode.streams import RgbdFrame
-from bridge.geometry import se3
 from twin.errors import TwinError
 from twin.scene.settings import FrameConfig
+from twin.scene.still import same_pose
 
 STILL_M = 0.002
 STILL_RAD = 0.0035
@@ -126,11 +126,7 @@ def _stamps(episode: Episode, camera_id: str) -> tuple[np.ndarray, bool]:
     tree = streams.transform_tree(episode)
     frame_id = streams.camera_info(episode, camera_id).frame_id
     poses = [tree.T_root_frame(frame_id, int(stamp)) for stamp in spread(stamps, 40)]
-    still = all(
-        np.linalg.norm(T[:3, 3] - poses[0][:3, 3]) < STILL_M
-        and se3.rotation_angle_rad(poses[0][:3, :3].T @ T[:3, :3]) < STILL_RAD
-        for T in poses
-    )
+    still = all(same_pose(poses[0], T, distance_m=STILL_M, angle_rad=STILL_RAD) for T in poses)
     return stamps, still and len(stamps) > 1
 
 

@@ -176,7 +176,7 @@ class LiveView:
         return LiveFrames(frames=frames, reasons=reasons)
 
 
-class NoFramesError(TwinError):
+class CameraNotReadyError(TwinError):
     """A camera gives no frames yet; the message says what is missing."""
 
 
@@ -185,11 +185,11 @@ def _frames_of(
 ) -> list[RgbdFrame]:
     missing = [f"{name}/info" for name in ("color", "depth") if name not in camera.infos]
     if missing:
-        raise NoFramesError(f"no calibration on {' and '.join(missing)}")
+        raise CameraNotReadyError(f"no calibration on {' and '.join(missing)}")
     known = set(tree.frames())
     unknown = [info.frame_id for info in camera.infos.values() if info.frame_id not in known]
     if unknown:
-        raise NoFramesError(f"no transform to {unknown[0]}")
+        raise CameraNotReadyError(f"no transform to {unknown[0]}")
     frame_id = camera.infos["color"].frame_id
     pairs = [
         (color, depth)
@@ -198,7 +198,7 @@ def _frames_of(
         and is_still(tree, frame_id, color.stamp_ns)
     ]
     if not pairs:
-        raise NoFramesError("no colour and depth pair taken at rest since the last motion")
+        raise CameraNotReadyError("no colour and depth pair taken at rest since the last motion")
     oldest_ns = pairs[-1][0].stamp_ns - MAX_SPAN_NS
     return [
         _frame(camera_id, camera.infos, tree, color, depth)

@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.episode import provenance, schema, streams
 from bridge.episode.metadata import Derived
@@ -17,11 +16,11 @@ from bridge.episode.streams import RgbdFrame
 from bridge.episode.transforms import TransformTree
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError
-from bridge.geometry import se3
 from bridge.task.robot import BASE_FRAME
 from bridge.task.task_file import Task
 from twin.scene.frames import rgbd_camera_ids
 from twin.scene.localise import LocaliseConfig, LocalisedObject, localise_objects
+from twin.scene.still import same_pose
 
 NO_SCENE = "noscene"
 STILL_WINDOW_NS = 40_000_000
@@ -167,13 +166,7 @@ def is_still(
     )
     before = tree.T_root_frame(frame_id, stamp_ns - STILL_WINDOW_NS)
     after = tree.T_root_frame(frame_id, last_ns)
-    return bool(_moved_m(before, after) < STILL_DISTANCE_M) and (
-        float(se3.rotation_angle_rad(before[:3, :3].T @ after[:3, :3])) < STILL_ANGLE_RAD
-    )
-
-
-def _moved_m(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> float:
-    return float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
+    return same_pose(before, after, distance_m=STILL_DISTANCE_M, angle_rad=STILL_ANGLE_RAD)
 
 
 def write_localised(

@@ -12,6 +12,7 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.task_file import ObjectModel, Task
 from twin.scene.localise_colour import ColourConfig, likeness, linear_from_srgb
+from twin.scene.still import same_pose
 
 STILL_DISTANCE_M = 5e-4
 STILL_ANGLE_RAD = 1e-3
@@ -82,9 +83,9 @@ def fuse_stills(
 def _same_pose(a: RgbdFrame, b: RgbdFrame) -> bool:
     if a.camera_id != b.camera_id or a.depth_m.shape != b.depth_m.shape:
         return False
-    T_a_b = se3.invert(a.T_base_depth) @ b.T_base_depth
-    near = np.linalg.norm(T_a_b[:3, 3]) < STILL_DISTANCE_M
-    return bool(near and se3.rotation_angle_rad(T_a_b[:3, :3]) < STILL_ANGLE_RAD)
+    return same_pose(
+        a.T_base_depth, b.T_base_depth, distance_m=STILL_DISTANCE_M, angle_rad=STILL_ANGLE_RAD
+    )
 
 
 def _view(frames: Sequence[RgbdFrame], task: Task, config: PointConfig) -> View:
