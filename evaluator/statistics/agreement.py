@@ -108,7 +108,9 @@ def mcnemar(pairs: Iterable[tuple[bool, bool]]) -> McNemar:
     if discordant == 0:
         raise UndefinedStatisticError(
             statistic="McNemar's test",
-            reason=f"none of the {len(seen)} pairs differ between the conditions",
+            reason=f"none of the {len(seen)} pairs differ between the conditions"
+            if seen
+            else "there are no pairs",
         )
     smaller = min(improved, worsened)
     masses = [math.comb(discordant, i) / 2**discordant for i in range(smaller + 1)]

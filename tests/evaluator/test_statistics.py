@@ -97,6 +97,8 @@ def test_mcnemar_of_four_improved_pairs() -> None:
 def test_mcnemar_without_a_discordant_pair_is_undefined() -> None:
     with pytest.raises(UndefinedStatisticError, match="none of the 2 pairs differ"):
         mcnemar([(True, True), (False, False)])
+    with pytest.raises(UndefinedStatisticError, match="there are no pairs"):
+        mcnemar([])
 
 
 @settings(max_examples=40, deadline=None)
