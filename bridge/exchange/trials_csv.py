@@ -72,31 +72,29 @@ class SourceRow:
 
     def whole(self, name: str) -> int | None:
         """Read a whole number of at least 0."""
-        text = self.text(name)
-        if not text:
+        number = self._number(name)
+        if number is None:
             return None
-        try:
-            number = float(text)
-        except ValueError:
-            number = -1.0
         if not (number >= 0 and number.is_integer()):
-            raise self.refuse(
-                f"{name} is {text!r}", f"{name} counts something: a whole number of at least 0"
-            )
+            hint = f"{name} counts something: a whole number of at least 0"
+            raise self.refuse(f"{name} is {self.text(name)!r}", hint)
         return int(number)
 
     def fraction(self, name: str) -> float | None:
         """Read a number in 0..1."""
-        text = self.text(name)
-        if not text:
-            return None
-        try:
-            number = float(text)
-        except ValueError:
-            number = -1.0
-        if not 0 <= number <= 1:
-            raise self.refuse(f"{name} is {text!r}", f"{name} is a fraction from 0 to 1")
+        number = self._number(name)
+        if number is not None and not 0 <= number <= 1:
+            hint = f"{name} is a fraction from 0 to 1"
+            raise self.refuse(f"{name} is {self.text(name)!r}", hint)
         return number
+
+    def _number(self, name: str) -> float | None:
+        """Return the number in a field, None when it is empty, -1 when it is no number."""
+        text = self.text(name)
+        try:
+            return float(text) if text else None
+        except ValueError:
+            return -1.0
 
     def answer(self, name: str) -> bool | None:
         """Read yes, no or unknown."""
@@ -116,16 +114,7 @@ def read_rows(path: Path, required: Sequence[str], known: Sequence[str]) -> list
         PathNotFoundError: When the file is not there.
         TableError: When it is no text, a column is missing, unknown or doubled, or a row is ragged.
     """
-    if not path.is_file():
-        raise PathNotFoundError(path=path, what="table", hint="Give a CSV file.")
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            lines = [line for line in enumerate(csv.reader(stream), start=1) if any(line[1])]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise TableError(
-            path=path, row=None, found=f"not a CSV file ({error})", hint="Save it as UTF-8 CSV"
-        ) from error
-    lines = [line for line in lines if not line[1][0].startswith("#")]
+    lines = _lines(path, what="table", hint="Give a CSV file.")
     if not lines:
         raise TableError(path=path, row=None, found="empty", hint=f"Columns: {', '.join(known)}")
     header = [name.strip() for name in lines[0][1]]
@@ -149,20 +138,23 @@ def read_rows(path: Path, required: Sequence[str], known: Sequence[str]) -> list
 
 def header_of(path: Path) -> list[str]:
     """Return the column names of a CSV file, to tell which table it is."""
+    hint = "Give a run folder, or a CSV file."
+    lines = _lines(path, what="run folder or table", hint=hint)
+    return [name.strip() for name in lines[0][1]] if lines else []
+
+
+def _lines(path: Path, *, what: str, hint: str) -> list[tuple[int, list[str]]]:
+    """Read numbered lines; blank ones and comments are left out."""
     if not path.is_file():
-        raise PathNotFoundError(
-            path=path, what="run folder or table", hint="Give a run folder, or a CSV file."
-        )
+        raise PathNotFoundError(path=path, what=what, hint=hint)
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
-            for line in csv.reader(stream):
-                if any(line) and not line[0].startswith("#"):
-                    return [name.strip() for name in line]
+            lines = [line for line in enumerate(csv.reader(stream), start=1) if any(line[1])]
     except (UnicodeDecodeError, csv.Error) as error:
         raise TableError(
             path=path, row=None, found=f"not a CSV file ({error})", hint="Save it as UTF-8 CSV"
         ) from error
-    return []
+    return [line for line in lines if not line[1][0].startswith("#")]
 
 
 def _check_header(
