@@ -14,9 +14,11 @@ from pathlib import Path
 
 import pytest
 
+import robot_gst
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run import RunFolder
 from bridge.episode.writer import EpisodeWriter
+from dashboards import demo
 from dashboards.config import DashboardConfig
 from dashboards.errors import AddressTakenError, NotHereError
 from dashboards.guard import Admission, host_name, is_loopback
@@ -100,6 +102,31 @@ def test_every_listed_file_has_a_page_and_nothing_else_has(tmp_path: Path) -> No
             episode_path(run, name)
     assert derived_paths(run, "*", "replay") == []
     assert [path.name for path in derived_paths(run, "t1", "replay")] == ["t1.replay.x.mcap"]
+
+
+def test_a_terminated_demo_ends_what_it_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left: list[demo.Background] = []
+
+    def start(arguments: list[str], log: Path) -> demo.Background:
+        process = subprocess.Popen(["sleep", "60"])
+        left.append(demo.Background(command=arguments[0], process=process, log=log))
+        return left[-1]
+
+    def answers(*_: object) -> bool:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return False
+
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        monkeypatch.setattr(demo, "_start", start)
+        monkeypatch.setattr(demo, "_answers", answers)
+        assert robot_gst.run(["demo", str(tmp_path / "run"), "--quiet"]) == 130
+        assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert [item.process.poll() for item in left] == [-signal.SIGTERM]
 
 
 def test_host_headers_are_split_from_their_port() -> None:
