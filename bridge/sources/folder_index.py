@@ -23,7 +23,7 @@ from bridge.sources.errors import FolderError
 INDEX_NAME = "scene.json"
 ROTATION_TOLERANCE = 0.01
 """Poses written with five digits are off by 5e-4; more than this is not a rotation."""
-_KEYS_HINT = "See the README of bridge.sources.folder_index, or add the key by hand."
+_KEYS_HINT = "docs/rgbd_folder.md lists the keys."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +67,7 @@ def read_index(folder: Path) -> FolderIndex:
     path = folder / INDEX_NAME
     if not path.is_file():
         raise PathNotFoundError(
-            path=path, what="index", hint="An RGB-D folder needs one; see docs for its keys."
+            path=path, what="index", hint="An RGB-D folder needs one. " + _KEYS_HINT
         )
     record = _load(path)
     registered = record.get("color_registered_to_depth", True)
