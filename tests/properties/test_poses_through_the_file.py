@@ -61,7 +61,7 @@ def test_a_motion_does_not_differ_from_itself_after_recording(seed: int) -> None
 @given(st.integers(0, 1000), st.floats(0.001, 0.2))
 def test_a_constant_offset_is_measured_as_it_is(seed: int, offset_m: float) -> None:
     run = motion(seed)
-    moved = PoseTrajectory(run.stamps_ns, run.p_m + [0.0, offset_m, 0.0], run.q_wxyz)
+    moved = PoseTrajectory(run.stamps_ns, run.p_m + np.array([0.0, offset_m, 0.0]), run.q_wxyz)
     errors = pose_errors(through_a_file(run), through_a_file(moved))
     np.testing.assert_allclose(errors.position_m, offset_m, atol=1e-12)
 
