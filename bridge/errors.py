@@ -4,6 +4,7 @@ Every error states what was found, where, and what to do. ``exit_code`` is the s
 line ends with (see the architecture page): 1 failed or broken file, 2 wrong use, 3 a threshold.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 
@@ -21,6 +22,30 @@ class UsageError(GstError):
     """The command was called with something that cannot be right."""
 
     exit_code = 2
+
+
+class OptionError(UsageError):
+    """A number given on the command line or in a settings file is outside its range."""
+
+    def __init__(self, *, name: str, value: int | float, allowed: str) -> None:
+        """Remember the option as it is spelt on the command line."""
+        self.name = "--" + name.replace("_", "-")
+        super().__init__(f"{self.name} {value:g} makes no sense; it must be {allowed}.")
+
+
+def refuse_outside(
+    settings: object, allowed: Mapping[str, tuple[int | float, int | float]]
+) -> None:
+    """Check numbers of a settings record against what is allowed, ends included.
+
+    Raises:
+        OptionError: Naming the first one that is outside.
+    """
+    for name, (least, most) in allowed.items():
+        value = getattr(settings, name)
+        if value is not None and not least <= value <= most:
+            top = "" if most == float("inf") else f" and at most {most:g}"
+            raise OptionError(name=name, value=value, allowed=f"at least {least:g}{top}")
 
 
 class MissingDependencyError(GstError):

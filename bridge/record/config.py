@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from bridge.errors import refuse_outside
+
 BYTES_PER_MB = 1_000_000
 
 
@@ -21,6 +23,13 @@ class RecorderConfig:
     """Messages of further topics in one episode are dropped and counted."""
     command_timeout_s: float = 60.0
     """A start or stop that the disk has not carried out after this long is reported [s]."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers with which nothing could be recorded."""
+        most = float("inf")
+        refuse_outside(self, {"queue_mb": (1, most), "max_topics": (1, most)})
+        refuse_outside(self, {"small_reserve_mb": (0, self.queue_mb)})
+        refuse_outside(self, {"command_timeout_s": (0.1, most)})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -53,8 +53,8 @@ def run_recorder(
     Raises:
         DiskError: When the episode cannot be written.
     """
-    run = RunFolder.create(run_path)
     with open_session(wire) as session:
+        run = RunFolder.create(run_path)
         recorder = Recorder(run, now_ns=session.now_ns, config=config)
         subscribers = [session.subscribe(key, _taker(recorder)) for key in config.topics]
         services = serve_control(session, recorder)

@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 
-from bridge.errors import UsageError
+from bridge.errors import UsageError, refuse_outside
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
@@ -29,5 +29,4 @@ class FolderConfig:
                     f"{what} name {name!r} cannot be part of a topic. "
                     "Use letters, digits and '_', starting with a letter."
                 )
-        if not 0 < self.rate_hz <= 1000:
-            raise UsageError(f"--rate-hz {self.rate_hz:g} is not between 0 and 1000.")
+        refuse_outside(self, {"rate_hz": (0.001, 1000), "max_frames": (1, 10**9)})

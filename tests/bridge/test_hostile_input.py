@@ -278,6 +278,28 @@ def test_zenoh_and_settings_files_may_come_in_any_order(tmp_path: Path) -> None:
     assert robot_gst._take_config(tokens) == (tokens[:4], settings)
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["publish", "standin", "--trials", "-1"],
+        ["publish", "standin", "--rounds", "0"],
+        ["publish", "standin", "--image-scale", "0"],
+        ["publish", "standin", "--rate-hz", "-1"],
+        ["publish", "folder", "DIR", "--max-frames", "-1"],
+        ["import", "rgbd", "DIR", "RUN", "--rate-hz", "nan"],
+        ["record", "RUN", "--queue-mb", "-1"],
+        ["record", "RUN", "--queue-mb", "8", "--small-reserve-mb", "16"],
+    ],
+)
+def test_a_number_out_of_range_is_wrong_use(
+    tmp_path: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = {"DIR": str(tmp_path / "folder"), "RUN": str(tmp_path / "run")}
+    assert robot_gst.run([places.get(word, word) for word in arguments]) == 2
+    assert f"{arguments[-2]} {arguments[-1]} makes no sense" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_checking_nothing_is_wrong_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert robot_gst.run(["check", str(tmp_path)]) == 2
     assert "no episodes in" in capsys.readouterr().err

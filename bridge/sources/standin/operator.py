@@ -255,18 +255,18 @@ class Operator:
         self._open = True
         self._cell.announce()
 
-    def _end(self, outcome: Outcome | None) -> None:
+    def _end(self, outcome: Outcome | None, *, discard: bool = False) -> None:
         record = None if outcome is None else asdict(outcome)
-        answer = self._control("stop", {"outcome": record, "discard": False})
+        answer = self._control("stop", {"outcome": record, "discard": discard})
         self._open = False
         self._output.detail(f"recorded {json.dumps(answer)}")
         self._cell.skip(BETWEEN_S)
 
-    def abandon(self) -> None:
-        """Close an episode that was interrupted, if one is open."""
+    def abandon(self, *, discard: bool) -> None:
+        """Close an episode that was interrupted, if one is open, or throw it away."""
         self._cell.cameras_running = False
         if self._open:
-            self._end(void_trial("interrupted"))
+            self._end(void_trial("interrupted"), discard=discard)
 
     def _control(self, verb: str, request: Mapping[str, Any]) -> dict[str, Any]:
         key = f"rec/{self._config.recorder}/ctl/{verb}"

@@ -1,10 +1,12 @@
 """One session of the stand-in cell, from the files to the last episode."""
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
 from bridge.clock import AnchoredClock
+from bridge.errors import BridgeError
 from bridge.sources.standin.cell import CellConfig, StandinCell, StoppedError
 from bridge.sources.standin.cell_file import load_cell
 from bridge.sources.standin.hidden import draw_hidden
@@ -56,8 +58,11 @@ def run_session(
         operator.trials()
     except StoppedError:
         stopped = True
-    finally:
-        operator.abandon()
+        operator.abandon(discard=False)
+    except Exception:
+        with contextlib.suppress(BridgeError):  # the first error is the one to show
+            operator.abandon(discard=True)
+        raise
     return _summary(operator, config, stopped=stopped)
 
 

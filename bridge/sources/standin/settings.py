@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from bridge.errors import refuse_outside
+
 CONDITIONS = ("without_replanning", "with_replanning")
 
 
@@ -46,3 +48,17 @@ class SessionConfig:
     """Resize the images of the cell file (320 x 240)."""
     real_time: bool = False
     """Keep pace with the wall clock instead of running as fast as possible."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that no session can have."""
+        most = float("inf")
+        allowed: dict[str, tuple[int | float, int | float]] = {
+            "seed": (0, 2**31),
+            "trials": (0, 8_000),
+            "first_trial": (0, 9_999),
+            "rounds": (1, 1_000),
+            "gate_timeout_s": (0.1, most),
+            "rate_hz": (0, 60),
+            "image_scale": (0.05, 8),
+        }
+        refuse_outside(self, allowed)

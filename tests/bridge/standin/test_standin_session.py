@@ -276,3 +276,20 @@ def test_importing_the_room_and_the_settings_loads_no_physics() -> None:
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
+
+
+def test_a_session_that_fails_leaves_no_half_episode(
+    make_session: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(cell: StandinCell) -> None:
+        message = "no picture"
+        raise ValueError(message)
+
+    session = make_session()
+    monkeypatch.setattr(StandinCell, "capture", broken)
+    with pytest.raises(ValueError, match="no picture"):
+        run_session(session, settings(trials=0, scan=True), QUIET, start_ns=0)
+    assert [(verb, request.get("discard")) for verb, request in session.control] == [
+        ("start", None),
+        ("stop", True),
+    ]
