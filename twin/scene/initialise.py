@@ -53,7 +53,8 @@ def fuse(points: list[PointSet], config: InitialiseConfig) -> GaussianCloud:
 def _no_surface(num_points: int) -> str:
     return (
         f"the depth images hold only {num_points} usable points. Check that depth is in "
-        "millimetres and that the camera sees surfaces nearer than --max-depth-m."
+        "millimetres, that the camera sees surfaces nearer than --max-depth-m, and that most "
+        "pixels have a measurement: points without measured neighbours are not trusted."
     )
 
 
