@@ -12,6 +12,7 @@ from typing import Any
 
 from bridge.errors import InvalidRecordError, PathNotFoundError
 from bridge.task.record import check_record, parse_record
+from bridge.units import Unit
 from evaluator.errors import EvaluatorError
 
 SCHEMA_VERSION = 1
@@ -55,7 +56,8 @@ class Measurement:
     """The recorded episodes the number rests on."""
 
     def __post_init__(self) -> None:
-        """Refuse NaN, infinity, and undefined values without a reason."""
+        """Refuse NaN, infinity, unknown units, and undefined values without a reason."""
+        Unit(self.unit)
         if self.value is not None and not math.isfinite(self.value):
             message = f"measurement {self.id} is {self.value}; say it is undefined and why"
             raise ValueError(message)

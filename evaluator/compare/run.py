@@ -158,7 +158,9 @@ def _read_recorded(run: RunFolder) -> tuple[list[Episode], list[Exclusion]]:
     episodes, left_out = [], []
     for path in run.episodes():
         try:
-            episodes.append(Episode.open(path))
+            episode = Episode.open(path)
+            _ = episode.info, episode.outcome  # both are needed; another program may have erred
+            episodes.append(episode)
         except BridgeError as error:
             left_out.append(_broken(path.name, error))
     return episodes, left_out

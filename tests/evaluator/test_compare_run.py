@@ -152,6 +152,16 @@ def test_tool_error_is_measured_at_matching_instants(maker: Any, start_ns: int) 
     assert series[0].t_s[-1] == pytest.approx(1.0)
 
 
+def test_an_episode_with_metadata_of_another_program_is_left_out_and_named(
+    six_trials: Any,
+) -> None:
+    with EpisodeWriter(six_trials.run.episodes_dir / "foreign.mcap") as writer:
+        writer.add_metadata("episode", {"id": "null", "kind": "7"})
+    comparison = compare_run(six_trials.run)
+    assert len(comparison.rows) == 6
+    assert "cannot be read" in reasons(comparison, "foreign.mcap")
+
+
 def test_a_broken_file_is_left_out_and_named(six_trials: Any) -> None:
     (six_trials.run.episodes_dir / "broken.mcap").write_bytes(b"\x89MCAP0\r\nnot really")
     (six_trials.run.derived_dir / "broken.replay.mcap").write_bytes(b"")
