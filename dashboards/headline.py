@@ -120,12 +120,14 @@ def _small(measurement: Measurement) -> str:
     return f"{text} ({why})" if why else text
 
 
-def _rates(measurements: Sequence[Measurement]) -> dict[str, dict[str, Measurement]]:
+def _rates(
+    measurements: Sequence[Measurement], start: str = "rate"
+) -> dict[str, dict[str, Measurement]]:
     """Map cell to side to measurement, in file order."""
     rates: dict[str, dict[str, Measurement]] = {}
     for measurement in measurements:
         parts = measurement.id.split(".", 2)
-        if len(parts) == 3 and parts[0] == "rate":
+        if len(parts) == 3 and parts[0] == start:
             rates.setdefault(parts[2], {})[parts[1]] = measurement
     return rates
 
@@ -163,9 +165,10 @@ def rate_table(measurements: Sequence[Measurement]) -> RateTable | None:
 
 
 def cells(measurements: Sequence[Measurement], rows: Sequence[TrialRow]) -> list[Cell]:
-    """Collect the cells that have both a recorded and a twin rate."""
+    """Collect the cells that have both rates; over the same trials where trials are known."""
     found = []
-    for cell, by_side in _rates(measurements).items():
+    over_same_trials = _rates(measurements, "rate_common")
+    for cell, by_side in (over_same_trials or _rates(measurements)).items():
         if "recorded" not in by_side or SIM_SIDE not in by_side:
             continue
         task, condition, policy = _cell_parts(cell)
@@ -220,5 +223,7 @@ def rest(measurements: Sequence[Measurement], shown: Sequence[Card]) -> tuple[Me
     """Whatever is in the results and not already on the page."""
     ids = {name for card in shown for name in card.ids}
     return tuple(
-        m for m in measurements if m.id not in ids and not m.id.startswith(("rate.", "gain"))
+        m
+        for m in measurements
+        if m.id not in ids and not m.id.startswith(("rate.", "rate_common.", "gain"))
     )

@@ -85,6 +85,15 @@ class RateCell:
     """Over the trials where both sides are known; these two enter r."""
     sim_rate: Fraction | None
     episodes: tuple[str, ...] = ()
+    recorded_common: Measurement | None = None
+    """Over the trials where both sides are known, with its interval; the scatter draws these two,
+    so that a point never compares different trials. None for a rates CSV."""
+    sim_common: Measurement | None = None
+
+    @property
+    def pair(self) -> tuple[Measurement, Measurement]:
+        """Sim and recorded rate over the same trials, or as given where trials are not known."""
+        return self.sim_common or self.sim, self.recorded_common or self.recorded
 
     @property
     def label(self) -> str:

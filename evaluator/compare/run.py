@@ -106,6 +106,7 @@ def compare_rows(
     pairs, unpaired = pair_starts(rows)
     measurements: list[Measurement] = [
         *rates,
+        *(rate for cell in cells for rate in cell.pair),
         *agreement(rows),
         *cell_agreement(cells),
         *gains,

@@ -113,6 +113,7 @@ def rate_cells(rows: Sequence[TrialRow], rates: Sequence[Measurement]) -> tuple[
     for key, members in group_rows(rows).items():
         both = [r for r in members if r.recorded is not None and r.sim_planned is not None]
         num = len(both)
+        recorded_common, sim_common = _common_rates(key, both)
         cells.append(
             RateCell(
                 task=key[0],
@@ -124,9 +125,29 @@ def rate_cells(rows: Sequence[TrialRow], rates: Sequence[Measurement]) -> tuple[
                 recorded_rate=Fraction(sum(r.recorded is True for r in both), num) if num else None,
                 sim_rate=Fraction(sum(r.sim_planned is True for r in both), num) if num else None,
                 episodes=tuple(row.episode for row in both),
+                recorded_common=recorded_common,
+                sim_common=sim_common,
             )
         )
     return tuple(cells)
+
+
+def _common_rates(
+    key: tuple[str, str, str], both: Sequence[TrialRow]
+) -> tuple[Measurement, Measurement]:
+    rates = [
+        proportion(
+            _rate_id(side, key).replace("rate.", "rate_common.", 1),
+            sum(answer(row) is True for row in both),
+            len(both),
+            definition=f"{definition}; over the trials where both sides are known",
+            counted="trial",
+            reason_if_undefined="no trial has both sides",
+            episodes=[row.episode for row in both],
+        )
+        for side, answer, definition in SIDES[:2]
+    ]
+    return rates[0], rates[1]
 
 
 def cell_agreement(cells: Sequence[RateCell]) -> list[Measurement]:

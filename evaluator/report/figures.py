@@ -28,14 +28,15 @@ LEFT, TOP = 64.0, 16.0
 
 def scatter_svg(cells: Sequence[RateCell], word: str) -> str | None:
     """Draw sim against recorded success rates with both Wilson intervals and the identity line."""
-    drawn = [c for c in cells if c.sim.value is not None and c.recorded.value is not None]
+    drawn = [c for c in cells if all(rate.value is not None for rate in c.pair)]
     if not drawn:
         return None
     groups = list(dict.fromkeys((cell.task, cell.policy) for cell in drawn))
     parts = [_frame(word)]
     taken: dict[tuple[float, float], int] = {}
     for cell in drawn:
-        place = (cell.sim.value or 0.0, cell.recorded.value or 0.0)
+        sim, recorded = cell.pair
+        place = (sim.value or 0.0, recorded.value or 0.0)
         nudge = 9.0 * taken.get(place, 0)
         taken[place] = taken.get(place, 0) + 1
         parts.append(_point(cell, groups.index((cell.task, cell.policy)), nudge))
@@ -80,15 +81,16 @@ def _frame(word: str) -> str:
 
 
 def _point(cell: RateCell, group: int, nudge: float) -> str:
-    x, y = _x(cell.sim.value or 0.0) - nudge, _y(cell.recorded.value or 0.0) + nudge
+    sim, recorded = cell.pair
+    x, y = _x(sim.value or 0.0) - nudge, _y(recorded.value or 0.0) + nudge
     whiskers = ""
-    if cell.sim.interval is not None:
-        low, high = _x(cell.sim.interval.low), _x(cell.sim.interval.high)
+    if sim.interval is not None:
+        low, high = _x(sim.interval.low), _x(sim.interval.high)
         whiskers += f"M{low:.1f} {y:.1f}H{high:.1f}"
-    if cell.recorded.interval is not None:
-        low, high = _y(cell.recorded.interval.low), _y(cell.recorded.interval.high)
+    if recorded.interval is not None:
+        low, high = _y(recorded.interval.low), _y(recorded.interval.high)
         whiskers += f"M{x:.1f} {low:.1f}V{high:.1f}"
-    tip = f"{cell.label}: sim {_percent(cell.sim)}, recorded {_percent(cell.recorded)}"
+    tip = f"{cell.label}: sim {_percent(sim)}, recorded {_percent(recorded)}"
     return (
         f'<g><title>{escape(tip)}</title><path class="whisker" d="{whiskers}"/>'
         f"{_marker(x, y, group, 'with' if cell.condition == WITH else 'without')}</g>"

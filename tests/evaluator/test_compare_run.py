@@ -42,6 +42,20 @@ def test_the_twin_agrees_with_five_of_six_trials(six_trials: Any) -> None:
     assert comparison.stand_in is True
 
 
+def test_a_point_of_the_scatter_compares_the_same_trials(six_trials: Any) -> None:
+    six_trials.trial("b4", recorded="failure", condition="with_replanning", sent=False)
+    comparison = compare_run(six_trials.run)
+    results = comparison.results()
+    cell = "cube_into_box.with_replanning.scripted"
+    everyone = results.get(f"rate.recorded.{cell}")
+    common = results.get(f"rate_common.recorded.{cell}")
+    assert (everyone.k, everyone.n) == (2, 4)
+    assert (common.k, common.n) == (2, 3)
+    assert set(common.episodes) == set(results.get(f"rate_common.sim_planned.{cell}").episodes)
+    with_replanning = next(c for c in comparison.cells if c.condition == "with_replanning")
+    assert with_replanning.pair[1] == common
+
+
 def test_success_rates_are_counted_per_cell_and_side(six_trials: Any) -> None:
     results = compare_run(six_trials.run).results()
     without = results.get("rate.recorded.cube_into_box.without_replanning.scripted")
