@@ -13,6 +13,7 @@ from typing import Any
 from bridge.errors import InvalidRecordError, PathNotFoundError
 from bridge.task.record import check_record, parse_record
 from bridge.units import Unit
+from bridge.whole_file import write_whole
 from evaluator.errors import EvaluatorError
 
 SCHEMA_VERSION = 1
@@ -128,11 +129,9 @@ class Results:
 def write_results(results: Results, path: Path) -> Path:
     """Write ``results.json``; a half-written file never carries the final name."""
     text = json.dumps(results.to_record(), indent=1, allow_nan=False)
-    part = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(text + "\n")
-        part.replace(path)
+        write_whole(path, f"{text}\n".encode())
     except OSError as error:
         message = f"cannot write {path}: {error.strerror}. Choose another folder with --out."
         raise EvaluatorError(message) from error

@@ -9,6 +9,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run import EPISODE_ID, RunFolder, check_episode_id
 from bridge.errors import GstError, PathNotFoundError
 from bridge.task.record import check_record, parse_record
+from bridge.whole_file import write_whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +84,5 @@ def label_episode(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:
     check_record(record, name="outcome")
     path = _sidecar(run, episode_id)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(record, indent=1) + "\n")
-    temporary.replace(path)
+    write_whole(path, (json.dumps(record, indent=1) + "\n").encode())
     return path

@@ -11,6 +11,7 @@ from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.run import RunFolder, check_episode_id
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
+from bridge.whole_file import write_whole
 
 
 @pytest.fixture
@@ -105,3 +106,11 @@ def test_every_command_has_help_with_an_example(
 ) -> None:
     assert robot_gst.run([name, "--help"]) == 0
     assert "Example" in capsys.readouterr().out
+
+
+def test_a_file_written_whole_has_its_bytes_and_leaves_no_part(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text("before")
+    write_whole(path, b"after")
+    assert path.read_bytes() == b"after"
+    assert list(tmp_path.iterdir()) == [path]

@@ -48,12 +48,11 @@ class ReplayOrigin:
 
 
 def write_replay(path: Path, result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Path:
-    """Write one replay; a stale part file of an interrupted run is replaced.
+    """Write one replay; the writer replaces a part file that an interrupted run left.
 
     Raises:
         UsageError: When the file exists.
     """
-    path.with_name(path.name + ".part").unlink(missing_ok=True)
     messages = [*_messages(result, plan, origin), *_events(result, plan, origin)]
     with EpisodeWriter(path) as writer:
         writer.describe(origin.info, derived=origin.derived)

@@ -215,7 +215,6 @@ def write_localised(
         for phase in quiet_phases(episode)
     ]
     path.unlink(missing_ok=True)
-    path.with_name(path.name + ".part").unlink(missing_ok=True)
     with EpisodeWriter(path) as writer:
         writer.describe(episode.info, derived=derived)
         for phase, objects in phases:

@@ -16,13 +16,14 @@ from jaxtyping import Bool, Float, Int
 from bridge.episode import provenance
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task
+from bridge.whole_file import write_whole
 from twin.scene.fill import fill_footprint
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate
 from twin.scene.localise import LocalisedObject
 from twin.scene.localise_colour import ColourConfig, likeness, linear_from_srgb
 from twin.scene.localise_fit import FitConfig, refine_on_points
 from twin.scene.localise_shape import surface_distances
-from twin.scene.ply import write_ply, write_whole
+from twin.scene.ply import write_ply
 
 OBJECT_VERSION = 1
 MIN_SPLATS_TO_REFINE = 50

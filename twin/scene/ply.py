@@ -1,11 +1,11 @@
 """Gaussians as the PLY file that other splat viewers read (SuperSplat, Rerun)."""
 
-import os
 from pathlib import Path
 
 import numpy as np
 
 from bridge.errors import PathNotFoundError
+from bridge.whole_file import write_whole
 from twin.errors import TwinError
 from twin.scene.gaussians import SH_DC, GaussianCloud, as_float32
 
@@ -51,16 +51,6 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
     header += [f"property float {name}" for name in COLUMNS]
     write_whole(path, "\n".join([*header, "end_header", ""]).encode() + table.tobytes())
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file that appears under its name only when it is complete."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-    part.replace(path)
 
 
 def read_ply(path: Path) -> GaussianCloud:

@@ -9,9 +9,10 @@ from typing import Any
 from bridge.episode import provenance
 from bridge.episode.run import RunFolder
 from bridge.errors import PathNotFoundError
+from bridge.whole_file import write_whole
 from twin.errors import TwinError
 from twin.scene.gaussians import GaussianCloud
-from twin.scene.ply import read_ply, write_whole
+from twin.scene.ply import read_ply
 
 SCENE_VERSION = 1
 BACKGROUND = "background.ply"

@@ -173,11 +173,6 @@ class StandinCell:
         """Tell the gripper which opening to go to; it moves while time passes."""
         self._width_target_m = width_m
 
-    @property
-    def target_rad(self) -> Float[np.ndarray, "6"]:
-        """Where the controller wants the arm, in encoder angles."""
-        return self._target_rad
-
     def _tick(self) -> None:
         if self._should_stop():
             raise StoppedError
