@@ -1,6 +1,6 @@
 # make demo    the whole loop on a stand-in cell, ends with the dashboard's address
 # make test    all tests but the very slow ones   make check   lint, types, import contracts
-# make bench   benchmarks against named references
+# make bench   benchmarks against named references; BENCH=record picks those of the recorder
 # Everything lives in .venv; the first target run makes it (about 5 GB, a few minutes).
 
 .DEFAULT_GOAL := help
@@ -10,6 +10,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 NATIVE := $(wildcard twin/scene/native/*)
 RUN ?= runs/demo
+BENCH ?=
 export OMP_WAIT_POLICY ?= passive
 
 .PHONY: help setup demo test fast check format bench clean
@@ -50,7 +51,7 @@ format: $(READY)
 	@$(BIN)/ruff format .
 
 bench: $(READY)
-	@for file in benchmarks/bench_*.py; do $(BIN)/python $$file || exit 1; done
+	@for file in benchmarks/bench_$(BENCH)*.py; do $(BIN)/python $$file || exit 1; done
 
 clean:
 	rm -rf build .venv .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
