@@ -1,12 +1,14 @@
 """The run folder: one run is one cell."""
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 from bridge.errors import PathNotFoundError, UsageError
 
 EPISODE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,120}")
+_LATER_PART = re.compile(rf"({EPISODE_ID.pattern})\.([1-9][0-9]{{0,5}})\.mcap")
 
 
 def check_episode_id(episode_id: str) -> str:
@@ -18,6 +20,39 @@ def check_episode_id(episode_id: str) -> str:
         )
         raise UsageError(message)
     return episode_id
+
+
+def part_name(episode_id: str, index: int) -> str:
+    """Return the file name of one part of an episode; the first, number 1, carries the bare id."""
+    return f"{episode_id}.mcap" if index == 1 else f"{episode_id}.{index}.mcap"
+
+
+def first_parts(names: Collection[str]) -> list[str]:
+    """Return the names that begin an episode, sorted.
+
+    A later part is one whose predecessor is among the names too. Without it the file stands for
+    itself, so that a missing part never hides those behind it.
+    """
+    there = set(names)
+    return sorted(name for name in there if _name_before(name) not in there)
+
+
+def _name_before(name: str) -> str | None:
+    found = _LATER_PART.fullmatch(name)
+    if found is None or found[2] == "1":
+        return None
+    return part_name(found[1], int(found[2]) - 1)
+
+
+def part_paths(path: Path) -> list[Path]:
+    """Return an episode file and the parts that follow it without a gap, in order."""
+    found = _LATER_PART.fullmatch(path.name)
+    episode_id, index = (found[1], int(found[2])) if found else (path.stem, 1)
+    paths = [path]
+    if EPISODE_ID.fullmatch(episode_id):  # a name with dots is another program's, and whole
+        while (later := path.with_name(part_name(episode_id, index + len(paths)))).is_file():
+            paths.append(later)
+    return paths
 
 
 @dataclass(frozen=True)
@@ -72,8 +107,13 @@ class RunFolder:
         return self.path / "notes"
 
     def episodes(self) -> list[Path]:
-        """Recorded episode files, in name order."""
-        return sorted(self.episodes_dir.glob("*.mcap"))
+        """Recorded episodes, in name order; of a split one, its first part."""
+        names = [path.name for path in self.episodes_dir.glob("*.mcap")]
+        return [self.episodes_dir / name for name in first_parts(names)]
+
+    def parts(self, path: Path) -> list[Path]:
+        """All files of the episode that begins with this one, in order."""
+        return part_paths(path)
 
     def derived(self, pattern: str = "*") -> list[Path]:
         """Derived episode files, in name order."""

@@ -1,0 +1,58 @@
+"""Which files of a run are episodes, and which are parts of one."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.episode.run import RunFolder, first_parts, part_name, part_paths
+
+
+def run_with(folder: Path, *names: str) -> RunFolder:
+    run = RunFolder.create(folder / "run")
+    for name in names:
+        (run.episodes_dir / name).write_bytes(b"")
+    return run
+
+
+def listed(run: RunFolder) -> list[str]:
+    return [path.name for path in run.episodes()]
+
+
+def test_a_split_episode_is_listed_once_and_all_its_parts_are_found(tmp_path: Path) -> None:
+    names = [part_name("t1", index) for index in range(1, 12)]
+    run = run_with(tmp_path, *reversed(names), "t2.mcap")
+    assert listed(run) == ["t1.mcap", "t2.mcap"]
+    assert [path.name for path in run.parts(run.episodes()[0])] == names
+    assert run.parts(run.episodes()[1]) == [run.episodes()[1]]
+
+
+def test_a_missing_part_does_not_hide_those_behind_it(tmp_path: Path) -> None:
+    run = run_with(tmp_path, "t1.mcap", "t1.3.mcap", "t1.4.mcap", "t2.2.mcap")
+    assert listed(run) == ["t1.3.mcap", "t1.mcap", "t2.2.mcap"]
+    assert [path.name for path in run.parts(run.episodes()[0])] == ["t1.3.mcap", "t1.4.mcap"]
+
+
+@pytest.mark.parametrize(
+    "name", ["t1.02.mcap", "t1.1.mcap", "t1.0.mcap", "t1.x.mcap", "a.b.2.mcap"]
+)
+def test_a_name_that_only_looks_like_a_part_stands_for_itself(tmp_path: Path, name: str) -> None:
+    run = run_with(tmp_path, "t1.mcap", "a.b.mcap", name)
+    assert name in listed(run)
+    assert [part.name for path in run.episodes() for part in run.parts(path)] == listed(run)
+
+
+def test_files_of_takes_still_open_are_no_episodes(tmp_path: Path) -> None:
+    assert listed(run_with(tmp_path, "t1.mcap.part", "t1.2.mcap.part", "notes.txt")) == []
+
+
+@given(st.sets(st.integers(1, 9)))
+def test_every_file_belongs_to_exactly_one_episode(indices: set[int]) -> None:
+    names = {part_name("a", index) for index in indices}
+    heads = [int(name.split(".")[1]) if name.count(".") > 1 else 1 for name in first_parts(names)]
+    assert sorted(heads) == [index for index in sorted(indices) if index - 1 not in indices]
+
+
+def test_parts_of_a_file_that_is_not_there_are_the_file_alone(tmp_path: Path) -> None:
+    assert part_paths(tmp_path / "t9.mcap") == [tmp_path / "t9.mcap"]
