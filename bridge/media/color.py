@@ -31,16 +31,33 @@ class UnreadableImageError(BridgeError):
 
 
 def encode_jpeg(
-    image_u8: UInt8[np.ndarray, "height width 3"], quality: int = JPEG_QUALITY
+    image_u8: UInt8[np.ndarray, "height width channels"],
+    quality: int = JPEG_QUALITY,
+    *,
+    layout: str = "RGB",
 ) -> bytes:
-    """Compress an sRGB image as JPEG."""
+    """Compress an sRGB image as JPEG.
+
+    Args:
+        image_u8: The image; its rows may lie apart in memory.
+        quality: 1 to 100.
+        layout: Order of the channels: RGB, BGR, RGBA, BGRA or GRAY.
+
+    Raises:
+        ValueError: The image is larger than JPEG allows (65500), or empty.
+    """
     try:
         import simplejpeg  # noqa: PLC0415  # the extra [record] brings it; reading PNG needs none
     except ImportError as error:
         raise MissingDependencyError(
             package="simplejpeg", extra="record", purpose="JPEG encoding"
         ) from error
-    return bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(image_u8), quality=quality))
+    coding = {"colorsubsampling": "Gray"} if layout == "GRAY" else {}
+    return bytes(
+        simplejpeg.encode_jpeg(
+            np.ascontiguousarray(image_u8), quality=quality, colorspace=layout, **coding
+        )
+    )
 
 
 def decode_color(data: bytes) -> UInt8[np.ndarray, "height width 3"]:

@@ -1,0 +1,72 @@
+"""The compressed depth images of ROS (``compressed_depth_image_transport``): RVL and PNG.
+
+Every image starts with 12 bytes that matter to 32-bit depth only (an int32 and two float32).
+RVL then states its columns and rows (int32) before the nibble stream; PNG follows as a file.
+"""
+
+import struct
+
+import numpy as np
+from jaxtyping import UInt8, UInt16
+
+from bridge.media import rvl
+from bridge.media.color import MAX_PIXELS, UnreadableImageError
+from bridge.media.depth import decode_depth_png
+
+RVL_FORMAT = "16UC1; compressedDepth rvl"
+PNG_FORMAT = "16UC1; compressedDepth png"
+_CONFIG = struct.pack("<iff", 0, 0.0, 0.0)
+_RVL_FRONT_BYTES = len(_CONFIG) + 8
+
+
+def is_compressed_depth(image_format: str) -> bool:
+    """Say whether a CompressedImage of this format holds depth."""
+    return "compressedDepth" in image_format
+
+
+def pack_rvl(rows: UInt8[np.ndarray, "height row"], *, swap_bytes: bool = False) -> list[bytes]:
+    """Encode 16-bit depth given as bytes.
+
+    Args:
+        rows: Pixels of each row, two bytes each; rows may lie apart in memory.
+        swap_bytes: The high byte comes first.
+
+    Returns:
+        What a CompressedImage of ``RVL_FORMAT`` holds, in two parts.
+    """
+    height, width = rows.shape[0], rows.shape[1] // 2
+    depth = np.ascontiguousarray(rows).view(">u2" if swap_bytes else "<u2").astype(np.uint16)
+    return [_CONFIG + struct.pack("<ii", width, height), rvl.encode(depth)]
+
+
+def unpack(image_format: str, data: bytes) -> UInt16[np.ndarray, "height width"]:
+    """Decode a compressed depth image to its stored numbers.
+
+    Raises:
+        UnreadableImageError: The format is not 16-bit depth, or the bytes are broken.
+    """
+    encoding, _, transport = image_format.partition(";")
+    if encoding.strip() not in ("16UC1", "mono16", ""):
+        raise UnreadableImageError(found=f"depth of encoding {encoding.strip()!r}, need 16UC1")
+    kind = transport.replace("compressedDepth", "").strip()
+    if len(data) < len(_CONFIG):
+        raise UnreadableImageError(found=f"{len(data)} bytes of compressed depth")
+    if kind == "rvl":
+        return _unpack_rvl(data)
+    if kind in ("", "png"):
+        return decode_depth_png(data[len(_CONFIG) :])
+    raise UnreadableImageError(found=f"depth compressed as {kind!r}")
+
+
+def _unpack_rvl(data: bytes) -> UInt16[np.ndarray, "height width"]:
+    if len(data) < _RVL_FRONT_BYTES:
+        raise UnreadableImageError(found=f"{len(data)} bytes of RVL depth")
+    width, height = struct.unpack_from("<ii", data, len(_CONFIG))
+    if width <= 0 or height <= 0 or width * height > MAX_PIXELS:
+        raise UnreadableImageError(found=f"RVL depth of {width} x {height} pixels")
+    try:
+        return rvl.decode(memoryview(data)[_RVL_FRONT_BYTES:], width * height).reshape(
+            height, width
+        )
+    except ValueError as error:
+        raise UnreadableImageError(found=str(error)) from error
