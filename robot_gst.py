@@ -20,6 +20,7 @@ HELP = (
 )
 
 EPISODES, LIVE, IMPORTS = "bridge.cli.episodes", "bridge.cli.live", "bridge.cli.imports"
+CATALOGUE = "bridge.cli.catalogue"
 
 COMMANDS: tuple[tuple[str, str, str, str], ...] = (
     ("demo", "dashboards.cli:demo", "The whole loop on a stand-in cell, in minutes.", "runs/demo"),
@@ -37,10 +38,10 @@ COMMANDS: tuple[tuple[str, str, str, str], ...] = (
         "Whether an episode is whole, and what it lost.",
         "runs/demo",
     ),
-    ("ls", f"{EPISODES}:ls", "List the episodes of a run.", "runs/demo"),
+    ("ls", f"{CATALOGUE}:ls", "List the episodes of a run.", "runs/demo --outcome failure"),
     (
         "label",
-        f"{EPISODES}:label",
+        f"{CATALOGUE}:label",
         "Say after the fact how an episode ended.",
         "runs/demo trial_1 --result failure",
     ),
@@ -127,6 +128,12 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
                 "dashboards.cli:export_rrd",
                 "An episode with its replays as a Rerun file.",
                 "EPISODE --out FILE.rrd",
+            ),
+            (
+                "catalogue",
+                f"{CATALOGUE}:export_catalogue",
+                "The list of a run's episodes as a Parquet table.",
+                "runs/monday monday.parquet",
             ),
         ),
     ),

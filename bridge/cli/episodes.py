@@ -2,7 +2,6 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
 
 from bridge.terminal import Output
 
@@ -97,64 +96,6 @@ def check(episodes: list[Path], /, *, output: Output = OUTPUT) -> int:
     output.result(data, "\n".join(lines))
     codes = {report.exit_code for report in reports}
     return 1 if 1 in codes else max(codes)
-
-
-def ls(run: Path, /, *, output: Output = OUTPUT) -> int:
-    """List the episodes of a run.
-
-    Example: robot-gst ls runs/demo
-
-    Args:
-        run: Run folder.
-        output: How to talk.
-    """
-    from bridge.episode.catalogue import list_episodes
-    from bridge.episode.run import RunFolder
-
-    entries = list_episodes(RunFolder.open(run))
-    lines = [
-        f"{entry.id:<28} {entry.kind:<9} {entry.condition:<20} {entry.outcome:<8} "
-        f"{entry.duration_s:7.1f} s {entry.size_bytes / 1e6:7.1f} MB"
-        f"{'  stand-in' if entry.stand_in else ''}{'  ' + entry.error if entry.error else ''}"
-        for entry in entries
-    ]
-    output.result(
-        {"episodes": [asdict(entry) for entry in entries]},
-        "\n".join(lines) or f"no episodes in {run}. Record some: robot-gst record {run}",
-    )
-    return 1 if any(entry.error for entry in entries) else 0
-
-
-def label(
-    run: Path,
-    episode: str,
-    /,
-    *,
-    result: Literal["success", "failure", "unknown"],
-    by: str = "operator",
-    detail: str | None = None,
-    output: Output = OUTPUT,
-) -> int:
-    """Say after the fact how an episode ended; kept in notes/, the episode is not rewritten.
-
-    Example: robot-gst label runs/monday trial_0003 --result failure --detail "slipped"
-
-    Args:
-        run: Run folder.
-        episode: Id of the episode: its file name without .mcap.
-        result: success, failure or unknown.
-        by: Who says so.
-        detail: What happened, in words.
-        output: How to talk.
-    """
-    from bridge.episode.catalogue import label_episode
-    from bridge.episode.metadata import Outcome
-    from bridge.episode.run import RunFolder
-
-    outcome = Outcome(result=result, k=int(result == "success"), n=1, by=by, detail=detail)
-    path = label_episode(RunFolder.open(run), episode, outcome)
-    output.result({"label": asdict(outcome), "file": str(path)}, f"{episode}: {result} ({path})")
-    return 0
 
 
 def doctor(*, output: Output = OUTPUT) -> int:

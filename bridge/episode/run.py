@@ -55,6 +55,13 @@ def part_paths(path: Path) -> list[Path]:
     return paths
 
 
+def first_part(path: Path) -> Path:
+    """Return the file that the episode of this one begins with; the file itself if unsplit."""
+    while (before := _name_before(path.name)) and path.with_name(before).is_file():
+        path = path.with_name(before)
+    return path
+
+
 @dataclass(frozen=True)
 class RunFolder:
     """``episodes/``, ``scene/``, ``derived/``, ``results/`` and ``notes/`` of one cell."""

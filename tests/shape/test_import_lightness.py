@@ -19,6 +19,7 @@ LIGHT_ROOMS = (
     "bridge.episode.reader",
     "bridge.episode.writer",
     "bridge.episode.streams",
+    "bridge.cli.catalogue",
     "bridge.cli.episodes",
     "bridge.cli.live",
     "bridge.cli.imports",
