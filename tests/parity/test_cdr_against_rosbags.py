@@ -1,12 +1,16 @@
 """Our CDR and schema texts against rosbags, an independent implementation."""
 
+import tracemalloc
+from collections.abc import Callable, Mapping
+
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from bridge.episode import cdr
+from bridge.episode.cdr_plan import PRIMITIVES, fields_of
 from bridge.episode.ros2_definitions import DEFINITIONS, schema_text
 
 pytestmark = pytest.mark.parity
@@ -81,6 +85,111 @@ def test_camera_info_written_by_rosbags_is_read_field_by_field() -> None:
     np.testing.assert_array_equal(message["p"], np.arange(12.0))
     assert message["roi"]["do_rectify"] is True
     assert cdr.encode("sensor_msgs/msg/CameraInfo", message) == data
+
+
+values_of = {
+    "bool": st.booleans(),
+    "string": st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9),
+    "float32": st.floats(width=32, allow_nan=False),
+    "float64": st.floats(allow_nan=False),
+} | {
+    f"{sign}int{bits}": st.integers(
+        0 if sign else -(2 ** (bits - 1)), 2 ** (bits if sign else bits - 1) - 1
+    )
+    for sign in ("", "u")
+    for bits in (8, 16, 32, 64)
+}
+
+
+def messages_of(name: str) -> st.SearchStrategy[dict[str, object]]:
+    """Random messages of a type, field by field after its definition."""
+    made = {}
+    for field in fields_of(name):
+        one = values_of.get(field.type_name)
+        one = messages_of(field.type_name) if one is None else one
+        if field.length is None:
+            made[field.name] = one
+        elif field.type_name == "uint8":
+            made[field.name] = st.binary(max_size=9)
+        else:
+            least, most = (field.length, field.length) if field.length else (0, 4)
+            made[field.name] = st.lists(one, min_size=least, max_size=most)
+    return st.fixed_dictionaries(made)
+
+
+def to_rosbags(name: str, message: Mapping[str, object]) -> object:
+    """Build the class of rosbags from our dict."""
+    values = []
+    for field in fields_of(name):
+        value = message[field.name]
+        if field.type_name in PRIMITIVES and field.length is not None:
+            if field.type_name == "uint8":
+                value = np.frombuffer(bytes(value), np.uint8)
+            else:
+                value = np.array(value, dtype=PRIMITIVES[field.type_name])
+        elif "/" in field.type_name:
+            inner = field.type_name
+            if field.length is None:
+                value = to_rosbags(inner, value)
+            else:
+                value = [to_rosbags(inner, item) for item in value]
+        values.append(value)
+    return STORE.types[name](*values)
+
+
+def same(ours: object, theirs: object) -> bool:
+    if isinstance(ours, dict):
+        return all(same(value, getattr(theirs, key)) for key, value in ours.items())
+    if isinstance(ours, list):
+        return len(ours) == len(theirs) and all(map(same, ours, theirs))
+    if isinstance(ours, bytes):
+        return ours == theirs.tobytes()
+    if isinstance(ours, np.ndarray):
+        return np.array_equal(ours, theirs)
+    return type(ours) is type(theirs) and ours == theirs
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(st.data(), st.booleans())
+@pytest.mark.parametrize("name", sorted(DEFINITIONS))
+def test_random_messages_of_rosbags_are_read_in_both_byte_orders(
+    name: str, data: st.DataObject, little_endian: bool
+) -> None:
+    message = data.draw(messages_of(name))
+    raw = bytes(STORE.serialize_cdr(to_rosbags(name, message), name, little_endian=little_endian))
+    decoded = cdr.decode(name, raw)
+    assert same(decoded, STORE.deserialize_cdr(raw, name))
+    cdr.validate(name, raw)
+    if little_endian:
+        assert cdr.encode(name, message) == raw
+        assert same(cdr.decode(name, memoryview(raw)), STORE.deserialize_cdr(raw, name))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.data(), st.sampled_from(sorted(DEFINITIONS)))
+def test_a_look_accepts_exactly_what_decoding_reads(data: st.DataObject, name: str) -> None:
+    raw = bytearray(cdr.encode(name, data.draw(messages_of(name))))
+    for _ in range(data.draw(st.integers(0, 3))):
+        raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
+    del raw[data.draw(st.integers(0, len(raw))) :]
+
+    def refused(function: Callable[[str, bytes], object]) -> bool:
+        try:
+            function(name, bytes(raw))
+        except cdr.MalformedMessageError:
+            return True
+        return False
+
+    assert refused(cdr.decode) == refused(cdr.validate)
+
+
+def test_a_look_at_a_large_image_copies_nothing() -> None:
+    data = cdr.encode("sensor_msgs/msg/Image", {"encoding": "16UC1", "data": bytes(50_000_000)})
+    tracemalloc.start()
+    cdr.validate("sensor_msgs/msg/Image", data)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 100_000
 
 
 @settings(max_examples=200, deadline=None)
