@@ -7,15 +7,29 @@ no encoding; such keys are read as the topic ``/chatter``.
 """
 
 import re
+from functools import lru_cache
+from typing import NamedTuple
 
 from bridge.wire.errors import BadTopicError
 
 _ROS_KEY = re.compile(
-    r"^\d+/(?P<topic>.+)/(?P<type>[^/]+)/(RIHS01_[0-9a-f]{64}|TypeHashNotSupported)$"
+    r"^\d+/(?P<topic>.+)/(?P<type>[^/]+)/(?P<hash>RIHS01_[0-9a-f]{64}|TypeHashNotSupported)$"
 )
 _FORBIDDEN = re.compile(r"[*$?#]")
 _CDR, _JSON = "application/cdr", "application/json"
 _ENCODINGS = {_CDR: "cdr", _JSON: "json"}
+NO_HASH = "TypeHashNotSupported"
+"""What ROS 2 Humble writes where later releases write a hash."""
+
+
+class NamedKey(NamedTuple):
+    """What a zenoh key says about its messages."""
+
+    topic: str
+    type_name: str
+    """ROS type; "" for a key that does not carry one."""
+    type_hash: str
+    """RIHS01 hash; "" for a key that does not carry one."""
 
 
 def key_from_topic(topic: str) -> str:
@@ -36,15 +50,17 @@ def key_from_topic(topic: str) -> str:
     return key
 
 
-def topic_from_key(key: str) -> tuple[str, str]:
-    """Return the topic of a key, and the ROS type name when the key carries one (else "")."""
+@lru_cache(maxsize=4096)
+def read_key(key: str) -> NamedKey:
+    """Tell the topic of a key, and type and hash when it is one of rmw_zenoh."""
     ros = _ROS_KEY.match(key)
     if ros is None:
-        return "/" + key, ""
-    return "/" + ros["topic"], _ros_type(ros["type"])
+        return NamedKey("/" + key, "", "")
+    type_hash = "" if ros["hash"] == NO_HASH else ros["hash"]
+    return NamedKey("/" + ros["topic"], ros_type(ros["type"]), type_hash)
 
 
-def _ros_type(dds_name: str) -> str:
+def ros_type(dds_name: str) -> str:
     """Turn ``std_msgs::msg::dds_::String_`` into ``std_msgs/msg/String``."""
     parts = [part for part in dds_name.split("::") if part != "dds_"]
     return "/".join(parts).removesuffix("_")
@@ -56,6 +72,7 @@ def encoding_of(type_name: str, message_encoding: str) -> str:
     return f"{kind};{type_name}" if type_name else kind
 
 
+@lru_cache(maxsize=4096)
 def parse_encoding(encoding: str) -> tuple[str, str]:
     """Split a zenoh encoding into (type name, MCAP message encoding); "" where unknown."""
     kind, _, type_name = encoding.partition(";")

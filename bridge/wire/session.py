@@ -6,20 +6,13 @@ samples finds them already delivered.
 """
 
 import contextlib
-import json
-import queue
-import threading
-import traceback
-import uuid
 from collections.abc import Callable
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
 from bridge.clock import AnchoredClock
 from bridge.episode import schema
-from bridge.errors import GstError, MissingDependencyError
-from bridge.wire import attachment, keys
+from bridge.wire import keys
 from bridge.wire.config import WireConfig as WireConfig
 from bridge.wire.errors import (
     BadTopicError,
@@ -31,32 +24,15 @@ from bridge.wire.errors import (
     WireError,
     cause_of,
 )
-
-try:
-    import zenoh
-except ImportError as import_error:  # pragma: no cover  # needs an environment without zenoh
-    raise MissingDependencyError(
-        package="eclipse-zenoh", extra="record", purpose="talking to a cell"
-    ) from import_error
-
-MAX_WAITING = 32
-"""Requests that wait for one service; each may hold a whole plan."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class WireSample:
-    """One message as it arrived."""
-
-    topic: str
-    type_name: str
-    """"" when the publisher did not say."""
-    message_encoding: str
-    """cdr, json or ""."""
-    data: bytes
-    source_ns: int | None
-    sequence: int | None
-    source_gid: bytes | None
-    received_ns: int
+from bridge.wire.library import zenoh
+from bridge.wire.publisher import BYTES_PER_MB, SharedPool
+from bridge.wire.publisher import WirePublisher as WirePublisher
+from bridge.wire.qos import Qos
+from bridge.wire.sample import WireSample as WireSample
+from bridge.wire.sample import copy_sample
+from bridge.wire.service import MAX_WAITING
+from bridge.wire.service import Service as Service
+from bridge.wire.zenoh_config import zenoh_config
 
 
 class Subscriber:
@@ -72,94 +48,41 @@ class Subscriber:
             self._inner.undeclare()
 
 
-class WirePublisher:
-    """Sends one topic, numbering its messages."""
+class AliveToken:
+    """Says that somebody is there, until it is closed or its process ends."""
 
     def __init__(self, inner: Any) -> None:
-        """Use ``WireSession.publisher``."""
+        """Use ``WireSession.declare_alive``."""
         self._inner = inner
-        self._sequence = 0
-        self.gid = uuid.uuid4().bytes
-
-    def put(self, data: bytes, *, source_ns: int) -> None:
-        """Send one serialised message made at ``source_ns``."""
-        note = attachment.Attachment(sequence=self._sequence, source_ns=source_ns, gid=self.gid)
-        self._sequence += 1
-        try:
-            self._inner.put(data, attachment=attachment.encode(note))
-        except zenoh.ZError as error:
-            raise WireError(f"cannot publish: {cause_of(error)}. Is the session open?") from error
 
     def close(self) -> None:
-        """Stop publishing."""
+        """Say goodbye."""
         with contextlib.suppress(zenoh.ZError):
             self._inner.undeclare()
-
-
-class Service:
-    """Answers requests on one key, one after another, on its own thread."""
-
-    def __init__(self, key: str, handler: Callable[[bytes], bytes], max_waiting: int) -> None:
-        """Use ``WireSession.serve``."""
-        self._handler = handler
-        self._max_waiting = max_waiting
-        self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._inner: Any = None
-        self._thread = threading.Thread(target=self._work, name=f"serve {key}", daemon=True)
-        self._thread.start()
-
-    def _take(self, query: Any) -> None:
-        """Queue a request, on the network thread; one too many is refused at once."""
-        if self._requests.qsize() < self._max_waiting:
-            self._requests.put(query)
-            return
-        with query, contextlib.suppress(zenoh.ZError):
-            query.reply_err(
-                f"busy: {self._max_waiting} requests on {query.key_expr} wait already. "
-                "Ask again later, or start another one under its own name."
-            )
-
-    def _work(self) -> None:
-        while (query := self._requests.get()) is not None:
-            with query, contextlib.suppress(zenoh.ZError):  # the asker may be gone
-                payload = b"" if query.payload is None else query.payload.to_bytes()
-                try:
-                    query.reply(query.key_expr, self._handler(payload))
-                except GstError as error:
-                    query.reply_err(str(error))
-                except Exception as error:  # noqa: BLE001  # a bug in one answer, not the end
-                    traceback.print_exc()
-                    query.reply_err(f"internal error: {type(error).__name__}: {error}")
-
-    def close(self) -> None:
-        """Stop answering; a request in work is finished first."""
-        with contextlib.suppress(zenoh.ZError):
-            self._inner.undeclare()
-        self._requests.put(None)
-        self._thread.join(timeout=5.0)
 
 
 class WireSession:
     """A live connection; use as a context manager."""
 
-    def __init__(self, inner: Any) -> None:
+    def __init__(self, inner: Any, *, shared_memory_mb: int = 0) -> None:
         """Use ``open_session``."""
         self._inner = inner
         self._clock = AnchoredClock()
         self._services: list[Service] = []
+        self._alive: list[AliveToken] = []
+        self._pool = SharedPool(shared_memory_mb * BYTES_PER_MB) if shared_memory_mb else None
 
     def now_ns(self) -> int:
         """The clock that stamps ``received_ns``; it never runs backwards."""
         return self._clock.now_ns()
 
-    def publisher(self, topic: str, type_name: str, *, block: bool = True) -> WirePublisher:
+    def publisher(self, topic: str, type_name: str, *, qos: Qos = Qos.RELIABLE) -> WirePublisher:
         """Announce a topic.
 
         Args:
             topic: With its leading slash.
             type_name: As in ``bridge.episode.schema``; foreign types count as CDR.
-            block: Wait when the network is behind; otherwise the message is lost and the
-                receiver sees a gap in the numbers. Control loops must not block.
+            qos: What happens when the network is behind; control loops use ``Qos.CONTROL``.
         """
         known = schema.schema_for(type_name)
         encoding = keys.encoding_of(type_name, known.message_encoding if known else "cdr")
@@ -168,18 +91,19 @@ class WireSession:
             inner = self._inner.declare_publisher(
                 keys.key_from_topic(topic),
                 encoding=encoding,
-                congestion_control=control.BLOCK if block else control.DROP,
+                congestion_control=control.BLOCK if qos.block else control.DROP,
+                priority=getattr(zenoh.Priority, qos.priority.upper()),
             )
         except zenoh.ZError as error:
             raise BadTopicError(topic=topic, found=cause_of(error)) from error
-        return WirePublisher(inner)
+        return WirePublisher(inner, self._pool if qos.shared_memory else None)
 
     def subscribe(self, key_expression: str, callback: Callable[[WireSample], None]) -> Subscriber:
         """Receive what matches, for example ``standin/**``, on the network thread."""
 
         def on_sample(sample: Any) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
-                callback(_copy(sample, self._clock.now_ns()))
+                callback(copy_sample(sample, self._clock.now_ns()))
 
         handler = zenoh.handlers.Callback(on_sample, indirect=False)
         try:
@@ -199,11 +123,11 @@ class WireSession:
             max_waiting: Requests that may wait for their turn; further ones are refused.
         """
         service = Service(key, handler, max_waiting)
-        callback = zenoh.handlers.Callback(service._take, indirect=False)
+        callback = zenoh.handlers.Callback(service.take, indirect=False)
         try:
-            service._inner = self._inner.declare_queryable(key, callback)
+            service.start(self._inner.declare_queryable(key, callback))
         except zenoh.ZError as error:
-            service._requests.put(None)
+            service.close()
             raise WireConfigError(f"cannot answer on {key!r}: {cause_of(error)}.") from error
         self._services.append(service)
         return service
@@ -228,11 +152,78 @@ class WireSession:
             raise NoReplyError(key=key, timeout_s=timeout_s)
         raise RemoteError(refusal)
 
+    def query_all(self, key_expression: str, *, timeout_s: float) -> list[WireSample]:
+        """Ask everybody and return every good answer, in the order they came.
+
+        Used for what caches keep: the last messages of a topic whose publisher spoke before we
+        listened. Whoever has not answered in time is left out.
+        """
+        try:
+            replies = self._inner.get(
+                key_expression,
+                timeout=timeout_s,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+            )
+            found = [reply.ok for reply in replies if reply.ok is not None]
+        except zenoh.ZError as error:
+            raise WireError(f"cannot ask {key_expression}: {cause_of(error)}.") from error
+        return [copy_sample(sample, self._clock.now_ns()) for sample in found]
+
+    def declare_alive(self, key: str) -> AliveToken:
+        """Let everybody see that this session is there, until it closes or its process ends."""
+        try:
+            token = AliveToken(self._inner.liveliness().declare_token(key))
+        except zenoh.ZError as error:
+            raise WireConfigError(f"cannot be seen as {key!r}: {cause_of(error)}.") from error
+        self._alive.append(token)  # zenoh withdraws a token that nobody holds
+        return token
+
+    def query_alive(self, key_expression: str, *, timeout_s: float = 5.0) -> list[str]:
+        """Return the keys of everybody who is there now."""
+        try:
+            replies = self._inner.liveliness().get(key_expression, timeout=timeout_s)
+            return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        except zenoh.ZError as error:
+            raise WireError(f"cannot ask {key_expression}: {cause_of(error)}.") from error
+
+    def watch_alive(
+        self,
+        key_expression: str,
+        callback: Callable[[str, bool], None],
+        *,
+        history: bool = True,
+    ) -> Subscriber:
+        """Hear who comes and goes, on the network thread.
+
+        Args:
+            key_expression: Which tokens, for example ``rec/*/alive``.
+            callback: Called with the key and whether it is there now.
+            history: Also tell of those that are there already.
+        """
+
+        def on_sample(sample: Any) -> None:
+            callback(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        handler = zenoh.handlers.Callback(on_sample, indirect=False)
+        try:
+            declared = self._inner.liveliness().declare_subscriber(
+                key_expression, handler, history=history
+            )
+        except zenoh.ZError as error:
+            message = f"cannot watch {key_expression!r}: {cause_of(error)}."
+            raise WireConfigError(message) from error
+        return Subscriber(declared)
+
     def close(self) -> None:
         """Finish answering, then leave the network."""
         for service in self._services:
             service.close()
         self._services.clear()
+        for token in self._alive:
+            token.close()
+        self._alive.clear()
         if not self._inner.is_closed():
             self._inner.close()
 
@@ -259,7 +250,7 @@ def open_session(config: WireConfig) -> WireSession:
         WireConfigError: When the file or an endpoint cannot be understood.
     """
     try:
-        return WireSession(zenoh.open(_zenoh_config(config)))
+        inner: Any = zenoh.open(zenoh_config(config))
     except zenoh.ZError as error:
         cause = cause_of(error)
         if "in use" in cause:
@@ -271,54 +262,8 @@ def open_session(config: WireConfig) -> WireSession:
             f"cannot open a zenoh session on {where}: {cause}. "
             "An endpoint looks like tcp/127.0.0.1:7447."
         ) from error
-
-
-def _zenoh_config(config: WireConfig) -> Any:
-    """Start from the file where given; mode, endpoints and scouting are ours in any case."""
-    settings: dict[str, Any] = {
-        "mode": config.mode,
-        "connect/endpoints": list(config.connect),
-        "listen/endpoints": list(config.listen),
-        "connect/timeout_ms": round(config.connect_timeout_s * 1e3),
-        "connect/exit_on_failure": True,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "scouting/delay": 0,  # there is nobody to wait for without scouting
-    }
-    made = zenoh.Config() if config.config is None else _config_from_file(config)
-    for key, value in settings.items():
-        try:
-            made.insert_json5(key, json.dumps(value))
-        except zenoh.ZError as error:
-            raise WireConfigError(
-                f"{key} = {value!r} is not usable: {cause_of(error)}. "
-                "An endpoint looks like tcp/127.0.0.1:7447."
-            ) from error
-    return made
-
-
-def _config_from_file(config: WireConfig) -> Any:
     try:
-        return zenoh.Config.from_file(str(config.config))
-    except zenoh.ZError as error:
-        raise WireConfigError(
-            f"zenoh configuration {config.config} cannot be read: {cause_of(error)}. "
-            "It must be a JSON5 file as zenoh documents it."
-        ) from error
-
-
-def _copy(sample: Any, received_ns: int) -> WireSample:
-    topic, ros_type = keys.topic_from_key(str(sample.key_expr))
-    type_name, message_encoding = keys.parse_encoding(str(sample.encoding))
-    raw = sample.attachment
-    note = attachment.decode(None if raw is None else raw.to_bytes())
-    return WireSample(
-        topic=topic,
-        type_name=type_name or ros_type,
-        message_encoding=message_encoding or ("cdr" if ros_type else ""),
-        data=sample.payload.to_bytes(),
-        source_ns=note.source_ns if note else None,
-        sequence=note.sequence if note else None,
-        source_gid=note.gid if note else None,
-        received_ns=received_ns,
-    )
+        return WireSession(inner, shared_memory_mb=config.shared_memory_mb)
+    except WireConfigError:
+        inner.close()
+        raise

@@ -25,6 +25,7 @@ from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan
 from bridge.task.record import check_record
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME
+from bridge.wire.qos import Qos
 
 GRIPPER_JOINT = "gripper_width"
 TRUTH_PARAMETERS = f"{schema.TRUTH_PREFIX}parameters"
@@ -42,7 +43,7 @@ class Publisher(Protocol):
 class Session(Protocol):
     """The part of ``bridge.wire.session.WireSession`` that the cell uses."""
 
-    def publisher(self, topic: str, type_name: str, *, block: bool = True) -> Publisher:
+    def publisher(self, topic: str, type_name: str, *, qos: Qos = Qos.RELIABLE) -> Publisher:
         """Announce a topic."""
 
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
@@ -72,7 +73,7 @@ class Streams:
         publisher = self._publishers.get(topic)
         if publisher is None:
             known = type_name or schema.type_of_topic(topic)
-            publisher = self._session.publisher(topic, known or schema.STRING, block=True)
+            publisher = self._session.publisher(topic, known or schema.STRING, qos=Qos.RELIABLE)
             self._publishers[topic] = publisher
         publisher.put(data, source_ns=stamp_ns)
 

@@ -1,6 +1,7 @@
 """Sequence numbers, the bounded queue, the ledger, latched messages: nothing is lost silently."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from hypothesis import given, settings
@@ -71,7 +72,7 @@ def test_every_message_is_kept_or_counted(sizes: list[int], missing: int) -> Non
     for number, size in enumerate(sizes):
         sample = plain_sample(sequence)
         intake.put(
-            WireSample(**{**sample.__dict__, "data": bytes(size), "received_ns": number * 10**8})
+            replace(sample, data=bytes(size), received_ns=number * 10**8)
         )
         sequence += 1 + (missing if number + 1 < len(sizes) else 0)
     while (entry := intake.get(0.0)) is not None:

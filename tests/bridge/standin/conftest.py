@@ -13,6 +13,7 @@ from bridge.sources.standin.hidden import HiddenParameters, draw_hidden, nominal
 from bridge.sources.standin.streams import Streams
 from bridge.task.task_file import Task, load_task
 from bridge.wire.errors import NoReplyError
+from bridge.wire.qos import Qos
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -36,7 +37,7 @@ class FakeSession:
     asked: list[str] = field(default_factory=list)
     episode: str | None = None
 
-    def publisher(self, topic: str, type_name: str, *, block: bool = True) -> "FakePublisher":
+    def publisher(self, topic: str, type_name: str, *, qos: Qos = Qos.RELIABLE) -> "FakePublisher":
         return FakePublisher(self, topic, type_name)
 
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:

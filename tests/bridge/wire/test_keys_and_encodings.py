@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.wire.errors import BadTopicError, is_loopback
-from bridge.wire.keys import encoding_of, key_from_topic, parse_encoding, topic_from_key
+from bridge.wire.keys import encoding_of, key_from_topic, parse_encoding, read_key
 
 PART = st.text("abcXYZ019_-. äß", min_size=1, max_size=8)
 
@@ -13,7 +13,7 @@ PART = st.text("abcXYZ019_-. äß", min_size=1, max_size=8)
 @given(st.lists(PART, min_size=1, max_size=5))
 def test_a_topic_survives_the_key(parts: list[str]) -> None:
     topic = "/" + "/".join(parts)
-    assert topic_from_key(key_from_topic(topic)) == (topic, "")
+    assert read_key(key_from_topic(topic)) == (topic, "", "")
 
 
 @pytest.mark.parametrize("topic", ["", "joint_states", "/", "/a//b", "/a/", "/a*", "/@x", "/a?b"])
@@ -22,11 +22,12 @@ def test_a_topic_that_cannot_travel_is_refused(topic: str) -> None:
         key_from_topic(topic)
 
 
-def test_a_ros_key_gives_topic_and_type() -> None:
-    key = "0/arm/chatter/std_msgs::msg::dds_::String_/RIHS01_" + "d" * 64
-    assert topic_from_key(key) == ("/arm/chatter", "std_msgs/msg/String")
+def test_a_ros_key_gives_topic_type_and_hash() -> None:
+    type_hash = "RIHS01_" + "d" * 64
+    key = f"0/arm/chatter/std_msgs::msg::dds_::String_/{type_hash}"
+    assert read_key(key) == ("/arm/chatter", "std_msgs/msg/String", type_hash)
     old = "7/chatter/std_msgs::msg::dds_::String_/TypeHashNotSupported"
-    assert topic_from_key(old) == ("/chatter", "std_msgs/msg/String")
+    assert read_key(old) == ("/chatter", "std_msgs/msg/String", "")
 
 
 def test_encodings_name_the_type() -> None:

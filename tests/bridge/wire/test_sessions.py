@@ -1,9 +1,7 @@
 """Sessions over real TCP on the loopback address."""
 
 import queue
-import socket
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,29 +18,6 @@ from bridge.wire.errors import (
     WireConfigError,
 )
 from bridge.wire.session import WireSample, WireSession, open_session
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-@pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
-
-
-@pytest.fixture
-def router(endpoint: str) -> Iterator[WireSession]:
-    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
-        yield session
-
-
-@pytest.fixture
-def client(router: WireSession, endpoint: str) -> Iterator[WireSession]:
-    with open_session(WireConfig(connect=(endpoint,))) as session:
-        yield session
 
 
 def test_samples_arrive_whole_and_in_order(router: WireSession, client: WireSession) -> None:
@@ -156,9 +131,9 @@ def test_a_configuration_file_does_not_turn_scouting_on(tmp_path: Path, endpoint
     path = tmp_path / "zenoh.json5"
     path.write_text("{scouting: {multicast: {enabled: true}}, listen: {endpoints: ['tcp/[::]:0']}}")
     config = WireConfig(mode="router", connect=(), listen=(endpoint,), config=path)
-    from bridge.wire.session import _zenoh_config
+    from bridge.wire.zenoh_config import zenoh_config
 
-    made = _zenoh_config(config)
+    made = zenoh_config(config)
     assert made.get_json("scouting/multicast/enabled") == "false"
     assert endpoint in made.get_json("listen/endpoints")
     assert "::" not in made.get_json("listen/endpoints")

@@ -1,0 +1,98 @@
+"""Sending one topic, through shared memory where that is on."""
+
+import contextlib
+import shutil
+import uuid
+from pathlib import Path
+from typing import Any
+
+from bridge.wire import attachment
+from bridge.wire.errors import WireConfigError, WireError, cause_of
+from bridge.wire.library import zenoh, zenoh_shm
+
+BYTES_PER_MB = 1_000_000
+SHARED_FROM_BYTES = 3072
+"""Smaller messages are cheaper to send than to place; zenoh's own optimisation says the same."""
+_MEMORY = Path("/dev/shm")  # where Linux keeps it; nothing is opened by this name
+
+
+class SharedPool:
+    """Memory that receivers on this machine read without a copy through the network."""
+
+    def __init__(self, num_bytes: int) -> None:
+        """Reserve the pool.
+
+        Raises:
+            WireConfigError: When the machine has not that much shared memory left. Writing to
+                memory that is not there would end the process, so this is asked first.
+        """
+        free = _free_bytes()
+        if free is not None and free < num_bytes:
+            problem = f"{_MEMORY} has {free / BYTES_PER_MB:.0f} MB left"
+        else:
+            problem = ""
+            try:
+                self._pool = zenoh_shm.ShmProvider.default_backend(num_bytes)
+            except zenoh.ZError as error:
+                problem = cause_of(error)
+        if problem:
+            raise WireConfigError(
+                f"{num_bytes / BYTES_PER_MB:.0f} MB of shared memory are not to be had: {problem}. "
+                "Ask for less, or pass 0 to send images over the network."
+            )
+        # Never BlockOn: a receiver that hangs keeps its buffers, and the sender must not hang too.
+        self._policy = zenoh_shm.Defragment(zenoh_shm.GarbageCollect())
+
+    def place(self, data: bytes | bytearray) -> Any | None:
+        """Copy a message into the pool; None when there is no room now."""
+        try:
+            buffer = self._pool.alloc(len(data), self._policy)
+        except zenoh.ZError:
+            return None
+        buffer[0 : len(data)] = data
+        return buffer
+
+
+def _free_bytes() -> int | None:
+    return shutil.disk_usage(_MEMORY).free if _MEMORY.is_dir() else None
+
+
+class WirePublisher:
+    """Sends one topic, numbering its messages."""
+
+    def __init__(self, inner: Any, pool: SharedPool | None = None) -> None:
+        """Use ``WireSession.publisher``."""
+        self._inner = inner
+        self._pool = pool
+        self._sequence = 0
+        self.gid = uuid.uuid4().bytes
+        self.not_shared = 0
+        """Messages that found the shared memory full and went over the network instead."""
+
+    def put(self, data: bytes | bytearray, *, source_ns: int) -> None:
+        """Send one serialised message made at ``source_ns``."""
+        note = attachment.Attachment(sequence=self._sequence, source_ns=source_ns, gid=self.gid)
+        self._sequence += 1
+        payload: Any = data
+        if self._pool is not None and len(data) >= SHARED_FROM_BYTES:
+            placed = self._pool.place(data)
+            if placed is None:
+                self.not_shared += 1
+            else:
+                payload = placed
+        try:
+            self._inner.put(payload, attachment=attachment.encode(note))
+        except zenoh.ZError as error:
+            raise WireError(f"cannot publish: {cause_of(error)}. Is the session open?") from error
+
+    def has_subscribers(self) -> bool:
+        """Say whether anybody would get a message; costly ones need not be made otherwise."""
+        try:
+            return bool(self._inner.matching_status.matching)
+        except zenoh.ZError:  # the session is closed
+            return False
+
+    def close(self) -> None:
+        """Stop publishing."""
+        with contextlib.suppress(zenoh.ZError):
+            self._inner.undeclare()

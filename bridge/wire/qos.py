@@ -1,0 +1,37 @@
+"""How a topic travels when the network is behind. Imports nothing heavy.
+
+``docs/qos.md`` says which preset belongs to which topic, with the measurements.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+
+@dataclass(frozen=True, kw_only=True)
+class Qos:
+    """One choice for one topic; use the presets."""
+
+    name: str
+    """What the preset is called in tables and errors."""
+    block: bool
+    """Wait for room when the network is behind; otherwise the message is lost and the receiver
+    sees a gap in the numbers."""
+    priority: str
+    """Which of zenoh's queues carries it, by its name there; a full queue delays no other one."""
+    shared_memory: bool = False
+    """Large messages go through shared memory when the session has some."""
+
+    CAMERA: ClassVar["Qos"]
+    """Images: many bytes, each worth little; the newest frame is never worth a stall."""
+    CONTROL: ClassVar["Qos"]
+    """Joints and whatever else a control loop sends: small, frequent, never waits."""
+    RELIABLE: ClassVar["Qos"]
+    """Plans, events, labels, files: nothing may be lost and the sender can wait."""
+    PREVIEW: ClassVar["Qos"]
+    """Pictures for a person; the first to go."""
+
+
+Qos.CAMERA = Qos(name="camera", block=False, priority="data_low", shared_memory=True)
+Qos.CONTROL = Qos(name="control", block=False, priority="real_time")
+Qos.RELIABLE = Qos(name="reliable", block=True, priority="data")
+Qos.PREVIEW = Qos(name="preview", block=False, priority="background")

@@ -1,0 +1,46 @@
+"""Turns our few settings, and a file of zenoh's own, into what zenoh opens a session with."""
+
+import json
+from typing import Any
+
+from bridge.wire.config import WireConfig
+from bridge.wire.errors import WireConfigError, cause_of
+from bridge.wire.library import zenoh
+
+
+def zenoh_config(config: WireConfig) -> Any:
+    """Start from the file where given; mode, endpoints and scouting are ours in any case.
+
+    Raises:
+        WireConfigError: When the file or an endpoint cannot be understood.
+    """
+    settings: dict[str, Any] = {
+        "mode": config.mode,
+        "connect/endpoints": list(config.connect),
+        "listen/endpoints": list(config.listen),
+        "connect/timeout_ms": round(config.connect_timeout_s * 1e3),
+        "connect/exit_on_failure": True,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": 0,  # there is nobody to wait for without scouting
+    }
+    made = zenoh.Config() if config.config is None else _config_from_file(config)
+    for key, value in settings.items():
+        try:
+            made.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise WireConfigError(
+                f"{key} = {value!r} is not usable: {cause_of(error)}. "
+                "An endpoint looks like tcp/127.0.0.1:7447."
+            ) from error
+    return made
+
+
+def _config_from_file(config: WireConfig) -> Any:
+    try:
+        return zenoh.Config.from_file(str(config.config))
+    except zenoh.ZError as error:
+        raise WireConfigError(
+            f"zenoh configuration {config.config} cannot be read: {cause_of(error)}. "
+            "It must be a JSON5 file as zenoh documents it."
+        ) from error

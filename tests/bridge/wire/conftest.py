@@ -1,0 +1,28 @@
+"""A router and a client of it over real TCP on the loopback address."""
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from bridge.wire.config import WireConfig
+from bridge.wire.session import WireSession, open_session
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def router(endpoint: str) -> Iterator[WireSession]:
+    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
+        yield session
+
+
+@pytest.fixture
+def client(router: WireSession, endpoint: str) -> Iterator[WireSession]:
+    with open_session(WireConfig(connect=(endpoint,))) as session:
+        yield session
