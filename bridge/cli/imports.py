@@ -23,46 +23,49 @@ def import_rgbd(
     config: Annotated[FolderConfig, Parameter(name="*")] = FOLDER,
     output: Output = OUTPUT,
 ) -> int:
-    """Turn an RGB-D folder (with a scene.json) into a scan episode.
+    """Turn an RGB-D folder into a scan episode: scene.json, TUM or 7-Scenes layout.
 
+    The layout is found by the files. TUM folders keep their real times and all their poses.
     Example: robot-gst import rgbd data/kitchen runs/kitchen --cell kitchen --camera kinect
 
     Args:
-        folder: Folder with scene.json, colour and depth images.
+        folder: Folder of one of the three layouts (docs/rgbd_folder.md).
         run: Run folder; made where needed.
         episode: Id of the new episode.
         config: Names and rate.
         output: How to talk.
     """
     from bridge.episode.metadata import EpisodeInfo
-    from bridge.episode.provenance import hash_file
     from bridge.episode.run import RunFolder
     from bridge.exchange.rgbd import write_scan
-    from bridge.sources.folder import folder_messages, num_frames
+    from bridge.sources.folder import describe_folder, folder_messages, num_frames
     from bridge.sources.folder_index import read_index
 
-    index = read_index(folder)
+    index = read_index(folder, config)
+    output.say(f"{index.path}: {index.summary}")
+    for name, value in index.assumed.items():
+        output.say(f"  assumed {name.replace('_', ' ')}: {value}")
     info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
-    source = {
-        "folder": index.name,
-        "index_sha256": hash_file(index.path),
-        "depth_unit_m": index.depth_unit_m,
-        "depth_rounded_to_m": 1e-3,
-        "frames_left_out_without_pose": index.num_unposed,
-        "times": f"nominal, {config.rate_hz:g} Hz from 0; the folder has none",
-    }
+    source = describe_folder(index, config)
     total = num_frames(index, config)
 
     with output.progress("import", total) as advance:
 
         def messages() -> Iterator[StampedMessage]:
-            for done, frame in enumerate(folder_messages(index, config, 0), start=1):
+            for done, frame in enumerate(folder_messages(index, config, None), start=1):
                 yield from frame
                 advance(done, "")
 
         path = write_scan(RunFolder.create(run), info, messages(), source=source)
-    data = {"file": str(path), "frames": total, "frames_left_out": index.num_unposed}
-    output.result(data, f"{path}: {total} frames")
+    left_out = index.num_unposed + index.num_unpaired
+    data = {
+        "file": str(path),
+        "layout": index.layout,
+        "frames": total,
+        "frames_left_out": left_out,
+        "assumed": index.assumed,
+    }
+    output.result(data, f"{path}: {total} frames of a folder in {index.layout} layout")
     return 0
 
 

@@ -157,12 +157,12 @@ def publish_folder(
     zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
     output: Output = OUTPUT,
 ) -> int:
-    """Publish an RGB-D folder (with a scene.json) as if it were a live camera.
+    """Publish an RGB-D folder (scene.json, TUM or 7-Scenes layout) as if it were a live camera.
 
     Example: robot-gst publish folder data/kitchen --cell kitchen --camera kinect --episode scan
 
     Args:
-        folder: Folder with scene.json, colour and depth images.
+        folder: Folder of one of the three layouts (docs/rgbd_folder.md).
         config: Names and rate.
         fast: Send as fast as the recorder takes it; stamps keep their distance.
         episode: Ask the recorder to record this episode from the first to the last frame.
@@ -179,7 +179,8 @@ def publish_folder(
     from bridge.wire.recorder_client import RecorderClient
     from bridge.wire.session import open_session
 
-    index = read_index(folder)
+    index = read_index(folder, config)
+    output.say(f"{index.path}: {index.summary}")
     answer: dict[str, Any] | None = None
     wire = WireConfig(connect=connect, config=zenoh_config)
     with stop_signals() as stop, open_session(wire) as session:

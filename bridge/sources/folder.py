@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
@@ -9,6 +10,7 @@ from jaxtyping import UInt8, UInt16
 from bridge.clock import ns_from_s
 from bridge.episode import schema
 from bridge.episode.message import StampedMessage
+from bridge.episode.provenance import hash_file
 from bridge.episode.records import (
     CameraInfo,
     CompressedColor,
@@ -16,12 +18,13 @@ from bridge.episode.records import (
     FrameTransform,
     transforms_to_cdr,
 )
+from bridge.errors import UsageError
 from bridge.geometry.camera import Camera
 from bridge.media.color import JPEG_MAGIC, UnreadableImageError, decode_color, encode_jpeg
-from bridge.media.depth import decode_depth_png, to_millimetres
+from bridge.media.depth import to_millimetres
 from bridge.sources.errors import FolderError
-from bridge.sources.folder_config import FolderConfig
-from bridge.sources.folder_index import FolderFrame, FolderIndex
+from bridge.sources.folder_config import DEFAULT_RATE_HZ, FolderConfig
+from bridge.sources.folder_record import FolderFrame, FolderIndex, read_stored_depth
 
 WORLD = "world"
 INFO_PERIOD_S = 1.0
@@ -33,58 +36,136 @@ def num_frames(index: FolderIndex, config: FolderConfig) -> int:
     return min(len(index.frames), config.max_frames or len(index.frames))
 
 
+def frame_times_ns(
+    index: FolderIndex, config: FolderConfig, start_ns: int | None = None
+) -> list[tuple[int, int]]:
+    """Stamps of colour and depth of every frame that will be sent [ns].
+
+    Real times are kept; moved so that the first is ``start_ns`` where that is given. A folder
+    without times gets the configured rate, from ``start_ns`` or 0.
+
+    Raises:
+        UsageError: When a rate is asked of a folder that has real times.
+    """
+    count = num_frames(index, config)
+    if not index.has_times:
+        period_ns = ns_from_s(1.0 / (config.rate_hz or DEFAULT_RATE_HZ))
+        stamps = [(start_ns or 0) + number * period_ns for number in range(count)]
+        return [(stamp_ns, stamp_ns) for stamp_ns in stamps]
+    if config.rate_hz is not None:
+        message = (
+            f"--rate-hz {config.rate_hz:g} was given, but {index.path} says when each frame was "
+            "taken. Leave the option out."
+        )
+        raise UsageError(message)
+    times = [
+        (frame.color_stamp_ns or 0, frame.depth_stamp_ns or 0) for frame in index.frames[:count]
+    ]
+    shift_ns = 0 if start_ns is None else start_ns - min(times[0])
+    return [(color_ns + shift_ns, depth_ns + shift_ns) for color_ns, depth_ns in times]
+
+
+def describe_folder(index: FolderIndex, config: FolderConfig) -> dict[str, Any]:
+    """What an episode's metadata says about the folder it came from."""
+    rate_hz = config.rate_hz or DEFAULT_RATE_HZ
+    nominal = f"nominal, {rate_hz:g} Hz from 0; the folder has none"
+    return {
+        "folder": index.name,
+        "layout": index.layout,
+        "index_sha256": hash_file(index.path) if index.path.is_file() else None,
+        "depth_unit_m": index.depth_unit_m,
+        "depth_rounded_to_m": 1e-3,
+        "frames_left_out_without_pose": index.num_unposed,
+        "frames_left_out_without_depth": index.num_unpaired,
+        "times": "the folder's own" if index.has_times else nominal,
+        "assumed": index.assumed,
+    }
+
+
 def folder_messages(
-    index: FolderIndex, config: FolderConfig, start_ns: int
+    index: FolderIndex, config: FolderConfig, start_ns: int | None
 ) -> Iterator[list[StampedMessage]]:
     """Yield the messages of one frame after another.
 
     Args:
         index: The checked index.
         config: Names and rate.
-        start_ns: Stamp of the first frame.
+        start_ns: Stamp of the first frame; None keeps the folder's own times (0 without any).
 
     Raises:
         FolderError: When an image cannot be read or has another size than its camera.
+        UsageError: When a rate is asked of a folder that has real times.
     """
-    period_ns = ns_from_s(1.0 / config.rate_hz)
-    info_every = max(1, round(INFO_PERIOD_S * config.rate_hz))
+    times = frame_times_ns(index, config, start_ns)
+    shift_ns = times[0][0] - (index.frames[0].color_stamp_ns or 0)
+    poses = _pose_messages(index, config, times, shift_ns)
+    pose = next(poses, None)
     color_camera: Camera | None = None
-    for number, frame in enumerate(index.frames[: num_frames(index, config)]):
-        stamp_ns = start_ns + number * period_ns
+    next_info_ns = min(times[0])
+    for number, (frame, stamps) in enumerate(zip(index.frames, times, strict=False), start=1):
         color = _read_color(frame)
         if color_camera is None:
             color_camera = _color_camera(index, color.shape)
         _check_size(frame.color_path, color.shape[:2], color_camera)
         messages = []
-        if number % info_every == 0:
-            messages += _calibration(index, config, color_camera, stamp_ns)
-        yield messages + _frame_messages(index, config, frame, color, stamp_ns)
+        if min(stamps) >= next_info_ns:
+            messages += _calibration(index, config, color_camera, min(stamps))
+            next_info_ns = min(stamps) + ns_from_s(INFO_PERIOD_S)
+        while pose is not None and (pose.stamp_ns <= max(stamps) or number == len(times)):
+            messages.append(pose)
+            pose = next(poses, None)
+        messages += _images(index, config, frame, color, stamps)
+        yield sorted(messages, key=lambda message: message.stamp_ns)
 
 
-def _frame_messages(
+def _pose_messages(
+    index: FolderIndex, config: FolderConfig, times: list[tuple[int, int]], shift_ns: int
+) -> Iterator[StampedMessage]:
+    """One pose per frame, or all that the folder has from before the first to after the last."""
+    if index.poses is None:
+        stamps = [color_ns for color_ns, _ in times]
+        transforms = [frame.T_world_depth for frame in index.frames[: len(times)]]
+    else:
+        inside = index.poses.stamps_ns + shift_ns
+        ends = [at for pair in times for at in pair]
+        first = max(int(np.searchsorted(inside, min(ends), side="right")) - 1, 0)
+        last = int(np.searchsorted(inside, max(ends))) + 1
+        stamps = [int(at) for at in inside[first:last]]
+        transforms = list(index.poses.transforms()[first:last])
+    for stamp_ns, T_world_depth in zip(stamps, transforms, strict=True):
+        pose = FrameTransform(
+            stamp_ns=stamp_ns,
+            parent=WORLD,
+            child=f"{config.camera}_depth_optical",
+            T_parent_child=T_world_depth,
+        )
+        yield _message("/tf", schema.TF_MESSAGE, transforms_to_cdr([pose]), stamp_ns)
+
+
+def _images(
     index: FolderIndex,
     config: FolderConfig,
     frame: FolderFrame,
     color: UInt8[np.ndarray, "height width 3"],
-    stamp_ns: int,
+    stamps: tuple[int, int],
 ) -> list[StampedMessage]:
-    depth_frame = f"{config.camera}_depth_optical"
-    pose = FrameTransform(
-        stamp_ns=stamp_ns, parent=WORLD, child=depth_frame, T_parent_child=frame.T_world_depth
+    color_ns, depth_ns = stamps
+    depth = DepthImage(
+        stamp_ns=depth_ns,
+        frame_id=f"{config.camera}_depth_optical",
+        depth_mm=_read_depth(index, frame),
     )
-    depth = DepthImage(stamp_ns=stamp_ns, frame_id=depth_frame, depth_mm=_read_depth(index, frame))
     stored = frame.color_path.read_bytes()
     image = CompressedColor(
-        stamp_ns=stamp_ns,
+        stamp_ns=color_ns,
         frame_id=f"{config.camera}_color_optical",
         format="jpeg",
         data=stored if stored[:2] == JPEG_MAGIC else encode_jpeg(color),
     )
     prefix = f"/{config.cell}/cam/{config.camera}"
     return [
-        _message("/tf", schema.TF_MESSAGE, transforms_to_cdr([pose]), stamp_ns),
-        _message(f"{prefix}/depth/image", schema.IMAGE, depth.to_cdr(), stamp_ns),
-        _message(f"{prefix}/color/image", schema.COMPRESSED_IMAGE, image.to_cdr(), stamp_ns),
+        _message(f"{prefix}/depth/image", schema.IMAGE, depth.to_cdr(), depth_ns),
+        _message(f"{prefix}/color/image", schema.COMPRESSED_IMAGE, image.to_cdr(), color_ns),
     ]
 
 
@@ -130,12 +211,7 @@ def _read_color(frame: FolderFrame) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def _read_depth(index: FolderIndex, frame: FolderFrame) -> UInt16[np.ndarray, "height width"]:
-    try:
-        stored = decode_depth_png(frame.depth_path.read_bytes())
-    except (UnreadableImageError, OSError) as error:
-        raise FolderError(
-            path=frame.depth_path, found=str(error), hint="Restore the file or remove the frame."
-        ) from error
+    stored = read_stored_depth(frame.depth_path)
     _check_size(frame.depth_path, stored.shape, index.depth_camera)
     return to_millimetres(
         stored,
@@ -150,5 +226,5 @@ def _check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
         raise FolderError(
             path=path,
             found=f"{shape[1]} x {shape[0]} pixels, camera {camera.width} x {camera.height}",
-            hint="Correct the intrinsics in scene.json or the image.",
+            hint="Correct the intrinsics or the image.",
         )

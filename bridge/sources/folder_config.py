@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from bridge.errors import UsageError, refuse_outside
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+DEFAULT_RATE_HZ = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,17 +17,29 @@ class FolderConfig:
     """Name of the cell in topics: /<cell>/cam/<camera>/color/image."""
     camera: str = "kinect"
     """Name of the camera in topics and frames."""
-    rate_hz: float = 30.0
-    """Frames per second; stamps are this far apart."""
+    rate_hz: float | None = None
+    """Frames per second of a folder without times, 30 if not given; real times are kept."""
     max_frames: int | None = None
     """Stop after so many frames."""
+    depth_intrinsics: tuple[float, float, float, float] | None = None
+    """FX FY CX CY of the depth camera [px, OpenCV]; not for scene.json, which holds its own."""
+    color_intrinsics: tuple[float, float, float, float] | None = None
+    """FX FY CX CY of a colour camera that is not registered to depth."""
+    depth_unit_m: float | None = None
+    """Metres per stored number, where the layout's own (TUM 1/5000, 7-Scenes 1/1000) is wrong."""
 
     def __post_init__(self) -> None:
-        """Refuse names that cannot be part of a topic, and a rate that is none."""
+        """Refuse names that cannot be part of a topic, and numbers that make no sense."""
         for what, name in (("cell", self.cell), ("camera", self.camera)):
             if not _NAME.fullmatch(name):
                 raise UsageError(
                     f"{what} name {name!r} cannot be part of a topic. "
                     "Use letters, digits and '_', starting with a letter."
                 )
-        refuse_outside(self, {"rate_hz": (0.001, 1000), "max_frames": (1, 10**9)})
+        allowed = {"rate_hz": (0.001, 1000), "max_frames": (1, 10**9), "depth_unit_m": (1e-6, 1)}
+        refuse_outside(self, allowed)
+        for option in ("depth_intrinsics", "color_intrinsics"):
+            values = getattr(self, option)
+            if values is not None and not min(values[:2]) > 0:
+                name = option.replace("_", "-")
+                raise UsageError(f"--{name} {values}: focal lengths FX and FY are above zero.")

@@ -4,9 +4,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from bridge.sources.folder import folder_messages, num_frames
+from bridge.clock import s_from_ns
+from bridge.sources.folder import folder_messages, frame_times_ns, num_frames
 from bridge.sources.folder_config import FolderConfig
-from bridge.sources.folder_index import FolderIndex
+from bridge.sources.folder_record import FolderIndex
 from bridge.terminal import Advance
 from bridge.wire.session import WirePublisher, WireSession
 
@@ -26,7 +27,7 @@ def publish_folder_frames(
         session: An open session.
         index: The checked folder.
         config: Names and rate.
-        fast: Do not wait between frames; stamps stay as far apart as the rate says.
+        fast: Do not wait between frames; stamps keep their distance.
         should_stop: Asked before each frame.
         advance: Told how many frames are out.
 
@@ -36,10 +37,12 @@ def publish_folder_frames(
     publishers: dict[str, WirePublisher] = {}
     sent: dict[str, int] = {}
     frames = 0
-    start_s = time.monotonic()
-    for messages in folder_messages(index, config, session.now_ns()):
+    start_ns, start_s = session.now_ns(), time.monotonic()
+    times = frame_times_ns(index, config, start_ns)
+    for messages in folder_messages(index, config, start_ns):
         if not fast:
-            time.sleep(max(0.0, start_s + frames / config.rate_hz - time.monotonic()))
+            due_s = start_s + s_from_ns(min(times[frames]) - start_ns)
+            time.sleep(max(0.0, due_s - time.monotonic()))
         if should_stop():
             break
         for message in messages:

@@ -1,0 +1,202 @@
+"""The layout of the TUM RGB-D benchmark: lists of stamped files and of stamped poses.
+
+``rgb.txt`` and ``depth.txt`` hold "stamp file", ``groundtruth.txt`` "stamp tx ty tz qx qy qz qw" of
+the colour camera, stamps in seconds; depth is registered to colour, 5000 stored per metre, 0 is
+"no measurement" (Sturm et al., IROS 2012, and the benchmark's page on file formats). Stamps are
+read as decimals, so that nanoseconds survive. ``camera.json`` is ours: ``export tum`` writes it,
+because the layout itself has no place for intrinsics.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.geometry.trajectory import PoseTrajectory
+from bridge.sources.errors import FolderError
+from bridge.sources.folder_config import FolderConfig
+from bridge.sources.folder_record import (
+    FolderFrame,
+    FolderIndex,
+    camera_of,
+    read_stored_depth,
+    require_image,
+)
+from bridge.sources.folder_tum_lists import (
+    StampedFile,
+    associate,
+    read_associations,
+    read_files,
+    read_poses,
+)
+
+COLOR_LIST, DEPTH_LIST, POSE_LIST = "rgb.txt", "depth.txt", "groundtruth.txt"
+ASSOCIATION_LISTS = ("associations.txt", "associate.txt", "association.txt")
+CAMERA_FILE = "camera.json"
+DEPTH_UNIT_M = 1 / 5000
+INTRINSICS = (525.0, 525.0, 319.5, 239.5)
+"""What the benchmark's makers recommend for its registered images [px]."""
+POSE_TOLERANCE_NS = 50_000_000
+"""A frame farther than this from any pose has none; motion capture has holes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TumCameras:
+    """Both cameras of a folder, and how they stand to each other."""
+
+    depth: Camera
+    color: Camera | None
+    T_color_depth: Float[np.ndarray, "4 4"]
+    assumed: dict[str, str]
+
+
+def find_lists(folder: Path) -> list[Path]:
+    """Return the lists that name the images; empty when the folder has another layout."""
+    both = [folder / COLOR_LIST, folder / DEPTH_LIST]
+    if all(path.is_file() for path in both):
+        return both
+    return [folder / name for name in ASSOCIATION_LISTS if (folder / name).is_file()][:1]
+
+
+def read_tum(folder: Path, config: FolderConfig) -> FolderIndex:
+    """Read a folder of the benchmark.
+
+    An association list is followed where there is one, else colour and depth are paired by time.
+
+    Raises:
+        PathNotFoundError: When a listed image is not there.
+        FolderError: Naming the line that makes no sense.
+    """
+    pairs, num_unpaired, path = _pairs(folder)
+    pose_path = folder / POSE_LIST
+    if not pose_path.is_file():
+        raise FolderError(
+            path=folder,
+            found=f"no {POSE_LIST}, so no frame has a pose",
+            hint="Add it: stamp tx ty tz qx qy qz qw of the camera.",
+        )
+    color_poses = read_poses(pose_path)
+    height, width = read_stored_depth(folder / pairs[0][1].name).shape
+    cameras = _cameras(folder, config, (width, height))
+    Ts_world_depth = color_poses.transforms() @ cameras.T_color_depth
+    q, p = se3.split(Ts_world_depth)
+    poses = PoseTrajectory(color_poses.stamps_ns, p, q)
+    frames = _frames(folder, pairs, poses, path)
+    if not frames:
+        raise FolderError(
+            path=pose_path,
+            found="no pose within 50 ms of any frame",
+            hint=f"Poses and {path.name} must count time from the same origin.",
+        )
+    return FolderIndex(
+        path=path,
+        layout="TUM",
+        name=folder.resolve().name,
+        depth_unit_m=config.depth_unit_m or DEPTH_UNIT_M,
+        depth_invalid_values=(0,),
+        depth_encoding="",
+        depth_camera=cameras.depth,
+        color_camera=cameras.color,
+        T_depth_color=se3.invert(cameras.T_color_depth),
+        frames=tuple(frames),
+        num_unposed=len(pairs) - len(frames),
+        num_unpaired=num_unpaired,
+        poses=poses,
+        assumed=cameras.assumed,
+    )
+
+
+def _pairs(folder: Path) -> tuple[list[tuple[StampedFile, StampedFile]], int, Path]:
+    """Return colour and depth of each frame, how many colours found no depth, and the list."""
+    for name in ASSOCIATION_LISTS:
+        if (folder / name).is_file():
+            return read_associations(folder / name), 0, folder / name
+    colors, depths = read_files(folder / COLOR_LIST), read_files(folder / DEPTH_LIST)
+    pairs = associate(colors, depths)
+    if not pairs:
+        raise FolderError(
+            path=folder / COLOR_LIST,
+            found="no colour image lies within 20 ms of a depth image",
+            hint=f"Check the stamps in {COLOR_LIST} and {DEPTH_LIST}.",
+        )
+    return pairs, len(colors) - len(pairs), folder / COLOR_LIST
+
+
+def _frames(
+    folder: Path,
+    pairs: list[tuple[StampedFile, StampedFile]],
+    poses: PoseTrajectory,
+    path: Path,
+) -> list[FolderFrame]:
+    frames = []
+    for color, depth in pairs:
+        files = {
+            what: require_image(
+                folder / item.name, what=what, named_by=f"{path} line {item.line} names it"
+            )
+            for what, item in (("color", color), ("depth", depth))
+        }
+        stamps = np.array([color.stamp_ns], dtype=np.int64)
+        if np.abs(poses.stamps_ns - color.stamp_ns).min() > POSE_TOLERANCE_NS:
+            continue
+        frames.append(
+            FolderFrame(
+                color_path=files["color"],
+                depth_path=files["depth"],
+                T_world_depth=poses.at(stamps).transforms()[0],
+                color_stamp_ns=color.stamp_ns,
+                depth_stamp_ns=depth.stamp_ns,
+            )
+        )
+    return frames
+
+
+def _cameras(folder: Path, config: FolderConfig, size: tuple[int, int]) -> TumCameras:
+    path = folder / CAMERA_FILE
+    if path.is_file() and config.depth_intrinsics is None and config.color_intrinsics is None:
+        return _own_cameras(path)
+    depth = camera_of(
+        config.depth_intrinsics, INTRINSICS, size, option="--depth-intrinsics", path=folder
+    )
+    color = None
+    if config.color_intrinsics is not None:
+        color = camera_of(
+            config.color_intrinsics, INTRINSICS, size, option="--color-intrinsics", path=folder
+        )
+    assumed = {"registration": "depth is registered to colour"}
+    if config.depth_intrinsics is None:
+        assumed["depth_intrinsics"] = f"{INTRINSICS}, the makers' recommendation, no distortion"
+    return TumCameras(depth=depth, color=color, T_color_depth=np.eye(4), assumed=assumed)
+
+
+def _own_cameras(path: Path) -> TumCameras:
+    try:
+        record = json.loads(path.read_text())
+        depth, color = (_camera(record[name]) for name in ("depth", "color"))
+        T_color_depth = np.array(record["T_color_depth"], dtype=np.float64)
+        if T_color_depth.shape != (4, 4) or not np.isfinite(T_color_depth).all():
+            message = "T_color_depth is not 4 x 4"
+            raise ValueError(message)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise FolderError(
+            path=path,
+            found=f"cannot be read ({type(error).__name__}: {error})",
+            hint="Export the folder again, or remove the file and give --depth-intrinsics.",
+        ) from error
+    registered = bool(np.array_equal(T_color_depth, np.eye(4))) and depth == color
+    return TumCameras(
+        depth=depth, color=None if registered else color, T_color_depth=T_color_depth, assumed={}
+    )
+
+
+def _camera(record: dict[str, Any]) -> Camera:
+    return Camera.from_ros(
+        width=int(record["width"]),
+        height=int(record["height"]),
+        **{name: float(record[name]) for name in ("fx", "fy", "cx", "cy")},
+    )
