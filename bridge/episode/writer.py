@@ -1,56 +1,102 @@
 """Write one episode: ``<name>.mcap.part`` while open, renamed when complete.
 
-A correct, plain writer over the official ``mcap`` package. Nothing half-written ever carries the
-final name; a crash leaves the ``.part`` file.
+Nothing half-written ever carries the final name; a crash leaves the ``.part`` file, which
+``recover`` reads. ``docs/decisions/0011-own-chunk-writer.md`` says why the chunks are our own.
 """
 
 import json
-import os
-from collections.abc import Mapping
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from mcap.writer import CompressionType, Writer
-
 from bridge.episode import metadata, provenance, schema
-from bridge.errors import BridgeError, UsageError
+from bridge.episode.channels import Channel, Channels
+from bridge.episode.chunks import EncodedChunk, OpenChunk
+from bridge.episode.data_section import DataSection
+from bridge.episode.grouping import LARGE_BYTES, first_bytes, is_large, is_worth_compressing
+from bridge.episode.mcap_format import Buffer, Payload, num_bytes
+from bridge.episode.part_file import BackgroundSync, cannot_write, open_part
 
 PROFILE = "ros2"
 LIBRARY = "robot-gst"
 
 
+@dataclass(frozen=True, kw_only=True)
+class WriterConfig:
+    """How an episode reaches the disk."""
+
+    chunk_bytes: int = 1 << 20
+    """A chunk is written before it grows beyond this many bytes."""
+    flush_s: float | None = None
+    """A live writer's ``tick`` writes messages older than this [s]; None fills chunks first."""
+    sync_s: float | None = None
+    """Force data to the disk this often, in a thread [s]; None only at the end."""
+    compress: bool = True
+    """Pack depth and small topics with zstd level 1."""
+
+
 class EpisodeWriter:
-    """Append messages to a new episode file.
+    """Append messages to a new episode file. For one thread.
 
     Topics start with a slash. ``log_time_ns`` is when the message was received,
-    ``publish_time_ns`` when its source made it.
+    ``publish_time_ns`` when its source made it. A payload is bytes, or pieces that are written one
+    after the other; the caller must not change its buffers afterwards.
+
+    Every call may raise OSError for a disk that is full or broken, also on behalf of an earlier
+    call. The message of the failed call is not taken, everything before is kept: in the file up
+    to its last whole record, and in memory. When there is space again, calls and ``close`` succeed
+    and nothing is lost. After a failed background sync nothing succeeds any more, for the disk may
+    hold holes: ``abandon`` and ``recover`` what is there.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Create ``<path>.part``; refuses to replace an existing episode."""
-        if path.exists():
-            message = f"{path} exists already. Choose another name, or move it away."
-            raise UsageError(message)
+    def __init__(
+        self,
+        path: Path,
+        *,
+        config: WriterConfig = WriterConfig(),
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Create ``<path>.part``, locked; refuses to replace an existing episode.
+
+        A writer without ``flush_s`` makes what can be made again, and replaces the ``.part`` of a
+        dead one. A live writer refuses: such a part is for ``recover``.
+
+        Raises:
+            UsageError: When the episode exists, or is being written, or waits to be recovered.
+            BridgeError: When the folder cannot be written.
+        """
         self.path = path
         self.part_path = path.with_name(path.name + ".part")
+        self.config = config
+        self._monotonic = monotonic
+        self._file = open_part(path, replace_dead=config.flush_s is None)
+        self._section = DataSection(self._file)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._stream = self.part_path.open("wb")
+            self._section.begin(PROFILE, LIBRARY)
         except OSError as error:
-            message = f"cannot write {self.part_path}: {error.strerror}. Choose another folder."
-            raise BridgeError(message) from error
-        self._writer = Writer(self._stream, compression=CompressionType.ZSTD, use_statistics=True)
-        self._writer.start(profile=PROFILE, library=LIBRARY)
-        self._schema_ids: dict[tuple[str, str], int] = {}
-        self._channel_ids: dict[tuple[str, str, str], int] = {}
-        self._sequences: dict[int, int] = {}
+            self.part_path.unlink(missing_ok=True)
+            self._file.close()
+            raise cannot_write(self.part_path, error) from error
+        self._channels = Channels(self._section.summary)
+        self._small = OpenChunk(compress=config.compress, gather=True)
+        self._groups = [self._small]
+        self._pending: deque[EncodedChunk] = deque()
+        self._sync = BackgroundSync(self._file, config.sync_s) if config.sync_s else None
         self._open = True
+
+    @property
+    def bytes_written(self) -> int:
+        """Bytes in the file so far; chunks being filled are not among them."""
+        return self._file.offset
 
     def write(
         self,
         topic: str,
-        data: bytes,
+        data: Payload,
         *,
         type_name: str,
         log_time_ns: int,
@@ -74,7 +120,7 @@ class EpisodeWriter:
     def write_foreign(
         self,
         topic: str,
-        data: bytes,
+        data: Payload,
         *,
         schema_record: schema.Schema | None,
         message_encoding: str = "",
@@ -83,35 +129,55 @@ class EpisodeWriter:
         sequence: int | None = None,
     ) -> None:
         """Append one message with the given schema, or none; the bytes are kept as they are."""
-        channel_id = self._channel(topic, schema_record, message_encoding)
+        channel = self._channels.find(topic, schema_record, message_encoding)
+        length = num_bytes(data) if isinstance(data, Buffer) else sum(map(num_bytes, data))
+        if self._pending or self._file.failed:
+            self._write_pending()
+        group = channel.group
+        if group is None or (length >= LARGE_BYTES and not channel.is_large):
+            group = self._assign_group(channel, data, length)
+        if group.size + length > self.config.chunk_bytes and group.has_messages:
+            self._flush(group)
+        if self.config.flush_s is not None and not group.has_messages:
+            group.opened_s = self._monotonic()
         if sequence is None:
-            sequence = self._sequences.get(channel_id, 0)
-        self._sequences[channel_id] = sequence + 1
-        self._writer.add_message(
-            channel_id=channel_id,
-            log_time=log_time_ns,
-            data=data,
-            publish_time=log_time_ns if publish_time_ns is None else publish_time_ns,
-            sequence=sequence & 0xFFFF_FFFF,
+            sequence = channel.next_sequence
+        group.add(
+            channel.id,
+            sequence & 0xFFFF_FFFF,
+            log_time_ns,
+            log_time_ns if publish_time_ns is None else publish_time_ns,
+            data,
+            length,
         )
+        channel.next_sequence = sequence + 1
 
-    def _channel(self, topic: str, record: schema.Schema | None, message_encoding: str) -> int:
-        key = (topic, record.name if record else "", _encoding(record, message_encoding))
-        if key not in self._channel_ids:
-            self._channel_ids[key] = self._writer.register_channel(
-                topic=topic,
-                message_encoding=_encoding(record, message_encoding),
-                schema_id=0 if record is None else self._schema(record),
-            )
-        return self._channel_ids[key]
+    def _assign_group(self, channel: Channel, data: Payload, length: int) -> OpenChunk:
+        group = self._small
+        if is_large(channel.type_name, length):
+            if channel.group is not None:  # keeps the topic's order in the file
+                self._flush(channel.group)
+            head = first_bytes(data)
+            compress = self.config.compress and is_worth_compressing(channel.type_name, head)
+            group = OpenChunk(compress=compress, gather=False)
+            self._groups.append(group)
+            channel.is_large = True
+        group.define(channel.definition)
+        channel.group = group
+        return group
 
-    def _schema(self, record: schema.Schema) -> int:
-        key = (record.name, record.schema_encoding)
-        if key not in self._schema_ids:
-            self._schema_ids[key] = self._writer.register_schema(
-                name=record.name, encoding=record.schema_encoding, data=record.data
-            )
-        return self._schema_ids[key]
+    def _flush(self, group: OpenChunk) -> None:
+        if group.has_messages:
+            self._pending.append(group.encode())
+        self._write_pending()
+
+    def _write_pending(self) -> None:
+        """Write chunks in the order they were closed; those the disk refuses stay here."""
+        if self._file.failed:
+            raise self._file.failed
+        while self._pending:
+            self._section.add_chunk(self._pending[0])
+            self._pending.popleft()
 
     def write_json(
         self,
@@ -133,18 +199,20 @@ class EpisodeWriter:
         )
 
     def attach(self, name: str, data: bytes, *, media_type: str, log_time_ns: int) -> None:
-        """Add an attachment, for example ``robot.urdf``."""
-        self._writer.add_attachment(
-            create_time=log_time_ns,
-            log_time=log_time_ns,
-            name=name,
+        """Add an attachment, for example ``robot.urdf``; it is in the file at once."""
+        self._write_pending()
+        self._section.add_attachment(
+            name,
+            data,
             media_type=media_type,
-            data=data,
+            log_time_ns=log_time_ns,
+            create_time_ns=log_time_ns,
         )
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Add a metadata record of plain strings."""
-        self._writer.add_metadata(name, dict(values))
+        """Add a metadata record of plain strings; it is in the file at once."""
+        self._write_pending()
+        self._section.add_metadata(name, values)
 
     def describe(
         self,
@@ -161,28 +229,42 @@ class EpisodeWriter:
         if derived is not None:
             self.add_metadata("derived", metadata.to_strings(derived))
 
+    def tick(self) -> None:
+        """Write the chunks that have been waiting for ``flush_s``; call it often."""
+        self._write_pending()
+        if self.config.flush_s is None:
+            return
+        before_s = self._monotonic() - self.config.flush_s
+        for group in self._groups:
+            if group.has_messages and group.opened_s <= before_s:
+                self._flush(group)
+
     def close(self) -> Path:
         """Finish, sync to disk and give the file its final name."""
-        if self._open:
-            self._open = False
-            self._writer.finish()  # type: ignore[no-untyped-call]
-            self._stream.flush()
-            os.fsync(self._stream.fileno())
-            self._stream.close()
-            self.part_path.rename(self.path)
-            _sync_folder(self.path.parent)
+        if not self._open:
+            return self.path
+        for group in self._groups:
+            self._flush(group)
+        self._section.finish(self.path)
+        self._stop()
         return self.path
 
     def abandon(self) -> None:
         """Stop without finishing; the ``.part`` file stays for recovery."""
         if self._open:
-            self._open = False
-            self._stream.close()
+            self._stop()
 
     def discard(self) -> None:
         """Stop and remove the ``.part`` file: the take was not wanted."""
-        self.abandon()
-        self.part_path.unlink(missing_ok=True)
+        if self._open:
+            self.part_path.unlink(missing_ok=True)
+            self._stop()
+
+    def _stop(self) -> None:
+        self._open = False
+        if self._sync is not None:
+            self._sync.stop()
+        self._file.close()
 
     def __enter__(self) -> "EpisodeWriter":
         """Use as a context manager: closes on success, abandons on an exception."""
@@ -195,19 +277,8 @@ class EpisodeWriter:
         traceback: TracebackType | None,
     ) -> None:
         """Close, or leave the ``.part`` file when an exception is passing through."""
-        if error is None:
-            self.close()
-        else:
+        try:
+            if error is None:
+                self.close()
+        finally:
             self.abandon()
-
-
-def _encoding(record: schema.Schema | None, message_encoding: str) -> str:
-    return message_encoding if record is None else record.message_encoding
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
