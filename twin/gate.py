@@ -43,6 +43,8 @@ class GateConfig:
 
     connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
     """Endpoints of the recorder."""
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None
+    """zenoh configuration (JSON5), for example with certificates."""
     cell: str = "standin"
     """Whose plans are judged: topics and the service are below this name."""
     task: str = "cube_into_box"
@@ -315,7 +317,8 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
         raise GateError(f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'.")
     run = RunFolder.open(path)
     eyes = LiveView(config.cell)
-    with stop_signals() as stopped, open_session(WireConfig(connect=config.connect)) as session:
+    wire = WireConfig(connect=config.connect, config=config.zenoh_config)
+    with stop_signals() as stopped, open_session(wire) as session:
         watch_cell(session, config.cell, eyes.take)
         gate = make_gate(run, config, eyes, session.now_ns)
         serve_gate(session, gate, eyes, config, output)

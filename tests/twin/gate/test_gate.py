@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bridge.episode.run import RunFolder
 from bridge.errors import InvalidRecordError
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output, stop_signals
+from bridge.wire.errors import WireConfigError
 from twin.errors import TwinError
 from twin.gate import (
     Gate,
@@ -364,3 +366,10 @@ def test_no_verdict_is_never_a_yes() -> None:
     verdict = no_verdict(PLAN, "because")
     assert verdict.accepted is None
     assert verdict.reason == "because"
+
+
+def test_a_zenoh_configuration_is_used(tmp_path: Any) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    config = GateConfig(zenoh_config=tmp_path / "missing.json5")
+    with pytest.raises(WireConfigError, match="missing.json5 cannot be read"):
+        run_gate(run.path, config, Output(quiet=True))
