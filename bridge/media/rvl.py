@@ -18,7 +18,7 @@ MAX_DELTA_NIBBLES = 6
 _WORD_SHIFTS = np.arange(28, -4, -4, dtype=np.uint32)
 
 
-def encode(depth: UInt16[np.ndarray, "height width"]) -> bytes:
+def encode_rvl(depth: UInt16[np.ndarray, "height width"]) -> bytes:
     """Encode pixel by pixel, row after row.
 
     Returns:
@@ -34,7 +34,8 @@ def encode(depth: UInt16[np.ndarray, "height width"]) -> bytes:
     stream = nibbles[places < counts[:, None]].astype(np.uint32)
     words = np.zeros((-(-len(stream) // 8), 8), dtype=np.uint32)
     words.reshape(-1)[: len(stream)] = stream
-    return (words << _WORD_SHIFTS).sum(axis=1, dtype=np.uint32).astype("<u4").tobytes()
+    packed = (words << _WORD_SHIFTS).sum(axis=1, dtype=np.uint32)
+    return bytes(packed.astype("<u4").tobytes())
 
 
 def _tokens(pixels: Int64[np.ndarray, " num_pixels"]) -> Int64[np.ndarray, " num_tokens"]:
@@ -54,7 +55,7 @@ def _tokens(pixels: Int64[np.ndarray, " num_pixels"]) -> Int64[np.ndarray, " num
     return np.insert(zigzag, np.repeat(before, 2), runs.reshape(-1))
 
 
-def decode(stream: bytes | memoryview, num_pixels: int) -> UInt16[np.ndarray, " num_pixels"]:
+def decode_rvl(stream: bytes | memoryview, num_pixels: int) -> UInt16[np.ndarray, " num_pixels"]:
     """Decode a nibble stream; what follows the last pixel is ignored.
 
     Raises:
