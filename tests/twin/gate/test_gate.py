@@ -371,5 +371,5 @@ def test_no_verdict_is_never_a_yes() -> None:
 def test_a_zenoh_configuration_is_used(tmp_path: Any) -> None:
     run = RunFolder.create(tmp_path / "run")
     config = GateConfig(zenoh_config=tmp_path / "missing.json5")
-    with pytest.raises(WireConfigError, match="missing.json5 cannot be read"):
+    with pytest.raises(WireConfigError, match=r"missing\.json5 cannot be read"):
         run_gate(run.path, config, Output(quiet=True))
