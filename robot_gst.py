@@ -20,6 +20,7 @@ HELP = (
 )
 
 EPISODES, LIVE, IMPORTS = "bridge.cli.episodes", "bridge.cli.live", "bridge.cli.imports"
+EXCHANGE = "bridge.cli.exchange"
 CATALOGUE = "bridge.cli.catalogue"
 
 COMMANDS: tuple[tuple[str, str, str, str], ...] = (
@@ -109,7 +110,7 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
             (
                 "rgbd",
                 f"{IMPORTS}:import_rgbd",
-                "An RGB-D folder with a scene.json.",
+                "An RGB-D folder: scene.json, TUM, 7-Scenes.",
                 "DIR runs/x",
             ),
             (
@@ -128,6 +129,18 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
                 "dashboards.cli:export_rrd",
                 "An episode with its replays as a Rerun file.",
                 "EPISODE --out FILE.rrd",
+            ),
+            (
+                "tum",
+                f"{EXCHANGE}:export_tum",
+                "Cameras as folders of the TUM RGB-D layout.",
+                "EPISODE DIR",
+            ),
+            (
+                "csv",
+                f"{EXCHANGE}:export_csv",
+                "Joints, poses, events ... as tidy CSV files.",
+                "runs/x DIR",
             ),
             (
                 "catalogue",

@@ -1,0 +1,104 @@
+"""Where exports go: a folder that appears whole or not at all, and names that stay inside it."""
+
+import json
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from bridge.episode.provenance import hash_file, software
+from bridge.errors import BridgeError, UsageError
+
+NOTE_NAME = "robot_gst_export.json"
+"""Says what an exported folder is made of; also the proof that ``--force`` may replace it."""
+_UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
+
+
+@contextmanager
+def new_folder(out: Path, *, force: bool) -> Iterator[Path]:
+    """Yield a folder to fill; it becomes ``out`` when the block ends well, and is removed if not.
+
+    Args:
+        out: The folder to make.
+        force: Replace what an earlier export wrote there; nothing else is ever replaced.
+
+    Raises:
+        UsageError: When something is there that may not be replaced.
+        BridgeError: When the place cannot be written.
+    """
+    if out.is_symlink() or out.exists():
+        _refuse_strangers(out, force=force)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        part = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".part", dir=out.parent))
+    except OSError as error:
+        message = f"cannot write into {out.parent}: {error.strerror}. Choose another place."
+        raise BridgeError(message) from error
+    try:
+        part.chmod(0o777 & ~_umask())
+        yield part
+        _sync(part)
+        if out.is_dir():
+            shutil.rmtree(out)
+        part.rename(out)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+
+
+def _refuse_strangers(out: Path, *, force: bool) -> None:
+    if not out.is_symlink() and out.is_dir():
+        if not any(out.iterdir()):
+            return
+        if (out / NOTE_NAME).is_file():
+            if force:
+                return
+            message = f"{out} exists already. Choose another folder, or replace it with --force."
+            raise UsageError(message)
+    message = (
+        f"{out} exists and was not written by an export, so it is not replaced. "
+        "Choose another folder, or move it away."
+    )
+    raise UsageError(message)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _sync(folder: Path) -> None:
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            with path.open("rb") as stream:
+                os.fsync(stream.fileno())
+
+
+def write_note(folder: Path, *, made_by: str, sources: list[Path], choices: dict[str, Any]) -> None:
+    """Write what the folder is made of: sources with their hashes, software, every choice."""
+    record = {
+        "made_by": made_by,
+        "software": software(),
+        "sources": [{"file": path.name, "sha256": hash_file(path)} for path in sources],
+        **choices,
+    }
+    text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
+    (folder / NOTE_NAME).write_text(text, encoding="utf-8")
+
+
+def safe_name(text: str) -> str:
+    """Turn a name from a recording into one that can be a file's: no separators, no dots.
+
+    Raises:
+        BridgeError: When nothing of it is left.
+    """
+    name = _UNSAFE.sub("_", text).strip("_")
+    if not name:
+        message = f"the name {text!r} in the recording cannot be a file's name. Rename it there."
+        raise BridgeError(message)
+    return name
