@@ -87,7 +87,10 @@ def _send_color(file: RerunFile, episode: Episode, topic: str, entity: str) -> l
 
 def _send_depth(file: RerunFile, episode: Episode, topic: str, entity: str) -> list[int]:
     stamps: list[int] = []
-    images = (DepthImage.from_cdr(message.data) for message in episode.messages([topic]))
+    images = (
+        DepthImage.from_message(message.type_name, message.data)
+        for message in episode.messages([topic])
+    )
     for batch in _batches(images):
         times = [image.stamp_ns for image in batch]
         formats = []

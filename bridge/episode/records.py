@@ -7,12 +7,16 @@ centres at +0.5) in memory and ROS (centres at whole numbers) on disk.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt16
+from jaxtyping import Float, UInt8, UInt16
 
 from bridge.clock import join_ns, split_ns
 from bridge.episode import cdr, schema
+from bridge.episode.cdr_plan import Message
+from bridge.episode.transcode import COLOR_LAYOUTS, DEPTH_ENCODINGS, image_header, pixel_rows
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from bridge.media import depth_codec
+from bridge.media.color import decode_color
 
 
 def _header(stamp_ns: int, frame_id: str) -> dict[str, object]:
@@ -20,7 +24,7 @@ def _header(stamp_ns: int, frame_id: str) -> dict[str, object]:
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
 
 
-def stamp_of(message: cdr.Message) -> int:
+def stamp_of(message: Message) -> int:
     """Return ``header.stamp`` of a decoded message [ns]."""
     stamp = message["header"]["stamp"]
     return join_ns(stamp["sec"], stamp["nanosec"])
@@ -65,7 +69,7 @@ class JointSample:
 
 @dataclass(frozen=True, kw_only=True)
 class CompressedColor:
-    """A JPEG or PNG colour image as it travels."""
+    """A JPEG or PNG colour image as it travels; ``format`` also tells compressed depth."""
 
     stamp_ns: int
     frame_id: str
@@ -91,6 +95,53 @@ class CompressedColor:
             format=message["format"],
             data=message["data"],
         )
+
+    def image_u8(self) -> UInt8[np.ndarray, "height width 3"]:
+        """Decode to sRGB; raises ``UnreadableImageError``."""
+        return decode_color(self.data)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawColor:
+    """An uncompressed colour image: pixels in the order that ``encoding`` states."""
+
+    stamp_ns: int
+    frame_id: str
+    encoding: str
+    pixels: UInt8[np.ndarray, "height width channels"]
+
+    @staticmethod
+    def from_cdr(data: bytes) -> "RawColor":
+        """Read a sensor_msgs/Image of 8-bit colour or grey; refuses other encodings."""
+        header = image_header(data)
+        if header.encoding not in COLOR_LAYOUTS:
+            raise cdr.MalformedMessageError(
+                type_name=schema.IMAGE,
+                found=f"encoding {header.encoding!r}, expected one of {', '.join(COLOR_LAYOUTS)}",
+            )
+        channels = COLOR_LAYOUTS[header.encoding][1]
+        rows = pixel_rows(data, header, channels)
+        return RawColor(
+            stamp_ns=header.stamp_ns,
+            frame_id=header.frame_id,
+            encoding=header.encoding,
+            pixels=rows.reshape(header.height, header.width, channels),
+        )
+
+    def image_u8(self) -> UInt8[np.ndarray, "height width 3"]:
+        """Put the channels in order; grey becomes three equal ones, alpha is dropped."""
+        layout, channels = COLOR_LAYOUTS[self.encoding]
+        order = [0, 0, 0] if channels == 1 else [layout.index(channel) for channel in "RGB"]
+        return self.pixels[..., order]
+
+
+def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColor:
+    """Read a colour image, compressed or raw; both have ``stamp_ns`` and ``image_u8()``.
+
+    Raises:
+        MalformedMessageError: The bytes are no such message.
+    """
+    return (RawColor if type_name == schema.IMAGE else CompressedColor).from_cdr(data)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,23 +169,33 @@ class DepthImage:
     @staticmethod
     def from_cdr(data: bytes) -> "DepthImage":
         """Read a sensor_msgs/Image; refuses other encodings and sizes that do not match."""
-        message = cdr.decode(schema.IMAGE, data)
-        height, width = message["height"], message["width"]
-        if message["encoding"] not in ("16UC1", "mono16"):
+        header = image_header(data)
+        if header.encoding not in DEPTH_ENCODINGS:
             raise cdr.MalformedMessageError(
-                type_name=schema.IMAGE, found=f"encoding {message['encoding']!r}, expected '16UC1'"
+                type_name=schema.IMAGE, found=f"encoding {header.encoding!r}, expected '16UC1'"
             )
-        if len(message["data"]) != 2 * height * width:
-            raise cdr.MalformedMessageError(
-                type_name=schema.IMAGE,
-                found=f"{len(message['data'])} bytes for {width} x {height} 16-bit pixels",
-            )
-        order = ">u2" if message["is_bigendian"] else "<u2"
-        depth_mm = np.frombuffer(message["data"], dtype=order).reshape(height, width)
+        rows = np.ascontiguousarray(pixel_rows(data, header, 2))
         return DepthImage(
-            stamp_ns=stamp_of(message),
-            frame_id=message["header"]["frame_id"],
-            depth_mm=depth_mm.astype(np.uint16, copy=False),
+            stamp_ns=header.stamp_ns,
+            frame_id=header.frame_id,
+            depth_mm=rows.view(">u2" if header.is_bigendian else "<u2").astype(np.uint16),
+        )
+
+    @staticmethod
+    def from_message(type_name: str, data: bytes) -> "DepthImage":
+        """Read depth in any form an episode may hold: raw, or compressed as RVL or PNG.
+
+        Raises:
+            MalformedMessageError: The bytes are no such message, or hold no 16-bit depth.
+            UnreadableImageError: What is compressed cannot be decoded.
+        """
+        if type_name == schema.IMAGE:
+            return DepthImage.from_cdr(data)
+        image = CompressedColor.from_cdr(data)
+        return DepthImage(
+            stamp_ns=image.stamp_ns,
+            frame_id=image.frame_id,
+            depth_mm=depth_codec.unpack(image.format, image.data),
         )
 
     def depth_m(self) -> Float[np.ndarray, "height width"]:

@@ -16,6 +16,8 @@ from bridge.episode.records import (
     DepthImage,
     JointSample,
     PoseSample,
+    RawColor,
+    color_from_message,
     string_from_cdr,
     transforms_from_cdr,
 )
@@ -24,7 +26,6 @@ from bridge.errors import EpisodeError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.geometry.trajectory import PoseTrajectory
-from bridge.media.color import decode_color
 from bridge.task.plan import Plan
 from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
@@ -114,20 +115,20 @@ def rgbd_frames(
     depth_info = camera_info(episode, camera_id, "depth")
     color_topic = _camera_topic(episode, camera_id, "color/image")
     depth_topic = _camera_topic(episode, camera_id, "depth/image")
-    waiting_colors: list[CompressedColor] = []
+    waiting_colors: list[CompressedColor | RawColor] = []
     waiting_depths: list[DepthImage] = []
     for message in episode.messages([color_topic, depth_topic]):
         if message.topic == color_topic:
-            waiting_colors.append(CompressedColor.from_cdr(message.data))
+            waiting_colors.append(color_from_message(message.type_name, message.data))
         else:
-            waiting_depths.append(DepthImage.from_cdr(message.data))
+            waiting_depths.append(DepthImage.from_message(message.type_name, message.data))
         pair = _pop_pair(waiting_colors, waiting_depths)
         if pair is not None:
             color, depth = pair
             yield RgbdFrame(
                 camera_id=camera_id,
                 stamp_ns=color.stamp_ns,
-                image_u8=decode_color(color.data),
+                image_u8=color.image_u8(),
                 depth_m=depth.depth_m(),
                 color_camera=color_info.camera,
                 depth_camera=depth_info.camera,
@@ -137,8 +138,8 @@ def rgbd_frames(
 
 
 def _pop_pair(
-    colors: list[CompressedColor], depths: list[DepthImage]
-) -> tuple[CompressedColor, DepthImage] | None:
+    colors: list[CompressedColor | RawColor], depths: list[DepthImage]
+) -> tuple[CompressedColor | RawColor, DepthImage] | None:
     while colors and depths:
         gap_ns = colors[0].stamp_ns - depths[0].stamp_ns
         if abs(gap_ns) <= PAIRING_TOLERANCE_NS:

@@ -25,9 +25,10 @@ MAX_PIXELS = 64_000_000
 class UnreadableImageError(BridgeError):
     """The bytes are not an image we can decode."""
 
-    def __init__(self, *, found: str) -> None:
+    def __init__(self, *, found: str, expected: str = "JPEG or 8-bit PNG") -> None:
         """Remember what the decoder said."""
-        super().__init__(f"unreadable image: {found}. Expected JPEG or 8-bit PNG.")
+        self.found = found
+        super().__init__(f"unreadable image: {found}. Expected {expected}.")
 
 
 def encode_jpeg(

@@ -22,6 +22,7 @@ except ImportError:
     NATIVE = False
 """``NATIVE``: the built extension codes; its NumPy twin is about a hundred times slower."""
 
+_EXPECTED = "16-bit depth as PNG or RVL"
 RVL_FORMAT = "16UC1; compressedDepth rvl"
 PNG_FORMAT = "16UC1; compressedDepth png"
 _CONFIG = struct.pack("<iff", 0, 0.0, 0.0)
@@ -52,30 +53,37 @@ def pack_rvl(rows: UInt8[np.ndarray, "height row"], *, swap_bytes: bool = False)
 def unpack(image_format: str, data: bytes) -> UInt16[np.ndarray, "height width"]:
     """Decode a compressed depth image to its stored numbers.
 
+    Args:
+        image_format: As the CompressedImage states it; without ``rvl`` it is PNG.
+        data: What the CompressedImage holds.
+
     Raises:
         UnreadableImageError: The format is not 16-bit depth, or the bytes are broken.
     """
     encoding, _, transport = image_format.partition(";")
-    if encoding.strip() not in ("16UC1", "mono16", ""):
-        raise UnreadableImageError(found=f"depth of encoding {encoding.strip()!r}, need 16UC1")
     kind = transport.replace("compressedDepth", "").strip()
-    if len(data) < len(_CONFIG):
-        raise UnreadableImageError(found=f"{len(data)} bytes of compressed depth")
+    if encoding.strip() not in ("16UC1", "mono16") or kind not in ("rvl", "png", ""):
+        raise _unreadable(f"format {image_format[:80]!r}")
     if kind == "rvl":
         return _unpack_rvl(data)
-    if kind in ("", "png"):
+    try:
         return decode_depth_png(data[len(_CONFIG) :])
-    raise UnreadableImageError(found=f"depth compressed as {kind!r}")
+    except UnreadableImageError as error:
+        raise _unreadable(error.found) from error
 
 
 def _unpack_rvl(data: bytes) -> UInt16[np.ndarray, "height width"]:
     if len(data) < _RVL_FRONT_BYTES:
-        raise UnreadableImageError(found=f"{len(data)} bytes of RVL depth")
+        raise _unreadable(f"{len(data)} bytes of RVL depth")
     width, height = struct.unpack_from("<ii", data, len(_CONFIG))
     if width <= 0 or height <= 0 or width * height > MAX_PIXELS:
-        raise UnreadableImageError(found=f"RVL depth of {width} x {height} pixels")
+        raise _unreadable(f"RVL depth of {width} x {height} pixels")
     try:
         pixels = decode_rvl(memoryview(data)[_RVL_FRONT_BYTES:], width * height)
     except ValueError as error:
-        raise UnreadableImageError(found=str(error)) from error
+        raise _unreadable(str(error)) from error
     return np.asarray(pixels).reshape(height, width)
+
+
+def _unreadable(found: str) -> UnreadableImageError:
+    return UnreadableImageError(found=found, expected=_EXPECTED)

@@ -7,7 +7,7 @@ import numpy as np
 
 from bridge.episode import schema, streams
 from bridge.episode.reader import Episode
-from bridge.episode.records import CompressedColor, DepthImage
+from bridge.episode.records import DepthImage, color_from_message
 from bridge.episode.run import RunFolder
 from bridge.episode.streams import RgbdFrame
 from twin.errors import TwinError
@@ -136,14 +136,14 @@ def _paired_stamps(episode: Episode, camera_id: str) -> Iterator[int]:
     colors, depths = (
         np.array(
             [
-                record.from_cdr(message.data).stamp_ns
+                read(message.type_name, message.data).stamp_ns
                 for topic in episode.topics()
                 if topic.endswith(f"{ending}{stream}/image") and not schema.is_truth(topic)
                 for message in episode.messages([topic])
             ],
             dtype=np.int64,
         )
-        for stream, record in (("color", CompressedColor), ("depth", DepthImage))
+        for stream, read in (("color", color_from_message), ("depth", DepthImage.from_message))
     )
     for stamp in np.unique(colors).tolist() if len(depths) else ():
         if np.abs(depths - stamp).min() <= streams.PAIRING_TOLERANCE_NS:
