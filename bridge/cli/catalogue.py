@@ -82,7 +82,10 @@ def _line(entry: "Entry") -> str:
 
 def _shown(text: str, most: int = 200) -> str:
     """Text of other programs without what would move the cursor, and not endless."""
-    return "".join(sign if sign.isprintable() else "?" for sign in text[:most])
+    text = text[:most]
+    if text.isprintable():
+        return text
+    return "".join(sign if sign.isprintable() else "?" for sign in text)
 
 
 def label(

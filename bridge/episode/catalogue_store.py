@@ -25,12 +25,24 @@ _INTEGERS = {"trial", "stand_in", "start_ns", "messages", "size_bytes", "parts",
 _INTEGERS |= {"recovered"}
 
 
+_OPTIONAL = {"start_id", "trial", "lost"}
+
+
 def _column(name: str) -> str:
     kind = "INTEGER" if name in _INTEGERS else "REAL" if name == "duration_s" else "TEXT"
-    return f"{name} {kind}{' PRIMARY KEY' if name == 'file' else ''}"
+    key = " PRIMARY KEY" if name == "file" else ""
+    return f"{name} {kind}{key}{'' if name in _OPTIONAL else ' NOT NULL'}"
 
 
-_CREATE = f"CREATE TABLE episodes ({', '.join(map(_column, _NAMES))}, stamp TEXT)"
+def _allowed(name: str) -> tuple[type, ...]:
+    kind = int if name in _INTEGERS else float if name == "duration_s" else str
+    return (kind, type(None)) if name in _OPTIONAL else (kind,)
+
+
+_ALLOWED = [_allowed(name) for name in _NAMES]
+
+
+_CREATE = f"CREATE TABLE episodes ({', '.join(map(_column, _NAMES))}, stamp TEXT NOT NULL)"
 _INSERT = f"INSERT OR REPLACE INTO episodes VALUES ({', '.join('?' * (len(_NAMES) + 1))})"
 _SELECT = f"SELECT {', '.join(_NAMES)} FROM episodes "
 
@@ -76,7 +88,10 @@ class CatalogueStore:
 
     def stamps(self) -> dict[str, str]:
         """The stamp of every row by file name."""
-        return dict(self._db.execute("SELECT file, stamp FROM episodes"))
+        found = dict(self._db.execute("SELECT file, stamp FROM episodes"))
+        if not all(isinstance(text, str) for pair in found.items() for text in pair):
+            raise sqlite3.DatabaseError("a name or stamp is no text")
+        return found
 
     def change(self, rows: Iterable[tuple[Entry, str]], gone: Iterable[str] = ()) -> None:
         """Put rows in, in place of those of the same file, and take others out, all or nothing."""
@@ -135,6 +150,8 @@ def _values(entry: Entry, stamp: str) -> list[Any]:
 
 
 def _entry(row: tuple[Any, ...]) -> Entry:
+    if not all(map(isinstance, row, _ALLOWED)):
+        raise ValueError("a column has the wrong type")
     record = dict(zip(_NAMES, row, strict=True))
     record["tags"] = tuple(json.loads(record["tags"]))
     record["stand_in"], record["recovered"] = bool(record["stand_in"]), bool(record["recovered"])

@@ -1,0 +1,341 @@
+"""The catalogue answers from its cache, and the cache always agrees with the files."""
+
+import json
+import os
+import sqlite3
+import time
+from pathlib import Path
+
+import pytest
+
+import robot_gst
+from bridge.episode import catalogue, metadata
+from bridge.episode.catalogue import (
+    Entry,
+    find_episodes,
+    label_episode,
+    list_episodes,
+    note_finished,
+)
+from bridge.episode.catalogue_entry import read_entry
+from bridge.episode.catalogue_query import CatalogueQuery
+from bridge.episode.catalogue_store import FILE_NAME, VERSION, CatalogueStore
+from bridge.episode.metadata import EpisodeInfo, Outcome
+from bridge.episode.run import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import OptionError, UsageError
+
+DAY_NS = 86_400_000_000_000
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    return RunFolder.create(tmp_path / "run")
+
+
+def write(
+    run: RunFolder,
+    name: str,
+    *,
+    start_ns: int = 0,
+    messages: int = 1,
+    lost: int | None = None,
+    outcome: str | None = None,
+    **about: object,
+) -> Path:
+    info = EpisodeInfo(**{"id": name, "kind": "trial", **about})  # type: ignore[arg-type]
+    path = run.episodes_dir / f"{name}.mcap"
+    path.unlink(missing_ok=True)
+    with EpisodeWriter(path) as writer:
+        writer.describe(info, outcome=None if outcome is None else Outcome(result=outcome))
+        for index in range(messages):
+            stamp_ns = start_ns + index * 1_000_000_000
+            writer.write_foreign("/x", b"x", schema_record=None, log_time_ns=stamp_ns)
+        if lost is not None:
+            drops = {"gaps": str(lost), "queue_drops": "0", "shed": "0"}
+            writer.add_metadata("drops", drops)
+    return path
+
+
+def settle(run: RunFolder) -> None:
+    """Make all files old enough to be trusted."""
+    for folder in (run.episodes_dir, run.notes_dir):
+        for path in folder.glob("*"):
+            os.utime(path, ns=(1_000_000_000, 1_000_000_000))
+
+
+def count_reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    read: list[str] = []
+
+    def counted(run: RunFolder, path: Path) -> Entry:
+        read.append(path.name)
+        return read_entry(run, path)
+
+    monkeypatch.setattr(catalogue, "read_entry", counted)
+    return read
+
+
+def ids(run: RunFolder, **query: object) -> list[str]:
+    found = find_episodes(run, CatalogueQuery(**query))  # type: ignore[arg-type]
+    return [entry.id for entry in found]
+
+
+def test_an_entry_says_what_the_episode_says(run: RunFolder) -> None:
+    about = {
+        "kind": "trial",
+        "task": "cube",
+        "condition": "with_replanning",
+        "policy": "p",
+        "start_id": "s1",
+        "trial": 7,
+        "operator": "Ada",
+        "robot": "ur5",
+        "cell": "lab",
+        "stand_in": True,
+        "tags": ("a", "b c"),
+    }
+    path = write(run, "t1", start_ns=5, messages=3, lost=2, outcome="success", **about)
+    (entry,) = list_episodes(run)
+    assert {name: getattr(entry, name) for name in about} == about
+    assert (entry.file, entry.id, entry.outcome, entry.error) == ("t1.mcap", "t1", "success", "")
+    assert (entry.start_ns, entry.duration_s, entry.messages) == (5, 2.0, 3)
+    assert (entry.size_bytes, entry.parts, entry.lost) == (path.stat().st_size, 1, 2)
+    assert not entry.recovered
+    settle(run)
+    assert list_episodes(run) == list_episodes(run) == [entry]  # once read, once from the cache
+
+
+def test_only_what_changed_is_opened_again(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("t1", "t2", "t3"):
+        write(run, name)
+    settle(run)
+    read = count_reads(monkeypatch)
+    list_episodes(run)
+    assert read == ["t1.mcap", "t2.mcap", "t3.mcap"]
+    read.clear()
+    assert [entry.id for entry in list_episodes(run)] == ["t1", "t2", "t3"]
+    assert read == []
+    write(run, "t2", task="new")
+    (run.episodes_dir / "t1.mcap").unlink()
+    assert [(entry.id, entry.task) for entry in list_episodes(run)] == [("t2", "new"), ("t3", "")]
+    assert read == ["t2.mcap"]
+
+
+def test_a_file_that_may_still_change_in_this_tick_is_not_trusted(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(run, "t1", task="one")
+    list_episodes(run)
+    size, now_ns = path.stat().st_size, time.time_ns()
+    write(run, "t1", task="two")
+    os.utime(path, ns=(now_ns, now_ns))
+    assert path.stat().st_size == size
+    assert list_episodes(run)[0].task == "two"
+
+
+def test_a_label_given_later_changes_the_row_at_once(run: RunFolder) -> None:
+    write(run, "t1", outcome="success")
+    settle(run)
+    assert list_episodes(run)[0].outcome == "success"
+    sidecar = label_episode(run, "t1", Outcome(result="failure"))
+    assert rows(run) == [("t1.mcap", "failure")]
+    assert list_episodes(run)[0].outcome == "failure"
+    sidecar.unlink()
+    assert list_episodes(run)[0].outcome == "success"
+
+
+def rows(run: RunFolder) -> list[tuple[str, str]]:
+    with sqlite3.connect(run.path / FILE_NAME) as database:
+        found = database.execute("SELECT file, outcome FROM episodes ORDER BY file").fetchall()
+    database.close()
+    return found
+
+
+def test_a_recorder_can_enter_an_episode_without_listing_all(run: RunFolder) -> None:
+    write(run, "t1")
+    note_finished(run, write(run, "t2", outcome="failure"))
+    assert rows(run) == [("t2.mcap", "failure")]
+    assert [entry.id for entry in list_episodes(run)] == ["t1", "t2"]
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_noting_an_episode_never_raises(run: RunFolder, there: bool) -> None:
+    if there:
+        (run.path / FILE_NAME).mkdir()
+    note_finished(run, run.episodes_dir / "nothing.mcap")
+
+
+def test_all_parts_of_a_split_episode_are_one_line(run: RunFolder) -> None:
+    sizes = []
+    for name in ("t1", "t1.2", "t1.3"):
+        path = write(run, name, id="t1", messages=2)
+        sizes.append(path.stat().st_size)
+    (entry,) = list_episodes(run)
+    assert (entry.id, entry.parts, entry.size_bytes) == ("t1", 3, sum(sizes))
+    note_finished(run, run.episodes_dir / "t1.3.mcap")
+    assert rows(run) == [("t1.mcap", "unknown")]
+
+
+@pytest.mark.parametrize(
+    "damage", [b"", b"no database at all" * 100, b"SQLite format 3\x00" + b"\xff" * 5000]
+)
+def test_a_damaged_cache_is_made_again(run: RunFolder, damage: bytes) -> None:
+    write(run, "t1")
+    (run.path / FILE_NAME).write_bytes(damage)
+    assert [entry.id for entry in list_episodes(run)] == ["t1"]
+    assert rows(run) == [("t1.mcap", "unknown")]
+
+
+def test_a_cache_cut_anywhere_gives_the_right_answer(run: RunFolder) -> None:
+    for index in range(40):
+        write(run, f"t{index:02}", tags=("x" * 200,))
+    settle(run)
+    before = list_episodes(run)
+    whole = (run.path / FILE_NAME).read_bytes()
+    for cut in range(0, len(whole), 1777):
+        (run.path / FILE_NAME).write_bytes(whole[:cut])
+        assert list_episodes(run) == before
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        f"PRAGMA user_version = {VERSION + 1}",
+        "ALTER TABLE episodes RENAME COLUMN task TO chore",
+        "UPDATE episodes SET tags = 'none'",
+        "DROP TABLE episodes",
+    ],
+)
+def test_a_cache_of_another_version_is_made_again(run: RunFolder, change: str) -> None:
+    write(run, "t1", task="cube")
+    settle(run)
+    list_episodes(run)
+    with sqlite3.connect(run.path / FILE_NAME) as database:
+        database.execute(change)
+    database.close()
+    assert [entry.task for entry in list_episodes(run)] == ["cube"]
+    assert rows(run) == [("t1.mcap", "unknown")]
+
+
+def test_a_cache_that_cannot_be_opened_costs_time_only(run: RunFolder) -> None:
+    write(run, "t1")
+    (run.path / FILE_NAME).mkdir()
+    assert [entry.id for entry in list_episodes(run)] == ["t1"]
+
+
+def test_a_cache_held_by_another_process_costs_time_only(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(run, "t1")
+    settle(run)
+    list_episodes(run)
+    write(run, "t2")
+    monkeypatch.setattr(catalogue, "CatalogueStore", lambda path: CatalogueStore(path, busy_s=0.0))
+    read = count_reads(monkeypatch)
+    holder = sqlite3.connect(run.path / FILE_NAME, isolation_level=None)
+    holder.execute("BEGIN IMMEDIATE")  # readers may go on
+    assert [entry.id for entry in list_episodes(run)] == ["t1", "t2"]
+    assert read == ["t2.mcap"]
+    holder.execute("ROLLBACK")
+    holder.execute("BEGIN EXCLUSIVE")  # nobody may
+    assert [entry.id for entry in list_episodes(run)] == ["t1", "t2"]
+    holder.close()
+
+
+def test_what_other_programs_wrote_fits_into_the_table(run: RunFolder) -> None:
+    drops = {"gaps": '"many"', "queue_drops": "0", "shed": "0"}
+    for name, values in (("a", {}), ("b", drops)):
+        with EpisodeWriter(run.episodes_dir / f"{name}.mcap") as writer:
+            info = metadata.to_strings(EpisodeInfo(id=name, kind="trial"))
+            odd = {
+                "trial": "1" + "0" * 40,
+                "tags": '["1", "\\ud800"]',
+                "task": '"\\u0000"',
+            }
+            writer.add_metadata("episode", {**info, **odd})
+            if values:
+                writer.add_metadata("drops", values)
+            writer.write_foreign("/x", b"", schema_record=None, log_time_ns=2**64 - 1)
+    (run.episodes_dir / os.fsdecode(b"\xff.mcap")).write_bytes(b"")
+    settle(run)
+    for _ in range(2):
+        broken, one, two = list_episodes(run)
+        assert one.error == ""
+        assert one.tags == ("1", "\\ud800")
+        assert (one.trial, one.start_ns, one.task) == (2**63 - 1, 2**63 - 1, "\0")
+        assert (one.lost, two.lost) == (None, None)
+        assert (broken.file, bool(broken.error)) == ("\\udcff.mcap", True)
+
+
+def test_filters_pick_and_sort(run: RunFolder) -> None:
+    write(run, "a", kind="scan", start_ns=1 * DAY_NS, messages=3)
+    write(run, "b", task="cube", operator="Ada", start_ns=3 * DAY_NS, lost=4, tags=("x", "y"))
+    write(run, "c", task="duck", policy="p", start_ns=2 * DAY_NS, lost=0, tags=("y",))
+    (run.episodes_dir / "d.mcap").write_bytes(b"broken")
+    label_episode(run, "c", Outcome(result="failure"))
+    assert ids(run) == ["a", "b", "c", "d"]
+    assert ids(run, kind=("scan",)) == ["a"]
+    assert ids(run, kind=("scan", "trial")) == ["a", "b", "c"]
+    assert ids(run, kind=("trial",), task=("duck",)) == ["c"]
+    assert ids(run, policy=("p",), operator=("Ada",)) == []
+    assert ids(run, outcome=("failure",)) == ["c"]
+    assert ids(run, tag=("y",)) == ["b", "c"]
+    assert ids(run, tag=("x", "y")) == ["b"]
+    assert (ids(run, lost=True), ids(run, lost=False)) == (["b"], ["a", "c", "d"])
+    assert (ids(run, error=True), ids(run, error=False)) == (["d"], ["a", "b", "c"])
+    assert ids(run, since="1970-01-03T00:00+00:00") == ["b", "c"]
+    assert ids(run, since="1970-01-02T12:00Z", until="1970-01-03T12:00Z") == ["c"]
+    assert ids(run, sort="start", reverse=True, limit=2) == ["b", "c"]
+    assert ids(run, sort="messages", reverse=True)[0] == "a"
+    assert ids(run, limit=0) == []
+
+
+def test_a_quote_in_a_filter_is_only_a_quote(run: RunFolder) -> None:
+    write(run, "a", task="x' OR 1=1 --", tags=('"', "b"))
+    write(run, "b")
+    assert ids(run, task=("x' OR 1=1 --",)) == ["a"]
+    assert ids(run, tag=('"',)) == ["a"]
+
+
+@pytest.mark.parametrize("text", ["yesterday", "2026-13-01", ""])
+def test_a_time_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="no date or time"):
+        CatalogueQuery(since=text)
+
+
+def test_a_negative_limit_is_refused() -> None:
+    with pytest.raises(OptionError, match="--limit -1"):
+        CatalogueQuery(limit=-1)
+
+
+def test_ls_takes_the_filters(run: RunFolder, capsys: pytest.CaptureFixture[str]) -> None:
+    write(run, "a", task="cube", lost=3)
+    write(run, "b", task="duck")
+    assert robot_gst.run(["ls", str(run.path), "--task", "cube", "--lost"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("a ")
+    assert "3 lost" in out
+    assert out.count("\n") == 1
+    assert robot_gst.run(["ls", str(run.path), "--task", "none"]) == 0
+    assert "passes these filters" in capsys.readouterr().out
+    assert robot_gst.run(["ls", str(run.path), "--no-lost", "--json"]) == 0
+    assert [item["id"] for item in json.loads(capsys.readouterr().out)["episodes"]] == ["b"]
+    assert robot_gst.run(["ls", str(run.path), "--since", "never"]) == 2
+
+
+def test_ls_shows_no_control_characters(run: RunFolder, capsys: pytest.CaptureFixture[str]) -> None:
+    write(run, "a", kind="\x1b[2Jtrial")
+    assert robot_gst.run(["ls", str(run.path)]) == 0
+    assert "\x1b" not in capsys.readouterr().out
+
+
+def test_the_parquet_table_holds_the_same(run: RunFolder, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    write(run, "a", task="cube", tags=("x", "y"), lost=1, trial=3)
+    write(run, "b", start_ns=7)
+    out = tmp_path / "list.parquet"
+    assert robot_gst.run(["export", "catalogue", str(run.path), str(out), "-q"]) == 0
+    found = [
+        Entry(**{**row, "tags": tuple(row["tags"])}) for row in parquet.read_table(out).to_pylist()
+    ]
+    assert found == list_episodes(run)

@@ -1,0 +1,73 @@
+"""Ten thousand episodes, several processes, and commands as a person runs them."""
+
+import subprocess
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from bridge.episode.catalogue import list_episodes
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.run import RunFolder
+from bridge.episode.writer import EpisodeWriter
+
+ROOT = Path(__file__).resolve().parents[3]
+NUM_EPISODES = 10_000
+
+pytestmark = pytest.mark.slow
+
+
+def fill(run: RunFolder, count: int) -> None:
+    """Copies of one tiny episode; what they say differs only in their names."""
+    first = run.episodes_dir / "t00000.mcap"
+    with EpisodeWriter(first) as writer:
+        writer.describe(EpisodeInfo(id="t", kind="trial", task="cube"))
+        writer.write_foreign("/x", b"x", schema_record=None, log_time_ns=1)
+    data = first.read_bytes()
+    for index in range(1, count):
+        (run.episodes_dir / f"t{index:05}.mcap").write_bytes(data)
+
+
+def quickest_ls(run: RunFolder, *arguments: str) -> tuple[float, list[str]]:
+    """Wall time of the whole command [s], the best of three, and its lines."""
+    times = []
+    lines: list[str] = []
+    for _ in range(3):
+        start_s = time.perf_counter()
+        done = subprocess.run(
+            [sys.executable, "robot_gst.py", "ls", str(run.path), *arguments],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        times.append(time.perf_counter() - start_s)
+        lines = done.stdout.splitlines()
+    return min(times), lines
+
+
+def test_ten_thousand_episodes_are_listed_in_under_a_second(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    fill(run, NUM_EPISODES)
+    time.sleep(2.1)  # younger files are not trusted to stay as they are
+    assert len(list_episodes(run)) == NUM_EPISODES
+    wall_s, lines = quickest_ls(run, "--task", "cube", "--sort", "start", "--reverse", "--limit=9")
+    assert (len(lines), lines[0].split()[0]) == (9, f"t{NUM_EPISODES - 1:05}")
+    assert wall_s < 1.0
+    (run.episodes_dir / "t00500.mcap").unlink()
+    wall_s, lines = quickest_ls(run)
+    assert len(lines) == NUM_EPISODES - 1
+    assert wall_s < 2.0  # printing ten thousand lines is not what the second is for
+
+
+def list_again_and_again(path: Path) -> set[int]:
+    return {len(list_episodes(RunFolder(path))) for _ in range(10)}
+
+
+def test_processes_that_list_at_once_all_get_the_answer(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    fill(run, 100)
+    with ProcessPoolExecutor(4) as pool:
+        assert set.union(*pool.map(list_again_and_again, [run.path] * 8)) == {100}
