@@ -17,6 +17,8 @@ DEFINITIONS: dict[str, str] = {
         "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
     ),
     "geometry_msgs/msg/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose\n",
+    "geometry_msgs/msg/Wrench": "geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque\n",
+    "geometry_msgs/msg/WrenchStamped": "std_msgs/Header header\ngeometry_msgs/Wrench wrench\n",
     "geometry_msgs/msg/Transform": (
         "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
     ),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 
-from bridge.episode import ros2_definitions
+from bridge.episode import protobuf, ros2_definitions
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -15,6 +15,7 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 STRING = "std_msgs/msg/String"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 PLAN = "gst/Plan"
 VERDICT = "gst/Verdict"
@@ -22,6 +23,7 @@ LOCALISATION = "gst/Localisation"
 EVENT = "gst/Event"
 DROPS = "recorder/Drops"
 POSES_IN_FRAME = "foxglove.PosesInFrame"
+COMPRESSED_VIDEO = "foxglove.CompressedVideo"
 
 DROPS_TOPIC = "/recorder/drops"
 TRUTH_PREFIX = "/standin/truth/"
@@ -60,7 +62,35 @@ def schema_for(name: str) -> Schema | None:
         return Schema(
             name=name, schema_encoding="jsonschema", message_encoding="json", data=text.encode()
         )
+    if name == COMPRESSED_VIDEO:
+        return Schema(
+            name=name,
+            schema_encoding="protobuf",
+            message_encoding="protobuf",
+            data=_video_descriptor(),
+        )
     return None
+
+
+def _video_descriptor() -> bytes:
+    timestamp = "google/protobuf/timestamp.proto"
+    return protobuf.file_descriptor(
+        name=timestamp,
+        package="google.protobuf",
+        message="Timestamp",
+        members=[("seconds", 1, protobuf.INT64_TYPE, ""), ("nanos", 2, protobuf.INT32_TYPE, "")],
+    ) + protobuf.file_descriptor(
+        name="foxglove/CompressedVideo.proto",
+        package="foxglove",
+        message="CompressedVideo",
+        imports=[timestamp],
+        members=[
+            ("timestamp", 1, protobuf.MESSAGE_TYPE, ".google.protobuf.Timestamp"),
+            ("frame_id", 2, protobuf.STRING_TYPE, ""),
+            ("data", 3, protobuf.BYTES_TYPE, ""),
+            ("format", 4, protobuf.STRING_TYPE, ""),
+        ],
+    )
 
 
 def json_schema_version(name: str) -> int:
@@ -74,6 +104,7 @@ def json_schema_version(name: str) -> int:
 
 _TOPIC_RULES: tuple[tuple[str, str], ...] = (
     (r"/cam/[^/]+/color/image$", COMPRESSED_IMAGE),
+    (r"/cam/[^/]+/color/preview$", COMPRESSED_VIDEO),
     (r"/cam/[^/]+/depth/image$", IMAGE),
     (r"/cam/[^/]+/(color|depth)/info$", CAMERA_INFO),
     (r"/joint_states$", JOINT_STATE),
