@@ -1,39 +1,26 @@
 """Read one episode: metadata, topics, raw messages; ``streams`` decodes them."""
 
-import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-import zstandard
-from mcap.exceptions import McapError
-from mcap.reader import McapReader, make_reader
 from mcap.summary import Summary
 
 from bridge.episode import metadata, schema
+from bridge.episode.mcap_file import McapFile, damaged
+from bridge.episode.mcap_walk import DAMAGE
+from bridge.episode.merge import Selection, merged
+from bridge.episode.parts import open_parts
 from bridge.errors import EpisodeError, PathNotFoundError, SchemaVersionError
 
-DAMAGE = (
-    McapError,
-    zstandard.ZstdError,
-    struct.error,
-    ValueError,
-    EOFError,
-    KeyError,
-    IndexError,
-    OverflowError,
-    OSError,
-    MemoryError,  # a damaged length asks for terabytes
-    RuntimeError,  # lz4's own
-)
-"""What the ``mcap`` package raises on bytes that are not what they claim to be."""
+LAST_PART_WINS = ("outcome", "drops", "recorder", "split")
+"""Metadata that only the end of an episode knows; every other record is that of its beginning."""
 
 Record = TypeVar("Record", metadata.EpisodeInfo, metadata.Outcome, metadata.Derived)
 
 
-@dataclass(frozen=True, kw_only=True)
-class RawMessage:
+class RawMessage(NamedTuple):
     """One message as stored."""
 
     topic: str
@@ -55,17 +42,24 @@ class TopicSummary:
 
 
 class Episode:
-    """An opened, finished episode file. Cheap to make: only the summary is read."""
+    """An opened, finished episode: one file, or several parts that are read as one.
 
-    def __init__(self, path: Path, summary: Summary, records: dict[str, dict[str, Any]]) -> None:
+    Cheap to make: only the summaries are read.
+    """
+
+    def __init__(self, files: tuple[McapFile, ...], missing_parts: tuple[Path, ...]) -> None:
         """Use ``Episode.open``."""
-        self.path = path
-        self._summary = summary
-        self._records = records
+        self.path = files[0].path
+        self.files = files
+        self.missing_parts = missing_parts
+        """Parts of a split episode that are not there or cannot be read."""
+        self._records = _joined_records(files)
 
     @staticmethod
     def open(path: Path) -> "Episode":
-        """Open a finished MCAP file.
+        """Open a finished MCAP file, and the parts behind it where an episode was split.
+
+        A part that is missing does not prevent reading the others: see ``missing_parts``.
 
         Raises:
             PathNotFoundError: When the file is not there.
@@ -75,29 +69,29 @@ class Episode:
         if not path.is_file():
             raise PathNotFoundError(path=path, what="episode", hint="robot-gst ls RUN lists them.")
         try:
-            with path.open("rb") as stream:
-                reader = make_reader(stream)
-                summary = reader.get_summary()
-                records = {
-                    record.name: metadata.from_strings(record.metadata)
-                    for record in reader.iter_metadata()
-                }
+            parts = open_parts(path)
         except DAMAGE as error:
             raise EpisodeError(
                 path=path,
                 found=f"not a finished MCAP file ({type(error).__name__}: {str(error)[:120]})",
-                hint="If a recorder was killed while writing it, its readable part is still there.",
+                hint="If a recorder was killed while writing it: robot-gst recover FILE.",
             ) from error
-        if summary is None:
-            raise EpisodeError(
-                path=path, found="no summary section", hint="The writer did not finish the file."
-            )
-        found = records.get("episode", {}).get("schema_version", metadata.SCHEMA_VERSION)
+        episode = Episode(parts.files, parts.missing)
+        found = episode._records.get("episode", {}).get("schema_version", metadata.SCHEMA_VERSION)
         if isinstance(found, int) and found > metadata.SCHEMA_VERSION:
             raise SchemaVersionError(
                 path=path, name="episode metadata", found=found, known=metadata.SCHEMA_VERSION
             )
-        return Episode(path, summary, records)
+        return episode
+
+    @property
+    def parts(self) -> tuple[Path, ...]:
+        """The files this episode is read from, in order."""
+        return tuple(file.path for file in self.files)
+
+    @property
+    def _summary(self) -> Summary:
+        return self.files[0].summary
 
     @property
     def info(self) -> metadata.EpisodeInfo:
@@ -134,13 +128,19 @@ class Episode:
 
     @property
     def start_ns(self) -> int:
-        """First log time, 0 without messages."""
-        return self._summary.statistics.message_start_time if self._summary.statistics else 0
+        """First log time of any part, 0 without messages."""
+        return min((start for start, _ in self._times_ns()), default=0)
 
     @property
     def end_ns(self) -> int:
-        """Last log time, 0 without messages."""
-        return self._summary.statistics.message_end_time if self._summary.statistics else 0
+        """Last log time of any part, 0 without messages."""
+        return max((end for _, end in self._times_ns()), default=0)
+
+    def _times_ns(self) -> Iterator[tuple[int, int]]:
+        for file in self.files:
+            statistics = file.summary.statistics
+            if statistics is not None and statistics.message_count:
+                yield statistics.message_start_time, statistics.message_end_time
 
     @property
     def duration_s(self) -> float:
@@ -149,18 +149,19 @@ class Episode:
 
     def topics(self) -> dict[str, TopicSummary]:
         """Return every topic with its type and number of messages."""
-        statistics = self._summary.statistics
-        counts = statistics.channel_message_counts if statistics else {}
         topics: dict[str, TopicSummary] = {}
-        for channel in self._summary.channels.values():
-            record = self._summary.schemas.get(channel.schema_id)
-            before = topics.get(channel.topic)
-            topics[channel.topic] = TopicSummary(
-                topic=channel.topic,
-                type_name=record.name if record else "",
-                message_encoding=channel.message_encoding,
-                count=counts.get(channel.id, 0) + (before.count if before else 0),
-            )
+        for file in self.files:
+            statistics = file.summary.statistics
+            counts = statistics.channel_message_counts if statistics else {}
+            for channel in file.summary.channels.values():
+                record = file.schema_of(channel)
+                before = topics.get(channel.topic)
+                topics[channel.topic] = TopicSummary(
+                    topic=channel.topic,
+                    type_name=record.name if record else "",
+                    message_encoding=channel.message_encoding,
+                    count=counts.get(channel.id, 0) + (before.count if before else 0),
+                )
         return dict(sorted(topics.items()))
 
     def topics_of_type(self, type_name: str) -> list[str]:
@@ -180,42 +181,48 @@ class Episode:
     ) -> Iterator[RawMessage]:
         """Yield messages in log order with CRCs checked, optionally of some topics only.
 
-        ``start_ns`` (included) and ``end_ns`` (excluded) bound the log time.
-        """
-        wanted = None if topics is None else list(topics)
-        if wanted == []:
-            return
-        try:
-            with self.path.open("rb") as stream:
-                reader: McapReader = make_reader(stream, validate_crcs=True)
-                for record, channel, message in reader.iter_messages(
-                    topics=wanted, starting_at=start_ns, ending_before=end_ns
-                ):
-                    yield RawMessage(
-                        topic=channel.topic,
-                        type_name=record.name if record else "",
-                        log_time_ns=message.log_time,
-                        publish_time_ns=message.publish_time,
-                        sequence=message.sequence,
-                        data=message.data,
-                    )
-        except DAMAGE as error:
-            raise self._damaged(error) from error
+        ``start_ns`` (included) and ``end_ns`` (excluded) bound the log time. Chunks without a
+        wanted topic are not read; few are held in memory at a time.
 
-    def _damaged(self, error: BaseException) -> EpisodeError:
-        return EpisodeError(
-            path=self.path,
-            found=f"damaged ({type(error).__name__}: {str(error)[:120]})",
-            hint="Run robot-gst check on it.",
-        )
+        Raises:
+            EpisodeError: When a file turns out to be damaged.
+        """
+        wanted = None if topics is None else frozenset(topics)
+        if wanted is not None and not wanted:
+            return
+        select = Selection(topics=wanted, start_ns=start_ns, end_ns=end_ns)
+        for item in merged(self.files, select):
+            record = item.file.schema_of(item.channel)
+            yield RawMessage(
+                item.channel.topic,
+                record.name if record else "",
+                item.log_time_ns,
+                item.publish_time_ns,
+                item.sequence,
+                item.data,
+            )
 
     def attachment(self, name: str) -> bytes | None:
-        """Return the bytes of an attachment, or None."""
-        try:
-            with self.path.open("rb") as stream:
-                for item in make_reader(stream).iter_attachments():
-                    if item.name == name:
-                        return item.data
-        except DAMAGE as error:
-            raise self._damaged(error) from error
+        """Return the bytes of the first attachment of this name with its CRC checked, or None.
+
+        Raises:
+            EpisodeError: When it is damaged.
+        """
+        for file in self.files:
+            try:
+                found = file.attachment(name)
+            except DAMAGE as error:
+                raise damaged(file.path, error) from error
+            if found is not None:
+                return found
         return None
+
+
+def _joined_records(files: tuple[McapFile, ...]) -> dict[str, dict[str, Any]]:
+    joined: dict[str, dict[str, Any]] = {}
+    for file in files:
+        of_part = {record.name: metadata.from_strings(record.metadata) for record in file.metadata}
+        for name, values in of_part.items():
+            if name in LAST_PART_WINS or name not in joined:
+                joined[name] = values
+    return joined
