@@ -7,6 +7,11 @@ from bridge.wire.config import WireConfig
 from bridge.wire.errors import WireConfigError, cause_of
 from bridge.wire.library import zenoh
 
+_OURS_WHERE_THE_FILE_IS_SILENT = {
+    # Room for about 1 MB of joints (5 s at 500 Hz) while a receiver hangs, before any is dropped.
+    "transport/link/tx/queue/size/real_time": 16,
+}
+
 
 def zenoh_config(config: WireConfig) -> Any:
     """Start from the file where given; mode, endpoints and scouting are ours in any case.
@@ -25,6 +30,10 @@ def zenoh_config(config: WireConfig) -> Any:
         "scouting/delay": 0,  # there is nobody to wait for without scouting
     }
     made = zenoh.Config() if config.config is None else _config_from_file(config)
+    plain = zenoh.Config()
+    for key, value in _OURS_WHERE_THE_FILE_IS_SILENT.items():
+        if made.get_json(key) == plain.get_json(key):
+            settings[key] = value
     for key, value in settings.items():
         try:
             made.insert_json5(key, json.dumps(value))
