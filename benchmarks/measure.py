@@ -6,7 +6,8 @@ import platform
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,51 @@ def report(name: str, rows: dict[str, list[float]], *, reference: str, note: str
         "machine": machine(),
         "software": software(),
     }
-    folder = ROOT / "benchmarks" / "results"
-    folder.mkdir(exist_ok=True)
+    store(name, record)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """One line of a table of targets: what was measured, and what it must reach."""
+
+    what: str
+    measured: float
+    limit: float
+    unit: str = ""
+    at_most: bool = True
+    """Otherwise at least."""
+    reference: str = ""
+    """What the named reference reached in the same run."""
+
+    @property
+    def met(self) -> bool:
+        """Whether the number is good enough; one that is none is not."""
+        return self.measured <= self.limit if self.at_most else self.measured >= self.limit
+
+
+def report_targets(name: str, targets: Sequence[Target], *, note: str, **details: Any) -> None:
+    """Print targets with what was measured, and store them under benchmarks/results."""
+    print(f"{name}: {note}")
+    print_targets(targets)
+    rows = [{**asdict(target), "met": target.met} for target in targets]
+    about = {"machine": machine(), "software": software()}
+    store(name, {"benchmark": name, "note": note, "targets": rows, **details, **about})
+
+
+def print_targets(targets: Sequence[Target]) -> None:
+    """One line each; what was missed says so."""
+    width = max((len(target.what) for target in targets), default=0)
+    for target in targets:
+        sign = "<=" if target.at_most else ">="
+        print(
+            f"  {target.what:<{width}}  {target.measured:10.4g} {target.unit:<6} "
+            f"{sign} {target.limit:<8.4g} {'ok    ' if target.met else 'MISSED'}  "
+            f"{target.reference}".rstrip()
+        )
+
+
+def store(name: str, record: dict[str, Any]) -> None:
+    """Keep a result; GST_BENCH_RESULTS names another folder than benchmarks/results."""
+    folder = Path(os.environ.get("GST_BENCH_RESULTS", ROOT / "benchmarks" / "results"))
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.json").write_text(json.dumps(record, indent=1) + "\n")
