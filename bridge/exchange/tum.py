@@ -216,7 +216,7 @@ def _write_cameras(
     path.write_text(json.dumps(record, indent=1) + "\n")
 
 
-def _camera_record(camera: Camera) -> dict[str, float]:
+def _camera_record(camera: Camera) -> dict[str, int | float]:
     fx, fy, cx, cy = camera.to_ros()
     return {
         "width": camera.width,

@@ -1,11 +1,10 @@
 """How an RGB-D folder is turned into messages. Imports nothing heavy."""
 
-import re
 from dataclasses import dataclass
 
 from bridge.errors import UsageError, refuse_outside
+from bridge.sources.names import refuse_bad_name
 
-_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 DEFAULT_RATE_HZ = 30.0
 
 
@@ -31,11 +30,7 @@ class FolderConfig:
     def __post_init__(self) -> None:
         """Refuse names that cannot be part of a topic, and numbers that make no sense."""
         for what, name in (("cell", self.cell), ("camera", self.camera)):
-            if not _NAME.fullmatch(name):
-                raise UsageError(
-                    f"{what} name {name!r} cannot be part of a topic. "
-                    "Use letters, digits and '_', starting with a letter."
-                )
+            refuse_bad_name(what, name)
         allowed = {"rate_hz": (0.001, 1000), "max_frames": (1, 10**9), "depth_unit_m": (1e-6, 1)}
         refuse_outside(self, allowed)
         for option in ("depth_intrinsics", "color_intrinsics"):

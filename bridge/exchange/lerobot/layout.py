@@ -1,0 +1,194 @@
+"""The layout of a LeRobotDataset v3.0: where its files lie and what ``meta/info.json`` says.
+
+Source: the format's documentation and the ``huggingface/lerobot`` repository (``datasets/utils.py``
+for path templates and default features, ``dataset_metadata.py`` for the episode columns). Many
+episodes share a data file and a video file; ``meta/episodes`` says where each lies.
+"""
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bridge.errors import BridgeError, MissingDependencyError, PathNotFoundError
+
+VERSION = "v3.0"
+INFO_PATH = "meta/info.json"
+STATS_PATH = "meta/stats.json"
+TASKS_PATH = "meta/tasks.parquet"
+FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+EPISODES_PATH = f"meta/episodes/{FILE}.parquet"
+DATA_PATH = f"data/{FILE}.parquet"
+VIDEO_PATH = f"videos/{{video_key}}/{FILE}.mp4"
+CHUNKS_SIZE = 1000
+"""Files per chunk folder."""
+DATA_FILE_MB = 100
+VIDEO_FILE_MB = 200
+STATE, ACTION, IMAGES = "observation.state", "action", "observation.images."
+DONE, SUCCESS = "next.done", "next.success"
+DEFAULT_FEATURES = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+"""Columns every dataset has, with their type; all are scalars."""
+_FIELD = re.compile(r"\{(\w+)(?::0?(\d+)d)?\}")
+
+
+class LeRobotFormatError(BridgeError):
+    """A dataset does not look as its format says."""
+
+    def __init__(self, *, path: Path, found: str, hint: str) -> None:
+        """Remember the file and what was found."""
+        self.path = path
+        self.found = found
+        super().__init__(f"{path}: {found}. {hint}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Feature:
+    """One column or one camera."""
+
+    key: str
+    dtype: str
+    shape: tuple[int, ...]
+    names: tuple[str, ...]
+    """One per number; made up where the dataset names none."""
+
+    @property
+    def is_numeric_vector(self) -> bool:
+        """Whether it is a scalar or a vector of numbers."""
+        numeric = self.dtype in ("bool",) or self.dtype.startswith(("float", "int", "uint"))
+        return numeric and len(self.shape) == 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetInfo:
+    """``meta/info.json``, checked."""
+
+    folder: Path
+    fps: float
+    robot_type: str
+    data_path: str
+    video_path: str | None
+    features: dict[str, Feature]
+    version: str
+
+    def data_file(self, chunk_index: int, file_index: int) -> Path:
+        """Return a data file by its indices."""
+        return self._inside(self.data_path, chunk_index=chunk_index, file_index=file_index)
+
+    def video_file(self, video_key: str, chunk_index: int, file_index: int) -> Path:
+        """Return a video file by its camera and indices."""
+        return self._inside(
+            self.video_path or VIDEO_PATH,
+            video_key=video_key,
+            chunk_index=chunk_index,
+            file_index=file_index,
+        )
+
+    def _inside(self, template: str, **values: int | str) -> Path:
+        """Fill in a path template; only plain fields, and never out of the folder."""
+
+        def fill(match: re.Match[str]) -> str:
+            value = values.get(match[1])
+            if value is None:
+                raise LeRobotFormatError(
+                    path=self.folder / INFO_PATH,
+                    found=f"path template {template!r} with the field {match[1]!r}",
+                    hint=f"Version {VERSION} knows {', '.join(values)}.",
+                )
+            return f"{value:0{match[2]}d}" if match[2] and isinstance(value, int) else str(value)
+
+        path = self.folder / _FIELD.sub(fill, template)
+        if not path.resolve().is_relative_to(self.folder.resolve()):
+            raise LeRobotFormatError(
+                path=self.folder / INFO_PATH,
+                found=f"path template {template!r} leads out of the dataset",
+                hint="Restore the file from the original dataset.",
+            )
+        return path
+
+
+def read_info(folder: Path) -> DatasetInfo:
+    """Read and check ``meta/info.json``.
+
+    Raises:
+        PathNotFoundError: When it is not there.
+        LeRobotFormatError: When it is another version, or a key is missing or makes no sense.
+    """
+    path = folder / INFO_PATH
+    if not path.is_file():
+        raise PathNotFoundError(
+            path=path, what="LeRobot dataset", hint="Give the folder that holds meta/info.json."
+        )
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        version = str(record["codebase_version"])
+        if not version.startswith("v3."):
+            raise LeRobotFormatError(
+                path=path,
+                found=f"version {version}, and only v3 is read",
+                hint="lerobot converts it: convert_dataset_v21_to_v30.",
+            )
+        fps = float(record["fps"])
+        if not 0 < fps < 10_000:
+            message = f"fps is {fps}"
+            raise ValueError(message)
+        features = {key: _feature(key, value) for key, value in record["features"].items()}
+        return DatasetInfo(
+            folder=folder,
+            fps=fps,
+            robot_type=str(record.get("robot_type") or ""),
+            data_path=str(record.get("data_path") or DATA_PATH),
+            video_path=record.get("video_path"),
+            features=features,
+            version=version,
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise LeRobotFormatError(
+            path=path,
+            found=f"cannot be read ({type(error).__name__}: {error})",
+            hint="Restore it from the original dataset.",
+        ) from error
+
+
+def _feature(key: str, record: dict[str, Any]) -> Feature:
+    shape = tuple(int(size) for size in record["shape"])
+    names: list[str] = []
+    if len(shape) == 1:
+        names = _flat_names(record.get("names"))
+        last = key.rsplit(".", 1)[-1]
+        if len(names) != shape[0] or len(set(names)) != len(names):
+            names = [last] if shape[0] == 1 else [f"{last}_{i}" for i in range(shape[0])]
+    return Feature(key=key, dtype=str(record["dtype"]), shape=shape, names=tuple(names))
+
+
+def _flat_names(names: object) -> list[str]:
+    """Names come as a list, as lists in a list, or under one key such as ``motors``."""
+    if isinstance(names, str):
+        return [names]
+    if isinstance(names, dict):
+        names = list(names.values())
+    if isinstance(names, list):
+        return [name for item in names for name in _flat_names(item)]
+    return []
+
+
+def parquet() -> tuple[Any, Any]:
+    """Return ``pyarrow`` and ``pyarrow.parquet``; an extra brings them.
+
+    Raises:
+        MissingDependencyError: When they are not installed.
+    """
+    try:
+        import pyarrow as pa  # noqa: PLC0415
+        import pyarrow.parquet as pq  # noqa: PLC0415
+    except ImportError as error:
+        raise MissingDependencyError(
+            package="pyarrow", extra="report", purpose="LeRobot's Parquet files"
+        ) from error
+    return pa, pq

@@ -1,0 +1,112 @@
+"""H.264 video files: frames in, and frames out at given times. PyAV (the extra [video]) does it."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from bridge.errors import MissingDependencyError
+from bridge.exchange.lerobot.layout import LeRobotFormatError
+
+CODEC = "libx264"
+KEYFRAME_EVERY = 2
+"""Training reads single frames at random, so every second one can be decoded alone."""
+
+
+def _av() -> Any:
+    try:
+        import av  # noqa: PLC0415
+    except ImportError as error:
+        raise MissingDependencyError(
+            package="av", extra="video", purpose="video in LeRobot datasets"
+        ) from error
+    return av
+
+
+class VideoWriter:
+    """Append frames to one MP4 file at a constant rate."""
+
+    def __init__(self, path: Path, *, fps: int, width: int, height: int, crf: int) -> None:
+        """Create the file; sizes that are odd get full chroma, for the usual one needs even."""
+        av = _av()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.path = path
+        self.num_frames = 0
+        self._frame_class = av.VideoFrame
+        self._container = av.open(str(path), "w")
+        options = {"crf": str(crf), "g": str(KEYFRAME_EVERY), "bf": "0", "preset": "veryfast"}
+        self._stream = self._container.add_stream(CODEC, rate=fps, options=options)
+        self._stream.width, self._stream.height = width, height
+        self.pix_fmt = "yuv420p" if width % 2 == 0 and height % 2 == 0 else "yuv444p"
+        self._stream.pix_fmt = self.pix_fmt
+
+    def write(self, image_u8: UInt8[np.ndarray, "height width 3"]) -> None:
+        """Append one frame."""
+        frame = self._frame_class.from_ndarray(image_u8, format="rgb24")
+        frame.pts = self.num_frames
+        for packet in self._stream.encode(frame):
+            self._container.mux(packet)
+        self.num_frames += 1
+
+    def close(self) -> None:
+        """Write what the encoder still holds, and the index."""
+        for packet in self._stream.encode(None):
+            self._container.mux(packet)
+        self._container.close()
+
+
+def read_frames(
+    path: Path, times_s: Sequence[float], tolerance_s: float
+) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    """Yield the frame nearest to each time; times ascend [s].
+
+    Raises:
+        LeRobotFormatError: Naming the time at which no frame is close enough, or what the decoder
+            says of the file.
+    """
+    if not len(times_s):
+        return
+    av = _av()
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise LeRobotFormatError(
+                    path=path, found="no video in it", hint="Restore it from the dataset."
+                )
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            if times_s[0] > 0:
+                container.seek(
+                    int((times_s[0] - tolerance_s) / stream.time_base),
+                    stream=stream,
+                    backward=True,
+                )
+            yield from _nearest(path, container.decode(stream), times_s, tolerance_s)
+    except (av.FFmpegError, OSError) as error:
+        raise LeRobotFormatError(
+            path=path,
+            found=f"cannot be decoded ({str(error)[:120]})",
+            hint="Restore it from the original dataset; robot-gst decodes H.264, HEVC and AV1.",
+        ) from error
+
+
+def _nearest(
+    path: Path, frames: Iterator[Any], times_s: Sequence[float], tolerance_s: float
+) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    before: Any = None
+    after: Any = next(frames, None)
+    for number, wanted_s in enumerate(times_s):
+        while after is not None and after.time < wanted_s:
+            before, after = after, next(frames, None)
+        close = [frame for frame in (before, after) if frame is not None]
+        best = min(close, key=lambda frame: abs(frame.time - wanted_s), default=None)
+        if best is None or abs(best.time - wanted_s) > tolerance_s:
+            there = "nothing is left" if best is None else f"the nearest is at {best.time:.4f} s"
+            raise LeRobotFormatError(
+                path=path,
+                found=f"no frame {number} of the episode at {wanted_s:.4f} s, {there}",
+                hint="The video does not fit meta/episodes; restore both from the dataset.",
+            )
+        yield best.to_ndarray(format="rgb24")
