@@ -22,6 +22,7 @@ except ImportError:
     NATIVE = False
 """``NATIVE``: the built extension codes; its NumPy twin is about a hundred times slower."""
 
+PNG_MAGIC = b"\x89PNG"
 _EXPECTED = "16-bit depth as PNG or RVL"
 RVL_FORMAT = "16UC1; compressedDepth rvl"
 PNG_FORMAT = "16UC1; compressedDepth png"
@@ -54,20 +55,27 @@ def unpack(image_format: str, data: bytes) -> UInt16[np.ndarray, "height width"]
     """Decode a compressed depth image to its stored numbers.
 
     Args:
-        image_format: As the CompressedImage states it; without ``rvl`` it is PNG.
+        image_format: As the CompressedImage states it; without ``rvl`` it is PNG. A bare PNG file
+            is read whatever the format says.
         data: What the CompressedImage holds.
 
     Raises:
         UnreadableImageError: The format is not 16-bit depth, or the bytes are broken.
     """
+    if data.startswith(PNG_MAGIC):
+        return _unpack_png(data)
     encoding, _, transport = image_format.partition(";")
     kind = transport.replace("compressedDepth", "").strip()
     if encoding.strip() not in ("16UC1", "mono16") or kind not in ("rvl", "png", ""):
         raise _unreadable(f"format {image_format[:80]!r}")
     if kind == "rvl":
         return _unpack_rvl(data)
+    return _unpack_png(data[len(_CONFIG) :])
+
+
+def _unpack_png(data: bytes) -> UInt16[np.ndarray, "height width"]:
     try:
-        return decode_depth_png(data[len(_CONFIG) :])
+        return decode_depth_png(data)
     except UnreadableImageError as error:
         raise _unreadable(error.found) from error
 

@@ -62,7 +62,10 @@ class Writer {
     }
 
     std::size_t finish() {
-        if (used_) out_ += 4;  // `put` has stored the unfinished word already
+        if (used_) {
+            store(out_, static_cast<std::uint32_t>(pending_ >> 32));
+            out_ += 4;
+        }
         return static_cast<std::size_t>(out_ - start_);
     }
 
