@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 from bridge.clock import join_ns
 from bridge.episode import schema
 from bridge.episode.cdr import ENCAPSULATION_LE, MalformedMessageError
+from bridge.episode.cdr_plan import Buffer
 from bridge.media.color import JPEG_QUALITY, MAX_PIXELS, encode_jpeg
 from bridge.media.depth_codec import RVL_FORMAT, pack_rvl
 
@@ -54,7 +55,7 @@ def _malformed(found: str) -> MalformedMessageError:
     return MalformedMessageError(type_name=schema.IMAGE, found=found)
 
 
-def image_header(data: bytes) -> ImageHeader:
+def image_header(data: Buffer) -> ImageHeader:
     """Read the front of a sensor_msgs/Image without touching its pixels.
 
     Raises:
@@ -94,7 +95,7 @@ def _aligned(at: int) -> int:
     return at + -at % 4  # the encapsulation's 4 bytes do not disturb alignment to 4
 
 
-def _string(data: bytes, at: int, order: str, *, align: bool = True) -> tuple[str, int]:
+def _string(data: Buffer, at: int, order: str, *, align: bool = True) -> tuple[str, int]:
     (length,) = struct.unpack_from(order + "I", data, at)
     at += 4
     if length > len(data) - at:
@@ -105,7 +106,9 @@ def _string(data: bytes, at: int, order: str, *, align: bool = True) -> tuple[st
     return text, _aligned(at) if align else at
 
 
-def pixel_rows(data: bytes, header: ImageHeader, pixel_bytes: int) -> UInt8[np.ndarray, "rows row"]:
+def pixel_rows(
+    data: Buffer, header: ImageHeader, pixel_bytes: int
+) -> UInt8[np.ndarray, "rows row"]:
     """View the pixels of a message, row padding cut off; nothing is copied.
 
     Raises:
@@ -123,7 +126,7 @@ def pixel_rows(data: bytes, header: ImageHeader, pixel_bytes: int) -> UInt8[np.n
     return flat.reshape(height, step)[:, :row]
 
 
-def image_to_jpeg(data: bytes, quality: int = JPEG_QUALITY) -> bytes | None:
+def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
     """Compress a raw colour image; an alpha channel is dropped.
 
     Args:
@@ -150,7 +153,7 @@ def image_to_jpeg(data: bytes, quality: int = JPEG_QUALITY) -> bytes | None:
     return _compressed_image(header, "jpeg", [jpeg])
 
 
-def depth_to_compact(data: bytes) -> bytes | None:
+def depth_to_compact(data: Buffer) -> bytes | None:
     """Compress a raw depth image without loss (RVL).
 
     Args:
