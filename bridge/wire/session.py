@@ -152,12 +152,17 @@ class WireSession:
             raise NoReplyError(key=key, timeout_s=timeout_s)
         raise RemoteError(refusal)
 
-    def query_all(self, key_expression: str, *, timeout_s: float) -> list[WireSample]:
+    def query_all(
+        self, key_expression: str, *, timeout_s: float, max_mb: int = 64
+    ) -> list[WireSample]:
         """Ask everybody and return every good answer, in the order they came.
 
         Used for what caches keep: the last messages of a topic whose publisher spoke before we
-        listened. Whoever has not answered in time is left out.
+        listened. Whoever has not answered in time is left out, and so is what comes after
+        ``max_mb`` [MB], for nobody knows what a cache holds.
         """
+        answers: list[WireSample] = []
+        room = max_mb * BYTES_PER_MB
         try:
             replies = self._inner.get(
                 key_expression,
@@ -166,10 +171,16 @@ class WireSession:
                 consolidation=zenoh.ConsolidationMode.NONE,
                 accept_replies=zenoh.ReplyKeyExpr.ANY,
             )
-            found = [reply.ok for reply in replies if reply.ok is not None]
+            for reply in replies:
+                if reply.ok is None:
+                    continue
+                room -= len(reply.ok.payload)
+                if room < 0:
+                    break
+                answers.append(copy_sample(reply.ok, self._clock.now_ns()))
         except zenoh.ZError as error:
             raise WireError(f"cannot ask {key_expression}: {cause_of(error)}.") from error
-        return [copy_sample(sample, self._clock.now_ns()) for sample in found]
+        return answers
 
     def declare_alive(self, key: str) -> AliveToken:
         """Let everybody see that this session is there, until it closes or its process ends."""

@@ -157,6 +157,8 @@ def test_a_cache_is_asked_for_what_it_kept(router: WireSession, client: WireSess
         ("/cache/b", b"two"),
     }
     assert client.query_all("nobody/**", timeout_s=5.0) == []
+    router.serve("large/a", lambda payload: bytes(1_500_000))
+    assert client.query_all("large/**", timeout_s=5.0, max_mb=1) == []
 
 
 def test_numbers_of_zenoh_itself_are_read(router: WireSession, client: WireSession) -> None:

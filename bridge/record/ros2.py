@@ -1,0 +1,165 @@
+"""Records a ROS 2 robot that speaks rmw_zenoh: who is there, and what was said before we came.
+
+Messages themselves arrive like any others. What is added here: the list of endpoints, the last
+messages of transient-local publishers (``/tf_static``, ``/robot_description``, maps), and what a
+person should know: types nobody can decode, definitions that differ, publishers that left.
+"""
+
+import contextlib
+import queue
+import threading
+from typing import Any, Protocol, runtime_checkable
+
+from bridge.errors import GstError, MissingDependencyError
+from bridge.wire import keys, rmw
+from bridge.wire.ros_types import is_known_definition, type_hash_of
+from bridge.wire.session import WireSample, WireSession
+
+HISTORY_TIMEOUT_S = 2.0
+MAX_ENDPOINTS = 10_000
+MAX_WARNINGS = 1_000
+
+
+@runtime_checkable
+class Receiver(Protocol):
+    """What takes messages; ``bridge.record.recorder.Recorder`` is one."""
+
+    def receive(self, sample: WireSample) -> None:
+        """Take a message; never waits."""
+
+
+class Ros2Graph:
+    """The ROS 2 endpoints on the network, followed from their liveliness tokens."""
+
+    def __init__(self, session: WireSession, recorder: Receiver) -> None:
+        """Use ``watch_ros2``."""
+        self._session = session
+        self._recorder = recorder
+        self._endpoints: dict[str, rmw.RosEndpoint] = {}
+        self._warnings: dict[str, None] = {}
+        self._lock = threading.Lock()
+        self._arrived: queue.SimpleQueue[rmw.RosEndpoint | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._work, name="ros2 history", daemon=True)
+        self._thread.start()
+        self._watching = session.watch_alive(rmw.TOKENS, self._on_token)
+
+    def endpoints(self) -> list[dict[str, Any]]:
+        """Everybody who is there, as JSON records, by topic."""
+        with self._lock:
+            found = sorted(self._endpoints.values(), key=lambda each: (each.topic, each.node))
+        return [
+            {
+                "kind": each.kind.name.lower(),
+                "node": each.node,
+                "domain": each.domain,
+                "topic": each.topic,
+                "type": each.type_name,
+                "type_hash": each.type_hash,
+                "qos": each.qos._asdict(),
+            }
+            for each in found
+        ]
+
+    def warnings(self) -> list[str]:
+        """What a person should know, oldest first, each once."""
+        with self._lock:
+            return list(self._warnings)
+
+    def close(self) -> None:
+        """Stop watching."""
+        self._watching.close()
+        self._arrived.put(None)
+        self._thread.join(timeout=2 * HISTORY_TIMEOUT_S + 1.0)
+
+    def _on_token(self, key: str, alive: bool) -> None:
+        """Note who came or went, on the network thread; nothing here may wait."""
+        endpoint = rmw.parse_token(key)
+        if endpoint is None:
+            return
+        with self._lock:
+            if not alive:
+                known = self._endpoints.pop(key, None)
+            elif len(self._endpoints) >= MAX_ENDPOINTS:
+                known = None
+            else:
+                known, self._endpoints[key] = endpoint, endpoint
+        if known is None or known.kind is not rmw.EntityKind.PUBLISHER:
+            return
+        if alive:
+            self._arrived.put(endpoint)
+        else:
+            self._warn(f"{known.topic}: the publisher in {known.node} left")
+
+    def _warn(self, text: str) -> None:
+        with self._lock:
+            if len(self._warnings) < MAX_WARNINGS:
+                self._warnings[text] = None
+
+    def _work(self) -> None:
+        while (endpoint := self._arrived.get()) is not None:
+            if endpoint.qos.transient_local:
+                with contextlib.suppress(GstError):  # the session is closing, or the key is no key
+                    self._fetch_history(endpoint)
+            self._check_type(endpoint)
+
+    def _fetch_history(self, endpoint: rmw.RosEndpoint) -> None:
+        """Hand over what the publisher sent before we listened, and nothing twice."""
+        live: set[tuple[object, ...]] = set()
+        listening = self._session.subscribe(endpoint.key, lambda each: live.add(_identity(each)))
+        try:
+            found = [
+                sample
+                for caches in _cache_keys(endpoint)
+                for sample in self._session.query_all(caches, timeout_s=HISTORY_TIMEOUT_S)
+            ]
+        finally:
+            listening.close()
+        for sample in found:
+            if _identity(sample) not in live:
+                live.add(_identity(sample))
+                self._recorder.receive(sample)
+
+    def _check_type(self, endpoint: rmw.RosEndpoint) -> None:
+        name, type_hash = endpoint.type_name, endpoint.type_hash
+        try:
+            newest = type_hash_of(name)
+            if newest is None:
+                self._warn(
+                    f"{endpoint.topic}: type {name} is not known here; its messages are kept "
+                    "under this name, without a definition"
+                )
+            elif type_hash != keys.NO_HASH and not is_known_definition(name, type_hash):
+                self._warn(
+                    f"{endpoint.topic}: {endpoint.node} was built with another definition of "
+                    f"{name} ({type_hash}) than any known here ({newest})"
+                )
+        except MissingDependencyError as error:
+            self._warn(str(error))
+
+
+def watch_ros2(session: WireSession, recorder: Receiver) -> Ros2Graph:
+    """Follow the ROS 2 endpoints on the network until ``close``.
+
+    Subscribe to the topics first: what is published meanwhile then arrives twice rather than not
+    at all, and the second copy is left out or counted as repeated.
+
+    Args:
+        session: An open session.
+        recorder: Gets the history of each transient-local publisher, once for each publisher.
+    """
+    return Ros2Graph(session, recorder)
+
+
+def _cache_keys(endpoint: rmw.RosEndpoint) -> tuple[str, str]:
+    """Where a transient-local publisher answers for its past.
+
+    The first is the cache of an AdvancedPublisher, the second the PublicationCache that
+    rmw_zenoh's first releases made.
+    """
+    return f"{endpoint.key}/@adv/**", f"{endpoint.session}/{endpoint.key}"
+
+
+def _identity(sample: WireSample) -> tuple[object, ...]:
+    if sample.sequence is None:
+        return (sample.data,)
+    return (sample.source_gid, sample.sequence)

@@ -1,0 +1,235 @@
+"""A ROS 2 node over rmw_zenoh in a process of its own, recorded and read by others' readers."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.run import RunFolder
+from bridge.record.recorder import Recorder
+from bridge.record.ros2 import Ros2Graph, watch_ros2
+from bridge.wire.config import WireConfig
+from bridge.wire.session import WireSample, WireSession, open_session
+
+ROOT = Path(__file__).resolve().parents[3]
+CHILD = Path(__file__).with_name("rmw_child.py")
+STRING = "std_msgs/msg/String"
+
+pytestmark = pytest.mark.slow
+
+
+class Robot:
+    """One emulated ROS 2 node."""
+
+    def __init__(self, endpoint: str, *arguments: str) -> None:
+        """Start it; it says nothing yet."""
+        self.process = subprocess.Popen(
+            [sys.executable, str(CHILD), endpoint, *arguments],
+            cwd=ROOT,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def speak(self) -> None:
+        """Send its messages and wait until they are on their way."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write("go\n")
+        self.process.stdin.flush()
+        assert self.process.stdout.readline().strip() == "sent"
+
+    def leave(self) -> None:
+        self.process.communicate(timeout=30.0)
+
+
+class Cell:
+    """A router with a recorder and the ROS 2 graph, and what reached the recorder."""
+
+    def __init__(self, session: WireSession, endpoint: str, run: RunFolder) -> None:
+        """Start recording."""
+        self.session, self.endpoint, self.run = session, endpoint, run
+        self.recorder = Recorder(run, now_ns=session.now_ns)
+        self.got: list[WireSample] = []
+        self.robots: list[Robot] = []
+        self.graph: Ros2Graph | None = None
+
+    def receive(self, sample: WireSample) -> None:
+        self.got.append(sample)
+        self.recorder.receive(sample)
+
+    def listen(self) -> Ros2Graph:
+        self.session.subscribe("**", self.receive)
+        self.graph = watch_ros2(self.session, self)
+        return self.graph
+
+    def robot(self, *arguments: str) -> Robot:
+        self.robots.append(Robot(self.endpoint, *arguments))
+        return self.robots[-1]
+
+    def wait_for(self, condition: Callable[[], bool], what: str) -> None:
+        end_s = time.monotonic() + 30.0
+        while not condition():
+            assert time.monotonic() < end_s, f"{what} did not happen"
+            time.sleep(0.01)
+
+
+@pytest.fixture
+def cell(run: RunFolder) -> Iterator[Cell]:
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
+        made = Cell(session, endpoint, run)
+        yield made
+        for robot in made.robots:
+            robot.process.kill()
+            robot.process.communicate()
+        if made.graph is not None:
+            made.graph.close()
+        made.recorder.close()
+
+
+def read(path: Path) -> list[tuple[Any, Any, Any]]:
+    with path.open("rb") as stream:
+        return [
+            each
+            for each in make_reader(stream, validate_crcs=True).iter_messages()
+            if each[1].topic == "/chatter"
+        ]
+
+
+@pytest.mark.parametrize("form", ["33", "77", "0"])
+def test_a_topic_is_recorded_so_that_others_can_decode_it(cell: Cell, form: str) -> None:
+    graph = cell.listen()
+    cell.recorder.start(EpisodeInfo(id="t1", kind="trial"))
+    robot = cell.robot(form, "20")
+    robot.speak()
+    cell.wait_for(lambda: len(cell.got) == 20, "the messages")
+    cell.wait_for(lambda: bool(graph.endpoints()), "the token")
+    answer = cell.recorder.stop()
+    found = read(cell.run.episodes_dir / "t1.mcap")
+    assert (len(found), answer["lost"]) == (20, 0)
+    schema, channel, _ = found[0]
+    assert (schema.name, schema.encoding, channel.message_encoding) == (STRING, "ros2msg", "cdr")
+    # Decoded by the definition in the file, not by one that rosbags has.
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(schema.data.decode(), schema.name))
+    texts = [store.deserialize_cdr(each.data, schema.name).data for _, _, each in found]
+    assert texts == [f"hello {number}" for number in range(20)]
+    if form != "0":
+        assert [each.sequence for _, _, each in found] == list(range(20))
+        assert [each.publish_time for _, _, each in found] == [1_000 + n for n in range(20)]
+    assert graph.endpoints() == [
+        {
+            "kind": "publisher",
+            "node": "/talker",
+            "domain": 0,
+            "topic": "/chatter",
+            "type": STRING,
+            "type_hash": get_typestore(Stores.ROS2_JAZZY).hash_rihs01(STRING),
+            "qos": {"reliable": True, "transient_local": False, "depth": 20, "keep_all": False},
+        }
+    ]
+    assert graph.warnings() == []
+    robot.leave()
+    cell.wait_for(lambda: graph.endpoints() == [], "the end of the token")
+    assert graph.warnings() == ["/chatter: the publisher in /talker left"]
+
+
+@pytest.mark.parametrize("flag", ["latched", "old-latched"])
+def test_what_was_said_before_we_came_is_recorded_once(cell: Cell, flag: str) -> None:
+    robot = cell.robot("33", "5", flag)
+    robot.speak()
+    cell.recorder.start(EpisodeInfo(id="t1", kind="trial"))
+    cell.listen()
+    cell.wait_for(lambda: len(cell.got) == 5, "the history")
+    robot.speak()
+    cell.wait_for(lambda: len(cell.got) >= 10, "the news")
+    time.sleep(0.2)
+    answer = cell.recorder.stop()
+    assert [sample.sequence for sample in cell.got] == list(range(10))
+    assert {sample.type_name for sample in cell.got} == {STRING}
+    found = read(cell.run.episodes_dir / "t1.mcap")
+    assert [each.sequence for _, _, each in found] == list(range(10))
+    assert answer["lost"] == 0
+
+
+def test_a_publisher_that_comes_later_is_not_recorded_twice(cell: Cell) -> None:
+    graph = cell.listen()
+    robot = cell.robot("33", "50", "latched")
+    for _ in range(10):
+        robot.speak()
+    cell.wait_for(lambda: len(cell.got) >= 500, "the messages")
+    graph.close()
+    numbers = [sample.sequence for sample in cell.got]
+    assert sorted(numbers) == list(range(500))
+
+
+def test_without_a_listener_for_history_the_past_is_missed(cell: Cell) -> None:
+    """The reason for the test above: a plain subscription gets nothing of the past."""
+    cell.robot("33", "5", "latched").speak()
+    cell.session.subscribe("**", cell.receive)
+    time.sleep(0.5)
+    assert cell.got == []
+
+
+def test_another_definition_is_flagged_and_kept_apart(cell: Cell) -> None:
+    graph = cell.listen()
+    cell.recorder.start(EpisodeInfo(id="t1", kind="trial"))
+    cell.robot("33", "3").speak()
+    cell.robot("33", "3", "other-hash").speak()
+    cell.wait_for(lambda: len(cell.got) == 6, "the messages of both")
+    cell.wait_for(lambda: bool(graph.warnings()), "the warning")
+    cell.recorder.stop()
+    assert graph.warnings()[0].startswith(
+        "/chatter: /talker was built with another definition of std_msgs/msg/String (RIHS01_555"
+    )
+    found = read(cell.run.episodes_dir / "t1.mcap")
+    assert len(found) == 6
+    assert len({channel.id for _, channel, _ in found}) == 2
+    assert {schema.encoding for schema, _, _ in found} == {"ros2msg", ""}
+
+
+def test_an_unknown_type_is_recorded_by_its_name_and_flagged(cell: Cell) -> None:
+    graph = cell.listen()
+    cell.recorder.start(EpisodeInfo(id="t1", kind="trial"))
+    cell.robot("33", "3", "unknown").speak()
+    cell.wait_for(lambda: len(cell.got) == 3, "the messages")
+    cell.wait_for(lambda: bool(graph.warnings()), "the warning")
+    cell.recorder.stop()
+    assert "type my_msgs/msg/Grip is not known here" in graph.warnings()[0]
+    found = read(cell.run.episodes_dir / "t1.mcap")
+    assert [each.sequence for _, _, each in found] == [0, 1, 2]
+    assert {(schema.name, schema.encoding) for schema, _, _ in found} == {("my_msgs/msg/Grip", "")}
+
+
+def test_a_killed_robot_is_noticed(cell: Cell) -> None:
+    graph = cell.listen()
+    robot = cell.robot("33", "1")
+    cell.wait_for(lambda: bool(graph.endpoints()), "the token")
+    robot.process.kill()
+    cell.wait_for(lambda: bool(graph.warnings()), "the end of the token")
+    assert graph.endpoints() == []
+
+
+def test_hostile_tokens_change_nothing(cell: Cell) -> None:
+    graph = cell.listen()
+    with open_session(WireConfig(connect=(cell.endpoint,))) as other:
+        other.declare_alive("@ros2_lv/0/z/0/1/MP/%/%/n/%$*/a::msg::B_/RIHS01_x/:1:,1")
+        other.declare_alive("@ros2_lv/nonsense")
+        other.declare_alive("@ros2_lv/0/z/0/1/NN/%/%/" + "n" * 10_000)
+        cell.wait_for(lambda: bool(graph.endpoints()), "the long name")
+    cell.wait_for(lambda: not graph.endpoints(), "its end")
+    assert graph.warnings() == []
