@@ -1,8 +1,11 @@
 """Time as integer nanoseconds, and a wall clock that never runs backwards."""
 
 import time
+from collections.abc import Callable
 
 NS_PER_S = 1_000_000_000
+STEP_NS = 50_000_000
+"""A system clock that moves this far at once was set, not trimmed."""
 
 
 def ns_from_s(seconds: float) -> int:
@@ -31,10 +34,52 @@ class AnchoredClock:
     A step of the system clock (NTP, a person) cannot reorder messages stamped with it.
     """
 
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        *,
+        wall_ns: Callable[[], int] = time.time_ns,
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         """Anchor the monotonic clock to the wall clock once."""
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
+        self._monotonic_ns = monotonic_ns
+        self._offset_ns = wall_ns() - monotonic_ns()
 
     def now_ns(self) -> int:
         """Return nanoseconds since the Unix epoch."""
-        return self._offset_ns + time.monotonic_ns()
+        return self._offset_ns + self._monotonic_ns()
+
+
+class StepWatch:
+    """Notices steps of the system clock, by comparing it with one that has none."""
+
+    def __init__(
+        self, now_ns: Callable[[], int], *, wall_ns: Callable[[], int] = time.time_ns
+    ) -> None:
+        """Remember how far the clocks are apart now.
+
+        Args:
+            now_ns: A clock without steps.
+            wall_ns: The system clock.
+        """
+        self._now_ns = now_ns
+        self._wall_ns = wall_ns
+        self._apart_ns = wall_ns() - now_ns()
+
+    def _read(self) -> int | None:
+        """How far the clocks are apart; None when something came between reading them."""
+        before_ns = self._now_ns()
+        wall_ns = self._wall_ns()
+        if self._now_ns() - before_ns > STEP_NS // 10:
+            return None
+        return wall_ns - before_ns
+
+    def step_ns(self) -> int:
+        """Return the step since the last call [ns], or 0 where there was none.
+
+        Forward is positive. Trimming (NTP slewing) stays far below ``STEP_NS`` from call to call.
+        """
+        apart_ns = self._read()
+        if apart_ns is None:
+            return 0
+        moved_ns, self._apart_ns = apart_ns - self._apart_ns, apart_ns
+        return moved_ns if abs(moved_ns) > STEP_NS else 0

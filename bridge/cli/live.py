@@ -121,7 +121,7 @@ def ctl(
         output: How to talk.
     """
     from bridge.errors import UsageError
-    from bridge.record.process import describe_status
+    from bridge.record.status import describe_status
     from bridge.wire.config import WireConfig
     from bridge.wire.recorder_client import RecorderClient
     from bridge.wire.session import open_session

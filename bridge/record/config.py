@@ -1,10 +1,60 @@
 """How the recorder behaves."""
 
 from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
 
 from bridge.errors import refuse_outside
 
 BYTES_PER_MB = 1_000_000
+UNBOUNDED = float("inf")
+
+
+@dataclass(frozen=True, kw_only=True)
+class QueueConfig:
+    """How much may wait in memory, and what is too much to take."""
+
+    camera_queue_mb: int = 256
+    """Memory for images not yet written [MB]; they are thinned as it fills, then dropped."""
+    small_queue_mb: int = 16
+    """Memory for everything else [MB]; its own, so that images never evict joints."""
+    max_message_mb: float = 64.0
+    """Larger messages are dropped and counted [MB]."""
+    max_rate_hz: int = 20_000
+    """Messages of one topic beyond this many in a second are dropped and counted [1/s]."""
+    max_topics: int = 4096
+    """Messages of further topics in one episode are dropped and counted."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers with which nothing could be recorded."""
+        names = ("camera_queue_mb", "small_queue_mb", "max_rate_hz", "max_topics")
+        refuse_outside(self, dict.fromkeys(names, (1, UNBOUNDED)))
+        refuse_outside(self, {"max_message_mb": (0.001, UNBOUNDED)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiskConfig:
+    """How episodes lie on the disk, and how much of it is left alone."""
+
+    min_free_mb: int = 500
+    """No episode starts with less free space than this, and an open one is finished at it [MB]."""
+    footer_mb: int = 64
+    """Space held back so that an episode can be finished on a full disk [MB]; 0 holds none."""
+    split_mb: int = 0
+    """Begin a new file of the same episode after this much [MB]; 0 never does."""
+    split_s: float = 0.0
+    """Begin a new file of the same episode after this long [s]; 0 never does."""
+    flush_s: float = 0.25
+    """What a crash of the recorder may cost, at most [s]."""
+    sync_s: float = 2.0
+    """What a power cut may cost, at most [s]."""
+
+    def __post_init__(self) -> None:
+        """Refuse negative sizes and times."""
+        refuse_outside(self, dict.fromkeys(("min_free_mb", "footer_mb"), (0, UNBOUNDED)))
+        refuse_outside(self, dict.fromkeys(("split_mb", "split_s"), (0, UNBOUNDED)))
+        refuse_outside(self, dict.fromkeys(("flush_s", "sync_s"), (0.01, UNBOUNDED)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,21 +65,32 @@ class RecorderConfig:
     """Name of this recorder in its control keys ``rec/<name>/ctl/...``."""
     topics: tuple[str, ...] = ("**",)
     """Zenoh key expressions to record; ``**`` is everything."""
-    queue_mb: int = 256
-    """Memory for messages not yet written [MB]; what comes on top is dropped and counted."""
-    small_reserve_mb: int = 16
-    """Part of it that only messages under 64 kB may use, so that images never evict joints [MB]."""
-    max_topics: int = 4096
-    """Messages of further topics in one episode are dropped and counted."""
+    color: Literal["jpeg", "as_is"] = "jpeg"
+    """Raw colour images: compress as JPEG, or keep every byte."""
+    jpeg_quality: int = 90
+    """Of colour that is compressed here, 1 to 100."""
+    depth: Literal["raw", "compact"] = "raw"
+    """Raw depth images: keep them (every viewer reads those), or compress without loss (RVL)."""
+    preview_video: bool = False
+    """Add an H.264 video of each raw colour stream, for people; needs the extra [video]."""
+    preview_hz: float = 5.0
+    """At most this many small pictures a second for whoever watches; 0 makes none [1/s]."""
+    preroll_s: float = 0.0
+    """Begin each episode this long before its start [s]; 0 begins at the start."""
+    preroll_mb: int = 512
+    """Memory for those seconds [MB]; with less, an episode begins later."""
     command_timeout_s: float = 60.0
     """A start or stop that the disk has not carried out after this long is reported [s]."""
+    queues: Annotated[QueueConfig, Parameter(name="*")] = QueueConfig()
+    """Memory and limits."""
+    disk: Annotated[DiskConfig, Parameter(name="*")] = DiskConfig()
+    """Files and free space."""
 
     def __post_init__(self) -> None:
         """Refuse numbers with which nothing could be recorded."""
-        most = float("inf")
-        refuse_outside(self, {"queue_mb": (1, most), "max_topics": (1, most)})
-        refuse_outside(self, {"small_reserve_mb": (0, self.queue_mb)})
-        refuse_outside(self, {"command_timeout_s": (0.1, most)})
+        refuse_outside(self, {"jpeg_quality": (1, 100), "command_timeout_s": (0.1, UNBOUNDED)})
+        refuse_outside(self, {"preview_hz": (0, 1000), "preroll_s": (0, 3600)})
+        refuse_outside(self, {"preroll_mb": (1, UNBOUNDED)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,3 +115,5 @@ class EpisodeAbout:
     """Which robot."""
     cell: str = ""
     """Name of the cell, as in its topics."""
+    tags: tuple[str, ...] = ()
+    """Words to find it by."""

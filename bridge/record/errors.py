@@ -13,13 +13,31 @@ class ControlError(UsageError):
     """A control command is malformed."""
 
 
-class DiskError(BridgeError):
-    """The episode could not be written; only its ``.part`` file is left."""
+class NoSpaceError(BridgeError):
+    """An episode was not started: the disk has too little space."""
 
-    def __init__(self, *, part_path: Path, cause: str) -> None:
-        """Remember the file that was being written."""
-        self.part_path = part_path
+    def __init__(self, *, folder: Path, free_mb: int, wanted_mb: int) -> None:
+        """Remember how much there was."""
+        self.folder = folder
         super().__init__(
-            f"cannot write {part_path}: {cause}. The recorder stopped; what was written until "
-            "then is in that file. Free some space or choose another disk, then record again."
+            f"{folder} has {free_mb} MB free, and {wanted_mb} MB must be left. Free some space, "
+            "choose another disk, or lower --min-free-mb and --footer-mb."
+        )
+
+
+class DiskError(BridgeError):
+    """The disk ended a recording."""
+
+    def __init__(self, *, path: Path, cause: str, is_finished: bool) -> None:
+        """Remember the file, and whether it could be finished."""
+        self.path = path
+        self.is_finished = is_finished
+        kept = (
+            "The episode was finished with all that was written until then"
+            if is_finished
+            else "What was written until then is in that file; robot-gst recover finishes it"
+        )
+        super().__init__(
+            f"cannot write {path}: {cause}. The recorder stopped. {kept}. "
+            "Free some space or choose another disk, then record again."
         )

@@ -1,9 +1,21 @@
-"""Looks whether a message is what its type says. Recording never depends on the answer."""
+"""Looks whether a message is what its type says. Recording never depends on the answer.
+
+Only what is cheap is looked at: the structure of the message, an image's size against its bytes,
+the first and last bytes of a JPEG. ``robot-gst check`` decodes everything afterwards.
+"""
 
 import json
+import struct
+from collections.abc import Callable
 from enum import StrEnum
+from functools import lru_cache
 
 from bridge.episode import cdr, schema
+from bridge.episode.transcode import DEPTH_ENCODINGS, ImageHeader, image_header
+
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_TAIL_BYTES = 64
+"""Cameras may pad a JPEG behind its end mark."""
 
 
 class Finding(StrEnum):
@@ -15,32 +27,66 @@ class Finding(StrEnum):
     UNKNOWN_TYPE = "unknown_type"
 
 
+GOOD = Finding.GOOD
+"""Looked up for every message."""
+
+
 def resolve_type(topic: str, type_name: str) -> str:
     """Trust the publisher's type name; without one, go by the topic."""
     return type_name or schema.type_of_topic(topic) or ""
 
 
 def inspect(type_name: str, message_encoding: str, data: bytes) -> Finding:
-    """Decode a message of a known type and throw the result away."""
+    """Check a message without building anything from it."""
+    return inspector(type_name, message_encoding)(data)
+
+
+@lru_cache(maxsize=4096)
+def inspector(type_name: str, message_encoding: str) -> Callable[[bytes], Finding]:
+    """Return the check for the messages of one type."""
     known = schema.schema_for(type_name) if type_name else None
     if known is None:
-        return Finding.UNKNOWN_TYPE
+        return lambda data: Finding.UNKNOWN_TYPE
     if message_encoding not in ("", known.message_encoding):
-        return Finding.UNDECODABLE
-    if known.message_encoding == "cdr":
-        return _inspect_cdr(type_name, data)
-    return _inspect_json(type_name, data)
+        return lambda data: Finding.UNDECODABLE
+    if known.message_encoding != "cdr":
+        version = schema.json_schema_version(type_name)
+        return lambda data: _inspect_json(version, data)
+    return lambda data: _inspect_cdr(type_name, data)
 
 
 def _inspect_cdr(type_name: str, data: bytes) -> Finding:
     try:
-        cdr.decode(type_name, data)
+        if type_name == schema.IMAGE:
+            return GOOD if fits(image_header(data)) else Finding.UNDECODABLE
+        cdr.validate(type_name, data)
     except cdr.MalformedMessageError:
         return Finding.UNDECODABLE
-    return Finding.GOOD
+    if type_name == schema.COMPRESSED_IMAGE and _is_cut_jpeg(data):
+        return Finding.UNDECODABLE
+    return GOOD
 
 
-def _inspect_json(type_name: str, data: bytes) -> Finding:
+def fits(header: ImageHeader) -> bool:
+    """Say whether an image has as many bytes as its size and step ask for."""
+    if header.data_length != header.height * header.step:
+        return False
+    return header.encoding not in DEPTH_ENCODINGS or header.step >= 2 * header.width
+
+
+def _is_cut_jpeg(data: bytes) -> bool:
+    """Say whether a sensor_msgs/CompressedImage begins as a JPEG and does not end as one."""
+    order = "<I" if data[1] else ">I"
+    at = 12  # behind the encapsulation and the stamp
+    for _ in ("frame_id", "format"):
+        (length,) = struct.unpack_from(order, data, at)
+        at += 4 + length
+        at += -at % 4
+    at += 4
+    return data.startswith(_JPEG_START, at) and _JPEG_END not in data[-_TAIL_BYTES:]
+
+
+def _inspect_json(newest: int, data: bytes) -> Finding:
     try:
         record = json.loads(data)
     except (ValueError, RecursionError):
@@ -50,6 +96,6 @@ def _inspect_json(type_name: str, data: bytes) -> Finding:
     version = record.get("schema_version", 1)
     if not isinstance(version, int):
         return Finding.UNDECODABLE
-    if version > schema.json_schema_version(type_name):
+    if version > newest:
         return Finding.NEWER_VERSION
-    return Finding.GOOD
+    return GOOD

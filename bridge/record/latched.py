@@ -31,6 +31,11 @@ class LatchedMessages:
         if len(self._kept) < MAX_LATCHED:
             self._kept[sample.topic, frames] = sample
 
+    def forget(self, prefix: str) -> None:
+        """Drop the messages of topics that begin so: their publisher has gone."""
+        for key in [key for key in self._kept if key[0].startswith(prefix)]:
+            del self._kept[key]
+
     def all(self) -> list[WireSample]:
         """What to write at the start of an episode, oldest first."""
         return list(self._kept.values())

@@ -1,24 +1,37 @@
-"""What was received and what was lost: per topic and second, and in total."""
+"""What was received and what was lost: per topic and second, and in total.
+
+Of every topic, as long as its messages are numbered:
+sent = received - repeated + gaps + queue_drops + shed.
+"""
 
 import json
+import threading
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
-from bridge.record.inspection import Finding
-from bridge.record.intake import Dropped, Received, second_of
+from bridge.record.entries import MAX_WARNINGS, Dropped, Item, second_of
+from bridge.record.inspection import GOOD, Finding
+
+OTHER_TOPICS = "(further topics)"
+"""The account of topics beyond those an episode may have."""
 
 
-@dataclass(kw_only=True)
+@dataclass(kw_only=True, slots=True)
 class Tally:
     """Counts of one topic."""
 
     received: int = 0
     """Written to the episode."""
     gaps: int = 0
-    """Lost before they reached the recorder, by the publishers' numbers."""
+    """Lost before they reached the recorder, by the publishers' numbers. Negative in a second in
+    which more of them arrived late than went missing."""
     queue_drops: int = 0
     """Reached the recorder, which could not keep them."""
+    shed: int = 0
+    """Reached the recorder, which left them out so that it could keep the others."""
+    reduced: int = 0
+    """Images written at less than the wanted quality, for the same reason."""
     undecodable: int = 0
     """Written as they are, but not what their type says."""
     newer_version: int = 0
@@ -26,53 +39,119 @@ class Tally:
     unknown_type: int = 0
     """Written as they are, of a type this software does not know."""
     repeated: int = 0
-    """Numbers that were seen before, or arrived late."""
+    """Written although their number was written before."""
     unnumbered: int = 0
     """Without a sequence number, so that losses cannot be seen."""
     bytes: int = 0
+    """As they came over the wire."""
+    clock_offset_ns: int | None = None
+    """The least time from publishing to receiving: transport delay plus clock offset."""
 
     def add(self, other: "Tally") -> None:
         """Add another tally to this one."""
-        for name, value in asdict(other).items():
-            setattr(self, name, getattr(self, name) + value)
+        for name in _COUNTS:
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        if other.clock_offset_ns is not None:
+            self.see_offset(other.clock_offset_ns)
+
+    def see_offset(self, offset_ns: int) -> None:
+        """Keep the least offset."""
+        if self.clock_offset_ns is None or offset_ns < self.clock_offset_ns:
+            self.clock_offset_ns = offset_ns
+
+    @property
+    def lost(self) -> int:
+        """Everything that was sent and is not in the episode."""
+        return self.gaps + self.queue_drops + self.shed
+
+    def to_record(self) -> dict[str, Any]:
+        """Counts by name."""
+        return {name: getattr(self, name) for name in _NAMES}
+
+
+_NAMES = tuple(item.name for item in fields(Tally))
+_COUNTS = tuple(name for name in _NAMES if name != "clock_offset_ns")
 
 
 class Ledger:
-    """The accounts of one episode."""
+    """The accounts of one episode. Written by one thread; totals may be read by any."""
 
-    def __init__(self) -> None:
+    def __init__(self, max_topics: int = 4096) -> None:
         """Start empty."""
+        self.warnings: list[str] = []
+        self._max_topics = max_topics
         self._totals: dict[str, Tally] = {}
         self._open: dict[tuple[int, str], Tally] = {}
+        self._closing = threading.Lock()
+        self._spans: list[tuple[int, int | None]] = [(0, None)]
+
+    def begin(self, ticket: int) -> None:
+        """Count what carries this ticket or a later one."""
+        self._spans = [(ticket, None)]
+
+    def pause(self, ticket: int) -> None:
+        """Count nothing from this ticket on."""
+        self._spans[-1] = (self._spans[-1][0], ticket)
+
+    def resume(self, ticket: int) -> None:
+        """Count again from this ticket on."""
+        self._spans.append((ticket, None))
+
+    def warn(self, text: str) -> None:
+        """Keep a remark about the recording; each is kept once."""
+        if text not in self.warnings and len(self.warnings) < MAX_WARNINGS:
+            self.warnings.append(text)
 
     def _tally(self, topic: str, second: int) -> Tally:
-        return self._open.setdefault((second, topic), Tally())
+        tally = self._open.get((second, topic))
+        if tally is None:
+            if topic not in self._totals:
+                if len(self._totals) >= self._max_topics and topic != OTHER_TOPICS:
+                    return self._tally(OTHER_TOPICS, second)
+                self._totals[topic] = Tally()
+            tally = self._open[second, topic] = Tally()
+        return tally
 
-    def count_received(self, entry: Received, finding: Finding) -> None:
+    def _book(self, tally: Tally, item: Item) -> None:
+        step = item.step
+        tally.gaps += step.gap
+        if step.fills is not None and self._was_booked(step.fills):
+            tally.gaps -= 1
+
+    def _was_booked(self, ticket: int) -> bool:
+        return any(first <= ticket and (end is None or ticket < end) for first, end in self._spans)
+
+    def count_received(self, item: Item, finding: Finding) -> None:
         """Book a message that was written."""
-        sample = entry.sample
+        sample = item.sample
         tally = self._tally(sample.topic, second_of(sample.received_ns))
         tally.received += 1
-        tally.bytes += len(sample.data)
-        tally.gaps += entry.step.gap
-        tally.repeated += entry.step.repeated
+        tally.bytes += item.size
+        self._book(tally, item)
+        tally.repeated += item.step.repeated
         tally.unnumbered += sample.sequence is None
-        if finding is not Finding.GOOD:
+        tally.reduced += item.reduced
+        if sample.source_ns is not None:
+            tally.see_offset(sample.received_ns - sample.source_ns)
+        if finding is not GOOD:
             setattr(tally, finding.value, getattr(tally, finding.value) + 1)
 
-    def count_refused(self, entry: Received) -> None:
+    def count_refused(self, item: Item) -> None:
         """Book a message that came out of the queue but could not be written."""
-        sample = entry.sample
+        sample = item.sample
         tally = self._tally(sample.topic, second_of(sample.received_ns))
-        tally.queue_drops += 1
-        tally.gaps += entry.step.gap
+        tally.queue_drops += not item.step.repeated
+        self._book(tally, item)
 
     def count_dropped(self, dropped: Dropped) -> None:
-        """Book messages the queue had no room for."""
+        """Book messages that were not taken in."""
         for (topic, second), count in dropped.counts.items():
             tally = self._tally(topic, second)
             tally.queue_drops += count.messages
-            tally.gaps += count.gaps
+            tally.shed += count.shed
+            tally.gaps += count.gaps - sum(map(self._was_booked, count.fills))
+        for text in dropped.warnings:
+            self.warn(text)
 
     def close_seconds(self, before: int | None = None) -> Iterator[dict[str, Any]]:
         """Yield a drops record for each topic and second that is over, and forget it.
@@ -83,15 +162,18 @@ class Ledger:
         for second, topic in sorted(self._open):
             if before is not None and second >= before:
                 continue
-            tally = self._open.pop((second, topic))
-            self._totals.setdefault(topic, Tally()).add(tally)
-            yield {"schema_version": 1, "topic": topic, "second": second, **asdict(tally)}
+            with self._closing:
+                tally = self._open.pop((second, topic))
+                self._totals[topic].add(tally)
+            yield {"schema_version": 1, "topic": topic, "second": second, **tally.to_record()}
 
     def totals(self) -> dict[str, Tally]:
         """Counts by topic, seconds still open included."""
-        totals = {topic: Tally(**asdict(tally)) for topic, tally in self._totals.items()}
-        for (_, topic), tally in self._open.items():
-            totals.setdefault(topic, Tally()).add(tally)
+        with self._closing:
+            closed, still_open = self._totals.copy(), self._open.copy()
+            totals = {topic: Tally(**tally.to_record()) for topic, tally in closed.items()}
+            for (_, topic), tally in still_open.items():
+                totals.setdefault(topic, Tally()).add(tally)
         return dict(sorted(totals.items()))
 
     def total(self) -> Tally:
@@ -102,7 +184,8 @@ class Ledger:
         return total
 
     def to_metadata(self) -> dict[str, str]:
-        """The ``drops`` metadata record: totals, and counts by topic."""
-        record = {name: json.dumps(value) for name, value in asdict(self.total()).items()}
-        by_topic = {topic: asdict(tally) for topic, tally in self.totals().items()}
-        return {**record, "topics": json.dumps(by_topic)}
+        """The ``drops`` metadata record: totals, counts by topic, and warnings."""
+        record = {name: json.dumps(value) for name, value in self.total().to_record().items()}
+        by_topic = {topic: tally.to_record() for topic, tally in self.totals().items()}
+        warnings = json.dumps(self.warnings)
+        return {**record, "topics": json.dumps(by_topic), "warnings": warnings}

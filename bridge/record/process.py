@@ -14,6 +14,7 @@ from bridge.record.config import EpisodeAbout, RecorderConfig
 from bridge.record.control import serve_control
 from bridge.record.keyboard import HELP, Keys, single_keys
 from bridge.record.recorder import Recorder
+from bridge.record.status import describe_status
 from bridge.terminal import Output
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import is_loopback
@@ -120,26 +121,6 @@ def _watch(
                 rate_hz = max(0, messages - last_messages) / (now_s - last_s)
                 last_messages, last_s = messages, now_s
                 show(describe_status(status, rate_hz))
-
-
-def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str:
-    """One line for people."""
-    free = f"{status['disk_free_bytes'] / 1e9:.1f} GB free"
-    if status["state"] == "failed":
-        return f"failed: {status['error']}"
-    if status["state"] == "idle":
-        return f"idle, {len(status['seen'])} topics seen, {free}"
-    rate = "" if rate_hz is None else f" ({rate_hz:.0f}/s)"
-    flags = "".join(
-        f", {status[name]} {name.replace('_', ' ')}"
-        for name in ("undecodable", "unknown_type")
-        if status[name]
-    )
-    return (
-        f"recording {status['episode']}: {status['duration_s']:.1f} s, "
-        f"{status['messages']} messages{rate}, {status['bytes'] / 1e6:.1f} MB, "
-        f"{status['lost']} lost{flags}, queue {status['queue_bytes'] / 1e6:.1f} MB, {free}"
-    )
 
 
 @contextmanager

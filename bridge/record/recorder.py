@@ -1,38 +1,52 @@
 """The recorder: messages and commands go in, episodes come out.
 
-One writer thread does everything that touches the disk, in the order things arrived.
+Network threads fill the queues, one thread for each image stream encodes, and one writer thread
+does everything that touches the disk.
 """
 
 import contextlib
-import shutil
 import threading
+import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import asdict, replace
-from typing import Any
+from dataclasses import replace
 
-from bridge.clock import s_from_ns
+from bridge.clock import StepWatch
 from bridge.episode import metadata
 from bridge.episode.catalogue import label_episode
 from bridge.episode.run import RunFolder, check_episode_id
-from bridge.errors import BridgeError, GstError, UsageError
+from bridge.errors import BridgeError, GstError
 from bridge.record.config import RecorderConfig
+from bridge.record.encoders import EncoderThreads, ImageEncoder, Preview
+from bridge.record.entries import Command, Dropped, Item
 from bridge.record.errors import DiskError, LifecycleError
-from bridge.record.intake import Command, Dropped, Entry, Intake, Received
-from bridge.record.latched import LatchedMessages
-from bridge.record.take import Take
+from bridge.record.intake import Intake
+from bridge.record.lifecycle import Answer, Lifecycle
+from bridge.record.merge import Merge
+from bridge.record.status import Status
 from bridge.wire.session import WireSample
 
-POLL_S = 0.25
-Answer = dict[str, Any]
+POLL_S = 0.02
+"""The writer looks for messages this often rather than being woken by each."""
+IDLE_POLL_S = 0.1
+BARRIER_POLL_S = 0.002
+SECOND_S = 1.0
+LAST_IMAGES_S = 2.0
+"""How long a failed disk waits for images in the encoders, to count them."""
 
 
 class Recorder:
     """Idle until ``start``; records one episode at a time into a run folder."""
 
     def __init__(
-        self, run: RunFolder, *, now_ns: Callable[[], int], config: RecorderConfig | None = None
+        self,
+        run: RunFolder,
+        *,
+        now_ns: Callable[[], int],
+        config: RecorderConfig | None = None,
+        preview: Preview = lambda sample, kind: None,
+        wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """Start the writer thread.
 
@@ -40,36 +54,52 @@ class Recorder:
             run: Where episodes go.
             now_ns: The clock that also stamps received messages.
             config: Settings.
+            preview: Called with images of which somebody wants a preview.
+            wall_ns: The system clock, watched for steps.
         """
         self.config = config or RecorderConfig()
         self.failed = threading.Event()
-        self.error: DiskError | None = None
-        self.last_episode: str | None = None
-        self._run = run
         self._now_ns = now_ns
-        self._intake = Intake(self.config)
-        self._latched = LatchedMessages()
-        self._seen: dict[str, int] = {}
-        self._unwritable: set[str] = set()
-        self._take: Take | None = None
-        self._state_lock = threading.Lock()
-        self._closing = False
+        self._run = run
+        encoder = ImageEncoder(self.config, lambda: self.intake.shed)
+        self._encoders = EncoderThreads(encoder, self._take_back, preview)
+        self.intake = Intake(self.config.queues, self._encoders.submit, encoder.kinds)
+        self._merge = Merge()
+        self._life = Lifecycle(run, self.config, lambda: self.intake.queued_bytes)
+        self._status = Status(run, self.config, self.intake, self._life, now_ns)
+        self._steps = StepWatch(now_ns, wall_ns=wall_ns)
+        self._next_second_s = 0.0
+        if self._life.is_quiet:
+            self.intake.be_quiet(0)
         self._thread = threading.Thread(target=self._work, name="episode writer", daemon=True)
         self._thread.start()
 
+    @property
+    def error(self) -> DiskError | None:
+        """What the disk said when it ended the recording."""
+        return self._life.error
+
+    @property
+    def last_episode(self) -> str | None:
+        """Id of the episode that was finished last."""
+        return self._life.last_episode
+
     def receive(self, sample: WireSample) -> None:
         """Take a message from the network; never waits."""
-        self._intake.put(sample)
+        self.intake.put(sample)
+
+    def _take_back(self, item: Item, saved: int) -> None:
+        self.intake.put_image(item, saved)
 
     def start(self, info: metadata.EpisodeInfo) -> Answer:
-        """Begin an episode.
+        """Begin an episode, with the pre-roll if there is one.
 
         Raises:
             UsageError: When the id is unsafe, taken, or another episode is being recorded.
-            BridgeError: When the folder cannot be written.
+            BridgeError: When the folder cannot be written, or has too little space.
         """
         check_episode_id(info.id)
-        return self._command(lambda stamp_ns: self._start(info, stamp_ns))
+        return self._command(lambda command: self._life.start(info, command))
 
     def stop(
         self,
@@ -80,177 +110,47 @@ class Recorder:
     ) -> Answer:
         """Finish the episode, or throw it away, after everything received so far."""
         return self._command(
-            lambda stamp_ns: self._stop(outcome, discard=discard, reason=reason, end_ns=stamp_ns)
+            lambda command: self._life.stop(outcome, command, discard=discard, reason=reason)
         )
 
     def mark(self, text: str) -> Answer:
-        """Note this instant in the episode."""
-        return self._command(lambda stamp_ns: self._event("mark", stamp_ns, text, None))
+        """Note this instant in the episode; does not wait for images in work."""
+        return self._command(
+            lambda command: self._life.event("mark", command, text, None), is_barrier=False
+        )
+
+    def pause(self) -> Answer:
+        """Leave messages out until ``resume``; what is latched is recorded all the same."""
+        return self._command(self._life.pause)
+
+    def resume(self) -> Answer:
+        """Record again."""
+        return self._command(self._life.resume)
+
+    def snapshot(self, info: metadata.EpisodeInfo) -> Answer:
+        """Write the pre-roll as an episode; needs ``preroll_s``, and no open episode."""
+        check_episode_id(info.id)
+        return self._command(lambda command: self._life.snapshot(info, command))
 
     def label(
         self, *, text: str = "", outcome: metadata.Outcome | None = None, episode: str | None = None
     ) -> Answer:
         """Say how the open episode went, or, by its id, a finished one (kept under notes/)."""
-        return self._command(lambda stamp_ns: self._label(stamp_ns, text, outcome, episode))
 
-    def status(self) -> Answer:
-        """What is going on; answers at once."""
-        with self._state_lock:
-            take = self._take
-            answer: Answer = {
-                "ok": self.error is None,
-                "recorder": self.config.recorder,
-                "run": str(self._run.path),
-                "state": "failed" if self.error else "recording" if take else "idle",
-                "error": str(self.error) if self.error else None,
-                "episode": take.info.id if take else None,
-                "last_episode": self.last_episode,
-                "queue_bytes": self._intake.queued_bytes,
-                "disk_free_bytes": shutil.disk_usage(self._run.path).free,
-                "seen": dict(sorted(self._seen.items())),
-            }
-            if take is not None:
-                answer["duration_s"] = s_from_ns(self._now_ns() - take.start_ns)
-                answer.update(_counts(take))
-                answer["topics"] = {
-                    topic: asdict(tally) for topic, tally in take.ledger.totals().items()
-                }
+        def act(command: Command) -> Answer:
+            take = self._life.take
+            if take is not None and episode in (None, take.info.id):
+                return self._life.event("label", command, text, outcome)
+            return {"finished": episode or self._life.last_episode}
+
+        answer = self._command(act, is_barrier=False)
+        if "finished" not in answer:
             return answer
+        return self._label_finished(answer["finished"], text, outcome)
 
-    def close(self, reason: str = "the recorder was stopped") -> Answer | None:
-        """Finish the open episode, if any, and end the writer thread."""
-        answer = None
-        if self._take is not None and self.error is None:
-            with contextlib.suppress(LifecycleError):  # somebody stopped it at this moment
-                answer = self.stop(reason=reason)
-        self._closing = True
-        self._intake.put_command(Command(action=lambda stamp_ns: None, received_ns=0))  # wake up
-        self._thread.join(timeout=self.config.command_timeout_s)
-        return answer
-
-    # Below: the writer thread.
-
-    def _command(self, act: Callable[[int], Answer]) -> Answer:
-        if self.error is not None:
-            raise self.error
-        future: Future[Answer] = Future()
-
-        def action(stamp_ns: int) -> None:
-            try:
-                future.set_result(act(stamp_ns))
-            except GstError as error:
-                future.set_exception(error)
-            except OSError as error:
-                future.set_exception(self._fail(error))
-            except Exception as error:  # noqa: BLE001  # a bug: tell the caller, keep recording
-                future.set_exception(error)
-
-        self._intake.put_command(Command(action=action, received_ns=self._now_ns()))
-        try:
-            return future.result(timeout=self.config.command_timeout_s)
-        except TimeoutError as error:
-            raise BridgeError(
-                f"the recorder did not finish within {self.config.command_timeout_s:g} s; "
-                "the disk is too slow or the queue very long. Ask for its status."
-            ) from error
-
-    def _work(self) -> None:
-        while True:
-            entry = self._intake.get(0.0 if self._closing else POLL_S)
-            with self._state_lock:
-                try:
-                    self._handle(entry)
-                except OSError as error:
-                    self._fail(error)
-            if entry is None and self._closing:
-                return
-
-    def _handle(self, entry: Entry | None) -> None:
-        if isinstance(entry, Received):
-            self._notice(entry.sample)
-            if self._take is not None:
-                self._write(self._take, entry)
-        elif isinstance(entry, Dropped):
-            if self._take is not None:
-                self._take.count_dropped(entry)
-        elif isinstance(entry, Command):
-            entry.action(entry.received_ns)
-        if self._take is not None:
-            self._take.tick(self._now_ns())
-
-    def _write(self, take: Take, entry: Received) -> None:
-        """One message that cannot be written is counted as lost; recording goes on."""
-        try:
-            take.write(entry)
-        except OSError:
-            raise
-        except Exception:  # noqa: BLE001  # a bug, or a message nobody thought of
-            if entry.sample.topic not in self._unwritable:
-                self._unwritable.add(entry.sample.topic)
-                traceback.print_exc()
-            take.ledger.count_refused(entry)
-
-    def _notice(self, sample: WireSample) -> None:
-        self._latched.remember(sample)
-        if sample.topic in self._seen or len(self._seen) < self.config.max_topics:
-            self._seen[sample.topic] = self._seen.get(sample.topic, 0) + 1
-
-    def _start(self, info: metadata.EpisodeInfo, stamp_ns: int) -> Answer:
-        if self._closing:
-            raise LifecycleError("the recorder is ending. Start it again for another episode.")
-        if self._take is not None:
-            raise LifecycleError(
-                f"episode {self._take.info.id!r} is being recorded. Stop it before {info.id!r}."
-            )
-        path = self._run.episodes_dir / f"{info.id}.mcap"
-        part_path = path.with_name(path.name + ".part")
-        if part_path.exists():
-            raise UsageError(
-                f"{part_path} is left from a take that was cut off. "
-                "Move it away or recover it, or choose another episode id."
-            )
-        take = Take(path, info, self.config, stamp_ns)
-        self._take = take
-        take.write_latched(self._latched.all())
-        return {"ok": True, "episode": info.id}
-
-    def _open_take(self) -> Take:
-        if self._take is None:
-            raise LifecycleError("nothing is being recorded. Start an episode first.")
-        return self._take
-
-    def _stop(
-        self, outcome: metadata.Outcome | None, *, discard: bool, reason: str, end_ns: int
+    def _label_finished(
+        self, name: str | None, text: str, outcome: metadata.Outcome | None
     ) -> Answer:
-        take = self._open_take()
-        if discard:
-            take.discard()
-        else:
-            take.close(end_ns=end_ns, reason=reason, outcome=outcome)
-            self.last_episode = take.info.id
-        self._take = None
-        return {
-            "ok": True,
-            "episode": take.info.id,
-            "discarded": discard,
-            "duration_s": s_from_ns(end_ns - take.start_ns),
-            **_counts(take),
-        }
-
-    def _event(
-        self, kind: str, stamp_ns: int, text: str, outcome: metadata.Outcome | None
-    ) -> Answer:
-        take = self._open_take()
-        take.write_event(kind, stamp_ns=stamp_ns, text=text, outcome=outcome)
-        return {"ok": True, "episode": take.info.id}
-
-    def _label(
-        self, stamp_ns: int, text: str, outcome: metadata.Outcome | None, episode: str | None
-    ) -> Answer:
-        is_open = self._take is not None and episode in (None, self._take.info.id)
-        if is_open:
-            return self._event("label", stamp_ns, text, outcome)
-        name = episode or self.last_episode
         if name is None:
             raise LifecycleError("there is no episode to label yet. Record one, or name one.")
         if outcome is None:
@@ -263,22 +163,144 @@ class Recorder:
         note = label_episode(self._run, name, outcome)
         return {"ok": True, "episode": name, "note": str(note)}
 
+    def forget(self, prefix: str) -> None:
+        """Repeat no latched message of topics that begin so: their publisher has gone."""
+
+        def act(command: Command) -> None:
+            self._life.latched.forget(prefix)
+
+        self.intake.put_command(Command(action=act, received_ns=0, is_barrier=False))
+
+    def note_recovered(self, reports: list[Answer]) -> None:
+        """Show in the status what was found cut off when the recorder began."""
+        self._status.recovered = reports
+
+    def status(self) -> Answer:
+        """What is going on; answers at once, whatever the disk does."""
+        return self._status.answer()
+
+    def close(self, reason: str = "the recorder was stopped") -> Answer | None:
+        """Finish the open episode, if any, and end all threads."""
+        answer = None
+        if self._life.take is not None and self.error is None:
+            with contextlib.suppress(LifecycleError, DiskError):  # somebody was quicker
+                answer = self.stop(reason=reason)
+        self._life.is_closing = True
+        self.intake.put_command(Command(action=lambda command: None, received_ns=0))  # wake up
+        self._thread.join(timeout=self.config.command_timeout_s)
+        self._encoders.close()
+        return answer
+
+    def _command(self, act: Callable[[Command], Answer], *, is_barrier: bool = True) -> Answer:
+        if self.error is not None:
+            raise self.error
+        future: Future[Answer] = Future()
+
+        def action(command: Command) -> None:
+            try:
+                if self.error is not None:
+                    raise self.error
+                future.set_result(act(command))
+            except GstError as error:
+                future.set_exception(error)
+            except OSError as error:
+                future.set_exception(self._fail(error))
+            except Exception as error:  # noqa: BLE001  # a bug: tell the caller, keep recording
+                future.set_exception(error)
+
+        self.intake.put_command(
+            Command(action=action, received_ns=self._now_ns(), is_barrier=is_barrier)
+        )
+        try:
+            return future.result(timeout=self.config.command_timeout_s)
+        except TimeoutError as error:
+            raise BridgeError(
+                f"the recorder did not finish within {self.config.command_timeout_s:g} s; "
+                "the disk is too slow or the queue very long. Ask for its status."
+            ) from error
+
+    # Below: the writer thread.
+
+    def _work(self) -> None:
+        while True:
+            if self._merge.is_waiting or self._life.is_closing:
+                poll_s = BARRIER_POLL_S
+            else:
+                poll_s = IDLE_POLL_S if self._life.is_quiet else POLL_S
+            self.intake.wait(poll_s)
+            entries, images = self.intake.take()
+            is_over = self._life.is_closing and not entries and not self._merge.is_waiting
+            self._merge.feed(entries, images)
+            self._drain()
+            self._guard(self._tick)
+            if is_over:
+                self._life.end()
+                return
+
+    def _drain(self) -> None:
+        for entry in self._merge.ready():
+            self._status.beat()
+            if isinstance(entry, Command):
+                entry.action(entry)
+                if self._life.is_quiet:
+                    self.intake.be_quiet(entry.number)
+                continue
+            try:
+                self._life.receive(entry)
+            except OSError as error:
+                self._fail(error)
+            except Exception:  # noqa: BLE001  # a bug in one message, not the end
+                traceback.print_exc()
+            if isinstance(entry, Item):
+                self.intake.release(entry)
+
+    def _guard(self, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except OSError as error:
+            self._fail(error)
+        except Exception:  # noqa: BLE001  # a bug; recording goes on
+            traceback.print_exc()
+
+    def _tick(self) -> None:
+        now_ns, now_s = self._now_ns(), time.monotonic()
+        self._status.beat()
+        self._life.tick(now_ns)
+        if now_s >= self._next_second_s:
+            self._next_second_s = now_s + SECOND_S
+            self._status.second(now_ns)
+            if step_ns := self._steps.step_ns():
+                self._status.clock_steps += 1
+                self._life.note_clock_step(step_ns, now_ns)
+            cause = self._life.look_at_disk()
+            if cause and not self._status.failing:
+                self._end_because(cause)
+
+    def _end_because(self, cause: str) -> None:
+        """Finish the open episode behind everything received so far, and stop."""
+
+        def act(command: Command) -> None:
+            self._life.fail(cause, command.received_ns, list)
+            self.failed.set()
+
+        self._status.failing = cause
+        self.intake.put_command(Command(action=act, received_ns=self._now_ns()))
+
     def _fail(self, error: OSError) -> DiskError:
-        part_path = self._take.part_path if self._take else self._run.episodes_dir
-        self.error = DiskError(part_path=part_path, cause=error.strerror or str(error))
-        if self._take is not None:
-            self._take.abandon()
-            self._take = None
+        cause = error.strerror or str(error)
+        if self._life.error is not None:
+            return self._life.error
+        self._status.failing = f"cannot write: {cause}. Finishing what there is."
+        self._encoders.is_passing = True
+        failure = self._life.fail(cause, self._now_ns(), self._rest)
         self.failed.set()
-        return self.error
+        return failure
 
-
-def _counts(take: Take) -> Answer:
-    total = take.ledger.total()
-    return {
-        "messages": total.received,
-        "bytes": total.bytes,
-        "lost": total.gaps + total.queue_drops,
-        "undecodable": total.undecodable,
-        "unknown_type": total.unknown_type,
-    }
+    def _rest(self) -> list[Item | Dropped]:
+        """What was received and not yet written, images in the encoders included."""
+        end_s = time.monotonic() + LAST_IMAGES_S
+        while True:
+            self._merge.feed(*self.intake.take())
+            if self._merge.images_seen == self.intake.images_in or time.monotonic() > end_s:
+                return self._merge.rest()
+            time.sleep(BARRIER_POLL_S)

@@ -1,17 +1,20 @@
 """One episode while it is being recorded. Used by the writer thread only."""
 
-import contextlib
 import json
+from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from bridge.episode import metadata, schema
-from bridge.episode.writer import EpisodeWriter
+from bridge.errors import BridgeError
+from bridge.record.channels import Channel, Channels
 from bridge.record.config import RecorderConfig
-from bridge.record.inspection import inspect, resolve_type
-from bridge.record.intake import Dropped, Received, second_of
+from bridge.record.entries import Dropped, Item, second_of
+from bridge.record.inspection import resolve_type
 from bridge.record.ledger import Ledger
+from bridge.record.parts import Parts
 from bridge.wire.session import WireSample
 
 
@@ -19,142 +22,201 @@ class Take:
     """Writes messages as they came, books losses, and finishes the file."""
 
     def __init__(
-        self, path: Path, info: metadata.EpisodeInfo, config: RecorderConfig, start_ns: int
+        self,
+        folder: Path,
+        info: metadata.EpisodeInfo,
+        config: RecorderConfig,
+        *,
+        start_ns: int,
+        latched: Callable[[], list[WireSample]],
     ) -> None:
         """Create the episode file and say in it who and what it is.
+
+        Args:
+            folder: Where episodes lie.
+            info: What is being recorded.
+            config: The recorder's settings.
+            start_ns: When it begins [ns].
+            latched: What was said before and still holds, repeated at the start of each file.
 
         Raises:
             UsageError: When the episode exists already.
             BridgeError: When the folder cannot be written.
         """
         self.info = info
-        self.ledger = Ledger()
+        self.ledger = Ledger(config.queues.max_topics)
         self.start_ns = start_ns
         self.outcome: metadata.Outcome | None = None
         self._config = config
-        self._channels: set[tuple[str, str]] = set()
-        self._last_ns = start_ns
+        self._latched = latched
+        self._channels = Channels(config.queues.max_topics, self.ledger.warn)
         self._num_latched = 0
         self._closed_second = second_of(start_ns)
-        self._writer = EpisodeWriter(path)
-        self._writer.describe(info)
+        self._records: deque[dict[str, Any]] = deque()
+        self._clock_steps_ns: list[int] = []
+        self._is_summed_up = False
+        self._parts = Parts(folder, info, config.disk, start_ns)
+        try:
+            self._repeat_latched(start_ns)
+        except OSError as error:
+            self._parts.discard()
+            raise BridgeError(
+                f"cannot write {self.part_path}: {error.strerror}. Choose another folder."
+            ) from error
 
     @property
     def part_path(self) -> Path:
         """The file while it is open."""
-        return self._writer.part_path
+        return self._parts.open_path
 
-    def _log_ns(self, received_ns: int) -> int:
-        """Log times never run backwards, also when two network threads deliver at once."""
-        self._last_ns = max(self._last_ns, received_ns)
-        return self._last_ns
+    @property
+    def path(self) -> Path:
+        """The episode's file when it is finished; its first one if it is split."""
+        return self._parts.first_path
 
-    def write_latched(self, samples: list[WireSample]) -> None:
-        """Repeat what was said before the episode began and still holds."""
+    @property
+    def num_parts(self) -> int:
+        """Files so far."""
+        return self._parts.index
+
+    def _repeat_latched(self, stamp_ns: int) -> None:
+        samples = self._latched()
         for sample in samples:
-            self._append(sample, self.start_ns)
+            channel = self._channels.of(sample, resolve_type(sample.topic, sample.type_name))
+            if channel is not None:
+                self._append(channel, sample, stamp_ns)
         self._num_latched = len(samples)
 
-    def write(self, entry: Received) -> None:
-        """Append a message as it came, whatever it is, and book it."""
-        sample = entry.sample
-        type_name = resolve_type(sample.topic, sample.type_name)
-        channel = (sample.topic, type_name)
-        if channel not in self._channels and len(self._channels) >= self._config.max_topics:
-            self.ledger.count_refused(entry)
+    def write(self, item: Item) -> None:
+        """Append a message, whatever it is, and book it."""
+        channel = self._channels.of(item.sample, item.type_name)
+        if channel is None:
+            self.ledger.count_refused(item)
             return
-        self._channels.add(channel)
-        finding = inspect(type_name, sample.message_encoding, sample.data)
-        self._append(sample, self._log_ns(sample.received_ns))
-        self.ledger.count_received(entry, finding)
+        finding = item.finding or channel.inspect(item.sample.data)
+        try:
+            self._append(channel, item.sample, item.sample.received_ns)
+        except OSError:
+            self.ledger.count_refused(item)
+            raise
+        self.ledger.count_received(item, finding)
 
-    def _append(self, sample: WireSample, log_time_ns: int) -> None:
-        type_name = resolve_type(sample.topic, sample.type_name)
+    def _append(self, channel: Channel, sample: WireSample, stamp_ns: int) -> None:
+        log_ns = channel.later(stamp_ns)
         source_ns = sample.source_ns
-        self._writer.write_foreign(
+        self._parts.writer.write_foreign(
             sample.topic,
             sample.data,
-            schema_record=_schema_record(type_name, sample.message_encoding),
+            schema_record=channel.record,
             message_encoding=sample.message_encoding,
-            log_time_ns=log_time_ns,
-            publish_time_ns=source_ns if source_ns is not None and source_ns >= 0 else log_time_ns,
+            log_time_ns=log_ns,
+            publish_time_ns=source_ns if source_ns is not None and source_ns >= 0 else log_ns,
             sequence=sample.sequence,
         )
 
-    def count_dropped(self, dropped: Dropped) -> None:
-        """Book messages the queue had no room for."""
-        self.ledger.count_dropped(dropped)
+    def tick(self, now_ns: int, health: dict[str, int]) -> None:
+        """Write what has waited long enough, and the ledger of the seconds that are over.
 
-    def tick(self, now_ns: int) -> None:
-        """Write the ledger of the seconds that are over."""
+        Args:
+            now_ns: The recorder's clock.
+            health: Numbers that go into each ledger record.
+        """
         # A message may wait in the queue while its second ends: give it one second more.
         before = second_of(now_ns) - 1
         if before > self._closed_second:
             self._closed_second = before
-            self._write_ledger(before, now_ns)
+            self._write_ledger(before, now_ns, health)
+        if self._parts.is_full(now_ns):
+            self._parts.roll(now_ns)
+            self._repeat_latched(now_ns)
+        self._parts.tick()
 
-    def _write_ledger(self, before: int | None, now_ns: int) -> None:
-        for record in self.ledger.close_seconds(before):
-            self._writer.write_json(
-                schema.DROPS_TOPIC,
-                record,
-                type_name=schema.DROPS,
-                log_time_ns=self._log_ns(now_ns),
-            )
+    def _write_ledger(self, before: int | None, now_ns: int, health: dict[str, int]) -> None:
+        closed = self.ledger.close_seconds(before)
+        self._records.extend({**record, **health} for record in closed)
+        while self._records:
+            self._write_json(schema.DROPS_TOPIC, self._records[0], schema.DROPS, now_ns)
+            self._records.popleft()
+
+    def _write_json(
+        self, topic: str, record: dict[str, Any], type_name: str, stamp_ns: int
+    ) -> None:
+        log_ns = self._channels.later(topic, stamp_ns)
+        self._parts.writer.write_json(topic, record, type_name=type_name, log_time_ns=log_ns)
 
     def write_event(
-        self, kind: str, *, stamp_ns: int, text: str = "", outcome: metadata.Outcome | None = None
+        self,
+        kind: str,
+        *,
+        stamp_ns: int,
+        text: str = "",
+        outcome: metadata.Outcome | None = None,
+        data: dict[str, Any] | None = None,
     ) -> None:
         """Append a mark or a label to the cell's events; a label is the outcome from now on."""
-        cell = self.info.cell or "recorder"
         record: dict[str, Any] = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind}
         if text:
             record["text"] = text
+        if data is not None:
+            record["data"] = data
         if outcome is not None:
-            self.outcome = outcome
             record["outcome"] = asdict(outcome)
-        self._writer.write_json(
-            f"/{cell}/event", record, type_name=schema.EVENT, log_time_ns=self._log_ns(stamp_ns)
-        )
+        topic = f"/{self.info.cell or 'recorder'}/event"
+        self._write_json(topic, record, schema.EVENT, stamp_ns)
+        self.outcome = outcome or self.outcome
 
-    def close(self, *, end_ns: int, reason: str, outcome: metadata.Outcome | None) -> Path:
-        """Write the accounts, finish the file and give it its final name."""
-        outcome = outcome or self.outcome
-        self._write_ledger(None, end_ns)
+    def note_clock_step(self, step_ns: int, *, stamp_ns: int) -> None:
+        """Write down that the system clock has jumped; log times have not."""
+        self._clock_steps_ns.append(step_ns)
+        self.write_event("clock_step", stamp_ns=stamp_ns, data={"step_ns": step_ns})
+
+    def refuse(self, entries: Iterable[Item | Dropped]) -> None:
+        """Book messages that came before the end and can no longer be written."""
+        for entry in entries:
+            if isinstance(entry, Item):
+                self.ledger.count_refused(entry)
+            else:
+                self.ledger.count_dropped(entry)
+
+    def close(
+        self,
+        *,
+        end_ns: int,
+        reason: str,
+        outcome: metadata.Outcome | None,
+        health: dict[str, int],
+    ) -> Path:
+        """Write the accounts, finish the file and give it its final name.
+
+        May be called again after an OSError, when there is space.
+        """
+        self._write_ledger(None, end_ns, health)
+        if not self._is_summed_up:
+            self._sum_up(end_ns, reason, outcome or self.outcome)
+            self._is_summed_up = True
+        return self._parts.close()
+
+    def _sum_up(self, end_ns: int, reason: str, outcome: metadata.Outcome | None) -> None:
+        writer = self._parts.writer
         if outcome is not None:
-            self._writer.add_metadata("outcome", metadata.to_strings(outcome))
-        self._writer.add_metadata("drops", self.ledger.to_metadata())
+            writer.add_metadata("outcome", metadata.to_strings(outcome))
+        writer.add_metadata("drops", self.ledger.to_metadata())
         recorder = {
             "settings": asdict(self._config),
             "start_ns": self.start_ns,
             "end_ns": end_ns,
             "stopped_by": reason,
             "latched_messages_repeated": self._num_latched,
+            "clock_steps_ns": self._clock_steps_ns,
+            "parts": self.num_parts,
         }
         values = {name: json.dumps(value) for name, value in recorder.items()}
-        self._writer.add_metadata("recorder", values)
-        return self._writer.close()
+        writer.add_metadata("recorder", values)
 
     def discard(self) -> None:
         """Remove the file: the take was not wanted."""
-        self._writer.discard()
+        self._parts.discard()
 
     def abandon(self) -> None:
         """Stop without finishing; the ``.part`` file stays."""
-        with contextlib.suppress(OSError):  # the disk that failed may fail again
-            self._writer.abandon()
-
-
-def _schema_record(type_name: str, message_encoding: str) -> schema.Schema | None:
-    """The schema to register: a known one, one with a name only, or none.
-
-    MCAP reads an empty schema encoding as "no schema available", which keeps the name.
-    """
-    known = schema.schema_for(type_name) if type_name else None
-    if known is not None and message_encoding in ("", known.message_encoding):
-        return known
-    if not type_name:
-        return None
-    return schema.Schema(
-        name=type_name, schema_encoding="", message_encoding=message_encoding, data=b""
-    )
+        self._parts.abandon()

@@ -1,136 +1,196 @@
-"""Sequence numbers, the bounded queue, the ledger, latched messages: nothing is lost silently."""
+"""Sequence numbers, the ledger, inspection, latched messages: nothing is lost silently."""
 
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.episode import schema
-from bridge.episode.records import FrameTransform, transforms_to_cdr
-from bridge.record.config import RecorderConfig
+from bridge.episode.records import (
+    CompressedColor,
+    DepthImage,
+    FrameTransform,
+    transforms_to_cdr,
+)
+from bridge.record.entries import DropCount, Dropped, Item
 from bridge.record.inspection import Finding, inspect
-from bridge.record.intake import Command, Dropped, Intake, Received
 from bridge.record.latched import LatchedMessages
-from bridge.record.ledger import Ledger
-from bridge.record.sequence import SequenceTracker
+from bridge.record.ledger import OTHER_TOPICS, Ledger
+from bridge.record.sequence import MAX_HOLES, SequenceTracker, Step
 from bridge.wire.session import WireSample
 
 MakeSample = Callable[..., WireSample]
 
 
-def plain_sample(sequence: int | None, gid: bytes = b"g" * 16) -> WireSample:
+def numbered(sequence: int | None, gid: bytes = b"g" * 16, source_ns: int | None = 0) -> WireSample:
     return WireSample(
         topic="/t",
         type_name="",
         message_encoding="",
         data=b"x",
-        source_ns=0,
+        source_ns=source_ns,
         sequence=sequence,
         source_gid=gid,
         received_ns=0,
     )
 
 
-@given(st.sets(st.integers(0, 60), min_size=1))
-def test_gaps_plus_received_is_what_was_sent_in_between(kept: set[int]) -> None:
+def item_of(sample: WireSample, step: Step, ticket: int = 0) -> Item:
+    return Item(sample, step, ticket, sample.type_name, len(sample.data), False)
+
+
+@given(st.permutations(range(30)), st.sets(st.integers(0, 29)), st.integers(0, 2**64))
+def test_reported_lost_is_truly_lost_whatever_the_order(
+    order: list[int], never: set[int], start: int
+) -> None:
+    """Law: after the first number, whatever comes late is taken back; the rest is the loss."""
+    tracker, ledger = SequenceTracker(), Ledger()
+    arriving = [*(number for number in order if number not in never), 30]
+    for ticket, number in enumerate(arriving):
+        sample = numbered(start + number)
+        ledger.count_received(item_of(sample, tracker.observe(sample, ticket), ticket), GOOD)
+    total = ledger.total()
+    assert total.gaps == sum(number > arriving[0] for number in never)  # before it: not claimed
+    assert (total.received, total.repeated) == (len(arriving), 0)
+
+
+GOOD = Finding.GOOD
+
+
+@given(st.lists(st.integers(0, 12), max_size=40))
+def test_copies_are_neither_gaps_nor_received_twice(numbers: list[int]) -> None:
+    tracker, ledger = SequenceTracker(), Ledger()
+    for ticket, number in enumerate([0, *numbers, 13]):
+        sample = numbered(number)
+        ledger.count_received(item_of(sample, tracker.observe(sample, ticket), ticket), GOOD)
+    total = ledger.total()
+    assert total.received - total.repeated == len({0, *numbers, 13})
+    assert total.received - total.repeated + total.gaps == 14
+
+
+@pytest.mark.parametrize("wrap", [2**32, 2**63])
+def test_numbers_wrap_without_a_gap_and_late_ones_from_before_still_count(wrap: int) -> None:
+    def raw(number: int) -> int:
+        return number if number < wrap else number - (2**32 if wrap == 2**32 else 2**64)
+
     tracker = SequenceTracker()
-    gaps = sum(tracker.observe(plain_sample(n)).gap for n in sorted(kept))
-    assert gaps + len(kept) == max(kept) - min(kept) + 1
+    steps = [tracker.observe(numbered(raw(wrap + n)), n + 9) for n in (-3, -2, 0, 1, -1, 4)]
+    assert [step.gap for step in steps] == [0, 0, 1, 0, 0, 2]
+    assert steps[4].fills == 9
+    assert not any(step.repeated for step in steps)
 
 
 def test_a_restarted_publisher_is_no_gap() -> None:
     tracker = SequenceTracker()
-    tracker.observe(plain_sample(500))
-    assert tracker.observe(plain_sample(0, gid=b"h" * 16)).gap == 0
-    assert tracker.observe(plain_sample(501)).gap == 0
+    tracker.observe(numbered(500))
+    assert tracker.observe(numbered(0, gid=b"h" * 16)) == Step()
+    assert tracker.observe(numbered(501)).gap == 0
 
 
-def test_a_repeated_number_is_counted_and_no_gap() -> None:
+def test_a_publisher_that_counts_from_zero_again_under_its_old_name_is_no_copy() -> None:
     tracker = SequenceTracker()
-    assert [tracker.observe(plain_sample(n)) for n in (0, 2, 1, 3)] == [
-        (0, False),
-        (1, False),
-        (0, True),
-        (0, False),
-    ]
+    for number in (7, 8, 9):
+        tracker.observe(numbered(number, source_ns=number))
+    assert tracker.observe(numbered(8, source_ns=8)).repeated
+    assert tracker.observe(numbered(0, source_ns=20)) == Step()
+    assert tracker.observe(numbered(3, source_ns=21)) == Step(gap=2)
+
+
+def test_a_jump_nobody_could_have_sent_is_another_numbering() -> None:
+    tracker = SequenceTracker()
+    tracker.observe(numbered(5))
+    assert tracker.observe(numbered(2**40)).gap == 0
+    assert tracker.observe(numbered(2**40 + 2)).gap == 1
 
 
 def test_without_numbers_nothing_is_claimed() -> None:
     tracker = SequenceTracker()
-    assert [tracker.observe(plain_sample(None)).gap for _ in range(3)] == [0, 0, 0]
+    assert [tracker.observe(numbered(None)) for _ in range(3)] == [Step()] * 3
 
 
-@settings(max_examples=50, deadline=None)
-@given(st.lists(st.integers(0, 400_000), max_size=40), st.integers(0, 3))
-def test_every_message_is_kept_or_counted(sizes: list[int], missing: int) -> None:
-    """Law: received + queue drops + gaps = sent, whatever the sizes and whatever fits."""
-    intake = Intake(RecorderConfig(queue_mb=1, small_reserve_mb=0))
+def test_what_is_remembered_of_missing_messages_is_bounded() -> None:
+    tracker = SequenceTracker()
+    for number in range(0, 4 * MAX_HOLES, 2):
+        tracker.observe(numbered(number))
+    assert tracker._num_holes <= MAX_HOLES
+    assert tracker.observe(numbered(1)).repeated  # too long ago: it stays booked as lost
+    assert tracker.observe(numbered(4 * MAX_HOLES - 3)).fills is not None
+
+
+def test_a_gap_booked_elsewhere_is_not_taken_back_here() -> None:
     ledger = Ledger()
-    sequence = 0
-    for number, size in enumerate(sizes):
-        sample = plain_sample(sequence)
-        intake.put(
-            replace(sample, data=bytes(size), received_ns=number * 10**8)
-        )
-        sequence += 1 + (missing if number + 1 < len(sizes) else 0)
-    while (entry := intake.get(0.0)) is not None:
-        if isinstance(entry, Received):
-            ledger.count_received(entry, Finding.GOOD)
-        elif isinstance(entry, Dropped):
-            ledger.count_dropped(entry)
+    ledger.begin(10)
+    ledger.pause(20)
+    ledger.resume(30)
+    for booked in (5, 12, 25, 35):
+        ledger.count_received(item_of(numbered(1), Step(fills=booked), 40), GOOD)
+    assert ledger.total().gaps == -2  # those of 12 and 35
+
+
+def test_the_seconds_add_up_to_the_totals_also_when_they_come_late() -> None:
+    ledger = Ledger()
+    sample = replace(numbered(3), received_ns=10**9, source_ns=10**9 - 5)
+    ledger.count_received(item_of(sample, Step(gap=3)), Finding.UNDECODABLE)
+    first = list(ledger.close_seconds())
+    ledger.count_received(item_of(sample, Step(fills=0)), GOOD)
+    count = DropCount(messages=2, shed=3, gaps=4, fills=[0])
+    ledger.count_dropped(Dropped(ticket=0, received_ns=0, counts={("/t", 1): count}))
+    second = list(ledger.close_seconds())
     total = ledger.total()
-    assert total.received + total.queue_drops == len(sizes)
-    assert total.received + total.queue_drops + total.gaps == sequence
-    assert intake.queued_bytes == 0
-    by_second = list(ledger.close_seconds())
-    assert sum(record["received"] for record in by_second) == total.received
-    assert sum(record["queue_drops"] for record in by_second) == total.queue_drops
-    assert ledger.total() == total  # closing the seconds changes no total
+    assert (first[0]["gaps"], second[0]["gaps"]) == (3, 2)
+    assert total.gaps == 5
+    assert (total.received, total.queue_drops, total.shed, total.undecodable) == (2, 2, 3, 1)
+    assert total.lost == 10
+    assert total.clock_offset_ns == 5
+    assert ledger.total() == total
 
 
-def test_images_never_evict_joints(make_sample: MakeSample) -> None:
-    intake = Intake(RecorderConfig(queue_mb=2, small_reserve_mb=1))
-    for _ in range(20):
-        intake.put(make_sample(topic="/cell/cam/a/depth/image", data=bytes(200_000)))
-    for _ in range(100):
-        intake.put(make_sample())
-    entries = []
-    while (entry := intake.get(0.0)) is not None:
-        entries.append(entry)
-    joints = [e for e in entries if isinstance(e, Received) and "joint" in e.sample.topic]
-    dropped = [e for e in entries if isinstance(e, Dropped)]
-    assert len(joints) == 100
-    assert sum(c.messages for d in dropped for c in d.counts.values()) == 20 - 4
+def test_topics_without_end_share_one_account() -> None:
+    ledger = Ledger(max_topics=3)
+    for number in range(9):
+        sample = replace(numbered(0), topic=f"/t{number}")
+        ledger.count_received(item_of(sample, Step()), GOOD)
+    assert ledger.totals()[OTHER_TOPICS].received == 6
+    assert ledger.total().received == 9
 
 
-def test_commands_keep_their_place_and_are_never_dropped(make_sample: MakeSample) -> None:
-    intake = Intake(RecorderConfig(queue_mb=1, small_reserve_mb=0))
-    first = make_sample(data=bytes(900_000))
-    intake.put(first)
-    command = Command(action=None, received_ns=0)
-    intake.put(make_sample(data=bytes(900_000)))
-    intake.put_command(command)
-    intake.put(make_sample(data=b""))
-    kinds = [type(intake.get(0.0)) for _ in range(4)]
-    assert kinds == [Received, Dropped, Command, Received]
+def jpeg_message(data: bytes) -> bytes:
+    return CompressedColor(stamp_ns=0, frame_id="c", format="jpeg", data=data).to_cdr()
 
 
 def test_newer_json_is_flagged_and_broken_messages_are_found(make_sample: MakeSample) -> None:
     good = make_sample().data
-    assert inspect(schema.JOINT_STATE, "cdr", good) is Finding.GOOD
+    assert inspect(schema.JOINT_STATE, "cdr", good) is GOOD
     assert inspect(schema.JOINT_STATE, "cdr", good[:-3]) is Finding.UNDECODABLE
     assert inspect(schema.JOINT_STATE, "json", good) is Finding.UNDECODABLE
-    assert inspect(schema.EVENT, "json", b'{"schema_version": 1}') is Finding.GOOD
+    assert inspect(schema.EVENT, "json", b'{"schema_version": 1}') is GOOD
     assert inspect(schema.EVENT, "json", b'{"schema_version": 99}') is Finding.NEWER_VERSION
     assert inspect(schema.EVENT, "json", b"{") is Finding.UNDECODABLE
     assert inspect("my/Thing", "cdr", b"") is Finding.UNKNOWN_TYPE
 
 
+def test_cut_images_are_found_without_decoding_them() -> None:
+    jpeg = b"\xff\xd8" + bytes(500) + b"\xff\xd9"
+    assert inspect(schema.COMPRESSED_IMAGE, "cdr", jpeg_message(jpeg)) is GOOD
+    assert inspect(schema.COMPRESSED_IMAGE, "cdr", jpeg_message(jpeg + bytes(9))) is GOOD
+    assert inspect(schema.COMPRESSED_IMAGE, "cdr", jpeg_message(jpeg[:-9])) is Finding.UNDECODABLE
+    other = jpeg_message(b"\x89PNG" + bytes(90))
+    assert inspect(schema.COMPRESSED_IMAGE, "cdr", other) is GOOD
+    depth = DepthImage(stamp_ns=0, frame_id="c", depth_mm=np.zeros((4, 6), np.uint16)).to_cdr()
+    assert inspect(schema.IMAGE, "cdr", depth) is GOOD
+    assert inspect(schema.IMAGE, "cdr", depth[:-1]) is Finding.UNDECODABLE
+    wrong_size = depth.replace(b"\x04\0\0\0\x06\0\0\0", b"\x05\0\0\0\x06\0\0\0")
+    assert inspect(schema.IMAGE, "cdr", wrong_size) is Finding.UNDECODABLE
+
+
+@settings(max_examples=50)
 @given(st.binary(max_size=200))
 def test_inspection_never_raises(data: bytes) -> None:
-    for name in (schema.JOINT_STATE, schema.IMAGE, schema.TF_MESSAGE, schema.PLAN, "x"):
+    names = (schema.JOINT_STATE, schema.IMAGE, schema.COMPRESSED_IMAGE, schema.PLAN, "x")
+    for name in names:
         assert isinstance(inspect(name, "", data), Finding)
 
 
@@ -154,3 +214,5 @@ def test_static_transforms_of_several_publishers_are_all_kept(make_sample: MakeS
     assert [sample.topic for sample in kept] == ["/tf_static", "/tf_static", kept[2].topic]
     assert kept[2].data == b"2"
     assert kept[0].data == static_transform("b", "a")
+    latched.forget("/cell/")
+    assert [sample.topic for sample in latched.all()] == ["/tf_static", "/tf_static"]

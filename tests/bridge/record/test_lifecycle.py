@@ -16,7 +16,7 @@ from bridge.episode.run import RunFolder
 from bridge.episode.streams import events
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import BridgeError, UsageError
-from bridge.record.config import EpisodeAbout, RecorderConfig
+from bridge.record.config import EpisodeAbout, QueueConfig, RecorderConfig
 from bridge.record.control import parse_info, parse_outcome
 from bridge.record.errors import ControlError, DiskError, LifecycleError
 from bridge.record.keyboard import Keys
@@ -173,11 +173,11 @@ def test_an_id_cannot_leave_the_run_folder(recorder: Recorder, episode_id: str) 
 def test_a_folder_that_cannot_be_written_is_one_sentence(
     recorder: Recorder, run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(self: Path, *args: object, **kwargs: object) -> None:
+    def refuse(path: Path) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
 
     # Tests may run as root, for whom no folder is read-only: refuse where the system would.
-    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr("bridge.episode.part_file.PartFile.create", refuse)
     with pytest.raises(BridgeError, match=r"Permission denied\. Choose another folder"):
         recorder.start(INFO)
     monkeypatch.undo()
@@ -208,7 +208,7 @@ def test_a_full_disk_stops_the_recorder_and_leaves_only_the_part(
 def test_topics_without_end_are_dropped_and_counted(
     run: RunFolder, make_sample: MakeSample
 ) -> None:
-    config = RecorderConfig(max_topics=5)
+    config = RecorderConfig(queues=QueueConfig(max_topics=5))
     recorder = Recorder(run, now_ns=AnchoredClock().now_ns, config=config)
     recorder.start(INFO)
     for number in range(9):
@@ -231,7 +231,7 @@ def test_a_message_nobody_thought_of_ends_nothing(
 
     recorder.start(EpisodeInfo(id="t1", kind="trial"))
     with monkeypatch.context() as patch:
-        patch.setattr("bridge.record.take.inspect", inspect_badly)
+        patch.setattr("bridge.episode.cdr.validate", inspect_badly)
         recorder.receive(make_sample())
         recorder.receive(make_sample())
         recorder.mark("behind both")

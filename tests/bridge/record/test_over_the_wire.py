@@ -15,8 +15,8 @@ from bridge.episode import schema
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.record.control import serve_control
-from bridge.record.process import describe_status
 from bridge.record.recorder import Recorder
+from bridge.record.status import describe_status
 from bridge.sources.folder_config import FolderConfig
 from bridge.sources.folder_index import read_index
 from bridge.sources.folder_publish import publish_folder_frames

@@ -1,0 +1,148 @@
+"""Images on their way to the writer: one thread for each stream, so that order is kept.
+
+The work is done outside Python's lock, and nothing else ever waits behind it. An image that
+cannot be turned into what was asked for is recorded as it came, and flagged.
+"""
+
+import queue
+import threading
+import traceback
+from collections.abc import Callable
+from dataclasses import replace
+
+from bridge.episode import schema
+from bridge.episode.cdr import MalformedMessageError
+from bridge.episode.transcode import (
+    COLOR_LAYOUTS,
+    DEPTH_ENCODINGS,
+    depth_to_compact,
+    image_header,
+    image_to_jpeg,
+)
+from bridge.record.config import RecorderConfig
+from bridge.record.entries import Item
+from bridge.record.inspection import GOOD, Finding, fits, inspect
+from bridge.record.shedding import REDUCED_QUALITY, Shed
+from bridge.wire.session import WireSample
+
+MAX_THREADS = 32
+"""Streams beyond this many share the threads of others."""
+
+Preview = Callable[[WireSample, str], None]
+"""Called with the image as it came and its kind, on the stream's thread."""
+
+
+class ImageEncoder:
+    """Turns raw images into what an episode holds."""
+
+    def __init__(self, config: RecorderConfig, shed: Callable[[], Shed]) -> None:
+        """Choose the profile; ``shed`` says how far shedding has gone."""
+        self._config = config
+        self._shed = shed
+        self.kinds: dict[str, str] = {}
+        """color or depth, for each image topic seen."""
+
+    def encode(self, item: Item) -> None:
+        """Replace the item's message where the profile asks for it; flag what is broken."""
+        sample = item.sample
+        if item.type_name != schema.IMAGE or sample.message_encoding not in ("", "cdr"):
+            item.finding = inspect(item.type_name, sample.message_encoding, sample.data)
+            if sample.topic not in self.kinds:
+                is_depth = b"compressedDepth" in sample.data[:256]
+                self.kinds[sample.topic] = "depth" if is_depth else "color"
+            return
+        try:
+            header = image_header(sample.data)
+            item.finding = GOOD if fits(header) else Finding.UNDECODABLE
+            if item.finding is GOOD:
+                self._transcode(item, header.encoding)
+        except MalformedMessageError:
+            item.finding = Finding.UNDECODABLE
+
+    def _transcode(self, item: Item, encoding: str) -> None:
+        data, reduced, topic = None, False, item.sample.topic
+        if encoding in COLOR_LAYOUTS:
+            self.kinds[topic] = "color"
+            if self._config.color == "jpeg":
+                quality = self._config.jpeg_quality
+                if self._shed() >= Shed.COLOR_QUALITY and quality > REDUCED_QUALITY:
+                    quality, reduced = REDUCED_QUALITY, True
+                data = image_to_jpeg(item.sample.data, quality)
+        elif encoding in DEPTH_ENCODINGS:
+            self.kinds[topic] = "depth"
+            if self._config.depth == "compact":
+                data = depth_to_compact(item.sample.data)
+        if data is not None:
+            item.sample = replace(
+                item.sample, data=data, type_name=schema.COMPRESSED_IMAGE, type_hash=""
+            )
+            item.type_name = schema.COMPRESSED_IMAGE
+            item.reduced = reduced
+
+
+class EncoderThreads:
+    """Hands each image to the thread of its stream."""
+
+    def __init__(
+        self, encoder: ImageEncoder, done: Callable[[Item, int], None], preview: Preview
+    ) -> None:
+        """Start without threads.
+
+        Args:
+            encoder: What is done to each image.
+            done: Called with each image, and the bytes it has become smaller.
+            preview: Called with each image as it came.
+        """
+        self._encoder = encoder
+        self._done = done
+        self._preview = preview
+        self._queues: dict[str, queue.SimpleQueue[Item | None]] = {}
+        self._threads: list[threading.Thread] = []
+        self.is_passing = False
+        """Hand images on untouched: the disk has failed and only their count matters."""
+
+    def submit(self, item: Item) -> None:
+        """Queue an image; never waits. For one caller at a time."""
+        topic = item.sample.topic
+        waiting = self._queues.get(topic)
+        if waiting is None:
+            waiting = self._queues[topic] = self._queue_for(topic)
+        waiting.put(item)
+
+    def _queue_for(self, topic: str) -> "queue.SimpleQueue[Item | None]":
+        if len(self._threads) >= MAX_THREADS:
+            shared = list(dict.fromkeys(self._queues.values()))
+            return shared[len(self._queues) % len(shared)]
+        waiting: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
+        thread = threading.Thread(
+            target=self._work, args=(waiting,), name=f"encode {topic}"[:60], daemon=True
+        )
+        self._threads.append(thread)
+        thread.start()
+        return waiting
+
+    def _work(self, waiting: "queue.SimpleQueue[Item | None]") -> None:
+        while (item := waiting.get()) is not None:
+            before = len(item.sample.data)
+            try:
+                if not self.is_passing:
+                    self._treat(item)
+            except Exception:  # noqa: BLE001  # a bug must not end the stream: record it as it is
+                traceback.print_exc()
+                item.finding = item.finding or Finding.UNDECODABLE
+            self._done(item, before - len(item.sample.data))
+
+    def _treat(self, item: Item) -> None:
+        original = item.sample
+        if not item.for_preview:
+            self._encoder.encode(item)
+        self._preview(original, self._encoder.kinds.get(original.topic, ""))
+
+    def close(self) -> None:
+        """End the threads after what they hold."""
+        for waiting in set(self._queues.values()):
+            waiting.put(None)
+        for thread in self._threads:
+            thread.join(timeout=5.0)
+        self._threads.clear()
+        self._queues.clear()

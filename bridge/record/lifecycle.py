@@ -1,0 +1,295 @@
+"""What the recorder is doing: idle, recording or paused; and the steps between. One thread."""
+
+import contextlib
+import traceback
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from bridge.clock import s_from_ns
+from bridge.episode import metadata
+from bridge.episode.run import RunFolder
+from bridge.errors import UsageError
+from bridge.record.config import BYTES_PER_MB, RecorderConfig
+from bridge.record.entries import Command, Dropped, Item
+from bridge.record.errors import DiskError, LifecycleError, NoSpaceError
+from bridge.record.latched import LatchedMessages, is_latched
+from bridge.record.preroll import PreRoll
+from bridge.record.reserve import FooterReserve, free_bytes
+from bridge.record.take import Take
+
+Answer = dict[str, Any]
+
+
+class Lifecycle:
+    """Decides what happens to each message, and carries out commands."""
+
+    def __init__(
+        self, run: RunFolder, config: RecorderConfig, queued_bytes: Callable[[], int]
+    ) -> None:
+        """Begin idle.
+
+        Args:
+            run: Where episodes go.
+            config: Settings.
+            queued_bytes: How much waits in the queues.
+        """
+        self.take: Take | None = None
+        self.is_paused = False
+        self.is_closing = False
+        self.is_finishing = False
+        self.error: DiskError | None = None
+        self.last_episode: str | None = None
+        self.latched = LatchedMessages()
+        self.ring = PreRoll(
+            seconds=config.preroll_s,
+            max_bytes=config.preroll_mb * BYTES_PER_MB,
+            passed=lambda item: self.latched.remember(item.sample),
+        )
+        self.free_bytes = free_bytes(run.path)
+        self._run = run
+        self._config = config
+        self._queued_bytes = queued_bytes
+        self._reserve = FooterReserve(run.episodes_dir, config.disk.footer_mb)
+        self._unwritable: set[str] = set()
+
+    @property
+    def is_quiet(self) -> bool:
+        """Say whether messages are of no use now, but for what is latched."""
+        return (self.take is None or self.is_paused) and not self.ring.is_on
+
+    @property
+    def state(self) -> str:
+        """One word."""
+        if self.error is not None:
+            return "failed"
+        if self.take is None:
+            return "idle"
+        return "finishing" if self.is_finishing else "paused" if self.is_paused else "recording"
+
+    def _health(self) -> dict[str, int]:
+        return {"queue_bytes": self._queued_bytes(), "disk_free_bytes": self.free_bytes}
+
+    def receive(self, entry: Item | Dropped) -> None:
+        """Write, keep for the pre-roll, or leave out."""
+        take = self.take
+        if take is None:
+            self.ring.add(entry)
+        elif isinstance(entry, Item):
+            self.latched.remember(entry.sample)
+            if not self.is_paused or is_latched(entry.sample.topic):
+                self._write(take, entry)
+        elif not self.is_paused:
+            take.ledger.count_dropped(entry)
+
+    def _write(self, take: Take, item: Item) -> None:
+        """One message that cannot be written is counted as lost; recording goes on."""
+        try:
+            take.write(item)
+        except OSError:
+            raise
+        except Exception:  # noqa: BLE001  # a bug, or a message nobody thought of
+            if item.sample.topic not in self._unwritable:
+                self._unwritable.add(item.sample.topic)
+                traceback.print_exc()
+            take.ledger.count_refused(item)
+
+    def tick(self, now_ns: int) -> None:
+        """Do what time asks for: flush, close seconds, split. Raises OSError for the disk."""
+        self.ring.trim(now_ns)
+        if self.take is not None:
+            self.take.tick(now_ns, self._health())
+
+    def look_at_disk(self) -> str:
+        """Return why the open episode must end now, or ""."""
+        self.free_bytes = free_bytes(self._run.path)
+        if self.take is None or self.free_bytes >= self._min_free_bytes:
+            return ""
+        free_mb, min_mb = self.free_bytes // BYTES_PER_MB, self._config.disk.min_free_mb
+        return f"only {free_mb} MB are free, and {min_mb} MB must be left"
+
+    @property
+    def _min_free_bytes(self) -> int:
+        return self._config.disk.min_free_mb * BYTES_PER_MB
+
+    def note_clock_step(self, step_ns: int, now_ns: int) -> None:
+        """Write down that the system clock has jumped."""
+        if self.take is not None:
+            self.take.note_clock_step(step_ns, stamp_ns=now_ns)
+
+    # Commands
+
+    def start(self, info: metadata.EpisodeInfo, command: Command) -> Answer:
+        """Begin an episode, with the pre-roll if there is one."""
+        self._refuse_start(info.id)
+        held = self.ring.held(command.received_ns)
+        self.take = self._open(info, held, command)
+        self.is_paused = False
+        self._write_held(self.take, held)
+        self.ring.empty()
+        return {"ok": True, "episode": info.id, **self._preroll(held, command.received_ns)}
+
+    def snapshot(self, info: metadata.EpisodeInfo, command: Command) -> Answer:
+        """Write the pre-roll as an episode of its own; it is kept as well."""
+        if not self.ring.is_on:
+            raise LifecycleError("there is no pre-roll. Start the recorder with --preroll-s 10.")
+        self._refuse_start(info.id)
+        held = self.ring.held(command.received_ns)
+        self.take = self._open(info, held, command)
+        self._write_held(self.take, held)
+        return self.stop(None, command, discard=False, reason="snapshot")
+
+    def _refuse_start(self, episode_id: str) -> None:
+        if self.is_closing:
+            raise LifecycleError("the recorder is ending. Start it again for another episode.")
+        if self.take is not None:
+            raise LifecycleError(
+                f"episode {self.take.info.id!r} is being recorded. Stop it before {episode_id!r}."
+            )
+        left = next(self._run.episodes_dir.glob(f"{episode_id}.*part"), None)
+        if left is not None:
+            raise UsageError(
+                f"{left} is being written, or left from a take that was cut off. "
+                "Recover it or move it away, or choose another episode id."
+            )
+        later = next(self._run.episodes_dir.glob(f"{episode_id}.[0-9]*.mcap"), None)
+        if later is not None:
+            raise UsageError(f"{later} exists already. Choose another episode id.")
+        self.free_bytes = free_bytes(self._run.path)
+        if self.free_bytes < self._min_free_bytes:
+            raise NoSpaceError(
+                folder=self._run.path,
+                free_mb=self.free_bytes // BYTES_PER_MB,
+                wanted_mb=self._config.disk.min_free_mb,
+            )
+
+    def _open(
+        self, info: metadata.EpisodeInfo, held: list[Item | Dropped], command: Command
+    ) -> Take:
+        self._reserve.hold()
+        first_ns = [entry.received_ns for entry in held]
+        take = Take(
+            self._run.episodes_dir,
+            info,
+            self._config,
+            start_ns=min([*first_ns, command.received_ns]),
+            latched=self.latched.all,
+        )
+        take.ledger.begin(held[0].ticket if held else command.ticket)
+        return take
+
+    def _write_held(self, take: Take, held: list[Item | Dropped]) -> None:
+        for entry in held:
+            if isinstance(entry, Item):
+                self._write(take, entry)
+            else:
+                take.ledger.count_dropped(entry)
+
+    def _preroll(self, held: list[Item | Dropped], now_ns: int) -> Answer:
+        if not self.ring.is_on:
+            return {}
+        first_ns = min([entry.received_ns for entry in held], default=now_ns)
+        return {"preroll_s": s_from_ns(now_ns - first_ns)}
+
+    def _open_take(self) -> Take:
+        if self.take is None:
+            raise LifecycleError("nothing is being recorded. Start an episode first.")
+        return self.take
+
+    def stop(
+        self,
+        outcome: metadata.Outcome | None,
+        command: Command,
+        *,
+        discard: bool,
+        reason: str,
+    ) -> Answer:
+        """Finish the episode, or throw it away."""
+        take = self._open_take()
+        end_ns = command.received_ns
+        self.is_finishing = True
+        if discard:
+            take.discard()
+        else:
+            take.close(end_ns=end_ns, reason=reason, outcome=outcome, health=self._health())
+            self.last_episode = take.info.id
+        self.take = None
+        self.is_finishing = False
+        answer = {"ok": True, "episode": take.info.id, "discarded": discard}
+        answer["duration_s"] = s_from_ns(end_ns - take.start_ns)
+        return {**answer, **counts(take)}
+
+    def event(
+        self, kind: str, command: Command, text: str, outcome: metadata.Outcome | None
+    ) -> Answer:
+        """Note this instant in the episode."""
+        take = self._open_take()
+        take.write_event(kind, stamp_ns=command.received_ns, text=text, outcome=outcome)
+        return {"ok": True, "episode": take.info.id}
+
+    def pause(self, command: Command) -> Answer:
+        """Leave messages out until ``resume``; they are not lost, they are not wanted."""
+        take = self._open_take()
+        if self.is_paused:
+            raise LifecycleError(f"episode {take.info.id!r} is paused already.")
+        answer = self.event("paused", command, "", None)
+        take.ledger.pause(command.ticket)
+        self.is_paused = True
+        return answer
+
+    def resume(self, command: Command) -> Answer:
+        """Record again."""
+        take = self._open_take()
+        if not self.is_paused:
+            raise LifecycleError(f"episode {take.info.id!r} is not paused.")
+        take.ledger.resume(command.ticket)
+        self.is_paused = False
+        return self.event("resumed", command, "", None)
+
+    def fail(
+        self, cause: str, now_ns: int, rest: Callable[[], Iterable[Item | Dropped]]
+    ) -> DiskError:
+        """End a recording the disk has refused, and finish its file if there is any way.
+
+        Args:
+            cause: What the disk said.
+            now_ns: When.
+            rest: Gives the messages received before, which can no longer be written.
+        """
+        take = self.take
+        path = take.part_path if take else self._run.episodes_dir
+        error = DiskError(path=path, cause=cause, is_finished=False)
+        if take is None:
+            self.error = error
+            return error
+        if not self.is_finishing:  # else they are of the time after its end
+            take.refuse(rest())
+        self._reserve.release()
+        try:
+            take.close(end_ns=now_ns, reason=f"disk: {cause}", outcome=None, health=self._health())
+            error = DiskError(path=take.path, cause=cause, is_finished=True)
+            self.last_episode = take.info.id
+        except OSError:
+            take.abandon()
+        self.error = error
+        self.take = None
+        self.is_finishing = False
+        return error
+
+    def end(self) -> None:
+        """Let go of the disk space held back."""
+        with contextlib.suppress(OSError):
+            self._reserve.release()
+
+
+def counts(take: Take) -> Answer:
+    """What an episode holds and lacks so far."""
+    total = take.ledger.total()
+    return {
+        "messages": total.received,
+        "bytes": total.bytes,
+        "lost": total.lost,
+        "undecodable": total.undecodable,
+        "unknown_type": total.unknown_type,
+        "shed": total.shed,
+        "parts": take.num_parts,
+    }

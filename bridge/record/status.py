@@ -1,0 +1,113 @@
+"""What is going on, for whoever asks: answered from memory, never waiting for disk or queue."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from bridge.clock import s_from_ns
+from bridge.episode.run import RunFolder
+from bridge.record.config import RecorderConfig
+from bridge.record.intake import Intake
+from bridge.record.lifecycle import Lifecycle, counts
+
+STALLED_S = 1.0
+"""A writer that has not moved for this long is waiting for its disk."""
+
+
+class Status:
+    """Collects what the parts of a recorder say of themselves."""
+
+    def __init__(
+        self,
+        run: RunFolder,
+        config: RecorderConfig,
+        intake: Intake,
+        life: Lifecycle,
+        now_ns: Callable[[], int],
+    ) -> None:
+        """Remember whom to ask."""
+        self.failing = ""
+        """What the disk said, while the episode is still being finished."""
+        self.clock_steps = 0
+        self.recovered: list[dict[str, Any]] = []
+        """What was found cut off when the recorder began."""
+        self._run = run
+        self._config = config
+        self._intake = intake
+        self._life = life
+        self._now_ns = now_ns
+        self._beat_s = time.monotonic()
+        self._counted: tuple[int, dict[str, int]] = (now_ns(), {})
+        self._rates_hz: dict[str, float] = {}
+
+    def beat(self) -> None:
+        """Note that the writer thread is moving."""
+        self._beat_s = time.monotonic()
+
+    def second(self, now_ns: int) -> None:
+        """Work out the rates since the last call; called about once a second."""
+        before_ns, before = self._counted
+        seen = self._intake.seen()
+        span_s = max(1e-9, s_from_ns(now_ns - before_ns))
+        self._rates_hz = {
+            topic: round((count - before.get(topic, 0)) / span_s, 1)
+            for topic, count in seen.items()
+        }
+        self._counted = (now_ns, seen)
+
+    def answer(self) -> dict[str, Any]:
+        """Say everything, as JSON values."""
+        life = self._life
+        take = life.take  # the writer thread may put another one there at any time
+        error = str(life.error) if life.error else self.failing or None
+        stalled_s = time.monotonic() - self._beat_s
+        answer: dict[str, Any] = {
+            "ok": error is None,
+            "recorder": self._config.recorder,
+            "run": str(self._run.path),
+            "state": "failed" if error else life.state,
+            "error": error,
+            "episode": take.info.id if take else None,
+            "last_episode": life.last_episode,
+            "queue_bytes": self._intake.queued_bytes,
+            "disk_free_bytes": life.free_bytes,
+            "shedding": self._intake.shed.name.lower(),
+            "stalled_s": round(stalled_s, 1) if stalled_s > STALLED_S else 0.0,
+            "clock_steps": self.clock_steps,
+            "preroll_s": round(life.ring.seconds(self._now_ns()), 1),
+            "recovered": self.recovered,
+            "seen": self._intake.seen(),
+            "rates_hz": self._rates_hz,
+        }
+        if take is not None:
+            answer["duration_s"] = s_from_ns(self._now_ns() - take.start_ns)
+            answer.update(counts(take))
+            totals = take.ledger.totals()
+            answer["topics"] = {topic: tally.to_record() for topic, tally in totals.items()}
+            answer["warnings"] = list(take.ledger.warnings)
+        return answer
+
+
+def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str:
+    """One line for people."""
+    free = f"{status['disk_free_bytes'] / 1e9:.1f} GB free"
+    if status["state"] == "failed":
+        return f"failed: {status['error']}"
+    stalled = f", the disk has not answered for {s:.0f} s" if (s := status["stalled_s"]) else ""
+    if status["state"] == "idle":
+        ring = f", pre-roll {s:.1f} s" if (s := status["preroll_s"]) else ""
+        return f"idle, {len(status['seen'])} topics seen{ring}, {free}{stalled}"
+    rate = "" if rate_hz is None else f" ({rate_hz:.0f}/s)"
+    flags = "".join(
+        f", {status[name]} {name.replace('_', ' ')}"
+        for name in ("undecodable", "unknown_type")
+        if status[name]
+    )
+    if status["shedding"] != "nothing":
+        flags += f", shedding {status['shedding'].replace('_', ' ')}"
+    return (
+        f"{status['state']} {status['episode']}: {status['duration_s']:.1f} s, "
+        f"{status['messages']} messages{rate}, {status['bytes'] / 1e6:.1f} MB, "
+        f"{status['lost']} lost{flags}, queue {status['queue_bytes'] / 1e6:.1f} MB, "
+        f"{free}{stalled}"
+    )

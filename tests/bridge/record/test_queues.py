@@ -1,0 +1,256 @@
+"""The queues: bounded in bytes, in order, images apart from joints, every loss counted."""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bridge.episode import schema
+from bridge.record.config import QueueConfig
+from bridge.record.entries import Command, Dropped, Entry, Item
+from bridge.record.inspection import Finding
+from bridge.record.intake import Intake
+from bridge.record.ledger import Ledger
+from bridge.record.merge import Merge
+from bridge.record.shedding import Shed, keep_every, next_level
+from bridge.wire.session import WireSample
+
+MakeSample = Callable[..., WireSample]
+
+
+class Queues:
+    """An intake whose images wait until they are let through."""
+
+    def __init__(self, **limits: object) -> None:
+        """Open the queues."""
+        self.images: deque[Item] = deque()
+        self.kinds: dict[str, str] = {}
+        self.intake = Intake(QueueConfig(**limits), self.images.append, self.kinds)  # type: ignore[arg-type]
+
+    def encode(self, count: int | None = None) -> None:
+        for _ in range(len(self.images) if count is None else count):
+            self.intake.put_image(self.images.popleft(), 0)
+
+    def drain(self) -> list[Entry]:
+        self.encode()
+        merge = Merge()
+        merge.feed(*self.intake.take())
+        entries = list(merge.ready())
+        for entry in entries:
+            if isinstance(entry, Item):
+                self.intake.release(entry)
+        return entries
+
+
+def image(number: int, size: int, **changes: object) -> WireSample:
+    sample = WireSample(
+        topic="/cell/cam/a/depth/image",
+        type_name=schema.IMAGE,
+        message_encoding="cdr",
+        data=bytes(size),
+        source_ns=None,
+        sequence=number,
+        source_gid=b"c" * 16,
+        received_ns=number * 10**7,
+    )
+    return replace(sample, **changes)  # type: ignore[arg-type]
+
+
+def command() -> Command:
+    return Command(action=lambda command: None, received_ns=0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 400_000), st.booleans(), st.integers(0, 2)), max_size=40),
+    st.integers(0, 40),
+)
+def test_every_message_is_kept_or_counted(
+    messages: list[tuple[int, bool, int]], encoded: int
+) -> None:
+    """Law: received + queue drops + shed + gaps = sent, whatever the sizes and whatever fits."""
+    queues = Queues(camera_queue_mb=1, small_queue_mb=1, max_message_mb=0.3, max_rate_hz=30)
+    queues.kinds["/cell/cam/a/depth/image"] = "depth"
+    ledger, sent = Ledger(), {True: 0, False: 0}
+    for number, (size, is_image, missing) in enumerate(messages):
+        sequence = sent[is_image]
+        sample = image(sequence, size, received_ns=number * 10**8)
+        if not is_image:
+            sample = replace(sample, topic="/small", type_name=schema.JOINT_STATE)
+        queues.intake.put(sample)
+        is_last = not any(other == is_image for _, other, _ in messages[number + 1 :])
+        sent[is_image] += 1 + (0 if is_last else missing)
+        if number == encoded:
+            queues.encode()
+    for entry in queues.drain():
+        if isinstance(entry, Item):
+            ledger.count_received(entry, Finding.GOOD)
+        elif isinstance(entry, Dropped):
+            ledger.count_dropped(entry)
+    total = ledger.total()
+    assert total.received + total.queue_drops + total.shed == len(messages)
+    assert total.received + total.lost == sum(sent.values())
+    assert queues.intake.queued_bytes == 0
+    by_second = list(ledger.close_seconds())
+    for name in ("received", "queue_drops", "shed", "gaps"):
+        assert sum(record[name] for record in by_second) == getattr(total, name)
+
+
+def test_images_never_evict_joints(make_sample: MakeSample) -> None:
+    queues = Queues(camera_queue_mb=1, small_queue_mb=1)
+    for number in range(20):
+        queues.intake.put(image(number, 200_000))
+    for _ in range(100):
+        queues.intake.put(make_sample())
+    entries = queues.drain()
+    joints = [e for e in entries if isinstance(e, Item) and "joint" in e.sample.topic]
+    dropped = [e for e in entries if isinstance(e, Dropped)]
+    assert len(joints) == 100
+    assert sum(c.messages for d in dropped for c in d.counts.values()) == 20 - 4
+
+
+def test_small_messages_have_a_bound_of_their_own(make_sample: MakeSample) -> None:
+    queues = Queues(small_queue_mb=1)
+    for _ in range(3000):
+        queues.intake.put(make_sample(data=bytes(500)))
+    kept = [entry for entry in queues.drain() if isinstance(entry, Item)]
+    assert len(kept) == 1_000_000 // (500 + 512)
+
+
+def test_commands_keep_their_place_and_wait_for_the_images_before_them(
+    make_sample: MakeSample,
+) -> None:
+    queues, merge = Queues(), Merge()
+    stop = command()
+    queues.intake.put(image(0, 10))
+    before = make_sample()
+    queues.intake.put(before)
+    queues.intake.put_command(stop)
+    queues.intake.put(image(1, 10))
+    after = make_sample()
+    queues.intake.put(after)
+
+    def ready() -> list[object]:
+        merge.feed(*queues.intake.take())
+        return [e.sample if isinstance(e, Item) else e for e in merge.ready()]
+
+    assert ready() == [before]  # small messages wait for no image
+    assert merge.is_waiting
+    queues.encode(1)
+    assert ready() == [image(0, 10), stop, after]
+    queues.encode(1)
+    assert ready() == [image(1, 10)]
+
+
+def test_an_image_from_behind_a_command_does_not_overtake_it() -> None:
+    queues, merge = Queues(), Merge()
+    queues.intake.put(image(0, 10, topic="/slow/cam/a/color/image"))
+    queues.intake.put_command(command())
+    queues.intake.put(image(1, 10))
+    slow = queues.images.popleft()
+    queues.encode()
+    merge.feed(*queues.intake.take())
+    assert list(merge.ready()) == []
+    queues.intake.put_image(slow, 0)
+    merge.feed(*queues.intake.take())
+    kinds = [type(entry) for entry in merge.ready()]
+    assert kinds == [Item, Command, Item]
+
+
+def test_what_is_given_up_ends_at_the_next_barrier() -> None:
+    queues, merge = Queues(), Merge()
+    stop = command()
+    queues.intake.put(image(0, 10))
+    queues.intake.put(image(1, 10, topic="/a", type_name="x"))
+    queues.intake.put_command(stop)
+    queues.intake.put(image(2, 10, topic="/b", type_name="x"))
+    queues.encode()
+    merge.feed(*queues.intake.take())
+    given_up = [entry.ticket for entry in merge.rest()]
+    assert sorted(given_up) == [0, 1]
+    assert [entry.ticket for entry in merge.ready()] == [stop.ticket, 3]
+
+
+def test_a_quiet_intake_queues_only_what_is_latched(make_sample: MakeSample) -> None:
+    queues = Queues()
+    queues.intake.be_quiet(0)
+    queues.intake.put(make_sample())
+    queues.intake.put(make_sample(topic="/tf_static"))
+    queues.intake.put(image(0, 10))
+    assert [e.sample.topic for e in queues.drain() if isinstance(e, Item)] == ["/tf_static"]
+    assert queues.intake.seen()["/cell/joint_states"] == 1
+    queues.intake.put_command(command())
+    queues.intake.be_quiet(0)  # too late: a command is on its way
+    queues.intake.put(make_sample())
+    assert [type(entry) for entry in queues.drain()] == [Command, Item]
+
+
+def test_too_large_and_too_many_are_dropped_and_said(make_sample: MakeSample) -> None:
+    queues = Queues(max_message_mb=0.1, max_rate_hz=5)
+    queues.intake.put(make_sample(data=bytes(100_001), topic="/huge"))
+    now_ns = make_sample().received_ns // 10**9 * 10**9
+    for _ in range(8):
+        queues.intake.put(make_sample(received_ns=now_ns))
+    queues.intake.put(make_sample(received_ns=now_ns + 10**9))
+    ledger = Ledger()
+    kept = 0
+    for entry in queues.drain():
+        kept += isinstance(entry, Item)
+        if isinstance(entry, Dropped):
+            ledger.count_dropped(entry)
+    assert kept == 5 + 1
+    assert ledger.total().queue_drops == 3 + 1
+    assert ledger.warnings == [
+        "/huge: messages over 0.1 MB are dropped",
+        "/cell/joint_states: over 5 messages a second are dropped",
+    ]
+
+
+def test_shedding_keeps_its_order_and_comes_back() -> None:
+    levels, level = [], Shed.NOTHING
+    for fill in (0.1, 0.3, 0.6, 0.75, 0.9, 0.7, 0.6, 0.4, 0.2, 0.1):
+        level = next_level(level, fill)
+        levels.append(int(level))
+    assert levels == [0, 1, 2, 3, 4, 4, 2, 2, 0, 0]
+    assert [keep_every(item, "color") for item in Shed] == [1, 1, 1, 2, 4]
+    assert [keep_every(item, "depth") for item in Shed] == [1, 1, 1, 1, 2]
+    assert [keep_every(item, "") for item in Shed] == [1] * 5
+
+
+def test_shed_images_are_counted_as_such() -> None:
+    queues = Queues(camera_queue_mb=1)
+    queues.kinds["/color"] = "color"
+    for number in range(16):
+        queues.intake.put(image(number, 50_000, topic="/color"))
+    ledger, kept = Ledger(), 0
+    for entry in queues.drain():
+        if isinstance(entry, Item):
+            kept += 1
+        elif isinstance(entry, Dropped):
+            ledger.count_dropped(entry)
+    assert ledger.total().shed > 0
+    assert ledger.total().queue_drops == 0
+    assert kept + ledger.total().shed == 16
+
+
+@pytest.mark.slow
+def test_threads_that_put_at_once_lose_nothing(make_sample: MakeSample) -> None:
+    queues = Queues(max_rate_hz=10**9, small_queue_mb=1000)
+    samples = [make_sample() for _ in range(5000)]
+
+    def put(gid: bytes) -> None:
+        for number, sample in enumerate(samples):
+            queues.intake.put(replace(sample, source_gid=gid, sequence=number))
+
+    threads = [threading.Thread(target=put, args=(bytes([n]) * 16,)) for n in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    entries = queues.drain()
+    assert len(entries) == 4 * len(samples)
+    assert sum(entry.step.gap for entry in entries if isinstance(entry, Item)) == 0
