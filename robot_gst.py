@@ -39,6 +39,12 @@ COMMANDS: tuple[tuple[str, str, str, str], ...] = (
         "Whether an episode is whole, and what it lost.",
         "runs/demo",
     ),
+    (
+        "recover",
+        "bridge.cli.recovery:recover",
+        "Finish what a killed recorder left, and say what was lost.",
+        "runs/demo",
+    ),
     ("ls", f"{CATALOGUE}:ls", "List the episodes of a run.", "runs/demo --outcome failure"),
     (
         "label",
@@ -88,13 +94,25 @@ COMMANDS: tuple[tuple[str, str, str, str], ...] = (
 
 GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
     "publish": (
-        "Speak on the wire: an RGB-D folder or the stand-in cell.",
+        "Speak on the wire: cameras, a robot, an RGB-D folder, the stand-in cell.",
         (
             (
                 "folder",
                 f"{LIVE}:publish_folder",
                 "Play an RGB-D folder as a live camera.",
                 "DIR --episode scan",
+            ),
+            (
+                "realsense",
+                f"{DEVICES}:publish_realsense",
+                "RealSense cameras: colour, depth, calibration.",
+                "--cell lab --camera side=123622270224",
+            ),
+            (
+                "ur",
+                f"{DEVICES}:publish_ur",
+                "A UR arm: joints, tool, gripper, modes.",
+                "192.168.1.10 --cell lab",
             ),
             (
                 "standin",
@@ -119,16 +137,34 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
                 "The Kinova reality-gap runs.",
                 "DIR runs/x",
             ),
+            (
+                "lerobot",
+                f"{EXCHANGE}:import_lerobot",
+                "A LeRobotDataset v3.0, one episode file each.",
+                "DIR runs/x --episodes 0-9",
+            ),
+            (
+                "trials",
+                f"{EXCHANGE}:import_trials",
+                "A trials CSV, for evaluate.",
+                "trials.csv runs/x",
+            ),
         ),
     ),
     "export": (
-        "Write an episode for other people's programs.",
+        "Write episodes for other people's programs.",
         (
             (
                 "rrd",
                 "dashboards.cli:export_rrd",
                 "An episode with its replays as a Rerun file.",
                 "EPISODE --out FILE.rrd",
+            ),
+            (
+                "lerobot",
+                f"{EXCHANGE}:export_lerobot",
+                "Trials as a LeRobotDataset v3.0.",
+                "runs/x DIR",
             ),
             (
                 "tum",

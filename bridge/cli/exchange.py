@@ -182,3 +182,29 @@ def import_lerobot(
         text,
     )
     return 0
+
+
+def import_trials(
+    table: Path, run: Path, /, *, force: bool = False, output: Output = OUTPUT
+) -> int:
+    """Check a trials CSV and keep it in the run as notes/trials.csv, where evaluate reads it.
+
+    A trial whose id is also that of a recorded episode does not count twice: the episode wins.
+    Example: robot-gst import trials experiment.csv runs/monday
+
+    Args:
+        table: One row per trial; docs/exchange.md lists the columns.
+        run: Run folder; made where needed.
+        force: Replace trials imported earlier.
+        output: How to talk.
+    """
+    from bridge.episode.run import RunFolder
+    from bridge.exchange.trials_import import import_trials as keep_trials
+    from bridge.exchange.trials_import import trials_path
+
+    folder = RunFolder(run)
+    trials = keep_trials(table, folder, force=force)
+    tasks = sorted({trial.task for trial in trials})
+    data = {"file": str(trials_path(folder)), "trials": len(trials), "tasks": tasks}
+    output.result(data, f"{trials_path(folder)}: {len(trials)} trials of {', '.join(tasks)}")
+    return 0

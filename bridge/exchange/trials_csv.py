@@ -6,6 +6,7 @@ field means unknown and stays unknown.
 """
 
 import csv
+import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -244,12 +245,18 @@ def _trial(row: SourceRow) -> TrialRecord:
 
 def write_trials(path: Path, trials: Iterable[TrialRecord]) -> Path:
     """Write a trials CSV that ``read_trials`` reads back as it was."""
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(COLUMNS)
-        for trial in trials:
-            writer.writerow([_field(name, getattr(trial, name)) for name in COLUMNS])
+    path.write_text(trials_text(trials), encoding="utf-8", newline="")
     return path
+
+
+def trials_text(trials: Iterable[TrialRecord]) -> str:
+    """The text of a trials CSV, all columns in order."""
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream)
+    writer.writerow(COLUMNS)
+    for trial in trials:
+        writer.writerow([_field(name, getattr(trial, name)) for name in COLUMNS])
+    return stream.getvalue()
 
 
 def _field(name: str, value: object) -> str:

@@ -8,7 +8,9 @@ from bridge.episode.provenance import hash_file, software
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.errors import BridgeError, GstError
+from bridge.exchange.trials_import import trials_path
 from evaluator.compare.bands import compare_bands
+from evaluator.compare.imported import imported_rows
 from evaluator.compare.pairing import (
     START_LIMIT_M,
     agreement,
@@ -63,10 +65,16 @@ def compare_run(run: RunFolder) -> Comparison:
             continue
         rows.append(row)
         left_out += lacking
+    imported, doubled = imported_rows(run, {episode.info.id for episode in recorded})
+    rows += imported
+    left_out += doubled
     views = compare_views(files, recorded, hashes)
     bands = compare_bands(recorded, files)
     base = compare_rows(
-        rows, run=run.path.resolve().name, source="run", stand_in=_stand_in(recorded, files)
+        rows,
+        run=run.path.resolve().name,
+        source="run",
+        stand_in=_stand_in(recorded, files, imported),
     )
     missing = [] if rows else ["trials: the run holds no recorded trial"]
     return replace(
@@ -78,6 +86,7 @@ def compare_run(run: RunFolder) -> Comparison:
         provenance={
             "software": software(),
             "start_limit_m": START_LIMIT_M,
+            "imported_trials": hash_file(trials_path(run)) if imported or doubled else None,
             "episodes": {_name_of(path, run): sha256 for path, sha256 in hashes.items()},
             "derived": {
                 _name_of(file.path, run): {
@@ -171,10 +180,13 @@ def _broken(name: str, error: GstError) -> Exclusion:
     return Exclusion(episode=name, scope="everything", reason=str(error))
 
 
-def _stand_in(recorded: Sequence[Episode], files: Sequence[DerivedFile]) -> bool | None:
+def _stand_in(
+    recorded: Sequence[Episode], files: Sequence[DerivedFile], imported: Sequence[TrialRow]
+) -> bool | None:
     """True as soon as one episode is a stand-in's: mixed results are not called real."""
     marks = [episode.info.stand_in for episode in recorded]
     marks += [file.episode.info.stand_in for file in files]
+    marks += [row.stand_in for row in imported]
     return any(marks) if marks else None
 
 

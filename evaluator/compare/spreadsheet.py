@@ -9,6 +9,7 @@ from bridge.episode.provenance import hash_file, software
 from bridge.errors import UsageError
 from bridge.exchange.trials_csv import TrialRecord, header_of, read_trials
 from bridge.exchange.trials_rates import RateRecord, read_rates
+from evaluator.compare.imported import row_from_record
 from evaluator.compare.measure import slug
 from evaluator.compare.rows import Comparison, RateCell, TrialRow
 from evaluator.compare.run import compare_rows
@@ -54,27 +55,6 @@ def compare_trials(path: Path) -> Comparison:
         if lacks
     ]
     return _with_source(base, path, left_out)
-
-
-def row_from_record(record: TrialRecord) -> TrialRow:
-    """Turn one line of a trials CSV into a trial row."""
-    return TrialRow(
-        episode=record.trial_id,
-        task=record.task,
-        condition=record.condition,
-        policy=record.policy,
-        start_id=record.start_id,
-        cell=record.cell,
-        stand_in=record.stand_in,
-        recorded=record.recorded,
-        unit=record.unit,
-        k=record.k,
-        n=record.n,
-        sim_planned=record.sim_planned,
-        sim_executed=record.sim_executed,
-        verdict=record.verdict,
-        p_success=record.p_success,
-    )
 
 
 def record_from_row(row: TrialRow) -> TrialRecord:

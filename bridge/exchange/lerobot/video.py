@@ -35,16 +35,25 @@ class VideoWriter:
         self.path = path
         self.num_frames = 0
         self._frame_class = av.VideoFrame
+        self._intra = av.video.frame.PictureType.I
         self._container = av.open(str(path), "w")
-        options = {"crf": str(crf), "g": str(KEYFRAME_EVERY), "bf": "0", "preset": "veryfast"}
+        options = {
+            "crf": str(crf),
+            "g": str(KEYFRAME_EVERY),
+            "bf": "0",
+            "preset": "veryfast",
+            "forced-idr": "1",
+        }
         self._stream = self._container.add_stream(CODEC, rate=fps, options=options)
         self._stream.width, self._stream.height = width, height
         self.pix_fmt = "yuv420p" if width % 2 == 0 and height % 2 == 0 else "yuv444p"
         self._stream.pix_fmt = self.pix_fmt
 
-    def write(self, image_u8: UInt8[np.ndarray, "height width 3"]) -> None:
-        """Append one frame."""
+    def write(self, image_u8: UInt8[np.ndarray, "height width 3"], *, first: bool) -> None:
+        """Append one frame; the first of an episode can be decoded without those before it."""
         frame = self._frame_class.from_ndarray(image_u8, format="rgb24")
+        if first:
+            frame.pict_type = self._intra
         frame.pts = self.num_frames
         for packet in self._stream.encode(frame):
             self._container.mux(packet)

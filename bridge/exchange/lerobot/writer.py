@@ -209,7 +209,7 @@ class DatasetWriter:
         first = video.writer.num_frames
         found = ImageStats()
         for image_u8 in frames:
-            video.writer.write(image_u8)
+            video.writer.write(image_u8, first=found.images == 0)
             found.add(image_u8)
         stats[key] = found
         used: dict[str, int | float] = {
