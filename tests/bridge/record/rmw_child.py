@@ -51,9 +51,7 @@ def open_client(endpoint: str) -> Any:
 
 def main() -> None:
     endpoint, form, count, *flags = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), *sys.argv[4:]
-    type_name = (
-        "my_msgs::msg::dds_::Grip_" if "unknown" in flags else "std_msgs::msg::dds_::String_"
-    )
+    name = "my_msgs::msg::dds_::Grip_" if "unknown" in flags else "std_msgs::msg::dds_::String_"
     type_hash = TYPESTORE.hash_rihs01(STRING)
     if "other-hash" in flags or "unknown" in flags:
         type_hash = "RIHS01_" + "5" * 64
