@@ -20,6 +20,7 @@ HELP = (
 )
 
 EPISODES, LIVE, IMPORTS = "bridge.cli.episodes", "bridge.cli.live", "bridge.cli.imports"
+DEVICES = "bridge.cli.devices"
 EXCHANGE = "bridge.cli.exchange"
 CATALOGUE = "bridge.cli.catalogue"
 

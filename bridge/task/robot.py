@@ -41,9 +41,18 @@ def _data_root() -> Path:
     return root
 
 
+def _ur5_path() -> Path:
+    return _data_root() / "robots" / "ur_description" / "urdf" / "ur5_robot.urdf"
+
+
+def ur5_urdf() -> str:
+    """Return the URDF text of the bare arm, as its data package holds it."""
+    return _ur5_path().read_text()
+
+
 def ur5_with_gripper_urdf() -> str:
     """Return the URDF text; mesh names stay ``package://`` URIs, see ``resolve_mesh``."""
-    arm = ET.parse(_data_root() / "robots" / "ur_description" / "urdf" / "ur5_robot.urdf").getroot()
+    arm = ET.parse(_ur5_path()).getroot()
     gripper = ET.parse(dataset_file("robots", "parallel_gripper", ".urdf")).getroot()
     for element in [item for item in arm if item.tag in ("transmission", "gazebo")]:
         arm.remove(element)

@@ -1,0 +1,1 @@
+"""Intel RealSense depth cameras: D435 (fixed views) and D405 (at the wrist)."""

@@ -1,0 +1,220 @@
+"""One RealSense camera through its sensors: calibration once, then every frame in order.
+
+No syncer stands between (unless depth is aligned): it would pair frames and drop the odd ones.
+Colour and depth of one camera can come from two sensors (D435) or from one (D405).
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry.camera import Camera
+from bridge.media.depth import to_millimetres
+from bridge.sources.realsense.config import RealSenseConfig
+from bridge.sources.realsense.errors import CameraStreamError
+from bridge.sources.realsense.frames import Calibration, ColorFrame, DepthFrame, Frame
+from bridge.sources.realsense.library import rs
+from bridge.sources.realsense.rectify import Rectifier, is_distorted
+from bridge.sources.realsense.stamps import FrameStamps
+
+QUEUE_FRAMES = 30
+"""Frames that wait for us inside the library; the driver owns about as many buffers."""
+UNIT_M = 0.001
+"""Episodes hold whole millimetres."""
+
+
+class _Chosen(NamedTuple):
+    sensor: Any
+    profile: Any
+
+
+def serial_of(device: Any) -> str:
+    """Serial number of a device, as printed on it."""
+    return str(device.get_info(rs.camera_info.serial_number))
+
+
+def describe_device(device: Any) -> str:
+    """Model and serial number."""
+    known = device.supports(rs.camera_info.name)
+    name = device.get_info(rs.camera_info.name) if known else "RealSense"
+    return f"{name.removeprefix('Intel RealSense ')} {serial_of(device)}"
+
+
+class CameraDevice:
+    """An open camera; close it, or the next one to open it finds it busy."""
+
+    def __init__(
+        self, device: Any, config: RealSenseConfig, *, camera: str, now_ns: Callable[[], int]
+    ) -> None:
+        """Open both sensors and start them.
+
+        Args:
+            device: ``rs.device``, also an ``rs.software_device``.
+            config: Size and rate; whether depth is aligned.
+            camera: Its name, for errors.
+            now_ns: The host's clock.
+
+        Raises:
+            CameraStreamError: When it has no such stream, or another program has it open.
+        """
+        self._camera = f"{camera} ({describe_device(device)})"
+        self._now_ns = now_ns
+        self._stamps = FrameStamps()
+        color = self._choose(device, config, rs.stream.color, rs.format.rgb8)
+        depth = self._choose(device, config, rs.stream.depth, rs.format.z16)
+        intrinsics = color.profile.as_video_stream_profile().get_intrinsics()
+        self._rectifier = Rectifier(intrinsics) if is_distorted(intrinsics) else None
+        self._set_unit(depth.sensor)
+        self.calibration = self._calibration(color.profile, depth.profile, aligned=config.align)
+        self._align = rs.align(rs.stream.color) if config.align else None
+        self._queue = (
+            rs.syncer(QUEUE_FRAMES) if config.align else rs.frame_queue(QUEUE_FRAMES, True)
+        )
+        self._started: list[Any] = []
+        self._start(color, depth)
+
+    @property
+    def rectified(self) -> bool:
+        """Whether lens distortion is taken out of colour images here."""
+        return self._rectifier is not None
+
+    def _choose(self, device: Any, config: RealSenseConfig, stream: Any, pixels: Any) -> _Chosen:
+        offers = []
+        for sensor in device.query_sensors():
+            for profile in sensor.get_stream_profiles():
+                if profile.stream_type() != stream or profile.format() != pixels:
+                    continue
+                video = profile.as_video_stream_profile()
+                if (video.width(), video.height(), video.fps()) == (*config.pixels(), config.fps):
+                    return _Chosen(sensor, profile)
+                offers.append(f"{video.width()}x{video.height()} at {video.fps()} Hz")
+        raise CameraStreamError(
+            camera=self._camera,
+            found=f"no {stream.name} images of {config.size} at {config.fps} Hz",
+            hint=f"It offers {', '.join(sorted(set(offers))) or 'none'}; "
+            "on USB 2 the list is shorter: use a USB 3 port and cable, or --size and --fps.",
+        )
+
+    def _set_unit(self, sensor: Any) -> None:
+        """Let the camera itself send millimetres; where it refuses, frames are converted."""
+        option = rs.option.depth_units
+        if not sensor.supports(option) or sensor.is_option_read_only(option):
+            return
+        try:
+            sensor.set_option(option, UNIT_M)
+        except RuntimeError:  # outside what this model allows
+            return
+
+    def _calibration(self, color: Any, depth: Any, *, aligned: bool) -> Calibration:
+        color_camera = _camera_of(color)
+        intrinsics = depth.as_video_stream_profile().get_intrinsics()
+        if is_distorted(intrinsics):
+            raise CameraStreamError(
+                camera=self._camera,
+                found="its depth images have lens distortion, which episodes do not hold",
+                hint="Reset the calibration with the vendor's viewer.",
+            )
+        if aligned:
+            return Calibration(
+                color_camera=color_camera, depth_camera=color_camera, T_color_depth=np.eye(4)
+            )
+        return Calibration(
+            color_camera=color_camera,
+            depth_camera=_camera_of(depth),
+            T_color_depth=_transform_of(depth.get_extrinsics_to(color)),
+        )
+
+    def _start(self, color: _Chosen, depth: _Chosen) -> None:
+        together = color.sensor == depth.sensor
+        groups = (
+            [(color.sensor, [color.profile, depth.profile])]
+            if together
+            else [(item.sensor, [item.profile]) for item in (depth, color)]
+        )
+        try:
+            for sensor, profiles in groups:
+                sensor.open(profiles)
+                self._started.append(sensor)
+                sensor.start(self._queue)
+        except RuntimeError as error:
+            self.close()
+            raise CameraStreamError(
+                camera=self._camera,
+                found=f"it cannot be opened: {error}",
+                hint="Close other programs that use it (realsense-viewer, a ROS node).",
+            ) from error
+
+    def read(self, timeout_s: float) -> list[Frame] | None:
+        """Return the next frames, or None when nothing came in time.
+
+        An empty list means that a frame came that is not yet of use: the offset between the
+        clocks is still being found, or depth has no colour image to be aligned to.
+        """
+        milliseconds = round(timeout_s * 1e3)
+        if self._align is None:
+            came, frame = self._queue.try_wait_for_frame(milliseconds)
+            items = [frame] if came else []
+        else:
+            came, frame = self._queue.try_wait_for_frames(milliseconds)
+            items = self._aligned(frame.as_frameset()) if came else []
+        if not came:
+            return None
+        received_ns = self._now_ns()
+        frames = [self._frame_of(item, received_ns) for item in items]
+        return [item for item in frames if item is not None]
+
+    def _aligned(self, frames: Any) -> list[Any]:
+        color = frames.get_color_frame()
+        if not color:
+            return []
+        if not frames.get_depth_frame():
+            return [color]
+        assert self._align is not None  # noqa: S101  # only called when aligning
+        return [color, self._align.process(frames).get_depth_frame()]
+
+    def _frame_of(self, frame: Any, received_ns: int) -> Frame | None:
+        depth = frame.is_depth_frame()
+        number = frame.get_frame_number()
+        stamp_ns = self._stamps.stamp_ns(frame, received_ns)
+        if stamp_ns is None:
+            return None
+        pixels = np.array(frame.get_data())  # a copy: the library gets its buffer back
+        if not depth:
+            image_u8 = pixels if self._rectifier is None else self._rectifier.apply(pixels)
+            return ColorFrame(number=number, stamp_ns=stamp_ns, image_u8=image_u8)
+        unit_m = round(frame.as_depth_frame().get_units(), 7)  # a float32, 1e-4 is 9.9999997e-5
+        if unit_m != UNIT_M:
+            pixels = to_millimetres(pixels, unit_m=unit_m)
+        return DepthFrame(number=number, stamp_ns=stamp_ns, depth_mm=pixels)
+
+    def close(self) -> None:
+        """Stop the sensors; a camera that is gone cannot be stopped, which is as good."""
+        for sensor in self._started:
+            for end in (sensor.stop, sensor.close):
+                try:
+                    end()
+                except RuntimeError:
+                    continue
+        self._started.clear()
+
+
+def _camera_of(profile: Any) -> Camera:
+    found = profile.as_video_stream_profile().get_intrinsics()
+    return Camera.from_ros(
+        width=found.width,
+        height=found.height,
+        fx=found.fx,
+        fy=found.fy,
+        cx=found.ppx,
+        cy=found.ppy,
+    )
+
+
+def _transform_of(extrinsics: Any) -> Float[np.ndarray, "4 4"]:
+    """The library keeps rotations column by column."""
+    T = np.eye(4)
+    T[:3, :3] = np.array(extrinsics.rotation).reshape(3, 3).T
+    T[:3, 3] = extrinsics.translation
+    return T

@@ -1,0 +1,218 @@
+"""Publishes RealSense cameras: one thread each, back again after the cable was pulled."""
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from bridge.errors import GstError
+from bridge.sources.announcer import Announcer
+from bridge.sources.numbered import NumberedPublisher
+from bridge.sources.realsense.config import DEFAULT_CAMERA, RealSenseConfig
+from bridge.sources.realsense.device import CameraDevice, describe_device, serial_of
+from bridge.sources.realsense.errors import CameraNotFoundError, CameraStreamError
+from bridge.sources.realsense.frames import ColorFrame, Frame
+from bridge.sources.realsense.library import rs
+from bridge.sources.realsense.messages import CameraMessages
+from bridge.sources.realsense.mounts import Mount, read_mounts
+from bridge.terminal import Output
+from bridge.wire.qos import Qos
+from bridge.wire.session import WireSession
+
+STALL_S = 3.0
+"""A camera that is silent for so long is taken for unplugged."""
+RETRY_S = 1.0
+POLL_S = 0.2
+
+ListDevices = Callable[[], list[Any]]
+
+
+def attached_devices() -> ListDevices:
+    """A function that lists the RealSense cameras attached to this machine."""
+    context = rs.context()
+    return lambda: list(context.query_devices())
+
+
+class CameraWorker:
+    """Reads one camera and publishes what it sends, for as long as it takes."""
+
+    def __init__(
+        self,
+        camera: str,
+        serial: str,
+        *,
+        config: RealSenseConfig,
+        session: WireSession,
+        announcer: Announcer,
+        mount: Mount | None,
+        list_devices: ListDevices,
+        output: Output,
+    ) -> None:
+        """Announce its topics."""
+        self.camera = camera
+        self._serial = serial
+        self._config = config
+        self._session = session
+        self._announcer = announcer
+        self._mount = mount
+        self._list_devices = list_devices
+        self._output = output
+        self._messages = CameraMessages(config, camera)
+        self._streams = {
+            stream: NumberedPublisher(
+                session.publisher(*self._messages.topic_and_type(stream), qos=Qos.CAMERA)
+            )
+            for stream in ("color", "depth")
+        }
+        self.failure: GstError | None = None
+        self.connections = 0
+
+    def run(self, stop: threading.Event) -> None:
+        """Work until stopped; a first opening that fails ends everything."""
+        try:
+            while not stop.is_set():
+                device = self._open()
+                if device is None:
+                    stop.wait(RETRY_S)
+                    continue
+                try:
+                    self._stream(device, stop)
+                finally:
+                    device.close()
+        except GstError as error:
+            self.failure = error
+            stop.set()
+
+    def _open(self) -> CameraDevice | None:
+        device = _find(self._list_devices, self._serial)
+        if device is None:
+            return None
+        try:
+            opened = CameraDevice(
+                device, self._config, camera=self.camera, now_ns=self._session.now_ns
+            )
+        except CameraStreamError as error:
+            if not self.connections:
+                raise
+            self._output.detail(f"{error} Trying again.")
+            return None
+        self.connections += 1
+        facts = self._messages.facts(opened.calibration, self._mount, self._session.now_ns())
+        for number, message in enumerate(facts):
+            self._announcer.fact((self.camera, number), message)
+        note = ", lens distortion taken out" if opened.rectified else ""
+        self._output.say(f"camera {self.camera} ({describe_device(device)}): streaming{note}")
+        return opened
+
+    def _stream(self, device: CameraDevice, stop: threading.Event) -> None:
+        silent_s = 0.0
+        while not stop.is_set():
+            frames = device.read(POLL_S)
+            silent_s = silent_s + POLL_S if frames is None else 0.0
+            if silent_s >= STALL_S:
+                self._output.say(
+                    f"camera {self.camera} ({self._serial}): no frames for {STALL_S:g} s, "
+                    "unplugged? Waiting for it to come back."
+                )
+                return
+            for frame in frames or ():
+                self._put(frame)
+
+    def _put(self, frame: Frame) -> None:
+        if isinstance(frame, ColorFrame):
+            stream, data = "color", self._messages.color(frame)
+        else:
+            stream, data = "depth", self._messages.depth(frame)
+        missing = self._streams[stream].put(frame.number, data, source_ns=frame.stamp_ns)
+        if missing:
+            self._output.detail(f"camera {self.camera}: {missing} {stream} frames missing")
+
+    def counts(self) -> dict[str, int]:
+        """What was sent, and what the camera or the bus dropped."""
+        return {
+            **{f"{name}_frames": stream.sent for name, stream in self._streams.items()},
+            **{f"{name}_lost": stream.lost for name, stream in self._streams.items()},
+            "connections": self.connections,
+        }
+
+
+def publish_cameras(
+    session: WireSession,
+    config: RealSenseConfig,
+    *,
+    stop: threading.Event,
+    output: Output,
+    list_devices: ListDevices,
+) -> dict[str, dict[str, int]]:
+    """Publish every camera asked for until stopped.
+
+    Args:
+        session: An open session.
+        config: Which cameras, and how.
+        stop: Set by the caller, or here when a camera failed.
+        output: Told what happens to the cameras.
+        list_devices: Called whenever a camera is looked for.
+
+    Returns:
+        Frames sent and lost by camera.
+
+    Raises:
+        CameraNotFoundError: When one of them is not attached at the start.
+        CameraStreamError: When one of them cannot be opened at the start.
+    """
+    wanted = choose_cameras(config, list_devices)
+    mounts = {} if config.mounts is None else read_mounts(config.mounts, list(wanted))
+    announcer = Announcer(session)
+    workers = [
+        CameraWorker(
+            camera,
+            serial,
+            config=config,
+            session=session,
+            announcer=announcer,
+            mount=mounts.get(camera),
+            list_devices=list_devices,
+            output=output,
+        )
+        for camera, serial in wanted.items()
+    ]
+    threads = [
+        threading.Thread(target=worker.run, args=(stop,), name=f"camera {worker.camera}")
+        for worker in workers
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    announcer.close()
+    failures = [worker.failure for worker in workers] + [announcer.failure]
+    for failure in failures:
+        if failure is not None:
+            raise failure
+    return {worker.camera: worker.counts() for worker in workers}
+
+
+def choose_cameras(config: RealSenseConfig, list_devices: ListDevices) -> dict[str, str]:
+    """Map names to serial numbers of cameras that are attached.
+
+    Raises:
+        CameraNotFoundError: When one is not, or none was named and there is not just one.
+    """
+    found = list_devices()
+    listed = [describe_device(device) for device in found]
+    wanted = config.serials()
+    if not wanted:
+        if len(found) != 1:
+            raise CameraNotFoundError(wanted="named with --camera NAME=SERIAL", found=listed)
+        return {DEFAULT_CAMERA: serial_of(found[0])}
+    serials = {serial_of(device) for device in found}
+    for name, serial in wanted.items():
+        if serial not in serials:
+            raise CameraNotFoundError(wanted=f"{name} with serial number {serial}", found=listed)
+    return wanted
+
+
+def _find(list_devices: ListDevices, serial: str) -> Any | None:
+    try:
+        return next((item for item in list_devices() if serial_of(item) == serial), None)
+    except RuntimeError:  # it went away while being asked
+        return None

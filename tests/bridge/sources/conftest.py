@@ -1,0 +1,45 @@
+"""Lets the tests of this folder import the peers that lie beside them; a real recorder."""
+
+import socket
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from bridge.episode.run import RunFolder
+from bridge.record.control import serve_control
+from bridge.record.recorder import Recorder
+from bridge.wire.config import WireConfig
+from bridge.wire.recorder_client import RecorderClient
+from bridge.wire.session import WireSession, open_session
+
+
+class Joined(NamedTuple):
+    """A real recorder behind a real zenoh router, and a client session beside it."""
+
+    run: RunFolder
+    client: WireSession
+    control: RecorderClient
+    endpoint: str
+
+    def episode_path(self, name: str) -> Path:
+        return self.run.episodes_dir / f"{name}.mcap"
+
+
+@pytest.fixture
+def joined(tmp_path: Path) -> Iterator[Joined]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    run = RunFolder.create(tmp_path / "run")
+    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
+        recorder = Recorder(run, now_ns=session.now_ns)
+        session.subscribe("**", recorder.receive)
+        serve_control(session, recorder)
+        with open_session(WireConfig(connect=(endpoint,))) as client:
+            yield Joined(run, client, RecorderClient(client, timeout_s=10.0), endpoint)
+        recorder.close()

@@ -1,0 +1,173 @@
+"""RTDE packages, recipes and gripper signals, against the guide's layout."""
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.errors import UsageError
+from bridge.sources.ur.config import UrConfig
+from bridge.sources.ur.gripper import parse_signal
+from bridge.sources.ur.messages import T_base_link_tcp
+from bridge.sources.ur.protocol import (
+    BrokenPackageError,
+    Kind,
+    Package,
+    PackageSplitter,
+    Recipe,
+    encode_package,
+    text_of,
+)
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from(list(Kind)), st.binary(max_size=80)), max_size=20),
+    st.integers(1, 40),
+)
+def test_packages_survive_any_way_of_being_cut(
+    packages: list[tuple[Kind, bytes]], size: int
+) -> None:
+    stream = b"".join(encode_package(kind, payload) for kind, payload in packages)
+    splitter = PackageSplitter()
+    found = [
+        package
+        for start in range(0, len(stream), size)
+        for package in splitter.feed(stream[start : start + size])
+    ]
+    assert found == [Package(kind=kind, payload=payload) for kind, payload in packages]
+
+
+@given(st.binary(max_size=300))
+def test_bytes_that_are_no_rtde_are_refused_or_waited_for(data: bytes) -> None:
+    splitter = PackageSplitter()
+    try:
+        found = list(splitter.feed(data))
+    except BrokenPackageError:
+        return
+    assert all(package.kind in set(Kind) for package in found)
+
+
+@pytest.mark.parametrize("greeting", [b"SSH-2.0-OpenSSH_9.6\r\n", b"HTTP/1.1 400 Bad", b"\0\0V"])
+def test_another_protocol_is_recognised_at_once(greeting: bytes) -> None:
+    with pytest.raises(BrokenPackageError, match="it sent"):
+        list(PackageSplitter().feed(greeting))
+
+
+def test_a_recipe_reads_every_type() -> None:
+    types = ("BOOL", "UINT8", "UINT32", "UINT64", "INT32", "DOUBLE", "VECTOR3D", "VECTOR6D")
+    types += ("VECTOR6INT32", "VECTOR6UINT32")
+    names = tuple(name.lower() for name in types)
+    payload = struct.pack(">B?BIQid3d6d6i6I", 7, True, 1, 2, 3, -4, 0.5, *range(21))
+    values = Recipe(names, types, 7).unpack(payload)
+    assert values["bool"] is True
+    assert (values["uint64"], values["int32"], values["double"]) == (3, -4, 0.5)
+    assert values["vector6d"] == (3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
+    assert values["vector6uint32"] == (15, 16, 17, 18, 19, 20)
+
+
+def test_data_of_another_length_or_recipe_is_refused() -> None:
+    recipe = Recipe(("timestamp",), ("DOUBLE",), 1)
+    with pytest.raises(BrokenPackageError, match="8 bytes, expected 9"):
+        recipe.unpack(bytes(8))
+    with pytest.raises(BrokenPackageError, match="recipe 2, expected 1"):
+        recipe.unpack(b"\x02" + bytes(8))
+    with pytest.raises(BrokenPackageError, match="MATRIX"):
+        Recipe(("a",), ("MATRIX",), 1)
+
+
+@given(st.binary(max_size=40))
+def test_any_text_message_can_be_read(payload: bytes) -> None:
+    text_of(payload)
+    assert text_of(b"\x02hi\x03urc\x01") == "urc: hi"
+
+
+def test_a_gripper_on_a_tool_input() -> None:
+    config = UrConfig(gripper="digital_in:17", gripper_open_value=1.0, gripper_closed_value=0.0)
+    gripper = config.make_gripper()
+    assert gripper is not None
+    assert gripper.width_m({"actual_digital_input_bits": 1 << 17}) == 0.085
+    assert gripper.width_m({"actual_digital_input_bits": 0xFFFF}) == 0.0
+
+
+@given(st.floats(-1e9, 1e9))
+def test_a_width_stays_between_its_ends(volts: float) -> None:
+    config = UrConfig(
+        gripper="tool_analog_in:0",
+        gripper_open_value=0.0,
+        gripper_closed_value=10.0,
+        gripper_open_m=0.14,
+        gripper_closed_m=0.002,
+    )
+    gripper = config.make_gripper()
+    assert gripper is not None
+    width_m = gripper.width_m({"tool_analog_input0": volts})
+    assert 0.002 - 1e-12 <= width_m <= 0.14 + 1e-12
+    assert gripper.width_m({"tool_analog_input0": 5.0}) == pytest.approx(0.071)
+
+
+def test_a_robotiq_position_in_a_register() -> None:
+    config = UrConfig(gripper="double_register:0", gripper_closed_value=255.0)
+    gripper = config.make_gripper()
+    assert gripper is not None
+    assert gripper.width_m({"output_double_register_0": 51.0}) == pytest.approx(0.068)
+
+
+@pytest.mark.parametrize("text", ["digital_in:18", "analog_in:2", "voltage:0", "digital_in", ""])
+def test_signals_that_do_not_exist_are_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="is no signal"):
+        parse_signal(text)
+    with pytest.raises(UsageError):
+        UrConfig(gripper=text)
+
+
+def test_settings_that_tell_nothing_are_refused() -> None:
+    with pytest.raises(UsageError, match="tell an open gripper"):
+        UrConfig(gripper_open_value=1.0, gripper_closed_value=1.0)
+    with pytest.raises(UsageError, match="rate-hz"):
+        UrConfig(rate_hz=0.0)
+
+
+def test_the_tool_pose_agrees_with_the_urdf_and_the_vendors_table() -> None:
+    """Denavit-Hartenberg numbers of the UR5 (vendor's table) against the URDF, by Pinocchio."""
+    pinocchio = pytest.importorskip("pinocchio")
+    from scipy.spatial.transform import Rotation
+
+    from bridge.task.robot import ur5_urdf
+
+    model = pinocchio.buildModelFromXML(ur5_urdf())
+    data = model.createData()
+    rng = np.random.default_rng(3)
+    rows = [
+        (0.089159, 0.0, np.pi / 2),
+        (0.0, -0.425, 0.0),
+        (0.0, -0.39225, 0.0),
+        (0.10915, 0.0, np.pi / 2),
+        (0.09465, 0.0, -np.pi / 2),
+        (0.0823, 0.0, 0.0),
+    ]
+    for q in rng.uniform(-np.pi, np.pi, (20, 6)):
+        T_base_tool = np.eye(4)
+        for angle, (d, a, alpha) in zip(q, rows, strict=True):
+            ca, sa = np.cos(alpha), np.sin(alpha)
+            c, s = np.cos(angle), np.sin(angle)
+            T_base_tool = T_base_tool @ np.array(
+                [
+                    [c, -s * ca, s * sa, a * c],
+                    [s, c * ca, -c * sa, a * s],
+                    [0, sa, ca, d],
+                    [0, 0, 0, 1],
+                ]
+            )
+        rotation_vector = Rotation.from_matrix(T_base_tool[:3, :3]).as_rotvec()
+        reported = np.concatenate([T_base_tool[:3, 3], rotation_vector])
+        pinocchio.framesForwardKinematics(model, data, q)
+        expected = data.oMf[model.getFrameId("tool0")].homogeneous
+        np.testing.assert_allclose(T_base_link_tcp(reported), expected, atol=2e-5)
+
+
+def test_no_rotation_is_a_pose_too() -> None:
+    T = T_base_link_tcp(np.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(T[:3, 3], [-0.1, -0.2, 0.3])
+    np.testing.assert_allclose(T[:3, :3], np.diag([-1.0, -1.0, 1.0]))
