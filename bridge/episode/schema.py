@@ -130,13 +130,6 @@ def type_of_topic(topic: str) -> str | None:
     return None
 
 
-def fits_topic(topic: str, type_name: str) -> bool:
-    """Say whether a type may stand on a topic of ours; images may be raw or compressed."""
-    expected = type_of_topic(topic)
-    images = (IMAGE, COMPRESSED_IMAGE)
-    return expected in (None, type_name) or (expected in images and type_name in images)
-
-
 def is_truth(topic: str) -> bool:
     """Say whether a topic holds stand-in ground truth, which ``twin`` must never read."""
     return topic.startswith(TRUTH_PREFIX)

@@ -1,0 +1,58 @@
+import contextlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.episode import protobuf, schema
+from bridge.episode.cdr import MalformedMessageError
+from bridge.episode.video import VideoFrame, video_message
+
+NS = 1_700_000_000_123_456_789
+
+
+@given(st.integers(-(2**40), 2**62), st.text(st.characters(codec="utf-8"), max_size=9), st.binary())
+def test_a_frame_comes_back(stamp_ns: int, frame_id: str, data: bytes) -> None:
+    frame = VideoFrame.from_protobuf(video_message(stamp_ns, frame_id, data))
+    assert frame == VideoFrame(stamp_ns=stamp_ns, frame_id=frame_id, data=data, format="h264")
+
+
+def test_fields_that_came_later_are_passed_over() -> None:
+    newer = video_message(NS, "c", b"x") + protobuf.bytes_field(100, b"an id")
+    newer += protobuf.number_field(101, 7) + protobuf.varint(102 << 3 | protobuf.FIXED64) + bytes(8)
+    assert VideoFrame.from_protobuf(newer) == VideoFrame.from_protobuf(video_message(NS, "c", b"x"))
+
+
+@pytest.mark.parametrize("cut", [1, 5, 14, 20])
+def test_a_cut_message_is_one_error(cut: int) -> None:
+    whole = video_message(NS, "camera", b"0123456789")
+    with pytest.raises(MalformedMessageError, match=r"not a valid foxglove\.CompressedVideo"):
+        VideoFrame.from_protobuf(whole[:cut])
+
+
+@pytest.mark.parametrize(
+    ("data", "found"),
+    [
+        (b"\x08\x01", "field 1 is a number"),
+        (b"\x0b", "wire type 3"),
+        (b"\x08" + b"\xff" * 11, "more than 64 bits"),
+        (protobuf.bytes_field(2, b"\xff\xfe"), "invalid start byte"),
+        (protobuf.bytes_field(1, protobuf.bytes_field(1, b"x")), "not made of numbers"),
+    ],
+)
+def test_other_bytes_are_one_error(data: bytes, found: str) -> None:
+    with pytest.raises(MalformedMessageError, match=found):
+        VideoFrame.from_protobuf(data)
+
+
+@given(st.binary(max_size=80))
+def test_arbitrary_bytes_are_a_frame_or_one_error(data: bytes) -> None:
+    with contextlib.suppress(MalformedMessageError):
+        VideoFrame.from_protobuf(data)
+
+
+def test_the_preview_topic_carries_video() -> None:
+    assert schema.type_of_topic("/cell/cam/a/color/preview") == schema.COMPRESSED_VIDEO
+    found = schema.schema_for(schema.COMPRESSED_VIDEO)
+    assert found is not None
+    assert (found.schema_encoding, found.message_encoding) == ("protobuf", "protobuf")
