@@ -1,141 +1,284 @@
-"""Is an episode whole? Every CRC, every record, every stream, and what it declares lost."""
+"""Is an episode whole? Every CRC, every index, every stream, and what it declares lost.
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+Broken is what contradicts itself: damage, indexes and counts that disagree with the data, messages
+that are not what they promise, parts that are missing. Lost is another matter: a ledger that lists
+losses, or a recording that was cut off and recovered, leaves a whole file (``exit_code`` 3). Files
+of other programs are held to the format only; our contract is asked of ours.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from bridge.episode import schema
-from bridge.episode.reader import Episode, RawMessage
-from bridge.episode.records import (
-    CameraInfo,
-    CompressedColor,
-    DepthImage,
-    JointSample,
-    PoseSample,
-    string_from_cdr,
-    transforms_from_cdr,
-)
+from bridge.episode.check_decode import Decoder
+from bridge.episode.check_file import Faults, FileCheck
+from bridge.episode.check_rerun import rerun_faults
+from bridge.episode.check_topics import TopicCheck, TopicWatch
+from bridge.episode.parts import name_of_part, record_of
+from bridge.episode.reader import Episode
+from bridge.episode.run import part_name
+from bridge.episode.writer import LIBRARY
 from bridge.errors import BridgeError
-from bridge.media.color import decode_color
-from bridge.task.plan import Plan
-from bridge.task.record import parse_record
-from bridge.task.verdict import Verdict
 
-MAX_LISTED = 20
-
-
-@dataclass(kw_only=True)
-class TopicCheck:
-    """What was found on one topic."""
-
-    messages: int = 0
-    sequence_gaps: int = 0
-    undecodable: int = 0
-    first_fault: str = ""
-    next_sequence: int | None = None
+SLOW_RATE = 0.9
+"""Below this part of its declared rate a topic is remarked upon."""
 
 
 @dataclass(kw_only=True)
 class CheckReport:
-    """What was found in one file. ``exit_code``: 0 clean, 1 broken, 3 declared losses."""
+    """What was found in one episode. ``exit_code``: 0 clean, 1 broken, 3 losses."""
 
     path: Path
+    parts: list[Path] = field(default_factory=list)
+    missing_parts: list[Path] = field(default_factory=list)
     messages: int = 0
     topics: dict[str, TopicCheck] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
+    """What makes it broken; the first 20."""
+    num_faults: int = 0
+    notes: list[str] = field(default_factory=list)
+    """What a person may want to know; never makes it broken."""
     declared_losses: int = 0
+    undeclared_losses: int = 0
+    """Numbers missing on topics of a recording whose ledger does not list them."""
+    recovered: dict[str, Any] | None = None
+    """What recovery said: the recorder died, and the end of the recording is unknown."""
 
     @property
     def exit_code(self) -> int:
         """Status of the ``check`` command."""
         if self.faults:
             return 1
-        return 3 if self.declared_losses else 0
+        lost = self.declared_losses or self.undeclared_losses or self.recovered is not None
+        return 3 if lost else 0
 
     @property
     def summary(self) -> str:
-        """One word."""
+        """A word or two."""
+        if self.exit_code == 3 and self.undeclared_losses:
+            return "losses not declared"
         return {0: "clean", 1: "broken", 3: "losses declared"}[self.exit_code]
 
+    def lines(self) -> list[str]:
+        """What to print: one line, and one for each fault and note."""
+        lost = f"{self.declared_losses} declared lost"
+        if self.undeclared_losses:
+            lost += f", {self.undeclared_losses} more missing"
+        parts = f" in {len(self.parts)} parts" if len(self.parts) > 1 else ""
+        lines = [f"{self.path.name}: {self.summary}, {self.messages} messages{parts}, {lost}"]
+        lines += [f"  {fault}" for fault in self.faults]
+        if self.num_faults > len(self.faults):
+            lines.append(f"  and {self.num_faults - len(self.faults)} more faults")
+        return lines + [f"  note: {note}" for note in self.notes]
 
-def check_episode(path: Path) -> CheckReport:
-    """Read every message with CRCs on and decode every type this project knows."""
+    def to_json(self) -> dict[str, Any]:
+        """Everything, for ``--json``."""
+        return {
+            "file": str(self.path),
+            "state": self.summary,
+            "parts": [str(path) for path in self.parts],
+            "missing_parts": [str(path) for path in self.missing_parts],
+            "messages": self.messages,
+            "declared_losses": self.declared_losses,
+            "undeclared_losses": self.undeclared_losses,
+            "recovered": self.recovered,
+            "faults": self.faults,
+            "num_faults": self.num_faults,
+            "notes": self.notes,
+            "topics": {topic: asdict(found) for topic, found in self.topics.items()},
+        }
+
+
+def check_episode(path: Path, *, rerun: bool = False) -> CheckReport:
+    """Read every byte of an episode and of its parts, and decode every type this project knows.
+
+    Args:
+        path: The episode; the parts behind it are found.
+        rerun: Let Rerun's own checker read each file too.
+
+    Raises:
+        MissingDependencyError: When ``rerun`` is asked for and not installed.
+    """
     report = CheckReport(path=path)
-    try:
-        episode = Episode.open(path)
-        kind = episode.info.kind
-        _ = episode.outcome, episode.derived  # raises when they cannot be read
-        declared = {topic: item.count for topic, item in episode.topics().items()}
-        for message in episode.messages():
-            _check_message(report, message)
-    except BridgeError as error:
-        report.faults.append(str(error))
-        return report
-    _check_counts(report, declared)
-    if kind != "imported":
-        _check_contract(report, episode)
-    _add_ledger(report, episode)
+    faults = Faults()
+    watch = _Watch()
+    episode = _open(path, faults, watch)
+    report.parts = list(episode.parts) if episode else [path]
+    for part in report.parts:
+        if episode is not None:
+            watch.read(FileCheck(part, faults))
+        if rerun:
+            for text in rerun_faults(part):
+                faults.add(text)
+    if episode is not None:
+        _check_parts(report, episode, faults)
+        _check_metadata(report, episode, faults)
+    _judge_topics(report, episode, watch, faults)
+    report.faults, report.num_faults = faults.listed, faults.count
     return report
 
 
-def _check_message(report: CheckReport, message: RawMessage) -> None:
-    topic = report.topics.setdefault(message.topic, TopicCheck())
-    topic.messages += 1
-    report.messages += 1
-    if topic.next_sequence is not None and message.sequence > topic.next_sequence:
-        topic.sequence_gaps += message.sequence - topic.next_sequence
-    topic.next_sequence = message.sequence + 1
-    decode = _DECODERS.get(message.type_name)
-    if decode is None:
-        return
+def check_all(paths: Iterable[Path], *, rerun: bool = False) -> Iterator[CheckReport]:
+    """Check every episode among some files; a later part goes with the first of its episode.
+
+    Args:
+        paths: Files, in any order.
+        rerun: Let Rerun's own checker read each file too.
+
+    Raises:
+        MissingDependencyError: When ``rerun`` is asked for and not installed.
+    """
+    done: set[Path] = set()
+    for path in sorted(paths, key=_by_part):
+        if path not in done:
+            report = check_episode(path, rerun=rerun)
+            done.update(report.parts)
+            yield report
+
+
+def _by_part(path: Path) -> tuple[Path, int, str]:
+    name = name_of_part(path)
+    if name is None:
+        return path.parent, 1, path.name
+    return path.parent, name.number, name.episode_id
+
+
+def _open(path: Path, faults: Faults, watch: "_Watch") -> Episode | None:
+    """Open an episode; one that cannot be opened is walked through for what else is wrong."""
     try:
-        decode(message.data)
+        return Episode.open(path)
     except BridgeError as error:
-        topic.undecodable += 1
-        if not topic.first_fault:
-            topic.first_fault = f"{message.topic}: {error}"
-            if len(report.faults) < MAX_LISTED:
-                report.faults.append(topic.first_fault)
+        said = str(error)
+    faults.add(said)
+    found = Faults()
+    watch.read(FileCheck(path, found))
+    for text in found.listed:
+        if text.rpartition("damaged: ")[2] not in said:
+            faults.add(text)
+    return None
 
 
-def _check_counts(report: CheckReport, declared: dict[str, int]) -> None:
-    for topic, count in declared.items():
-        found = report.topics[topic].messages if topic in report.topics else 0
-        if found != count:
-            report.faults.append(f"{topic}: the summary says {count} messages, {found} were read")
+class _Watch:
+    """All topics over all parts."""
+
+    def __init__(self) -> None:
+        self.decoder = Decoder()
+        self.topics: dict[str, TopicWatch] = {}
+        self.is_ours = False
+
+    def read(self, file: FileCheck) -> None:
+        """Walk through one file."""
+        for message in file.messages():
+            topic = message.channel.topic
+            if topic not in self.topics:
+                self.topics[topic] = TopicWatch(topic=topic)
+            self.topics[topic].see(message, self.decoder)
+        self.is_ours = self.is_ours or file.library.startswith(LIBRARY)
 
 
-def _check_contract(report: CheckReport, episode: Episode) -> None:
-    if "episode" not in episode.metadata_records:
-        report.faults.append("no 'episode' metadata record: who made it and for what is unknown")
+def _check_parts(report: CheckReport, episode: Episode, faults: Faults) -> None:
+    report.missing_parts = list(episode.missing_parts)
+    for path in episode.missing_parts:
+        if path.exists():
+            faults.add(f"part {path.name} cannot be read; the others are checked without it")
+        elif path.with_name(path.name + ".part").exists():
+            faults.add(f"part {path.name} is not finished: robot-gst recover {path}.part")
+        else:
+            faults.add(f"part {path.name} of this split episode is missing")
+    name = name_of_part(episode.path)
+    if name is not None and name.number > 1:
+        before = part_name(name.episode_id, name.number - 1)
+        if not episode.path.with_name(before).exists():
+            faults.add(f"part {before} of this split episode is missing")
+    for file in episode.files:
+        recovered = record_of(file, "recovered")
+        if recovered:
+            report.recovered = recovered
+            lost = recovered.get("bytes_lost", "an unknown number of")
+            why = recovered.get("reason", "its recorder died")
+            report.notes.append(f"{file.path.name} was recovered ({why}); {lost} bytes were lost")
+
+
+def _check_metadata(report: CheckReport, episode: Episode, faults: Faults) -> None:
+    try:
+        kind = episode.info.kind
+        _ = episode.outcome, episode.derived  # raises when they cannot be read
+    except BridgeError as error:
+        faults.add(str(error))
+        return
+    if kind == "imported":
+        return
     for topic, item in episode.topics().items():
         expected = schema.type_of_topic(topic)
-        if expected is not None and item.count and item.type_name not in (expected, ""):
-            allowed = {expected, schema.COMPRESSED_IMAGE} if "/depth/image" in topic else {expected}
-            if item.type_name not in allowed:
-                report.faults.append(f"{topic} carries {item.type_name}, expected {expected}")
+        if expected is None or not item.count or item.type_name in (expected, ""):
+            continue
+        images = {schema.IMAGE, schema.COMPRESSED_IMAGE}
+        if topic.endswith("/image") and expected in images and item.type_name in images:
+            continue
+        faults.add(f"{topic} carries {item.type_name}, expected {expected}")
 
 
-def _add_ledger(report: CheckReport, episode: Episode) -> None:
-    for message in episode.messages(topic for topic in episode.topics_of_type(schema.DROPS)):
-        try:
-            record = parse_record(message.data, name="drops", package="bridge.episode")
-        except BridgeError:
-            continue  # already listed as undecodable
-        report.declared_losses += record["gaps"] + record["queue_drops"]
+def _judge_topics(
+    report: CheckReport, episode: Episode | None, watch: _Watch, faults: Faults
+) -> None:
+    decoder = watch.decoder
+    ours = watch.is_ours and not _is_imported(episode)
+    is_recording = episode is not None and "recorder" in episode.metadata_records
+    report.notes += sorted(decoder.missing)
+    rates = _declared_rates(episode)
+    for topic, topic_watch in sorted(watch.topics.items()):
+        result = report.topics[topic] = topic_watch.finish()
+        report.messages += result.messages
+        result.declared_losses = decoder.ledger.get(topic, 0)
+        result.declared_rate_hz = rates.get(topic)
+        if result.undecodable:
+            _say(report, faults if ours else None, result.first_fault)
+        if result.time_steps_back:
+            text = f"{topic}: its log time steps back {result.time_steps_back} times"
+            _say(report, faults if ours and is_recording else None, text)
+        if decoder.has_ledger:
+            missing = max(0, result.sequence_gaps - result.declared_losses)
+            report.undeclared_losses += missing
+            if missing:
+                report.notes.append(
+                    f"{topic}: {result.sequence_gaps} numbers are missing, "
+                    f"the ledger declares {result.declared_losses}"
+                )
+        report.notes += _rate_notes(topic, result)
+    report.declared_losses = sum(decoder.ledger.values())
+    for text in decoder.size_faults():
+        _say(report, faults if ours else None, text)
 
 
-_DECODERS: dict[str, Callable[[bytes], object]] = {
-    schema.JOINT_STATE: JointSample.from_cdr,
-    schema.COMPRESSED_IMAGE: lambda data: decode_color(CompressedColor.from_cdr(data).data),
-    schema.IMAGE: DepthImage.from_cdr,
-    schema.CAMERA_INFO: CameraInfo.from_cdr,
-    schema.TF_MESSAGE: transforms_from_cdr,
-    schema.POSE_STAMPED: PoseSample.from_cdr,
-    schema.STRING: string_from_cdr,
-    schema.PLAN: Plan.from_json,
-    schema.VERDICT: Verdict.from_json,
-    schema.LOCALISATION: lambda data: parse_record(data, name="localisation"),
-    schema.EVENT: lambda data: parse_record(data, name="event", package="bridge.episode"),
-    schema.DROPS: lambda data: parse_record(data, name="drops", package="bridge.episode"),
-}
+def _say(report: CheckReport, faults: Faults | None, text: str) -> None:
+    if faults is None:
+        report.notes.append(text)
+    else:
+        faults.add(text)
+
+
+def _is_imported(episode: Episode | None) -> bool:
+    """Whether we only keep what another program wrote."""
+    record = episode.metadata_records.get("episode") if episode else None
+    return record is not None and record.get("kind") == "imported"
+
+
+def _declared_rates(episode: Episode | None) -> dict[str, float]:
+    """The rates a recording promises: ``rates_hz`` by topic in its ``recorder`` record."""
+    record = episode.metadata_records.get("recorder", {}) if episode else {}
+    rates = record.get("rates_hz")
+    if not isinstance(rates, dict):
+        return {}
+    return {
+        topic: float(rate)
+        for topic, rate in rates.items()
+        if isinstance(rate, int | float) and rate > 0
+    }
+
+
+def _rate_notes(topic: str, result: TopicCheck) -> Iterator[str]:
+    declared = result.declared_rate_hz
+    if declared is not None and result.rate_hz < SLOW_RATE * declared:
+        yield f"{topic}: {result.rate_hz:.1f} messages a second, {declared:g} are declared"

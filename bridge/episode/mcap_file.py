@@ -57,10 +57,10 @@ class McapFile:
         """
         self.path = path
         with path.open("rb") as stream:
-            self.header = _read_header(stream)
-            self.footer, self._footer_at = _read_footer(stream)
+            self.header = read_header(stream)
+            self.footer, self._footer_at = read_footer(stream)
             self.data_end = self.footer.summary_start or self._footer_at
-            summary = _read_summary(stream, self.footer, self._footer_at)
+            summary = read_summary(stream, self.footer, self._footer_at)
             if summary is None or not _is_complete(summary):
                 summary = rebuild_summary(stream, self.data_end)
             self.summary = summary
@@ -94,7 +94,7 @@ class McapFile:
             for entry in self.summary.attachment_indexes:
                 if name in (None, entry.name):
                     place = self._indexed(stream, entry.offset, mcap_format.ATTACHMENT)
-                    yield attachment_of(stream, place)
+                    yield attachment_of(stream, place).record
 
     def schema_of(self, channel: records.Channel) -> records.Schema | None:
         """Return the schema of a channel, or None where it has none."""
@@ -136,7 +136,8 @@ def _note(stream: BinaryIO, place: Place, found: LooseMessages) -> None:
     found.channel_ids.append(head.channel_id)
 
 
-def _read_header(stream: BinaryIO) -> records.Header:
+def read_header(stream: BinaryIO) -> records.Header:
+    """Read magic and first record; raises BrokenRecordError."""
     if stream.read(len(MAGIC)) != MAGIC:
         message = "it does not begin as an MCAP file does"
         raise BrokenRecordError(message)
@@ -149,7 +150,8 @@ def _read_header(stream: BinaryIO) -> records.Header:
     return record
 
 
-def _read_footer(stream: BinaryIO) -> tuple[records.Footer, int]:
+def read_footer(stream: BinaryIO) -> tuple[records.Footer, int]:
+    """Read the last record and say where it begins; raises BrokenRecordError."""
     at = stream.seek(0, 2) - _FOOTER_BYTES
     stream.seek(max(at, 0))
     tail = stream.read(_FOOTER_BYTES)
@@ -166,7 +168,12 @@ def _read_footer(stream: BinaryIO) -> tuple[records.Footer, int]:
     return footer, at
 
 
-def _read_summary(stream: BinaryIO, footer: records.Footer, footer_at: int) -> Summary | None:
+def read_summary(stream: BinaryIO, footer: records.Footer, footer_at: int) -> Summary | None:
+    """Read the summary section with its CRC checked, None where there is none.
+
+    Raises:
+        BrokenRecordError: When it is damaged.
+    """
     if not footer.summary_start:
         return None
     stream.seek(footer.summary_start)

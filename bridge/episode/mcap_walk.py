@@ -253,7 +253,14 @@ def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
         at = after
 
 
-def attachment_of(stream: BinaryIO, place: Place, *, keep: bool = True) -> records.Attachment:
+class FoundAttachment(NamedTuple):
+    """An attachment whose CRC is right."""
+
+    record: records.Attachment
+    data_size: int
+
+
+def attachment_of(stream: BinaryIO, place: Place, *, keep: bool = True) -> FoundAttachment:
     """Read an attachment record and check its CRC; without ``keep`` its data is left empty.
 
     Raises:
@@ -278,13 +285,14 @@ def attachment_of(stream: BinaryIO, place: Place, *, keep: bool = True) -> recor
     if declared and declared != crc:
         message = f"attachment {name!r} has another CRC than it declares"
         raise BrokenRecordError(message)
-    return records.Attachment(
+    record = records.Attachment(
         create_time=create_ns,
         log_time=log_ns,
         name=name,
         media_type=media_type,
         data=b"".join(pieces),
     )
+    return FoundAttachment(record, size)
 
 
 def _attachment_crc(

@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bridge.episode import metadata
 from bridge.episode.mcap_file import McapFile
@@ -11,6 +11,20 @@ from bridge.episode.mcap_walk import DAMAGE
 from bridge.episode.run import EPISODE_ID, part_name
 
 _NAME = re.compile(rf"({EPISODE_ID.pattern})(?:\.([1-9][0-9]{{0,5}}))?\.mcap")
+
+
+class PartName(NamedTuple):
+    """What a file name says."""
+
+    episode_id: str
+    number: int
+    """1 for the first part, and for an episode in one file."""
+
+
+def name_of_part(path: Path) -> PartName | None:
+    """Read a file name; None for names no recorder of ours gives."""
+    found = _NAME.fullmatch(path.name)
+    return None if found is None else PartName(found[1], int(found[2] or 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,13 +47,13 @@ def open_parts(path: Path) -> Parts:
         OSError: When the first file cannot be read.
     """
     first = McapFile(path)
-    name = _NAME.fullmatch(path.name)
+    name = name_of_part(path)
     if name is None or is_last_part(first):
         return Parts(files=(first,), missing=())
-    episode_id, index = name[1], int(name[2] or 1)
-    if split_of(first) is None and not path.with_name(part_name(episode_id, index + 1)).exists():
+    following = path.with_name(part_name(name.episode_id, name.number + 1))
+    if split_of(first) is None and not following.exists():
         return Parts(files=(first,), missing=())
-    return _follow(first, episode_id, index)
+    return _follow(first, *name)
 
 
 def _follow(first: McapFile, episode_id: str, index: int) -> Parts:
@@ -74,8 +88,8 @@ def _open_later(path: Path, *, of: McapFile) -> McapFile | None:
 
 
 def _highest_part(path: Path, episode_id: str) -> int:
-    found = (_NAME.fullmatch(other.name) for other in path.parent.glob(f"{episode_id}.*.mcap"))
-    return max((int(name[2] or 1) for name in found if name is not None), default=1)
+    names = map(name_of_part, path.parent.glob(f"{episode_id}.*.mcap"))
+    return max((name.number for name in names if name is not None), default=1)
 
 
 def record_of(file: McapFile, name: str) -> dict[str, Any]:

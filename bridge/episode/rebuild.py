@@ -9,6 +9,7 @@ from bridge.episode import mcap_format
 from bridge.episode.mcap_format import MAGIC, MESSAGE_HEAD
 from bridge.episode.mcap_walk import (
     BrokenRecordError,
+    ChunkHead,
     Place,
     attachment_of,
     message_head,
@@ -31,6 +32,43 @@ def rebuild_summary(stream: BinaryIO, data_end: int) -> Summary:
     for place in walk(stream, len(MAGIC), data_end):
         builder.add(stream, place)
     return builder.finish()
+
+
+def chunk_entry(place: Place, chunk: ChunkHead) -> records.ChunkIndex:
+    """Make the index entry of a chunk; its message indexes are yet to be added."""
+    return records.ChunkIndex(
+        chunk_length=place.end - place.offset,
+        chunk_start_offset=place.offset,
+        compression=chunk.compression,
+        compressed_size=len(chunk.data),
+        message_start_time=chunk.start_ns,
+        message_end_time=chunk.end_ns,
+        message_index_length=0,
+        message_index_offsets={},
+        uncompressed_size=chunk.size,
+    )
+
+
+def metadata_entry(place: Place, record: records.Metadata) -> records.MetadataIndex:
+    """Make the index entry of a metadata record."""
+    return records.MetadataIndex(
+        offset=place.offset, length=place.end - place.offset, name=record.name
+    )
+
+
+def attachment_entry(
+    place: Place, record: records.Attachment, data_size: int
+) -> records.AttachmentIndex:
+    """Make the index entry of an attachment."""
+    return records.AttachmentIndex(
+        offset=place.offset,
+        length=place.end - place.offset,
+        log_time=record.log_time,
+        create_time=record.create_time,
+        data_size=data_size,
+        name=record.name,
+        media_type=record.media_type,
+    )
 
 
 class _Builder:
@@ -63,10 +101,7 @@ class _Builder:
 
     def _note(self, place: Place, record: records.McapRecord | None) -> None:
         if isinstance(record, records.Metadata):
-            entry = records.MetadataIndex(
-                offset=place.offset, length=place.end - place.offset, name=record.name
-            )
-            self.summary.metadata_indexes.append(entry)
+            self.summary.metadata_indexes.append(metadata_entry(place, record))
         elif isinstance(record, records.MessageIndex) and self._chunk is not None:
             self._chunk.message_index_offsets[record.channel_id] = place.offset
             self._chunk.message_index_length += place.end - place.offset
@@ -98,31 +133,12 @@ class _Builder:
             else:
                 body = at + mcap_format.RECORD_HEAD.size
                 self._define(parse(opcode, data[body : body + length]))
-        self._chunk = records.ChunkIndex(
-            chunk_length=place.end - place.offset,
-            chunk_start_offset=place.offset,
-            compression=chunk.compression,
-            compressed_size=len(chunk.data),
-            message_start_time=chunk.start_ns,
-            message_end_time=chunk.end_ns,
-            message_index_length=0,
-            message_index_offsets={},
-            uncompressed_size=chunk.size,
-        )
+        self._chunk = chunk_entry(place, chunk)
         self.summary.chunk_indexes.append(self._chunk)
 
     def _add_attachment(self, stream: BinaryIO, place: Place) -> None:
-        found = attachment_of(stream, place, keep=False)
-        entry = records.AttachmentIndex(
-            offset=place.offset,
-            length=place.end - place.offset,
-            log_time=found.log_time,
-            create_time=found.create_time,
-            data_size=0,
-            name=found.name,
-            media_type=found.media_type,
-        )
-        self.summary.attachment_indexes.append(entry)
+        found, data_size = attachment_of(stream, place, keep=False)
+        self.summary.attachment_indexes.append(attachment_entry(place, found, data_size))
 
     def finish(self) -> Summary:
         """Return the summary with its statistics."""
