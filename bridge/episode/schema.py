@@ -22,6 +22,7 @@ VERDICT = "gst/Verdict"
 LOCALISATION = "gst/Localisation"
 EVENT = "gst/Event"
 DROPS = "recorder/Drops"
+STATUS = "recorder/Status"
 POSES_IN_FRAME = "foxglove.PosesInFrame"
 COMPRESSED_VIDEO = "foxglove.CompressedVideo"
 
@@ -34,6 +35,7 @@ _JSON_SCHEMAS = {
     LOCALISATION: ("bridge.task", "schemas/localisation.schema.json"),
     EVENT: ("bridge.episode", "schemas/event.schema.json"),
     DROPS: ("bridge.episode", "schemas/drops.schema.json"),
+    STATUS: ("bridge.episode", "schemas/status.schema.json"),
     POSES_IN_FRAME: ("bridge.episode", "schemas/poses_in_frame.schema.json"),
 }
 

@@ -1,4 +1,8 @@
-"""The recorder's control keys: ``rec/<recorder>/ctl/{start,stop,mark,label,status}``, JSON."""
+"""The recorder's control keys ``rec/<recorder>/ctl/<verb>``, JSON in and out.
+
+Verbs: start, stop, mark, label, pause, resume, snapshot, list, status. Each has its own thread, so
+that a status is never behind a stop.
+"""
 
 import json
 from collections.abc import Callable
@@ -13,6 +17,8 @@ from bridge.task.record import check_record
 from bridge.wire.recorder_client import control_key
 from bridge.wire.session import Service, WireSession
 
+MAX_LISTED = 1000
+"""Episodes in one answer."""
 RESULTS = ("success", "failure", "unknown")
 Record = TypeVar("Record")
 
@@ -42,11 +48,31 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
             episode=None if episode is None else check_episode_id(str(episode)),
         )
 
+    def snapshot(request: dict[str, Any]) -> dict[str, Any]:
+        _only(request, "snapshot", {"id", "info"})
+        return recorder.snapshot(parse_info(request.get("id"), request.get("info", {})))
+
+    def pause(request: dict[str, Any]) -> dict[str, Any]:
+        _only(request, "pause", set())
+        return recorder.pause()
+
+    def resume(request: dict[str, Any]) -> dict[str, Any]:
+        _only(request, "resume", set())
+        return recorder.resume()
+
+    def list_(request: dict[str, Any]) -> dict[str, Any]:
+        _only(request, "list", {"last"})
+        return recorder.episodes(_whole_number(request, "last", MAX_LISTED))
+
     verbs: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
         "start": start,
         "stop": stop,
         "mark": mark,
         "label": label,
+        "pause": pause,
+        "resume": resume,
+        "snapshot": snapshot,
+        "list": list_,
         "status": lambda request: recorder.status(),
     }
     return [
@@ -76,6 +102,13 @@ def _only(request: dict[str, Any], verb: str, known: set[str]) -> None:
         raise ControlError(
             f"{verb} does not know {', '.join(unknown)}. It knows: {', '.join(sorted(known))}."
         )
+
+
+def _whole_number(request: dict[str, Any], name: str, most: int) -> int:
+    number = request.get(name, most)
+    if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= most:
+        raise ControlError(f"{name} must be a whole number from 1 to {most}, got {number!r:.80}.")
+    return number
 
 
 def _text(request: dict[str, Any]) -> str:

@@ -92,6 +92,10 @@ class Intake:
             counts[flow.topic] = counts.get(flow.topic, 0) + flow.seen
         return dict(sorted(counts.items()))
 
+    def image_topics(self) -> list[str]:
+        """Topics that carry images, in the order they were first seen."""
+        return [flow.topic for flow in list(self._flows.values()) if flow.is_image]
+
     def put(self, sample: WireSample) -> None:
         """Take a message; never waits, never raises."""
         with self._lock:

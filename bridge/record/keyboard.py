@@ -5,6 +5,7 @@ import os
 import select
 import sys
 from collections.abc import Iterator
+from typing import Any
 
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.run import RunFolder
@@ -13,7 +14,10 @@ from bridge.record.config import EpisodeAbout
 from bridge.record.control import parse_info
 from bridge.record.recorder import Recorder
 
-HELP = "keys: s start, x stop, m mark, y success, n failure; Ctrl-C ends"
+HELP = (
+    "keys: s start, x stop, p pause or resume, m mark, y success, n failure, "
+    "w write the pre-roll; Ctrl-C ends"
+)
 
 
 @contextlib.contextmanager
@@ -63,19 +67,31 @@ class Keys:
 
     def act(self, key: str) -> str:
         """Do what a key stands for; a refusal is a line to show as well."""
-        recorder = self._recorder
         try:
-            if key == "s":
-                return f"started {recorder.start(next_info(self._run, self._about))['episode']}"
-            if key == "x":
-                answer = recorder.stop(reason="keyboard")
-                return f"{answer['episode']}: {answer['messages']} messages, {answer['lost']} lost"
-            if key == "m":
-                return f"marked {recorder.mark('')['episode']}"
-            if key in ("y", "n"):
-                result = "success" if key == "y" else "failure"
-                outcome = Outcome(result=result, k=int(key == "y"))
-                return f"{recorder.label(outcome=outcome)['episode']}: {result}"
+            return self._act(key)
         except GstError as error:
             return str(error)
+
+    def _act(self, key: str) -> str:
+        recorder = self._recorder
+        if key == "s":
+            return f"started {recorder.start(next_info(self._run, self._about))['episode']}"
+        if key == "x":
+            return _summary(recorder.stop(reason="keyboard"))
+        if key == "p":
+            if recorder.is_paused:
+                return f"resumed {recorder.resume()['episode']}"
+            return f"paused {recorder.pause()['episode']}"
+        if key == "w":
+            return _summary(recorder.snapshot(next_info(self._run, self._about)))
+        if key == "m":
+            return f"marked {recorder.mark('')['episode']}"
+        if key in ("y", "n"):
+            result = "success" if key == "y" else "failure"
+            outcome = Outcome(result=result, k=int(key == "y"))
+            return f"{recorder.label(outcome=outcome)['episode']}: {result}"
         return ""
+
+
+def _summary(answer: dict[str, Any]) -> str:
+    return f"{answer['episode']}: {answer['messages']} messages, {answer['lost']} lost"

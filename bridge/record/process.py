@@ -1,4 +1,4 @@
-"""The recorder as a process: a zenoh router on this machine, a status line, a clean end."""
+"""The recorder as a process: keys, a status line, a clean end."""
 
 import sys
 import threading
@@ -11,18 +11,17 @@ from typing import Any
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run import RunFolder
 from bridge.record.config import EpisodeAbout, RecorderConfig
-from bridge.record.control import serve_control
 from bridge.record.keyboard import HELP, Keys, single_keys
+from bridge.record.live import LiveRecorder
 from bridge.record.recorder import Recorder
 from bridge.record.status import describe_status
 from bridge.terminal import Output
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import is_loopback
-from bridge.wire.session import WireSample, open_session
+from bridge.wire.session import open_session
 
 STATUS_PERIOD_S = 5.0
 LIVE_PERIOD_S = 0.5
-CONTROL_PREFIX = "/rec/"
 
 
 def run_recorder(
@@ -56,38 +55,24 @@ def run_recorder(
     """
     with open_session(wire) as session:
         run = RunFolder.create(run_path)
-        recorder = Recorder(run, now_ns=session.now_ns, config=config)
-        subscribers = [session.subscribe(key, _taker(recorder)) for key in config.topics]
-        services = serve_control(session, recorder)
-        _say_where(output, wire, recorder, run)
+        recorder = LiveRecorder(session, run, config, output.say)
+        _say_where(output, wire, config.recorder, run)
         try:
             if episode is not None:
-                recorder.start(episode)
+                recorder.core.start(episode)
             with single_keys() as has_keys:
-                keys = Keys(recorder, run, about or EpisodeAbout()) if has_keys else None
-                _watch(recorder, stop, duration_s, output, keys)
+                keys = Keys(recorder.core, run, about or EpisodeAbout()) if has_keys else None
+                _watch(recorder.core, stop, duration_s, output, keys)
         finally:
-            for service in services:
-                service.close()
-            for subscriber in subscribers:
-                subscriber.close()
             answer = recorder.close()
-        if recorder.error is not None:
-            raise recorder.error
+        if recorder.core.error is not None:
+            raise recorder.core.error
     return answer
 
 
-def _taker(recorder: Recorder) -> Callable[[WireSample], None]:
-    def take(sample: WireSample) -> None:
-        if not sample.topic.startswith(CONTROL_PREFIX):
-            recorder.receive(sample)
-
-    return take
-
-
-def _say_where(output: Output, wire: WireConfig, recorder: Recorder, run: RunFolder) -> None:
+def _say_where(output: Output, wire: WireConfig, recorder: str, run: RunFolder) -> None:
     where = ", ".join(wire.listen)
-    output.say(f"recorder {recorder.config.recorder!r} listens on {where}, writes to {run.path}")
+    output.say(f"recorder {recorder!r} listens on {where}, writes to {run.path}")
     for endpoint in wire.listen:
         if not is_loopback(endpoint):
             output.say(

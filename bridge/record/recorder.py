@@ -10,12 +10,12 @@ import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 from bridge.clock import StepWatch
 from bridge.episode import metadata
-from bridge.episode.catalogue import label_episode
-from bridge.episode.run import RunFolder, check_episode_id
+from bridge.episode.catalogue import label_episode, list_episodes, note_finished
+from bridge.episode.run import RunFolder, check_episode_id, part_name
 from bridge.errors import BridgeError, GstError
 from bridge.record.config import RecorderConfig
 from bridge.record.encoders import EncoderThreads, ImageEncoder, Preview
@@ -80,6 +80,11 @@ class Recorder:
         return self._life.error
 
     @property
+    def is_paused(self) -> bool:
+        """Say whether the open episode is paused."""
+        return self._life.is_paused and self._life.take is not None
+
+    @property
     def last_episode(self) -> str | None:
         """Id of the episode that was finished last."""
         return self._life.last_episode
@@ -109,9 +114,15 @@ class Recorder:
         reason: str = "command",
     ) -> Answer:
         """Finish the episode, or throw it away, after everything received so far."""
-        return self._command(
+        answer = self._command(
             lambda command: self._life.stop(outcome, command, discard=discard, reason=reason)
         )
+        if not discard:
+            self._enter(answer["episode"])
+        return answer
+
+    def _enter(self, episode_id: str) -> None:
+        note_finished(self._run, self._run.episodes_dir / part_name(episode_id, 1))
 
     def mark(self, text: str) -> Answer:
         """Note this instant in the episode; does not wait for images in work."""
@@ -130,7 +141,9 @@ class Recorder:
     def snapshot(self, info: metadata.EpisodeInfo) -> Answer:
         """Write the pre-roll as an episode; needs ``preroll_s``, and no open episode."""
         check_episode_id(info.id)
-        return self._command(lambda command: self._life.snapshot(info, command))
+        answer = self._command(lambda command: self._life.snapshot(info, command))
+        self._enter(info.id)
+        return answer
 
     def label(
         self, *, text: str = "", outcome: metadata.Outcome | None = None, episode: str | None = None
@@ -163,6 +176,12 @@ class Recorder:
         note = label_episode(self._run, name, outcome)
         return {"ok": True, "episode": name, "note": str(note)}
 
+    def episodes(self, last: int) -> Answer:
+        """The last episodes of the run folder, by name, as the catalogue knows them."""
+        entries = list_episodes(self._run)
+        episodes = [asdict(entry) for entry in entries[-last:]]
+        return {"ok": True, "of": len(entries), "episodes": episodes}
+
     def forget(self, prefix: str) -> None:
         """Repeat no latched message of topics that begin so: their publisher has gone."""
 
@@ -174,6 +193,10 @@ class Recorder:
     def note_recovered(self, reports: list[Answer]) -> None:
         """Show in the status what was found cut off when the recorder began."""
         self._status.recovered = reports
+
+    def also_tell(self, name: str, ask: Callable[[], object]) -> None:
+        """Add something to every status; ``ask`` must answer at once."""
+        self._status.others[name] = ask
 
     def status(self) -> Answer:
         """What is going on; answers at once, whatever the disk does."""

@@ -31,6 +31,8 @@ class Status:
         self.clock_steps = 0
         self.recovered: list[dict[str, Any]] = []
         """What was found cut off when the recorder began."""
+        self.others: dict[str, Callable[[], object]] = {}
+        """What others have to say, by name."""
         self._run = run
         self._config = config
         self._intake = intake
@@ -79,6 +81,7 @@ class Status:
             "seen": self._intake.seen(),
             "rates_hz": self._rates_hz,
         }
+        answer.update({name: ask() for name, ask in self.others.items()})
         if take is not None:
             answer["duration_s"] = s_from_ns(self._now_ns() - take.start_ns)
             answer.update(counts(take))

@@ -1,0 +1,195 @@
+"""A recorder on the wire: session, recorder, control keys, status, previews; from Python too.
+
+from bridge.record.live import open_recorder
+
+with open_recorder(Path("runs/monday")) as recorder:
+    recorder.start("trial_0001", task="cube_into_box", operator="ada")
+    recorder.mark("gripper closed")
+    print(recorder.stop(result="success"))
+"""
+
+import contextlib
+import json
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from bridge.episode import schema
+from bridge.episode.metadata import Outcome
+from bridge.episode.recover import recover_parts
+from bridge.episode.recover_tally import RecoveryReport
+from bridge.episode.run import RunFolder
+from bridge.record.config import RecorderConfig
+from bridge.record.control import parse_info, parse_outcome, serve_control
+from bridge.record.departures import Departures
+from bridge.record.preview import Previews
+from bridge.record.recorder import Recorder
+from bridge.record.ros2 import watch_ros2
+from bridge.wire.config import DEFAULT_ENDPOINT, WireConfig
+from bridge.wire.errors import WireError
+from bridge.wire.qos import Qos
+from bridge.wire.session import WireSample, WireSession, open_session
+
+STATUS_PERIOD_S = 1.0
+CONTROL_PREFIX = "/rec/"
+HOST = WireConfig(mode="router", connect=(), listen=(DEFAULT_ENDPOINT,))
+"""The recorder is where everybody else connects."""
+
+
+class LiveRecorder:
+    """A recorder that others can see and control; use ``open_recorder``."""
+
+    def __init__(
+        self,
+        session: WireSession,
+        run: RunFolder,
+        config: RecorderConfig,
+        say: Callable[[str], None],
+    ) -> None:
+        """Recover what a crash left, then listen."""
+        self.run = run
+        self.session = session
+        reports = recover_parts(run)
+        for report in reports:
+            say(_describe_recovery(report))
+        previews = Previews(session, config.recorder, config.preview_hz, lambda: core.intake.shed)
+        core = self.core = Recorder(
+            run, now_ns=session.now_ns, config=config, preview=previews.show
+        )
+        core.note_recovered([_recovery_record(report) for report in reports])
+        self._previews = previews
+        self._ended = threading.Event()
+        self._subscribers = [session.subscribe(key, self._take) for key in config.topics]
+        self._departures = Departures(session, core)
+        self._graph = watch_ros2(session, core)
+        core.also_tell("ros2_warnings", self._graph.warnings)
+        self._services = serve_control(session, core)
+        name = f"/rec/{config.recorder}/status"
+        self._status = session.publisher(name, schema.STATUS, qos=Qos.PREVIEW)
+        session.declare_alive(f"rec/{config.recorder}/alive")
+        self._thread = threading.Thread(target=self._tell, name="status", daemon=True)
+        self._thread.start()
+
+    def _take(self, sample: WireSample) -> None:
+        if not sample.topic.startswith(CONTROL_PREFIX):
+            self.core.receive(sample)
+
+    def _tell(self) -> None:
+        while not self._ended.wait(STATUS_PERIOD_S):
+            with contextlib.suppress(WireError):  # the session is closing
+                self.core.intake.watched = self._previews.look(self.core.intake.image_topics())
+                if self._status.has_subscribers():
+                    data = json.dumps(self.core.status()).encode()
+                    self._status.put(data, source_ns=self.session.now_ns())
+
+    def start(self, episode_id: str, **about: Any) -> dict[str, Any]:
+        """Begin an episode; ``about`` are fields of ``EpisodeInfo``: task, operator, tags ...
+
+        Raises:
+            UsageError: When the id or a field is wrong, or another episode is open.
+            BridgeError: When the disk has no room.
+        """
+        return self.core.start(parse_info(episode_id, about))
+
+    def stop(
+        self, *, result: str | None = None, detail: str | None = None, discard: bool = False
+    ) -> dict[str, Any]:
+        """Finish the episode; ``result`` is success, failure or unknown."""
+        return self.core.stop(outcome=_outcome(result, detail), discard=discard)
+
+    def mark(self, text: str = "") -> dict[str, Any]:
+        """Note this instant."""
+        return self.core.mark(text)
+
+    def label(
+        self, result: str, *, detail: str | None = None, episode: str | None = None
+    ) -> dict[str, Any]:
+        """Say how the open episode went, or a finished one by its id."""
+        return self.core.label(outcome=_outcome(result, detail), episode=episode)
+
+    def pause(self) -> dict[str, Any]:
+        """Leave messages out until ``resume``."""
+        return self.core.pause()
+
+    def resume(self) -> dict[str, Any]:
+        """Record again."""
+        return self.core.resume()
+
+    def snapshot(self, episode_id: str, **about: Any) -> dict[str, Any]:
+        """Write the pre-roll as an episode."""
+        return self.core.snapshot(parse_info(episode_id, about))
+
+    def status(self) -> dict[str, Any]:
+        """What is going on."""
+        return self.core.status()
+
+    def close(self) -> dict[str, Any] | None:
+        """Finish the open episode, then leave the network; returns the answer to that stop."""
+        self._ended.set()
+        for service in self._services:
+            service.close()
+        for subscriber in self._subscribers:
+            subscriber.close()
+        self._departures.close()
+        self._graph.close()
+        self._thread.join(timeout=STATUS_PERIOD_S)
+        return self.core.close()
+
+
+@contextlib.contextmanager
+def open_recorder(
+    run_path: Path,
+    *,
+    wire: WireConfig = HOST,
+    config: RecorderConfig | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Iterator[LiveRecorder]:
+    """Record whatever is published, until the block ends; an open episode is then finished.
+
+    Args:
+        run_path: The run folder; made where needed.
+        wire: Where to listen or connect.
+        config: The recorder's settings.
+        say: Called with remarks for people, such as what was recovered.
+
+    Raises:
+        DiskError: At the end of the block, when the disk ended the recording.
+        WireError: When the port is taken, or the configuration cannot be used.
+    """
+    with open_session(wire) as session:
+        recorder = LiveRecorder(
+            session, RunFolder.create(run_path), config or RecorderConfig(), say
+        )
+        try:
+            yield recorder
+        finally:
+            recorder.close()
+        if recorder.core.error is not None:
+            raise recorder.core.error
+
+
+def _outcome(result: str | None, detail: str | None) -> Outcome | None:
+    if result is None:
+        return None
+    success = int(result == "success")
+    return parse_outcome({"result": result, "k": success, "n": 1, "detail": detail})
+
+
+def _describe_recovery(report: RecoveryReport) -> str:
+    if report.output is None:
+        return f"cut off: {report.path.name} cannot be recovered: {report.reason}"
+    return (
+        f"recovered {report.output.name}: {report.messages} messages, "
+        f"{report.bytes_lost} bytes lost ({report.reason or 'complete'})"
+    )
+
+
+def _recovery_record(report: RecoveryReport) -> dict[str, Any]:
+    return {
+        "file": report.path.name,
+        "output": report.output.name if report.output else None,
+        "messages": report.messages,
+        "bytes_lost": report.bytes_lost,
+        "reason": report.reason,
+    }
