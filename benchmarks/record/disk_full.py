@@ -1,5 +1,6 @@
 """A disk that fills up while recording: how soon is it known, and is the file whole?"""
 
+import contextlib
 import json
 import os
 import subprocess
@@ -9,7 +10,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from bridge.errors import GstError
+from bridge.wire.recorder_client import RecorderClient
 from bridge.wire.session import WireSample
 from record.cell import CellSpec
 from record.children import Publisher, children
@@ -28,7 +32,7 @@ class DiskFullRun:
     """What a person or a program watching the recorder would see."""
 
     status_after_s: float
-    """From the disk being full to an error in the published status; infinite if never."""
+    """From the disk being full to an error in the status, heard or asked for [s]."""
     exit_after_s: float
     exit_code: int | None
     is_valid: bool
@@ -59,12 +63,25 @@ class Watch:
         self._recorder = recorder
         self._disk = disk
         self._subscriber = recorder.session.subscribe("rec/*/status", self._hear)
-        self._thread = threading.Thread(target=self._watch, daemon=True)
-        self._thread.start()
+        self._client = RecorderClient(recorder.session, timeout_s=1.0)
+        self._threads = [
+            threading.Thread(target=work, daemon=True) for work in (self._watch, self._ask)
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def _hear(self, sample: WireSample) -> None:
-        status = json.loads(sample.data)
-        if status.get("error") or status.get("state") == "failed":
+        self._judge(json.loads(sample.data))
+
+    def _ask(self) -> None:
+        """Somebody may also ask instead of listening."""
+        while self._recorder.is_running():
+            with contextlib.suppress(GstError):  # it may be ending
+                self._judge(self._client.status())
+            time.sleep(0.05)
+
+    def _judge(self, status: dict[str, Any]) -> None:
+        if status.get("error"):
             self.status_s = min(self.status_s, time.monotonic())
 
     def _watch(self) -> None:
@@ -79,11 +96,13 @@ class Watch:
 
     def wait(self) -> None:
         """Until the recorder ended, or long enough."""
-        self._thread.join()
+        for thread in self._threads:
+            thread.join()
 
 
 def run_disk_full(spec: CellSpec, folder: Path, disk: Path) -> DiskFullRun:
     """Record onto the small disk until it is full; no reserve, so that the disk itself says no."""
+    folder.mkdir(parents=True)
     with children() as started:
         limits = ("--min-free-mb", "0", "--footer-mb", "4")
         recorder = OurRecorder(folder, "--color", "jpeg", *limits, run=disk / "run")

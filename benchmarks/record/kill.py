@@ -29,8 +29,10 @@ class KillRun:
 
     recovered: bool
     """There is a file with its final name that the official reader reads, and it is right."""
+    finished: bool
+    """The kill came too late: the file had its final name already."""
     tail_s: dict[str, float]
-    """By topic: from the last message kept to the last one sent before the kill."""
+    """By topic: from the last message kept to the last one sent before the kill, or the stop."""
     holes: int
     """Messages missing before the tail."""
     problem: str = ""
@@ -51,22 +53,23 @@ def kill_ours(
         recorder.client.start(EPISODE, {"cell": "bench"})
         publisher.tell("go")
         time.sleep(rng.uniform(0.3, seconds))
+        end_ns = time.time_ns()  # of the kill, or of the stop: what comes later is not wanted
         if finalising:
             threading.Thread(target=_stop, args=(recorder,), daemon=True).start()
             time.sleep(rng.uniform(0, FINALISE_S))
-        killed_ns = time.time_ns()
         recorder.send_signal(signal.SIGKILL)
         recorder.process.wait()
         publisher.tell("stop")
         publisher.summary()
     path = recorder.run_path / "episodes" / f"{EPISODE}.mcap"
+    finished = path.is_file()
     try:
-        if not path.is_file():
+        if not finished:
             path = recover(path.with_name(path.name + ".part")).output
-        return _judge(path, publisher.account_path, spec, killed_ns, stopped=finalising)
+        return _judge(path, publisher.account_path, spec, end_ns, finished=finished)
     except (GstError, McapError, OSError, ValueError) as error:
         problem = f"{type(error).__name__}: {error}"
-        return KillRun(recovered=False, tail_s={}, holes=0, problem=problem)
+        return KillRun(recovered=False, finished=finished, tail_s={}, holes=0, problem=problem)
 
 
 def _stop(recorder: OurRecorder) -> None:
@@ -74,14 +77,10 @@ def _stop(recorder: OurRecorder) -> None:
         recorder.stop()
 
 
-def _judge(path: Path, account: Path, spec: CellSpec, killed_ns: int, *, stopped: bool) -> KillRun:
+def _judge(path: Path, account: Path, spec: CellSpec, end_ns: int, *, finished: bool) -> KillRun:
     kept: dict[str, set[int]] = {}
-    last_ns = 0
     for _, channel, message in messages_of([path]):
         kept.setdefault(channel.topic, set()).add(message.sequence)
-        last_ns = max(last_ns, message.publish_time)
-    # What came after a stop was not wanted; with a stop the end is the last message kept.
-    end_ns = last_ns if stopped else killed_ns
     tail_s, holes = {}, 0
     with np.load(account) as data:
         for stream in streams_of(spec):
@@ -93,7 +92,7 @@ def _judge(path: Path, account: Path, spec: CellSpec, killed_ns: int, *, stopped
             if len(sent):
                 before = stamps[last] if last >= 0 else sent[0] - stream.period_ns
                 tail_s[stream.topic] = max(0.0, float(sent[-1] - before) * 1e-9)
-    return KillRun(recovered=bool(kept), tail_s=tail_s, holes=holes)
+    return KillRun(recovered=bool(kept), finished=finished, tail_s=tail_s, holes=holes)
 
 
 def kill_reference(spec: CellSpec, folder: Path, *, seconds: float) -> tuple[int, int]:

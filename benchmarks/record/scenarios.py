@@ -260,7 +260,12 @@ def kill(plan: Plan) -> None:
                 limit=0,
             ),
         ],
-        note=plan.note(", ".join(f"{name}: {len(group)}" for name, group in runs.items())),
+        note=plan.note(
+            ", ".join(
+                f"{name}: {len(group)} ({sum(run.finished for run in group)} too late)"
+                for name, group in runs.items()
+            )
+        ),
         median_tail_s=statistics.median(tails),
         runs={name: [asdict(run) for run in group] for name, group in runs.items()},
     )

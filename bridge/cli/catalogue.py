@@ -11,7 +11,7 @@ from bridge.episode.catalogue_query import CatalogueQuery
 from bridge.terminal import Advance, Output
 
 if TYPE_CHECKING:
-    from bridge.episode.catalogue import Entry
+    from bridge.episode.catalogue_entry import Entry
 
 OUTPUT = Output()
 EVERYTHING = CatalogueQuery()
@@ -46,7 +46,7 @@ def ls(
 
 
 def _find(run: Path, query: CatalogueQuery, output: Output) -> "list[Entry]":
-    from bridge.episode.catalogue import find_episodes
+    from bridge.episode.catalogue_find import find_episodes
     from bridge.episode.run import RunFolder
 
     with ExitStack() as stack:

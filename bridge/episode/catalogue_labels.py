@@ -4,6 +4,7 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+from bridge.episode.catalogue_entry import LABEL_SUFFIX
 from bridge.episode.metadata import Outcome, build
 from bridge.episode.reader import Episode
 from bridge.episode.run import EPISODE_ID, RunFolder, check_episode_id
@@ -11,12 +12,10 @@ from bridge.errors import PathNotFoundError
 from bridge.task.record import check_record, parse_record
 from bridge.whole_file import write_whole
 
-SUFFIX = ".outcome.json"
-
 
 def sidecar_path(run: RunFolder, episode_id: str) -> Path:
     """Where the label of an episode is kept."""
-    return run.notes_dir / f"{check_episode_id(episode_id)}{SUFFIX}"
+    return run.notes_dir / f"{check_episode_id(episode_id)}{LABEL_SUFFIX}"
 
 
 def outcome_of(run: RunFolder, episode: Episode) -> Outcome | None:

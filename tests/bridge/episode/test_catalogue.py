@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import robot_gst
-from bridge.episode import catalogue, metadata
+from bridge.episode import catalogue_find, catalogue_reading, metadata
 from bridge.episode.catalogue import (
     Entry,
     find_episodes,
@@ -17,8 +17,8 @@ from bridge.episode.catalogue import (
     list_episodes,
     note_finished,
 )
-from bridge.episode.catalogue_entry import read_entry
 from bridge.episode.catalogue_query import CatalogueQuery
+from bridge.episode.catalogue_reading import read_entry
 from bridge.episode.catalogue_store import FILE_NAME, VERSION, CatalogueStore
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.run import RunFolder
@@ -71,7 +71,7 @@ def count_reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         read.append(path.name)
         return read_entry(run, path)
 
-    monkeypatch.setattr(catalogue, "read_entry", counted)
+    monkeypatch.setattr(catalogue_reading, "read_entry", counted)
     return read
 
 
@@ -230,7 +230,9 @@ def test_a_cache_held_by_another_process_costs_time_only(
     settle(run)
     list_episodes(run)
     write(run, "t2")
-    monkeypatch.setattr(catalogue, "CatalogueStore", lambda path: CatalogueStore(path, busy_s=0.0))
+    monkeypatch.setattr(
+        catalogue_find, "CatalogueStore", lambda path: CatalogueStore(path, busy_s=0.0)
+    )
     read = count_reads(monkeypatch)
     holder = sqlite3.connect(run.path / FILE_NAME, isolation_level=None)
     holder.execute("BEGIN IMMEDIATE")  # readers may go on
