@@ -52,6 +52,7 @@ format: $(READY)
 
 bench: $(READY)
 	@for file in benchmarks/bench_$(BENCH)*.py; do $(BIN)/python $$file || exit 1; done
+	@$(BIN)/python benchmarks/table.py $(BENCH)
 
 clean:
 	rm -rf build .venv .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
