@@ -26,6 +26,8 @@ COLOR_LAYOUTS = {
     "mono8": ("GRAY", 1),
 }
 """Colour encodings of sensor_msgs/Image: the order of their channels, and how many."""
+SUBSAMPLING = "420"
+"""Half the work and the size of full colour; cameras interpolate their colour anyway."""
 DEPTH_ENCODINGS = ("16UC1", "mono16")
 
 
@@ -147,7 +149,7 @@ def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
     rows = pixel_rows(data, header, channels)
     image_u8 = rows.reshape(header.height, header.width, channels)
     try:
-        jpeg = encode_jpeg(image_u8, quality, layout=layout)
+        jpeg = encode_jpeg(image_u8, quality, layout=layout, subsampling=SUBSAMPLING)
     except ValueError as error:
         raise _malformed(str(error)) from error
     return _compressed_image(header, "jpeg", [jpeg])

@@ -36,6 +36,7 @@ def encode_jpeg(
     quality: int = JPEG_QUALITY,
     *,
     layout: str = "RGB",
+    subsampling: str = "444",
 ) -> bytes:
     """Compress an sRGB image as JPEG.
 
@@ -43,6 +44,7 @@ def encode_jpeg(
         image_u8: The image; its rows may lie apart in memory.
         quality: 1 to 100.
         layout: Order of the channels: RGB, BGR, RGBA, BGRA or GRAY.
+        subsampling: Of colour: 444 keeps all of it, 420 halves it in both directions.
 
     Raises:
         ValueError: The image is larger than JPEG allows (65500), or empty.
@@ -53,10 +55,12 @@ def encode_jpeg(
         raise MissingDependencyError(
             package="simplejpeg", extra="record", purpose="JPEG encoding"
         ) from error
-    coding = {"colorsubsampling": "Gray"} if layout == "GRAY" else {}
     return bytes(
         simplejpeg.encode_jpeg(
-            np.ascontiguousarray(image_u8), quality=quality, colorspace=layout, **coding
+            np.ascontiguousarray(image_u8),
+            quality=quality,
+            colorspace=layout,
+            colorsubsampling="Gray" if layout == "GRAY" else subsampling,
         )
     )
 
