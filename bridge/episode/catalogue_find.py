@@ -6,7 +6,6 @@ The modules that open episodes are imported only when there is something to open
 import contextlib
 import sqlite3
 from collections.abc import Callable, Iterable
-from pathlib import Path
 
 from bridge.episode.catalogue_entry import Entry, Trace, scan
 from bridge.episode.catalogue_query import CatalogueQuery

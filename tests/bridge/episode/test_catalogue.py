@@ -176,6 +176,16 @@ def test_all_parts_of_a_split_episode_are_one_line(run: RunFolder) -> None:
     assert rows(run) == [("t1.mcap", "unknown")]
 
 
+def test_an_episode_of_which_a_part_was_recovered_counts_as_lossy(run: RunFolder) -> None:
+    write(run, "t1", lost=0)
+    with EpisodeWriter(run.episodes_dir / "t1.2.mcap") as writer:
+        writer.describe(EpisodeInfo(id="t1", kind="trial"))
+        writer.add_metadata("recovered", {"reason": '"killed"'})
+    write(run, "t2", lost=0)
+    assert [entry.recovered for entry in list_episodes(run)] == [True, False]
+    assert ids(run, lost=True) == ["t1"]
+
+
 @pytest.mark.parametrize(
     "damage", [b"", b"no database at all" * 100, b"SQLite format 3\x00" + b"\xff" * 5000]
 )
