@@ -5,7 +5,7 @@ nearest in time. Action: the plan's command for the next row, or the next row's 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -100,7 +100,9 @@ def sample(episode: Episode, fps: int) -> Samples:
             path=episode.path, found=f"camera {empty[0]} has no images", hint="Leave it out."
         )
     start_ns = max(int(span[0]) for span in spans)
-    end_ns = min(int(span[-1]) for span in spans)
+    # The last image also serves a row half a step later; joints are never extended.
+    reach_ns = [0] * len(tracks) + [NS_PER_S // (2 * fps)] * len(cameras)
+    end_ns = min(int(span[-1]) + reach for span, reach in zip(spans, reach_ns, strict=True))
     if end_ns < start_ns:
         raise EpisodeError(
             path=episode.path,
@@ -118,11 +120,20 @@ def sample(episode: Episode, fps: int) -> Samples:
     return Samples(
         names=names,
         stamps_ns=stamps_ns,
-        state=np.hstack([track.at(stamps_ns) for track in tracks]),
+        state=np.hstack([_at(track, stamps_ns) for track in tracks]),
         command=_commands(episode, tracks, stamps_ns + NS_PER_S // fps),
         images=images,
         max_image_offset_ns=offsets,
     )
+
+
+def _at(
+    track: JointTrack, stamps_ns: Int[np.ndarray, " num_rows"]
+) -> Float[np.ndarray, "num_rows num_joints"]:
+    """Interpolate; times since the first row, for 64-bit floats round today's stamps to 256 ns."""
+    origin_ns = stamps_ns[0]
+    near = replace(track, stamps_ns=track.stamps_ns - origin_ns)
+    return near.at(stamps_ns - origin_ns)
 
 
 def row_images(

@@ -1,0 +1,78 @@
+"""``import trials``: a spreadsheet becomes part of a run, or is refused with its row."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import robot_gst
+from bridge.episode.run import RunFolder
+from bridge.exchange.trials_csv import read_trials
+from evaluator.compare import compare_run
+
+HEAD = "trial_id,task,condition,start_id,recorded,sim_planned,stand_in\r\n"
+ROWS = "t1,cube,without_replanning,s1,success,success,false\r\nt2,cube,,,failure,success,false\r\n"
+
+
+def run(*arguments: object) -> int:
+    return robot_gst.run([str(item) for item in arguments])
+
+
+def table(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "table.csv"
+    path.write_text(text, newline="")
+    return path
+
+
+def test_an_imported_table_is_what_evaluate_compares(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = table(tmp_path, HEAD + ROWS)
+    assert run("import", "trials", source, tmp_path / "run") == 0
+    assert "2 trials of cube" in capsys.readouterr().out
+    kept = tmp_path / "run" / "notes" / "trials.csv"
+    assert read_trials(kept) == read_trials(source)
+    assert run("evaluate", tmp_path / "run", "--json") == 0
+    results = json.loads(capsys.readouterr().out)
+    values = {item["id"]: item for item in results["measurements"]}
+    assert values["agreement.sim_planned.rate"]["value"] == 0.5
+    assert values["agreement.sim_planned.rate"]["n"] == 2
+
+
+def test_a_recorded_trial_is_not_counted_twice(
+    make_trial: Callable[..., Path], tmp_path: Path
+) -> None:
+    make_trial(id="t1", cameras=(), num_frames=3)
+    source = table(tmp_path, HEAD + ROWS)
+    assert run("import", "trials", source, tmp_path / "run") == 0
+    comparison = compare_run(RunFolder.open(tmp_path / "run"))
+    assert [row.episode for row in comparison.rows] == ["t1", "t2"]
+    (doubled,) = [item for item in comparison.exclusions if "trials.csv" in item.reason]
+    assert doubled.episode == "t1"
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        (HEAD + "t1,cube,,,maybe,,\r\n", "table.csv row 2: recorded is 'maybe'"),
+        (HEAD + ROWS + "t1,cube,,,,,\r\n", "row 4: trial_id 't1' stands in row 2 already"),
+        (HEAD + "t1,cube\r\n", "row 2: 2 fields where the header has 7"),
+        ("trial_id\r\nt1\r\n", "no column 'task'"),
+        ("", "table.csv: empty"),
+    ],
+)
+def test_a_bad_row_is_named_and_nothing_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, match: str
+) -> None:
+    assert run("import", "trials", table(tmp_path, text), tmp_path / "run") == 1
+    assert match in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_second_import_needs_force(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = table(tmp_path, HEAD + ROWS)
+    assert run("import", "trials", source, tmp_path / "run") == 0
+    assert run("import", "trials", source, tmp_path / "run") == 2
+    assert "Replace it with --force" in capsys.readouterr().err
+    assert run("import", "trials", source, tmp_path / "run", "--force") == 0
