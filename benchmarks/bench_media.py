@@ -17,6 +17,8 @@ NUM_FRAMES = int(os.environ.get("MEDIA_FRAMES", "30"))
 REPEATS = int(os.environ.get("MEDIA_REPEATS", "9"))
 ENCODE_MS, DECODE_MS = 1.4, 1.2
 """What RVL may cost a frame on one core."""
+JPEG_RATIO = 1.2
+"""The whole message may cost this much of OpenCV's JPEG of the bare pixels; both use one library."""
 
 
 def main() -> None:
@@ -133,7 +135,7 @@ def color_row(colors: list[np.ndarray]) -> tuple[list[Target], dict[str, Any]]:
     target = Target(
         what="raw Image to JPEG 90, whole message",
         measured=ours_ms / theirs_ms,
-        limit=1.0,
+        limit=JPEG_RATIO,
         unit="x",
         reference=f"{ours_ms:.2f} ms; cv2 JPEG 90 of the pixels: {theirs_ms:.2f} ms",
     )

@@ -20,7 +20,7 @@ except ImportError:
     from bridge.media.rvl import decode_rvl, encode_rvl
 
     NATIVE = False
-"""``NATIVE``: the built extension codes; its NumPy twin is about a hundred times slower."""
+"""``NATIVE``: the built extension codes; its NumPy twin is about fifty times slower."""
 
 PNG_MAGIC = b"\x89PNG"
 _EXPECTED = "16-bit depth as PNG or RVL"
