@@ -18,7 +18,7 @@ REPEATS = int(os.environ.get("MEDIA_REPEATS", "9"))
 ENCODE_MS, DECODE_MS = 1.4, 1.2
 """What RVL may cost a frame on one core."""
 JPEG_RATIO = 1.2
-"""The whole message may cost this much of OpenCV's JPEG of the bare pixels; both use one library."""
+"""What the whole message may cost in terms of OpenCV's JPEG of the bare pixels."""
 
 
 def main() -> None:
