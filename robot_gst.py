@@ -20,16 +20,17 @@ HELP = (
 )
 
 EPISODES, LIVE, IMPORTS = "bridge.cli.episodes", "bridge.cli.live", "bridge.cli.imports"
+RECORDING = "bridge.cli.recording"
 DEVICES = "bridge.cli.devices"
 EXCHANGE = "bridge.cli.exchange"
 CATALOGUE = "bridge.cli.catalogue"
 
 COMMANDS: tuple[tuple[str, str, str, str], ...] = (
     ("demo", "dashboards.cli:demo", "The whole loop on a stand-in cell, in minutes.", "runs/demo"),
-    ("record", f"{LIVE}:record", "Record episodes live over zenoh.", "runs/monday"),
+    ("record", f"{RECORDING}:record", "Record episodes live over zenoh.", "runs/monday"),
     (
         "ctl",
-        f"{LIVE}:ctl",
+        f"{RECORDING}:ctl",
         "Start, stop, mark or label from anywhere.",
         "start --id trial_1",
     ),

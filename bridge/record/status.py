@@ -92,7 +92,7 @@ class Status:
 
 
 def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str:
-    """One line for people."""
+    """One line about a recorder."""
     free = f"{status['disk_free_bytes'] / 1e9:.1f} GB free"
     if status["state"] == "failed":
         return f"failed: {status['error']}"
@@ -114,3 +114,26 @@ def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str
         f"{status['lost']} lost{flags}, queue {status['queue_bytes'] / 1e6:.1f} MB, "
         f"{free}{stalled}"
     )
+
+
+def describe_answer(answer: dict[str, Any]) -> str:
+    """One line about the answer to a command."""
+    if answer.get("discarded"):
+        return f"{answer['episode']}: discarded"
+    if "messages" in answer:
+        return (
+            f"{answer['episode']}: {answer['messages']} messages, {answer['lost']} lost, "
+            f"{answer['undecodable']} undecodable, {answer['duration_s']:.1f} s"
+        )
+    return f"{answer['episode']}: ok"
+
+
+def describe_list(answer: dict[str, Any]) -> str:
+    """One line for each episode."""
+    lines = [
+        f"{item['id']:<24} {item['kind']:<8} {item['outcome']:<8} {item['duration_s']:>7.1f} s  "
+        f"{item['task'] or item['error']}"
+        for item in answer["episodes"]
+    ]
+    left_out = answer["of"] - len(lines)
+    return "\n".join([*([f"({left_out} more before these)"] if left_out else []), *lines])

@@ -22,6 +22,7 @@ LIGHT_ROOMS = (
     "bridge.cli.catalogue",
     "bridge.cli.episodes",
     "bridge.cli.live",
+    "bridge.cli.recording",
     "bridge.cli.imports",
     "twin.cli",
     "evaluator.cli",

@@ -1,0 +1,142 @@
+"""Commands that record, and that control a recorder from anywhere."""
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from bridge.record.config import EpisodeAbout, RecorderConfig
+from bridge.terminal import Output, stop_signals
+from bridge.wire.config import DEFAULT_ENDPOINT
+
+OUTPUT = Output()
+ABOUT = EpisodeAbout()
+RECORDER = RecorderConfig()
+LOOPBACK = (DEFAULT_ENDPOINT,)
+Action = Literal["start", "stop", "mark", "label", "pause", "resume", "snapshot", "list", "status"]
+
+
+def record(
+    run: Path,
+    /,
+    *,
+    episode: str | None = None,
+    duration_s: Annotated[float | None, Parameter(name=("--duration", "--duration-s"))] = None,
+    about: Annotated[EpisodeAbout, Parameter(name="*")] = ABOUT,
+    config: Annotated[RecorderConfig, Parameter(name="*")] = RECORDER,
+    listen: tuple[str, ...] = LOOPBACK,
+    connect: tuple[str, ...] = (),
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Record episodes live; everything published to this recorder ends up in one.
+
+    Without --episode it waits for robot-gst ctl start, or the keys shown on a terminal.
+    SIGINT or SIGTERM finish the open episode.
+    Example: robot-gst record runs/monday --episode scan --duration 30
+
+    Args:
+        run: Run folder; made where needed.
+        episode: Start this episode at once.
+        duration_s: Stop after this long [s]; with --episode.
+        about: What is being recorded, with --episode or the key s.
+        config: The recorder's settings.
+        listen: Where to listen; other processes connect here.
+        connect: Other zenoh routers to join.
+        zenoh_config: zenoh configuration (JSON5), for example with access control.
+        output: How to talk.
+    """
+    from bridge.errors import UsageError
+    from bridge.record.control import parse_info
+    from bridge.record.process import run_recorder
+    from bridge.record.status import describe_answer
+    from bridge.wire.config import WireConfig
+
+    if duration_s is not None and (episode is None or duration_s <= 0):
+        raise UsageError("--duration needs --episode ID and a time above zero.")
+    info = None if episode is None else parse_info(episode, asdict(about))
+    wire = WireConfig(mode="router", listen=listen, connect=connect, config=zenoh_config)
+    with stop_signals() as stop:
+        answer = run_recorder(
+            run,
+            wire=wire,
+            config=config,
+            stop=stop,
+            output=output,
+            episode=info,
+            duration_s=duration_s,
+            about=about,
+        )
+    data = answer or {"ok": True, "episode": None}
+    output.result(data, describe_answer(data) if answer else "stopped; no episode was open")
+    return 0
+
+
+def ctl(
+    action: Action,
+    text: str = "",
+    /,
+    *,
+    id: str | None = None,
+    about: Annotated[EpisodeAbout, Parameter(name="*")] = ABOUT,
+    result: Literal["success", "failure", "unknown"] | None = None,
+    detail: str | None = None,
+    discard: bool = False,
+    last: int = 20,
+    recorder: str = "main",
+    connect: tuple[str, ...] = LOOPBACK,
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Control a recorder from anywhere.
+
+    Example: robot-gst ctl start --id trial_0001 --task cube_into_box --cell standin
+
+    Args:
+        action: start, stop, mark, label, pause, resume, list, status, or snapshot, which writes
+            the pre-roll as an episode.
+        text: Words of a mark or label.
+        id: Episode to start or to write (snapshot), or to label after it has been finished.
+        about: What is being recorded (start, snapshot).
+        result: How it went (stop, label).
+        detail: What happened, in words (stop, label).
+        discard: Throw the open episode away (stop).
+        last: How many episodes, by name from the end (list).
+        recorder: Name of the recorder.
+        connect: Where it listens.
+        zenoh_config: zenoh configuration (JSON5).
+        output: How to talk.
+    """
+    from bridge.errors import UsageError
+    from bridge.record.status import describe_answer, describe_list, describe_status
+    from bridge.wire.config import WireConfig
+    from bridge.wire.recorder_client import RecorderClient
+    from bridge.wire.session import open_session
+
+    outcome = None
+    if result is not None:
+        outcome = {"result": result, "k": int(result == "success"), "n": 1, "detail": detail}
+    requests: dict[str, dict[str, Any]] = {
+        "start": {"id": id, "info": asdict(about)},
+        "stop": {"outcome": outcome, "discard": discard},
+        "mark": {"text": text},
+        "label": {"text": text, "outcome": outcome, "episode": id},
+        "pause": {},
+        "resume": {},
+        "snapshot": {"id": id, "info": asdict(about)},
+        "list": {"last": last},
+        "status": {},
+    }
+    if action in ("start", "snapshot") and id is None:
+        raise UsageError(
+            f"{action} needs the new episode's id: robot-gst ctl {action} --id trial_0001."
+        )
+    with open_session(WireConfig(connect=connect, config=zenoh_config)) as session:
+        answer = RecorderClient(session, recorder).ask(action, requests[action])
+    describe: Callable[[dict[str, Any]], str] = describe_answer
+    if action in ("status", "list"):
+        describe = describe_status if action == "status" else describe_list
+    output.result(answer, describe(answer))
+    return 0
