@@ -7,7 +7,7 @@ record at a time, and the index.
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 from mcap import records
 
@@ -19,6 +19,7 @@ from bridge.episode.mcap_walk import (
     DAMAGE,
     PIECE_BYTES,
     BrokenRecordError,
+    ByteStream,
     MessageHead,
     Place,
     attachment_of,
@@ -91,7 +92,7 @@ class FileCheck:
         except DAMAGE as error:
             self._fault(f"damaged: {error}" if str(error) else f"damaged ({type(error).__name__})")
 
-    def _walk_data(self, stream: BinaryIO, data_end: int) -> Iterator[ScannedMessage]:
+    def _walk_data(self, stream: ByteStream, data_end: int) -> Iterator[ScannedMessage]:
         stream.seek(0)
         self._crc = zlib.crc32(stream.read(len(MAGIC)))
         ended = False
@@ -193,7 +194,7 @@ class FileCheck:
         self._chunk_entries = {}
         self._indexed = set()
 
-    def _add_attachment(self, stream: BinaryIO, place: Place) -> None:
+    def _add_attachment(self, stream: ByteStream, place: Place) -> None:
         try:
             found, data_size = attachment_of(stream, place, keep=False)
             self.seen.attachments.append(attachment_entry(place, found, data_size))
@@ -209,7 +210,7 @@ class FileCheck:
             left -= len(piece)
             self._crc = zlib.crc32(piece, self._crc)
 
-    def _check_data_end(self, stream: BinaryIO, place: Place) -> None:
+    def _check_data_end(self, stream: ByteStream, place: Place) -> None:
         record = parse(place.opcode, read_body(stream, place))
         if isinstance(record, records.DataEnd) and record.data_section_crc not in (0, self._crc):
             self._fault("its data has another CRC than it declares")

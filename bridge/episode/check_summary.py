@@ -2,12 +2,19 @@
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
-from typing import BinaryIO
 
 from mcap import records
 from mcap.summary import Summary
 
-from bridge.episode.mcap_walk import MessageHead, Place, parse, read_body, walk
+from bridge.episode.mcap_walk import (
+    BrokenRecordError,
+    ByteStream,
+    MessageHead,
+    Place,
+    parse,
+    read_body,
+    walk,
+)
 from bridge.episode.rebuild import metadata_entry
 
 
@@ -52,7 +59,7 @@ class Seen:
 
 
 def summary_faults(
-    stream: BinaryIO, seen: Seen, summary: Summary | None, footer: records.Footer, footer_at: int
+    stream: ByteStream, seen: Seen, summary: Summary | None, footer: records.Footer, footer_at: int
 ) -> Iterator[str]:
     """Yield a sentence for every place where summary and data disagree.
 
@@ -130,14 +137,21 @@ def _index_faults(what: str, said: list, found: list, key: str) -> Iterator[str]
         yield f"the {what} at byte {at} is not in the index"
 
 
-def _offset_faults(stream: BinaryIO, footer: records.Footer, footer_at: int) -> Iterator[str]:
+def _offset_faults(stream: ByteStream, footer: records.Footer, footer_at: int) -> Iterator[str]:
     for place in walk(stream, footer.summary_offset_start, footer_at):
         record = parse(place.opcode, read_body(stream, place))
         if not isinstance(record, records.SummaryOffset):
             yield f"a record of kind {place.opcode} among the summary's offsets"
             continue
         start, end = record.group_start, record.group_start + record.group_length
-        inside = footer.summary_start <= start <= end <= footer.summary_offset_start
-        kinds = {other.opcode for other in walk(stream, start, end)} if inside else set()
-        if kinds - {record.group_opcode} or not inside:
+        is_inside = footer.summary_start <= start <= end <= footer.summary_offset_start
+        if not is_inside or _kinds(stream, start, end) != {record.group_opcode}:
             yield f"the summary's offset of records of kind {record.group_opcode} is wrong"
+
+
+def _kinds(stream: ByteStream, start: int, end: int) -> set[int]:
+    """The opcodes of the records between two offsets; none when they do not end there."""
+    try:
+        return {place.opcode for place in walk(stream, start, end)}
+    except BrokenRecordError:
+        return set()

@@ -5,7 +5,6 @@ from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
 
 from mcap import records
 from mcap.summary import Summary
@@ -14,6 +13,7 @@ from bridge.episode import mcap_format
 from bridge.episode.mcap_format import FOOTER_FIELDS, MAGIC, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
 from bridge.episode.mcap_walk import (
     BrokenRecordError,
+    ByteStream,
     Place,
     attachment_of,
     message_head,
@@ -67,14 +67,14 @@ class McapFile:
             self.metadata = list(self._read_metadata(stream))
         self._loose: LooseMessages | None = None
 
-    def _read_metadata(self, stream: BinaryIO) -> Iterator[records.Metadata]:
+    def _read_metadata(self, stream: ByteStream) -> Iterator[records.Metadata]:
         for entry in self.summary.metadata_indexes:
             place = self._indexed(stream, entry.offset, mcap_format.METADATA)
             record = parse(place.opcode, read_body(stream, place))
             if isinstance(record, records.Metadata):
                 yield record
 
-    def _indexed(self, stream: BinaryIO, offset: int, opcode: int) -> Place:
+    def _indexed(self, stream: ByteStream, offset: int, opcode: int) -> Place:
         """Return the place of the record an index points at."""
         place = next(walk(stream, offset, self.data_end), None)
         if place is None or place.opcode != opcode:
@@ -128,7 +128,7 @@ class McapFile:
             yield at, self.data_end
 
 
-def _note(stream: BinaryIO, place: Place, found: LooseMessages) -> None:
+def _note(stream: ByteStream, place: Place, found: LooseMessages) -> None:
     stream.seek(place.offset)
     head = message_head(stream.read(MESSAGE_HEAD.size), 0, place.offset)
     found.log_times_ns.append(head.log_time_ns)
@@ -136,7 +136,7 @@ def _note(stream: BinaryIO, place: Place, found: LooseMessages) -> None:
     found.channel_ids.append(head.channel_id)
 
 
-def read_header(stream: BinaryIO) -> records.Header:
+def read_header(stream: ByteStream) -> records.Header:
     """Read magic and first record; raises BrokenRecordError."""
     if stream.read(len(MAGIC)) != MAGIC:
         message = "it does not begin as an MCAP file does"
@@ -150,7 +150,7 @@ def read_header(stream: BinaryIO) -> records.Header:
     return record
 
 
-def read_footer(stream: BinaryIO) -> tuple[records.Footer, int]:
+def read_footer(stream: ByteStream) -> tuple[records.Footer, int]:
     """Read the last record and say where it begins; raises BrokenRecordError."""
     at = stream.seek(0, 2) - _FOOTER_BYTES
     stream.seek(max(at, 0))
@@ -168,7 +168,7 @@ def read_footer(stream: BinaryIO) -> tuple[records.Footer, int]:
     return footer, at
 
 
-def read_summary(stream: BinaryIO, footer: records.Footer, footer_at: int) -> Summary | None:
+def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> Summary | None:
     """Read the summary section with its CRC checked, None where there is none.
 
     Raises:

@@ -7,8 +7,8 @@ to ``MAX_CHUNK_BYTES`` when it is unpacked.
 import struct
 import zlib
 from collections.abc import Iterator
-from io import BytesIO
-from typing import Any, BinaryIO, NamedTuple
+from io import BufferedReader, BytesIO
+from typing import Any, NamedTuple
 
 import lz4.frame
 import zstandard
@@ -19,6 +19,8 @@ from mcap.exceptions import EndOfFile, McapError
 from bridge.episode import mcap_format
 from bridge.episode.mcap_format import CHUNK_FIELDS, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
 
+ByteStream = BufferedReader | BytesIO
+"""An open file, or bytes that act as one."""
 MAX_CHUNK_BYTES = 1 << 30
 """No chunk may unpack to more: a few bytes of zstd can claim terabytes."""
 PIECE_BYTES = 1 << 20
@@ -69,7 +71,7 @@ class Place(NamedTuple):
         return self.offset + RECORD_HEAD.size + self.length
 
 
-def walk(stream: BinaryIO, start: int, end: int) -> Iterator[Place]:
+def walk(stream: ByteStream, start: int, end: int) -> Iterator[Place]:
     """Yield the places of all records between two offsets; the stream may be used in between.
 
     Raises:
@@ -91,7 +93,7 @@ def walk(stream: BinaryIO, start: int, end: int) -> Iterator[Place]:
         at = place.end
 
 
-def read_body(stream: BinaryIO, place: Place) -> bytes:
+def read_body(stream: ByteStream, place: Place) -> bytes:
     """Return a record's bytes without opcode and length."""
     stream.seek(place.offset + RECORD_HEAD.size)
     body = stream.read(place.length)
@@ -260,7 +262,7 @@ class FoundAttachment(NamedTuple):
     data_size: int
 
 
-def attachment_of(stream: BinaryIO, place: Place, *, keep: bool = True) -> FoundAttachment:
+def attachment_of(stream: ByteStream, place: Place, *, keep: bool = True) -> FoundAttachment:
     """Read an attachment record and check its CRC; without ``keep`` its data is left empty.
 
     Raises:
@@ -296,7 +298,7 @@ def attachment_of(stream: BinaryIO, place: Place, *, keep: bool = True) -> Found
 
 
 def _attachment_crc(
-    stream: BinaryIO, place: Place, count: int, data_start: int, *, keep: bool
+    stream: ByteStream, place: Place, count: int, data_start: int, *, keep: bool
 ) -> tuple[int, list[bytes]]:
     stream.seek(place.offset + RECORD_HEAD.size)
     crc = zlib.crc32(stream.read(data_start))

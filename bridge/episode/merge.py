@@ -7,7 +7,7 @@ would pass ``MEMORY_BYTES``, the one needed last is forgotten and unpacked again
 
 import heapq
 from collections.abc import Iterable, Iterator, Sequence
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from mcap import records
@@ -17,6 +17,7 @@ from bridge.episode.mcap_format import CHUNK, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
 from bridge.episode.mcap_walk import (
     DAMAGE,
     BrokenRecordError,
+    ByteStream,
     MessageHead,
     Place,
     message_head,
@@ -81,9 +82,9 @@ class _OpenFile:
         }
         self.pending = 0
         """Sources that still have messages."""
-        self._stream: BinaryIO | None = None
+        self._stream: ByteStream | None = None
 
-    def stream(self) -> BinaryIO:
+    def stream(self) -> ByteStream:
         if self._stream is None:
             self._stream = self.file.path.open("rb")
         return self._stream

@@ -1,7 +1,5 @@
 """Build the summary a file lacks from its data, as other writers may leave it out."""
 
-from typing import BinaryIO
-
 from mcap import records
 from mcap.summary import Summary
 
@@ -9,6 +7,7 @@ from bridge.episode import mcap_format
 from bridge.episode.mcap_format import MAGIC, MESSAGE_HEAD
 from bridge.episode.mcap_walk import (
     BrokenRecordError,
+    ByteStream,
     ChunkHead,
     Place,
     attachment_of,
@@ -22,7 +21,7 @@ from bridge.episode.mcap_walk import (
 )
 
 
-def rebuild_summary(stream: BinaryIO, data_end: int) -> Summary:
+def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
     """Read the whole data section once; every chunk is unpacked and its CRC checked.
 
     Raises:
@@ -79,7 +78,7 @@ class _Builder:
         self._end_ns = 0
         self._chunk: records.ChunkIndex | None = None
 
-    def add(self, stream: BinaryIO, place: Place) -> None:
+    def add(self, stream: ByteStream, place: Place) -> None:
         """Take one record of the data section."""
         if place.opcode == mcap_format.MESSAGE:
             stream.seek(place.offset)
@@ -123,7 +122,7 @@ class _Builder:
         self._start_ns = min(earliest, log_time_ns)
         self._end_ns = max(self._end_ns, log_time_ns)
 
-    def _add_chunk(self, stream: BinaryIO, place: Place) -> None:
+    def _add_chunk(self, stream: ByteStream, place: Place) -> None:
         chunk = parse_chunk(read_body(stream, place))
         data = unpack_chunk(chunk, whose=f"the chunk at byte {place.offset}")
         for opcode, at, length in records_in(data):
@@ -136,7 +135,7 @@ class _Builder:
         self._chunk = chunk_entry(place, chunk)
         self.summary.chunk_indexes.append(self._chunk)
 
-    def _add_attachment(self, stream: BinaryIO, place: Place) -> None:
+    def _add_attachment(self, stream: ByteStream, place: Place) -> None:
         found, data_size = attachment_of(stream, place, keep=False)
         self.summary.attachment_indexes.append(attachment_entry(place, found, data_size))
 
