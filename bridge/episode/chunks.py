@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import zstandard
 
 from bridge.episode import mcap_format
+from bridge.episode.checksum import joined_crc
 from bridge.episode.mcap_format import MESSAGE, MESSAGE_FIELDS, MESSAGE_HEAD, Buffer, Payload
 
 ZSTD_LEVEL = 1
@@ -18,10 +19,8 @@ class EncodedChunk:
 
     buffers: list[Buffer]
     length: int
-    head_crc: int
-    """CRC-32 of the record up to its data."""
-    data_crc: int
-    """CRC-32 of its data as written."""
+    crc: int
+    """CRC-32 of the whole record."""
     start_ns: int
     end_ns: int
     compression: str
@@ -143,8 +142,7 @@ class OpenChunk:
         encoded = EncodedChunk(
             buffers=[head, *data],
             length=len(head) + data_size,
-            head_crc=zlib.crc32(head),
-            data_crc=data_crc,
+            crc=joined_crc(zlib.crc32(head), data_crc, data_size),
             start_ns=self._start_ns,
             end_ns=self._end_ns,
             compression=compression,

@@ -2,7 +2,6 @@
 
 import zlib
 from collections.abc import Mapping
-from pathlib import Path
 
 from bridge.episode import mcap_format
 from bridge.episode.checksum import joined_crc
@@ -26,19 +25,29 @@ class DataSection:
 
     def add_chunk(self, chunk: EncodedChunk) -> None:
         """Write a chunk and its message indexes."""
-        file = self.file
-        start = file.offset
+        start = self.file.offset
         indexes, offsets = index_records(chunk.index, start + chunk.length)
-        crc = joined_crc(file.crc, chunk.head_crc, chunk.length - chunk.compressed_size)
-        crc = joined_crc(crc, chunk.data_crc, chunk.compressed_size)
-        file.append([*chunk.buffers, indexes], crc=zlib.crc32(indexes, crc))
+        crc = joined_crc(self.file.crc, chunk.crc, chunk.length)
+        self.file.append([*chunk.buffers, indexes], crc=zlib.crc32(indexes, crc))
+        self.book(chunk, start, offsets, len(indexes))
+
+    def add_indexes(self, chunk: EncodedChunk, start: int) -> None:
+        """Write the message indexes of a chunk that lies at ``start``, at the end of the file."""
+        indexes, offsets = index_records(chunk.index, self.file.offset)
+        self.file.append([indexes])
+        self.book(chunk, start, offsets, len(indexes))
+
+    def book(
+        self, chunk: EncodedChunk, start: int, offsets: dict[int, int], index_length: int
+    ) -> None:
+        """Tell the summary of a chunk at ``start`` with message indexes at ``offsets``."""
         place = ChunkPlace(
             start_ns=chunk.start_ns,
             end_ns=chunk.end_ns,
             offset=start,
             length=chunk.length,
             index_offsets=offsets,
-            index_length=len(indexes),
+            index_length=index_length,
             compression=chunk.compression,
             compressed_size=chunk.compressed_size,
             uncompressed_size=chunk.uncompressed_size,
@@ -75,16 +84,11 @@ class DataSection:
         self.file.append([mcap_format.metadata(name, values)])
         self.summary.add_metadata(name, offset=offset, length=self.file.offset - offset)
 
-    def finish(self, final_path: Path) -> None:
-        """Write the end of the data and the summary, sync, and give the file its final name."""
-        offset, crc = self.file.offset, self.file.crc
-        data_end = mcap_format.data_end(crc)
-        self.file.append([data_end, self.summary.encode(offset + len(data_end))])
-        try:
-            self.file.publish(final_path)
-        except OSError:
-            self.file.truncate(offset, crc)
-            raise
+    def seal(self) -> None:
+        """Write the end of the data, the summary and the footer."""
+        data_end = mcap_format.data_end(self.file.crc)
+        summary = self.summary.encode(self.file.offset + len(data_end))
+        self.file.append([data_end, summary])
 
 
 def index_records(index: dict[int, list[int]], start: int) -> tuple[bytes, dict[int, int]]:

@@ -83,6 +83,10 @@ class PartFile:
                 rest = rest[written:]
         return offset
 
+    def overwrite(self, offset: int, data: bytes) -> None:
+        """Replace a few bytes inside the file; ``crc`` is the caller's to set anew."""
+        os.pwrite(self._descriptor, data, offset)
+
     def sync_data(self) -> None:
         """Force what was written to the disk; safe from another thread.
 
@@ -201,13 +205,17 @@ def cannot_write(path: Path, error: OSError) -> BridgeError:
     return BridgeError(f"cannot write {path}: {error.strerror}. Choose another folder.")
 
 
-def lock_dead(path: Path) -> int | None:
+def lock_dead(path: Path, *, write: bool = True) -> int | None:
     """Open and lock a file whose writer is gone; None when it is still being written.
+
+    Args:
+        path: The file.
+        write: Open it for writing too.
 
     Raises:
         OSError: When it cannot be opened.
     """
-    descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    descriptor = os.open(path, (os.O_RDWR if write else os.O_RDONLY) | os.O_CLOEXEC)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         # Its writer may have finished and renamed it between the two calls.

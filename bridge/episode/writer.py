@@ -245,7 +245,13 @@ class EpisodeWriter:
             return self.path
         for group in self._groups:
             self._flush(group)
-        self._section.finish(self.path)
+        offset, crc = self._file.offset, self._file.crc
+        self._section.seal()
+        try:
+            self._file.publish(self.path)
+        except OSError:
+            self._file.truncate(offset, crc)
+            raise
         self._stop()
         return self.path
 

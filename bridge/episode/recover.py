@@ -1,0 +1,234 @@
+"""Make a readable episode of what a killed writer left, whoever the writer was.
+
+A part is recovered into a copy beside it (``<name>.recovering``). When the copy is on the disk and
+proved, it takes the part's name, then the final one: whenever this is killed, either the old part
+or a finished one is there, and it can be run again.
+"""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from bridge.episode.mcap_scan import scan
+from bridge.episode.part_file import PartFile, lock_dead, sync_folder
+from bridge.episode.record_file import RecordFile, finished_data_end
+from bridge.episode.recover_copy import CopyTarget
+from bridge.episode.recover_in_place import InPlaceTarget, NeedsCopyError
+from bridge.episode.recover_tally import RECORD_NAME, Tally, to_metadata
+from bridge.episode.recover_tally import RecoveryReport as RecoveryReport
+from bridge.episode.run import RunFolder
+from bridge.errors import BridgeError, GstError, PathNotFoundError
+
+PART, SUFFIX, TEMPORARY, UNREADABLE = ".part", ".mcap", ".recovering", ".unreadable"
+SPARE_BYTES = 16 << 20
+"""Left free beside a copy."""
+
+
+class RecoveryError(BridgeError):
+    """A file cannot be recovered now."""
+
+
+class StillWrittenError(RecoveryError):
+    """The writer of a part is alive."""
+
+
+def recover(path: Path, *, in_place: bool | None = None) -> RecoveryReport:
+    """Recover one file.
+
+    ``<id>.mcap.part`` becomes ``<id>.mcap``, or ``<id>_recovered.mcap`` where that name is taken.
+    Another broken file stays as it is, and ``<name>_recovered.mcap`` is made of it. A finished
+    file is only renamed, if that.
+
+    Args:
+        path: A part, or an MCAP file of any writer.
+        in_place: Finish the file itself instead of a copy; None does so only for a part, and only
+            when the disk has no room for a copy.
+
+    Raises:
+        PathNotFoundError: When there is no such file.
+        StillWrittenError: While its writer lives.
+        RecoveryError: When the disk has no room, or the copy could not be proved.
+        OSError: When the disk fails.
+    """
+    if not path.is_file():
+        hint = "robot-gst recover takes files, or folders to search for *.mcap.part."
+        raise PathNotFoundError(path=path, what="file", hint=hint)
+    is_part = path.name.endswith(PART)
+    write = in_place if in_place is not None else is_part
+    with _locked(path, write=write) as descriptor:
+        source = RecordFile(descriptor)
+        finished = _report_finished(path, source)
+        if finished is not None:
+            return finished
+        if in_place is None:
+            has_room = shutil.disk_usage(path.parent).free >= source.size + SPARE_BYTES
+            if not has_room and not is_part:
+                raise _no_room(path, source.size)
+            in_place = not has_room
+        if in_place:
+            return _recover_in_place(path, source)
+        return _recover_copy(path, source)
+
+
+def recover_parts(run: RunFolder) -> list[RecoveryReport]:
+    """Recover every part a dead writer left in ``episodes/``; parts being written are left alone.
+
+    What cannot be read at all is renamed to ``*.unreadable``, so that its name is free again. A
+    part that fails for another reason stays, and its report says why.
+    """
+    reports = []
+    for path in sorted(run.episodes_dir.glob(f"*{SUFFIX}{PART}")):
+        try:
+            report = recover(path)
+        except StillWrittenError:
+            continue
+        except (GstError, OSError) as error:
+            report = RecoveryReport(path=path, output=None, reason=str(error))
+        else:
+            if report.output is None:
+                _set_aside(path)
+        reports.append(report)
+    return reports
+
+
+def _set_aside(path: Path) -> None:
+    """Give an unreadable part a name that stands in nobody's way."""
+    base = path.name.removesuffix(PART)
+    target, number = path.with_name(base + UNREADABLE), 2
+    while target.exists():
+        target, number = path.with_name(f"{base}{UNREADABLE}{number}"), number + 1
+    path.rename(target)
+
+
+@contextmanager
+def _locked(path: Path, *, write: bool) -> Iterator[int]:
+    descriptor = lock_dead(path, write=write)
+    if descriptor is None:
+        message = f"{path} is still being written. Stop its recorder first."
+        raise StillWrittenError(message)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
+    """Rename a file that is whole; None when it is not."""
+    data_end = finished_data_end(source)
+    if data_end is None:
+        return None
+    tally = Tally()
+    for found in scan(source):
+        tally.take(found)
+    if tally.losses or tally.reached_end != data_end:
+        return None
+    output = _publish(path) if path.name.endswith(PART) else path
+    return tally.report(path, output, finished=True)
+
+
+def _recover_copy(path: Path, source: RecordFile) -> RecoveryReport:
+    temporary = path.with_name(_final_name(path) + TEMPORARY)
+    temporary.unlink(missing_ok=True)  # of a recovery that was killed; the lock is ours
+    tally = Tally()
+    target: CopyTarget | None = None
+    try:
+        for found in scan(source):
+            tally.take(found)
+            if tally.has_data and target is None:
+                target = CopyTarget(source, temporary)
+            if target is not None:
+                target.take(found)
+        report = tally.report(path, None, finished=False)
+        if target is None:
+            return report
+        target.finish(RECORD_NAME, to_metadata(report))
+        _prove(temporary)
+        original = _keep_original(path) if tally.damaged_inside else None
+        return replace(report, output=_replace(path, temporary), original=original)
+    except OSError as error:
+        message = f"{path} could not be copied: {error.strerror}. Free some space, then try again."
+        raise RecoveryError(message) from error
+    finally:
+        if target is not None:
+            target.section.file.close()
+        temporary.unlink(missing_ok=True)
+
+
+def _recover_in_place(path: Path, source: RecordFile) -> RecoveryReport:
+    tally = Tally()
+    target = InPlaceTarget(source, PartFile(path, source.descriptor))
+    try:
+        for found in scan(source):
+            tally.take(found)
+            target.take(found)
+    except NeedsCopyError as error:
+        raise _no_room(path, source.size) from error
+    report = tally.report(path, None, finished=False)
+    if not tally.has_data:
+        return report
+    target.finish(RECORD_NAME, to_metadata(report))
+    return replace(report, output=_publish(path) if path.name.endswith(PART) else path)
+
+
+def _prove(path: Path) -> None:
+    """Read the copy back; its CRC covers every byte that was found whole before."""
+    with path.open("rb") as stream:
+        if finished_data_end(RecordFile(stream.fileno())) is None:
+            message = f"{path} does not hold what was written to it. Check the disk."
+            raise RecoveryError(message)
+
+
+def _keep_original(path: Path) -> Path | None:
+    if not path.name.endswith(PART):
+        return path
+    kept = path.with_name(_final_name(path) + ".damaged")
+    try:
+        if not kept.exists():
+            kept.hardlink_to(path)
+    except OSError:  # some disks have no hard links; the damage is in the report all the same
+        return None
+    return kept
+
+
+def _replace(path: Path, temporary: Path) -> Path:
+    if path.name.endswith(PART):
+        temporary.rename(path)
+        sync_folder(path.parent)
+        return _publish(path)
+    output = _free_name(path, taken=True)
+    temporary.rename(output)
+    sync_folder(output.parent)
+    return output
+
+
+def _publish(part_path: Path) -> Path:
+    output = _free_name(part_path.with_name(_final_name(part_path)), taken=False)
+    part_path.rename(output)
+    sync_folder(output.parent)
+    return output
+
+
+def _final_name(path: Path) -> str:
+    return path.name.removesuffix(PART)
+
+
+def _free_name(path: Path, *, taken: bool) -> Path:
+    """Return the path, or where it is ``taken`` one with ``_recovered`` behind the id."""
+    base, dot, rest = path.name.partition(".")
+    number = 1
+    output = path
+    while taken or output.exists():
+        suffix = "_recovered" if number == 1 else f"_recovered_{number}"
+        output = path.with_name(f"{base}{suffix}{dot}{rest}")
+        taken, number = False, number + 1
+    return output
+
+
+def _no_room(path: Path, size: int) -> RecoveryError:
+    return RecoveryError(
+        f"{path} needs {size / 1e6:.0f} MB beside it for a copy. Free some space, "
+        "move it to another disk, or pass --in-place where its end only is broken."
+    )

@@ -1,0 +1,436 @@
+"""Cut and damage files of several writers; what was whole must come back, and nothing may hang."""
+
+import fcntl
+import functools
+import itertools
+import json
+import os
+import random
+import struct
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap_samples import linear, put, read_all, some_messages, write_official, write_ours
+
+from bridge.episode.mcap_parse import MAX_CHUNK_BYTES
+from bridge.episode.recover import RecoveryError, RecoveryReport, recover, recover_parts
+from bridge.episode.run import RunFolder
+from bridge.episode.writer import EpisodeWriter, WriterConfig
+from bridge.errors import PathNotFoundError, UsageError
+
+MESSAGES = some_messages(40)
+
+
+def cut(path: Path, at: int, name: str = "cut.mcap.part") -> Path:
+    """A file as a killed writer leaves it."""
+    part = path.with_name(name)
+    part.write_bytes(path.read_bytes()[:at])
+    return part
+
+
+def metadata_of(path: Path) -> dict[str, dict[str, str]]:
+    with path.open("rb") as stream:
+        return {item.name: item.metadata for item in make_reader(stream).iter_metadata()}
+
+
+@pytest.fixture(params=["ours", "ours unpacked", "zstd", "lz4", "none", "unchunked"])
+def whole(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """The same messages by our writer and by the official one in all its forms."""
+    path = tmp_path / "whole.mcap"
+    match request.param:
+        case "ours":
+            return write_ours(path, MESSAGES)
+        case "ours unpacked":
+            return write_ours(path, MESSAGES, compress=False)
+        case "unchunked":
+            return write_official(path, MESSAGES, chunked=False)
+        case name:
+            return write_official(path, MESSAGES, compression=CompressionType[name.upper()])
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_a_file_cut_anywhere_gives_back_every_whole_record(whole: Path, in_place: bool) -> None:
+    size = whole.stat().st_size
+    rng = random.Random(1)
+    for at in sorted(rng.sample(range(60, size), 25)):
+        part = cut(whole, at)
+        expected = linear(part)
+        report = recover(part, in_place=in_place)
+        assert report.output == whole.with_name("cut.mcap")
+        assert not part.exists()
+        found = read_all(report.output) if not _is_unchunked(whole, in_place) else expected
+        assert set(expected) <= set(found) <= set(MESSAGES), at
+        assert report.messages == len(found)
+        report.output.unlink()
+
+
+def _is_unchunked(whole: Path, in_place: bool) -> bool:
+    with whole.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    return in_place and not summary.chunk_indexes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("in_place", [False, True])
+def test_a_file_cut_at_every_single_byte_is_recovered(tmp_path: Path, in_place: bool) -> None:
+    whole = tmp_path / "whole.mcap"
+    with EpisodeWriter(whole, config=WriterConfig(chunk_bytes=120)) as writer:
+        writer.add_metadata("m", {"a": "b"})
+        for index in range(12):
+            writer.write_foreign(
+                f"/{index % 2}", bytes([index]) * 9, schema_record=None, log_time_ns=index
+            )
+        writer.attach("x", b"yz", media_type="", log_time_ns=1)
+    messages = read_all(whole)
+    assert len(messages) == 12
+    for at in range(whole.stat().st_size + 1):
+        part = cut(whole, at)
+        expected = linear(part)
+        report = recover(part, in_place=in_place)
+        if report.output is None:
+            assert not expected
+            assert part.read_bytes() == whole.read_bytes()[:at]
+            continue
+        found = read_all(report.output)
+        assert set(expected) <= set(found) <= set(messages), at
+        report.output.unlink()
+
+
+def test_whole_messages_of_a_cut_chunk_are_kept(tmp_path: Path) -> None:
+    messages = [item for item in MESSAGES if item.topic == "/joint_states"]
+    for compression in (CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD):
+        whole = write_official(
+            tmp_path / "one_chunk.mcap", messages, compression=compression, chunk_size=1 << 20
+        )
+        part = cut(whole, 3000)
+        assert linear(part) == []
+        report = recover(part)
+        assert report.output is not None
+        # zstd packs these few messages into one block, of which a part is nothing.
+        least = 0 if compression is not CompressionType.NONE else 15
+        assert report.messages >= least
+        assert read_all(report.output) == messages[: report.messages]
+        report.output.unlink()
+
+
+def test_foxgloves_unfinished_tail_chunk_is_understood(tmp_path: Path) -> None:
+    whole = write_official(tmp_path / "w.mcap", MESSAGES, compression=CompressionType.NONE)
+    data = bytearray(whole.read_bytes())
+    with whole.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    last = summary.chunk_indexes[-1]
+    head = last.chunk_start_offset
+    data[head + 1 : head + 9] = b"\xff" * 8  # length of the record
+    data[head + 9 : head + 37] = bytes(28)  # times, size and CRC are filled in at the end
+    data[head + 41 : head + 49] = b"\xff" * 8  # length of its data
+    part = tmp_path / "fox.mcap.part"
+    part.write_bytes(data[: head + last.chunk_length - 40])
+    report = recover(part)
+    assert report.output is not None
+    assert read_all(report.output) == sorted(MESSAGES[: report.messages], key=lambda m: m.log_time)
+    assert report.messages == len(MESSAGES) - 1
+
+
+def test_attachments_and_metadata_come_along_and_the_loss_is_declared(whole: Path) -> None:
+    part = cut(whole, whole.stat().st_size * 3 // 4)
+    report = recover(part)
+    assert report.output is not None
+    with report.output.open("rb") as stream:
+        (attachment,) = make_reader(stream).iter_attachments()
+    assert attachment.data == b"hello" * 20
+    records = metadata_of(report.output)
+    assert {"episode", "software", "recovered"} <= records.keys() or "note" in records
+    said = {name: json.loads(value) for name, value in records["recovered"].items()}
+    assert said["messages"] == report.messages == len(read_all(report.output))
+    assert said["bytes_lost"] == report.bytes_lost
+    assert "did not finish" in said["reason"]
+    assert said["last_log_time_ns"] == report.last_log_time_ns
+    assert said["tool"]["name"] == "robot-gst"
+    assert report.attachments == 1
+
+
+def test_a_finished_part_is_only_renamed(tmp_path: Path) -> None:
+    whole = write_ours(tmp_path / "w.mcap", MESSAGES)
+    data = whole.read_bytes()
+    part = tmp_path / "f.mcap.part"
+    part.write_bytes(data)
+    report = recover(part)
+    assert report.finished
+    assert (report.bytes_lost, report.reason) == (0, "")
+    assert (tmp_path / "f.mcap").read_bytes() == data
+    assert not part.exists()
+
+
+def test_a_taken_name_is_not_overwritten(tmp_path: Path) -> None:
+    whole = write_ours(tmp_path / "a.mcap", MESSAGES)
+    before = whole.read_bytes()
+    for expected in ("a_recovered.mcap", "a_recovered_2.mcap"):
+        part = cut(whole, 3000, "a.mcap.part")
+        assert recover(part).output == tmp_path / expected
+    split = cut(whole, 3000, "a.2.mcap.part")
+    (tmp_path / "a.2.mcap").touch()
+    assert recover(split).output == tmp_path / "a_recovered.2.mcap"
+    assert whole.read_bytes() == before
+
+
+def test_another_writers_broken_file_stays_as_it_is(tmp_path: Path) -> None:
+    whole = write_official(tmp_path / "w.mcap", MESSAGES)
+    broken = cut(whole, 4000, "b.mcap")
+    before = broken.read_bytes()
+    report = recover(broken)
+    assert report.output == tmp_path / "b_recovered.mcap"
+    assert broken.read_bytes() == before
+    report = recover(broken, in_place=True)
+    assert report.output == broken
+    assert len(read_all(broken)) == report.messages
+
+
+def test_a_file_being_written_is_left_alone(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path)
+    path = run.episodes_dir / "live.mcap"
+    with EpisodeWriter(path, config=WriterConfig(flush_s=0.25)) as writer:
+        for item in MESSAGES:
+            put(writer, item)
+        with pytest.raises(RecoveryError, match="still being written"):
+            recover(writer.part_path)
+        assert recover_parts(run) == []
+    assert len(read_all(path)) == len(MESSAGES)
+
+
+def test_a_part_of_a_dead_writer_is_refused_to_the_next_recording(tmp_path: Path) -> None:
+    config = WriterConfig(flush_s=0.25)
+    EpisodeWriter(tmp_path / "a.mcap", config=config).abandon()
+    with pytest.raises(UsageError, match="robot-gst recover"):
+        EpisodeWriter(tmp_path / "a.mcap", config=config)
+    EpisodeWriter(tmp_path / "a.mcap").close()  # what can be made again is replaced
+
+
+def test_every_part_of_a_run_is_recovered_and_the_unreadable_set_aside(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path)
+    whole = write_ours(tmp_path / "w.mcap", MESSAGES)
+    for name in ("t1", "t2"):
+        (run.episodes_dir / f"{name}.mcap.part").write_bytes(whole.read_bytes()[:5000])
+    (run.episodes_dir / "t3.mcap.part").write_bytes(b"")
+    (run.episodes_dir / "t4.mcap.part").write_bytes(b"no mcap at all" * 100)
+    reports = recover_parts(run)
+    assert [report.output and report.output.name for report in reports] == [
+        "t1.mcap",
+        "t2.mcap",
+        None,
+        None,
+    ]
+    assert sorted(path.name for path in run.episodes_dir.iterdir()) == [
+        "t1.mcap",
+        "t2.mcap",
+        "t3.mcap.unreadable",
+        "t4.mcap.unreadable",
+    ]
+    assert recover_parts(run) == []
+
+
+def test_damage_inside_costs_only_the_damaged_chunk(tmp_path: Path) -> None:
+    whole = write_ours(tmp_path / "w.mcap", MESSAGES, compress=False)
+    with whole.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    hit = summary.chunk_indexes[3]
+    for offset in (hit.chunk_start_offset + 200, hit.chunk_start_offset + 5):
+        data = bytearray(whole.read_bytes())
+        data[offset] ^= 0x40
+        part = tmp_path / "d.mcap.part"
+        part.write_bytes(data)
+        report = recover(part)
+        assert report.output is not None
+        assert len(MESSAGES) - 25 < report.messages < len(MESSAGES)
+        assert report.bytes_lost >= hit.chunk_length
+        assert f"at byte {hit.chunk_start_offset}" in report.reason
+        assert set(read_all(report.output)) < set(MESSAGES)
+        assert report.original is not None
+        assert report.original.read_bytes() == data
+        report.output.unlink()
+        report.original.unlink()
+
+
+def test_messages_of_a_lost_definition_keep_their_bytes(tmp_path: Path) -> None:
+    whole = write_ours(tmp_path / "w.mcap", MESSAGES, compress=False)
+    with whole.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    data = bytearray(whole.read_bytes())
+    first = min(item.chunk_start_offset for item in summary.chunk_indexes)
+    data[first + 100] ^= 1
+    part = tmp_path / "d.mcap.part"
+    part.write_bytes(data)
+    report = recover(part)
+    assert report.output is not None
+    assert any(topic.startswith("/recovered/channel_") for topic in report.topics)
+    assert len(read_all(report.output)) == report.messages
+
+
+def test_a_chunk_that_claims_terabytes_is_refused(tmp_path: Path) -> None:
+    whole = write_official(tmp_path / "w.mcap", MESSAGES)
+    data = bytearray(whole.read_bytes())
+    with whole.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    for size in (1 << 50, MAX_CHUNK_BYTES + 1):
+        for item in summary.chunk_indexes:
+            struct.pack_into("<Q", data, item.chunk_start_offset + 25, size)
+        part = tmp_path / "bomb.mcap.part"
+        part.write_bytes(data)
+        report = recover(part)
+        assert report.output is not None
+        assert report.messages == 0
+        report.output.unlink()
+        if report.original is not None:
+            report.original.unlink()
+
+
+@given(
+    flips=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(1, 255)), max_size=8),
+    keep=st.floats(0, 1),
+    compress=st.booleans(),
+    in_place=st.booleans(),
+)
+@settings(max_examples=60)
+def test_flipped_bytes_never_crash_it(
+    tmp_path_factory: pytest.TempPathFactory,
+    flips: list[tuple[float, int]],
+    keep: float,
+    compress: bool,
+    in_place: bool,
+) -> None:
+    folder = tmp_path_factory.mktemp("flips")
+    whole = write_ours(folder / "w.mcap", MESSAGES[:30], compress=compress)
+    data = bytearray(whole.read_bytes())
+    data = data[: int(len(data) * keep)]
+    for place, mask in flips:
+        if data:
+            data[int(place * len(data))] ^= mask
+    part = folder / "f.mcap.part"
+    part.write_bytes(data)
+    try:
+        report = recover(part, in_place=in_place)
+    except RecoveryError:  # damage inside needs a copy
+        report = recover(part, in_place=False)
+    if report.output is not None:
+        assert len(read_all(report.output)) == report.messages
+
+
+@given(data=st.binary(max_size=400))
+@settings(max_examples=60)
+def test_any_bytes_after_a_good_front_never_crash_it(
+    tmp_path_factory: pytest.TempPathFactory, data: bytes
+) -> None:
+    folder = tmp_path_factory.mktemp("bytes")
+    part = folder / "f.mcap.part"
+    writer = EpisodeWriter(folder / "f.mcap")
+    writer.abandon()
+    part.write_bytes(part.read_bytes() + data)
+    report = recover(part)
+    assert report.output is not None
+    assert len(read_all(report.output)) == report.messages
+
+
+KILL_POINTS = ("pwritev", "fdatasync", "fsync", "rename")
+
+
+def test_a_recovery_that_was_killed_is_done_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At every system call that changes a name or the file, for copies and in place."""
+    whole = write_ours(tmp_path / "w.mcap", MESSAGES)
+    at = whole.stat().st_size * 2 // 3
+    expected = set(linear(cut(whole, at)))
+    for in_place, call in itertools.product((False, True), KILL_POINTS):
+        for nth in range(1, 12):
+            part = cut(whole, at)
+            again = functools.partial(recover, part, in_place=in_place)
+            with monkeypatch.context() as patch:
+                killed = _kill_at(patch, call, nth, again)
+            if part.exists():
+                recover(part)
+            final = part.with_name("cut.mcap")
+            assert expected <= set(read_all(final)), (in_place, call, nth)
+            final.unlink()
+            if not killed:
+                break
+
+
+class Killed(BaseException):
+    """Stands for a SIGKILL: nobody may handle it."""
+
+
+def _kill_at(patch: pytest.MonkeyPatch, call: str, nth: int, work: object) -> bool:
+    owner = Path if call == "rename" else os
+    real = getattr(owner, call)
+    count = 0
+
+    def counted(*arguments: object) -> object:
+        nonlocal count
+        count += 1
+        if count == nth:
+            raise Killed
+        return real(*arguments)
+
+    patch.setattr(owner, call, counted)
+    patch.setattr(Path, "unlink", lambda *_, **__: None)  # a killed process tidies nothing
+    try:
+        work()  # type: ignore[operator]
+    except Killed:
+        return True
+    return False
+
+
+def test_no_file_and_no_room_are_said_in_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(PathNotFoundError, match="file not found"):
+        recover(tmp_path / "none.mcap.part")
+    whole = write_official(tmp_path / "w.mcap", MESSAGES)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: _Usage())
+    with pytest.raises(RecoveryError, match="Free some space"):
+        recover(cut(whole, 4000, "b.mcap"))
+    report = recover(cut(whole, 4000))  # a part is then finished in place
+    assert report.output is not None
+    assert read_all(report.output)
+
+
+class _Usage:
+    free = 1000
+
+
+def test_the_command_lists_losses_and_answers_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from robot_gst import run
+
+    whole = write_ours(tmp_path / "w.mcap", MESSAGES)
+    cut(whole, 6000, "a.mcap.part")
+    assert run(["recover", str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert "recovered" in text
+    assert "bytes lost" in text
+    cut(whole, 6000, "b.mcap.part")
+    (tmp_path / "c.mcap.part").write_bytes(b"nothing")
+    assert run(["recover", str(tmp_path), "--json"]) == 1
+    answer = json.loads(capsys.readouterr().out)
+    assert [bool(item["output"]) for item in answer["files"]] == [True, False]
+    assert run(["recover", str(tmp_path / "gone.mcap")]) == 2
+
+
+def test_the_lock_of_a_reader_is_respected(tmp_path: Path) -> None:
+    whole = write_ours(tmp_path / "w.mcap", MESSAGES)
+    part = cut(whole, 6000)
+    descriptor = os.open(part, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    with pytest.raises(RecoveryError, match="still being written"):
+        recover(part)
+    os.close(descriptor)
+    assert isinstance(recover(part), RecoveryReport)
