@@ -1,0 +1,406 @@
+"""``import lerobot``: datasets laid out here by hand, from the format's description alone."""
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import robot_gst
+from bridge.episode.reader import Episode
+from bridge.episode.records import CompressedColor, JointSample
+from bridge.media.color import decode_color
+
+av = pytest.importorskip("av")
+pa = pytest.importorskip("pyarrow")
+pq = pytest.importorskip("pyarrow.parquet")
+
+FPS, WIDTH, HEIGHT = 10, 48, 32
+LENGTHS = (7, 5, 9)
+CAMERA = "observation.images.front"
+
+
+def run(*arguments: object) -> int:
+    return robot_gst.run([str(item) for item in arguments])
+
+
+def shade(index: int) -> np.ndarray:
+    """The flat colour of the frame with this global index."""
+    return np.array([20 + 9 * index, 240 - 9 * index, 128], dtype=np.uint8)
+
+
+def state(index: int) -> list[float]:
+    return [float(np.float32(0.1 * index)), float(np.float32(-index)), 0.5]
+
+
+def write_video(path: Path, indices: list[int], codec: str = "libx264") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=FPS)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for index in indices:
+            picture = np.broadcast_to(shade(index), (HEIGHT, WIDTH, 3))
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+def png(index: int) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(np.broadcast_to(shade(index), (4, 6, 3)))).save(
+        stream, "PNG"
+    )
+    return stream.getvalue()
+
+
+class Dataset:
+    """A v3.0 dataset: episodes 0 and 1 share files, episode 2 has files of its own."""
+
+    def __init__(self, folder: Path) -> None:  # noqa: D107
+        self.folder = folder
+        self.info: dict[str, Any] = {
+            "codebase_version": "v3.0",
+            "robot_type": "so100",
+            "total_episodes": 3,
+            "total_frames": sum(LENGTHS),
+            "total_tasks": 2,
+            "chunks_size": 1000,
+            "fps": FPS,
+            "splits": {"train": "0:3"},
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+            "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+            "features": {
+                "observation.state": {
+                    "dtype": "float32",
+                    "shape": [3],
+                    "names": {"motors": ["pan", "lift", "grip"]},
+                },
+                "action": {"dtype": "float32", "shape": [3], "names": None},
+                "observation.env": {"dtype": "float32", "shape": [2, 2], "names": None},
+                CAMERA: {"dtype": "video", "shape": [HEIGHT, WIDTH, 3], "names": ["h", "w", "c"]},
+                "observation.images.still": {"dtype": "image", "shape": [4, 6, 3], "names": None},
+                "next.reward": {"dtype": "float32", "shape": [1], "names": None},
+                "next.success": {"dtype": "bool", "shape": [1], "names": None},
+                **{
+                    key: {"dtype": dtype, "shape": [1], "names": None}
+                    for key, dtype in (
+                        ("timestamp", "float32"),
+                        ("frame_index", "int64"),
+                        ("episode_index", "int64"),
+                        ("index", "int64"),
+                        ("task_index", "int64"),
+                    )
+                },
+            },
+        }
+        self.rows: list[dict[str, Any]] = []
+        self.episodes: list[dict[str, Any]] = []
+        first = 0
+        for number, length in enumerate(LENGTHS):
+            for frame in range(length):
+                self.rows.append(self.row(number, frame, first + frame, frame == length - 1))
+            start = 0.0 if number in (0, 2) else first / FPS
+            self.episodes.append(
+                {
+                    "episode_index": number,
+                    "tasks": ["fold the towel" if number == 2 else "pick the cube"],
+                    "length": length,
+                    "data/chunk_index": 0,
+                    "data/file_index": number // 2,
+                    "dataset_from_index": first,
+                    "dataset_to_index": first + length,
+                    f"videos/{CAMERA}/chunk_index": 0,
+                    f"videos/{CAMERA}/file_index": number // 2,
+                    f"videos/{CAMERA}/from_timestamp": start,
+                    f"videos/{CAMERA}/to_timestamp": start + length / FPS,
+                    "stats/action/min": [0.0, 0.0, 0.0],
+                }
+            )
+            first += length
+
+    def row(self, number: int, frame: int, index: int, last: bool) -> dict[str, Any]:
+        return {
+            "observation.state": state(index),
+            "action": [value + 1 for value in state(index)],
+            "observation.env": [[1.0, 2.0], [3.0, 4.0]],
+            "observation.images.still": {"bytes": png(index), "path": None},
+            "next.reward": float(last),
+            "next.success": last and number != 1,
+            "timestamp": frame / FPS,
+            "frame_index": frame,
+            "episode_index": number,
+            "index": index,
+            "task_index": number // 2,
+        }
+
+    def write(self) -> Path:
+        schema = pa.schema(
+            [
+                ("observation.state", pa.list_(pa.float32(), 3)),
+                ("action", pa.list_(pa.float32())),
+                ("observation.env", pa.list_(pa.list_(pa.float32()))),
+                (
+                    "observation.images.still",
+                    pa.struct([("bytes", pa.binary()), ("path", pa.string())]),
+                ),
+                ("next.reward", pa.float32()),
+                ("next.success", pa.bool_()),
+                ("timestamp", pa.float32()),
+                ("frame_index", pa.int64()),
+                ("episode_index", pa.int64()),
+                ("index", pa.int64()),
+                ("task_index", pa.int64()),
+            ]
+        )
+        for file in (0, 1):
+            rows = [row for row in self.rows if row["episode_index"] // 2 == file]
+            path = self.folder / f"data/chunk-000/file-{file:03d}.parquet"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # Small row groups that do not end where an episode does.
+            table = pa.Table.from_pylist(rows, schema=schema)
+            pq.write_table(table, path, row_group_size=4)
+            video = self.folder / f"videos/{CAMERA}/chunk-000/file-{file:03d}.mp4"
+            write_video(video, [row["index"] for row in rows])
+        path = self.folder / "meta/episodes/chunk-000/file-000.parquet"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.Table.from_pylist(self.episodes), path)
+        (self.folder / "meta/info.json").write_text(json.dumps(self.info))
+        return self.folder
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Dataset:
+    return Dataset(tmp_path / "ds")
+
+
+def joints(path: Path, topic: str) -> list[JointSample]:
+    return [JointSample.from_cdr(m.data) for m in Episode.open(path).messages([topic])]
+
+
+def colors(path: Path, topic: str) -> list[CompressedColor]:
+    return [CompressedColor.from_cdr(m.data) for m in Episode.open(path).messages([topic])]
+
+
+def test_every_episode_becomes_a_file_with_its_rows(dataset: Dataset, tmp_path: Path) -> None:
+    assert run("import", "lerobot", dataset.write(), tmp_path / "run") == 0
+    paths = sorted((tmp_path / "run" / "episodes").iterdir())
+    assert [path.name for path in paths] == [f"ep_00000{n}.mcap" for n in range(3)]
+    first = 0
+    for path, length in zip(paths, LENGTHS, strict=True):
+        samples = joints(path, "/lerobot/joint_states")
+        assert [sample.position.tolist() for sample in samples] == [
+            state(first + frame) for frame in range(length)
+        ]
+        assert samples[0].names == ("pan", "lift", "grip")
+        assert [sample.stamp_ns for sample in samples] == [k * 10**8 for k in range(length)]
+        actions = joints(path, "/lerobot/action")
+        assert actions[-1].position.tolist() == pytest.approx(
+            [value + 1 for value in state(first + length - 1)], abs=1e-6
+        )
+        assert actions[0].names == ("action_0", "action_1", "action_2")
+        reward = joints(path, "/lerobot/next/reward")
+        assert [sample.position[0] for sample in reward] == [0.0] * (length - 1) + [1.0]
+        first += length
+
+
+def test_each_row_has_the_video_frame_of_its_time(dataset: Dataset, tmp_path: Path) -> None:
+    assert run("import", "lerobot", dataset.write(), tmp_path / "run") == 0
+    index = 0
+    for number, length in enumerate(LENGTHS):
+        path = tmp_path / "run" / "episodes" / f"ep_{number:06d}.mcap"
+        found = colors(path, "/lerobot/cam/front/color/image")
+        assert [item.stamp_ns for item in found] == [k * 10**8 for k in range(length)]
+        for item in found:
+            mean = decode_color(item.data).astype(float).mean(axis=(0, 1))
+            np.testing.assert_allclose(mean, shade(index), atol=4)
+            index += 1
+        stills = colors(path, "/lerobot/cam/still/color/image")
+        assert bytes(stills[-1].data) == png(index - 1)  # bytes of the table pass through
+        assert stills[-1].format == "png"
+        assert run("check", path) == 0
+
+
+def test_the_episode_says_what_it_is_made_of(dataset: Dataset, tmp_path: Path) -> None:
+    assert run("import", "lerobot", dataset.write(), tmp_path / "run", "--cell", "lab") == 0
+    episodes = [Episode.open(p) for p in sorted((tmp_path / "run" / "episodes").iterdir())]
+    assert [e.info.instruction for e in episodes] == ["pick the cube"] * 2 + ["fold the towel"]
+    assert {(e.info.kind, e.info.cell, e.info.robot) for e in episodes} == {
+        ("imported", "lab", "so100")
+    }
+    assert [e.outcome.result for e in episodes if e.outcome] == ["success", "failure", "success"]
+    source = episodes[2].metadata_records["source"]
+    assert source["episode_index"] == 2
+    assert "re-encoded as JPEG" in source["images"]
+    assert "nominal" in source["times"]
+    assert source["left_out"] == ["observation.env (float32 [2, 2])"]
+
+
+def test_a_selection_imports_only_those_and_a_second_run_only_the_rest(
+    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = dataset.write()
+    assert run("import", "lerobot", folder, tmp_path / "run", "--episodes", "1-2") == 0
+    names = [p.name for p in sorted((tmp_path / "run" / "episodes").iterdir())]
+    assert names == ["ep_000001.mcap", "ep_000002.mcap"]
+    capsys.readouterr()
+    assert run("import", "lerobot", folder, tmp_path / "run", "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["already_there"] == 2
+    assert [Path(name).name for name in report["files"]] == ["ep_000000.mcap"]
+    assert run("import", "lerobot", folder, tmp_path / "run", "--episodes", "1,x") == 2
+    assert "'1,x' is no list of numbers" in capsys.readouterr().err
+    assert run("import", "lerobot", folder, tmp_path / "run", "--episodes", "7") == 2
+    dataset.info["robot_type"] = "other"
+    dataset.write()
+    assert run("import", "lerobot", folder, tmp_path / "run") == 2
+    assert "comes from another dataset" in capsys.readouterr().err
+
+
+def break_version(dataset: Dataset) -> None:
+    dataset.info["codebase_version"] = "v2.1"
+
+
+def break_template(dataset: Dataset) -> None:
+    dataset.info["data_path"] = "../../{chunk_index}/{file_index}"
+
+
+def break_field(dataset: Dataset) -> None:
+    dataset.info["data_path"] = "data/{episode_chunk:03d}.parquet"
+
+
+def break_fps(dataset: Dataset) -> None:
+    dataset.info["fps"] = 0
+
+
+def break_columns(dataset: Dataset) -> None:
+    for row in dataset.episodes:
+        del row["length"]
+
+
+def break_length(dataset: Dataset) -> None:
+    dataset.episodes[1]["length"] = 6
+
+
+def break_count(dataset: Dataset) -> None:
+    dataset.rows[3]["frame_index"] = 5
+
+
+def break_width(dataset: Dataset) -> None:
+    dataset.info["features"]["action"]["shape"] = [4]
+
+
+def break_still(dataset: Dataset) -> None:
+    dataset.rows[8]["observation.images.still"] = {"bytes": None, "path": "images/8.png"}
+
+
+def break_place(dataset: Dataset) -> None:
+    dataset.episodes[1]["data/file_index"] = 1
+
+
+def break_span(dataset: Dataset) -> None:
+    dataset.episodes[2][f"videos/{CAMERA}/from_timestamp"] = 0.5
+
+
+def break_time(dataset: Dataset) -> None:
+    dataset.rows[1]["timestamp"] = 0.0
+
+
+@pytest.mark.parametrize(
+    ("damage", "code", "match"),
+    [
+        (break_version, 1, "info.json: version v2.1, and only v3 is read"),
+        (break_template, 1, "leads out of the dataset"),
+        (break_field, 1, "with the field 'episode_chunk'"),
+        (break_fps, 1, "info.json: cannot be read (ValueError: fps is 0.0)"),
+        (break_columns, 1, "meta/episodes/chunk-000/file-000.parquet: row 1: KeyError 'length'"),
+        (break_length, 1, "file-000.parquet: row 8: episode 1 has 5 rows, meta/episodes says 6"),
+        (break_count, 1, "file-000.parquet: row 4: frame_index does not count from 0"),
+        (break_width, 1, "row 1: 'action' has 3 numbers, meta/info.json says 4"),
+        (break_still, 1, "row 9: 'observation.images.still' holds no image"),
+        (break_place, 1, "file-001.parquet: no rows of episode 1"),
+        (break_span, 1, "file-001.mp4: no frame 4 of the episode at 0.9000 s"),
+        (break_time, 1, "row 1: the timestamps of episode 0 do not rise"),
+    ],
+)
+def test_a_broken_dataset_is_one_sentence_with_its_place(
+    dataset: Dataset,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    damage: Callable[[Dataset], None],
+    code: int,
+    match: str,
+) -> None:
+    damage(dataset)
+    assert run("import", "lerobot", dataset.write(), tmp_path / "run") == code
+    assert match in capsys.readouterr().err.replace("\n", " ")
+    left = list((tmp_path / "run").rglob("*.part"))
+    assert left == []
+
+
+@pytest.mark.parametrize(
+    ("name", "match"),
+    [
+        ("data/chunk-000/file-001.parquet", "file-001.parquet: cannot be read"),
+        (f"videos/{CAMERA}/chunk-000/file-001.mp4", "file-001.mp4: cannot be decoded"),
+        ("meta/episodes/chunk-000/file-000.parquet", "file-000.parquet: cannot be read"),
+        ("meta/info.json", "info.json: cannot be read"),
+    ],
+)
+@pytest.mark.parametrize("how", ["cut", "gone"])
+def test_a_damaged_or_missing_file_is_named_and_whole_episodes_stay(
+    dataset: Dataset,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+    match: str,
+    how: str,
+) -> None:
+    folder = dataset.write()
+    if how == "gone":
+        (folder / name).unlink()
+    else:
+        whole = (folder / name).read_bytes()
+        (folder / name).write_bytes(whole[: len(whole) // 3])
+    assert run("import", "lerobot", folder, tmp_path / "run") != 0
+    error = capsys.readouterr().err
+    assert Path(name).name in error or "meta/episodes" in error
+    if how == "cut":
+        assert match in error
+    for path in (tmp_path / "run").rglob("*.mcap*"):
+        assert run("check", path) == 0
+
+
+def test_what_we_export_we_import(make_trial: Callable[..., Path], tmp_path: Path) -> None:
+    path = make_trial(cameras=("wrist",))
+    assert run("export", "lerobot", tmp_path / "run", tmp_path / "out") == 0
+    assert run("import", "lerobot", tmp_path / "out", tmp_path / "back") == 0
+    (back,) = (tmp_path / "back" / "episodes").iterdir()
+    samples = joints(back, "/lerobot/joint_states")
+    assert samples[0].names == ("a", "b", "c", "gripper_width")
+    before = colors(path, "/lab/cam/wrist/color/image")
+    after = colors(back, "/lerobot/cam/wrist/color/image")
+    assert len(before) == len(after) == len(samples) == 12
+    for old, new in zip(before, after, strict=True):
+        difference = decode_color(old.data)[6:, 6:].astype(float) - decode_color(new.data)[6:, 6:]
+        assert np.abs(difference).mean() < 8
+
+
+def test_a_missing_package_is_named(
+    dataset: Dataset,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    import sys
+
+    folder = dataset.write()
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert run("import", "lerobot", folder, tmp_path / "run") == 1
+    assert "av is not installed" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert run("import", "lerobot", folder, tmp_path / "run2") == 1
+    assert "robot-gst[report]" in capsys.readouterr().err
