@@ -16,7 +16,7 @@ class RealSenseConfig:
     """Which cameras are published, and how."""
 
     cell: str = "cell"
-    """Name of the cell in topics: /<cell>/cam/<camera>/color/image."""
+    """Name of the cell in topics: /CELL/cam/CAMERA/color/image."""
     camera: tuple[str, ...] = ()
     """NAME=SERIAL, once for each camera; without it the only attached one is named camera."""
     size: Size = "640x480"

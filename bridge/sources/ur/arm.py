@@ -1,9 +1,7 @@
 """Turns the samples of a UR arm into messages and publishes them, numbered by the robot's time."""
 
-from collections.abc import Callable
-
-import numpy as np
-from jaxtyping import Float
+from collections.abc import Sequence
+from typing import NamedTuple, cast
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
@@ -13,10 +11,11 @@ from bridge.sources.numbered import NumberedPublisher
 from bridge.sources.ur import messages
 from bridge.sources.ur.client import Sample, Wish
 from bridge.sources.ur.config import UrConfig
+from bridge.sources.ur.template import MessageTemplate
+from bridge.task.robot import ARM_JOINTS
 from bridge.wire.qos import Qos
 from bridge.wire.session import WireSession
 
-Vector = Float[np.ndarray, " count"]
 SLOW_HZ = 125.0
 """The gripper and the transform of the tool change slowly enough for this rate."""
 LONGEST_GAP_S = 3600.0
@@ -25,21 +24,20 @@ SPEED_STEP = 0.01
 """A change of the speed scaling worth a message; without one there is a message each second."""
 
 REQUIRED = ("actual_q", "actual_qd")
-FAST: dict[str, tuple[str, str, Callable[[Vector, int], bytes]]] = {
-    "target_q": (
-        "joint_targets",
-        schema.JOINT_STATE,
-        lambda q, stamp_ns: messages.joints_cdr(q, q[:0], stamp_ns),
-    ),
-    "actual_TCP_pose": (
-        "tcp/pose",
-        schema.POSE_STAMPED,
-        lambda pose, stamp_ns: messages.tcp_cdr(messages.T_base_link_tcp(pose), stamp_ns),
-    ),
-    "actual_TCP_force": ("tcp/wrench", schema.WRENCH_STAMPED, messages.wrench_cdr),
-}
-"""Variables published with every sample: topic, type, how it is serialised."""
-OPTIONAL = (*FAST, "speed_scaling", "robot_mode", "safety_mode")
+OPTIONAL = (
+    "target_q",
+    "actual_TCP_pose",
+    "actual_TCP_force",
+    "speed_scaling",
+    "robot_mode",
+    "safety_mode",
+)
+
+
+class _Topic(NamedTuple):
+    name: str
+    type_name: str
+    template: MessageTemplate
 
 
 def wish_of(config: UrConfig) -> Wish:
@@ -55,19 +53,30 @@ class ArmPublisher:
     def __init__(self, session: WireSession, config: UrConfig, announcer: Announcer) -> None:
         """Announce nothing yet: the topics follow from what the controller knows."""
         self._session = session
-        self._cell = config.cell
+        self._cell = cell = config.cell
         self._announcer = announcer
         self._gripper = config.make_gripper()
+        state = schema.JOINT_STATE
+        targets = messages.joints_template(ARM_JOINTS, velocities=False)
+        width = messages.joints_template((messages.GRIPPER_JOINT,), velocities=False)
+        speed = messages.joints_template((messages.SPEED_NAME,), velocities=False)
+        self._joints = _Topic(f"/{cell}/joint_states", state, messages.arm_template())
+        self._targets = _Topic(f"/{cell}/joint_targets", state, targets)
+        self._pose = _Topic(f"/{cell}/tcp/pose", schema.POSE_STAMPED, messages.pose_template())
+        self._wrench = _Topic(
+            f"/{cell}/tcp/wrench", schema.WRENCH_STAMPED, messages.wrench_template()
+        )
+        self._width = _Topic(f"/{cell}/gripper/state", state, width)
+        self._frame = _Topic("/tf", schema.TF_MESSAGE, messages.frame_template())
+        self._speed = _Topic(f"/{cell}/speed_scaling", state, speed)
         self._streams: dict[str, NumberedPublisher] = {}
         self._clock = HostClock()
         self._rate_hz = SLOW_HZ
         self._last_s: float | None = None
         self._number = 0
         self._slow_number = -1
-        self._modes: tuple[int | None, int | None] | None = None
-        self._speed = 0.0
-        self._speed_said_ns = -NS_PER_S
-        self._said = 0
+        self._modes: tuple[int | None, int | None] = (None, None)
+        self._said_speed = (0.0, -NS_PER_S, 0)
 
     def begin(self, rate_hz: float) -> None:
         """Say how many samples a second the connection that follows brings."""
@@ -93,11 +102,8 @@ class ArmPublisher:
 
     def counts(self) -> dict[str, int]:
         """Samples sent, and lost before they got here."""
-        joints = self._streams.get("joint_states")
-        return {
-            "samples": joints.sent if joints else 0,
-            "lost": joints.lost if joints else 0,
-        }
+        joints = self._streams.get(self._joints.name)
+        return {"samples": joints.sent if joints else 0, "lost": joints.lost if joints else 0}
 
     def _count(self, robot_s: float) -> int:
         """Number the sample by the robot's clock: what it left out becomes a gap."""
@@ -109,45 +115,49 @@ class ArmPublisher:
         return steps - 1
 
     def _every_sample(self, sample: Sample, stamp_ns: int) -> None:
-        q, qd = (messages.vector(sample.values, name) for name in REQUIRED)
-        data = messages.joints_cdr(q, qd, stamp_ns)
-        self._put("joint_states", schema.JOINT_STATE, data, stamp_ns, self._number)
-        for variable, (topic, type_name, serialise) in FAST.items():
-            if variable in sample.values:
-                data = serialise(messages.vector(sample.values, variable), stamp_ns)
-                self._put(topic, type_name, data, stamp_ns, self._number)
+        values, number = sample.values, self._number
+        joints = (*_vector(values["actual_q"]), *_vector(values["actual_qd"]))
+        self._put(self._joints, joints, stamp_ns, number)
+        if "target_q" in values:
+            self._put(self._targets, _vector(values["target_q"]), stamp_ns, number)
+        if "actual_TCP_pose" in values:
+            pose = messages.tool_pose(_vector(values["actual_TCP_pose"]))
+            self._put(self._pose, pose, stamp_ns, number)
+        if "actual_TCP_force" in values:
+            wrench = messages.tool_wrench(_vector(values["actual_TCP_force"]))
+            self._put(self._wrench, wrench, stamp_ns, number)
 
     def _slowly(self, sample: Sample, stamp_ns: int) -> None:
         number = self._slow_number
         if self._gripper is not None:
             width_m = self._gripper.width_m(sample.values)
-            data = messages.number_cdr(messages.GRIPPER_JOINT, width_m, stamp_ns)
-            self._put("gripper/state", schema.JOINT_STATE, data, stamp_ns, number)
+            self._put(self._width, (width_m,), stamp_ns, number)
         if "actual_TCP_pose" in sample.values:
-            T = messages.T_base_link_tcp(messages.vector(sample.values, "actual_TCP_pose"))
-            data = messages.tcp_frame_cdr(T, stamp_ns)
-            self._put("/tf", schema.TF_MESSAGE, data, stamp_ns, number)
+            pose = messages.tool_pose(_vector(sample.values["actual_TCP_pose"]))
+            self._put(self._frame, pose, stamp_ns, number)
 
     def _on_change(self, sample: Sample, stamp_ns: int) -> None:
         values = sample.values
-        modes = values.get("robot_mode"), values.get("safety_mode")
-        if modes != self._modes and modes != (None, None):
-            self._modes = modes  # type: ignore[assignment]
-            self._announcer.event(messages.mode_event(self._cell, *modes, stamp_ns))  # type: ignore[arg-type]
-        if "speed_scaling" not in values:
-            return
-        speed = float(values["speed_scaling"])  # type: ignore[arg-type]
-        changed = abs(speed - self._speed) >= SPEED_STEP
-        if changed or stamp_ns - self._speed_said_ns >= NS_PER_S:
-            self._speed, self._speed_said_ns = speed, stamp_ns
-            data = messages.number_cdr(messages.SPEED_NAME, speed, stamp_ns)
-            self._said += 1
-            self._put("speed_scaling", schema.JOINT_STATE, data, stamp_ns, self._said)
+        modes = cast(
+            "tuple[int | None, int | None]", (values.get("robot_mode"), values.get("safety_mode"))
+        )
+        if modes != self._modes:
+            self._modes = modes
+            self._announcer.event(messages.mode_event(self._cell, *modes, stamp_ns))
+        if "speed_scaling" in values:
+            speed = cast("float", values["speed_scaling"])
+            last, said_ns, number = self._said_speed
+            if abs(speed - last) >= SPEED_STEP or stamp_ns - said_ns >= NS_PER_S:
+                self._said_speed = (speed, stamp_ns, number + 1)
+                self._put(self._speed, (speed,), stamp_ns, number)
 
-    def _put(self, topic: str, type_name: str, data: bytes, stamp_ns: int, number: int) -> None:
-        stream = self._streams.get(topic)
+    def _put(self, topic: _Topic, numbers: Sequence[float], stamp_ns: int, number: int) -> None:
+        stream = self._streams.get(topic.name)
         if stream is None:
-            full = topic if topic.startswith("/") else f"/{self._cell}/{topic}"
-            publisher = self._session.publisher(full, type_name, qos=Qos.CONTROL)
-            stream = self._streams[topic] = NumberedPublisher(publisher)
-        stream.put(number, data, source_ns=stamp_ns)
+            publisher = self._session.publisher(topic.name, topic.type_name, qos=Qos.CONTROL)
+            stream = self._streams[topic.name] = NumberedPublisher(publisher)
+        stream.put(number, topic.template.fill(stamp_ns, numbers), source_ns=stamp_ns)
+
+
+def _vector(value: object) -> tuple[float, ...]:
+    return cast("tuple[float, ...]", value)

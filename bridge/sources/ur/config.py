@@ -16,7 +16,7 @@ class UrConfig:
     """What is read from the arm, and how it is named."""
 
     cell: str = "cell"
-    """Name of the cell in topics: /<cell>/joint_states."""
+    """Name of the cell in topics: /CELL/joint_states."""
     rate_hz: float | None = None
     """Samples per second; without it the controller's own (e-Series 500, CB3 125)."""
     port: int = RTDE_PORT

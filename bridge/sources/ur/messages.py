@@ -6,90 +6,96 @@ URDF.
 """
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Sequence
+from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
-from bridge.clock import split_ns
-from bridge.episode import cdr, schema
+from bridge.episode import schema
 from bridge.episode.message import StampedMessage
-from bridge.episode.records import FrameTransform, JointSample, PoseSample, transforms_to_cdr
-from bridge.geometry import se3
-from bridge.sources.ur.gripper import Value
 from bridge.sources.ur.modes import robot_mode_name, safety_mode_name
+from bridge.sources.ur.template import MessageTemplate, Stamp
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME
 
 CONTROLLER_TCP_FRAME = "tool0_controller"
 """The controller's active tool centre point, as ROS drivers of UR arms call it."""
 GRIPPER_JOINT = "gripper_width"
 SPEED_NAME = "speed_scaling"
-T_BASE_LINK_BASE = np.diag([-1.0, -1.0, 1.0, 1.0])
-T_BASE_LINK_BASE.setflags(write=False)
 SMALLEST_ANGLE_RAD = 1e-12
 
 
-def vector(values: Mapping[str, Value], name: str) -> Float[np.ndarray, " count"]:
-    """A variable of the controller as an array."""
-    return np.asarray(values[name], dtype=np.float64)
+def tool_pose(pose: Sequence[float]) -> tuple[float, ...]:
+    """The tool in base_link from the controller's (x, y, z [m], rotation vector [rad]).
+
+    Returns:
+        x, y, z [m], then the quaternion in the order of ROS messages: x, y, z, w.
+    """
+    x, y, z, rx, ry, rz = pose
+    angle_rad = math.sqrt(rx * rx + ry * ry + rz * rz)
+    scale = math.sin(angle_rad / 2) / angle_rad if angle_rad > SMALLEST_ANGLE_RAD else 0.5
+    w, i, j, k = math.cos(angle_rad / 2), scale * rx, scale * ry, scale * rz
+    # Half a turn about z from the left: (0, 0, 0, 1) times (w, i, j, k).
+    turned = (-j, i, w, -k)
+    sign = -1.0 if turned[3] < 0 else 1.0
+    return (-x, -y, z, *(sign * part for part in turned))
 
 
-def T_base_link_tcp(pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
-    """Pose of the tool from the controller's (x, y, z [m], rotation vector [rad])."""
-    turn = pose[3:]
-    angle_rad = float(np.linalg.norm(turn))
-    axis = turn / angle_rad if angle_rad > SMALLEST_ANGLE_RAD else np.array([1.0, 0.0, 0.0])
-    q_wxyz = np.concatenate([[np.cos(angle_rad / 2)], np.sin(angle_rad / 2) * axis])
-    return np.asarray(T_BASE_LINK_BASE @ se3.transform_from(q_wxyz, pose[:3]))
-
-
-def joints_cdr(
-    position_rad: Float[np.ndarray, "6"], velocity: Float[np.ndarray, " n"], stamp_ns: int
-) -> bytes:
-    """Joint positions [rad] and velocities [rad/s] (or none) of the arm."""
-    return JointSample(
-        stamp_ns=stamp_ns,
-        names=ARM_JOINTS,
-        position=position_rad,
-        velocity=velocity,
-        effort=np.zeros(0),
-    ).to_cdr()
-
-
-def number_cdr(name: str, value: float, stamp_ns: int) -> bytes:
-    """One named number, in the form that viewers plot without being told how."""
-    return JointSample(
-        stamp_ns=stamp_ns,
-        names=(name,),
-        position=np.array([value]),
-        velocity=np.zeros(0),
-        effort=np.zeros(0),
-    ).to_cdr()
-
-
-def tcp_cdr(T: Float[np.ndarray, "4 4"], stamp_ns: int) -> bytes:
-    """Pose ``T_base_link_tcp`` of the tool."""
-    return PoseSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=T).to_cdr()
-
-
-def tcp_frame_cdr(T: Float[np.ndarray, "4 4"], stamp_ns: int) -> bytes:
-    """The same pose as a transform, so that a camera at the wrist has a place."""
-    item = FrameTransform(
-        stamp_ns=stamp_ns, parent=BASE_FRAME, child=CONTROLLER_TCP_FRAME, T_parent_child=T
-    )
-    return transforms_to_cdr([item])
-
-
-def wrench_cdr(wrench: Float[np.ndarray, "6"], stamp_ns: int) -> bytes:
+def tool_wrench(wrench: Sequence[float]) -> tuple[float, ...]:
     """Force [N] at, and torque [Nm] about, the tool centre point, along the axes of base_link."""
-    sec, nanosec = split_ns(stamp_ns)
-    rotated = T_BASE_LINK_BASE[:3, :3] @ wrench.reshape(2, 3).T
-    force, torque = (dict(zip("xyz", map(float, row), strict=True)) for row in rotated.T)
-    message = {
-        "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": BASE_FRAME},
-        "wrench": {"force": force, "torque": torque},
-    }
-    return cdr.encode(schema.WRENCH_STAMPED, message)
+    fx, fy, fz, tx, ty, tz = wrench
+    return -fx, -fy, fz, -tx, -ty, tz
+
+
+def joints_template(names: tuple[str, ...], *, velocities: bool) -> MessageTemplate:
+    """sensor_msgs/JointState: positions [rad or m], then velocities [per s] where wanted."""
+    count = len(names)
+
+    def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
+        header = {"stamp": stamp, "frame_id": ""}
+        first, rest = numbers[:count], numbers[count:]
+        return {"header": header, "name": list(names), "position": first, "velocity": rest}
+
+    return MessageTemplate(schema.JOINT_STATE, build, count * (2 if velocities else 1))
+
+
+def pose_template() -> MessageTemplate:
+    """geometry_msgs/PoseStamped in base_link, filled with ``tool_pose``."""
+
+    def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
+        pose = {"position": _named("xyz", numbers), "orientation": _named("xyzw", numbers[3:])}
+        return {"header": {"stamp": stamp, "frame_id": BASE_FRAME}, "pose": pose}
+
+    return MessageTemplate(schema.POSE_STAMPED, build, 7)
+
+
+def frame_template() -> MessageTemplate:
+    """tf2_msgs/TFMessage with the tool's frame, so that a camera at the wrist has a place."""
+
+    def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
+        transform = {"translation": _named("xyz", numbers), "rotation": _named("xyzw", numbers[3:])}
+        header = {"stamp": stamp, "frame_id": BASE_FRAME}
+        item = {"header": header, "child_frame_id": CONTROLLER_TCP_FRAME, "transform": transform}
+        return {"transforms": [item]}
+
+    return MessageTemplate(schema.TF_MESSAGE, build, 7)
+
+
+def wrench_template() -> MessageTemplate:
+    """geometry_msgs/WrenchStamped along base_link, filled with ``tool_wrench``."""
+
+    def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
+        wrench = {"force": _named("xyz", numbers), "torque": _named("xyz", numbers[3:])}
+        return {"header": {"stamp": stamp, "frame_id": BASE_FRAME}, "wrench": wrench}
+
+    return MessageTemplate(schema.WRENCH_STAMPED, build, 6)
+
+
+def _named(axes: str, numbers: Sequence[float]) -> dict[str, float]:
+    return dict(zip(axes, numbers, strict=False))
+
+
+def arm_template() -> MessageTemplate:
+    """Positions and velocities of the arm's joints."""
+    return joints_template(ARM_JOINTS, velocities=True)
 
 
 def mode_event(
