@@ -145,13 +145,13 @@ def _offset_faults(stream: ByteStream, footer: records.Footer, footer_at: int) -
             continue
         start, end = record.group_start, record.group_start + record.group_length
         is_inside = footer.summary_start <= start <= end <= footer.summary_offset_start
-        if not is_inside or _kinds(stream, start, end) != {record.group_opcode}:
+        if not is_inside or not _are_all(record.group_opcode, stream, start, end):
             yield f"the summary's offset of records of kind {record.group_opcode} is wrong"
 
 
-def _kinds(stream: ByteStream, start: int, end: int) -> set[int]:
-    """The opcodes of the records between two offsets; none when they do not end there."""
+def _are_all(opcode: int, stream: ByteStream, start: int, end: int) -> bool:
+    """Whether whole records of one kind, or none, lie between two offsets."""
     try:
-        return {place.opcode for place in walk(stream, start, end)}
+        return all(place.opcode == opcode for place in walk(stream, start, end))
     except BrokenRecordError:
-        return set()
+        return False

@@ -1,0 +1,258 @@
+"""Losses, rates, times and decoding: what the check says of each topic."""
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+import robot_gst
+from bridge.episode import cdr, schema
+from bridge.episode.check import CheckReport, check_episode
+from bridge.episode.check_topics import SequenceWatch
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.records import CameraInfo, DepthImage, JointSample
+from bridge.episode.writer import EpisodeWriter
+from bridge.geometry.camera import Camera
+
+JOINTS = "/c/joint_states"
+DEPTH = "/c/cam/side/depth/image"
+INFO = EpisodeInfo(id="e1", kind="trial")
+
+
+def joint() -> bytes:
+    return JointSample(
+        stamp_ns=0,
+        names=("a",),
+        position=np.zeros(1),
+        velocity=np.zeros(0),
+        effort=np.zeros(0),
+    ).to_cdr()
+
+
+def depth(width: int, height: int) -> bytes:
+    depth_mm = np.zeros((height, width), dtype=np.uint16)
+    return DepthImage(stamp_ns=0, frame_id="", depth_mm=depth_mm).to_cdr()
+
+
+def drops(topic: str, **counts: int) -> dict[str, Any]:
+    empty = {"received": 0, "gaps": 0, "queue_drops": 0, "bytes": 0}
+    return {"schema_version": 1, "topic": topic, "second": 0, **empty, **counts}
+
+
+def check(folder: Path, fill: Callable[[EpisodeWriter], None], info: Any = INFO) -> CheckReport:
+    path = folder / "e1.mcap"
+    with EpisodeWriter(path) as writer:
+        if info is not None:
+            writer.describe(info)
+        fill(writer)
+    return check_episode(path)
+
+
+def write_joints(writer: EpisodeWriter, sequences: list[int], step_ns: int = 1) -> None:
+    for number, sequence in enumerate(sequences):
+        writer.write(
+            JOINTS,
+            joint(),
+            type_name=schema.JOINT_STATE,
+            log_time_ns=1000 + number * step_ns,
+            publish_time_ns=990,
+            sequence=sequence,
+        )
+
+
+def watched(sequences: list[int]) -> SequenceWatch:
+    watch = SequenceWatch()
+    for sequence in sequences:
+        watch.see(sequence)
+    return watch
+
+
+@given(st.integers(0, 2**32 - 1), st.sets(st.integers(1, 60)), st.randoms())
+def test_missing_numbers_are_counted_over_the_wrap_and_in_any_near_order(
+    start: int, lost: set[int], random: Any
+) -> None:
+    kept = [n for n in range(62) if n not in lost]
+    in_order = watched([(start + n) % 2**32 for n in kept])
+    assert (in_order.gaps, in_order.backward) == (len(lost), 0)
+    shuffled = list(kept)
+    for n in range(1, len(kept) - 2, 3):  # neighbours change places; the first number stays
+        if random.random() < 0.5:
+            shuffled[n : n + 2] = reversed(shuffled[n : n + 2])
+    assert watched([(start + n) % 2**32 for n in shuffled]).gaps == len(lost)
+
+
+def test_a_publisher_that_begins_anew_is_no_gap_but_its_losses_are() -> None:
+    watch = watched([100, 101, 0, 1, 2, 4])
+    assert (watch.gaps, watch.backward) == (1, 2)
+
+
+def test_a_repeated_message_is_no_gap() -> None:
+    assert watched([5, 6, 5, 7, 8]).gaps == 0
+
+
+def test_losses_the_ledger_lists_are_declared(tmp_path: Path) -> None:
+    def fill(writer: EpisodeWriter) -> None:
+        write_joints(writer, [0, 1, 5, 6, 9])
+        record = drops(JOINTS, gaps=2, queue_drops=2, shed=1)
+        writer.write_json(schema.DROPS_TOPIC, record, type_name=schema.DROPS, log_time_ns=2000)
+
+    report = check(tmp_path, fill)
+    assert (report.exit_code, report.summary) == (3, "losses declared")
+    assert (report.declared_losses, report.undeclared_losses) == (5, 0)
+    assert report.topics[JOINTS].sequence_gaps == 5
+    assert report.topics[JOINTS].declared_losses == 5
+
+
+def test_losses_the_ledger_does_not_list_are_named(tmp_path: Path) -> None:
+    def fill(writer: EpisodeWriter) -> None:
+        write_joints(writer, [0, 1, 5])
+        record = drops(JOINTS, gaps=1)
+        writer.write_json(schema.DROPS_TOPIC, record, type_name=schema.DROPS, log_time_ns=2000)
+
+    report = check(tmp_path, fill)
+    assert (report.exit_code, report.summary) == (3, "losses not declared")
+    assert (report.declared_losses, report.undeclared_losses) == (1, 2)
+    assert report.notes == [f"{JOINTS}: 3 numbers are missing, the ledger declares 1"]
+
+
+def test_without_a_ledger_numbers_prove_nothing(tmp_path: Path) -> None:
+    report = check(tmp_path, lambda writer: write_joints(writer, [0, 7]))
+    assert report.exit_code == 0
+    assert report.topics[JOINTS].sequence_gaps == 6
+
+
+def test_rates_and_latencies_are_reported(tmp_path: Path) -> None:
+    def fill(writer: EpisodeWriter) -> None:
+        write_joints(writer, list(range(11)), step_ns=10_000_000)
+        writer.add_metadata("recorder", {"rates_hz": json.dumps({JOINTS: 125, "/other": 3})})
+
+    report = check(tmp_path, fill)
+    found = report.topics[JOINTS]
+    assert found.rate_hz == pytest.approx(100)
+    assert found.latency_median_s == pytest.approx(0.05, abs=1e-6)
+    assert found.latency_max_s == pytest.approx(0.1, abs=1e-6)
+    assert report.exit_code == 0
+    assert report.notes == [f"{JOINTS}: 100.0 messages a second, 125 are declared"]
+
+
+@pytest.mark.parametrize("is_recording", [True, False])
+def test_log_time_of_a_recording_never_steps_back(tmp_path: Path, is_recording: bool) -> None:
+    def fill(writer: EpisodeWriter) -> None:
+        write_joints(writer, [0, 1, 2], step_ns=-1)
+        if is_recording:
+            writer.add_metadata("recorder", {"stopped_by": '"test"'})
+
+    report = check(tmp_path, fill)
+    assert report.topics[JOINTS].time_steps_back == 2
+    text = f"{JOINTS}: its log time steps back 2 times"
+    assert (report.faults if is_recording else report.notes) == [text]
+
+
+def test_a_depth_image_of_another_size_is_found(tmp_path: Path) -> None:
+    def fill(writer: EpisodeWriter) -> None:
+        for n, size in enumerate([(8, 6), (8, 6), (6, 8)]):
+            writer.write(DEPTH, depth(*size), type_name=schema.IMAGE, log_time_ns=n)
+
+    report = check(tmp_path, fill)
+    assert report.exit_code == 1
+    assert "a depth image of 6 x 8 after one of 8 x 6" in report.faults[0]
+
+
+def test_depth_images_that_do_not_fit_their_camera_are_found(tmp_path: Path) -> None:
+    def fill(writer: EpisodeWriter) -> None:
+        camera = Camera.from_ros(width=9, height=6, fx=5.0, fy=5.0, cx=4.0, cy=3.0)
+        data = CameraInfo(stamp_ns=0, frame_id="", camera=camera).to_cdr()
+        topic = DEPTH.replace("image", "info")
+        writer.write(topic, data, type_name=schema.CAMERA_INFO, log_time_ns=1)
+        writer.write(DEPTH, depth(8, 6), type_name=schema.IMAGE, log_time_ns=2)
+
+    assert "its camera info says 9 x 6" in check(tmp_path, fill).faults[0]
+
+
+def test_topics_outside_the_contract_need_only_be_valid(tmp_path: Path) -> None:
+    def fill(writer: EpisodeWriter) -> None:
+        image = {"height": 1, "width": 1, "encoding": "bgr8", "step": 3, "data": b"abc"}
+        info = {"width": 1, "height": 1, "d": [0.1], "distortion_model": "plumb_bob"}
+        webp = {"format": "webp", "data": b"RIFF"}
+        for topic, name, record in (
+            ("/camera/image_raw", schema.IMAGE, image),
+            ("/camera/camera_info", schema.CAMERA_INFO, info),
+            ("/camera/compressed", schema.COMPRESSED_IMAGE, webp),
+        ):
+            writer.write(topic, cdr.encode(name, record), type_name=name, log_time_ns=1)
+
+    report = check(tmp_path, fill)
+    assert (report.exit_code, report.notes) == (0, [])
+
+
+def foreign(path: Path, topic: str, name: str, data: bytes) -> Path:
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start(profile="ros2", library="libmcap 1.1.0")
+    known = schema.schema_for(name)
+    assert known is not None
+    schema_id = writer.register_schema(name=name, encoding="ros2msg", data=known.data)
+    channel = writer.register_channel(topic, known.message_encoding, schema_id)
+    for log_ns in (5, 3):
+        writer.add_message(channel, log_ns, data, log_ns, sequence=7)
+    writer.finish()
+    path.write_bytes(stream.getvalue())
+    return path
+
+
+def test_our_contract_is_not_asked_of_other_programs(tmp_path: Path) -> None:
+    path = foreign(tmp_path / "x.mcap", JOINTS, schema.JOINT_STATE, b"no CDR")
+    report = check_episode(path)
+    assert (report.exit_code, report.summary) == (0, "clean")
+    assert report.topics[JOINTS].undecodable == 2
+    assert any("not a valid" in note for note in report.notes)
+
+
+def test_the_command_prints_everything_as_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fill(writer: EpisodeWriter) -> None:
+        write_joints(writer, [0, 2])
+        record = drops(JOINTS, gaps=1)
+        writer.write_json(schema.DROPS_TOPIC, record, type_name=schema.DROPS, log_time_ns=2000)
+
+    check(tmp_path, fill)
+    part = tmp_path / "e2.mcap.part"
+    part.write_bytes(b"")
+    assert robot_gst.run(["check", str(tmp_path), "--json"]) == 3
+    said = capsys.readouterr()
+    assert f"robot-gst recover {part}" in said.err
+    data = json.loads(said.out)
+    assert data["unfinished"] == [str(part)]
+    (episode,) = data["episodes"]
+    assert episode["state"] == "losses declared"
+    assert episode["topics"][JOINTS]["sequence_gaps"] == 1
+    assert episode["topics"][JOINTS]["messages"] == 2
+    assert episode["parts"] == [str(tmp_path / "e1.mcap")]
+
+
+def test_an_unfinished_file_named_alone_is_no_success(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    part = tmp_path / "e2.mcap.part"
+    part.write_bytes(b"")
+    assert robot_gst.run(["check", str(part)]) == 1
+    assert "robot-gst recover" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_rerun_gives_a_second_opinion(tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    check(tmp_path, lambda writer: write_joints(writer, [0, 1]))
+    assert check_episode(tmp_path / "e1.mcap", rerun=True).exit_code == 0
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes((tmp_path / "e1.mcap").read_bytes()[:-20])
+    faults = check_episode(broken, rerun=True).faults
+    assert any("rerun mcap check says" in fault for fault in faults)
