@@ -19,7 +19,7 @@ from record.recorders import OurRecorder, ReferenceRecorder
 from record.throughput import EPISODE
 from record.verify import messages_of
 
-FINALISE_S = 0.12
+FINALISE_S = 0.06
 """A stop of a short episode takes about this long; kills while finalising fall within it [s]."""
 
 
