@@ -9,7 +9,7 @@ from pathlib import Path
 
 from bridge.episode import schema
 from bridge.episode.reader import Episode
-from bridge.episode.records import CompressedColor
+from bridge.episode.records import color_file_from_message
 from dashboards.errors import NotHereError
 
 RENDERED = "rendered:"
@@ -49,7 +49,10 @@ def _tracks(path: Path, _mtime_ns: int, _size: int) -> dict[str, CameraTrack]:
     episode = Episode.open(path)
     names = {
         topic: name
-        for topic in episode.topics_of_type(schema.COMPRESSED_IMAGE)
+        for topic in (
+            *episode.topics_of_type(schema.COMPRESSED_IMAGE),
+            *episode.topics_of_type(schema.IMAGE),
+        )
         if (name := _camera_of(topic)) is not None
     }
     stamps: dict[str, list[tuple[int, int]]] = {topic: [] for topic in names}
@@ -78,7 +81,10 @@ def _camera_of(topic: str) -> str | None:
 
 
 def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
-    """Return the image nearest to an instant, byte for byte as recorded, and its media type."""
+    """Return the image nearest to an instant and its media type.
+
+    A compressed image is given byte for byte as recorded; a raw one becomes JPEG.
+    """
     tracks = camera_tracks(path)
     if camera_id not in tracks:
         found = ", ".join(tracks) or "none"
@@ -90,7 +96,7 @@ def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
     episode = Episode.open(path)
     for message in episode.messages([track.topic], start_ns=log_ns, end_ns=log_ns + 1):
         if message.publish_time_ns == track.stamps_ns[index]:
-            data = CompressedColor.from_cdr(message.data).data
+            data = color_file_from_message(message.type_name, message.data).data
             return data, media_type(data, path)
     text = f"{path.name} changed while it was read; reload the page."
     raise NotHereError(text)

@@ -9,7 +9,7 @@ import rerun as rr
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
-from bridge.episode.records import CameraInfo, CompressedColor, DepthImage
+from bridge.episode.records import CameraInfo, DepthImage, color_file_from_message
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
 from bridge.geometry import se3
@@ -66,7 +66,10 @@ def _batches(items: Iterator[Item]) -> Iterator[list[Item]]:
 
 def _send_color(file: RerunFile, episode: Episode, topic: str, entity: str) -> list[int]:
     stamps = []
-    images = (CompressedColor.from_cdr(message.data) for message in episode.messages([topic]))
+    images = (
+        color_file_from_message(message.type_name, message.data)
+        for message in episode.messages([topic])
+    )
     for batch in _batches(images):
         kept = []
         for image in batch:

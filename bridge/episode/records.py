@@ -12,7 +12,13 @@ from jaxtyping import Float, UInt8, UInt16
 from bridge.clock import join_ns, split_ns
 from bridge.episode import cdr, schema
 from bridge.episode.cdr_plan import Message
-from bridge.episode.transcode import COLOR_LAYOUTS, DEPTH_ENCODINGS, image_header, pixel_rows
+from bridge.episode.transcode import (
+    COLOR_LAYOUTS,
+    DEPTH_ENCODINGS,
+    image_header,
+    image_to_jpeg,
+    pixel_rows,
+)
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media import depth_codec
@@ -115,10 +121,7 @@ class RawColor:
         """Read a sensor_msgs/Image of 8-bit colour or grey; refuses other encodings."""
         header = image_header(data)
         if header.encoding not in COLOR_LAYOUTS:
-            raise cdr.MalformedMessageError(
-                type_name=schema.IMAGE,
-                found=f"encoding {header.encoding!r}, expected one of {', '.join(COLOR_LAYOUTS)}",
-            )
+            raise _no_color(header.encoding)
         channels = COLOR_LAYOUTS[header.encoding][1]
         rows = pixel_rows(data, header, channels)
         return RawColor(
@@ -135,6 +138,11 @@ class RawColor:
         return self.pixels[..., order]
 
 
+def _no_color(encoding: str) -> cdr.MalformedMessageError:
+    found = f"encoding {encoding!r}, expected one of {', '.join(COLOR_LAYOUTS)}"
+    return cdr.MalformedMessageError(type_name=schema.IMAGE, found=found)
+
+
 def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColor:
     """Read a colour image, compressed or raw; both have ``stamp_ns`` and ``image_u8()``.
 
@@ -142,6 +150,20 @@ def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColo
         MalformedMessageError: The bytes are no such message.
     """
     return (RawColor if type_name == schema.IMAGE else CompressedColor).from_cdr(data)
+
+
+def color_file_from_message(type_name: str, data: bytes) -> CompressedColor:
+    """Read a colour image as a file to show: as it was recorded, or as JPEG when it is raw.
+
+    Raises:
+        MalformedMessageError: The bytes are no such message, or hold no 8-bit colour.
+    """
+    if type_name != schema.IMAGE:
+        return CompressedColor.from_cdr(data)
+    jpeg = image_to_jpeg(data)
+    if jpeg is None:
+        raise _no_color(image_header(data).encoding)
+    return CompressedColor.from_cdr(jpeg)
 
 
 @dataclass(frozen=True, kw_only=True)
