@@ -15,6 +15,7 @@ from bridge.episode.records import (
     transforms_from_cdr,
 )
 from bridge.episode.ros2_definitions import DEFINITIONS
+from bridge.episode.video import VideoFrame
 from bridge.errors import MissingDependencyError
 from bridge.media.color import decode_color
 from bridge.task.plan import Plan
@@ -109,6 +110,7 @@ _KNOWN_COLORS = ("jpeg", "jpg", "png", "rgb8; jpeg", "bgr8; jpeg", "rgb8; png", 
 _DECODERS: dict[str, Callable[[bytes], object]] = {
     schema.JOINT_STATE: JointSample.from_cdr,
     schema.COMPRESSED_IMAGE: _color,
+    schema.COMPRESSED_VIDEO: VideoFrame.from_protobuf,
     schema.TF_MESSAGE: transforms_from_cdr,
     schema.POSE_STAMPED: PoseSample.from_cdr,
     schema.STRING: string_from_cdr,
