@@ -15,7 +15,7 @@ def check_episode_id(episode_id: str) -> str:
     """Return the id if it is safe as a file name; remote requests cannot leave the run folder."""
     if not EPISODE_ID.fullmatch(episode_id):
         message = (
-            f"episode id {episode_id!r} is not usable as a file name. "
+            f"episode id {episode_id!r:.80} is not usable as a file name. "
             "Use letters, digits, '_' and '-', at most 121 characters."
         )
         raise UsageError(message)

@@ -4,7 +4,9 @@ import re
 
 from bridge.errors import BridgeError, UsageError
 
+_WITH_CERTIFICATES = ("tls/", "quic/", "wss/")
 _ADDRESS = re.compile(r"^[a-z0-9_-]+/(\[[0-9a-f:]+\]|[^:/]+)")
+_BEHIND_HASH = re.compile(r"#[^\s,\])]*")
 _SOURCE_LINE = re.compile(r"\s+at /\S+\.rs:\d+\.?\]?")
 
 
@@ -18,9 +20,13 @@ class NoPeerError(WireError):
     def __init__(self, *, endpoints: tuple[str, ...]) -> None:
         """Remember the endpoints that were tried."""
         self.endpoints = endpoints
+        where = " or ".join(public(endpoint) for endpoint in endpoints)
+        refused = ""
+        if any(endpoint.startswith(_WITH_CERTIFICATES) for endpoint in endpoints):
+            refused = " Or it refused us: it may want a certificate, given with --config."
         super().__init__(
-            f"no zenoh peer at {' or '.join(endpoints)}; "
-            "start robot-gst record RUN first or pass --connect with its address."
+            f"no zenoh peer at {where}; "
+            f"start robot-gst record RUN first or pass --connect with its address.{refused}"
         )
 
 
@@ -31,8 +37,8 @@ class PortTakenError(WireError):
         """Remember the endpoint that is in use."""
         self.endpoint = endpoint
         super().__init__(
-            f"{endpoint} is in use by another process, perhaps a second recorder or a zenoh "
-            "router. Stop it, or pass --listen with another port (for example "
+            f"{public(endpoint)} is in use by another process, perhaps a second recorder or a "
+            "zenoh router. Stop it, or pass --listen with another port (for example "
             "tcp/127.0.0.1:7448)."
         )
 
@@ -71,8 +77,13 @@ class NoReplyError(WireError):
 
 
 def cause_of(error: Exception) -> str:
-    """The first sentence of a zenoh error without the library's source paths."""
-    return _SOURCE_LINE.sub("", str(error)).strip().rstrip(".")
+    """The first sentence of a zenoh error without source paths and endpoint settings."""
+    return public(_SOURCE_LINE.sub("", str(error))).strip().rstrip(".")
+
+
+def public(text: str) -> str:
+    """Leave out the settings that may follow an endpoint's ``#``: keys can stand there."""
+    return _BEHIND_HASH.sub("", text)
 
 
 def is_loopback(endpoint: str) -> bool:

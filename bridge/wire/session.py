@@ -23,6 +23,7 @@ from bridge.wire.errors import (
     WireConfigError,
     WireError,
     cause_of,
+    public,
 )
 from bridge.wire.library import zenoh
 from bridge.wire.publisher import BYTES_PER_MB, SharedPool
@@ -268,7 +269,7 @@ def open_session(config: WireConfig) -> WireSession:
             raise PortTakenError(endpoint=" or ".join(config.listen)) from error
         if "Unable to connect" in cause or "Timeout" in cause:
             raise NoPeerError(endpoints=config.connect) from error
-        where = ", ".join(config.listen + config.connect)
+        where = public(", ".join(config.listen + config.connect))
         raise WireConfigError(
             f"cannot open a zenoh session on {where}: {cause}. "
             "An endpoint looks like tcp/127.0.0.1:7447."

@@ -1,12 +1,20 @@
 """Turns our few settings, and a file of zenoh's own, into what zenoh opens a session with."""
 
 import json
+import re
 from typing import Any
 
 from bridge.wire.config import WireConfig
-from bridge.wire.errors import WireConfigError, cause_of
+from bridge.wire.errors import WireConfigError, cause_of, public
 from bridge.wire.library import zenoh
 
+_WRONG_VALUE = re.compile(
+    r'msg: "(?P<message>.*)", location: .*?line: (?P<line>\d+)', flags=re.DOTALL
+)
+_QUOTED_VALUE = re.compile(r"(invalid (?:type|value): [a-z ]+?) (?:\".*\"|`[^`]*`)", re.DOTALL)
+_WRONG_SYNTAX = re.compile(
+    r"--> (?P<line>\d+):(?P<column>\d+).*\n\s*= (?P<message>.*?)(?: at /|$)", re.DOTALL
+)
 _OURS_WHERE_THE_FILE_IS_SILENT = {
     # Room for about 1 MB of joints (5 s at 500 Hz) while a receiver hangs, before any is dropped.
     "transport/link/tx/queue/size/real_time": 16,
@@ -39,7 +47,7 @@ def zenoh_config(config: WireConfig) -> Any:
             made.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
             raise WireConfigError(
-                f"{key} = {value!r} is not usable: {cause_of(error)}. "
+                f"{key} = {public(repr(value))} is not usable: {cause_of(error)}. "
                 "An endpoint looks like tcp/127.0.0.1:7447."
             ) from error
     return made
@@ -50,6 +58,17 @@ def _config_from_file(config: WireConfig) -> Any:
         return zenoh.Config.from_file(str(config.config))
     except zenoh.ZError as error:
         raise WireConfigError(
-            f"zenoh configuration {config.config} cannot be read: {cause_of(error)}. "
+            f"zenoh configuration {config.config} cannot be read: {_complaint(error)}. "
             "It must be a JSON5 file as zenoh documents it."
-        ) from error
+        ) from None  # zenoh's own words quote the file, and passwords stand in it
+
+
+def _complaint(error: Exception) -> str:
+    """Say what zenoh has against a file, and where, but not what stands there."""
+    text = str(error)
+    if found := _WRONG_VALUE.search(text):
+        complaint = _QUOTED_VALUE.sub(r"\1", found["message"].replace('\\"', '"'))
+        return f"line {found['line']}: {complaint}"
+    if found := _WRONG_SYNTAX.search(text):
+        return f"line {found['line']}, column {found['column']}: {found['message'].strip()}"
+    return cause_of(error)
