@@ -62,8 +62,9 @@ class CameraDevice:
         self._camera = f"{camera} ({describe_device(device)})"
         self._now_ns = now_ns
         self._stamps = FrameStamps()
-        color = self._choose(device, config, rs.stream.color, rs.format.rgb8)
-        depth = self._choose(device, config, rs.stream.depth, rs.format.z16)
+        sensors = list(device.query_sensors())
+        color = self._choose(sensors, config, rs.stream.color, rs.format.rgb8)
+        depth = self._choose(sensors, config, rs.stream.depth, rs.format.z16)
         intrinsics = color.profile.as_video_stream_profile().get_intrinsics()
         self._rectifier = Rectifier(intrinsics) if is_distorted(intrinsics) else None
         self._set_unit(depth.sensor)
@@ -80,9 +81,11 @@ class CameraDevice:
         """Whether lens distortion is taken out of colour images here."""
         return self._rectifier is not None
 
-    def _choose(self, device: Any, config: RealSenseConfig, stream: Any, pixels: Any) -> _Chosen:
+    def _choose(
+        self, sensors: list[Any], config: RealSenseConfig, stream: Any, pixels: Any
+    ) -> _Chosen:
         offers = []
-        for sensor in device.query_sensors():
+        for sensor in sensors:
             for profile in sensor.get_stream_profiles():
                 if profile.stream_type() != stream or profile.format() != pixels:
                     continue
@@ -127,7 +130,7 @@ class CameraDevice:
         )
 
     def _start(self, color: _Chosen, depth: _Chosen) -> None:
-        together = color.sensor == depth.sensor
+        together = color.sensor is depth.sensor
         groups = (
             [(color.sensor, [color.profile, depth.profile])]
             if together

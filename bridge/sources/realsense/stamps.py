@@ -5,7 +5,7 @@ from typing import Any
 from bridge.sources.host_clock import HostClock
 from bridge.sources.realsense.library import rs
 
-NS_PER_MS = 1_000_000
+US_PER_MS, NS_PER_US = 1000, 1000
 COUNTER_WRAPS_NS = 2**32 * 1_000
 """The camera counts microseconds in 32 bits: 71.6 minutes."""
 
@@ -30,7 +30,8 @@ class FrameStamps:
             frame: ``rs.frame``.
             received_ns: When it arrived, by the host's clock.
         """
-        device_ns: int = round(frame.get_timestamp() * NS_PER_MS)
+        # A double holds today's time in microseconds exactly, in nanoseconds not.
+        device_ns: int = round(frame.get_timestamp() * US_PER_MS) * NS_PER_US
         if frame.get_frame_timestamp_domain() != rs.timestamp_domain.hardware_clock:
             return device_ns
         try:
