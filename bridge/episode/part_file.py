@@ -170,6 +170,9 @@ def open_part(path: Path, *, replace_dead: bool) -> PartFile:
         raise _exists(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(part_path, error) from error
+    try:
         if replace_dead:
             _remove_dead(part_path)
         file = PartFile.create(part_path)

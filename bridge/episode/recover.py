@@ -169,7 +169,13 @@ def _recover_in_place(path: Path, source: RecordFile) -> RecoveryReport:
     report = tally.report(path, None, finished=False)
     if not tally.has_data:
         return report
-    target.finish(RECORD_NAME, to_metadata(report))
+    try:
+        target.finish(RECORD_NAME, to_metadata(report))
+    except OSError as error:
+        message = (
+            f"{path} could not be finished: {error.strerror}. Free some space, then try again."
+        )
+        raise RecoveryError(message) from error
     return replace(report, output=_publish(path) if path.name.endswith(PART) else path)
 
 

@@ -93,6 +93,11 @@ class EpisodeWriter:
         """Bytes in the file so far; chunks being filled are not among them."""
         return self._file.offset
 
+    @property
+    def has_failed(self) -> bool:
+        """True after a failed sync: no call will succeed any more."""
+        return self._file.failed is not None
+
     def write(
         self,
         topic: str,
@@ -173,8 +178,9 @@ class EpisodeWriter:
 
     def _write_pending(self) -> None:
         """Write chunks in the order they were closed; those the disk refuses stay here."""
-        if self._file.failed:
-            raise self._file.failed
+        failed = self._file.failed
+        if failed:
+            raise OSError(failed.errno, failed.strerror, str(self.part_path)) from failed
         while self._pending:
             self._section.add_chunk(self._pending[0])
             self._pending.popleft()
