@@ -140,6 +140,12 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
                 "DIR runs/x",
             ),
             (
+                "rosbag2",
+                f"{IMPORTS}:import_rosbag2",
+                "A rosbag2 recording in MCAP, byte for byte.",
+                "BAG runs/x",
+            ),
+            (
                 "lerobot",
                 f"{EXCHANGE}:import_lerobot",
                 "A LeRobotDataset v3.0, one episode file each.",

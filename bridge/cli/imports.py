@@ -91,3 +91,41 @@ def import_kinova(folder: Path, run: Path, /, *, output: Output = OUTPUT) -> int
     data = {"real": len(real), "simulated": len(simulated), "files": files}
     output.result(data, f"{len(real)} real and {len(simulated)} simulated runs in {run}")
     return 0
+
+
+def import_rosbag2(
+    bag: Path, run: Path, /, *, episode: str | None = None, output: Output = OUTPUT
+) -> int:
+    """Turn a rosbag2 recording in MCAP into an episode; every message stays byte for byte.
+
+    Example: robot-gst import rosbag2 bags/monday runs/monday
+
+    Args:
+        bag: A .mcap file, or the folder with metadata.yaml, split files included.
+        run: Run folder; made where needed.
+        episode: Id of the new episode; by default from the name of the bag.
+        output: How to talk.
+    """
+    import re
+
+    from bridge.episode.run import RunFolder
+    from bridge.exchange.rosbag2 import count_messages, import_bag
+
+    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", bag.resolve().name.removesuffix(".mcap")).strip("_-")
+    total = count_messages(bag)
+    with output.progress("import", total) as advance:
+        report = import_bag(
+            bag, RunFolder.create(run), episode_id=episode or plain or "bag", advance=advance
+        )
+    data = {
+        "file": str(report.path),
+        "bag_files": report.files,
+        "messages": report.messages,
+        "topics": report.topics,
+    }
+    output.result(
+        data,
+        f"{report.path}: {report.messages} messages on {len(report.topics)} topics "
+        f"of {len(report.files)} files",
+    )
+    return 0

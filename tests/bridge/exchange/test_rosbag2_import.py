@@ -1,0 +1,165 @@
+"""A bag becomes an episode without a byte of any message changed."""
+
+import io
+import json
+import os
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.records import Channel, Schema
+from mcap.writer import CompressionType, Writer
+
+import robot_gst
+from bridge.episode.check import check_episode
+from bridge.episode.provenance import hash_file
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
+from bridge.errors import BridgeError, EpisodeError, PathNotFoundError, UsageError
+from bridge.exchange.rosbag2 import find_files, import_bag
+
+DATA = Path(os.environ.get("GST_SHARED_DATA", Path(__file__).resolve().parents[4] / "shared/data"))
+BAGS = sorted((DATA / "mcap_foreign_rosbag2").glob("*.mcap"))
+
+
+def head_of(channel: Channel, schema: Schema | None) -> tuple[object, ...]:
+    kind = None if schema is None else (schema.name, schema.encoding, schema.data)
+    return channel.topic, channel.message_encoding, kind
+
+
+def contents(path: Path) -> list[tuple[object, ...]]:
+    """Everything about every message, by the official reader."""
+    with path.open("rb") as stream:
+        return [
+            (*head_of(c, s), m.log_time, m.publish_time, m.sequence, m.data)
+            for s, c, m in make_reader(stream, validate_crcs=True).iter_messages()
+        ]
+
+
+def bag(path: Path, times: range, *, schema: bytes = b"string data\n") -> Path:
+    stream = io.BytesIO()
+    writer = Writer(stream, compression=CompressionType.ZSTD, chunk_size=200)
+    writer.start(profile="ros2", library="libmcap 1.1.0")
+    schema_id = writer.register_schema("std_msgs/msg/String", "ros2msg", schema)
+    topic = writer.register_channel("/a", "cdr", schema_id, {"offered_qos_profiles": "- depth: 1"})
+    bare = writer.register_channel("no slash", "json", 0)
+    writer.register_channel("/silent", "cdr", schema_id)
+    for n in times:
+        data = b"\0\1\0\0" + n.to_bytes(4, "big")
+        writer.add_message(topic, n * 10, data, n * 9, sequence=n * 7)
+        writer.add_message(bare, n * 10, b"{}", n * 10, sequence=0)
+    writer.add_attachment(1, 2, "notes.txt", "text/plain", b"notes")
+    writer.add_metadata("rosbag2", {"serialized_metadata": "version: 8"})
+    writer.add_metadata("episode", {"id": "of another program"})
+    writer.finish()
+    path.write_bytes(stream.getvalue())
+    return path
+
+
+def folder_bag(folder: Path, *names: str, extra: str = "") -> Path:
+    folder.mkdir(exist_ok=True)
+    listed = "".join(f"    - {name}\n" for name in names)
+    text = f"rosbag2_bagfile_information:\n  version: 8\n  storage_identifier: mcap\n{extra}"
+    (folder / "metadata.yaml").write_text(text + f"  relative_file_paths:\n{listed}")
+    return folder
+
+
+def imported(source: Path, folder: Path) -> Path:
+    return import_bag(source, RunFolder.create(folder / "run"), episode_id="b").path
+
+
+@pytest.mark.parametrize("path", BAGS, ids=lambda path: path.stem)
+def test_bags_of_other_programs_come_through_byte_for_byte(path: Path, tmp_path: Path) -> None:
+    made = imported(path, tmp_path)
+    assert contents(made) == contents(path)
+    report = check_episode(made)
+    assert (report.exit_code, report.faults) == (0, [])
+    episode = Episode.open(made)
+    assert episode.info.kind == "imported"
+    (source,) = episode.metadata_records["source"]["files"]
+    assert (source["name"], source["sha256"]) == (path.name, hash_file(path))
+
+
+def test_everything_beside_the_messages_is_kept_too(tmp_path: Path) -> None:
+    made = imported(bag(tmp_path / "x_0.mcap", range(9)), tmp_path)
+    episode = Episode.open(made)
+    records = episode.metadata_records
+    assert records["rosbag2"] == {"serialized_metadata": "version: 8"}
+    assert records["source.episode"] == {"id": "of another program"}
+    assert records["source"]["silent_topics"] == ["/silent"]
+    assert records["source"]["channels"] == {"/a": {"offered_qos_profiles": "- depth: 1"}}
+    assert episode.attachment("notes.txt") == b"notes"
+    assert episode.info.id == "b"
+
+
+def test_a_bag_of_several_files_is_one_episode_in_log_order(tmp_path: Path) -> None:
+    folder = folder_bag(tmp_path / "bag", "x_0.mcap", '"x_1.mcap"')
+    parts = [bag(folder / "x_0.mcap", range(9)), bag(folder / "x_1.mcap", range(5, 14))]
+    found = contents(imported(folder, tmp_path))
+    expected = [item for part in parts for item in contents(part)]
+    assert found == sorted(expected, key=lambda item: item[3])
+    assert len(found) == 36
+
+
+def test_a_schema_that_changes_between_files_is_kept_in_both_forms(tmp_path: Path) -> None:
+    folder = folder_bag(tmp_path / "bag", "x_0.mcap", "x_1.mcap")
+    bag(folder / "x_0.mcap", range(2))
+    bag(folder / "x_1.mcap", range(2, 4), schema=b"string data # new\n")
+    texts = {item[2][2] for item in contents(imported(folder, tmp_path)) if item[2]}
+    assert texts == {b"string data\n", b"string data # new\n"}
+
+
+def test_a_folder_without_metadata_is_all_its_files(tmp_path: Path) -> None:
+    paths = [bag(tmp_path / f"x_{n}.mcap", range(n, n + 2)) for n in (1, 0)]
+    assert find_files(tmp_path) == sorted(paths)
+
+
+@pytest.mark.parametrize(
+    ("extra", "names", "error", "found"),
+    [
+        ("", ("gone.mcap",), PathNotFoundError, "gone.mcap"),
+        ("", ("../outside.mcap",), BridgeError, "lies outside its folder"),
+        ("  compression_mode: FILE\n", ("x.mcap.zstd",), BridgeError, "compressed by rosbag2"),
+        ("  broken: [\n", ("x.mcap",), BridgeError, "it is no YAML"),
+        ("  relative_file_paths: 3\n", (), BridgeError, "it is no YAML|lists no files"),
+    ],
+)
+def test_a_bag_that_cannot_be_read_is_one_sentence(
+    tmp_path: Path, extra: str, names: tuple[str, ...], error: type[Exception], found: str
+) -> None:
+    bag(tmp_path / "outside.mcap", range(2))
+    folder = folder_bag(tmp_path / "bag", *names, extra=extra)
+    with pytest.raises(error, match=found):
+        import_bag(folder, RunFolder.create(tmp_path / "run"), episode_id="b")
+    assert list((tmp_path / "run" / "episodes").iterdir()) == []
+
+
+def test_another_storage_is_refused(tmp_path: Path) -> None:
+    folder = folder_bag(tmp_path / "bag", "x.db3")
+    about = folder / "metadata.yaml"
+    about.write_text(about.read_text().replace(": mcap", ": sqlite3"))
+    with pytest.raises(BridgeError, match="its storage is 'sqlite3', not mcap"):
+        find_files(folder)
+
+
+@pytest.mark.parametrize("keep", [0.5, 0.9])
+def test_an_unfinished_or_damaged_bag_leaves_no_episode(tmp_path: Path, keep: float) -> None:
+    path = bag(tmp_path / "x.mcap", range(40))
+    data = bytearray(path.read_bytes())
+    data[int(len(data) * 0.2)] ^= 1
+    path.write_bytes(data if keep > 0.5 else data[: len(data) // 2])
+    with pytest.raises(EpisodeError, match=r"x\.mcap"):
+        imported(path, tmp_path)
+    assert list((tmp_path / "run" / "episodes").iterdir()) == []
+
+
+def test_the_command_imports_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = bag(tmp_path / "rosbag2 2024.05.01_0.mcap", range(3))
+    command = ["import", "rosbag2", str(path), str(tmp_path / "run"), "--json"]
+    assert robot_gst.run(command) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["messages"] == 6
+    assert Path(data["file"]).name == "rosbag2_2024_05_01_0.mcap"
+    with pytest.raises(UsageError, match="exists already"):
+        import_bag(path, RunFolder(tmp_path / "run"), episode_id="rosbag2_2024_05_01_0")
+    assert robot_gst.run(command) == 2
