@@ -9,7 +9,8 @@ from typing import TextIO
 from bridge.episode.catalogue_labels import outcome_of
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
-from bridge.errors import BridgeError, EpisodeError, UsageError
+from bridge.errors import UsageError
+from bridge.exchange.naming import message_named
 from bridge.exchange.output import new_folder, write_note
 from bridge.exchange.tables import COMMON, TABLES, TableKind, field_text, seconds_text
 from bridge.terminal import Advance
@@ -145,25 +146,12 @@ def _rows(
         counts[message.topic] += 1
         if message.type_name != kind.type_name:  # a topic may carry two types
             continue
-        try:
-            for stamp_ns, values in kind.rows(message):
-                yield (
-                    kind,
-                    [
-                        name,
-                        message.topic,
-                        str(stamp_ns),
-                        seconds_text(stamp_ns),
-                        str(message.log_time_ns),
-                        *map(field_text, values),
-                    ],
-                )
-        except BridgeError as error:
-            raise EpisodeError(
-                path=episode.path,
-                found=f"message {counts[message.topic]} of {message.topic}: {error}",
-                hint="robot-gst check lists everything that is wrong with it.",
-            ) from error
+        with message_named(episode, message.topic, counts[message.topic]):
+            rows = list(kind.rows(message))
+        for stamp_ns, values in rows:
+            log_ns = str(message.log_time_ns)
+            times = [str(stamp_ns), seconds_text(stamp_ns), log_ns]
+            yield kind, [name, message.topic, *times, *map(field_text, values)]
 
 
 def _episode_cells(name: str, episode: Episode, run: RunFolder | None) -> list[str]:

@@ -5,7 +5,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -91,14 +91,14 @@ def write_note(folder: Path, *, made_by: str, sources: list[Path], choices: dict
     (folder / NOTE_NAME).write_text(text, encoding="utf-8")
 
 
-def safe_name(text: str) -> str:
-    """Turn a name from a recording into one that can be a file's: no separators, no dots.
-
-    Raises:
-        BridgeError: When nothing of it is left.
-    """
-    name = _UNSAFE.sub("_", text).strip("_")
-    if not name:
-        message = f"the name {text!r} in the recording cannot be a file's name. Rename it there."
-        raise BridgeError(message)
-    return name
+def safe_names(names: Iterable[str]) -> dict[str, str]:
+    """Give each name from a recording one that can be a file's, and no two the same."""
+    safe: dict[str, str] = {}
+    for name in names:
+        stem = _UNSAFE.sub("_", name).strip("_") or "unnamed"
+        number, candidate = 1, stem
+        while candidate in safe.values():
+            number += 1
+            candidate = f"{stem}_{number}"
+        safe[name] = candidate
+    return safe

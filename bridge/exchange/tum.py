@@ -7,24 +7,29 @@ intrinsics: ``camera.json`` beside the lists holds them, and ``import rgbd`` rea
 """
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import UInt16
 
-from bridge.clock import NS_PER_S
 from bridge.episode.reader import Episode
-from bridge.episode.records import CameraInfo, CompressedColor, DepthImage
+from bridge.episode.records import (
+    CameraInfo,
+    CompressedColor,
+    DepthImage,
+    RawColor,
+    color_from_message,
+)
 from bridge.episode.streams import camera_ids, camera_info, find_camera_topic, transform_tree
 from bridge.episode.transforms import TransformTree
 from bridge.errors import EpisodeError, MissingDependencyError
-from bridge.exchange.output import new_folder, safe_name, write_note
+from bridge.exchange.naming import message_named
+from bridge.exchange.output import new_folder, safe_names, write_note
+from bridge.exchange.tables import seconds_text
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.media.color import JPEG_MAGIC, decode_color
+from bridge.media.color import JPEG_MAGIC
 from bridge.terminal import Advance
 
 STORED_PER_MM = 5
@@ -85,8 +90,8 @@ def export_tum(
     tree = transform_tree(episode)
     reports: list[CameraReport] = []
     with new_folder(out, force=force) as folder:
-        for name in wanted:
-            place = folder if len(wanted) == 1 else folder / safe_name(name)
+        for name, place_name in safe_names(wanted).items():
+            place = folder if len(wanted) == 1 else folder / place_name
             reports.append(_write_camera(episode, name, tree, place, color, advance))
         choices = {
             "color": "JPEG as recorded" if color == "recorded" else "PNG",
@@ -113,14 +118,20 @@ def _write_camera(
     info = camera_info(episode, name, "color")
     for part in ("rgb", "depth"):
         (place / part).mkdir(parents=True, exist_ok=True)
-    for topic, stamp_ns, image in _images(episode, name):
-        if isinstance(image, CompressedColor):
-            report.colors.append(_write_color(place, image, color))
-        else:
-            item, too_far = _write_depth(place, stamp_ns, image.depth_mm)
-            report.depths.append(item)
-            report.depth_too_far += too_far
-        advance(len(report.colors) + len(report.depths), topic)
+    topics = [find_camera_topic(episode, name, f"{kind}/image") for kind in ("color", "depth")]
+    counts = dict.fromkeys(topics, 0)
+    for message in episode.messages([topic for topic in topics if topic is not None]):
+        counts[message.topic] += 1
+        with message_named(episode, message.topic, counts[message.topic]):
+            if message.topic == topics[0]:
+                image = color_from_message(message.type_name, message.data)
+                report.colors.append(_write_color(place, image, color))
+            else:
+                depth = DepthImage.from_message(message.type_name, message.data)
+                item, too_far = _write_depth(place, depth)
+                report.depths.append(item)
+                report.depth_too_far += too_far
+        advance(len(report.colors) + len(report.depths), message.topic)
     _write_list(place / "rgb.txt", "color images", report.colors)
     _write_list(place / "depth.txt", "depth maps", report.depths)
     stamps = sorted({item.stamp_ns for item in report.colors + report.depths})
@@ -129,42 +140,24 @@ def _write_camera(
     return report
 
 
-def _images(episode: Episode, name: str) -> Iterator[tuple[str, int, CompressedColor | DepthImage]]:
-    topics = [find_camera_topic(episode, name, f"{kind}/image") for kind in ("color", "depth")]
-    for message in episode.messages([topic for topic in topics if topic is not None]):
-        if message.topic == topics[0]:
-            color = CompressedColor.from_cdr(message.data)
-            yield message.topic, color.stamp_ns, color
-        else:
-            depth = DepthImage.from_cdr(message.data)
-            yield message.topic, depth.stamp_ns, depth
-
-
-def stamp_text(stamp_ns: int) -> str:
-    """Seconds with nine decimals, exact."""
-    seconds, rest = divmod(stamp_ns, NS_PER_S)
-    return f"{seconds}.{rest:09d}"
-
-
-def _write_color(place: Path, image: CompressedColor, color: ColorFormat) -> Stamped:
-    stem = f"rgb/{stamp_text(image.stamp_ns)}"
-    if color == "recorded" and image.data[:2] == JPEG_MAGIC:
+def _write_color(place: Path, image: CompressedColor | RawColor, color: ColorFormat) -> Stamped:
+    stem = f"rgb/{seconds_text(image.stamp_ns)}"
+    data = image.data if isinstance(image, CompressedColor) and color == "recorded" else b""
+    if data[:2] == JPEG_MAGIC:
         name = f"{stem}.jpg"
-        (place / name).write_bytes(image.data)
+        (place / name).write_bytes(data)
     else:
         name = f"{stem}.png"
-        _save_png(place / name, decode_color(image.data))
+        _save_png(place / name, image.image_u8())
     return Stamped(image.stamp_ns, name)
 
 
-def _write_depth(
-    place: Path, stamp_ns: int, depth_mm: UInt16[np.ndarray, "height width"]
-) -> tuple[Stamped, int]:
-    too_far = depth_mm > MAX_MM
-    stored = np.where(too_far, 0, depth_mm.astype(np.uint32) * STORED_PER_MM).astype(np.uint16)
-    name = f"depth/{stamp_text(stamp_ns)}.png"
-    _save_png(place / name, stored)
-    return Stamped(stamp_ns, name), int(too_far.sum())
+def _write_depth(place: Path, depth: DepthImage) -> tuple[Stamped, int]:
+    too_far = depth.depth_mm > MAX_MM
+    stored = np.where(too_far, 0, depth.depth_mm.astype(np.uint32) * STORED_PER_MM)
+    name = f"depth/{seconds_text(depth.stamp_ns)}.png"
+    _save_png(place / name, stored.astype(np.uint16))
+    return Stamped(depth.stamp_ns, name), int(too_far.sum())
 
 
 def _save_png(path: Path, pixels: np.ndarray) -> None:
@@ -179,7 +172,7 @@ def _save_png(path: Path, pixels: np.ndarray) -> None:
 
 def _write_list(path: Path, what: str, items: list[Stamped]) -> None:
     lines = [f"# {what}", "# timestamp filename"]
-    lines += [f"{stamp_text(item.stamp_ns)} {item.name}" for item in sorted(items)]
+    lines += [f"{seconds_text(item.stamp_ns)} {item.name}" for item in sorted(items)]
     path.write_text("\n".join(lines) + "\n")
 
 
@@ -189,7 +182,7 @@ def _write_poses(path: Path, tree: TransformTree, frame: str, stamps: list[int])
         q, p = se3.split(tree.T_root_frame(frame, stamp_ns))
         w, x, y, z = (float(value) for value in q)
         numbers = " ".join(repr(value) for value in (*map(float, p), x, y, z, w))
-        lines.append(f"{stamp_text(stamp_ns)} {numbers}")
+        lines.append(f"{seconds_text(stamp_ns)} {numbers}")
     path.write_text("\n".join(lines) + "\n")
 
 

@@ -23,7 +23,7 @@ from bridge.exchange.lerobot.sampling import (
     sample,
 )
 from bridge.exchange.lerobot.writer import DatasetShape, DatasetWriter
-from bridge.exchange.output import new_folder, safe_name, write_note
+from bridge.exchange.output import new_folder, safe_names, write_note
 from bridge.terminal import Advance
 
 KINDS = ("trial", "imported")
@@ -98,35 +98,25 @@ def export_lerobot(
         fps = config.fps or choose_fps(first)
         success = [_success(run, Episode.open(path)) for path in files]
         kind, sizes = _look(files, fps, config, advance)
-        names = sample(first, fps).names
+        cameras = safe_names(sizes)
         shape = DatasetShape(
             fps=fps,
-            names=names,
-            cameras={safe_name(camera): size for camera, size in sizes.items()},
+            names=sample(first, fps).names,
+            cameras={safe: sizes[camera] for camera, safe in cameras.items()},
             robot_type=first.info.robot or first.info.cell,
             labelled=None not in success,
             crf=config.crf,
         )
         writer = DatasetWriter(folder, shape)
-        table: list[dict[str, Any]] = []
         try:
-            for number, path in enumerate(files):
-                episode = Episode.open(path)
-                samples = sample(episode, fps)
-                writer.add(
-                    task=_task(episode),
-                    state=samples.state,
-                    action=samples.action(kind),
-                    success=success[number],
-                    images={
-                        safe_name(camera): _images(episode, camera, samples.images[camera], size)
-                        for camera, size in sizes.items()
-                    },
-                )
-                table.append(_row(number, episode, samples, success[number]))
-                advance(len(files) + number + 1, path.stem)
-        finally:
+            table = []
+            for row in _add_all(writer, files, success, kind, cameras, shape):
+                table.append(row)
+                advance(len(files) + len(table), str(row["id"]))
             writer.close()
+        except BaseException:
+            writer.abandon()
+            raise
         _write_about(folder, files, shape, kind, table)
     return ExportReport(
         episodes=len(files),
@@ -139,6 +129,31 @@ def export_lerobot(
             (offset for row in table for offset in row["max_image_offset_ns"].values()), default=0
         ),
     )
+
+
+def _add_all(
+    writer: DatasetWriter,
+    files: Sequence[Path],
+    success: Sequence[bool | None],
+    kind: ActionKind,
+    cameras: dict[str, str],
+    shape: DatasetShape,
+) -> Iterator[dict[str, Any]]:
+    """Write one episode after another; yields what there is to say of each."""
+    for number, path in enumerate(files):
+        episode = Episode.open(path)
+        samples = sample(episode, shape.fps)
+        writer.add(
+            task=_task(episode),
+            state=samples.state,
+            action=samples.action(kind),
+            success=success[number],
+            images={
+                safe: _images(episode, camera, samples.images[camera], shape.cameras[safe])
+                for camera, safe in cameras.items()
+            },
+        )
+        yield _row(number, episode, samples, success[number])
 
 
 def _look(

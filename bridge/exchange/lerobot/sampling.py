@@ -13,8 +13,8 @@ from jaxtyping import Float, Int, UInt8
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
-from bridge.episode.reader import Episode, RawMessage
-from bridge.episode.records import CompressedColor
+from bridge.episode.reader import Episode
+from bridge.episode.records import color_from_message
 from bridge.episode.streams import (
     JointTrack,
     camera_ids,
@@ -24,9 +24,8 @@ from bridge.episode.streams import (
     joint_track,
     plans,
 )
-from bridge.episode.transcode import image_to_jpeg
 from bridge.errors import EpisodeError
-from bridge.media.color import decode_color
+from bridge.exchange.naming import message_named
 from bridge.task.plan import Plan
 
 ActionKind = Literal["plan", "next_state"]
@@ -54,24 +53,6 @@ class Samples:
         if kind == "plan" and self.command is not None:
             return self.command
         return np.vstack([self.state[1:], self.state[-1:]])
-
-
-def color_of(episode: Episode, message: RawMessage) -> CompressedColor:
-    """Read a colour image; an uncompressed one becomes JPEG first.
-
-    Raises:
-        EpisodeError: When its encoding is unknown.
-    """
-    data: bytes | None = message.data
-    if message.type_name == schema.IMAGE:
-        data = image_to_jpeg(message.data)
-    if data is None:
-        raise EpisodeError(
-            path=episode.path,
-            found=f"{message.topic} carries an encoding that is no colour image",
-            hint="Record rgb8, bgr8, mono8 or JPEG.",
-        )
-    return CompressedColor.from_cdr(data)
 
 
 def choose_fps(episode: Episode) -> int:
@@ -146,7 +127,8 @@ def row_images(
             return
         if number != wanted[row]:
             continue
-        image_u8 = decode_color(color_of(episode, message).data)
+        with message_named(episode, message.topic, number + 1):
+            image_u8 = color_from_message(message.type_name, message.data).image_u8()
         while row < len(wanted) and number == wanted[row]:
             yield image_u8
             row += 1
@@ -165,9 +147,8 @@ def _image_stamps(
     stamps: list[int] = []
     numbers: list[int] = []
     for number, message in enumerate(episode.messages([_topic(episode, camera)])):
-        stamp_ns = message.publish_time_ns
-        if message.type_name == schema.COMPRESSED_IMAGE:
-            stamp_ns = CompressedColor.from_cdr(message.data).stamp_ns
+        with message_named(episode, message.topic, number + 1):
+            stamp_ns = color_from_message(message.type_name, message.data).stamp_ns
         if not stamps or stamp_ns > stamps[-1]:
             stamps.append(stamp_ns)
             numbers.append(number)

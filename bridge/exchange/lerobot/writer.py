@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -238,16 +239,24 @@ class DatasetWriter:
     def close(self) -> None:
         """Finish all files and write tasks, statistics and ``meta/info.json``."""
         self._flush_episodes()
+        self._close_files()
+        self._write_tasks()
+        stats = {key: found.record() for key, found in self._stats.items()}
+        self._write_json(layout.STATS_PATH, stats)
+        self._write_json(layout.INFO_PATH, self._info())
+
+    def abandon(self) -> None:
+        """Let go of open files after a failure; what they hold is of no use."""
+        with suppress(Exception):  # the failure itself is the one to show
+            self._close_files()
+
+    def _close_files(self) -> None:
         for writer in (self._data, self._episodes):
             if writer is not None:
                 writer.close()
         for video in self._videos.values():
             if video.writer is not None:
                 video.writer.close()
-        self._write_tasks()
-        stats = {key: found.record() for key, found in self._stats.items()}
-        self._write_json(layout.STATS_PATH, stats)
-        self._write_json(layout.INFO_PATH, self._info())
 
     def _write_tasks(self) -> None:
         try:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import robot_gst
+from bridge.episode.reader import Episode
 from bridge.exchange.lerobot.stats import RunningStats
 
 av = pytest.importorskip("av")
@@ -307,3 +308,56 @@ def test_an_episode_without_joints_is_refused(
     make_trial(id="t1", has_joints=False, num_frames=2)
     assert run("export", "lerobot", tmp_path / "run", tmp_path / "ds") == 1
     assert "t1.mcap: no joint states" in capsys.readouterr().err
+
+
+def test_full_files_are_followed_by_the_next_and_all_is_found_again(
+    make_trial: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bridge.exchange.lerobot.layout.DATA_FILE_MB", 0)
+    monkeypatch.setattr("bridge.exchange.lerobot.layout.VIDEO_FILE_MB", 0)
+    monkeypatch.setattr("bridge.exchange.lerobot.layout.CHUNKS_SIZE", 2)
+    monkeypatch.setattr("bridge.exchange.lerobot.writer.FLUSH_EPISODES", 2)
+    for number in range(3):
+        make_trial(id=f"t{number}", num_frames=6 + number)
+    assert run("export", "lerobot", tmp_path / "run", tmp_path / "ds") == 0
+    found = sorted(p.relative_to(tmp_path / "ds").as_posix() for p in tmp_path.rglob("file-*.mp4"))
+    key = "videos/observation.images.wrist"
+    assert found == [
+        f"{key}/chunk-000/file-000.mp4",
+        f"{key}/chunk-000/file-001.mp4",
+        f"{key}/chunk-001/file-000.mp4",
+    ]
+    path = tmp_path / "ds/meta/episodes/chunk-000/file-000.parquet"
+    rows = pq.read_table(path).to_pylist()
+    assert [(row["data/chunk_index"], row["data/file_index"]) for row in rows] == [
+        (0, 0),
+        (0, 1),
+        (1, 0),
+    ]
+    assert {row["videos/observation.images.wrist/from_timestamp"] for row in rows} == {0.0}
+    assert run("import", "lerobot", tmp_path / "ds", tmp_path / "back") == 0
+    for number in range(3):
+        path = tmp_path / "back" / "episodes" / f"ep_{number:06d}.mcap"
+        assert Episode.open(path).topics()["/lerobot/joint_states"].count == 6 + number
+
+
+def test_a_broken_image_is_named_and_nothing_is_left(
+    make_trial: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    made_trial: Any, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    from bridge.media import color
+
+    calls = iter(range(100))
+    monkeypatch.setitem(
+        made_trial._write_camera.__globals__,
+        "encode_jpeg",
+        lambda image: color.encode_jpeg(image)[: 80 if next(calls) == 4 else None],
+    )
+    make_trial(id="t1")
+    assert run("export", "lerobot", tmp_path / "run", tmp_path / "ds") == 1
+    error = capsys.readouterr().err
+    assert "t1.mcap: message 5 of /lab/cam/wrist/color/image: unreadable image" in error
+    assert not (tmp_path / "ds").exists()
+    assert run("export", "tum", tmp_path / "run/episodes/t1.mcap", tmp_path / "t", "--color", "png")
+    assert "message 5 of /lab/cam/wrist/color/image" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]

@@ -4,6 +4,7 @@ import io
 import json
 import os
 import shutil
+import time
 from itertools import pairwise
 from pathlib import Path
 
@@ -276,3 +277,40 @@ def test_the_kitchen_reads_the_same_with_and_without_its_index(tmp_path: Path) -
     record = json.loads((KITCHEN / "scene.json").read_text())
     shutil.copy(KITCHEN / "camera-intrinsics.txt", raw)
     assert read_index(raw).depth_camera.fx == record["depth_intrinsics"]["fx"]
+
+
+def test_a_published_tum_folder_keeps_the_distances_between_its_times(tum: Path) -> None:
+    class Session:
+        def __init__(self) -> None:
+            self.sent: dict[str, list[int]] = {}
+
+        def now_ns(self) -> int:
+            return 50_000_000_000
+
+        def publisher(self, topic: str, type_name: str) -> "Publisher":
+            return Publisher(self.sent.setdefault(topic, []))
+
+    class Publisher:
+        def __init__(self, sent: list[int]) -> None:
+            self._sent = sent
+
+        def put(self, data: bytes, *, source_ns: int) -> None:
+            self._sent.append(source_ns)
+
+    from bridge.sources.folder_publish import publish_folder_frames
+
+    session = Session()
+    begun = time.monotonic()
+    unchecked = getattr(publish_folder_frames, "__wrapped__", publish_folder_frames)
+    sent = unchecked(  # our session only looks like one
+        session,
+        read_index(tum, TUM),
+        TUM,
+        fast=False,
+        should_stop=lambda: False,
+        advance=lambda done, note: None,
+    )
+    assert time.monotonic() - begun >= (STAMPS_NS[2] - STAMPS_NS[0]) * 1e-9
+    assert sent["frames"] == 3
+    color = session.sent["/kitchen/cam/kinect/color/image"]
+    assert color == [50_000_000_000 + stamp - STAMPS_NS[0] for stamp in STAMPS_NS]
