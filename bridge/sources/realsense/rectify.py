@@ -10,12 +10,18 @@ from jaxtyping import Float, UInt8
 
 from bridge.sources.realsense.library import rs
 
-ONE = 1 << 7
-"""Weights are seven-bit fixed point: four products of 8 and 14 bits fit into 32."""
+ONE = 256
+"""Weights are eight-bit fixed point and sum to this: 255 times it still fits into 16 bits."""
+TWO_LANES = 0x00FF00FF
+HALF = 0x00800080
 
 
 class Rectifier:
-    """Resamples distorted images bilinearly; pixels that see outside the image become black."""
+    """Resamples distorted images bilinearly; pixels that see outside the image become black.
+
+    Two colours are weighted at once, each in 16 bits of one 32-bit number: a third of the time
+    that NumPy needs for bytes. Not for several threads: the buffers are kept.
+    """
 
     def __init__(self, intrinsics: Any) -> None:
         """Ask the library once where each ideal pixel lies in the distorted image.
@@ -28,26 +34,45 @@ class Rectifier:
         inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
         left = np.clip(np.floor(u), 0, width - 2).astype(np.intp)
         top = np.clip(np.floor(v), 0, height - 2).astype(np.intp)
-        self._shape = (height, width, 3)
-        self._corner = (top * width + left).ravel()
-        self._steps = (0, 1, width, width + 1)
-        across = np.rint((u - left) * ONE).astype(np.int32)
-        down = np.rint((v - top) * ONE).astype(np.int32)
-        weights = [
-            (ONE - across) * (ONE - down),
-            across * (ONE - down),
-            (ONE - across) * down,
-            across * down,
+        corner = (top * width + left).ravel()
+        right_part, bottom_part = u - left, v - top
+        shares = [
+            right_part * (1 - bottom_part),
+            (1 - right_part) * bottom_part,
+            right_part * bottom_part,
         ]
-        self._weights = [np.where(inside, w, 0).astype(np.uint32).reshape(-1, 1) for w in weights]
+        weights = [np.where(inside, np.floor(share * ONE), 0.0) for share in shares]
+        weights.insert(0, np.where(inside, ONE - sum(weights), 0.0))
+        self._taps = [
+            (corner + step, weight.astype(np.uint32).ravel())
+            for step, weight in zip((0, 1, width, width + 1), weights, strict=True)
+        ]
+        self._pixels = np.zeros((height, width, 4), np.uint8)
+        self._read, self._work, self._outer, self._inner = np.zeros(
+            (4, height * width), dtype=np.uint32
+        )
 
     def apply(self, image_u8: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """Return the image an ideal camera of the same focal lengths would have taken."""
-        pixels = image_u8.reshape(-1, 3)
-        total = np.full(pixels.shape, ONE * ONE // 2, np.uint32)
-        for step, weight in zip(self._steps, self._weights, strict=True):
-            total += weight * pixels[self._corner + step]
-        return (total // (ONE * ONE)).astype(np.uint8).reshape(self._shape)
+        self._pixels[..., :3] = image_u8
+        packed = self._pixels.view(np.uint32).ravel()
+        self._outer[:] = HALF
+        self._inner[:] = HALF
+        for places, weight in self._taps:
+            np.take(packed, places, out=self._read, mode="clip")
+            self._add(self._outer, weight)
+            np.right_shift(self._read, 8, out=self._read)
+            self._add(self._inner, weight)
+        np.right_shift(self._outer, 8, out=self._outer)
+        np.bitwise_and(self._outer, TWO_LANES, out=self._outer)
+        np.bitwise_and(self._inner, TWO_LANES << 8, out=self._inner)
+        np.bitwise_or(self._outer, self._inner, out=self._outer)
+        return np.array(self._outer.view(np.uint8).reshape(self._pixels.shape)[..., :3])
+
+    def _add(self, total: np.ndarray, weight: np.ndarray) -> None:
+        np.bitwise_and(self._read, TWO_LANES, out=self._work)
+        np.multiply(self._work, weight, out=self._work)
+        np.add(total, self._work, out=total)
 
 
 def is_distorted(intrinsics: Any) -> bool:
