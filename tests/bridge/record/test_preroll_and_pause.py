@@ -1,0 +1,311 @@
+"""Before, between and beside: pre-roll, pause, snapshot, split, clock steps."""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.clock import AnchoredClock, StepWatch
+from bridge.episode import schema
+from bridge.episode.metadata import EpisodeInfo, Outcome
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
+from bridge.episode.streams import events
+from bridge.errors import UsageError
+from bridge.record.config import DiskConfig, RecorderConfig
+from bridge.record.errors import LifecycleError
+from bridge.record.recorder import Recorder
+from bridge.wire.session import WireSample
+
+MakeSample = Callable[..., WireSample]
+MakeRecorder = Callable[..., Recorder]
+JOINTS = "/cell/joint_states"
+
+
+@pytest.fixture
+def make_recorder(run: RunFolder) -> Iterator[MakeRecorder]:
+    made: list[Recorder] = []
+
+    def make(*, wall_ns: Callable[[], int] = time.time_ns, **settings: object) -> Recorder:
+        clock = AnchoredClock()
+        config = RecorderConfig(**settings)  # type: ignore[arg-type]
+        made.append(Recorder(run, now_ns=clock.now_ns, config=config, wall_ns=wall_ns))
+        return made[-1]
+
+    yield make
+    for recorder in made:
+        recorder.close()
+
+
+def episode_of(run: RunFolder, name: str = "t1") -> Episode:
+    return Episode.open(run.episodes_dir / f"{name}.mcap")
+
+
+def data_of(episode: Episode, topic: str = JOINTS) -> list[bytes]:
+    return [message.data for message in episode.messages([topic])]
+
+
+def wait_until(is_so: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + 10.0
+    while not is_so():
+        assert time.monotonic() < end_s, "it never came"
+        time.sleep(0.01)
+
+
+def info(name: str = "t1") -> EpisodeInfo:
+    return EpisodeInfo(id=name, kind="trial", cell="cell")
+
+
+def test_the_preroll_opens_the_episode_and_its_losses_are_counted(
+    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    recorder = make_recorder(preroll_s=30.0)
+    before = [make_sample(sequence=number) for number in (0, 1, 4, 2)]
+    for sample in before:
+        recorder.receive(sample)
+    answer = recorder.start(info())
+    assert 0 < answer["preroll_s"] < 30
+    after = make_sample(sequence=6)
+    recorder.receive(after)
+    stopped = recorder.stop()
+    assert (stopped["messages"], stopped["lost"]) == (5, 2)  # 3 and 5; 2 only came late
+    episode = episode_of(run)
+    assert data_of(episode) == [sample.data for sample in (*before, after)]
+    assert episode.start_ns <= before[0].received_ns
+
+
+def test_the_preroll_reaches_back_as_far_as_asked_and_no_further(
+    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    recorder = make_recorder(preroll_s=5.0)
+    now_ns = make_sample().received_ns
+    old = make_sample(received_ns=now_ns - 6 * 10**9)
+    urdf = make_sample(
+        topic="/robot_description",
+        type_name=schema.STRING,
+        data=b"urdf",
+        received_ns=now_ns - 9 * 10**9,
+    )
+    young = make_sample(received_ns=now_ns - 4 * 10**9)
+    for sample in (urdf, old, young):
+        recorder.receive(sample)
+    recorder.start(info())
+    recorder.stop()
+    assert data_of(episode_of(run)) == [young.data]
+    assert data_of(episode_of(run), "/robot_description") == [b"urdf"]  # kept apart
+
+
+def test_the_preroll_is_bounded_in_bytes(
+    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    recorder = make_recorder(preroll_s=60.0, preroll_mb=1)
+    for number in range(40):
+        recorder.receive(make_sample(data=bytes([number]) * 100_000, type_name="x"))
+    recorder.start(info())
+    assert recorder.stop()["messages"] == 1_000_000 // 100_512
+
+
+def test_a_snapshot_writes_the_preroll_and_keeps_it(
+    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    recorder = make_recorder(preroll_s=30.0)
+    sent = [make_sample() for _ in range(5)]
+    for sample in sent:
+        recorder.receive(sample)
+    for name in ("s1", "s2"):
+        assert recorder.snapshot(info(name))["messages"] == 5
+        assert data_of(episode_of(run, name)) == [sample.data for sample in sent]
+    recorder.start(info())
+    with pytest.raises(LifecycleError, match="'t1' is being recorded"):
+        recorder.snapshot(info("s3"))
+    assert recorder.stop()["messages"] == 5
+
+
+def test_without_a_preroll_there_is_no_snapshot(make_recorder: MakeRecorder) -> None:
+    with pytest.raises(LifecycleError, match="--preroll-s"):
+        make_recorder().snapshot(info())
+
+
+def test_a_refused_start_costs_no_preroll(
+    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    recorder = make_recorder(preroll_s=30.0)
+    recorder.receive(make_sample())
+    (run.episodes_dir / "taken.mcap").write_bytes(b"")
+    with pytest.raises(UsageError, match="exists already"):
+        recorder.start(info("taken"))
+    recorder.start(info())
+    assert recorder.stop()["messages"] == 1
+
+
+def test_a_pause_leaves_messages_out_and_calls_none_of_them_lost(
+    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    recorder = make_recorder()
+    recorder.start(info())
+    kept = [make_sample(sequence=0)]
+    recorder.receive(kept[0])
+    recorder.pause()
+    assert recorder.status()["state"] == "paused"
+    for number in (1, 2, 5, 6):  # 3 and 4 are lost while nobody wants them
+        recorder.receive(make_sample(sequence=number))
+    recorder.receive(make_sample(topic="/tf_static", type_name=schema.TF_MESSAGE, sequence=0))
+    with pytest.raises(LifecycleError, match="paused already"):
+        recorder.pause()
+    recorder.resume()
+    with pytest.raises(LifecycleError, match="not paused"):
+        recorder.resume()
+    recorder.receive(make_sample(sequence=3))  # late: its gap was not counted
+    kept.append(make_sample(sequence=8))
+    recorder.receive(kept[-1])
+    answer = recorder.stop()
+    assert answer["lost"] == 1  # number 7
+    assert len(data_of(episode_of(run))) == 3
+    assert len(data_of(episode_of(run), "/tf_static")) == 1  # still true after the pause
+    assert [event["type"] for event in events(episode_of(run))] == ["paused", "resumed"]
+
+
+def test_stopping_a_paused_episode_finishes_it(make_recorder: MakeRecorder, run: RunFolder) -> None:
+    recorder = make_recorder()
+    recorder.start(info())
+    recorder.pause()
+    recorder.stop()
+    recorder.start(info("t2"))
+    assert recorder.status()["state"] == "recording"
+
+
+def test_a_split_episode_reads_as_one_with_every_message_once(
+    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    recorder = make_recorder(disk=DiskConfig(split_mb=1))
+    recorder.receive(make_sample(topic="/robot_description", type_name=schema.STRING, data=b"urdf"))
+    recorder.start(info())
+    rng = np.random.default_rng(0)
+    sent = []
+    for number in range(48):
+        sent.append(make_sample(data=rng.bytes(99_000), type_name="x"))
+        recorder.receive(sent[-1])
+        if number % 12 == 11:
+            wait_until(lambda number=number: recorder.status()["parts"] == 2 + number // 12)
+    answer = recorder.stop(outcome=Outcome(result="success"))
+    assert (answer["messages"], answer["lost"]) == (48, 0)
+    names = sorted(path.name for path in run.episodes_dir.iterdir())
+    assert names == ["t1.2.mcap", "t1.3.mcap", "t1.4.mcap", "t1.5.mcap", "t1.mcap"]
+    assert answer["parts"] == 5
+    episode = episode_of(run)
+    assert data_of(episode) == [sample.data for sample in sent]
+    assert episode.outcome is not None
+    assert episode.metadata_records["drops"]["received"] == 48
+    for number, path in enumerate(run.parts(run.episodes_dir / "t1.mcap"), start=1):
+        alone = run.path / f"alone{number}.mcap"
+        alone.write_bytes(path.read_bytes())
+        part = Episode.open(alone)  # each stands for itself
+        assert part.info == info()
+        assert part.metadata_records["split"] == {"index": number, "last": number == 5}
+        assert data_of(part, "/robot_description") == [b"urdf"]
+
+
+def test_a_split_by_time_discards_all_its_parts(
+    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    recorder = make_recorder(disk=DiskConfig(split_s=0.05))
+    recorder.start(info())
+    recorder.receive(make_sample())
+    wait_until(lambda: recorder.status()["parts"] >= 3)
+    recorder.stop(discard=True)
+    assert list(run.episodes_dir.iterdir()) == []
+
+
+def test_a_start_beside_later_parts_is_refused(make_recorder: MakeRecorder, run: RunFolder) -> None:
+    (run.episodes_dir / "t1.2.mcap").write_bytes(b"")
+    with pytest.raises(UsageError, match=r"t1\.2\.mcap exists already"):
+        make_recorder().start(info())
+
+
+def test_a_step_of_the_system_clock_is_written_down_and_reorders_nothing(
+    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    shift_ns = 0
+    recorder = make_recorder(wall_ns=lambda: time.time_ns() + shift_ns)
+    recorder.start(info())
+    for count, step_ns in enumerate((3_600 * 10**9, -2 * 3_600 * 10**9), start=1):
+        recorder.receive(make_sample())
+        shift_ns += step_ns
+        wait_until(lambda count=count: recorder.status()["clock_steps"] == count)
+    recorder.receive(make_sample())
+    recorder.stop()
+    episode = episode_of(run)
+    found = [event["data"]["step_ns"] for event in events(episode)]
+    assert [round(step / 1e9) for step in found] == [3_600, -7_200]
+    assert episode.metadata_records["recorder"]["clock_steps_ns"] == found
+    times = [message.log_time_ns for message in episode.messages([JOINTS])]
+    assert times == sorted(times)
+    assert times[-1] - times[0] < 60 * 10**9
+
+
+def test_trimming_a_clock_and_a_stopped_process_are_no_steps() -> None:
+    now_ns, wall_ns = 0, 10**18
+
+    def slow_now() -> int:  # a process stopped between two readings
+        nonlocal now_ns
+        now_ns += stopped_ns
+        return now_ns
+
+    stopped_ns = 0
+    watch = StepWatch(slow_now, wall_ns=lambda: wall_ns)
+    for _ in range(10):
+        now_ns += 10**9
+        wall_ns += 10**9 + 500_000  # 500 ppm fast
+        assert watch.step_ns() == 0
+    stopped_ns = 5 * 10**9
+    assert watch.step_ns() == 0
+
+
+def test_ledger_records_say_how_things_stood(
+    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    recorder = make_recorder()
+    recorder.start(info())
+    for delay_ns in (5_000_000, 3_000_000, 9_000_000):
+        sample = make_sample()
+        recorder.receive(replace(sample, source_ns=sample.received_ns - delay_ns))
+    recorder.stop()
+    records = [json.loads(data) for data in data_of(episode_of(run), schema.DROPS_TOPIC)]
+    mine = [record for record in records if record["topic"] == JOINTS]
+    assert min(record["clock_offset_ns"] for record in mine) == 3_000_000
+    for record in mine:
+        assert record["disk_free_bytes"] > 0
+        assert record["queue_bytes"] >= 0
+    assert episode_of(run).metadata_records["drops"]["clock_offset_ns"] == 3_000_000
+
+
+@pytest.mark.slow
+def test_a_thousand_episodes_leave_no_threads_files_or_memory(
+    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
+) -> None:
+    import gc
+    import os
+    import threading
+
+    def resources() -> tuple[int, int, int]:
+        gc.collect()
+        rss = int(Path("/proc/self/statm").read_text().split()[1])
+        return len(list(Path("/proc/self/fd").iterdir())), threading.active_count(), rss
+
+    recorder = make_recorder(disk=DiskConfig(sync_s=100.0))
+    before = (0, 0, 0)
+    for number in range(1000):
+        recorder.start(info(f"t{number}"))
+        for _ in range(5):
+            recorder.receive(make_sample())
+        recorder.stop(discard=number % 2 == 1)
+        if number == 200:
+            before = resources()
+    files, threads, pages = resources()
+    assert (files, threads) == before[:2]
+    assert (pages - before[2]) * os.sysconf("SC_PAGE_SIZE") < 20e6
+    assert len(run.episodes()) == 500
