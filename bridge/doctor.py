@@ -12,6 +12,9 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "report": ("pandas", "pyarrow", "plotly", "matplotlib"),
     "dashboard": ("starlette", "uvicorn", "jinja2", "rerun-sdk"),
     "standin": ("mujoco", "open3d", "pin", "example-robot-data"),
+    "video": ("av",),
+    "realsense": ("pyrealsense2",),
+    "ur": ("example-robot-data",),
 }
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-HEAVY = ("zenoh", "torch", "open3d", "mujoco", "pybullet", "rerun", "pandas")
+HEAVY = ("pyrealsense2", "zenoh", "torch", "open3d", "mujoco", "pybullet", "rerun", "pandas")
 LIGHT_ROOMS = (
     "bridge",
     "bridge.geometry.se3",
@@ -22,6 +22,7 @@ LIGHT_ROOMS = (
     "bridge.cli.catalogue",
     "bridge.cli.episodes",
     "bridge.cli.live",
+    "bridge.cli.devices",
     "bridge.cli.recording",
     "bridge.cli.imports",
     "twin.cli",

@@ -10,6 +10,8 @@ from bridge.errors import PathNotFoundError
 from bridge.geometry import se3
 from bridge.sources.realsense.errors import MountsError
 
+ROUNDED = 0.01
+"""Quaternions written by hand have few digits; a length this far from one is still a rotation."""
 Mount = tuple[str, Float[np.ndarray, "4 4"]]
 """Parent frame and ``T_parent_color``."""
 
@@ -50,6 +52,6 @@ def _mount(path: Path, name: str, entry: object) -> Mount:
         raise MountsError(path=path, found=f"{name}: {error!r}") from error
     if p_m.shape != (3,) or q_wxyz.shape != (4,) or not parent:
         raise MountsError(path=path, found=f"{name}: wrong number of values")
-    if not (np.isfinite(p_m).all() and abs(np.linalg.norm(q_wxyz) - 1.0) < 1e-3):
+    if not (np.isfinite(p_m).all() and abs(np.linalg.norm(q_wxyz) - 1.0) < ROUNDED):
         raise MountsError(path=path, found=f"{name}: q_wxyz is not a unit quaternion")
     return parent, se3.transform_from(q_wxyz, p_m)
