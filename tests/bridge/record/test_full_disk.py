@@ -1,0 +1,222 @@
+"""A disk that is full, broken or slow: said at once, finished where possible, counted exactly."""
+
+import errno
+import os
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.clock import AnchoredClock
+from bridge.episode.check import check_episode
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.part_file import PartFile
+from bridge.episode.reader import Episode
+from bridge.episode.recover import recover_parts
+from bridge.episode.run import RunFolder
+from bridge.record.config import DiskConfig, RecorderConfig
+from bridge.record.errors import DiskError, NoSpaceError
+from bridge.record.recorder import Recorder
+from bridge.record.reserve import FooterReserve
+from bridge.wire.session import WireSample
+
+MakeSample = Callable[..., WireSample]
+MakeRecorder = Callable[..., Recorder]
+INFO = EpisodeInfo(id="t1", kind="trial")
+RNG = np.random.default_rng(0)
+
+
+@pytest.fixture
+def make_recorder() -> Iterator[MakeRecorder]:
+    made: list[Recorder] = []
+
+    def make(run: RunFolder, **disk: object) -> Recorder:
+        config = RecorderConfig(disk=DiskConfig(**disk))  # type: ignore[arg-type]
+        made.append(Recorder(run, now_ns=AnchoredClock().now_ns, config=config))
+        return made[-1]
+
+    yield make
+    for recorder in made:
+        recorder.close()
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of its own, 12 MB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=12m", "tmpfs", str(place)],
+        capture_output=True,
+        check=False,
+    )
+    if mounted.returncode:
+        pytest.skip("a file system cannot be mounted here (needs root)")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+def fill(recorder: Recorder, make_sample: MakeSample) -> int:
+    """Send until the recorder has had enough; returns how many messages were sent."""
+    for sent in range(1000):
+        if recorder.status()["error"] is not None:
+            return sent
+        recorder.receive(make_sample(topic="/bulk", data=RNG.bytes(60_000), type_name="x"))
+        time.sleep(0.002)
+    raise AssertionError("the disk never filled")
+
+
+def test_a_full_disk_finishes_the_file_and_counts_what_it_could_not_keep(
+    small_disk: Path, make_recorder: MakeRecorder, make_sample: MakeSample
+) -> None:
+    run = RunFolder.create(small_disk / "run")
+    recorder = make_recorder(run, min_free_mb=0, footer_mb=2)
+    recorder.start(INFO)
+    recorder.receive(make_sample())
+    sent = 1 + fill(recorder, make_sample)
+    began_s = time.monotonic()
+    assert recorder.failed.wait(5.0)
+    assert time.monotonic() - began_s < 1.0
+    status = recorder.status()
+    assert status["state"] == "failed"
+    assert "No space left on device" in status["error"]
+    assert "was finished" in status["error"]
+    with pytest.raises(DiskError, match="Free some space"):
+        recorder.start(EpisodeInfo(id="t2", kind="trial"))
+    assert [path.name for path in run.episodes_dir.iterdir()] == ["t1.mcap"]
+    path = run.episodes_dir / "t1.mcap"
+    assert check_episode(path).faults == []
+    episode = Episode.open(path)
+    drops = episode.metadata_records["drops"]
+    # One may have been on its way when the end was decided: it is of no episode.
+    assert sent - 1 <= drops["received"] + drops["queue_drops"] <= sent
+    written = sum(1 for _ in episode.messages(["/cell/joint_states", "/bulk"]))
+    assert written == drops["received"]
+    assert "No space left" in episode.metadata_records["recorder"]["stopped_by"]
+
+
+def test_an_episode_ends_before_the_last_free_space_is_used(
+    small_disk: Path, make_recorder: MakeRecorder, make_sample: MakeSample
+) -> None:
+    run = RunFolder.create(small_disk / "run")
+    recorder = make_recorder(run, min_free_mb=6, footer_mb=1)
+    recorder.start(INFO)
+    sent = 0
+    end_s = time.monotonic() + 20.0
+    while not recorder.failed.is_set():
+        assert time.monotonic() < end_s
+        recorder.receive(make_sample(topic="/bulk", data=RNG.bytes(60_000), type_name="x"))
+        sent += 1
+        time.sleep(0.02)
+    assert "must be left" in recorder.status()["error"]
+    assert check_episode(run.episodes_dir / "t1.mcap").faults == []
+    received = Episode.open(run.episodes_dir / "t1.mcap").metadata_records["drops"]["received"]
+    assert sent - 3 <= received <= sent  # what came after the decision is of no episode
+
+
+def test_a_start_without_space_is_refused(
+    small_disk: Path, make_recorder: MakeRecorder, make_sample: MakeSample
+) -> None:
+    run = RunFolder.create(small_disk / "run")
+    with pytest.raises(NoSpaceError, match=r"\d\d MB free, and 500 MB must be left"):
+        make_recorder(run).start(INFO)
+    with pytest.raises(NoSpaceError, match="--footer-mb"):
+        make_recorder(run, min_free_mb=0, footer_mb=50).start(INFO)
+    recorder = make_recorder(run, min_free_mb=1, footer_mb=2)
+    recorder.start(INFO)
+    recorder.receive(make_sample())
+    assert recorder.stop()["messages"] == 1
+
+
+def test_the_space_held_back_has_no_name_and_comes_back(small_disk: Path) -> None:
+    def used_mb() -> float:
+        found = os.statvfs(small_disk)
+        return (found.f_blocks - found.f_bfree) * found.f_frsize / 1e6
+
+    reserve = FooterReserve(small_disk, 5)
+    reserve.hold()
+    reserve.hold()
+    assert 4.9 < used_mb() < 5.2
+    assert list(small_disk.iterdir()) == []
+    reserve.release()
+    reserve.release()
+    assert used_mb() < 0.1
+
+
+def test_a_broken_disk_leaves_a_part_that_can_be_recovered(
+    run: RunFolder,
+    make_recorder: MakeRecorder,
+    make_sample: MakeSample,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    recorder = make_recorder(run, flush_s=0.05)
+    recorder.start(INFO)
+    for _ in range(20):
+        recorder.receive(make_sample())
+    time.sleep(0.3)
+
+    def broken(*_: object, **__: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(PartFile, "append", broken)
+    recorder.receive(make_sample())
+    assert recorder.failed.wait(5.0)
+    assert "Input/output error" in recorder.status()["error"]
+    assert "robot-gst recover" in recorder.status()["error"]
+    recorder.close()
+    monkeypatch.undo()
+    assert [path.name for path in run.episodes_dir.iterdir()] == ["t1.mcap.part"]
+    [report] = recover_parts(run)
+    assert report.topics["/cell/joint_states"] == 20
+
+
+def test_a_status_answers_while_the_disk_hangs(
+    run: RunFolder,
+    make_recorder: MakeRecorder,
+    make_sample: MakeSample,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gate = threading.Event()
+    close = PartFile.publish
+
+    def slow(self: PartFile, path: Path) -> None:
+        gate.wait(10.0)
+        close(self, path)
+
+    monkeypatch.setattr(PartFile, "publish", slow)
+    recorder = make_recorder(run)
+    recorder.start(INFO)
+    stopping = threading.Thread(target=recorder.stop)
+    stopping.start()
+    end_s = time.monotonic() + 10.0
+    while recorder.status()["stalled_s"] < 1.0:
+        began_s = time.monotonic()
+        state = recorder.status()["state"]
+        assert time.monotonic() - began_s < 0.5
+        assert time.monotonic() < end_s
+        time.sleep(0.05)
+    assert state == "finishing"
+    for _ in range(100):
+        recorder.receive(make_sample())
+    gate.set()
+    stopping.join(10.0)
+    assert recorder.status()["state"] == "idle"
+
+
+def test_two_recorders_in_one_folder_cannot_write_one_episode(
+    run: RunFolder, make_recorder: MakeRecorder, make_sample: MakeSample
+) -> None:
+    first, second = make_recorder(run), make_recorder(run)
+    first.start(INFO)
+    with pytest.raises(Exception, match="being written"):
+        second.start(INFO)
+    assert recover_parts(run) == []  # the file is alive
+    second.start(EpisodeInfo(id="t2", kind="trial"))
+    for recorder in (first, second):
+        recorder.receive(make_sample())
+        assert recorder.stop()["messages"] == 1
+    assert [path.name for path in run.episodes()] == ["t1.mcap", "t2.mcap"]
