@@ -4,11 +4,15 @@ The walk believes neither summary nor index; they are compared with what it find
 record at a time, and the index.
 """
 
+import struct
 import zlib
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import UInt64
 from mcap import records
 
 from bridge.episode import mcap_format
@@ -33,7 +37,9 @@ from bridge.episode.mcap_walk import (
 )
 from bridge.episode.rebuild import attachment_entry, chunk_entry
 
-_STREAMED = (mcap_format.ATTACHMENT,)
+_INDEX_HEAD = struct.Struct("<HI")
+NEVER = 1 << 64
+"""After every log time there can be."""
 
 
 class Faults:
@@ -72,7 +78,8 @@ class FileCheck:
         self.library = ""
         self._crc = 0
         self._chunk: records.ChunkIndex | None = None
-        self._chunk_entries: dict[int, list[tuple[int, int]]] = {}
+        self._entries: dict[int, array[int]] = {}
+        """By channel: log time and offset of its messages in the chunk, one after the other."""
         self._indexed: set[int] = set()
 
     def _fault(self, text: str) -> None:
@@ -106,7 +113,7 @@ class FileCheck:
                 self._end_chunk()
                 self._check_data_end(stream, place)
                 ended = True
-            elif place.opcode in _STREAMED:
+            elif place.opcode == mcap_format.ATTACHMENT:
                 self._add_attachment(stream, place)
             else:
                 body = read_body(stream, place)
@@ -128,7 +135,7 @@ class FileCheck:
         elif place.opcode == mcap_format.CHUNK:
             yield from self._walk_chunk(place, body)
         elif place.opcode == mcap_format.MESSAGE_INDEX:
-            self._check_index(place, parse(place.opcode, body))
+            self._check_index(place, body)
         else:
             self._define(place, parse(place.opcode, body))
 
@@ -151,47 +158,55 @@ class FileCheck:
         chunk = parse_chunk(body)
         self._chunk = chunk_entry(place, chunk)
         data = unpack_chunk(chunk, whose=whose)
-        entries = self._chunk_entries
+        first_ns, last_ns = NEVER, 0
         for opcode, at, length in records_in(data):
             start = at + RECORD_HEAD.size
             if opcode == MESSAGE:
                 head = message_head(data, at, at)
-                entries.setdefault(head.channel_id, []).append((head.log_time_ns, at))
+                first_ns = min(first_ns, head.log_time_ns)
+                last_ns = max(last_ns, head.log_time_ns)
+                self._note(head)
                 payload = at + MESSAGE_HEAD.size
                 yield from self._message(head, data[payload : start + length])
             else:
                 self._define(Place(opcode, at, length), parse(opcode, data[start : start + length]))
-        times = [time for of_channel in entries.values() for time, _ in of_channel]
-        found = (min(times), max(times)) if times else (0, 0)
+        found = (first_ns, last_ns) if self._entries else (0, 0)
         if found != (chunk.start_ns, chunk.end_ns):
             said = (chunk.start_ns, chunk.end_ns)
             self._fault(f"{whose} says its messages are from {said}, they are from {found}")
 
-    def _check_index(self, place: Place, record: records.McapRecord | None) -> None:
-        if not isinstance(record, records.MessageIndex):
-            return
+    def _note(self, head: MessageHead) -> None:
+        entries = self._entries.get(head.channel_id)
+        if entries is None:
+            entries = self._entries[head.channel_id] = array("Q")
+        entries.append(head.log_time_ns)
+        entries.append(head.at)
+
+    def _check_index(self, place: Place, body: bytes) -> None:
+        channel_id, said = _index_entries(body)
         if self._chunk is None:
             self._fault(f"the message index at byte {place.offset} follows no chunk")
             return
-        self._chunk.message_index_offsets[record.channel_id] = place.offset
+        self._chunk.message_index_offsets[channel_id] = place.offset
         self._chunk.message_index_length += place.end - place.offset
-        self._indexed.add(record.channel_id)
-        if sorted(record.records) != sorted(self._chunk_entries.get(record.channel_id, [])):
+        self._indexed.add(channel_id)
+        found = np.array(self._entries.get(channel_id, ()), dtype=np.uint64).reshape(-1, 2)
+        if not np.array_equal(_in_order(said), _in_order(found)):
             self._fault(
                 f"the message index at byte {place.offset} does not point at the messages of "
-                f"channel {record.channel_id} in its chunk"
+                f"channel {channel_id} in its chunk"
             )
 
     def _end_chunk(self) -> None:
         if self._chunk is None:
             return
-        absent = self._chunk_entries.keys() - self._indexed
+        absent = self._entries.keys() - self._indexed
         if self._indexed and absent:
             at = self._chunk.chunk_start_offset
             self._fault(f"the chunk at byte {at} has no index of channels {sorted(absent)}")
         self.seen.chunks.append(self._chunk)
         self._chunk = None
-        self._chunk_entries = {}
+        self._entries = {}
         self._indexed = set()
 
     def _add_attachment(self, stream: ByteStream, place: Place) -> None:
@@ -214,3 +229,20 @@ class FileCheck:
         record = parse(place.opcode, read_body(stream, place))
         if isinstance(record, records.DataEnd) and record.data_section_crc not in (0, self._crc):
             self._fault("its data has another CRC than it declares")
+
+
+def _index_entries(body: bytes) -> tuple[int, UInt64[np.ndarray, "entries 2"]]:
+    """Read a message index: its channel, and log time and offset of each message."""
+    if len(body) < _INDEX_HEAD.size:
+        message = f"a message index of {len(body)} bytes"
+        raise BrokenRecordError(message)
+    channel_id, length = _INDEX_HEAD.unpack_from(body)
+    if length % 16 or length > len(body) - _INDEX_HEAD.size:
+        message = f"a message index of {len(body)} bytes claims {length} bytes of entries"
+        raise BrokenRecordError(message)
+    entries = np.frombuffer(body, dtype="<u8", count=length // 8, offset=_INDEX_HEAD.size)
+    return channel_id, entries.astype(np.uint64).reshape(-1, 2)
+
+
+def _in_order(entries: UInt64[np.ndarray, "entries 2"]) -> UInt64[np.ndarray, "entries 2"]:
+    return entries[np.lexsort((entries[:, 1], entries[:, 0]))]

@@ -75,7 +75,7 @@ def walk(stream: ByteStream, start: int, end: int) -> Iterator[Place]:
     """Yield the places of all records between two offsets; the stream may be used in between.
 
     Raises:
-        BrokenRecordError: When a record claims more bytes than are left.
+        BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
     """
     at = start
     while at < end:
@@ -86,6 +86,9 @@ def walk(stream: ByteStream, start: int, end: int) -> Iterator[Place]:
             raise BrokenRecordError(message)
         opcode, length = RECORD_HEAD.unpack(head)
         place = Place(opcode, at, length)
+        if opcode == 0:
+            message = f"the record at byte {at} is of kind 0, which there is not"
+            raise BrokenRecordError(message)
         if place.end > end:
             message = f"the record at byte {at} claims {place.length} bytes, {end - at} are left"
             raise BrokenRecordError(message)
@@ -238,7 +241,7 @@ def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, offset and body length of each record in a chunk's unpacked data.
 
     Raises:
-        BrokenRecordError: When a record claims more bytes than are left.
+        BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
     """
     at, end = 0, len(data)
     head_bytes, unpack = RECORD_HEAD.size, RECORD_HEAD.unpack_from
@@ -248,8 +251,8 @@ def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
             raise BrokenRecordError(message)
         opcode, length = unpack(data, at)
         after = at + head_bytes + length
-        if after > end or (opcode == MESSAGE and length < MESSAGE_FIELDS):
-            message = f"a record in a chunk claims {length} bytes, {end - at} are left"
+        if after > end or opcode == 0 or (opcode == MESSAGE and length < MESSAGE_FIELDS):
+            message = f"a record of kind {opcode} in a chunk claims {length} of {end - at} bytes"
             raise BrokenRecordError(message)
         yield opcode, at, length
         at = after

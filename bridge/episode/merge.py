@@ -6,6 +6,7 @@ would pass ``MEMORY_BYTES``, the one needed last is forgotten and unpacked again
 """
 
 import heapq
+from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -113,12 +114,12 @@ class _Chunk:
         self.next_ns: int = index.message_start_time
         self.is_done = False
         self._data = b""
-        self._heads: list[MessageHead] | None = None
+        self._wanted: _Wanted | None = None
         self._position = 0
 
     @property
     def is_loaded(self) -> bool:
-        return self._heads is not None
+        return self._wanted is not None
 
     def load(self) -> None:
         stream = self.file.stream()
@@ -129,45 +130,60 @@ class _Chunk:
         chunk = parse_chunk(read_body(stream, place))
         self._data = unpack_chunk(chunk, whose=f"the chunk at byte {self.offset}")
         self.size = len(self._data)
-        self._heads = _heads_in(self._data, self.file)
-        self._look_ahead(self._heads)
+        self._wanted = _wanted_in(self._data, self.file)
+        self._look_ahead()
 
     def unload(self) -> None:
-        self._data, self._heads = b"", None
+        self._data, self._wanted = b"", None
 
-    def _look_ahead(self, heads: list[MessageHead]) -> None:
-        self.is_done = self._position >= len(heads)
+    def _look_ahead(self) -> None:
+        times_ns = self._wanted.times_ns if self._wanted else ()
+        self.is_done = self._position >= len(times_ns)
         if not self.is_done:
-            self.next_ns = heads[self._position].log_time_ns
+            self.next_ns = int(times_ns[self._position])
 
     def take_until(self, limit_ns: int, wins_tie: bool) -> Iterator[tuple[MessageHead, bytes]]:
         """Yield messages before the limit, or at it where this chunk comes first."""
-        heads, data, position = self._heads or [], self._data, self._position
-        while position < len(heads):
-            head = heads[position]
-            if head.log_time_ns >= limit_ns and (head.log_time_ns > limit_ns or not wins_tie):
+        data, wanted, position = self._data, self._wanted or _Wanted(), self._position
+        times_ns, places = wanted.times_ns, wanted.places
+        while position < len(times_ns):
+            time_ns = times_ns[position]
+            if time_ns >= limit_ns and (time_ns > limit_ns or not wins_tie):
                 break
+            at = places[position]
             position += 1
-            start = head.at + MESSAGE_HEAD.size
+            head = message_head(data, at, at)
+            start = at + MESSAGE_HEAD.size
             yield head, data[start : start + head.length]
         self._position = position
-        self._look_ahead(heads)
+        self._look_ahead()
 
 
-def _heads_in(data: bytes, file: _OpenFile) -> list[MessageHead]:
-    heads = []
+class _Wanted(NamedTuple):
+    """Wanted messages of one chunk in log order. 16 bytes each, however many there are."""
+
+    times_ns: array = array("Q")  # type: ignore[type-arg]
+    places: array = array("Q")  # type: ignore[type-arg]
+
+
+def _wanted_in(data: bytes, file: _OpenFile) -> _Wanted:
+    times_ns, places = array("Q"), array("Q")
     in_order, before = True, -1
     for opcode, at, _ in records_in(data):
         if opcode != MESSAGE:
             continue
-        head = message_head(data, at, at)
-        if file.wants(head.channel_id, head.log_time_ns):
-            heads.append(head)
-            in_order = in_order and head.log_time_ns >= before
-            before = head.log_time_ns
-    if not in_order:
-        heads.sort(key=lambda head: head.log_time_ns)
-    return heads
+        _, _, channel_id, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(data, at)
+        if file.wants(channel_id, log_time_ns):
+            times_ns.append(log_time_ns)
+            places.append(at)
+            in_order = in_order and log_time_ns >= before
+            before = log_time_ns
+    if in_order:
+        return _Wanted(times_ns, places)
+    unsorted = np.frombuffer(times_ns, dtype=np.uint64)
+    order = np.argsort(unsorted, kind="stable")
+    by_time = array("Q", unsorted[order].tobytes())
+    return _Wanted(by_time, array("Q", np.frombuffer(places, dtype=np.uint64)[order].tobytes()))
 
 
 class _Loose:

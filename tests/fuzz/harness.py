@@ -1,8 +1,9 @@
 """Feed bytes made by libFuzzer to everything that reads bytes of unknown origin.
 
 Run it for long by hand: ``TMPDIR=/dev/shm python tests/fuzz/harness.py read CORPUS
--max_total_time=3600``; the corpus folder is made and seeded where needed. Whatever is raised beyond ``GstError``, a hang
-(``-timeout``) and memory beyond ``LIMIT_BYTES`` end the run with the input kept in ``crash-*``.
+-max_total_time=3600``; the corpus folder is made and seeded where needed. Whatever is raised
+beyond ``GstError``, a hang (``-timeout``) and memory beyond ``LIMIT_BYTES`` end the run with the
+input kept in ``crash-*``.
 """
 
 import contextlib
