@@ -32,8 +32,9 @@ class _Chosen(NamedTuple):
 
 
 def serial_of(device: Any) -> str:
-    """Serial number of a device, as printed on it."""
-    return str(device.get_info(rs.camera_info.serial_number))
+    """Serial number of a device, as printed on it; one in recovery mode does not tell."""
+    known = device.supports(rs.camera_info.serial_number)
+    return str(device.get_info(rs.camera_info.serial_number)) if known else "(recovery mode)"
 
 
 def describe_device(device: Any) -> str:

@@ -90,10 +90,11 @@ class CameraWorker:
             opened = CameraDevice(
                 device, self._config, camera=self.camera, now_ns=self._session.now_ns
             )
-        except CameraStreamError as error:
+        except (CameraStreamError, RuntimeError) as error:  # the library raises the latter
+            problem = self._problem(error)
             if not self.connections:
-                raise
-            self._output.detail(f"{error} Trying again.")
+                raise problem from error
+            self._output.detail(f"{problem} Trying again.")
             return None
         self.connections += 1
         facts = self._messages.facts(opened.calibration, self._mount, self._session.now_ns())
@@ -103,10 +104,23 @@ class CameraWorker:
         self._output.say(f"camera {self.camera} ({describe_device(device)}): streaming{note}")
         return opened
 
+    def _problem(self, error: Exception) -> CameraStreamError:
+        if isinstance(error, CameraStreamError):
+            return error
+        return CameraStreamError(
+            camera=f"{self.camera} ({self._serial})",
+            found=f"the driver says: {error}",
+            hint="Unplug it and plug it in again.",
+        )
+
     def _stream(self, device: CameraDevice, stop: threading.Event) -> None:
         silent_s = 0.0
         while not stop.is_set():
-            frames = device.read(POLL_S)
+            try:
+                frames = device.read(POLL_S)
+            except RuntimeError as error:
+                self._output.say(f"{self._problem(error)} Waiting for it to come back.")
+                return
             silent_s = silent_s + POLL_S if frames is None else 0.0
             if silent_s >= STALL_S:
                 self._output.say(

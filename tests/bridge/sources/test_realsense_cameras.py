@@ -348,6 +348,31 @@ def test_a_failure_at_the_start_ends_the_command(joined: Joined) -> None:
     running._sub.close()
 
 
+class Flaky:
+    """A device that goes away while it is being opened."""
+
+    def __init__(self, device: Any) -> None:
+        """Take the place of a device."""
+        self._device = device
+        self.gone = True
+
+    def __getattr__(self, name: str) -> Any:
+        """Answer as the device does, until its sensors are asked for."""
+        if name == "query_sensors" and self.gone:
+            message = "failed to open USB interface"
+            raise RuntimeError(message)
+        return getattr(self._device, name)
+
+
+def test_a_driver_that_fails_is_one_sentence(joined: Joined) -> None:
+    camera = SoftwareCamera(serial="9")
+    running = Running(joined, PLAIN, lambda: [Flaky(camera.device)])
+    running._thread.join(timeout=ANSWER_S)
+    running._sub.close()
+    assert isinstance(running.error, CameraStreamError)
+    assert "camera (9): the driver says: failed to open USB interface. Unplug" in str(running.error)
+
+
 def test_colour_types_are_declared(joined: Joined) -> None:
     from bridge.sources.realsense.messages import CameraMessages
 
