@@ -20,6 +20,8 @@ class Qos:
     """Which of zenoh's queues carries it, by its name there; a full queue delays no other one."""
     shared_memory: bool = False
     """Large messages go through shared memory when the session has some."""
+    is_remote: bool = False
+    """Subscribers of the same session get none, and do not count as somebody who looks."""
 
     CAMERA: ClassVar["Qos"]
     """Images: many bytes, each worth little; the newest frame is never worth a stall."""
@@ -34,4 +36,4 @@ class Qos:
 Qos.CAMERA = Qos(name="camera", block=False, priority="data_low", shared_memory=True)
 Qos.CONTROL = Qos(name="control", block=False, priority="real_time")
 Qos.RELIABLE = Qos(name="reliable", block=True, priority="data")
-Qos.PREVIEW = Qos(name="preview", block=False, priority="background")
+Qos.PREVIEW = Qos(name="preview", block=False, priority="background", is_remote=True)

@@ -94,6 +94,7 @@ class WireSession:
                 encoding=encoding,
                 congestion_control=control.BLOCK if qos.block else control.DROP,
                 priority=getattr(zenoh.Priority, qos.priority.upper()),
+                allowed_destination=zenoh.Locality.REMOTE if qos.is_remote else zenoh.Locality.ANY,
             )
         except zenoh.ZError as error:
             raise BadTopicError(topic=topic, found=cause_of(error)) from error

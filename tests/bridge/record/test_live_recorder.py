@@ -1,0 +1,185 @@
+"""The recorder on the wire: from Python, with status, liveliness, previews and departures."""
+
+import json
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.episode import schema
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.records import CompressedColor
+from bridge.episode.run import RunFolder
+from bridge.episode.writer import EpisodeWriter, WriterConfig
+from bridge.errors import UsageError
+from bridge.media.color import decode_color, encode_jpeg
+from bridge.record.config import RecorderConfig
+from bridge.record.live import LiveRecorder, open_recorder
+from bridge.task.record import parse_record
+from bridge.wire.config import WireConfig
+from bridge.wire.recorder_client import RecorderClient
+from bridge.wire.session import WireSample, WireSession, open_session
+
+WAIT_S = 10.0
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def wire(endpoint: str) -> WireConfig:
+    return WireConfig(mode="router", connect=(), listen=(endpoint,))
+
+
+@pytest.fixture
+def live(tmp_path: Path, wire: WireConfig) -> Iterator[LiveRecorder]:
+    with open_recorder(tmp_path / "run", wire=wire, config=RecorderConfig(preroll_s=9.0)) as made:
+        yield made
+
+
+@pytest.fixture
+def client(live: LiveRecorder, endpoint: str) -> Iterator[WireSession]:
+    with open_session(WireConfig(connect=(endpoint,))) as session:
+        yield session
+
+
+def wait_for(is_so: Callable[[], object]) -> None:
+    end_s = time.monotonic() + WAIT_S
+    while not is_so():
+        assert time.monotonic() < end_s, "it never came"
+        time.sleep(0.02)
+
+
+def test_recording_from_python(tmp_path: Path, wire: WireConfig, endpoint: str) -> None:
+    with open_recorder(tmp_path / "run", wire=wire) as recorder:
+        recorder.start("t1", task="cube", operator="ada", tags=("x",), cell="lab")
+        with open_session(WireConfig(connect=(endpoint,))) as session:
+            publisher = session.publisher("/lab/note", "odd/Type")
+            publisher.put(b"1", source_ns=1)
+            wait_for(lambda: recorder.status()["messages"] == 1)
+        recorder.mark("here")
+        recorder.pause()
+        recorder.resume()
+        answer = recorder.stop(result="success", detail="well done")
+        assert (answer["messages"], answer["lost"]) == (1, 0)
+        recorder.label("failure", episode="t1")
+        with pytest.raises(UsageError, match="info does not know taks"):
+            recorder.start("t2", taks="typo")
+        recorder.start("t2")
+    run = RunFolder.open(tmp_path / "run")
+    assert [path.name for path in run.episodes()] == ["t1.mcap", "t2.mcap"]  # t2 was finished
+    episode = Episode.open(run.episodes()[0])
+    assert (episode.info.operator, episode.info.tags) == ("ada", ("x",))
+    assert episode.outcome is not None
+    assert episode.outcome.detail == "well done"
+
+
+def test_the_status_is_published_and_fits_its_schema(
+    live: LiveRecorder, client: WireSession
+) -> None:
+    got: list[WireSample] = []
+    client.subscribe("rec/main/status", got.append)
+    live.start("t1")
+    publisher = client.publisher("/lab/event", schema.EVENT)
+    publisher.put(b"{}", source_ns=time.time_ns())
+    wait_for(lambda: any(b'"messages": 1' in sample.data for sample in got))
+    status = parse_record(got[-1].data, name="status", package="bridge.episode")
+    assert (status["state"], status["episode"]) == ("recording", "t1")
+    assert status["topics"]["/lab/event"]["received"] == 1
+    assert abs(status["topics"]["/lab/event"]["clock_offset_ns"]) < 10**9
+    assert {"rates_hz", "disk_free_bytes", "recovered", "ros2_warnings"} <= set(status)
+    assert not any(topic.startswith("/rec/") for topic in status["seen"])
+
+
+def test_the_recorder_is_seen_while_it_lives(
+    tmp_path: Path, wire: WireConfig, endpoint: str
+) -> None:
+    with open_session(wire) as router:
+        config = WireConfig(connect=(endpoint,))
+        with open_recorder(tmp_path / "run", wire=config):
+            wait_for(lambda: router.query_alive("rec/*/alive") == ["rec/main/alive"])
+        wait_for(lambda: router.query_alive("rec/*/alive") == [])
+
+
+def test_every_command_is_answered_over_the_wire(live: LiveRecorder, client: WireSession) -> None:
+    ask = RecorderClient(client, timeout_s=WAIT_S).ask
+    client.publisher("/lab/x", "odd/Type").put(b"1", source_ns=1)
+    wait_for(lambda: "/lab/x" in live.status()["seen"])
+    assert ask("snapshot", {"id": "s1"})["messages"] == 1
+    ask("start", {"id": "t1", "info": {"task": "cube"}})
+    assert ask("pause", {})["ok"]
+    assert ask("status", {})["state"] == "paused"
+    assert ask("resume", {})["ok"]
+    ask("stop", {"outcome": {"result": "failure"}})
+    listed = ask("list", {})
+    found = [(item["id"], item["task"], item["outcome"]) for item in listed["episodes"]]
+    assert found == [("s1", "", "unknown"), ("t1", "cube", "failure")]
+    assert [item["id"] for item in ask("list", {"last": 1})["episodes"]] == ["t1"]
+    with pytest.raises(Exception, match="last must be a whole number"):
+        ask("list", {"last": 0})
+
+
+def test_a_preview_is_made_only_while_somebody_looks(
+    live: LiveRecorder, client: WireSession
+) -> None:
+    got: list[WireSample] = []
+    pixels = np.full((480, 640, 3), 90, np.uint8)
+    message = CompressedColor(stamp_ns=5, frame_id="c", format="jpeg", data=encode_jpeg(pixels))
+    publisher = client.publisher("/lab/cam/eye/color/image", schema.COMPRESSED_IMAGE)
+    publisher.put(message.to_cdr(), source_ns=1)
+    wait_for(lambda: "/lab/cam/eye/color/image" in live.status()["seen"])
+    assert live.core.intake.watched == frozenset()
+    looking = client.subscribe("rec/main/preview/eye", got.append)
+    wait_for(lambda: live.core.intake.watched)
+    publisher.put(message.to_cdr(), source_ns=1)
+    wait_for(lambda: got)
+    assert decode_color(CompressedColor.from_cdr(got[0].data).data).shape == (240, 320, 3)
+    looking.close()
+    wait_for(lambda: not live.core.intake.watched)
+
+
+def test_what_a_departed_source_said_is_not_repeated(
+    live: LiveRecorder, client: WireSession, endpoint: str
+) -> None:
+    client.publisher("/tf_static", schema.TF_MESSAGE).put(b"", source_ns=1)
+    with open_session(WireConfig(connect=(endpoint,))) as source:
+        source.declare_alive("lab/alive")
+        source.publisher("/lab/cam/a/color/info", schema.CAMERA_INFO).put(b"x", source_ns=1)
+        wait_for(lambda: len(live.status()["seen"]) == 2)
+        live.start("t1")
+        live.stop()
+    wait_for(lambda: len(live.core._life.latched.all()) == 1)
+    live.start("t2")
+    live.stop()
+    topics = [
+        set(Episode.open(live.run.episodes_dir / f"{name}.mcap").topics()) for name in ("t1", "t2")
+    ]
+    assert "/lab/cam/a/color/info" in topics[0]
+    assert "/lab/cam/a/color/info" not in topics[1]
+    assert "/tf_static" in topics[1]  # of a source that declared nothing: still true
+
+
+def test_what_a_crash_left_is_recovered_and_said(tmp_path: Path, wire: WireConfig) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    writer = EpisodeWriter(run.episodes_dir / "old.mcap", config=WriterConfig(flush_s=0.01))
+    writer.describe(EpisodeInfo(id="old", kind="trial"))
+    for number in range(10):
+        writer.write_json("/a/event", {}, type_name=schema.EVENT, log_time_ns=number)
+    time.sleep(0.02)
+    writer.tick()
+    writer.abandon()
+    said: list[str] = []
+    with open_recorder(run.path, wire=wire, say=said.append) as recorder:
+        [report] = recorder.status()["recovered"]
+    assert (report["output"], report["messages"]) == ("old.mcap", 10)
+    assert said[0].startswith("recovered old.mcap: 10 messages")
+    assert Episode.open(run.episodes_dir / "old.mcap").info.id == "old"
+    assert json.dumps(report)
