@@ -48,7 +48,7 @@ class Output:
         if self.json:
             sys.stdout.write(json.dumps(data, indent=2, default=str) + "\n")
         else:
-            sys.stdout.write(text.rstrip("\n") + "\n")
+            sys.stdout.write(printable(text.rstrip("\n")) + "\n")
         sys.stdout.flush()
 
     @contextmanager
@@ -60,6 +60,13 @@ class Output:
             yield from _bar(label, total)
         else:
             yield from _plain(label, total)
+
+
+def printable(text: str) -> str:
+    """Keep text of other programs from moving the cursor; line breaks and tabs stay."""
+    if text.isprintable():
+        return text
+    return "".join(sign if sign.isprintable() or sign in "\n\t" else "?" for sign in text)
 
 
 def _err() -> Console:

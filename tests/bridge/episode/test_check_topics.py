@@ -247,6 +247,17 @@ def test_an_unfinished_file_named_alone_is_no_success(
     assert "robot-gst recover" in capsys.readouterr().err
 
 
+def test_names_of_other_programs_do_not_move_the_cursor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = foreign(tmp_path / "x.mcap", "/a\x1b[2J\r", schema.JOINT_STATE, b"no CDR")
+    assert robot_gst.run(["info", str(path)]) == 0
+    assert robot_gst.run(["check", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert "/a?[2J?" in said
+    assert "\x1b" not in said
+
+
 @pytest.mark.slow
 def test_rerun_gives_a_second_opinion(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
