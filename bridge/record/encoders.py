@@ -23,6 +23,7 @@ from bridge.record.config import RecorderConfig
 from bridge.record.entries import Item
 from bridge.record.inspection import GOOD, Finding, fits, inspect
 from bridge.record.shedding import REDUCED_QUALITY, Shed
+from bridge.record.video import VideoStreams
 from bridge.wire.session import WireSample
 
 MAX_THREADS = 32
@@ -36,14 +37,26 @@ class ImageEncoder:
     """Turns raw images into what an episode holds."""
 
     def __init__(self, config: RecorderConfig, shed: Callable[[], Shed]) -> None:
-        """Choose the profile; ``shed`` says how far shedding has gone."""
+        """Choose the profile; ``shed`` says how far shedding has gone.
+
+        Raises:
+            MissingDependencyError: When a preview video is wanted and PyAV is not installed.
+        """
         self._config = config
         self._shed = shed
+        self._video = VideoStreams() if config.preview_video else None
         self.kinds: dict[str, str] = {}
         """color or depth, for each image topic seen."""
 
     def encode(self, item: Item) -> None:
         """Replace the item's message where the profile asks for it; flag what is broken."""
+        original = item.sample
+        self._look_and_transcode(item)
+        is_good_color = item.finding is GOOD and self.kinds.get(original.topic) == "color"
+        if self._video is not None and is_good_color and self._shed() < Shed.PREVIEWS:
+            item.extra = self._video.frame(original)
+
+    def _look_and_transcode(self, item: Item) -> None:
         sample = item.sample
         if item.type_name != schema.IMAGE or sample.message_encoding not in ("", "cdr"):
             item.finding = inspect(item.type_name, sample.message_encoding, sample.data)

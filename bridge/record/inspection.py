@@ -12,6 +12,7 @@ from functools import lru_cache
 
 from bridge.episode import cdr, schema
 from bridge.episode.transcode import DEPTH_ENCODINGS, ImageHeader, image_header
+from bridge.episode.video import VideoFrame
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _TAIL_BYTES = 64
@@ -49,10 +50,20 @@ def inspector(type_name: str, message_encoding: str) -> Callable[[bytes], Findin
         return lambda data: Finding.UNKNOWN_TYPE
     if message_encoding not in ("", known.message_encoding):
         return lambda data: Finding.UNDECODABLE
-    if known.message_encoding != "cdr":
+    if known.message_encoding == "cdr":
+        return lambda data: _inspect_cdr(type_name, data)
+    if known.message_encoding == "json":
         version = schema.json_schema_version(type_name)
         return lambda data: _inspect_json(version, data)
-    return lambda data: _inspect_cdr(type_name, data)
+    return _inspect_video
+
+
+def _inspect_video(data: bytes) -> Finding:
+    try:
+        VideoFrame.from_protobuf(data)
+    except cdr.MalformedMessageError:
+        return Finding.UNDECODABLE
+    return GOOD
 
 
 def _inspect_cdr(type_name: str, data: bytes) -> Finding:

@@ -101,6 +101,12 @@ class Take:
             raise
         self.ledger.count_received(item, finding)
 
+    def write_beside(self, sample: WireSample) -> None:
+        """Append something the recorder made itself; it is in no account."""
+        channel = self._channels.of(sample, sample.type_name)
+        if channel is not None:
+            self._append(channel, sample, sample.received_ns)
+
     def _append(self, channel: Channel, sample: WireSample, stamp_ns: int) -> None:
         log_ns = channel.later(stamp_ns)
         source_ns = sample.source_ns
