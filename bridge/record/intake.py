@@ -35,6 +35,8 @@ class Flow:
     type_name: str
     is_image: bool
     is_latched: bool
+    is_ledger: bool
+    """The topic on which a recorder says what it lost; nobody else may."""
     seen: int = 0
     second: int = 0
     in_second: int = 0
@@ -130,7 +132,14 @@ class Intake:
         if len(self._flows) >= self._limits.max_topics:
             del self._flows[next(iter(self._flows))]
         type_name = resolve_type(sample.topic, sample.type_name)
-        flow = Flow(sample.topic, type_name, type_name in IMAGE_TYPES, is_latched(sample.topic))
+        topic = sample.topic
+        flow = Flow(
+            topic,
+            type_name,
+            is_image=type_name in IMAGE_TYPES,
+            is_latched=is_latched(topic),
+            is_ledger=topic == schema.DROPS_TOPIC,
+        )
         self._flows[sample.topic, sample.type_name] = flow
         return flow
 
@@ -146,6 +155,8 @@ class Intake:
             self._drop(sample, step, f"over {self._limits.max_rate_hz} messages a second")
         elif cost - OVERHEAD_BYTES > self._max_bytes:
             self._drop(sample, step, f"messages over {self._limits.max_message_mb:g} MB")
+        elif flow.is_ledger:
+            self._drop(sample, step, "messages of anybody but the recorder")
         elif is_bulk and self._is_shed(flow):
             self._drop(sample, step, None)
         elif cost > self._room(is_bulk=is_bulk):

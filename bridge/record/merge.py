@@ -50,14 +50,16 @@ class Merge:
             yield self._entries.popleft()
 
     def _images_before(self, ticket: int | None) -> Iterator[Item]:
-        waiting, self._held = self._held, deque()
-        while waiting:
-            item = waiting.popleft()
+        # One by one: what has not been yielded must be found by rest(), called in between.
+        at = 0
+        while at < len(self._held):
+            item = self._held[at]
             if ticket is None or item.ticket < ticket:
+                del self._held[at]
                 self.images_out += 1
                 yield item
             else:
-                self._held.append(item)
+                at += 1
 
     def rest(self) -> list[Item | Dropped]:
         """Give up what has not been yielded, up to the next barrier; commands stay."""
