@@ -1,12 +1,11 @@
 """Chunks being filled: messages of one group, until the group is written as one MCAP record."""
 
-import zlib
 from dataclasses import dataclass
 
 import zstandard
 
 from bridge.episode import mcap_format
-from bridge.episode.checksum import joined_crc
+from bridge.episode.checksum import crc32, joined_crc
 from bridge.episode.mcap_format import MESSAGE, MESSAGE_FIELDS, MESSAGE_HEAD, Buffer, Payload
 
 ZSTD_LEVEL = 1
@@ -124,12 +123,12 @@ class OpenChunk:
         pieces: list[Buffer] = [self._buffer] if self._gather else self._pieces
         crc = 0
         for piece in pieces:
-            crc = zlib.crc32(piece, crc)
+            crc = crc32(piece, crc)
         data, data_crc, compression = pieces, crc, ""
         if self._compressor is not None:
             packed = self._compressor.compress(pieces[0] if self._gather else b"".join(pieces))
             if len(packed) < self.size:
-                data, data_crc, compression = [packed], zlib.crc32(packed), "zstd"
+                data, data_crc, compression = [packed], crc32(packed, 0), "zstd"
         data_size = len(data[0]) if compression else self.size
         head = mcap_format.chunk_head(
             start_ns=self._start_ns,
@@ -142,7 +141,7 @@ class OpenChunk:
         encoded = EncodedChunk(
             buffers=[head, *data],
             length=len(head) + data_size,
-            crc=joined_crc(zlib.crc32(head), data_crc, data_size),
+            crc=joined_crc(crc32(head, 0), data_crc, data_size),
             start_ns=self._start_ns,
             end_ns=self._end_ns,
             compression=compression,

@@ -1,10 +1,9 @@
 """Append records to an MCAP file and book each in the summary, for the writer and for recovery."""
 
-import zlib
 from collections.abc import Mapping
 
 from bridge.episode import mcap_format
-from bridge.episode.checksum import joined_crc
+from bridge.episode.checksum import crc32, joined_crc
 from bridge.episode.chunks import EncodedChunk
 from bridge.episode.mcap_format import ChunkPlace
 from bridge.episode.part_file import PartFile
@@ -28,7 +27,7 @@ class DataSection:
         start = self.file.offset
         indexes, offsets = index_records(chunk.index, start + chunk.length)
         crc = joined_crc(self.file.crc, chunk.crc, chunk.length)
-        self.file.append([*chunk.buffers, indexes], crc=zlib.crc32(indexes, crc))
+        self.file.append([*chunk.buffers, indexes], crc=crc32(indexes, crc))
         self.book(chunk, start, offsets, len(indexes))
 
     def add_indexes(self, chunk: EncodedChunk, start: int) -> None:

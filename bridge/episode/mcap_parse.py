@@ -1,11 +1,11 @@
 """Read MCAP records whose bytes may be anything: every length is checked before it is believed."""
 
 import struct
-import zlib
 from dataclasses import dataclass, field
 
 import zstandard
 
+from bridge.episode.checksum import crc32
 from bridge.episode.mcap_format import (
     CHANNEL,
     CHUNK,
@@ -23,6 +23,7 @@ MAX_CHUNK_BYTES = 1 << 29
 _INDEX_FIELDS = struct.Struct("<HxxxxQ")
 """Channel and log time of a message, after its record head."""
 _CHUNK_HEAD_BYTES = RECORD_HEAD.size + CHUNK_FIELDS.size + 4
+_ZSTD = zstandard.ZstdDecompressor()
 _COMPRESSIONS = ("", "lz4", "zstd")
 
 
@@ -223,7 +224,7 @@ def unpack_chunk(head: ChunkHead, data: bytes) -> bytes:
     if len(records) != head.uncompressed_size:
         message = f"its data unpacks to {len(records)} bytes instead of {head.uncompressed_size}"
         raise DamagedRecordError(message)
-    if head.crc and zlib.crc32(records) != head.crc:
+    if head.crc and crc32(records, 0) != head.crc:
         message = "its CRC is wrong"
         raise DamagedRecordError(message)
     return records
@@ -236,7 +237,7 @@ def _unpack_at_once(head: ChunkHead, data: bytes) -> bytes | None:
             head.compression == "zstd"
             and zstandard.frame_content_size(data) == head.uncompressed_size
         ):
-            return zstandard.ZstdDecompressor().decompress(data)
+            return _ZSTD.decompress(data)
     except (zstandard.ZstdError, MemoryError):
         pass
     return None

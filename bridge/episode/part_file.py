@@ -8,10 +8,10 @@ import contextlib
 import fcntl
 import os
 import threading
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
+from bridge.episode.checksum import crc32
 from bridge.episode.mcap_format import Buffer, num_bytes
 from bridge.errors import BridgeError, UsageError
 
@@ -68,7 +68,7 @@ class PartFile:
         if crc is None:
             crc = self.crc
             for piece in buffers:
-                crc = zlib.crc32(piece, crc)
+                crc = crc32(piece, crc)
         self.crc = crc
         self.offset = offset
 

@@ -4,10 +4,10 @@ Chunks are copied byte for byte. Messages outside chunks are put into chunks, be
 use the index see nothing else. Message indexes, summary and footer are made anew.
 """
 
-import zlib
 from pathlib import Path
 
 from bridge.episode import mcap_format as mcap
+from bridge.episode.checksum import crc32
 from bridge.episode.chunks import EncodedChunk, OpenChunk
 from bridge.episode.data_section import DataSection
 from bridge.episode.mcap_found import (
@@ -147,7 +147,7 @@ def verbatim(found: Chunk) -> EncodedChunk:
     return EncodedChunk(
         buffers=[found.raw],
         length=found.length,
-        crc=zlib.crc32(found.raw),
+        crc=crc32(found.raw, 0),
         start_ns=start_ns,
         end_ns=end_ns,
         compression=found.head.compression,
@@ -164,7 +164,7 @@ def salvaged_head(records: bytes, contents: Contents) -> bytes:
         start_ns=start_ns,
         end_ns=end_ns,
         size=len(records),
-        crc=zlib.crc32(records),
+        crc=crc32(records, 0),
         compression="",
         data_size=len(records),
     )
@@ -177,7 +177,7 @@ def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
     return EncodedChunk(
         buffers=[head, records],
         length=len(head) + len(records),
-        crc=zlib.crc32(records, zlib.crc32(head)),
+        crc=crc32(records, crc32(head, 0)),
         start_ns=start_ns,
         end_ns=end_ns,
         compression="",

@@ -1,0 +1,41 @@
+"""Checksums against zlib, with and without the native function."""
+
+import os
+import sys
+import zlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.episode import checksum
+
+START = st.integers(0, 2**32 - 1)
+
+
+@given(a=st.binary(max_size=5000), b=st.binary(max_size=5000))
+def test_joined_crcs_are_the_crc_of_the_join(a: bytes, b: bytes) -> None:
+    assert checksum.joined_crc(zlib.crc32(a), zlib.crc32(b), len(b)) == zlib.crc32(a + b)
+
+
+@pytest.mark.parity
+@given(data=st.binary(max_size=700), start=START, skip=st.integers(0, 20))
+def test_any_start_length_and_place_in_memory_gives_zlibs_answer(
+    data: bytes, start: int, skip: int
+) -> None:
+    piece = memoryview(data)[skip:]
+    assert checksum.crc32(piece, start) == zlib.crc32(piece, start)
+
+
+@pytest.mark.parity
+@pytest.mark.parametrize("size", [65_535, 65_536, 1_000_003])
+def test_large_buffers_of_every_kind_give_zlibs_answer(size: int) -> None:
+    data = os.urandom(size)
+    for buffer in (data, bytearray(data), memoryview(data)):
+        assert checksum.crc32(buffer, 5) == zlib.crc32(data, 5)
+
+
+def test_without_the_extension_zlib_does_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "bridge.episode._crc32", None)
+    monkeypatch.delattr("bridge.episode._crc32", raising=False)
+    assert checksum._fastest() is zlib.crc32
