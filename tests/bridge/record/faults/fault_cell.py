@@ -1,6 +1,7 @@
 """Processes that record and publish, for tests that break them."""
 
 import base64
+import contextlib
 import json
 import os
 import signal
@@ -62,7 +63,7 @@ class Child:
     def kill(self) -> None:
         """End it as a power cut would."""
         self.process.kill()
-        self.process.communicate()
+        self.process.wait()
 
     def finish(self, number: signal.Signals = signal.SIGTERM) -> int:
         """Ask it to end; returns its exit code."""
@@ -141,6 +142,10 @@ class FaultCell:
             if child.process.poll() is None:
                 child.send(signal.SIGCONT)
                 child.kill()
+            for pipe in (child.process.stdin, child.process.stdout):
+                if pipe is not None:
+                    with contextlib.suppress(BrokenPipeError):
+                        pipe.close()
 
     def record(
         self, *arguments: str, endpoint: str = "", program: str = "robot_gst.py", **options: Any

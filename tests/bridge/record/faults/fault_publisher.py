@@ -26,17 +26,13 @@ OWN_QOS = {"joints": Qos.CONTROL, "gripper": Qos.CONTROL}
 
 
 class Publisher:
-    def __init__(self, session: WireSession, endpoint: str, account: int) -> None:
-        """Open a plain zenoh session too, for what ours would refuse to send."""
+    def __init__(self, session: WireSession, account: int) -> None:
+        """Use one session for everything, so that all arrives in the order it left."""
         self.session = session
+        self.plain: Any = session._inner  # for what our publishers would refuse to send
         self.account = account
         self.publishers: dict[str, Any] = {}
         self.counts: dict[str, int] = {}
-        config = zenoh.Config()
-        config.insert_json5("mode", '"client"')
-        config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-        config.insert_json5("scouting/multicast/enabled", "false")
-        self.plain = zenoh.open(config)
 
     def book(self, topic: str, sequence: int | None, gid: str, data: bytes | bytearray) -> None:
         digest = hashlib.sha256(data).hexdigest()
@@ -94,7 +90,7 @@ def main() -> None:
     endpoint, account_path = sys.argv[1:3]
     account = os.open(account_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     with open_session(WireConfig(connect=(endpoint,))) as session:
-        publisher = Publisher(session, endpoint, account)
+        publisher = Publisher(session, account)
         print(json.dumps("ready"), flush=True)
         for line in sys.stdin:
             request = json.loads(line)
@@ -107,7 +103,6 @@ def main() -> None:
                 names, period_s = request["streams"], request["period_s"]
                 answer = publisher.flow(request["flow"], names, request["qos"], period_s)
             print(json.dumps(answer), flush=True)
-        publisher.plain.close()
 
 
 if __name__ == "__main__":

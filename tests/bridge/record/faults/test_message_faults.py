@@ -5,6 +5,7 @@ what its type says is flagged; the recorder goes on, and its file is valid to ev
 """
 
 import base64
+import json
 import os
 import struct
 import time
@@ -265,3 +266,21 @@ def test_requests_of_rubbish_are_refused_and_cost_the_episode_nothing(live: Live
     assert refused > 7 * len(GARBAGE)
     assert check_code(live.path("asked")) == 0
     assert lost(ledger(live.path("asked"))["/cell/joint_states"]) == 0
+
+
+def test_nobody_else_writes_into_the_ledger(live: LiveCell) -> None:
+    """Law: what the accounts of an episode say comes from its recorder alone."""
+    lie = {"schema_version": 1, "topic": "/cell/joint_states", "second": 1, "gaps": 1000}
+    data = json.dumps(lie).encode()
+    live.start("forged")
+    live.put(
+        put("/cell/joint_states", joints(), 0),
+        put(schema.DROPS_TOPIC, data, 0, encoding=f"application/json;{schema.DROPS}"),
+    )
+    answer = live.stop()
+    path = live.path("forged")
+    topics = ledger(path)  # the seconds add up to the totals
+    assert answer["lost"] == topics[schema.DROPS_TOPIC]["queue_drops"] == 1
+    assert topics["/cell/joint_states"]["gaps"] == 0
+    assert any(schema.DROPS_TOPIC in text for text in metadata(path, "drops")["warnings"])
+    assert check_code(path) == 3

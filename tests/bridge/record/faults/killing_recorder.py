@@ -1,0 +1,48 @@
+"""robot-gst, but it kills itself at a chosen system call of an episode's end.
+
+Arguments: PHASE:CALL:NUMBER:SIDE, then those of robot-gst. PHASE is finish (from the stop on) or
+start (recovery at start-up); CALL is pwritev, fdatasync, fsync or rename; SIDE is before or after.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import robot_gst
+from bridge.record.parts import Parts
+
+
+def main() -> None:
+    phase, call, number, side = sys.argv.pop(1).split(":")
+    owner = Path if call == "rename" else os
+    real = getattr(owner, call)
+    left = int(number)
+    armed = phase == "start"
+
+    def counted(*arguments: Any) -> Any:
+        nonlocal left
+        left -= armed
+        if armed and left == 0 and side == "before":
+            os.kill(os.getpid(), signal.SIGKILL)
+        result = real(*arguments)
+        if armed and left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return result
+
+    setattr(owner, call, counted)
+    close: Callable[[Parts], Path] = Parts.close
+
+    def close_armed(parts: Parts) -> Path:
+        nonlocal armed
+        armed = True
+        return close(parts)
+
+    Parts.close = close_armed  # type: ignore[method-assign]
+    sys.exit(robot_gst.main())
+
+
+if __name__ == "__main__":
+    main()

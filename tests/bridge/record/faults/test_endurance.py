@@ -1,0 +1,93 @@
+"""A recorder that runs for long: a thousand episodes, and a cell in full flow."""
+
+import os
+import threading
+import time
+
+import numpy as np
+import pytest
+from fault_account import check_code, ledger, lost, read
+from fault_cell import Child, FaultCell
+from fault_messages import MIX
+
+pytestmark = pytest.mark.slow
+
+EPISODES = 1000
+SOAK_S = float(os.environ.get("GST_SOAK_S", "60"))
+WARM_UP_S = 15.0
+MAX_MB_PER_MIN = 3.0
+MAX_GROWTH_MB = 20.0
+
+
+def test_a_thousand_episodes_leave_no_files_threads_or_memory(cell: FaultCell) -> None:
+    """Law: what an episode took, its end gives back."""
+    recorder = cell.record()
+    publisher = cell.publisher()
+
+    def record(name: str) -> None:
+        assert publisher.ask("start", {"id": name, "info": {"cell": "cell"}})["ok"]["ok"]
+        publisher.flow(0.0, *MIX)
+        publisher.answer()
+        answer = publisher.ask("stop")["ok"]
+        assert (answer["messages"], answer["lost"]) == (4, 0)
+
+    for number in range(50):
+        record(f"warm_{number}")
+    before = recorder.open_files(), recorder.number("Threads")
+    before_mb = recorder.memory_mb()
+    begin_s = time.monotonic()
+    for number in range(EPISODES):
+        record(f"e{number:04d}")
+    took_s = time.monotonic() - begin_s
+    time.sleep(1.0)
+    after = recorder.open_files(), recorder.number("Threads")
+    after_mb = recorder.memory_mb()
+    print(
+        f"{EPISODES} episodes in {took_s:.0f} s: files and threads {before} -> {after}, "
+        f"{before_mb:.1f} -> {after_mb:.1f} MB"
+    )
+    assert after[0] <= before[0] + 2
+    assert after[1] <= before[1] + 2
+    assert after_mb - before_mb < MAX_GROWTH_MB
+    assert len(list((cell.run / "episodes").iterdir())) == EPISODES + 50
+    for name in ("e0000", "e0999"):
+        assert len(read(cell.path(name))) == 4
+        assert check_code(cell.path(name)) == 0
+
+
+def slope_mb_per_min(recorder: Child, ended: threading.Event) -> tuple[float, float, float]:
+    """Slope, least and most of the memory after the warm-up."""
+    times, sizes = [], []
+    begin_s = time.monotonic()
+    while not ended.wait(0.5):
+        if (now_s := time.monotonic() - begin_s) > WARM_UP_S:
+            times.append(now_s / 60.0)
+            sizes.append(recorder.memory_mb())
+    return float(np.polyfit(times, sizes, 1)[0]), min(sizes), max(sizes)
+
+
+def test_memory_does_not_grow_while_a_cell_is_recorded(cell: FaultCell) -> None:
+    """Law: in one long episode, nothing is lost and memory stays what it was."""
+    recorder = cell.record()
+    publisher = cell.publisher()
+    assert publisher.ask("start", {"id": "soak", "info": {"cell": "cell"}})["ok"]["ok"]
+    ended = threading.Event()
+
+    def flow() -> None:
+        publisher.flow(WARM_UP_S + SOAK_S, *MIX, "raw")
+        publisher.answer()
+        ended.set()
+
+    thread = threading.Thread(target=flow)
+    thread.start()
+    slope, least_mb, most_mb = slope_mb_per_min(recorder, ended)
+    thread.join()
+    answer = publisher.ask("stop")["ok"]
+    print(
+        f"{SOAK_S:g} s, {answer['messages']} messages, {answer['lost']} lost: "
+        f"{slope:+.2f} MB/min between {least_mb:.0f} and {most_mb:.0f} MB"
+    )
+    assert answer["messages"] == len(publisher.sent())
+    assert sum(lost(tally) for tally in ledger(cell.path("soak")).values()) == 0
+    assert slope < MAX_MB_PER_MIN
+    assert check_code(cell.path("soak")) == 0

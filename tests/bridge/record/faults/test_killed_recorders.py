@@ -1,0 +1,150 @@
+"""SIGKILL: at random instants, and between the system calls that finish an episode.
+
+The law: whatever the instant, the next start recovers the file and lists what was lost. Of every
+topic it holds all that was sent until half a second before, byte for byte, and nothing else.
+"""
+
+import os
+import random
+import signal
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+from fault_account import check_code, metadata, nothing_invented, read
+from fault_cell import Child, FaultCell, Sent
+from fault_messages import MIX
+
+TAIL_S = 0.5
+MIXES = {"joints": ("joints",), "mix": MIX}
+KILLS = int(os.environ.get("GST_KILLS", "12"))
+KILLER = str(Path(__file__).with_name("killing_recorder.py"))
+
+
+def assert_only_the_tail_is_missing(path: Path, sent: list[Sent], killed_ns: int) -> None:
+    """Of each topic a beginning without holes, up to less than the tail before the kill."""
+    found = read(path)
+    nothing_invented(found, sent)
+    numbers = defaultdict(list)
+    for item in found:
+        numbers[item.topic].append(item.sequence)
+    for topic, of_topic in numbers.items():
+        assert of_topic == list(range(len(of_topic))), topic
+    for topic in {item.topic for item in sent}:
+        old = sum(s.topic == topic and s.put_ns < killed_ns - TAIL_S * 1e9 for s in sent)
+        assert len(numbers[topic]) >= old, f"{topic}: {len(numbers[topic])} of {old} in the file"
+
+
+def listed_by_the_next_start(cell: FaultCell, path: Path) -> Child:
+    """Start another recorder, which says what it recovered; it goes on as if nothing had been."""
+    recorder = cell.record()
+    publisher = cell.publisher()
+    status = publisher.ask("status")["ok"]
+    (report,) = status["recovered"]
+    assert report["file"] == path.name + ".part"
+    assert report["output"] == path.name
+    assert report["messages"] >= len(read(path))  # with our own records
+    assert f"recovered {path.name}: {report['messages']} messages" in recorder.said()
+    if report["reason"]:  # else it was whole, and only its name was missing
+        assert metadata(path, "recovered")["messages"] == report["messages"]
+    assert status["state"] == "idle"
+    publisher.kill()
+    return recorder
+
+
+def kill_while_recording(cell: FaultCell, streams: tuple[str, ...], after_s: float) -> None:
+    recorder = cell.record("--episode", "t1")
+    publisher = cell.publisher()
+    publisher.flow(60.0, *streams)
+    time.sleep(after_s)
+    killed_ns = time.time_ns()
+    recorder.kill()
+    publisher.kill()
+    path = cell.path("t1")
+    assert not path.exists()
+    listed_by_the_next_start(cell, path).kill()
+    assert_only_the_tail_is_missing(path, publisher.sent(), killed_ns)
+    assert check_code(path) == 3
+
+
+@pytest.mark.parametrize("mix", sorted(MIXES))
+def test_a_killed_recorder_loses_only_the_tail(cell: FaultCell, mix: str) -> None:
+    kill_while_recording(cell, MIXES[mix], random.uniform(0.6, 1.2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("instant", range(KILLS))
+@pytest.mark.parametrize("mix", sorted(MIXES))
+def test_at_any_instant(cell: FaultCell, mix: str, instant: int) -> None:
+    after_s = random.Random(f"{mix} {instant}").uniform(0.0, 4.0)
+    kill_while_recording(cell, MIXES[mix], after_s)
+
+
+def kill_while_finishing(cell: FaultCell, point: str) -> bool:
+    """Say whether the recorder got that far."""
+    recorder = cell.record(program=f"{KILLER} finish:{point}")
+    publisher = cell.publisher()
+    publisher.ask("start", {"id": "t1", "info": {"cell": "cell"}})
+    publisher.flow(0.4, *MIX)
+    publisher.answer()
+    stopped_ns = time.time_ns()
+    publisher.tell(ask="stop", payload="")
+    code = recorder.process.wait(timeout=60.0) if _dies(recorder) else None
+    publisher.kill()
+    if code is None:
+        recorder.kill()
+        return False
+    assert code == -signal.SIGKILL
+    path = cell.path("t1")
+    if path.exists():  # it had its name already: nothing is missing, and nothing to recover
+        assert len(read(path)) == len(publisher.sent())
+        assert check_code(path) == 0
+        return True
+    listed_by_the_next_start(cell, path).kill()
+    assert_only_the_tail_is_missing(path, publisher.sent(), stopped_ns)
+    if "rename" in point:  # all was written and synced
+        assert len(read(path)) == len(publisher.sent())
+        assert check_code(path) == 0
+    else:
+        assert check_code(path) in (0, 3)
+    return True
+
+
+def _dies(recorder: Child) -> bool:
+    end_s = time.monotonic() + 3.0
+    while time.monotonic() < end_s and recorder.process.poll() is None:
+        time.sleep(0.02)
+    return recorder.process.poll() is not None
+
+
+def test_killed_before_the_last_rename_nothing_is_lost(cell: FaultCell) -> None:
+    assert kill_while_finishing(cell, "rename:1:before")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("side", ["before", "after"])
+@pytest.mark.parametrize("call", ["pwritev", "fdatasync", "rename", "fsync"])
+@pytest.mark.parametrize("number", [1, 2, 3, 5])
+def test_killed_between_the_calls_that_finish_an_episode(
+    cell: FaultCell, call: str, number: int, side: str
+) -> None:
+    if not kill_while_finishing(cell, f"{call}:{number}:{side}"):
+        assert number > 1, "the end of an episode makes each of these calls"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("call", ["pwritev", "fdatasync", "rename", "fsync"])
+def test_killed_while_recovering_it_is_done_by_the_next(cell: FaultCell, call: str) -> None:
+    recorder = cell.record("--episode", "t1")
+    publisher = cell.publisher()
+    publisher.flow(1.0, *MIX)
+    publisher.answer()
+    killed_ns = time.time_ns()
+    recorder.kill()
+    publisher.kill()
+    second = cell.start_recording(program=f"{KILLER} start:{call}:1:before")
+    assert second.process.wait(timeout=60.0) == -signal.SIGKILL
+    listed_by_the_next_start(cell, cell.path("t1")).kill()
+    assert_only_the_tail_is_missing(cell.path("t1"), publisher.sent(), killed_ns)
+    assert check_code(cell.path("t1")) == 3

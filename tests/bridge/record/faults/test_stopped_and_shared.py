@@ -1,0 +1,141 @@
+"""A recorder that hangs, publishers that die, messages too large, two recorders on one folder."""
+
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from fault_account import accounts_are_exact, check_code, ledger, lost, nothing_invented, read
+from fault_cell import FaultCell, free_endpoint
+from fault_messages import JOINTS, MIX
+
+STOP_S = 5.0
+HUGE_BYTES = 200_000_000
+
+
+@pytest.mark.slow
+def test_a_recorder_stopped_for_five_seconds_accounts_for_every_message(cell: FaultCell) -> None:
+    """Law: sent = written + declared lost, on every topic, whatever was dropped on the way."""
+    recorder = cell.record()
+    publisher = cell.publisher()
+    publisher.ask("start", {"id": "t1", "info": {"cell": "cell"}})
+    publisher.flow(STOP_S + 4.0, *MIX, "raw", qos="own")
+    time.sleep(1.0)
+    recorder.send(signal.SIGSTOP)
+    time.sleep(STOP_S)
+    recorder.send(signal.SIGCONT)
+    publisher.answer()
+    time.sleep(1.0)
+    publisher.flow(0.0, *MIX, "raw", qos="own")  # one more of each: a loss before it is a gap now
+    publisher.answer()
+    time.sleep(1.0)
+    answer = publisher.ask("stop")["ok"]
+    path = cell.path("t1")
+    topics = accounts_are_exact(path, publisher.sent(), transcoded=("/cell/cam/raw/color/image",))
+    assert answer["lost"] == sum(lost(tally) for tally in topics.values())
+    assert answer["messages"] + answer["lost"] == len(publisher.sent())
+    print({topic: (tally["received"], lost(tally)) for topic, tally in topics.items()})
+    assert answer["lost"] > 0, "the stop was too short to prove anything"
+    assert check_code(path) == 3
+
+
+def test_a_publisher_killed_and_come_back_is_no_gap(cell: FaultCell) -> None:
+    """Law: what a dead publisher did not send is not lost, nor is what it sent before."""
+    cell.record()
+    asker, first = cell.publisher(), cell.publisher()
+    asker.ask("start", {"id": "t1", "info": {"cell": "cell"}})
+    first.flow(60.0, *MIX)
+    time.sleep(0.6)
+    first.kill()
+    second = cell.publisher()
+    second.flow(0.5, *MIX)
+    second.answer()
+    answer = second.ask("stop")["ok"]
+    path = cell.path("t1")
+    found, sent = read(path), first.sent() + second.sent()
+    nothing_invented(found, sent)
+    assert answer["lost"] == sum(lost(tally) for tally in ledger(path).values()) == 0
+    # What the network still held of the first went with it; all of the second is there.
+    digests = {item.digest for item in found}
+    assert all(item.digest in digests for item in second.sent())
+    of_first = len(found) - len(second.sent())
+    assert 0.8 * len(first.sent()) < of_first <= len(first.sent())
+    assert check_code(path) == 0
+
+
+@pytest.mark.slow
+def test_messages_of_200_megabytes_are_refused_and_counted(cell: FaultCell) -> None:
+    """Law: too large a message is counted as lost, and memory holds no more than one or two."""
+    recorder = cell.record()
+    publisher = cell.publisher()
+    publisher.ask("start", {"id": "t1", "info": {"cell": "cell"}})
+    before_mb = recorder.memory_mb()
+    peaks_mb = []
+    for _ in range(6):
+        publisher.flow(0.05, "joints")
+        publisher.answer()
+        huge = {"topic": "/huge", "key": "huge", "encoding": "", "zeros": HUGE_BYTES}
+        publisher.tell(puts=[{**huge, "note": None, "sequence": None, "gid": ""}])
+        publisher.answer()
+        peaks_mb.append(recorder.memory_mb("VmHWM"))
+    answer = publisher.ask("stop")["ok"]
+    path = cell.path("t1")
+    topics = ledger(path)
+    assert topics["/huge"]["queue_drops"] == answer["lost"] == 6
+    assert topics[JOINTS]["received"] == sum(s.topic == JOINTS for s in publisher.sent())
+    assert check_code(path) == 3
+    after_mb = recorder.memory_mb()
+    print(f"{before_mb:.0f} MB before, at most {peaks_mb} MB, {after_mb:.0f} MB after")
+    # The network's own buffer, the assembled message and our copy; the allocator keeps some.
+    assert max(peaks_mb) - before_mb < 3.5 * HUGE_BYTES / 1e6
+    assert peaks_mb[-1] - peaks_mb[2] < 0.5 * HUGE_BYTES / 1e6  # six are no worse than three
+
+
+def test_two_recorders_share_a_folder_but_no_episode(cell: FaultCell) -> None:
+    """Law: one id, one writer; nobody touches a file that another is writing."""
+    cell.record("--episode", "t1", "--cell", "cell")
+    publisher = cell.publisher()
+    publisher.flow(1.0, "joints", "gripper")
+    part = cell.path("t1").with_suffix(".mcap.part")
+    inode, size = part.stat().st_ino, part.stat().st_size
+    other_endpoint = free_endpoint()
+    other = cell.record(endpoint=other_endpoint)  # its recovery at start-up sees the live part
+    assert "recovered" not in other.said()
+    asker = cell.publisher(other_endpoint)
+    assert asker.ask("status")["ok"]["recovered"] == []
+    refused = asker.ask("start", {"id": "t1"})["refused"]
+    assert refused.startswith(str(part))
+    assert "choose another episode id" in refused
+    assert "\n" not in refused
+    assert asker.ask("start", {"id": "t2", "info": {"cell": "cell"}})["ok"]["ok"]
+    asker.flow(0.3, *MIX)
+    asker.answer()
+    assert asker.ask("stop")["ok"]["lost"] == 0
+    publisher.answer()
+    publisher.flow(0.5, "joints", "gripper")
+    publisher.answer()
+    assert part.stat().st_ino == inode
+    assert part.stat().st_size > size
+    assert publisher.ask("stop")["ok"]["lost"] == 0
+    accounts_are_exact(cell.path("t1"), publisher.sent())
+    accounts_are_exact(cell.path("t2"), asker.sent())
+    assert [check_code(cell.path(name)) for name in ("t1", "t2")] == [0, 0]
+    assert asker.ask("start", {"id": "t1"})["refused"].endswith("move it away.")
+    assert names(cell) == ["t1.mcap", "t2.mcap"]
+
+
+def names(cell: FaultCell) -> list[str]:
+    return sorted(path.name for path in Path(cell.run / "episodes").iterdir())
+
+
+def test_a_recorder_given_an_id_in_use_ends_with_one_sentence(cell: FaultCell) -> None:
+    cell.record("--episode", "t1")
+    part = cell.path("t1").with_suffix(".mcap.part")
+    end_s = time.monotonic() + 10.0
+    while not part.exists() and time.monotonic() < end_s:
+        time.sleep(0.02)
+    second = cell.start_recording("--episode", "t1", endpoint=free_endpoint())
+    assert second.process.wait(timeout=60.0) == 2
+    (sentence,) = [line for line in second.said().splitlines() if "listens on" not in line]
+    assert "t1.mcap.part is being written" in sentence
+    assert names(cell) == ["t1.mcap.part"]
