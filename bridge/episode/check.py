@@ -228,6 +228,7 @@ def _judge_topics(
     is_recording = episode is not None and "recorder" in episode.metadata_records
     report.notes += sorted(decoder.missing)
     rates = _declared_rates(episode)
+    shared = _shared_topics(episode)
     for topic, topic_watch in sorted(watch.topics.items()):
         result = report.topics[topic] = topic_watch.finish()
         report.messages += result.messages
@@ -238,7 +239,7 @@ def _judge_topics(
         if result.time_steps_back:
             text = f"{topic}: its log time steps back {result.time_steps_back} times"
             _say(report, faults if ours and is_recording else None, text)
-        if decoder.has_ledger:
+        if decoder.has_ledger and topic not in shared:
             missing = max(0, result.sequence_gaps - result.declared_losses)
             report.undeclared_losses += missing
             if missing:
@@ -263,6 +264,13 @@ def _is_imported(episode: Episode | None) -> bool:
     """Whether we only keep what another program wrote."""
     record = episode.metadata_records.get("episode") if episode else None
     return record is not None and record.get("kind") == "imported"
+
+
+def _shared_topics(episode: Episode | None) -> list[str]:
+    """Topics of several publishers: a file does not say whose number is whose, the ledger knew."""
+    record = episode.metadata_records.get("drops", {}) if episode else {}
+    topics = record.get("several_publishers")
+    return topics if isinstance(topics, list) else []
 
 
 def _declared_rates(episode: Episode | None) -> dict[str, float]:

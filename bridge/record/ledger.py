@@ -82,6 +82,8 @@ class Ledger:
         self._max_topics = max_topics
         self._totals: dict[str, Tally] = {}
         self._open: dict[tuple[int, str], Tally] = {}
+        self._first_gid: dict[str, bytes] = {}
+        self._shared: set[str] = set()
         self._closing = threading.Lock()
         self._spans: list[tuple[int, int | None]] = [(0, None)]
 
@@ -131,6 +133,9 @@ class Ledger:
         tally.repeated += item.step.repeated
         tally.unnumbered += sample.sequence is None
         tally.reduced += item.reduced
+        gid = sample.source_gid
+        if gid is not None and self._first_gid.setdefault(sample.topic, gid) != gid:
+            self._shared.add(sample.topic)
         if sample.source_ns is not None:
             tally.see_offset(sample.received_ns - sample.source_ns)
         if finding is not GOOD:
@@ -184,8 +189,13 @@ class Ledger:
         return total
 
     def to_metadata(self) -> dict[str, str]:
-        """The ``drops`` metadata record: totals, counts by topic, and warnings."""
+        """The ``drops`` metadata record: totals, counts by topic, and warnings.
+
+        ``several_publishers`` lists the topics whose numbers are no single row.
+        """
         record = {name: json.dumps(value) for name, value in self.total().to_record().items()}
         by_topic = {topic: tally.to_record() for topic, tally in self.totals().items()}
         warnings = json.dumps(self.warnings)
-        return {**record, "topics": json.dumps(by_topic), "warnings": warnings}
+        shared = json.dumps(sorted(self._shared))
+        topics = json.dumps(by_topic)
+        return {**record, "topics": topics, "warnings": warnings, "several_publishers": shared}

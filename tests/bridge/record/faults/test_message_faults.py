@@ -9,6 +9,7 @@ import json
 import os
 import struct
 import time
+import uuid
 from collections import Counter
 from typing import Any
 
@@ -143,6 +144,27 @@ def test_a_publisher_that_counts_from_zero_again_has_lost_nothing(
     assert check_code(live.path(name)) == 0
 
 
+def test_publishers_that_share_a_topic_count_each_for_themselves(live: LiveCell) -> None:
+    """Law: holes between the numbers of two publishers (as on /tf) are nobody's loss."""
+    live.start("shared")
+    for n in range(20):
+        live.put(
+            put("/cell/joint_states", joints(n), n, gid=b"1" * 16),
+            put("/cell/joint_states", joints(n + 100), 5000 + 3 * n, gid=b"2" * 16),
+        )
+    answer = live.stop()
+    assert answer["lost"] == 2 * 19  # the second one's own, of which each third number came
+    assert check_code(live.path("shared")) == 3
+    live.start("shared_whole")
+    for n in range(20):
+        live.put(
+            put("/cell/joint_states", joints(n), 20 + n, gid=b"1" * 16),
+            put("/cell/joint_states", joints(n + 100), 5058 + n, gid=b"2" * 16),
+        )
+    assert live.stop()["lost"] == 0
+    assert check_code(live.path("shared_whole")) == 0
+
+
 @pytest.mark.parametrize("form", [0, 33, 77, 5, 33 + 44 + 1, 5000])
 def test_any_attachment_or_none_is_taken(live: LiveCell, form: int) -> None:
     """Law: numbers are used where they can be read; without them nothing is claimed."""
@@ -156,6 +178,27 @@ def test_any_attachment_or_none_is_taken(live: LiveCell, form: int) -> None:
     assert (tally["gaps"], tally["unnumbered"]) == ((3, 0) if is_numbered else (0, 5))
     assert [f.digest for f in read(live.path(name))] == [s.digest for s in live.sent()]
     assert check_code(live.path(name)) == (3 if is_numbered else 0)
+
+
+@pytest.mark.parametrize(
+    ("sequence", "source_ns"),
+    [(-(2**63), -(2**63)), (-1, -1), (2**63 - 1, 2**63 - 1), (2**32, 0), (0, 2**62)],
+)
+def test_numbers_and_times_no_publisher_has_are_recorded_all_the_same(
+    live: LiveCell, sequence: int, source_ns: int
+) -> None:
+    """Law: an attachment may say anything; the message is kept, and nothing is claimed of it."""
+    name = f"extreme{abs(sequence)}_{source_ns < 0}".lower()
+    gid = uuid.uuid4().bytes
+    live.start(name)
+    live.put(
+        put("/cell/joint_states", joints(1), sequence, source_ns=source_ns, gid=gid),
+        put("/cell/joint_states", joints(2), 7, gid=uuid.uuid4().bytes),
+    )
+    answer = live.stop()
+    assert (answer["messages"], answer["lost"], answer["undecodable"]) == (2, 0, 0)
+    assert [f.digest for f in read(live.path(name))] == [s.digest for s in live.sent()]
+    assert check_code(live.path(name)) == 0
 
 
 def test_one_topic_with_two_types_has_two_channels_and_a_warning(live: LiveCell) -> None:

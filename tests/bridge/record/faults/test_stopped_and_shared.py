@@ -65,7 +65,7 @@ def test_a_publisher_killed_and_come_back_is_no_gap(cell: FaultCell) -> None:
 
 @pytest.mark.slow
 def test_messages_of_200_megabytes_are_refused_and_counted(cell: FaultCell) -> None:
-    """Law: too large a message is counted as lost, and memory holds no more than one or two."""
+    """Law: too large a message is counted as lost, and memory holds three copies at most."""
     recorder = cell.record()
     publisher = cell.publisher()
     publisher.ask("start", {"id": "t1", "info": {"cell": "cell"}})
