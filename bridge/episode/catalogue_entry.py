@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.episode.run import RunFolder, first_parts, part_paths
+from bridge.episode.run import RunFolder, grouped_parts, part_paths
 
 LABEL_SUFFIX = ".outcome.json"
 """Of the sidecar under ``notes/`` that holds a label given after the fact."""
@@ -64,11 +64,15 @@ def scan(run: RunFolder) -> dict[str, Trace]:
     now_ns = time.time_ns()
     names = _names(run.episodes_dir, ".mcap")
     labels = set(_names(run.notes_dir, LABEL_SUFFIX))
-    heads = first_parts(names)
-    alone = len(heads) == len(names)
     return {
-        printable(name): trace(run, run.episodes_dir / name, labels, now_ns, alone=alone)
-        for name in heads
+        printable(name): trace(
+            run,
+            run.episodes_dir / name,
+            labels,
+            now_ns,
+            [run.episodes_dir / part for part in parts],
+        )
+        for name, parts in grouped_parts(names).items()
     }
 
 
@@ -84,8 +88,7 @@ def trace(
     path: Path,
     labels: set[str] | None = None,
     now_ns: int | None = None,
-    *,
-    alone: bool = False,
+    parts: list[Path] | None = None,
 ) -> Trace:
     """Look at the files of one episode.
 
@@ -94,10 +97,10 @@ def trace(
         path: First part.
         labels: Names of the sidecars that exist; None looks.
         now_ns: Wall time; None asks the clock [ns].
-        alone: No episode of this run has a second part.
+        parts: All its files; None looks.
     """
     now_ns = time.time_ns() if now_ns is None else now_ns
-    files = [path] if alone else part_paths(path)
+    files = part_paths(path) if parts is None else [*parts]
     label = f"{path.stem}{LABEL_SUFFIX}"
     if labels is None or label in labels:
         files.append(run.notes_dir / label)

@@ -7,7 +7,7 @@ from typing import Any
 from bridge.episode.catalogue_entry import Entry, printable
 from bridge.episode.catalogue_labels import outcome_of
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder, part_paths
+from bridge.episode.run import RunFolder
 from bridge.errors import GstError
 
 _LARGEST = 2**63 - 1
@@ -15,19 +15,19 @@ _LARGEST = 2**63 - 1
 
 def read_entry(run: RunFolder, path: Path) -> Entry:
     """Open an episode and sum it up; a broken one is listed with its error."""
-    parts = part_paths(path)
-    file = printable(path.name)
-    size = sum(part.stat().st_size for part in parts if part.is_file())
-    name = {"file": file, "id": printable(path.stem), "size_bytes": size, "parts": len(parts)}
+    parts: tuple[Path, ...] = (path,)
+    name: dict[str, Any] = {"file": printable(path.name), "id": printable(path.stem)}
     try:
         episode = Episode.open(path)
+        parts = episode.parts
         info, outcome = episode.info, outcome_of(run, episode)
         messages = sum(topic.count for topic in episode.topics().values())
     except GstError as error:
-        return Entry(**name, error=printable(str(error)))  # type: ignore[arg-type]
+        return Entry(**name, **_extent(parts), error=printable(str(error)))
     records = episode.metadata_records
     return Entry(
-        **name,  # type: ignore[arg-type]
+        **name,
+        **_extent(parts),
         kind=printable(info.kind),
         task=printable(info.task),
         condition=printable(info.condition),
@@ -46,6 +46,11 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         lost=_declared_lost(records.get("drops")),
         recovered="recovered" in records,
     )
+
+
+def _extent(parts: tuple[Path, ...]) -> dict[str, Any]:
+    sizes = [part.stat().st_size for part in parts if part.is_file()]
+    return {"size_bytes": sum(sizes), "parts": len(parts)}
 
 
 def _declared_lost(drops: dict[str, Any] | None) -> int | None:

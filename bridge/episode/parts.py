@@ -51,7 +51,7 @@ def open_parts(path: Path) -> Parts:
     if name is None or is_last_part(first):
         return Parts(files=(first,), missing=())
     following = path.with_name(part_name(name.episode_id, name.number + 1))
-    if split_of(first) is None and not following.exists():
+    if split_of(first) is None and not _was_cut_off(first) and not following.exists():
         return Parts(files=(first,), missing=())
     return _follow(first, *name)
 

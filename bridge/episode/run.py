@@ -27,39 +27,54 @@ def part_name(episode_id: str, index: int) -> str:
     return f"{episode_id}.mcap" if index == 1 else f"{episode_id}.{index}.mcap"
 
 
-def first_parts(names: Collection[str]) -> list[str]:
-    """Return the names that begin an episode, sorted.
-
-    A later part is one whose predecessor is among the names too. Without it the file stands for
-    itself, so that a missing part never hides those behind it.
-    """
-    there = set(names)
-    return sorted(name for name in there if _name_before(name) not in there)
-
-
-def _name_before(name: str) -> str | None:
+def _part_of(name: str) -> tuple[str, int]:
+    """Return the episode a file name belongs to, and its number; another program's is whole."""
     found = _LATER_PART.fullmatch(name)
     if found is None or found[2] == "1":
-        return None
-    return part_name(found[1], int(found[2]) - 1)
+        return name.removesuffix(".mcap"), 1
+    return found[1], int(found[2])
+
+
+def grouped_parts(names: Collection[str]) -> dict[str, list[str]]:
+    """Return all parts of each episode among some file names, by the first of them.
+
+    That is ``<id>.mcap``. Where it is missing, the lowest part that is there stands for it, so
+    that no file is hidden and none is listed twice.
+    """
+    episodes: dict[str, list[tuple[int, str]]] = {}
+    for name in sorted(set(names)):
+        episode_id, index = _part_of(name)
+        episodes.setdefault(episode_id, []).append((index, name))
+    groups = [[name for _, name in sorted(parts)] for parts in episodes.values()]
+    return {group[0]: group for group in sorted(groups)}
+
+
+def first_parts(names: Collection[str]) -> list[str]:
+    """Return the names that begin an episode, sorted."""
+    return list(grouped_parts(names))
+
+
+def _later_parts(path: Path) -> list[tuple[int, Path]]:
+    episode_id, _ = _part_of(path.name)
+    if not EPISODE_ID.fullmatch(episode_id):  # a name with dots is another program's, and whole
+        return []
+    found = [(_part_of(each.name)[1], each) for each in path.parent.glob(f"{episode_id}.*.mcap")]
+    return sorted((index, each) for index, each in found if index > 1)
 
 
 def part_paths(path: Path) -> list[Path]:
-    """Return an episode file and the parts that follow it without a gap, in order."""
-    found = _LATER_PART.fullmatch(path.name)
-    episode_id, index = (found[1], int(found[2])) if found else (path.stem, 1)
-    paths = [path]
-    if EPISODE_ID.fullmatch(episode_id):  # a name with dots is another program's, and whole
-        while (later := path.with_name(part_name(episode_id, index + len(paths)))).is_file():
-            paths.append(later)
-    return paths
+    """Return an episode file and the parts behind it, in order; some may be missing between."""
+    index = _part_of(path.name)[1]
+    return [path, *(later for number, later in _later_parts(path) if number > index)]
 
 
 def first_part(path: Path) -> Path:
     """Return the file that the episode of this one begins with; the file itself if unsplit."""
-    while (before := _name_before(path.name)) and path.with_name(before).is_file():
-        path = path.with_name(before)
-    return path
+    episode_id, index = _part_of(path.name)
+    if index == 1:
+        return path
+    first = path.with_name(part_name(episode_id, 1))
+    return first if first.is_file() else min([(index, path), *_later_parts(path)])[1]
 
 
 @dataclass(frozen=True)

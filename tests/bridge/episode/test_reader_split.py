@@ -104,6 +104,14 @@ def test_a_missing_part_in_the_middle_is_named_and_the_others_are_read(tmp_path:
     assert report.faults == ["part t1.2.mcap of this split episode is missing"]
 
 
+def test_a_missing_part_behind_a_recovered_one_is_named(tmp_path: Path) -> None:
+    path = write_part(tmp_path, 1, [10], last=None, recovered=True)
+    write_part(tmp_path, 3, [40], last=True, sequence=4)
+    assert Episode.open(path).missing_parts == (tmp_path / "t1.2.mcap",)
+    (report,) = check_all(tmp_path.glob("*.mcap"))
+    assert report.faults == ["part t1.2.mcap of this split episode is missing"]
+
+
 def test_a_missing_last_part_is_named(tmp_path: Path) -> None:
     path = split_in_three(tmp_path)
     (tmp_path / "t1.3.mcap").rename(tmp_path / "t1.3.mcap.part")

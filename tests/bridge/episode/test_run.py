@@ -6,7 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.episode.run import RunFolder, first_parts, part_name, part_paths
+from bridge.episode.run import (
+    RunFolder,
+    first_part,
+    first_parts,
+    grouped_parts,
+    part_name,
+    part_paths,
+)
 
 
 def run_with(folder: Path, *names: str) -> RunFolder:
@@ -28,10 +35,13 @@ def test_a_split_episode_is_listed_once_and_all_its_parts_are_found(tmp_path: Pa
     assert run.parts(run.episodes()[1]) == [run.episodes()[1]]
 
 
-def test_a_missing_part_does_not_hide_those_behind_it(tmp_path: Path) -> None:
-    run = run_with(tmp_path, "t1.mcap", "t1.3.mcap", "t1.4.mcap", "t2.2.mcap")
-    assert listed(run) == ["t1.3.mcap", "t1.mcap", "t2.2.mcap"]
-    assert [path.name for path in run.parts(run.episodes()[0])] == ["t1.3.mcap", "t1.4.mcap"]
+def test_parts_behind_a_missing_one_go_with_their_episode(tmp_path: Path) -> None:
+    run = run_with(tmp_path, "t1.mcap", "t1.3.mcap", "t1.4.mcap", "t2.10.mcap", "t2.2.mcap")
+    assert listed(run) == ["t1.mcap", "t2.2.mcap"]
+    found = [[path.name for path in run.parts(first)] for first in run.episodes()]
+    assert found == [["t1.mcap", "t1.3.mcap", "t1.4.mcap"], ["t2.2.mcap", "t2.10.mcap"]]
+    for first, names in zip(run.episodes(), found, strict=True):
+        assert {first_part(run.episodes_dir / name) for name in names} == {first}
 
 
 @pytest.mark.parametrize(
@@ -47,11 +57,11 @@ def test_files_of_takes_still_open_are_no_episodes(tmp_path: Path) -> None:
     assert listed(run_with(tmp_path, "t1.mcap.part", "t1.2.mcap.part", "notes.txt")) == []
 
 
-@given(st.sets(st.integers(1, 9)))
+@given(st.sets(st.integers(1, 12)))
 def test_every_file_belongs_to_exactly_one_episode(indices: set[int]) -> None:
-    names = {part_name("a", index) for index in indices}
-    heads = [int(name.split(".")[1]) if name.count(".") > 1 else 1 for name in first_parts(names)]
-    assert sorted(heads) == [index for index in sorted(indices) if index - 1 not in indices]
+    names = [part_name("a", index) for index in sorted(indices)]
+    assert first_parts(names[::-1]) == names[:1]
+    assert list(grouped_parts(names[::-1]).values()) == [names][: len(indices)]
 
 
 def test_parts_of_a_file_that_is_not_there_are_the_file_alone(tmp_path: Path) -> None:
