@@ -89,7 +89,8 @@ def nothing_invented(
         (item.topic, item.sequence or 0, "" if item.topic in transcoded else item.digest)
         for item in sent
     )
-    assert not in_file - on_wire
+    strange = in_file - on_wire
+    assert not strange, strange.most_common(5)
 
 
 def accounts_are_exact(
@@ -108,7 +109,7 @@ def accounts_are_exact(
         topic: tally["received"] - tally["repeated"] + lost(tally)
         for topic, tally in topics.items()
     }
-    assert said == different
+    assert said == different, {t: (said.get(t), different.get(t)) for t in {*said, *different}}
     return topics
 
 

@@ -81,6 +81,8 @@ class Publisher:
     def send(self, name: str, topic: str, data: bytearray) -> None:
         publisher, number = self.publishers[name], self.counts[name]
         data[STAMP] = number.to_bytes(8, "little")
+        if name in ("depth", "raw"):  # pixels: each piece the network cuts tells its message
+            data[4096::8192] = bytes([number % 251]) * len(data[4096::8192])
         self.book(topic, number, publisher.gid.hex(), data)
         publisher.put(bytes(data), source_ns=time.time_ns())
         self.counts[name] = number + 1
