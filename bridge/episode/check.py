@@ -11,19 +11,16 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bridge.episode import schema
+from bridge.episode import schema, streams
 from bridge.episode.check_decode import Decoder
 from bridge.episode.check_file import Faults, FileCheck
 from bridge.episode.check_rerun import rerun_faults
-from bridge.episode.check_topics import TopicCheck, TopicWatch
+from bridge.episode.check_topics import Pauses, TopicCheck, TopicWatch
 from bridge.episode.parts import name_of_part, record_of
 from bridge.episode.reader import Episode
 from bridge.episode.run import part_name
 from bridge.episode.writer import LIBRARY
 from bridge.errors import BridgeError
-
-SLOW_RATE = 0.9
-"""Below this part of its declared rate a topic is remarked upon."""
 
 
 @dataclass(kw_only=True)
@@ -106,6 +103,8 @@ def check_episode(path: Path, *, rerun: bool = False) -> CheckReport:
     watch = _Watch()
     episode = _open(path, faults, watch)
     report.parts = list(episode.parts) if episode else [path]
+    if episode is not None:
+        watch.pauses = Pauses(_paused_spans(episode))
     for part in report.parts:
         if episode is not None:
             watch.read(FileCheck(part, faults))
@@ -166,6 +165,7 @@ class _Watch:
     def __init__(self) -> None:
         self.decoder = Decoder()
         self.topics: dict[str, TopicWatch] = {}
+        self.pauses = Pauses([])
         self.is_ours = False
 
     def read(self, file: FileCheck) -> None:
@@ -173,7 +173,7 @@ class _Watch:
         for message in file.messages():
             topic = message.channel.topic
             if topic not in self.topics:
-                self.topics[topic] = TopicWatch(topic=topic)
+                self.topics[topic] = TopicWatch(topic=topic, pauses=self.pauses)
             self.topics[topic].see(message, self.decoder)
         self.is_ours = self.is_ours or file.library.startswith(LIBRARY)
 
@@ -227,13 +227,11 @@ def _judge_topics(
     ours = watch.is_ours and not _is_imported(episode)
     is_recording = episode is not None and "recorder" in episode.metadata_records
     report.notes += sorted(decoder.missing)
-    rates = _declared_rates(episode)
     shared = _shared_topics(episode)
     for topic, topic_watch in sorted(watch.topics.items()):
         result = report.topics[topic] = topic_watch.finish()
         report.messages += result.messages
         result.declared_losses = decoder.ledger.get(topic, 0)
-        result.declared_rate_hz = rates.get(topic)
         if result.undecodable:
             _say(report, faults if ours else None, result.first_fault)
         if result.time_steps_back:
@@ -247,7 +245,6 @@ def _judge_topics(
                     f"{topic}: {result.sequence_gaps} numbers are missing, "
                     f"the ledger declares {result.declared_losses}"
                 )
-        report.notes += _rate_notes(topic, result)
     report.declared_losses = sum(decoder.ledger.values())
     for text in decoder.size_faults():
         _say(report, faults if ours else None, text)
@@ -273,20 +270,25 @@ def _shared_topics(episode: Episode | None) -> list[str]:
     return topics if isinstance(topics, list) else []
 
 
-def _declared_rates(episode: Episode | None) -> dict[str, float]:
-    """The rates a recording promises: ``rates_hz`` by topic in its ``recorder`` record."""
-    record = episode.metadata_records.get("recorder", {}) if episode else {}
-    rates = record.get("rates_hz")
-    if not isinstance(rates, dict):
-        return {}
-    return {
-        topic: float(rate)
-        for topic, rate in rates.items()
-        if isinstance(rate, int | float) and rate > 0
-    }
+def _paused_spans(episode: Episode) -> list[tuple[int, int]]:
+    """When the recorder left messages out on purpose [ns]; of a recovered one, by its events."""
+    record = episode.metadata_records.get("recorder")
+    if record is not None:
+        spans = record.get("paused")
+        return [
+            span for item in (spans if isinstance(spans, list) else []) if (span := _span(item))
+        ]
+    try:
+        said = [(event["stamp_ns"], event["type"]) for event in streams.events(episode)]
+    except BridgeError:  # the walk finds what is wrong
+        return []
+    said = [each for each in said if each[1] in ("paused", "resumed")]
+    ends = [*(stamp_ns for stamp_ns, _ in said[1:]), episode.end_ns]
+    pairs = zip(said, ends, strict=False)
+    return [(start_ns, end_ns) for (start_ns, kind), end_ns in pairs if kind == "paused"]
 
 
-def _rate_notes(topic: str, result: TopicCheck) -> Iterator[str]:
-    declared = result.declared_rate_hz
-    if declared is not None and result.rate_hz < SLOW_RATE * declared:
-        yield f"{topic}: {result.rate_hz:.1f} messages a second, {declared:g} are declared"
+def _span(item: object) -> tuple[int, int] | None:
+    if isinstance(item, list) and len(item) == 2 and all(type(end) is int for end in item):
+        return item[0], item[1]
+    return None

@@ -1,7 +1,9 @@
 """What one topic shows over a whole episode: numbers, times, rate, and whether it decodes."""
 
 from array import array
+from bisect import bisect_left
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +14,7 @@ from bridge.errors import BridgeError
 
 _WRAP = 1 << 32
 _MAX_OPEN_GAPS = 64
+ON_ITS_WAY_NS = 100_000_000
 
 
 class SequenceWatch:
@@ -26,14 +29,19 @@ class SequenceWatch:
         self._open: deque[tuple[int, int]] = deque(maxlen=_MAX_OPEN_GAPS)
         self._last_backward: int | None = None
 
-    def see(self, sequence: int) -> None:
-        """Take the next number in the order of the file."""
+    def see(self, sequence: int, *, may_skip: bool = False) -> None:
+        """Take the next number in the order of the file.
+
+        Args:
+            sequence: The number.
+            may_skip: What is missing before this one was left out on purpose.
+        """
         if self._next is None:
             self._next = (sequence + 1) % _WRAP
             return
         ahead = (sequence - self._next) % _WRAP
         if ahead < _WRAP // 2:
-            if ahead:
+            if ahead and not may_skip:
                 self.gaps += ahead
                 self._open.append((self._next, ahead))
             self._next = (sequence + 1) % _WRAP
@@ -61,6 +69,24 @@ class SequenceWatch:
         return False
 
 
+class Pauses:
+    """The spans in which a recorder left messages out because it was told to."""
+
+    def __init__(self, spans_ns: Iterable[tuple[int, int]]) -> None:
+        """Take spans that do not overlap [ns]."""
+        ordered = sorted(spans_ns)
+        self._starts_ns = [start_ns for start_ns, _ in ordered]
+        self._ends_ns = [end_ns for _, end_ns in ordered]
+
+    def lies_between(self, before_ns: int, after_ns: int) -> bool:
+        """Say whether two messages of a topic lie on both sides of a pause [ns].
+
+        A message on its way when the recorder was told may be on either side.
+        """
+        index = bisect_left(self._starts_ns, after_ns) - 1
+        return index >= 0 and before_ns < self._ends_ns[index] + ON_ITS_WAY_NS
+
+
 @dataclass(kw_only=True)
 class TopicCheck:
     """What was found on one topic."""
@@ -69,7 +95,6 @@ class TopicCheck:
     type_name: str = ""
     rate_hz: float = 0.0
     """Mean over the topic's own time, 0 for fewer than two messages."""
-    declared_rate_hz: float | None = None
     sequence_gaps: int = 0
     """Numbers missing between those that are there."""
     sequences_backward: int = 0
@@ -90,6 +115,7 @@ class TopicWatch:
     """Follows one topic through all parts of an episode."""
 
     topic: str
+    pauses: Pauses
     result: TopicCheck = field(default_factory=TopicCheck)
     sequences: SequenceWatch = field(default_factory=SequenceWatch)
     first_ns: int | None = None
@@ -101,7 +127,8 @@ class TopicWatch:
         head, result = message.head, self.result
         result.messages += 1
         result.type_name = message.schema.name if message.schema else ""
-        self.sequences.see(head.sequence)
+        may_skip = self.pauses.lies_between(self.last_ns, head.log_time_ns)
+        self.sequences.see(head.sequence, may_skip=may_skip)
         if self.first_ns is None:
             self.first_ns = head.log_time_ns
         elif head.log_time_ns < self.last_ns:

@@ -40,6 +40,8 @@ class Lifecycle:
         self.error: DiskError | None = None
         self.last_episode: str | None = None
         self.latched = LatchedMessages()
+        self.others: dict[str, Callable[[], object]] = {}
+        """What others have to say of each episode, by name."""
         self.ring = PreRoll(
             seconds=config.preroll_s,
             max_bytes=config.preroll_mb * BYTES_PER_MB,
@@ -176,6 +178,7 @@ class Lifecycle:
             self._config,
             start_ns=min([*first_ns, command.received_ns]),
             latched=self.latched.all,
+            others=self.others,
         )
         take.ledger.begin(held[0].ticket if held else command.ticket)
         return take
@@ -234,19 +237,18 @@ class Lifecycle:
         take = self._open_take()
         if self.is_paused:
             raise LifecycleError(f"episode {take.info.id!r} is paused already.")
-        answer = self.event("paused", command, "", None)
-        take.ledger.pause(command.ticket)
+        take.pause(command)
         self.is_paused = True
-        return answer
+        return {"ok": True, "episode": take.info.id}
 
     def resume(self, command: Command) -> Answer:
         """Record again."""
         take = self._open_take()
         if not self.is_paused:
             raise LifecycleError(f"episode {take.info.id!r} is not paused.")
-        take.ledger.resume(command.ticket)
+        take.resume(command)
         self.is_paused = False
-        return self.event("resumed", command, "", None)
+        return {"ok": True, "episode": take.info.id}
 
     def fail(
         self, cause: str, now_ns: int, rest: Callable[[], Iterable[Item | Dropped]]

@@ -195,8 +195,9 @@ class Recorder:
         self._status.recovered = reports
 
     def also_tell(self, name: str, ask: Callable[[], object]) -> None:
-        """Add something to every status; ``ask`` must answer at once."""
+        """Add something to every status and episode; ``ask`` must answer at once."""
         self._status.others[name] = ask
+        self._life.others[name] = ask
 
     def status(self) -> Answer:
         """What is going on; answers at once, whatever the disk does."""

@@ -2,7 +2,7 @@
 
 import json
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from bridge.episode import metadata, schema
 from bridge.errors import BridgeError
 from bridge.record.channels import Channel, Channels
 from bridge.record.config import RecorderConfig
-from bridge.record.entries import Dropped, Item, second_of
+from bridge.record.entries import Command, Dropped, Item, second_of
 from bridge.record.inspection import resolve_type
 from bridge.record.ledger import Ledger
 from bridge.record.parts import Parts
@@ -29,6 +29,7 @@ class Take:
         *,
         start_ns: int,
         latched: Callable[[], list[WireSample]],
+        others: Mapping[str, Callable[[], object]],
     ) -> None:
         """Create the episode file and say in it who and what it is.
 
@@ -38,6 +39,7 @@ class Take:
             config: The recorder's settings.
             start_ns: When it begins [ns].
             latched: What was said before and still holds, repeated at the start of each file.
+            others: What else goes into the ``recorder`` record, by name; asked at the end.
 
         Raises:
             UsageError: When the episode exists already.
@@ -49,6 +51,8 @@ class Take:
         self.outcome: metadata.Outcome | None = None
         self._config = config
         self._latched = latched
+        self._others = others
+        self._paused_ns: list[list[int]] = []
         self._channels = Channels(config.queues.max_topics, self.ledger.warn)
         self._num_latched = 0
         self._closed_second = second_of(start_ns)
@@ -176,6 +180,18 @@ class Take:
         self._clock_steps_ns.append(step_ns)
         self.write_event("clock_step", stamp_ns=stamp_ns, data={"step_ns": step_ns})
 
+    def pause(self, command: Command) -> None:
+        """Leave out, and count as no loss, what comes after this command."""
+        self.write_event("paused", stamp_ns=command.received_ns)
+        self.ledger.pause(command.ticket)
+        self._paused_ns.append([command.received_ns])
+
+    def resume(self, command: Command) -> None:
+        """Record and count again what comes after this command."""
+        self.ledger.resume(command.ticket)
+        self._paused_ns[-1].append(command.received_ns)
+        self.write_event("resumed", stamp_ns=command.received_ns)
+
     def refuse(self, entries: Iterable[Item | Dropped]) -> None:
         """Book messages that came before the end and can no longer be written."""
         for entry in entries:
@@ -214,7 +230,9 @@ class Take:
             "stopped_by": reason,
             "latched_messages_repeated": self._num_latched,
             "clock_steps_ns": self._clock_steps_ns,
+            "paused": [[*span, end_ns][:2] for span in self._paused_ns],
             "parts": self.num_parts,
+            **{name: ask() for name, ask in self._others.items()},
         }
         values = {name: json.dumps(value) for name, value in recorder.items()}
         writer.add_metadata("recorder", values)

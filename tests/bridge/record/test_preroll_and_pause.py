@@ -11,6 +11,7 @@ import pytest
 
 from bridge.clock import AnchoredClock, StepWatch
 from bridge.episode import schema
+from bridge.episode.check import check_episode
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
@@ -166,7 +167,12 @@ def test_a_pause_leaves_messages_out_and_calls_none_of_them_lost(
     assert answer["lost"] == 1  # number 7
     assert len(data_of(episode_of(run))) == 3
     assert len(data_of(episode_of(run), "/tf_static")) == 1  # still true after the pause
-    assert [event["type"] for event in events(episode_of(run))] == ["paused", "resumed"]
+    found = events(episode_of(run))
+    assert [event["type"] for event in found] == ["paused", "resumed"]
+    span = [event["stamp_ns"] for event in found]
+    assert episode_of(run).metadata_records["recorder"]["paused"] == [span]
+    report = check_episode(run.episodes_dir / "t1.mcap")
+    assert (report.declared_losses, report.undeclared_losses, report.faults) == (1, 0, [])
 
 
 def test_stopping_a_paused_episode_finishes_it(make_recorder: MakeRecorder, run: RunFolder) -> None:
@@ -174,8 +180,21 @@ def test_stopping_a_paused_episode_finishes_it(make_recorder: MakeRecorder, run:
     recorder.start(info())
     recorder.pause()
     recorder.stop()
+    record = episode_of(run).metadata_records["recorder"]
+    assert [end_ns for _, end_ns in record["paused"]] == [record["end_ns"]]
     recorder.start(info("t2"))
     assert recorder.status()["state"] == "recording"
+
+
+def test_what_others_say_is_kept_in_the_episode(
+    make_recorder: MakeRecorder, run: RunFolder
+) -> None:
+    recorder = make_recorder()
+    recorder.also_tell("ros2_warnings", lambda: ["/map: another definition"])
+    recorder.start(info())
+    recorder.stop()
+    record = episode_of(run).metadata_records["recorder"]
+    assert record["ros2_warnings"] == recorder.status()["ros2_warnings"]
 
 
 def test_a_split_episode_reads_as_one_with_every_message_once(
