@@ -32,6 +32,11 @@ class QueueConfig:
         refuse_outside(self, dict.fromkeys(names, (1, UNBOUNDED)))
         refuse_outside(self, {"max_message_mb": (0.001, UNBOUNDED)})
 
+    @property
+    def max_message_bytes(self) -> int:
+        """The limit for one message in bytes."""
+        return round(self.max_message_mb * BYTES_PER_MB)
+
 
 @dataclass(frozen=True, kw_only=True)
 class DiskConfig:

@@ -1,7 +1,7 @@
 """Images on their way to the writer: one thread for each stream, so that order is kept.
 
 The work is done outside Python's lock, and nothing else ever waits behind it. An image that
-cannot be turned into what was asked for is recorded as it came, and flagged.
+cannot be turned into what was asked for is recorded as it came, and flagged where it is broken.
 """
 
 import queue

@@ -60,7 +60,7 @@ class Intake:
         self._limits = limits
         self._bulk_budget = limits.camera_queue_mb * BYTES_PER_MB
         self._small_budget = limits.small_queue_mb * BYTES_PER_MB
-        self._max_bytes = round(limits.max_message_mb * BYTES_PER_MB)
+        self._max_bytes = limits.max_message_bytes
         self._hand_over = hand_over
         self._kinds = kinds
         self._tracker = SequenceTracker()
@@ -153,7 +153,7 @@ class Intake:
         flow.in_second += 1
         if flow.in_second > self._limits.max_rate_hz:
             self._drop(sample, step, f"over {self._limits.max_rate_hz} messages a second")
-        elif cost - OVERHEAD_BYTES > self._max_bytes:
+        elif sample.oversize_bytes or cost - OVERHEAD_BYTES > self._max_bytes:
             self._drop(sample, step, f"messages over {self._limits.max_message_mb:g} MB")
         elif flow.is_ledger:
             self._drop(sample, step, "messages of anybody but the recorder")

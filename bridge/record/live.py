@@ -60,7 +60,10 @@ class LiveRecorder:
         core.note_recovered([_recovery_record(report) for report in reports])
         self._previews = previews
         self._ended = threading.Event()
-        self._subscribers = [session.subscribe(key, self._take) for key in config.topics]
+        self._subscribers = [
+            session.subscribe(key, self._take, max_bytes=config.queues.max_message_bytes)
+            for key in config.topics
+        ]
         self._departures = Departures(session, core)
         self._graph = watch_ros2(session, core)
         core.also_tell("ros2_warnings", self._graph.warnings)

@@ -1,6 +1,7 @@
 """A message as it arrived, copied out of the network's own memory at once."""
 
 import hashlib
+import sys
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -27,10 +28,14 @@ class WireSample:
     source_gid: bytes | None
     """16 bytes that no other publisher has."""
     received_ns: int
+    oversize_bytes: int = 0
+    """Size of a payload beyond the subscription's limit; then ``data`` is empty, not a copy."""
 
 
-def copy_sample(sample: Any, received_ns: int) -> WireSample:
+def copy_sample(sample: Any, received_ns: int, *, max_bytes: int = sys.maxsize) -> WireSample:
     """Read a zenoh sample. Its payload is copied: a kept one would pin the sender's memory."""
+    size = len(sample.payload)
+    is_oversize = size > max_bytes
     named = keys.read_key(str(sample.key_expr))
     type_name, message_encoding = keys.parse_encoding(str(sample.encoding))
     raw = sample.attachment
@@ -45,11 +50,12 @@ def copy_sample(sample: Any, received_ns: int) -> WireSample:
         type_name=type_name or named.type_name,
         message_encoding=message_encoding or ("cdr" if named.type_name else ""),
         type_hash=named.type_hash,
-        data=sample.payload.to_bytes(),
+        data=b"" if is_oversize else sample.payload.to_bytes(),
         source_ns=source_ns,
         sequence=sequence,
         source_gid=gid,
         received_ns=received_ns,
+        oversize_bytes=size if is_oversize else 0,
     )
 
 

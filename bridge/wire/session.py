@@ -6,6 +6,7 @@ samples finds them already delivered.
 """
 
 import contextlib
+import sys
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any
@@ -100,12 +101,21 @@ class WireSession:
             raise BadTopicError(topic=topic, found=cause_of(error)) from error
         return WirePublisher(inner, self._pool if qos.shared_memory else None)
 
-    def subscribe(self, key_expression: str, callback: Callable[[WireSample], None]) -> Subscriber:
-        """Receive what matches, for example ``standin/**``, on the network thread."""
+    def subscribe(
+        self,
+        key_expression: str,
+        callback: Callable[[WireSample], None],
+        *,
+        max_bytes: int = sys.maxsize,
+    ) -> Subscriber:
+        """Receive what matches, for example ``standin/**``, on the network thread.
+
+        Larger payloads than ``max_bytes`` are told of (``oversize_bytes``) and not copied.
+        """
 
         def on_sample(sample: Any) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
-                callback(copy_sample(sample, self._clock.now_ns()))
+                callback(copy_sample(sample, self._clock.now_ns(), max_bytes=max_bytes))
 
         handler = zenoh.handlers.Callback(on_sample, indirect=False)
         try:

@@ -41,6 +41,24 @@ def test_samples_arrive_whole_and_in_order(router: WireSession, client: WireSess
     assert received == sorted(received)
 
 
+def test_payloads_beyond_the_limit_are_told_of_and_not_copied(
+    router: WireSession, client: WireSession
+) -> None:
+    got: list[WireSample] = []
+    router.subscribe("cell/**", got.append, max_bytes=1000)
+    done = router.serve("cell/done", lambda payload: b"")
+    publisher = client.publisher("/cell/cam/a/color/image", schema.IMAGE)
+    for size in (1000, 1001, 10):
+        publisher.put(b"x" * size, source_ns=1)
+    client.query("cell/done", b"", timeout_s=5.0)
+    done.close()
+    assert [(len(s.data), s.oversize_bytes, s.sequence) for s in got] == [
+        (1000, 0, 0),
+        (0, 1001, 1),
+        (10, 0, 2),
+    ]
+
+
 def test_a_refusal_carries_the_message(router: WireSession, client: WireSession) -> None:
     def refuse(payload: bytes) -> bytes:
         raise UsageError(f"cannot do {payload.decode()}")
@@ -142,3 +160,5 @@ def test_a_configuration_file_does_not_turn_scouting_on(tmp_path: Path, endpoint
 def test_a_bad_topic_is_refused_when_announced(client: WireSession) -> None:
     with pytest.raises(BadTopicError):
         client.publisher("/a//b", schema.STRING)
+
+
