@@ -298,11 +298,11 @@ def serve_gate(session: Any, gate: Gate, eyes: Eyes, config: GateConfig, output:
     session.serve(f"{config.cell}/gate/verdict", answer)
 
 
-def watch_cell(session: Any, cell: str, take: Callable[[str, bytes, int], None]) -> None:
+def watch_cell(session: Any, cell: str, take: Callable[[str, bytes, int, str], None]) -> None:
     """Hand the cell's images, transforms, description and events to ``take``."""
 
     def on_sample(sample: Any) -> None:
-        take(sample.topic, sample.data, sample.received_ns)
+        take(sample.topic, sample.data, sample.received_ns, sample.type_name)
 
     for key in (f"{cell}/cam/**", f"{cell}/event", "tf", "tf_static", "robot_description"):
         session.subscribe(key, on_sample)

@@ -14,13 +14,14 @@ from bridge.episode.records import (
     CompressedColor,
     DepthImage,
     FrameTransform,
+    RawColor,
+    color_from_message,
     string_from_cdr,
     transforms_from_cdr,
 )
 from bridge.episode.streams import PAIRING_TOLERANCE_NS, RgbdFrame
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
-from bridge.media.color import decode_color
 from bridge.task.record import parse_record
 from twin.errors import TwinError
 from twin.scene.localise_episode import STILL_WINDOW_NS, is_still
@@ -39,7 +40,9 @@ class _Camera:
     """What one camera sent last."""
 
     infos: dict[str, CameraInfo] = field(default_factory=dict)
-    colors: deque[CompressedColor] = field(default_factory=lambda: deque(maxlen=KEPT_IMAGES))
+    colors: deque[CompressedColor | RawColor] = field(
+        default_factory=lambda: deque(maxlen=KEPT_IMAGES)
+    )
     depths: deque[DepthImage] = field(default_factory=lambda: deque(maxlen=KEPT_IMAGES))
 
 
@@ -68,18 +71,25 @@ class LiveView:
         self._heard_ns = 0
         self.malformed = 0
 
-    def take(self, topic: str, data: bytes, received_ns: int) -> None:
-        """Remember one message; one that cannot be read is counted and passed over."""
+    def take(self, topic: str, data: bytes, received_ns: int, type_name: str = "") -> None:
+        """Remember one message; one that cannot be read is counted and passed over.
+
+        Args:
+            topic: Where it was published.
+            data: As it came.
+            received_ns: On the receiver's clock.
+            type_name: Of an image: raw or compressed; "" is what the topic's name promises.
+        """
         if schema.is_truth(topic):
             return
         try:
             with self._lock:
-                self._take(topic, data)
+                self._take(topic, data, type_name or schema.type_of_topic(topic) or "")
                 self._heard_ns = max(self._heard_ns, received_ns)
         except (GstError, cdr.MalformedMessageError, ValueError):
             self.malformed += 1
 
-    def _take(self, topic: str, data: bytes) -> None:
+    def _take(self, topic: str, data: bytes, type_name: str) -> None:
         if topic == "/tf":
             items = transforms_from_cdr(data)
             self._moving.extend(items)
@@ -93,7 +103,7 @@ class LiveView:
         elif topic == f"/{self._cell}/event":
             self._take_event(data)
         elif topic.startswith(f"/{self._cell}/cam/"):
-            self._take_image(topic, data)
+            self._take_image(topic, data, type_name)
 
     def _take_event(self, data: bytes) -> None:
         event = parse_record(data, name="event", package="bridge.episode")
@@ -104,7 +114,7 @@ class LiveView:
             self._executing = None
             self._quiet_since_ns = max(self._quiet_since_ns, int(event["stamp_ns"]))
 
-    def _take_image(self, topic: str, data: bytes) -> None:
+    def _take_image(self, topic: str, data: bytes, type_name: str) -> None:
         parts = topic.split("/")
         if len(parts) != 6:
             return
@@ -115,10 +125,10 @@ class LiveView:
         if kind == "info":
             camera.infos[stream] = CameraInfo.from_cdr(data)
         elif kind == "image" and stream == "color":
-            camera.colors.append(CompressedColor.from_cdr(data))
+            camera.colors.append(color_from_message(type_name, data))
             self._newest_ns = max(self._newest_ns, camera.colors[-1].stamp_ns)
         elif kind == "image" and stream == "depth":
-            camera.depths.append(DepthImage.from_cdr(data))
+            camera.depths.append(DepthImage.from_message(type_name, data))
 
     def urdf(self) -> str | None:
         """The robot description, None before it arrived."""
@@ -207,7 +217,7 @@ def _frames_of(
     ]
 
 
-def _pairs(camera: _Camera) -> list[tuple[CompressedColor, DepthImage]]:
+def _pairs(camera: _Camera) -> list[tuple[CompressedColor | RawColor, DepthImage]]:
     pairs = []
     for color in camera.colors:
         gaps_ns = [abs(depth.stamp_ns - color.stamp_ns) for depth in camera.depths]
@@ -220,13 +230,13 @@ def _frame(
     camera_id: str,
     infos: dict[str, CameraInfo],
     tree: TransformTree,
-    color: CompressedColor,
+    color: CompressedColor | RawColor,
     depth: DepthImage,
 ) -> RgbdFrame:
     return RgbdFrame(
         camera_id=camera_id,
         stamp_ns=color.stamp_ns,
-        image_u8=decode_color(color.data),
+        image_u8=color.image_u8(),
         depth_m=depth.depth_m(),
         color_camera=infos["color"].camera,
         depth_camera=infos["depth"].camera,

@@ -337,8 +337,9 @@ def test_only_cameras_events_and_transforms_are_subscribed() -> None:
         "tf",
         "tf_static",
     ]
-    session.subscriptions["tf"](SimpleNamespace(topic="/tf", data=b"x", received_ns=3))
-    assert taken == [("/tf", b"x", 3)]
+    sample = SimpleNamespace(topic="/tf", data=b"x", received_ns=3, type_name="t")
+    session.subscriptions["tf"](sample)
+    assert taken == [("/tf", b"x", 3, "t")]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from bridge.episode import cdr, schema
 from bridge.episode.records import (
     CameraInfo,
     CompressedColor,
@@ -14,6 +15,7 @@ from bridge.episode.records import (
     string_to_cdr,
     transforms_to_cdr,
 )
+from bridge.episode.transcode import depth_to_compact
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
 from twin.scene.live import KEPT_IMAGES, LiveFrames, LiveView
@@ -66,6 +68,33 @@ def ready() -> LiveView:
     calibrate(view)
     place(view)
     return view
+
+
+def test_raw_colour_and_compressed_depth_are_frames_too() -> None:
+    depth_mm = np.arange(1000, 1048, dtype=np.uint16).reshape(6, 8)
+    raw_depth = DepthImage(stamp_ns=S, frame_id="d", depth_mm=depth_mm).to_cdr()
+    compact = depth_to_compact(raw_depth)
+    assert compact is not None
+    pixels = np.arange(6 * 8 * 3, dtype=np.uint8).reshape(6, 8, 3)
+    message = {
+        "header": {"stamp": {"sec": 1, "nanosec": 0}, "frame_id": "c"},
+        "height": 6,
+        "width": 8,
+        "encoding": "bgr8",
+        "is_bigendian": 0,
+        "step": 24,
+        "data": pixels.tobytes(),
+    }
+    raw_color = cdr.encode(schema.IMAGE, message)
+    view = ready()
+    view.take("/standin/cam/side/color/image", raw_color, 0, schema.IMAGE)
+    view.take("/standin/cam/side/depth/image", compact, 0, schema.COMPRESSED_IMAGE)
+    (frame,) = look(view).frames
+    np.testing.assert_array_equal(frame.image_u8, pixels[..., ::-1])
+    np.testing.assert_allclose(frame.depth_m, depth_mm * 1e-3, rtol=1e-6)
+    view.take("/standin/cam/side/color/image", IMAGE[:9], 0, schema.COMPRESSED_IMAGE)
+    view.take("/standin/cam/side/depth/image", compact[:-9], 0, schema.COMPRESSED_IMAGE)
+    assert view.malformed == 2
 
 
 def test_the_newest_frames_are_given_in_metres() -> None:
