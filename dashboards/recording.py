@@ -6,7 +6,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-from bridge.episode import provenance, schema, streams
+from bridge.episode import schema, streams
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack
@@ -110,7 +110,7 @@ def _read(path: Path, _mtime_ns: int, size: int) -> Recording:
     tracked = {name: poses(topic) for name, topic in streams.object_pose_topics(episode).items()}
     return Recording(
         path=path,
-        sha256=provenance.hash_file(path),
+        sha256=episode.sha256(),
         size_bytes=size,
         info=episode.info,
         outcome=episode.outcome,

@@ -12,6 +12,7 @@ from bridge.episode.mcap_file import McapFile, damaged
 from bridge.episode.mcap_walk import DAMAGE
 from bridge.episode.merge import Selection, merged
 from bridge.episode.parts import open_parts
+from bridge.episode.provenance import hash_files
 from bridge.errors import EpisodeError, PathNotFoundError, SchemaVersionError
 
 LAST_PART_WINS = ("outcome", "drops", "recorder", "split")
@@ -88,6 +89,10 @@ class Episode:
     def parts(self) -> tuple[Path, ...]:
         """The files this episode is read from, in order."""
         return tuple(file.path for file in self.files)
+
+    def sha256(self) -> str:
+        """SHA-256 of the bytes of all parts, one after the other, in hexadecimal; reads them."""
+        return hash_files(self.parts)
 
     @property
     def _summary(self) -> Summary:

@@ -53,7 +53,7 @@ def compare_run(run: RunFolder) -> Comparison:
     recorded, left_out = _read_recorded(run)
     files, broken = read_derived(run)
     left_out += broken
-    hashes = {episode.path: hash_file(episode.path) for episode in recorded}
+    hashes = {episode.path: episode.sha256() for episode in recorded}
     rows = []
     for episode in recorded:
         if episode.info.kind != "trial":

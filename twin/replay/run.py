@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 from bridge.episode import streams
-from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.errors import GstError, UsageError
@@ -98,7 +97,7 @@ def _jobs_of(
     starts = localised_starts(
         run, episode, load_task(task_name), scene_hash=scene_hash, force=config.relocalise
     )
-    digest = hash_file(path)
+    digest = episode.sha256()
     jobs = []
     for index, (stamp_ns, plan) in enumerate(plans):
         interval = streams.executed_interval_ns(episode, plan.id)

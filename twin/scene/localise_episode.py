@@ -198,7 +198,7 @@ def write_localised(
     derived = Derived(
         kind="localised",
         source_episode=episode.info.id,
-        source_sha256=provenance.hash_file(episode.path),
+        source_sha256=episode.sha256(),
         scene_hash=scene_hash,
         engine="colour_shape_fit",
         settings={"task": asdict(task), **asdict(config)},

@@ -119,7 +119,7 @@ def _key(sources: Sources, config: RebuildConfig) -> str:
     settings = asdict(config)
     settings.pop("force")
     settings["fit"].pop("threads")
-    hashes = {str(e.path.name): provenance.hash_file(e.path) for e in sources.episodes}
+    hashes = {str(e.path.name): e.sha256() for e in sources.episodes}
     return provenance.hash_settings(
         {
             "method": METHOD_VERSION,

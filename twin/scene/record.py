@@ -44,8 +44,7 @@ def make_record(
         "remark": sources.remark,
         "stand_in": any(episode.info.stand_in for episode in sources.episodes),
         "sources": [
-            {"id": e.info.id, "kind": e.info.kind, "sha256": provenance.hash_file(e.path)}
-            for e in sources.episodes
+            {"id": e.info.id, "kind": e.info.kind, "sha256": e.sha256()} for e in sources.episodes
         ],
         "cameras": [_camera_record(choice) for choice in choices],
         "settings": settings,

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bridge.episode import provenance, schema, streams
+from bridge.episode import schema, streams
 from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
 from bridge.episode.records import CameraInfo, CompressedColor, DepthImage
@@ -93,7 +93,7 @@ def write_views(
                 derived=Derived(
                     kind="views",
                     source_episode=episode.info.id,
-                    source_sha256=provenance.hash_file(path),
+                    source_sha256=episode.sha256(),
                     scene_hash=job.scene_hash,
                     engine="robot-gst splat",
                     settings=job.settings(),

@@ -1,5 +1,6 @@
 """A split episode reads as one; what is missing is named and keeps nothing else from being read."""
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from bridge.episode import schema, streams
 from bridge.episode.check import check_all, check_episode
 from bridge.episode.metadata import EpisodeInfo, Outcome, to_strings
+from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.records import JointSample, string_to_cdr
 from bridge.episode.run import part_name
@@ -91,6 +93,14 @@ def test_three_parts_read_as_one_episode(tmp_path: Path) -> None:
     ]
     report = check_episode(path)
     assert (report.exit_code, report.messages, report.notes) == (0, 8, [])
+
+
+def test_the_hash_of_an_episode_is_that_of_all_its_bytes(tmp_path: Path) -> None:
+    episode = Episode.open(split_in_three(tmp_path))
+    whole = b"".join(path.read_bytes() for path in episode.parts)
+    assert episode.sha256() == hashlib.sha256(whole).hexdigest()
+    alone = Episode.open(tmp_path / "t1.3.mcap")
+    assert alone.sha256() == hash_file(tmp_path / "t1.3.mcap")
 
 
 def test_a_missing_part_in_the_middle_is_named_and_the_others_are_read(tmp_path: Path) -> None:
