@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import dataclass
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 
 EXTRAS: dict[str, tuple[str, ...]] = {
@@ -16,6 +17,12 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "realsense": ("pyrealsense2",),
     "ur": ("example-robot-data",),
 }
+NATIVE = (
+    ("splat rasteriser", "twin.scene._splat", "no place can be rebuilt"),
+    ("depth codec", "bridge.media._depth", "slow fallback, for playing back only"),
+    ("checksum", "bridge.episode._crc32", "slower fallback (zlib)"),
+)
+"""What our own extensions are for, and how it goes without each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,9 +36,9 @@ class Finding:
 
 
 def examine() -> list[Finding]:
-    """Look at packages, the native extension, system libraries and programs; import nothing."""
+    """Look at packages, the native extensions, system libraries and programs; import nothing."""
     findings = [_package(name, extra) for extra, names in EXTRAS.items() for name in names]
-    findings.append(_native())
+    findings.extend(_native(*each) for each in NATIVE)
     findings.append(_program("chromium", "needed only to test the dashboard: apt install chromium"))
     findings.extend(_system_libraries())
     return findings
@@ -46,14 +53,11 @@ def _package(name: str, extra: str) -> Finding:
     return Finding(what=f"{name} [{extra}]", found=found, ok=True)
 
 
-def _native() -> Finding:
-    from importlib.util import find_spec  # noqa: PLC0415  # keeps this module's imports plain
-
-    spec = find_spec("twin.scene._splat")
-    if spec is None:
-        advice = "run make, or pip install . with a C++17 compiler present"
-        return Finding(what="splat rasteriser", found="not built", ok=False, advice=advice)
-    return Finding(what="splat rasteriser", found="built", ok=True)
+def _native(what: str, module: str, without: str) -> Finding:
+    if find_spec(module) is not None:
+        return Finding(what=what, found="built", ok=True)
+    advice = "run make, or pip install . with a C++17 compiler present"
+    return Finding(what=what, found=f"not built: {without}", ok=False, advice=advice)
 
 
 def _program(name: str, advice: str) -> Finding:

@@ -1,0 +1,22 @@
+"""What ``robot-gst doctor`` finds."""
+
+import importlib.util
+
+import pytest
+
+from bridge import doctor
+
+
+def test_each_native_extension_is_built_or_what_goes_without_it_is_said(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    find_spec = importlib.util.find_spec
+    for what, module, without in doctor.NATIVE:
+        is_built = find_spec(module) is not None
+        (found,) = [finding for finding in doctor.examine() if finding.what == what]
+        assert found.ok == is_built
+        with monkeypatch.context() as patch:
+            patch.setattr(doctor, "find_spec", lambda name: None)
+            (found,) = [finding for finding in doctor.examine() if finding.what == what]
+        assert (found.ok, found.found) == (False, f"not built: {without}")
+        assert "make" in found.advice
