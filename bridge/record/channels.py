@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from bridge.episode import schema
 from bridge.errors import MissingDependencyError
@@ -33,13 +34,17 @@ class Channel:
 class Channels:
     """Remembers the channels of one episode; a topic with two definitions gets two."""
 
-    def __init__(self, max_topics: int, warn: Callable[[str], None]) -> None:
+    def __init__(
+        self, max_topics: int, warn: Callable[[str], None], msg_folder: Path | None = None
+    ) -> None:
         """Start empty.
 
         Args:
             max_topics: Further ones are refused.
             warn: Called with what a person should know.
+            msg_folder: Definitions of ROS 2 types of one's own.
         """
+        self._msg_folder = msg_folder
         self._max_topics = max_topics
         self._warn = warn
         self._channels: dict[tuple[str, str, str, str], Channel] = {}
@@ -87,10 +92,10 @@ class Channels:
         if encoding not in ("", known.message_encoding if known else "cdr"):
             return _name_only(type_name, encoding), False
         type_hash = sample.type_hash if sample.type_hash.startswith(HASH_PREFIX) else ""
-        newest = _newest_hash(type_name) if type_hash else None
+        newest = _newest_hash(type_name, self._msg_folder) if type_hash else None
         if known is not None and newest in (None, type_hash):
             return known, False
-        found = _from_ros(type_name, type_hash)
+        found = _from_ros(type_name, type_hash, self._msg_folder)
         if found is not None:
             return found, False
         is_first = not type_hash or self._hashes.setdefault(type_name, type_hash) == type_hash
@@ -103,15 +108,15 @@ def _name_only(name: str, encoding: str) -> schema.Schema:
     return schema.Schema(name=name, schema_encoding="", message_encoding=encoding, data=b"")
 
 
-def _newest_hash(type_name: str) -> str | None:
+def _newest_hash(type_name: str, folder: Path | None) -> str | None:
     try:
-        return type_hash_of(type_name)
+        return type_hash_of(type_name, folder=folder)
     except MissingDependencyError:
         return None
 
 
-def _from_ros(type_name: str, type_hash: str) -> schema.Schema | None:
+def _from_ros(type_name: str, type_hash: str, folder: Path | None) -> schema.Schema | None:
     try:
-        return ros_schema(type_name, type_hash=type_hash)
+        return ros_schema(type_name, type_hash=type_hash, folder=folder)
     except MissingDependencyError:
         return None

@@ -1,6 +1,7 @@
 """How the recorder behaves."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
@@ -67,7 +68,7 @@ class RecorderConfig:
     """Settings of one recorder; stored in every episode it writes."""
 
     recorder: str = "main"
-    """Name of this recorder in its control keys ``rec/<name>/ctl/...``."""
+    """Name of this recorder in its control keys ``rec/NAME/ctl/...``."""
     topics: tuple[str, ...] = ("**",)
     """Zenoh key expressions to record; ``**`` is everything."""
     color: Literal["jpeg", "as_is"] = "jpeg"
@@ -76,6 +77,8 @@ class RecorderConfig:
     """Of colour that is compressed here, 1 to 100."""
     depth: Literal["raw", "compact"] = "raw"
     """Raw depth images: keep them (every viewer reads those), or compress without loss (RVL)."""
+    msg_folder: Path | None = None
+    """Where the .msg files of your own ROS 2 types lie, as PACKAGE/msg/NAME.msg at any depth."""
     preview_video: bool = False
     """Add an H.264 video of each raw colour stream, for people; needs the extra [video]."""
     preview_hz: float = 5.0

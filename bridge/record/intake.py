@@ -15,7 +15,7 @@ from bridge.episode import schema
 from bridge.record.config import BYTES_PER_MB, QueueConfig
 from bridge.record.entries import Command, DropCount, Dropped, Entry, Item, second_of
 from bridge.record.inspection import resolve_type
-from bridge.record.latched import is_latched
+from bridge.record.latched import LatchedTopics
 from bridge.record.sequence import SequenceTracker, Step
 from bridge.record.shedding import Shed, keep_every, next_level
 from bridge.wire.session import WireSample
@@ -34,7 +34,6 @@ class Flow:
     topic: str
     type_name: str
     is_image: bool
-    is_latched: bool
     is_ledger: bool
     """The topic on which a recorder says what it lost; nobody else may."""
     seen: int = 0
@@ -64,6 +63,8 @@ class Intake:
         self._hand_over = hand_over
         self._kinds = kinds
         self._tracker = SequenceTracker()
+        self.latched = LatchedTopics()
+        """Queued even while nothing is recorded."""
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._entries: deque[Entry] = deque()
@@ -107,7 +108,7 @@ class Intake:
             flow = self._flows.get((sample.topic, sample.type_name)) or self._new_flow(sample)
             flow.seen += 1
             for_preview = False
-            if self._is_quiet and not flow.is_latched:
+            if self._is_quiet and sample.topic not in self.latched:
                 for_preview = flow.is_image and sample.topic in self.watched
                 if not for_preview:
                     return
@@ -137,7 +138,6 @@ class Intake:
             topic,
             type_name,
             is_image=type_name in IMAGE_TYPES,
-            is_latched=is_latched(topic),
             is_ledger=topic == schema.DROPS_TOPIC,
         )
         self._flows[sample.topic, sample.type_name] = flow

@@ -12,7 +12,7 @@ from bridge.errors import UsageError
 from bridge.record.config import BYTES_PER_MB, RecorderConfig
 from bridge.record.entries import Command, Dropped, Item
 from bridge.record.errors import DiskError, LifecycleError, NoSpaceError
-from bridge.record.latched import LatchedMessages, is_latched
+from bridge.record.latched import LatchedMessages, LatchedTopics
 from bridge.record.preroll import PreRoll
 from bridge.record.reserve import FooterReserve, free_bytes
 from bridge.record.take import Take
@@ -24,7 +24,11 @@ class Lifecycle:
     """Decides what happens to each message, and carries out commands."""
 
     def __init__(
-        self, run: RunFolder, config: RecorderConfig, queued_bytes: Callable[[], int]
+        self,
+        run: RunFolder,
+        config: RecorderConfig,
+        queued_bytes: Callable[[], int],
+        latched: LatchedTopics,
     ) -> None:
         """Begin idle.
 
@@ -32,6 +36,7 @@ class Lifecycle:
             run: Where episodes go.
             config: Settings.
             queued_bytes: How much waits in the queues.
+            latched: Topics whose last message stays true.
         """
         self.take: Take | None = None
         self.is_paused = False
@@ -39,7 +44,7 @@ class Lifecycle:
         self.is_finishing = False
         self.error: DiskError | None = None
         self.last_episode: str | None = None
-        self.latched = LatchedMessages()
+        self.latched = LatchedMessages(latched)
         self.others: dict[str, Callable[[], object]] = {}
         """What others have to say of each episode, by name."""
         self.ring = PreRoll(
@@ -78,7 +83,7 @@ class Lifecycle:
             self.ring.add(entry)
         elif isinstance(entry, Item):
             self.latched.remember(entry.sample)
-            if not self.is_paused or is_latched(entry.sample.topic):
+            if not self.is_paused or entry.sample.topic in self.latched.topics:
                 self._write(take, entry)
         elif not self.is_paused:
             take.ledger.count_dropped(entry)

@@ -29,6 +29,7 @@ from bridge.record.ros2 import watch_ros2
 from bridge.wire.config import DEFAULT_ENDPOINT, WireConfig
 from bridge.wire.errors import WireError
 from bridge.wire.qos import Qos
+from bridge.wire.ros_types import read_definitions
 from bridge.wire.session import WireSample, WireSession, open_session
 
 STATUS_PERIOD_S = 1.0
@@ -47,7 +48,13 @@ class LiveRecorder:
         config: RecorderConfig,
         say: Callable[[str], None],
     ) -> None:
-        """Recover what a crash left, then listen."""
+        """Recover what a crash left, then listen.
+
+        Raises:
+            UsageError: When ``msg_folder`` holds no definitions, or one that is none.
+        """
+        if config.msg_folder is not None:  # complain now, not at the first message
+            read_definitions(config.msg_folder)
         self.run = run
         self.session = session
         reports = recover_parts(run)
@@ -65,7 +72,7 @@ class LiveRecorder:
             for key in config.topics
         ]
         self._departures = Departures(session, core)
-        self._graph = watch_ros2(session, core)
+        self._graph = watch_ros2(session, core, config.msg_folder)
         core.also_tell("ros2_warnings", self._graph.warnings)
         self._services = serve_control(session, core)
         name = f"/rec/{config.recorder}/status"

@@ -65,7 +65,9 @@ class Recorder:
         self._encoders = EncoderThreads(encoder, self._take_back, preview)
         self.intake = Intake(self.config.queues, self._encoders.submit, encoder.kinds)
         self._merge = Merge()
-        self._life = Lifecycle(run, self.config, lambda: self.intake.queued_bytes)
+        self._life = Lifecycle(
+            run, self.config, lambda: self.intake.queued_bytes, self.intake.latched
+        )
         self._status = Status(run, self.config, self.intake, self._life, now_ns)
         self._steps = StepWatch(now_ns, wall_ns=wall_ns)
         self._next_second_s = 0.0
@@ -181,6 +183,10 @@ class Recorder:
         entries = list_episodes(self._run)
         episodes = [asdict(entry) for entry in entries[-last:]]
         return {"ok": True, "of": len(entries), "episodes": episodes}
+
+    def declare_latched(self, topic: str) -> None:
+        """Begin later episodes with the last message of a topic; its publisher says so."""
+        self.intake.latched.declare(topic)
 
     def forget(self, prefix: str) -> None:
         """Repeat no latched message of topics that begin so: their publisher has gone."""

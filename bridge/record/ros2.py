@@ -8,6 +8,7 @@ person should know: types nobody can decode, definitions that differ, publishers
 import contextlib
 import queue
 import threading
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from bridge.errors import GstError, MissingDependencyError
@@ -27,14 +28,18 @@ class Receiver(Protocol):
     def receive(self, sample: WireSample) -> None:
         """Take a message; never waits."""
 
+    def declare_latched(self, topic: str) -> None:
+        """Learn that the last message of a topic stays true; never waits."""
+
 
 class Ros2Graph:
     """The ROS 2 endpoints on the network, followed from their liveliness tokens."""
 
-    def __init__(self, session: WireSession, recorder: Receiver) -> None:
+    def __init__(self, session: WireSession, recorder: Receiver, msg_folder: Path | None) -> None:
         """Use ``watch_ros2``."""
         self._session = session
         self._recorder = recorder
+        self._msg_folder = msg_folder
         self._endpoints: dict[str, rmw.RosEndpoint] = {}
         self._warnings: dict[str, None] = {}
         self._lock = threading.Lock()
@@ -86,6 +91,8 @@ class Ros2Graph:
         if known is None or known.kind is not rmw.EntityKind.PUBLISHER:
             return
         if alive:
+            if known.qos.transient_local:
+                self._recorder.declare_latched(known.topic)
             self._arrived.put(endpoint)
         else:
             self._warn(f"{known.topic}: the publisher in {known.node} left")
@@ -122,13 +129,15 @@ class Ros2Graph:
     def _check_type(self, endpoint: rmw.RosEndpoint) -> None:
         name, type_hash = endpoint.type_name, endpoint.type_hash
         try:
-            newest = type_hash_of(name)
+            newest = type_hash_of(name, folder=self._msg_folder)
             if newest is None:
                 self._warn(
                     f"{endpoint.topic}: type {name} is not known here; its messages are kept "
                     "under this name, without a definition"
                 )
-            elif type_hash != keys.NO_HASH and not is_known_definition(name, type_hash):
+            elif type_hash != keys.NO_HASH and not is_known_definition(
+                name, type_hash, folder=self._msg_folder
+            ):
                 self._warn(
                     f"{endpoint.topic}: {endpoint.node} was built with another definition of "
                     f"{name} ({type_hash}) than any known here ({newest})"
@@ -137,7 +146,9 @@ class Ros2Graph:
             self._warn(str(error))
 
 
-def watch_ros2(session: WireSession, recorder: Receiver) -> Ros2Graph:
+def watch_ros2(
+    session: WireSession, recorder: Receiver, msg_folder: Path | None = None
+) -> Ros2Graph:
     """Follow the ROS 2 endpoints on the network until ``close``.
 
     Subscribe to the topics first: what is published meanwhile then arrives twice rather than not
@@ -146,8 +157,9 @@ def watch_ros2(session: WireSession, recorder: Receiver) -> Ros2Graph:
     Args:
         session: An open session.
         recorder: Gets the history of each transient-local publisher, once for each publisher.
+        msg_folder: Definitions of ROS 2 types of one's own.
     """
-    return Ros2Graph(session, recorder)
+    return Ros2Graph(session, recorder, msg_folder)
 
 
 def _cache_keys(endpoint: rmw.RosEndpoint) -> tuple[str, str]:

@@ -53,7 +53,7 @@ class Take:
         self._latched = latched
         self._others = others
         self._paused_ns: list[list[int]] = []
-        self._channels = Channels(config.queues.max_topics, self.ledger.warn)
+        self._channels = Channels(config.queues.max_topics, self.ledger.warn, config.msg_folder)
         self._num_latched = 0
         self._closed_second = second_of(start_ns)
         self._records: deque[dict[str, Any]] = deque()
@@ -234,7 +234,7 @@ class Take:
             "parts": self.num_parts,
             **{name: ask() for name, ask in self._others.items()},
         }
-        values = {name: json.dumps(value) for name, value in recorder.items()}
+        values = {name: json.dumps(value, default=str) for name, value in recorder.items()}
         writer.add_metadata("recorder", values)
 
     def discard(self) -> None:

@@ -13,7 +13,7 @@ class FolderConfig:
     """How a folder is turned into messages."""
 
     cell: str = "kitchen"
-    """Name of the cell in topics: /<cell>/cam/<camera>/color/image."""
+    """Name of the cell in topics: /CELL/cam/CAMERA/color/image."""
     camera: str = "kinect"
     """Name of the camera in topics and frames."""
     rate_hz: float | None = None

@@ -86,6 +86,16 @@ def _store(name: str, folder: Path | None) -> Any:
     return store
 
 
+def read_definitions(folder: Path) -> None:
+    """Read a folder of definitions now rather than at the first message.
+
+    Raises:
+        MissingDependencyError: When rosbags is not installed.
+        UsageError: When a file in the folder is not a message definition, or there is none.
+    """
+    _store(_release_names()[0], folder)
+
+
 def _read_folder(folder: Path) -> dict[str, Any]:
     typesys = _typesys()
     found: dict[str, Any] = {}

@@ -1,6 +1,11 @@
 """The front door: exit codes, one clear sentence, JSON on stdout."""
 
+import dataclasses
+import importlib
+import inspect
 import json
+import re
+import typing
 from pathlib import Path
 
 import pytest
@@ -106,6 +111,30 @@ def test_every_command_has_help_with_an_example(
 ) -> None:
     assert robot_gst.run([name, "--help"]) == 0
     assert "Example" in capsys.readouterr().out
+
+
+TARGETS = [command[1] for command in robot_gst.COMMANDS] + [
+    member[1] for _, members in robot_gst.GROUPS.values() for member in members
+]
+
+
+def help_sources(kind: type) -> list[str]:
+    """The source of a settings class, and of those inside it: their docstrings are the help."""
+    inner = [field.type for field in dataclasses.fields(kind)]
+    inner = [getattr(each, "__origin__", each) for each in inner]
+    found = [each for each in inner if dataclasses.is_dataclass(each)]
+    return [inspect.getsource(kind), *(text for each in found for text in help_sources(each))]
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_no_help_text_holds_what_the_terminal_would_swallow(target: str) -> None:
+    module, name = target.split(":")
+    function = getattr(importlib.import_module(module), name)
+    texts = [inspect.getdoc(function) or ""]
+    for kind in typing.get_type_hints(function).values():
+        if dataclasses.is_dataclass(kind):
+            texts.extend(help_sources(kind))
+    assert [token for text in texts for token in re.findall(r"<[a-z_ ]+>", text)] == []
 
 
 def test_a_file_written_whole_has_its_bytes_and_leaves_no_part(tmp_path: Path) -> None:

@@ -203,6 +203,24 @@ def static_transform(*children: str) -> bytes:
     )
 
 
+def test_declared_topics_are_latched_for_each_publisher_within_bounds(
+    make_sample: MakeSample, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bridge.record.latched.MAX_LATCHED_BYTES", 10)
+    latched = LatchedMessages()
+    latched.remember(make_sample(topic="/map", data=b"unknown"))
+    for topic in ("/map", "/rosout"):
+        latched.topics.declare(topic)
+        for gid, data in ((b"a", b"old"), (b"b", b"other"), (b"a", b"newer")):
+            latched.remember(make_sample(topic=topic, data=data, source_gid=gid * 16))
+    assert [sample.data for sample in latched.all()] == [b"other", b"newer"]
+    latched.remember(make_sample(topic="/map", data=bytes(6), source_gid=b"b" * 16))
+    assert [sample.data for sample in latched.all()] == [b"newer"]  # the other is out of date
+    latched.forget("/map")
+    latched.remember(make_sample(topic="/map", data=bytes(10)))
+    assert [len(sample.data) for sample in latched.all()] == [10]
+
+
 def test_static_transforms_of_several_publishers_are_all_kept(make_sample: MakeSample) -> None:
     latched = LatchedMessages()
     for children in (("a", "b"), ("c",), ("b", "a"), ("c",)):

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
+from bridge.clock import AnchoredClock
 from bridge.episode import schema
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
@@ -19,6 +21,7 @@ from bridge.errors import UsageError
 from bridge.media.color import decode_color, encode_jpeg
 from bridge.record.config import RecorderConfig
 from bridge.record.live import LiveRecorder, open_recorder
+from bridge.record.recorder import Recorder
 from bridge.task.record import parse_record
 from bridge.wire.config import WireConfig
 from bridge.wire.recorder_client import RecorderClient
@@ -183,3 +186,38 @@ def test_what_a_crash_left_is_recovered_and_said(tmp_path: Path, wire: WireConfi
     assert said[0].startswith("recovered old.mcap: 10 messages")
     assert Episode.open(run.episodes_dir / "old.mcap").info.id == "old"
     assert json.dumps(report)
+
+
+def test_messages_of_ones_own_type_carry_their_definition(
+    run: RunFolder, make_sample: Callable[..., WireSample], tmp_path: Path
+) -> None:
+    folder = tmp_path / "src"
+    (folder / "my_msgs" / "msg").mkdir(parents=True)
+    definition = folder / "my_msgs" / "msg" / "Grip.msg"
+    definition.write_text("float64 width\n")
+    config = RecorderConfig(msg_folder=folder)
+    recorder = Recorder(run, now_ns=AnchoredClock().now_ns, config=config)
+    recorder.start(EpisodeInfo(id="t1", kind="trial"))
+    recorder.receive(make_sample(topic="/grip", type_name="my_msgs/msg/Grip", data=bytes(12)))
+    recorder.stop()
+    recorder.close()
+    path = run.episodes_dir / "t1.mcap"
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    (found,) = [each for each in summary.schemas.values() if each.name == "my_msgs/msg/Grip"]
+    assert (found.encoding, b"float64 width" in found.data) == ("ros2msg", True)
+    settings = Episode.open(path).metadata_records["recorder"]["settings"]
+    assert settings["msg_folder"] == str(folder)
+
+
+def test_a_folder_without_definitions_is_refused_at_the_start(tmp_path: Path) -> None:
+    with (
+        pytest.raises(UsageError, match="holds no message definitions"),
+        open_recorder(
+            tmp_path / "run",
+            wire=WireConfig(mode="peer", connect=(), listen=()),
+            config=RecorderConfig(msg_folder=tmp_path),
+        ),
+    ):
+        pass

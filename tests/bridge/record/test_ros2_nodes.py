@@ -67,6 +67,9 @@ class Cell:
         self.got.append(sample)
         self.recorder.receive(sample)
 
+    def declare_latched(self, topic: str) -> None:
+        self.recorder.declare_latched(topic)
+
     def listen(self) -> Ros2Graph:
         self.session.subscribe("**", self.receive)
         self.graph = watch_ros2(self.session, self)
@@ -164,6 +167,18 @@ def test_what_was_said_before_we_came_is_recorded_once(cell: Cell, flag: str) ->
     found = read(cell.run.episodes_dir / "t1.mcap")
     assert [each.sequence for _, _, each in found] == list(range(10))
     assert answer["lost"] == 0
+
+
+def test_what_a_transient_local_publisher_said_last_begins_the_next_episode(cell: Cell) -> None:
+    cell.listen()
+    robot = cell.robot("33", "3", "latched")
+    cell.wait_for(lambda: "/chatter" in cell.recorder.intake.latched, "the token")
+    robot.speak()
+    cell.wait_for(lambda: len(cell.got) == 3, "the messages")
+    cell.recorder.start(EpisodeInfo(id="t1", kind="trial"))
+    cell.recorder.stop()
+    found = read(cell.run.episodes_dir / "t1.mcap")
+    assert [each.sequence for _, _, each in found] == [2]
 
 
 def test_a_publisher_that_comes_later_is_not_recorded_twice(cell: Cell) -> None:
