@@ -72,7 +72,7 @@ class CameraMessages:
                 stamp_ns=frame.stamp_ns,
                 frame_id=self.color_frame,
                 format="jpeg",
-                data=encode_jpeg(frame.image_u8, self._config.quality),
+                data=encode_jpeg(frame.image_u8, self._config.quality, subsampling="420"),
             ).to_cdr()
         height, width, _ = frame.image_u8.shape
         sec, nanosec = split_ns(frame.stamp_ns)

@@ -1,5 +1,6 @@
 """RealSense cameras, played by librealsense's software device, from driver to checked episode."""
 
+import io
 import json
 import threading
 import time
@@ -9,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Joined
+from PIL import Image
+from PIL.JpegImagePlugin import get_sampling
 
 rs = pytest.importorskip("pyrealsense2", reason="the extra [realsense] is not installed")
 
@@ -383,3 +386,5 @@ def test_colour_types_are_declared(joined: Joined) -> None:
     decoded = CompressedColor.from_cdr(jpeg.color(frame))
     assert (decoded.stamp_ns, decoded.frame_id) == (5, "a_color_optical")
     assert decode_color(decoded.data).shape == (HEIGHT, WIDTH, 3)
+    with Image.open(io.BytesIO(decoded.data)) as image:
+        assert get_sampling(image) == 2  # 4:2:0: colour at half the size, for half the work
