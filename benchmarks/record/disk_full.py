@@ -22,8 +22,8 @@ from record.throughput import EPISODE
 from record.verify import verify
 
 SIZE_MB = 80
-FULL_BYTES = 300_000
-"""Less than one depth image is left."""
+FULL_BYTES = 1_300_000
+"""Less than one chunk is left; the disk says no at this instant or a little later."""
 GIVE_UP_S = 30.0
 
 
