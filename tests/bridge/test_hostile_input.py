@@ -287,8 +287,8 @@ def test_zenoh_and_settings_files_may_come_in_any_order(tmp_path: Path) -> None:
         ["publish", "standin", "--rate-hz", "-1"],
         ["publish", "folder", "DIR", "--max-frames", "-1"],
         ["import", "rgbd", "DIR", "RUN", "--rate-hz", "nan"],
-        ["record", "RUN", "--queue-mb", "-1"],
-        ["record", "RUN", "--queue-mb", "8", "--small-reserve-mb", "16"],
+        ["record", "RUN", "--camera-queue-mb", "-1"],
+        ["record", "RUN", "--small-queue-mb", "0"],
     ],
 )
 def test_a_number_out_of_range_is_wrong_use(
