@@ -30,7 +30,7 @@ def wall_seconds(work: Callable[[], object], repeats: int = REPEATS) -> list[flo
 def main() -> None:
     """Tiny episodes of a few tasks and outcomes."""
     from bridge.episode.catalogue import list_episodes
-    from bridge.episode.catalogue_reading import read_entry
+    from bridge.episode.catalogue.reading import read_entry
     from bridge.episode.metadata import EpisodeInfo, Outcome
     from bridge.episode.run import RunFolder
     from bridge.episode.writer import EpisodeWriter

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from bridge.episode.catalogue_query import CatalogueQuery
+from bridge.episode.catalogue.query import CatalogueQuery
 from bridge.terminal import Advance, Output
 
 if TYPE_CHECKING:
-    from bridge.episode.catalogue_entry import Entry
+    from bridge.episode.catalogue.entry import Entry
 
 OUTPUT = Output()
 EVERYTHING = CatalogueQuery()
@@ -46,7 +46,7 @@ def ls(
 
 
 def _find(run: Path, query: CatalogueQuery, output: Output) -> "list[Entry]":
-    from bridge.episode.catalogue_find import find_episodes
+    from bridge.episode.catalogue.find import find_episodes
     from bridge.episode.run import RunFolder
 
     with ExitStack() as stack:
@@ -138,7 +138,7 @@ def export_catalogue(
         query: Which, and in what order.
         output: How to talk.
     """
-    from bridge.episode.catalogue_parquet import write_parquet
+    from bridge.episode.catalogue.parquet import write_parquet
 
     entries = _find(run, query, output)
     write_parquet(entries, out)

@@ -1,8 +1,9 @@
 """The channels of a file being written: one for each topic and schema, numbered as they come."""
 
-from bridge.episode import mcap_format, schema
-from bridge.episode.chunks import OpenChunk
-from bridge.episode.summary import Summary
+from bridge.episode import schema
+from bridge.episode.mcap import format as mcap_format
+from bridge.episode.mcap.chunks import OpenChunk
+from bridge.episode.mcap.summary import Summary
 
 
 class Channel:

@@ -15,11 +15,12 @@ import numpy as np
 from jaxtyping import UInt64
 from mcap import records
 
-from bridge.episode import mcap_format
 from bridge.episode.check_summary import Seen, summary_faults
-from bridge.episode.mcap_file import read_footer, read_header, read_summary
-from bridge.episode.mcap_format import MAGIC, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
-from bridge.episode.mcap_walk import (
+from bridge.episode.mcap import format as mcap_format
+from bridge.episode.mcap.file import read_footer, read_header, read_summary
+from bridge.episode.mcap.format import MAGIC, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from bridge.episode.mcap.rebuild import attachment_entry, chunk_entry
+from bridge.episode.mcap.walk import (
     DAMAGE,
     PIECE_BYTES,
     BrokenRecordError,
@@ -35,7 +36,6 @@ from bridge.episode.mcap_walk import (
     unpack_chunk,
     walk,
 )
-from bridge.episode.rebuild import attachment_entry, chunk_entry
 
 _INDEX_HEAD = struct.Struct("<HI")
 NEVER = 1 << 64

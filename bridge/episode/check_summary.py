@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from mcap import records
 from mcap.summary import Summary
 
-from bridge.episode.mcap_walk import (
+from bridge.episode.mcap.rebuild import metadata_entry
+from bridge.episode.mcap.walk import (
     BrokenRecordError,
     ByteStream,
     MessageHead,
@@ -15,7 +16,6 @@ from bridge.episode.mcap_walk import (
     read_body,
     walk,
 )
-from bridge.episode.rebuild import metadata_entry
 
 
 @dataclass(kw_only=True)

@@ -6,7 +6,7 @@ small topics share theirs (the recorder study, sections 1.1 and 1.6).
 """
 
 from bridge.episode import schema
-from bridge.episode.mcap_format import Buffer, Payload
+from bridge.episode.mcap.format import Buffer, Payload
 
 LARGE_BYTES = 1 << 16
 """A topic with a message of this size counts as a large stream from then on."""

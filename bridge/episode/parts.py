@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bridge.episode import metadata
-from bridge.episode.mcap_file import McapFile
-from bridge.episode.mcap_walk import DAMAGE
+from bridge.episode.mcap.file import McapFile
+from bridge.episode.mcap.walk import DAMAGE
 from bridge.episode.run import EPISODE_ID, part_name
 
 _NAME = re.compile(rf"({EPISODE_ID.pattern})(?:\.([1-9][0-9]{{0,5}}))?\.mcap")

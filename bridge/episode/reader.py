@@ -8,9 +8,9 @@ from typing import Any, NamedTuple, TypeVar
 from mcap.summary import Summary
 
 from bridge.episode import metadata, schema
-from bridge.episode.mcap_file import McapFile, damaged
-from bridge.episode.mcap_walk import DAMAGE
-from bridge.episode.merge import Selection, merged
+from bridge.episode.mcap.file import McapFile, damaged
+from bridge.episode.mcap.merge import Selection, merged
+from bridge.episode.mcap.walk import DAMAGE
 from bridge.episode.parts import open_parts
 from bridge.episode.provenance import hash_files
 from bridge.errors import EpisodeError, PathNotFoundError, SchemaVersionError

@@ -12,9 +12,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from bridge.episode.mcap_scan import scan
-from bridge.episode.part_file import PartFile, lock_dead, sync_folder
-from bridge.episode.record_file import RecordFile, finished_data_end
+from bridge.episode.mcap.part_file import PartFile, lock_dead, sync_folder
+from bridge.episode.mcap.record_file import RecordFile, finished_data_end
+from bridge.episode.mcap.scan import scan
 from bridge.episode.recover_copy import CopyTarget
 from bridge.episode.recover_in_place import InPlaceTarget, NeedsCopyError
 from bridge.episode.recover_tally import RECORD_NAME, Tally, to_metadata

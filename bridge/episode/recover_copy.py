@@ -6,11 +6,11 @@ use the index see nothing else. Message indexes, summary and footer are made ane
 
 from pathlib import Path
 
-from bridge.episode import mcap_format as mcap
-from bridge.episode.checksum import crc32
-from bridge.episode.chunks import EncodedChunk, OpenChunk
-from bridge.episode.data_section import DataSection
-from bridge.episode.mcap_found import (
+from bridge.episode.mcap import format as mcap
+from bridge.episode.mcap.checksum import crc32
+from bridge.episode.mcap.chunks import EncodedChunk, OpenChunk
+from bridge.episode.mcap.data_section import DataSection
+from bridge.episode.mcap.found import (
     AttachmentSpan,
     Chunk,
     CutChunk,
@@ -18,9 +18,9 @@ from bridge.episode.mcap_found import (
     Plain,
     TopMessage,
 )
-from bridge.episode.mcap_parse import Contents, Cursor, parse_channel, parse_schema_id
-from bridge.episode.part_file import PartFile
-from bridge.episode.record_file import RecordFile
+from bridge.episode.mcap.parse import Contents, Cursor, parse_channel, parse_schema_id
+from bridge.episode.mcap.part_file import PartFile
+from bridge.episode.mcap.record_file import RecordFile
 from bridge.episode.recover_tally import unknown_topic
 
 CHUNK_BYTES = 1 << 20

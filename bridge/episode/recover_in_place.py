@@ -4,9 +4,9 @@ Only the end of the file is touched: what is whole stays, the torn rest is cut o
 part is written. Killed at any moment, it can be done again.
 """
 
-from bridge.episode import mcap_format as mcap
-from bridge.episode.data_section import DataSection
-from bridge.episode.mcap_found import (
+from bridge.episode.mcap import format as mcap
+from bridge.episode.mcap.data_section import DataSection
+from bridge.episode.mcap.found import (
     AttachmentSpan,
     Chunk,
     CutChunk,
@@ -17,9 +17,9 @@ from bridge.episode.mcap_found import (
     Plain,
     TopMessage,
 )
-from bridge.episode.mcap_parse import Contents, Cursor, parse_channel, parse_schema_id
-from bridge.episode.part_file import PartFile
-from bridge.episode.record_file import RecordFile
+from bridge.episode.mcap.parse import Contents, Cursor, parse_channel, parse_schema_id
+from bridge.episode.mcap.part_file import PartFile
+from bridge.episode.mcap.record_file import RecordFile
 from bridge.episode.recover_copy import salvaged, salvaged_head, verbatim
 
 

@@ -4,9 +4,9 @@ import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bridge.episode import mcap_format as mcap
 from bridge.episode import provenance
-from bridge.episode.mcap_found import (
+from bridge.episode.mcap import format as mcap
+from bridge.episode.mcap.found import (
     AttachmentSpan,
     Chunk,
     CutChunk,
@@ -17,7 +17,7 @@ from bridge.episode.mcap_found import (
     Plain,
     TopMessage,
 )
-from bridge.episode.mcap_parse import Contents, Cursor, parse_channel
+from bridge.episode.mcap.parse import Contents, Cursor, parse_channel
 from bridge.episode.metadata import from_strings
 
 RECORD_NAME = "recovered"

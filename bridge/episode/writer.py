@@ -15,11 +15,11 @@ from typing import Any
 
 from bridge.episode import metadata, provenance, schema
 from bridge.episode.channels import Channel, Channels
-from bridge.episode.chunks import EncodedChunk, OpenChunk
-from bridge.episode.data_section import DataSection
 from bridge.episode.grouping import LARGE_BYTES, first_bytes, is_large, is_worth_compressing
-from bridge.episode.mcap_format import Buffer, Payload, num_bytes
-from bridge.episode.part_file import BackgroundSync, cannot_write, open_part
+from bridge.episode.mcap.chunks import EncodedChunk, OpenChunk
+from bridge.episode.mcap.data_section import DataSection
+from bridge.episode.mcap.format import Buffer, Payload, num_bytes
+from bridge.episode.mcap.part_file import BackgroundSync, cannot_write, open_part
 
 PROFILE = "ros2"
 LIBRARY = "robot-gst"

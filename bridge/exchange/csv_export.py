@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TextIO
 
-from bridge.episode.catalogue_labels import outcome_of
+from bridge.episode.catalogue import outcome_of
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.errors import UsageError

@@ -14,9 +14,9 @@ from typing import Any
 from mcap import records
 
 from bridge.episode import schema
-from bridge.episode.mcap_file import McapFile, damaged
-from bridge.episode.mcap_walk import DAMAGE
-from bridge.episode.merge import Selection, Stored, merged
+from bridge.episode.mcap.file import McapFile, damaged
+from bridge.episode.mcap.merge import Selection, Stored, merged
+from bridge.episode.mcap.walk import DAMAGE
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.provenance import hash_file
 from bridge.episode.run import RunFolder, check_episode_id

@@ -11,11 +11,11 @@ import pytest
 from mcap.reader import make_reader
 from mcap.records import Attachment, McapRecord
 
-from bridge.episode import mcap_format
 from bridge.episode.check import check_episode
-from bridge.episode.mcap_file import McapFile
-from bridge.episode.mcap_format import MAGIC, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
-from bridge.episode.mcap_walk import (
+from bridge.episode.mcap import format as mcap_format
+from bridge.episode.mcap.file import McapFile
+from bridge.episode.mcap.format import MAGIC, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from bridge.episode.mcap.walk import (
     attachment_of,
     message_head,
     parse,

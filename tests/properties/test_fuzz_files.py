@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
-from bridge.episode import mcap_format
 from bridge.episode.check import check_episode
-from bridge.episode.mcap_format import MAGIC, RECORD_HEAD
+from bridge.episode.mcap import format as mcap_format
+from bridge.episode.mcap.format import MAGIC, RECORD_HEAD
 from bridge.episode.reader import Episode
 from bridge.errors import GstError
 from bridge.wire import attachment

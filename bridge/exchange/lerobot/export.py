@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from bridge.episode.catalogue_labels import outcome_of
+from bridge.episode.catalogue import outcome_of
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.errors import EpisodeError, UsageError

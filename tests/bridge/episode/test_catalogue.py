@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import robot_gst
-from bridge.episode import catalogue_find, catalogue_reading, metadata
+from bridge.episode import metadata
 from bridge.episode.catalogue import (
     Entry,
     find_episodes,
@@ -17,9 +17,11 @@ from bridge.episode.catalogue import (
     list_episodes,
     note_finished,
 )
-from bridge.episode.catalogue_query import CatalogueQuery
-from bridge.episode.catalogue_reading import read_entry
-from bridge.episode.catalogue_store import FILE_NAME, VERSION, CatalogueStore
+from bridge.episode.catalogue import find as catalogue_find
+from bridge.episode.catalogue import reading as catalogue_reading
+from bridge.episode.catalogue.query import CatalogueQuery
+from bridge.episode.catalogue.reading import read_entry
+from bridge.episode.catalogue.store import FILE_NAME, VERSION, CatalogueStore
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.run import RunFolder
 from bridge.episode.writer import EpisodeWriter

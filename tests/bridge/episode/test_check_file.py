@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from bridge.episode import mcap_format
 from bridge.episode.check import check_episode
-from bridge.episode.mcap_format import MAGIC, RECORD_HEAD
-from bridge.episode.mcap_walk import Place, walk
+from bridge.episode.mcap import format as mcap_format
+from bridge.episode.mcap.format import MAGIC, RECORD_HEAD
+from bridge.episode.mcap.walk import Place, walk
 
 FOOTER_CRC_BYTES = 4 + len(MAGIC)
 

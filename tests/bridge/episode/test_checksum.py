@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.episode import checksum
+from bridge.episode.mcap import checksum
 
 START = st.integers(0, 2**32 - 1)
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from bridge.episode import merge
+from bridge.episode.mcap import merge
 from bridge.episode.reader import Episode
 from bridge.errors import EpisodeError
 

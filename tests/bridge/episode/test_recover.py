@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap_samples import linear, put, read_all, some_messages, write_official, write_ours
 
-from bridge.episode.mcap_parse import MAX_CHUNK_BYTES
+from bridge.episode.mcap.parse import MAX_CHUNK_BYTES
 from bridge.episode.recover import RecoveryError, RecoveryReport, recover, recover_parts
 from bridge.episode.run import RunFolder
 from bridge.episode.writer import EpisodeWriter, WriterConfig

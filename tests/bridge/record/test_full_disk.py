@@ -13,8 +13,8 @@ import pytest
 
 from bridge.clock import AnchoredClock
 from bridge.episode.check import check_episode
+from bridge.episode.mcap.part_file import PartFile
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.part_file import PartFile
 from bridge.episode.reader import Episode
 from bridge.episode.recover import recover_parts
 from bridge.episode.run import RunFolder

@@ -177,7 +177,7 @@ def test_a_folder_that_cannot_be_written_is_one_sentence(
         raise PermissionError(errno.EACCES, "Permission denied")
 
     # Tests may run as root, for whom no folder is read-only: refuse where the system would.
-    monkeypatch.setattr("bridge.episode.part_file.PartFile.create", refuse)
+    monkeypatch.setattr("bridge.episode.mcap.part_file.PartFile.create", refuse)
     with pytest.raises(BridgeError, match=r"Permission denied\. Choose another folder"):
         recorder.start(INFO)
     monkeypatch.undo()

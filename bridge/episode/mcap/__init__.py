@@ -1,0 +1,1 @@
+"""The file format: chunks and records, written, read, merged and scanned."""

@@ -1,0 +1,220 @@
+"""One finished MCAP file: its summary, its metadata, and where its messages lie."""
+
+import zlib
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mcap import records
+from mcap.summary import Summary
+
+from bridge.episode.mcap import format as mcap_format
+from bridge.episode.mcap.format import FOOTER_FIELDS, MAGIC, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from bridge.episode.mcap.rebuild import rebuild_summary
+from bridge.episode.mcap.walk import (
+    BrokenRecordError,
+    ByteStream,
+    Place,
+    attachment_of,
+    message_head,
+    parse,
+    read_body,
+    walk,
+)
+from bridge.errors import EpisodeError
+
+_FOOTER_BYTES = RECORD_HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
+
+
+@dataclass
+class LooseMessages:
+    """Messages that lie outside chunks, in file order. 18 bytes of memory each."""
+
+    log_times_ns: array = field(default_factory=lambda: array("Q"))  # type: ignore[type-arg]
+    offsets: array = field(default_factory=lambda: array("Q"))  # type: ignore[type-arg]
+    channel_ids: array = field(default_factory=lambda: array("H"))  # type: ignore[type-arg]
+
+
+def damaged(path: Path, error: BaseException) -> EpisodeError:
+    """Make one sentence of what reading a file's bytes raised."""
+    return EpisodeError(
+        path=path,
+        found=f"damaged ({type(error).__name__}: {str(error)[:120]})",
+        hint="Run robot-gst check on it; robot-gst recover keeps what is readable.",
+    )
+
+
+class McapFile:
+    """What a reader must know of one file before it reads messages."""
+
+    def __init__(self, path: Path) -> None:
+        """Read header, summary and metadata. A summary that is left out is built from the data.
+
+        Raises:
+            BrokenRecordError: When the file is no finished MCAP file, or its end is damaged.
+            OSError: When it cannot be read.
+        """
+        self.path = path
+        with path.open("rb") as stream:
+            self.header = read_header(stream)
+            self.footer, self._footer_at = read_footer(stream)
+            self.data_end = self.footer.summary_start or self._footer_at
+            summary = read_summary(stream, self.footer, self._footer_at)
+            if summary is None or not _is_complete(summary):
+                summary = rebuild_summary(stream, self.data_end)
+            self.summary = summary
+            self.metadata = list(self._read_metadata(stream))
+        self._loose: LooseMessages | None = None
+
+    def _read_metadata(self, stream: ByteStream) -> Iterator[records.Metadata]:
+        for entry in self.summary.metadata_indexes:
+            place = self._indexed(stream, entry.offset, mcap_format.METADATA)
+            record = parse(place.opcode, read_body(stream, place))
+            if isinstance(record, records.Metadata):
+                yield record
+
+    def _indexed(self, stream: ByteStream, offset: int, opcode: int) -> Place:
+        """Return the place of the record an index points at."""
+        place = next(walk(stream, offset, self.data_end), None)
+        if place is None or place.opcode != opcode:
+            message = f"the index points at byte {offset}, where no such record lies"
+            raise BrokenRecordError(message)
+        return place
+
+    def attachment(self, name: str) -> bytes | None:
+        """Return the bytes of the first attachment of this name, its CRC checked, or None."""
+        for found in self.attachments(name):
+            return bytes(found.data)
+        return None
+
+    def attachments(self, name: str | None = None) -> Iterator[records.Attachment]:
+        """Yield attachments, all or those of one name; each is held in memory."""
+        with self.path.open("rb") as stream:
+            for entry in self.summary.attachment_indexes:
+                if name in (None, entry.name):
+                    place = self._indexed(stream, entry.offset, mcap_format.ATTACHMENT)
+                    yield attachment_of(stream, place).record
+
+    def schema_of(self, channel: records.Channel) -> records.Schema | None:
+        """Return the schema of a channel, or None where it has none."""
+        return self.summary.schemas.get(channel.schema_id)
+
+    def loose(self) -> LooseMessages:
+        """Return the messages outside chunks; found once, between the records that are indexed."""
+        if self._loose is None:
+            found = LooseMessages()
+            with self.path.open("rb") as stream:
+                for start, end in self._gaps():
+                    for place in walk(stream, start, end):
+                        if place.opcode == MESSAGE:
+                            _note(stream, place, found)
+            self._loose = found
+        return self._loose
+
+    def _gaps(self) -> Iterator[tuple[int, int]]:
+        known = [
+            (chunk.chunk_start_offset, chunk.chunk_length + chunk.message_index_length)
+            for chunk in self.summary.chunk_indexes
+        ]
+        known += [(entry.offset, entry.length) for entry in self.summary.attachment_indexes]
+        known += [(entry.offset, entry.length) for entry in self.summary.metadata_indexes]
+        at = len(MAGIC)
+        for offset, length in sorted(known):
+            if offset > at:
+                yield at, offset
+            at = max(at, offset + length)
+        if at < self.data_end:
+            yield at, self.data_end
+
+
+def _note(stream: ByteStream, place: Place, found: LooseMessages) -> None:
+    stream.seek(place.offset)
+    head = message_head(stream.read(MESSAGE_HEAD.size), 0, place.offset)
+    found.log_times_ns.append(head.log_time_ns)
+    found.offsets.append(place.offset)
+    found.channel_ids.append(head.channel_id)
+
+
+def read_header(stream: ByteStream) -> records.Header:
+    """Read magic and first record; raises BrokenRecordError."""
+    if stream.read(len(MAGIC)) != MAGIC:
+        message = "it does not begin as an MCAP file does"
+        raise BrokenRecordError(message)
+    size = stream.seek(0, 2)
+    place = next(walk(stream, len(MAGIC), size), None)
+    record = parse(place.opcode, read_body(stream, place)) if place else None
+    if not isinstance(record, records.Header):
+        message = "its first record is no header"
+        raise BrokenRecordError(message)
+    return record
+
+
+def read_footer(stream: ByteStream) -> tuple[records.Footer, int]:
+    """Read the last record and say where it begins; raises BrokenRecordError."""
+    at = stream.seek(0, 2) - _FOOTER_BYTES
+    stream.seek(max(at, 0))
+    tail = stream.read(_FOOTER_BYTES)
+    if len(tail) < _FOOTER_BYTES or not tail.endswith(MAGIC):
+        message = "it does not end as a finished MCAP file does"
+        raise BrokenRecordError(message)
+    footer = parse(tail[0], tail[RECORD_HEAD.size : -len(MAGIC)])
+    if not isinstance(footer, records.Footer):
+        message = "its last record is no footer"
+        raise BrokenRecordError(message)
+    if footer.summary_start > at:
+        message = f"its summary should begin at byte {footer.summary_start}, behind its footer"
+        raise BrokenRecordError(message)
+    return footer, at
+
+
+def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> Summary | None:
+    """Read the summary section with its CRC checked, None where there is none.
+
+    Raises:
+        BrokenRecordError: When it is damaged.
+    """
+    if not footer.summary_start:
+        return None
+    stream.seek(footer.summary_start)
+    # The CRC covers everything up to itself, the last field of the footer.
+    section = stream.read(footer_at + RECORD_HEAD.size + 16 - footer.summary_start)
+    if footer.summary_crc and zlib.crc32(section) != footer.summary_crc:
+        message = "its summary has another CRC than it declares"
+        raise BrokenRecordError(message)
+    summary = Summary()
+    for place in walk(stream, footer.summary_start, footer_at):
+        body = section[place.offset + RECORD_HEAD.size - footer.summary_start :][: place.length]
+        _add(summary, parse(place.opcode, body))
+    return summary
+
+
+def _add(summary: Summary, record: records.McapRecord | None) -> None:
+    if isinstance(record, records.Statistics):
+        summary.statistics = record
+    elif isinstance(record, records.Schema):
+        summary.schemas[record.id] = record
+    elif isinstance(record, records.Channel):
+        summary.channels[record.id] = record
+    elif isinstance(record, records.AttachmentIndex):
+        summary.attachment_indexes.append(record)
+    elif isinstance(record, records.ChunkIndex):
+        summary.chunk_indexes.append(record)
+    elif isinstance(record, records.MetadataIndex):
+        summary.metadata_indexes.append(record)
+
+
+def _is_complete(summary: Summary) -> bool:
+    """Whether the summary repeats and indexes everything its statistics count."""
+    counts = summary.statistics
+    if counts is None:
+        return False
+    known = {channel.schema_id for channel in summary.channels.values()} - {0}
+    return (
+        len(summary.chunk_indexes) == counts.chunk_count
+        and len(summary.attachment_indexes) == counts.attachment_count
+        and len(summary.metadata_indexes) == counts.metadata_count
+        and len(summary.channels) >= counts.channel_count
+        and set(counts.channel_message_counts) <= set(summary.channels)
+        and known <= set(summary.schemas)
+    )

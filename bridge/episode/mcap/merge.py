@@ -1,0 +1,331 @@
+"""Yield the messages of one or several MCAP files in log order, holding few chunks at a time.
+
+Chunks may overlap in time. Each is unpacked when its first log time comes up and forgotten after
+its last message; one without a wanted topic is never read. Where so many overlap that their data
+would pass ``MEMORY_BYTES``, the one needed last is forgotten and unpacked again in its turn.
+"""
+
+import heapq
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from mcap import records
+
+from bridge.episode.mcap.file import McapFile, damaged
+from bridge.episode.mcap.format import CHUNK, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from bridge.episode.mcap.walk import (
+    DAMAGE,
+    BrokenRecordError,
+    ByteStream,
+    MessageHead,
+    Place,
+    message_head,
+    parse_chunk,
+    read_body,
+    records_in,
+    unpack_chunk,
+    walk,
+)
+
+MEMORY_BYTES = 256 << 20
+"""Unpacked chunks held at a time; one chunk may be larger."""
+NEVER = 1 << 64
+"""After every log time there can be."""
+
+
+class Stored(NamedTuple):
+    """One message as it lies in a file."""
+
+    file: McapFile
+    channel: records.Channel
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+    data: bytes
+
+
+class Selection(NamedTuple):
+    """Which messages are wanted."""
+
+    topics: frozenset[str] | None = None
+    """None for all."""
+    start_ns: int | None = None
+    """Included."""
+    end_ns: int | None = None
+    """Excluded."""
+
+    def has_time(self, log_time_ns: int) -> bool:
+        """Whether a log time is wanted."""
+        return (self.start_ns is None or log_time_ns >= self.start_ns) and (
+            self.end_ns is None or log_time_ns < self.end_ns
+        )
+
+    def overlaps(self, start_ns: int, end_ns: int) -> bool:
+        """Whether a stretch of time, ends included, holds a wanted one."""
+        return (self.start_ns is None or end_ns >= self.start_ns) and (
+            self.end_ns is None or start_ns < self.end_ns
+        )
+
+
+class _OpenFile:
+    """A file while it is read: opened at its first message, closed after its last."""
+
+    def __init__(self, file: McapFile, number: int, select: Selection) -> None:
+        self.file = file
+        self.number = number
+        self.select = select
+        self.wanted_channels = {
+            channel_id
+            for channel_id, channel in file.summary.channels.items()
+            if select.topics is None or channel.topic in select.topics
+        }
+        self.pending = 0
+        """Sources that still have messages."""
+        self._stream: ByteStream | None = None
+
+    def stream(self) -> ByteStream:
+        if self._stream is None:
+            self._stream = self.file.path.open("rb")
+        return self._stream
+
+    def close(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+
+    def wants(self, channel_id: int, log_time_ns: int) -> bool:
+        if channel_id in self.wanted_channels:
+            return self.select.has_time(log_time_ns)
+        if channel_id not in self.file.summary.channels:
+            message = f"a message is of channel {channel_id}, which was never announced"
+            raise BrokenRecordError(message)
+        return False
+
+
+class _Chunk:
+    """One chunk: where it lies and, once its time has come, what is wanted of it."""
+
+    def __init__(self, file: _OpenFile, index: records.ChunkIndex) -> None:
+        self.file = file
+        self.offset: int = index.chunk_start_offset
+        self.size: int = index.uncompressed_size
+        self.next_ns: int = index.message_start_time
+        self.is_done = False
+        self._data = b""
+        self._wanted: _Wanted | None = None
+        self._position = 0
+
+    @property
+    def is_loaded(self) -> bool:
+        return self._wanted is not None
+
+    def load(self) -> None:
+        stream = self.file.stream()
+        place = next(walk(stream, self.offset, self.file.file.data_end), None)
+        if place is None or place.opcode != CHUNK:
+            message = f"the index points at byte {self.offset}, where no chunk lies"
+            raise BrokenRecordError(message)
+        chunk = parse_chunk(read_body(stream, place))
+        self._data = unpack_chunk(chunk, whose=f"the chunk at byte {self.offset}")
+        self.size = len(self._data)
+        self._wanted = _wanted_in(self._data, self.file)
+        self._look_ahead()
+
+    def unload(self) -> None:
+        self._data, self._wanted = b"", None
+
+    def _look_ahead(self) -> None:
+        times_ns = self._wanted.times_ns if self._wanted else ()
+        self.is_done = self._position >= len(times_ns)
+        if not self.is_done:
+            self.next_ns = int(times_ns[self._position])
+
+    def take_until(self, limit_ns: int, wins_tie: bool) -> Iterator[tuple[MessageHead, bytes]]:
+        """Yield messages before the limit, or at it where this chunk comes first."""
+        data, wanted, position = self._data, self._wanted or _Wanted(), self._position
+        times_ns, places = wanted.times_ns, wanted.places
+        while position < len(times_ns):
+            time_ns = times_ns[position]
+            if time_ns >= limit_ns and (time_ns > limit_ns or not wins_tie):
+                break
+            at = places[position]
+            position += 1
+            head = message_head(data, at, at)
+            start = at + MESSAGE_HEAD.size
+            yield head, data[start : start + head.length]
+        self._position = position
+        self._look_ahead()
+
+
+class _Wanted(NamedTuple):
+    """Wanted messages of one chunk in log order. 16 bytes each, however many there are."""
+
+    times_ns: array = array("Q")  # type: ignore[type-arg]
+    places: array = array("Q")  # type: ignore[type-arg]
+
+
+def _wanted_in(data: bytes, file: _OpenFile) -> _Wanted:
+    times_ns, places = array("Q"), array("Q")
+    in_order, before = True, -1
+    for opcode, at, _ in records_in(data):
+        if opcode != MESSAGE:
+            continue
+        _, _, channel_id, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(data, at)
+        if file.wants(channel_id, log_time_ns):
+            times_ns.append(log_time_ns)
+            places.append(at)
+            in_order = in_order and log_time_ns >= before
+            before = log_time_ns
+    if in_order:
+        return _Wanted(times_ns, places)
+    unsorted = np.frombuffer(times_ns, dtype=np.uint64)
+    order = np.argsort(unsorted, kind="stable")
+    by_time = array("Q", unsorted[order].tobytes())
+    return _Wanted(by_time, array("Q", np.frombuffer(places, dtype=np.uint64)[order].tobytes()))
+
+
+class _Loose:
+    """The messages of a file that lie outside chunks, read one by one."""
+
+    size = 0
+    offset = 0
+    is_loaded = True
+
+    def __init__(self, file: _OpenFile) -> None:
+        self.file = file
+        found = file.file.loose()
+        times = np.array(found.log_times_ns, dtype=np.uint64)
+        wanted = np.fromiter(
+            map(file.wants, found.channel_ids, found.log_times_ns), dtype=bool, count=len(times)
+        )
+        order = np.argsort(times[wanted], kind="stable")
+        self._times_ns = times[wanted][order]
+        self._offsets = np.array(found.offsets, dtype=np.uint64)[wanted][order]
+        self._position = 0
+        self.next_ns = 0
+        self.is_done = False
+        self._look_ahead()
+
+    def load(self) -> None:
+        """Nothing is held."""
+
+    def unload(self) -> None:
+        """Nothing is held."""
+
+    def _look_ahead(self) -> None:
+        self.is_done = self._position >= len(self._times_ns)
+        if not self.is_done:
+            self.next_ns = int(self._times_ns[self._position])
+
+    def take_until(self, limit_ns: int, wins_tie: bool) -> Iterator[tuple[MessageHead, bytes]]:
+        """Yield messages before the limit, or at it where this source comes first."""
+        stream = self.file.stream()
+        while not self.is_done and (
+            self.next_ns < limit_ns or (self.next_ns == limit_ns and wins_tie)
+        ):
+            offset = int(self._offsets[self._position])
+            self._position += 1
+            self._look_ahead()
+            stream.seek(offset)
+            head = message_head(stream.read(MESSAGE_HEAD.size), 0, offset)
+            payload_at = offset + MESSAGE_HEAD.size - RECORD_HEAD.size
+            yield head, read_body(stream, Place(MESSAGE, payload_at, head.length))
+
+
+_Source = _Chunk | _Loose
+_Entry = tuple[int, int, int, _Source]
+"""Log time, number of the file, offset: the order of messages; then where they come from."""
+
+
+def merged(files: Sequence[McapFile], select: Selection) -> Iterator[Stored]:
+    """Yield the wanted messages in order of log time, then of file, then of place in the file.
+
+    Raises:
+        EpisodeError: When a file is damaged or cannot be read.
+    """
+    opened = [_OpenFile(file, number, select) for number, file in enumerate(files)]
+    heap: list[_Entry] = []
+    for file in opened:
+        try:
+            for source in _sources(file):
+                heap.append((source.next_ns, file.number, source.offset, source))
+                file.pending += 1
+        except DAMAGE as error:
+            raise damaged(file.file.path, error) from error
+    heapq.heapify(heap)
+    try:
+        yield from _drained(heap)
+    finally:
+        for file in opened:
+            file.close()
+
+
+def _sources(file: _OpenFile) -> Iterable[_Source]:
+    if file.wanted_channels:
+        loose = _Loose(file)
+        if not loose.is_done:
+            yield loose
+    for index in file.file.summary.chunk_indexes:
+        if not file.select.overlaps(index.message_start_time, index.message_end_time):
+            continue
+        channels = index.message_index_offsets
+        if not channels or not file.wanted_channels.isdisjoint(channels):
+            yield _Chunk(file, index)
+
+
+def _drained(heap: list[_Entry]) -> Iterator[Stored]:
+    held = _Held()
+    while heap:
+        *_, source = heapq.heappop(heap)
+        file = source.file
+        try:
+            if source.is_loaded:
+                limit = heap[0][:3] if heap else (NEVER, 0, 0)
+                wins_tie = (file.number, source.offset) < limit[1:]
+                channels = file.file.summary.channels
+                for head, data in source.take_until(limit[0], wins_tie):
+                    yield Stored(
+                        file.file,
+                        channels[head.channel_id],
+                        head.log_time_ns,
+                        head.publish_time_ns,
+                        head.sequence,
+                        data,
+                    )
+            else:
+                held.load(source)
+        except DAMAGE as error:
+            raise damaged(file.file.path, error) from error
+        if source.is_done:
+            held.forget(source)
+            file.pending -= 1
+            if not file.pending:
+                file.close()
+        else:
+            heapq.heappush(heap, (source.next_ns, file.number, source.offset, source))
+
+
+class _Held:
+    """The chunks whose data is in memory."""
+
+    def __init__(self) -> None:
+        self._sources: set[_Source] = set()
+        self._bytes = 0
+
+    def load(self, source: _Source) -> None:
+        """Read a chunk, after those needed last made room for it."""
+        while self._sources and self._bytes + source.size > MEMORY_BYTES:
+            last = max(self._sources, key=lambda held: held.next_ns)
+            self.forget(last)
+        source.load()
+        self._sources.add(source)
+        self._bytes += source.size
+
+    def forget(self, source: _Source) -> None:
+        """Drop a chunk's data; it can be read again."""
+        if source in self._sources:
+            self._sources.remove(source)
+            self._bytes -= source.size
+        source.unload()

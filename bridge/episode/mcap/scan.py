@@ -1,0 +1,269 @@
+"""Walk through an MCAP file record by record, finished or not, whoever wrote it.
+
+Nothing but the front of the file is believed: no summary, no index. Damage is stepped over where
+a later chunk can be found. Memory is bounded by one chunk.
+"""
+
+import struct
+from collections.abc import Iterator
+
+from bridge.episode.mcap import format as mcap
+from bridge.episode.mcap.found import (
+    AttachmentSpan,
+    Chunk,
+    CutChunk,
+    Damage,
+    DataEnd,
+    Found,
+    IndexSpan,
+    Plain,
+    TopMessage,
+)
+from bridge.episode.mcap.parse import (
+    MAX_CHUNK_BYTES,
+    Cursor,
+    DamagedRecordError,
+    parse_channel,
+    parse_chunk_head,
+    parse_schema_id,
+    unpack_chunk,
+    unpack_front,
+    walk_records,
+)
+from bridge.episode.mcap.record_file import BLOCK_BYTES, RecordFile
+
+MAX_PLAIN_BYTES = 64 << 20
+"""Headers, schemas, channels and metadata beyond this are refused."""
+_FRONT_BYTES = 64
+"""Enough for every fixed part of a record."""
+_SUMMARY_ONLY = frozenset(
+    {
+        mcap.FOOTER,
+        mcap.CHUNK_INDEX,
+        mcap.ATTACHMENT_INDEX,
+        mcap.STATISTICS,
+        mcap.METADATA_INDEX,
+        mcap.SUMMARY_OFFSET,
+    }
+)
+_KINDS = {
+    mcap.HEADER: "header",
+    mcap.SCHEMA: "schema",
+    mcap.CHANNEL: "channel",
+    mcap.MESSAGE: "message",
+    mcap.CHUNK: "chunk",
+    mcap.MESSAGE_INDEX: "message index",
+    mcap.ATTACHMENT: "attachment",
+    mcap.METADATA: "metadata record",
+    mcap.DATA_END: "end of the data",
+}
+PRIVATE = 0x80
+"""Opcodes from here on belong to applications; every reader skips those it does not know."""
+
+
+def scan(file: RecordFile) -> Iterator[Found]:
+    """Return what the file holds, in order, without a gap; ends at DataEnd or the last damage."""
+    position = len(mcap.MAGIC)
+    if file.read(0, position) != mcap.MAGIC:
+        damage = _step_over(file, 0, "it does not begin like an MCAP file")
+        yield damage
+        position = damage.end
+    while position < file.size:
+        try:
+            found = _read_record(file, position)
+        except DamagedRecordError as error:
+            found = _read_damaged(file, position, str(error))
+        if found is None:
+            return
+        yield found
+        if isinstance(found, DataEnd):
+            return
+        position = found.end
+
+
+def _read_record(file: RecordFile, offset: int) -> Found | None:
+    """Read the record at an offset; None where the summary begins without an end of the data."""
+    front = file.read(offset, _FRONT_BYTES)
+    if len(front) < mcap.RECORD_HEAD.size:
+        message = "the file ends inside a record"
+        raise DamagedRecordError(message)
+    opcode, size = mcap.RECORD_HEAD.unpack_from(front)
+    if opcode in _SUMMARY_ONLY:
+        return None
+    if opcode == 0 or (opcode not in _KINDS and opcode < PRIVATE):
+        message = f"there is no record of kind {opcode}"
+        raise DamagedRecordError(message)
+    length = mcap.RECORD_HEAD.size + size
+    kind = _KINDS.get(opcode, "private record")
+    if offset + length > file.size:
+        message = f"the file ends inside a {kind}"
+        raise DamagedRecordError(message)
+    if opcode == mcap.CHUNK:
+        return _read_chunk(file, offset, front)
+    if opcode == mcap.MESSAGE:
+        return _read_message(offset, length, front)
+    if opcode == mcap.MESSAGE_INDEX:
+        return IndexSpan(offset=offset, length=length)
+    if opcode == mcap.ATTACHMENT:
+        return _read_attachment(file, offset, length)
+    if opcode == mcap.DATA_END:
+        crc = int.from_bytes(front[mcap.RECORD_HEAD.size :][:4], "little")
+        return DataEnd(offset=offset, length=length, crc=crc)
+    if length > MAX_PLAIN_BYTES:
+        message = f"a {kind} claims {length} bytes"
+        raise DamagedRecordError(message)
+    raw = file.read(offset, length)
+    _check_plain(opcode, raw)
+    return Plain(offset=offset, length=length, opcode=opcode, raw=raw)
+
+
+def _check_plain(opcode: int, raw: bytes) -> None:
+    cursor = Cursor(raw, mcap.RECORD_HEAD.size)
+    if opcode == mcap.SCHEMA:
+        parse_schema_id(raw)
+    elif opcode == mcap.CHANNEL:
+        parse_channel(raw)
+    elif opcode == mcap.HEADER:
+        cursor.text()
+        cursor.text()
+    elif opcode == mcap.METADATA:
+        cursor.text()
+        cursor.text_map()
+
+
+def _read_chunk(file: RecordFile, offset: int, front: bytes) -> Chunk:
+    head = parse_chunk_head(front)
+    if not head.is_consistent:
+        message = "the lengths of a chunk contradict each other or are beyond all limits"
+        raise DamagedRecordError(message)
+    raw = file.read(offset, head.record_bytes)
+    try:
+        records = unpack_chunk(head, raw[head.head_bytes :])
+    except DamagedRecordError as error:
+        message = f"a chunk is damaged: {error}"
+        raise DamagedRecordError(message) from error
+    contents = walk_records(records)
+    if contents.size != len(records):
+        message = "a chunk is damaged: its records are torn"
+        raise DamagedRecordError(message)
+    return Chunk(offset=offset, length=len(raw), raw=raw, head=head, contents=contents)
+
+
+def _read_message(offset: int, length: int, front: bytes) -> TopMessage:
+    if not mcap.MESSAGE_HEAD.size <= length <= MAX_CHUNK_BYTES:
+        message = f"a message claims {length} bytes"
+        raise DamagedRecordError(message)
+    _, _, channel_id, _, log_time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(front)
+    return TopMessage(offset=offset, length=length, channel_id=channel_id, log_time_ns=log_time_ns)
+
+
+def _read_attachment(file: RecordFile, offset: int, length: int) -> AttachmentSpan:
+    cursor = Cursor(file.read(offset, min(length, BLOCK_BYTES)), mcap.RECORD_HEAD.size)
+    log_time_ns, create_time_ns = cursor.number(8), cursor.number(8)
+    name, media_type, data_size = cursor.text(), cursor.text(), cursor.number(8)
+    if cursor.position + data_size + 4 != length:
+        message = "the lengths of an attachment contradict each other"
+        raise DamagedRecordError(message)
+    (crc,) = struct.unpack("<I", file.read(offset + length - 4, 4))
+    body = mcap.RECORD_HEAD.size
+    if crc and crc != file.crc(offset + body, length - body - 4):
+        message = f"the CRC of the attachment {name!r} is wrong"
+        raise DamagedRecordError(message)
+    return AttachmentSpan(
+        offset=offset,
+        length=length,
+        name=name,
+        media_type=media_type,
+        log_time_ns=log_time_ns,
+        create_time_ns=create_time_ns,
+        data_size=data_size,
+    )
+
+
+def _read_damaged(file: RecordFile, offset: int, what: str) -> Found | None:
+    """Step over damage, or take what a cut record at the end still holds."""
+    length = _trusted_length(file, offset)
+    if length:
+        end = offset + length
+        return Damage(offset=offset, length=length, what=_at(offset, what), at_end=end >= file.size)
+    damage = _step_over(file, offset, what)
+    if not damage.at_end:
+        return damage
+    front = file.read(offset, _FRONT_BYTES)
+    if front[0] == mcap.DATA_END:
+        return None
+    if front[0] == mcap.MESSAGE_INDEX:
+        return IndexSpan(offset=offset, length=damage.length)
+    return _read_cut_chunk(file, offset, front) or damage
+
+
+def _trusted_length(file: RecordFile, offset: int) -> int:
+    """Length of a damaged record, 0 unless another record or the end of the file follows it."""
+    front = file.read(offset, mcap.RECORD_HEAD.size)
+    if len(front) < mcap.RECORD_HEAD.size:
+        return 0
+    opcode, size = mcap.RECORD_HEAD.unpack_from(front)
+    end = offset + mcap.RECORD_HEAD.size + size
+    if opcode not in _KINDS or end > file.size:
+        return 0
+    following = file.read(end, 1)
+    known = not following or following[0] in _KINDS or following[0] in _SUMMARY_ONLY
+    return end - offset if known else 0
+
+
+def _read_cut_chunk(file: RecordFile, offset: int, front: bytes) -> CutChunk | None:
+    try:
+        head = parse_chunk_head(front)
+    except DamagedRecordError:
+        return None
+    if offset + head.record_bytes <= file.size or head.uncompressed_size > MAX_CHUNK_BYTES:
+        return None
+    records = unpack_front(head, file.read(offset + head.head_bytes, MAX_CHUNK_BYTES))
+    contents = walk_records(records)
+    if not contents.num_messages:
+        return None
+    return CutChunk(
+        offset=offset,
+        length=file.size - offset,
+        head=head,
+        records=records[: contents.size],
+        unpacked_size=len(records),
+        contents=contents,
+    )
+
+
+def _at(offset: int, what: str) -> str:
+    return f"at byte {offset} {what}"
+
+
+def _step_over(file: RecordFile, offset: int, what: str) -> Damage:
+    """Find the next thing that looks like a chunk after a damaged place."""
+    following = _next_chunk(file, offset)
+    return Damage(
+        offset=offset,
+        length=(file.size if following is None else following) - offset,
+        what=_at(offset, what),
+        at_end=following is None,
+    )
+
+
+def _next_chunk(file: RecordFile, offset: int) -> int | None:
+    """Return where the next thing that looks like a chunk begins, after ``offset``."""
+    start = offset + 1
+    while start < file.size:
+        window = file.read(start, BLOCK_BYTES + _FRONT_BYTES)
+        at = window.find(mcap.CHUNK, 0, BLOCK_BYTES)
+        while at >= 0:
+            if window[at + 7 : at + 9] == b"\0\0" and _is_chunk(file, start + at, window, at):
+                return start + at
+            at = window.find(mcap.CHUNK, at + 1, BLOCK_BYTES)
+        start += BLOCK_BYTES
+    return None
+
+
+def _is_chunk(file: RecordFile, offset: int, window: bytes, at: int) -> bool:
+    try:
+        head = parse_chunk_head(window[at : at + _FRONT_BYTES])
+    except DamagedRecordError:
+        return False
+    return head.is_consistent and offset + head.record_bytes <= file.size

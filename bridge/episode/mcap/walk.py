@@ -1,0 +1,319 @@
+"""Walk through MCAP bytes record by record, believing no length and no size that is claimed.
+
+Nothing here needs a summary. What is read into memory is one record at a time; a chunk may grow
+to ``MAX_CHUNK_BYTES`` when it is unpacked.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from io import BufferedReader, BytesIO
+from typing import Any, NamedTuple
+
+import lz4.frame
+import zstandard
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, McapError
+
+from bridge.episode.mcap import format as mcap_format
+from bridge.episode.mcap.format import CHUNK_FIELDS, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+
+ByteStream = BufferedReader | BytesIO
+"""An open file, or bytes that act as one."""
+MAX_CHUNK_BYTES = 1 << 30
+"""No chunk may unpack to more: a few bytes of zstd can claim terabytes."""
+PIECE_BYTES = 1 << 20
+
+_CLASSES: dict[int, Any] = {
+    mcap_format.HEADER: records.Header,
+    mcap_format.FOOTER: records.Footer,
+    mcap_format.SCHEMA: records.Schema,
+    mcap_format.CHANNEL: records.Channel,
+    mcap_format.MESSAGE_INDEX: records.MessageIndex,
+    mcap_format.CHUNK_INDEX: records.ChunkIndex,
+    mcap_format.ATTACHMENT_INDEX: records.AttachmentIndex,
+    mcap_format.STATISTICS: records.Statistics,
+    mcap_format.METADATA: records.Metadata,
+    mcap_format.METADATA_INDEX: records.MetadataIndex,
+    mcap_format.SUMMARY_OFFSET: records.SummaryOffset,
+    mcap_format.DATA_END: records.DataEnd,
+}
+DAMAGE = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    EOFError,
+    OSError,
+    MemoryError,
+    RuntimeError,  # lz4's own
+)
+"""What reading bytes that are not what they claim to be may raise."""
+
+
+class BrokenRecordError(ValueError):
+    """A record is not what it claims to be. The reader makes a sentence with the file's name."""
+
+
+class Place(NamedTuple):
+    """Where a record lies."""
+
+    opcode: int
+    offset: int
+    """Of its opcode, from the start of the file."""
+    length: int
+    """Bytes after opcode and length."""
+
+    @property
+    def end(self) -> int:
+        """Where the next record begins."""
+        return self.offset + RECORD_HEAD.size + self.length
+
+
+def walk(stream: ByteStream, start: int, end: int) -> Iterator[Place]:
+    """Yield the places of all records between two offsets; the stream may be used in between.
+
+    Raises:
+        BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
+    """
+    at = start
+    while at < end:
+        stream.seek(at)
+        head = stream.read(RECORD_HEAD.size)
+        if len(head) < RECORD_HEAD.size:
+            message = f"the record at byte {at} is cut off"
+            raise BrokenRecordError(message)
+        opcode, length = RECORD_HEAD.unpack(head)
+        place = Place(opcode, at, length)
+        if opcode == 0:
+            message = f"the record at byte {at} is of kind 0, which there is not"
+            raise BrokenRecordError(message)
+        if place.end > end:
+            message = f"the record at byte {at} claims {place.length} bytes, {end - at} are left"
+            raise BrokenRecordError(message)
+        yield place
+        at = place.end
+
+
+def read_body(stream: ByteStream, place: Place) -> bytes:
+    """Return a record's bytes without opcode and length."""
+    stream.seek(place.offset + RECORD_HEAD.size)
+    body = stream.read(place.length)
+    if len(body) < place.length:
+        message = f"the record at byte {place.offset} is cut off"
+        raise BrokenRecordError(message)
+    return body
+
+
+class _ExactStream(ReadDataStream):
+    """The ``mcap`` package takes fewer bytes than asked for without a word; this does not."""
+
+    def read(self, length: int) -> bytes:
+        data = super().read(length)
+        if len(data) != length:
+            raise EndOfFile
+        return bytes(data)
+
+
+def parse(opcode: int, body: bytes) -> records.McapRecord | None:
+    """Read a record other than messages, chunks and attachments; None for unknown opcodes.
+
+    Raises:
+        BrokenRecordError: When its fields run past its end.
+    """
+    kind = _CLASSES.get(opcode)
+    if kind is None:
+        return None
+    try:
+        found: records.McapRecord = kind.read(_ExactStream(BytesIO(body)))
+    except (McapError, struct.error, ValueError) as error:
+        message = f"a {kind.__name__} record of {len(body)} bytes cannot be read"
+        raise BrokenRecordError(message) from error
+    return found
+
+
+class ChunkHead(NamedTuple):
+    """A chunk record, its data still packed."""
+
+    start_ns: int
+    end_ns: int
+    size: int
+    """Bytes of the records inside when unpacked."""
+    crc: int
+    """CRC-32 of those bytes, 0 for unknown."""
+    compression: str
+    data: memoryview
+
+
+def parse_chunk(body: bytes) -> ChunkHead:
+    """Read a chunk record.
+
+    Raises:
+        BrokenRecordError: When its fields run past its end.
+    """
+    try:
+        start_ns, end_ns, size, crc = CHUNK_FIELDS.unpack_from(body, 0)
+        at = CHUNK_FIELDS.size
+        (length,) = struct.unpack_from("<I", body, at)
+        at += 4
+        compression = str(body[at : at + length], "utf-8")
+        at += length
+        (length,) = struct.unpack_from("<Q", body, at)
+    except (struct.error, ValueError) as error:
+        message = f"a chunk record of {len(body)} bytes cannot be read"
+        raise BrokenRecordError(message) from error
+    at += 8
+    if length > len(body) - at:
+        message = f"a chunk claims {length} bytes of data, {len(body) - at} are there"
+        raise BrokenRecordError(message)
+    data = memoryview(body)[at : at + length]
+    return ChunkHead(start_ns, end_ns, size, crc, compression, data)
+
+
+def unpack_chunk(chunk: ChunkHead, *, whose: str = "a chunk") -> bytes:
+    """Decompress a chunk and compare its size and CRC.
+
+    Raises:
+        BrokenRecordError: When one of them is wrong, or it is too large to be believed.
+    """
+    if chunk.size > MAX_CHUNK_BYTES:
+        message = f"{whose} claims {chunk.size} bytes, more than {MAX_CHUNK_BYTES}"
+        raise BrokenRecordError(message)
+    try:
+        data = _decompress(chunk)
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        message = f"{whose} cannot be unpacked ({error})"
+        raise BrokenRecordError(message) from error
+    if len(data) != chunk.size:
+        message = f"{whose} has {len(data)} bytes, {chunk.size} are declared"
+        raise BrokenRecordError(message)
+    if chunk.crc and zlib.crc32(data) != chunk.crc:
+        message = f"{whose} has another CRC than it declares"
+        raise BrokenRecordError(message)
+    return data
+
+
+def _decompress(chunk: ChunkHead) -> bytes:
+    if chunk.compression == "":
+        return bytes(chunk.data)
+    if not chunk.size:
+        return b""
+    if chunk.compression == "zstd":
+        declared = zstandard.get_frame_parameters(chunk.data).content_size
+        if declared not in (chunk.size, zstandard.CONTENTSIZE_UNKNOWN):
+            message = f"a zstd frame of {declared} bytes where {chunk.size} are declared"
+            raise BrokenRecordError(message)
+        return zstandard.decompress(chunk.data, max_output_size=chunk.size)
+    if chunk.compression == "lz4":
+        unpacker = lz4.frame.LZ4FrameDecompressor()
+        return bytes(unpacker.decompress(chunk.data, max_length=chunk.size))
+    message = f"compression {chunk.compression!r} is not known"
+    raise BrokenRecordError(message)
+
+
+class MessageHead(NamedTuple):
+    """A message inside a buffer or file, its payload left where it is."""
+
+    log_time_ns: int
+    at: int
+    """Where the record begins: in a chunk's data, or in the file."""
+    length: int
+    """Of the payload."""
+    channel_id: int
+    sequence: int
+    publish_time_ns: int
+
+
+MESSAGE_FIELDS = MESSAGE_HEAD.size - RECORD_HEAD.size
+
+
+def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
+    """Read the front of the message record at ``at``; ``where`` becomes its ``at``."""
+    _, length, channel_id, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, at)
+    if length < MESSAGE_FIELDS:
+        message = f"a message record of {length} bytes"
+        raise BrokenRecordError(message)
+    return MessageHead(log_ns, where, length - MESSAGE_FIELDS, channel_id, sequence, publish_ns)
+
+
+def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, offset and body length of each record in a chunk's unpacked data.
+
+    Raises:
+        BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
+    """
+    at, end = 0, len(data)
+    head_bytes, unpack = RECORD_HEAD.size, RECORD_HEAD.unpack_from
+    while at < end:
+        if end - at < head_bytes:
+            message = f"{end - at} bytes too many at the end of a chunk"
+            raise BrokenRecordError(message)
+        opcode, length = unpack(data, at)
+        after = at + head_bytes + length
+        if after > end or opcode == 0 or (opcode == MESSAGE and length < MESSAGE_FIELDS):
+            message = f"a record of kind {opcode} in a chunk claims {length} of {end - at} bytes"
+            raise BrokenRecordError(message)
+        yield opcode, at, length
+        at = after
+
+
+class FoundAttachment(NamedTuple):
+    """An attachment whose CRC is right."""
+
+    record: records.Attachment
+    data_size: int
+
+
+def attachment_of(stream: ByteStream, place: Place, *, keep: bool = True) -> FoundAttachment:
+    """Read an attachment record and check its CRC; without ``keep`` its data is left empty.
+
+    Raises:
+        BrokenRecordError: When its fields run past its end, or its CRC is wrong.
+    """
+    head_bytes = min(place.length, PIECE_BYTES)
+    stream.seek(place.offset + RECORD_HEAD.size)
+    front = _ExactStream(BytesIO(stream.read(head_bytes)))
+    try:
+        log_ns, create_ns = front.read8(), front.read8()
+        name, media_type = front.read_prefixed_string(), front.read_prefixed_string()
+        size = front.read8()
+    except (McapError, struct.error, ValueError) as error:
+        message = f"the attachment at byte {place.offset} cannot be read"
+        raise BrokenRecordError(message) from error
+    start = front.count
+    if size > place.length - start - 4:
+        message = f"attachment {name!r} claims {size} bytes, {place.length - start - 4} are there"
+        raise BrokenRecordError(message)
+    crc, pieces = _attachment_crc(stream, place, start + size, start, keep=keep)
+    (declared,) = struct.unpack("<I", stream.read(4))
+    if declared and declared != crc:
+        message = f"attachment {name!r} has another CRC than it declares"
+        raise BrokenRecordError(message)
+    record = records.Attachment(
+        create_time=create_ns,
+        log_time=log_ns,
+        name=name,
+        media_type=media_type,
+        data=b"".join(pieces),
+    )
+    return FoundAttachment(record, size)
+
+
+def _attachment_crc(
+    stream: ByteStream, place: Place, count: int, data_start: int, *, keep: bool
+) -> tuple[int, list[bytes]]:
+    stream.seek(place.offset + RECORD_HEAD.size)
+    crc = zlib.crc32(stream.read(data_start))
+    pieces = []
+    left = count - data_start
+    while left:
+        piece = stream.read(min(left, PIECE_BYTES))
+        if not piece:
+            message = f"the attachment at byte {place.offset} is cut off"
+            raise BrokenRecordError(message)
+        left -= len(piece)
+        crc = zlib.crc32(piece, crc)
+        if keep:
+            pieces.append(piece)
+    return crc, pieces
