@@ -89,9 +89,12 @@ class LiveRecorder:
         while not self._ended.wait(STATUS_PERIOD_S):
             with contextlib.suppress(WireError):  # the session is closing
                 self.core.intake.watched = self._previews.look(self.core.intake.image_topics())
-                if self._status.has_subscribers():
-                    data = json.dumps(self.core.status()).encode()
-                    self._status.put(data, source_ns=self.session.now_ns())
+                self._say_status()
+
+    def _say_status(self) -> None:
+        if self._status.has_subscribers():
+            data = json.dumps(self.core.status()).encode()
+            self._status.put(data, source_ns=self.session.now_ns())
 
     def start(self, episode_id: str, **about: Any) -> dict[str, Any]:
         """Begin an episode; ``about`` are fields of ``EpisodeInfo``: task, operator, tags ...
@@ -137,6 +140,9 @@ class LiveRecorder:
     def close(self) -> dict[str, Any] | None:
         """Finish the open episode, then leave the network; returns the answer to that stop."""
         self._ended.set()
+        if self.core.error is not None:  # whoever listens hears why, before the next second
+            with contextlib.suppress(WireError):
+                self._say_status()
         for service in self._services:
             service.close()
         for subscriber in self._subscribers:
