@@ -160,5 +160,3 @@ def test_a_configuration_file_does_not_turn_scouting_on(tmp_path: Path, endpoint
 def test_a_bad_topic_is_refused_when_announced(client: WireSession) -> None:
     with pytest.raises(BadTopicError):
         client.publisher("/a//b", schema.STRING)
-
-
