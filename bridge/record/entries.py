@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from bridge.clock import NS_PER_S
 from bridge.record.inspection import Finding
 from bridge.record.sequence import Step
 from bridge.wire.session import WireSample
@@ -86,4 +87,4 @@ Entry = Item | Dropped | Command
 
 def second_of(stamp_ns: int) -> int:
     """The whole second a stamp lies in."""
-    return stamp_ns // 1_000_000_000
+    return stamp_ns // NS_PER_S

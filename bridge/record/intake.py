@@ -147,7 +147,7 @@ class Intake:
         self, flow: Flow, sample: WireSample, step: Step, *, cost: int, is_bulk: bool
     ) -> bool:
         """Say whether a message may be taken in; count it if not."""
-        second = sample.received_ns // 1_000_000_000
+        second = second_of(sample.received_ns)
         if second != flow.second:
             flow.second, flow.in_second = second, 0
         flow.in_second += 1
