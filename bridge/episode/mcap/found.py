@@ -31,7 +31,8 @@ class Plain(Span):
 class Chunk(Span):
     """A chunk whose CRC and structure are right."""
 
-    raw: bytes
+    raw: memoryview
+    """The whole record, until the walk goes on."""
     head: ChunkHead
     contents: Contents
 

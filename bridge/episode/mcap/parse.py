@@ -14,7 +14,9 @@ from bridge.episode.mcap.format import (
     MESSAGE_FIELDS,
     RECORD_HEAD,
     SCHEMA,
+    Buffer,
 )
+from bridge.episode.mcap.scratch import Scratch
 from bridge.errors import MissingDependencyError
 
 MAX_CHUNK_BYTES = 1 << 29
@@ -23,7 +25,6 @@ MAX_CHUNK_BYTES = 1 << 29
 _INDEX_FIELDS = struct.Struct("<HxxxxQ")
 """Channel and log time of a message, after its record head."""
 _CHUNK_HEAD_BYTES = RECORD_HEAD.size + CHUNK_FIELDS.size + 4
-_ZSTD = zstandard.ZstdDecompressor()
 _COMPRESSIONS = ("", "lz4", "zstd")
 
 
@@ -182,7 +183,7 @@ class Contents:
         return (min(times), max(times)) if times else (0, 0)
 
 
-def walk_records(data: bytes) -> Contents:
+def walk_records(data: Buffer) -> Contents:
     """Find the records at the front of a chunk's data, up to the first that is cut or wrong."""
     found = Contents()
     position, size, index = 0, len(data), found.index
@@ -200,7 +201,7 @@ def walk_records(data: bytes) -> Contents:
                 entries = index[channel_id] = []
             entries += (log_time_ns, position)
         elif opcode in (SCHEMA, CHANNEL):
-            record = data[position:end]
+            record = bytes(data[position:end])
             try:
                 _ = parse_schema_id(record) if opcode == SCHEMA else parse_channel(record)
             except DamagedRecordError:
@@ -211,16 +212,16 @@ def walk_records(data: bytes) -> Contents:
     return found
 
 
-def unpack_chunk(head: ChunkHead, data: bytes) -> bytes:
+def unpack_chunk(head: ChunkHead, data: memoryview, scratch: Scratch) -> Buffer:
     """Return a whole chunk's records.
 
     Raises:
         DamagedRecordError: When size or CRC are not as claimed.
         MissingDependencyError: When it is packed with lz4 and that is not installed.
     """
-    records = _unpack_at_once(head, data)
+    records = _unpack_at_once(head, data, scratch)
     if records is None:
-        records = unpack_front(head, data)
+        records = unpack_front(head, bytes(data))
     if len(records) != head.uncompressed_size:
         message = f"its data unpacks to {len(records)} bytes instead of {head.uncompressed_size}"
         raise DamagedRecordError(message)
@@ -230,14 +231,16 @@ def unpack_chunk(head: ChunkHead, data: bytes) -> bytes:
     return records
 
 
-def _unpack_at_once(head: ChunkHead, data: bytes) -> bytes | None:
-    """Unpack the usual case quickly: one zstd frame that says how much it holds."""
+def _unpack_at_once(head: ChunkHead, data: memoryview, scratch: Scratch) -> Buffer | None:
+    """Unpack the usual cases quickly: nothing, or one zstd frame that says how much it holds."""
+    if head.compression == "":
+        return data
     try:
         if (
             head.compression == "zstd"
             and zstandard.frame_content_size(data) == head.uncompressed_size
         ):
-            return _ZSTD.decompress(data)
+            return scratch.unpack(data, head.uncompressed_size)
     except (zstandard.ZstdError, MemoryError):
         pass
     return None

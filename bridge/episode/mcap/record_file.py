@@ -28,6 +28,16 @@ class RecordFile:
             data += more
         return data
 
+    def read_into(self, offset: int, room: memoryview) -> int:
+        """Fill ``room`` and return how many bytes there were, fewer only at the end."""
+        done = 0
+        while done < len(room):
+            count = os.preadv(self.descriptor, [room[done:]], offset + done)
+            if not count:
+                break
+            done += count
+        return done
+
     def blocks(self, offset: int, size: int) -> Iterator[bytes]:
         """Return a range in blocks."""
         end = min(offset + size, self.size)

@@ -31,6 +31,7 @@ from bridge.episode.mcap.parse import (
     walk_records,
 )
 from bridge.episode.mcap.record_file import BLOCK_BYTES, RecordFile
+from bridge.episode.mcap.scratch import Scratch
 
 MAX_PLAIN_BYTES = 64 << 20
 """Headers, schemas, channels and metadata beyond this are refused."""
@@ -62,15 +63,18 @@ PRIVATE = 0x80
 
 
 def scan(file: RecordFile) -> Iterator[Found]:
-    """Return what the file holds, in order, without a gap; ends at DataEnd or the last damage."""
-    position = len(mcap.MAGIC)
+    """Return what the file holds, in order, without a gap; ends at DataEnd or the last damage.
+
+    The bytes of a chunk (``Chunk.raw``) are gone when the next thing is asked for.
+    """
+    position, scratch = len(mcap.MAGIC), Scratch()
     if file.read(0, position) != mcap.MAGIC:
         damage = _step_over(file, 0, "it does not begin like an MCAP file")
         yield damage
         position = damage.end
     while position < file.size:
         try:
-            found = _read_record(file, position)
+            found = _read_record(file, position, scratch)
         except DamagedRecordError as error:
             found = _read_damaged(file, position, str(error))
         if found is None:
@@ -81,7 +85,7 @@ def scan(file: RecordFile) -> Iterator[Found]:
         position = found.end
 
 
-def _read_record(file: RecordFile, offset: int) -> Found | None:
+def _read_record(file: RecordFile, offset: int, scratch: Scratch) -> Found | None:
     """Read the record at an offset; None where the summary begins without an end of the data."""
     front = file.read(offset, _FRONT_BYTES)
     if len(front) < mcap.RECORD_HEAD.size:
@@ -99,7 +103,7 @@ def _read_record(file: RecordFile, offset: int) -> Found | None:
         message = f"the file ends inside a {kind}"
         raise DamagedRecordError(message)
     if opcode == mcap.CHUNK:
-        return _read_chunk(file, offset, front)
+        return _read_chunk(file, offset, front, scratch)
     if opcode == mcap.MESSAGE:
         return _read_message(offset, length, front)
     if opcode == mcap.MESSAGE_INDEX:
@@ -131,14 +135,14 @@ def _check_plain(opcode: int, raw: bytes) -> None:
         cursor.text_map()
 
 
-def _read_chunk(file: RecordFile, offset: int, front: bytes) -> Chunk:
+def _read_chunk(file: RecordFile, offset: int, front: bytes, scratch: Scratch) -> Chunk:
     head = parse_chunk_head(front)
     if not head.is_consistent:
         message = "the lengths of a chunk contradict each other or are beyond all limits"
         raise DamagedRecordError(message)
-    raw = file.read(offset, head.record_bytes)
+    raw = scratch.read(file, offset, head.record_bytes)
     try:
-        records = unpack_chunk(head, raw[head.head_bytes :])
+        records = unpack_chunk(head, raw[head.head_bytes :], scratch)
     except DamagedRecordError as error:
         message = f"a chunk is damaged: {error}"
         raise DamagedRecordError(message) from error
