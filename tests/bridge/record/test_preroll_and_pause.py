@@ -303,7 +303,7 @@ def test_ledger_records_say_how_things_stood(
 
 
 @pytest.mark.slow
-def test_a_thousand_episodes_leave_no_threads_files_or_memory(
+def test_episodes_kept_and_discarded_leave_no_threads_files_or_memory(
     make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
 ) -> None:
     import gc
@@ -317,14 +317,14 @@ def test_a_thousand_episodes_leave_no_threads_files_or_memory(
 
     recorder = make_recorder(disk=DiskConfig(sync_s=100.0))
     before = (0, 0, 0)
-    for number in range(1000):
+    for number in range(300):  # test_endurance.py records a thousand, between processes
         recorder.start(info(f"t{number}"))
         for _ in range(5):
             recorder.receive(make_sample())
         recorder.stop(discard=number % 2 == 1)
-        if number == 200:
+        if number == 100:
             before = resources()
     files, threads, pages = resources()
     assert (files, threads) == before[:2]
     assert (pages - before[2]) * os.sysconf("SC_PAGE_SIZE") < 20e6
-    assert len(run.episodes()) == 500
+    assert len(run.episodes()) == 150
