@@ -1,12 +1,22 @@
 """A cloud of Gaussians: what is stored, what is fitted, what is drawn."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 SH_DC = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi)); PLY files store (c - 0.5) / SH_DC."""
+
+SH_FIRST = 0.4886025119029199
+"""Factor of the three real spherical harmonics of degree 1, sqrt(3 / (4 pi))."""
+
+NUM_FIRST = 3
+"""Spherical harmonics of degree 1."""
+
+
+def _no_harmonics() -> np.ndarray:
+    return np.zeros((0, 0, 3), dtype=np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,10 +35,26 @@ class GaussianCloud:
     opacities_logit: Float32[np.ndarray, " num_splats"]
     colors: Float32[np.ndarray, "num_splats 3"]
     """sRGB, nominally 0..1; may leave that range, the drawn image is clipped."""
+    harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"] = field(
+        default_factory=_no_harmonics
+    )
+    """How colour changes with the direction it is seen along: coefficients of the real spherical
+    harmonics of degree 1, none or three of them (``harmonic_basis``) for each colour."""
+
+    def __post_init__(self) -> None:
+        """A cloud made without harmonics has rows of none."""
+        if len(self.harmonics) == 0 and len(self.means_m) > 0:
+            none = np.zeros((len(self.means_m), 0, 3), dtype=np.float32)
+            object.__setattr__(self, "harmonics", none)
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
         return len(self.means_m)
+
+    @property
+    def num_harmonics(self) -> int:
+        """Coefficients of each colour beside the constant: 0 or 3."""
+        return int(self.harmonics.shape[1])
 
     def take(self, index: np.ndarray) -> "GaussianCloud":
         """Select and order Gaussians by a mask or a list of ids."""
@@ -40,8 +66,12 @@ class GaussianCloud:
 
 
 def arrays(cloud: GaussianCloud) -> list[tuple[str, np.ndarray]]:
-    """Return the arrays of a cloud with their names, in the order of the fields."""
-    return [(field.name, getattr(cloud, field.name)) for field in fields(cloud)]
+    """Return the arrays of a cloud with their names, in the order of the fields.
+
+    ``harmonics`` is left out where there are none.
+    """
+    named = [(item.name, getattr(cloud, item.name)) for item in fields(cloud)]
+    return named if cloud.num_harmonics else named[:-1]
 
 
 def as_float32(values: np.ndarray) -> np.ndarray:
@@ -50,11 +80,66 @@ def as_float32(values: np.ndarray) -> np.ndarray:
 
 
 def concatenate(clouds: list[GaussianCloud]) -> GaussianCloud:
-    """Put clouds one after another."""
-    names = [field.name for field in fields(GaussianCloud)]
+    """Put clouds one after another; those without harmonics get zeros where others have some."""
+    most = max(cloud.num_harmonics for cloud in clouds)
+    padded = [with_harmonics(cloud, most) for cloud in clouds]
+    names = [item.name for item in fields(GaussianCloud)]
     return GaussianCloud(
-        **{name: as_float32(np.concatenate([getattr(c, name) for c in clouds])) for name in names}
+        **{name: as_float32(np.concatenate([getattr(c, name) for c in padded])) for name in names}
     )
+
+
+def with_harmonics(cloud: GaussianCloud, num_harmonics: int = NUM_FIRST) -> GaussianCloud:
+    """The same Gaussians with this many harmonics: zeros added, or those beyond cut off."""
+    kept = min(num_harmonics, cloud.num_harmonics)
+    harmonics = np.zeros((len(cloud), num_harmonics, 3), dtype=np.float32)
+    harmonics[:, :kept] = cloud.harmonics[:, :kept]
+    return GaussianCloud(**(dict(arrays(cloud)) | {"harmonics": harmonics}))
+
+
+def harmonic_basis(
+    directions: Float[np.ndarray, "*shape 3"],
+) -> Float[np.ndarray, "*shape 3"]:
+    """Values of the three real spherical harmonics of degree 1 along unit directions.
+
+    In the order and with the signs of 3D Gaussian splatting files: sqrt(3 / (4 pi)) (-y, z, -x).
+    """
+    x, y, z = np.moveaxis(directions, -1, 0)
+    return np.stack([-y, z, -x], axis=-1) * np.asarray(SH_FIRST, dtype=directions.dtype)
+
+
+def effective_colors(
+    cloud: GaussianCloud, camera_centre_m: Float[np.ndarray, "3"]
+) -> Float32[np.ndarray, "num_splats 3"]:
+    """Colour of each Gaussian as seen from a point of the cloud's frame, not clipped."""
+    if cloud.num_harmonics == 0:
+        return cloud.colors
+    basis = harmonic_basis(view_directions(cloud.means_m, camera_centre_m))
+    return as_float32(cloud.colors + np.einsum("nk,nkc->nc", basis, cloud.harmonics))
+
+
+def view_directions(
+    means_m: Float32[np.ndarray, "num_splats 3"], camera_centre_m: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "num_splats 3"]:
+    """Unit vectors from the camera centre to each mean."""
+    ray = means_m.astype(np.float64) - camera_centre_m
+    return np.asarray(ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12))
+
+
+def turned_harmonics(
+    harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"],
+    R_new_old: Float[np.ndarray, "3 3"],
+) -> Float32[np.ndarray, "num_splats num_harmonics 3"]:
+    """The harmonics of Gaussians that were turned with all that shines on them.
+
+    Degree 1 is a vector for each colour, sqrt(3 / (4 pi)) v . d with v = (-h_2, -h_0, h_1), and
+    turns like one.
+    """
+    if harmonics.shape[1] == 0:
+        return harmonics
+    v = np.stack([-harmonics[:, 2], -harmonics[:, 0], harmonics[:, 1]], axis=1)
+    x, y, z = np.moveaxis(np.einsum("ij,njc->nic", R_new_old, v), 1, 0)
+    return as_float32(np.stack([-y, z, -x], axis=1))
 
 
 def morton_order(

@@ -18,7 +18,7 @@ from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task
 from bridge.whole_file import write_whole
 from twin.scene.fill import fill_footprint
-from twin.scene.gaussians import GaussianCloud, as_float32, concatenate
+from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, turned_harmonics
 from twin.scene.localise import LocalisedObject
 from twin.scene.localise_colour import ColourConfig, likeness, linear_from_srgb
 from twin.scene.localise_fit import FitConfig, refine_on_points
@@ -101,7 +101,7 @@ def split_objects(
 
 
 def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> GaussianCloud:
-    """The same Gaussians after a rigid motion; colours do not depend on direction."""
+    """The same Gaussians after a rigid motion; what their colour owes to direction turns along."""
     q, _ = se3.split(T_new_old)
     w, x, y, z = q
     w2, x2, y2, z2 = cloud.quats_wxyz.astype(np.float64).T
@@ -120,6 +120,7 @@ def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> Ga
         scales_log=cloud.scales_log,
         opacities_logit=cloud.opacities_logit,
         colors=cloud.colors,
+        harmonics=turned_harmonics(cloud.harmonics, T_new_old[:3, :3]),
     )
 
 

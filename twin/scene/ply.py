@@ -7,7 +7,7 @@ import numpy as np
 from bridge.errors import PathNotFoundError
 from bridge.whole_file import write_whole
 from twin.errors import TwinError
-from twin.scene.gaussians import SH_DC, GaussianCloud, as_float32
+from twin.scene.gaussians import NUM_FIRST, SH_DC, GaussianCloud, as_float32
 
 COLUMNS = (
     *("x", "y", "z", "nx", "ny", "nz"),
@@ -15,6 +15,9 @@ COLUMNS = (
     *("scale_0", "scale_1", "scale_2"),
     *("rot_0", "rot_1", "rot_2", "rot_3"),
 )
+REST_COLUMNS = tuple(f"f_rest_{index}" for index in range(3 * NUM_FIRST))
+"""Harmonics of degree 1: all of red, then green, then blue. Written only where there are any."""
+REST_COUNTS = (9, 24, 45)
 MAX_SPLATS = 50_000_000
 
 
@@ -34,7 +37,8 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
     """Write a cloud; the file appears under its name only when it is complete.
 
     Scales are natural logarithms, opacities logits, rotations wxyz, colours the constant
-    spherical harmonic. Metres, in the frame that ``scene.json`` names.
+    spherical harmonic with those of degree 1 as ``f_rest_0..8`` where the cloud has them.
+    Metres, in the frame that ``scene.json`` names.
     """
     quats = cloud.quats_wxyz / np.linalg.norm(cloud.quats_wxyz, axis=1, keepdims=True)
     table = np.concatenate(
@@ -42,6 +46,7 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
             cloud.means_m,
             np.zeros_like(cloud.means_m),
             (cloud.colors - 0.5) / SH_DC,
+            np.swapaxes(cloud.harmonics, 1, 2).reshape(len(cloud), 3 * cloud.num_harmonics),
             cloud.opacities_logit[:, None],
             cloud.scales_log,
             quats,
@@ -49,12 +54,12 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
         axis=1,
     ).astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
-    header += [f"property float {name}" for name in COLUMNS]
+    header += [f"property float {name}" for name in _columns_of(cloud)]
     write_whole(path, "\n".join([*header, "end_header", ""]).encode() + table.tobytes())
 
 
 def read_ply(path: Path) -> GaussianCloud:
-    """Read a splat PLY; further columns (higher harmonics) are ignored.
+    """Read a splat PLY. Harmonics above degree 1 and unknown columns are ignored.
 
     Raises:
         PathNotFoundError: When the file is not there.
@@ -87,7 +92,26 @@ def read_ply(path: Path) -> GaussianCloud:
         scales_log=columns("scale_0", "scale_1", "scale_2"),
         opacities_logit=columns("opacity")[:, 0].copy(),
         colors=as_float32(columns("f_dc_0", "f_dc_1", "f_dc_2") * np.float32(SH_DC) + 0.5),
+        harmonics=_harmonics(names, table),
     )
+
+
+def _columns_of(cloud: GaussianCloud) -> tuple[str, ...]:
+    after_color = COLUMNS.index("f_dc_2") + 1
+    rest = REST_COLUMNS[: 3 * cloud.num_harmonics]
+    return (*COLUMNS[:after_color], *rest, *COLUMNS[after_color:])
+
+
+def _harmonics(names: list[str], table: np.ndarray) -> np.ndarray:
+    """Degree 1 of files with degree 1, 2 or 3 (9, 24 or 45 columns); none from others."""
+    total = sum(name.startswith("f_rest_") for name in names)
+    wanted = [
+        [f"f_rest_{color * (total // 3) + index}" for color in range(3)]
+        for index in range(NUM_FIRST)
+    ]
+    if total not in REST_COUNTS or any(name not in names for row in wanted for name in row):
+        return np.zeros((len(table), 0, 3), dtype=np.float32)
+    return as_float32(table[:, [[names.index(name) for name in row] for row in wanted]])
 
 
 def _header(path: Path, lines: list[str]) -> tuple[list[str], int]:

@@ -14,7 +14,14 @@ from jaxtyping import Bool, Float, Float32
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.errors import TwinError
-from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.gaussians import (
+    SH_FIRST,
+    GaussianCloud,
+    as_float32,
+    effective_colors,
+    harmonic_basis,
+    view_directions,
+)
 
 NUM_PLANES = 5
 """Red, green, blue, sum of weighted depth, sum of weights."""
@@ -68,6 +75,7 @@ class CloudGradient:
     scales_log: Float32[np.ndarray, "num_splats 3"]
     opacities_logit: Float32[np.ndarray, " num_splats"]
     colors: Float32[np.ndarray, "num_splats 3"]
+    harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +104,8 @@ class Rasteriser:
         """Load the native code."""
         self.config = config or RasterConfig()
         self._native = load_native().Rasteriser(self.config.threads, self.config.isa)
+        self._cloud: GaussianCloud | None = None
+        self._centre_m = np.zeros(3)
 
     @property
     def isa(self) -> str:
@@ -106,6 +116,7 @@ class Rasteriser:
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "5 height width"]:
         """Draw red, green, blue, weighted depth [m] and alpha as five planes over black."""
+        self._cloud, self._centre_m = cloud, np.asarray(T_base_camera[:3, 3])
         T_camera_base = as_float32(se3.invert(T_base_camera)[:3])
         intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         planes: np.ndarray = self._native.draw(
@@ -113,7 +124,7 @@ class Rasteriser:
             cloud.quats_wxyz,
             cloud.scales_log,
             cloud.opacities_logit,
-            cloud.colors,
+            effective_colors(cloud, T_base_camera[:3, 3]),
             T_camera_base,
             intrinsics,
             self.config.alpha_cut,
@@ -128,13 +139,29 @@ class Rasteriser:
     ) -> CloudGradient:
         """Carry a gradient on the planes of the last ``draw_planes`` back to its cloud."""
         means, quats, scales, opacities, colors = self._native.pull(planes, plane_gradients)
+        harmonics, through_direction = self._harmonic_gradients(colors)
         return CloudGradient(
-            means_m=means,
+            means_m=means + through_direction,
             quats_wxyz=quats,
             scales_log=scales,
             opacities_logit=opacities,
             colors=colors,
+            harmonics=harmonics,
         )
+
+    def _harmonic_gradients(self, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gradients on harmonics, and on means by way of the viewing direction."""
+        cloud = self._cloud
+        if cloud is None or cloud.num_harmonics == 0:
+            return np.zeros((len(colors), 0, 3), dtype=np.float32), np.zeros_like(colors)
+        directions = view_directions(cloud.means_m, self._centre_m)
+        basis = harmonic_basis(directions)
+        along = np.einsum("nkc,nc->nk", cloud.harmonics, colors)
+        d_direction = SH_FIRST * np.stack([-along[:, 2], -along[:, 0], along[:, 1]], axis=1)
+        across = d_direction - directions * (d_direction * directions).sum(axis=1, keepdims=True)
+        length = np.linalg.norm(cloud.means_m - self._centre_m, axis=1, keepdims=True)
+        harmonics = basis[:, :, None] * colors[:, None, :]
+        return as_float32(harmonics), as_float32(across / np.maximum(length, 1e-12))
 
     def visible_mask(self) -> Bool[np.ndarray, " num_splats"]:
         """Say which Gaussians could touch the last image."""
