@@ -93,8 +93,9 @@ def test_a_cloud_moved_with_its_camera_looks_the_same() -> None:
 
 def test_colours_change_with_the_side_they_are_seen_from() -> None:
     cloud = shiny_cloud()
-    front = effective_colors(cloud, cloud.means_m.mean(axis=0) - [0.0, 0.0, 9.0])
-    back = effective_colors(cloud, cloud.means_m.mean(axis=0) + [0.0, 0.0, 9.0])
+    middle, away = cloud.means_m.mean(axis=0), np.array([0.0, 0.0, 9.0])
+    front = effective_colors(cloud, middle - away)
+    back = effective_colors(cloud, middle + away)
     # Degree 1 is odd: what one side gains the other loses.
     np.testing.assert_allclose((front + back) / 2, cloud.colors, atol=0.02)
     assert np.abs(front - back).max() > 0.1
