@@ -1,0 +1,1 @@
+"""What is what in a rebuilt scene: masks lifted into Gaussians, instances, parts, queries."""

@@ -1,0 +1,100 @@
+"""What segmentation gives: masks in images, instances in the scene, feature maps."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt16
+
+from twin.errors import TwinError
+
+MAX_INSTANCES = 65535
+"""Labels are 16 bit, 0 is the background."""
+
+
+class SemanticsError(TwinError):
+    """Masks, features or a query do not fit the scene they are meant for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mask:
+    """One thing in one image, as a 2D segmenter reports it."""
+
+    image: Bool[np.ndarray, "height width"]
+    """True on the thing; the size of the camera's image."""
+    label: str
+    """What the segmenter calls it; may be empty."""
+    score: float = 1.0
+    """The segmenter's confidence, 0..1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskSet:
+    """All masks of one frame; ids need not agree between frames, masks may overlap."""
+
+    camera_id: str
+    stamp_ns: int
+    masks: Sequence[Mask]
+    source: str = "supplied masks"
+    """Which segmenter made them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureMap:
+    """Features of one image at a fraction of its resolution."""
+
+    values: Float32[np.ndarray, "num_channels map_height map_width"]
+    stride: int
+    """Image pixels per feature cell, along rows and along columns."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Instance:
+    """One thing of the scene, as a set of its Gaussians."""
+
+    id: int
+    """Its value in ``SemanticScene.labels``; from 1."""
+    label: str
+    mask: Bool[np.ndarray, " num_splats"]
+    support: int
+    """Frames that vouch for it: a mask of theirs was matched, or they show it."""
+    seen: int
+    """Frames in which enough of it is visible."""
+    score: float
+    """0..1: mean confidence of its masks; of the default segmenter the share of firm points."""
+    source: str
+    color_srgb: tuple[int, int, int]
+    """Median colour of its Gaussians."""
+    T_base_instance: Float[np.ndarray, "4 4"]
+    """Centre and axes of its box: z up, x along the longer side, see ``size_m``."""
+    size_m: tuple[float, float, float]
+    """Extents of its box along those axes."""
+    parts: Mapping[str, Bool[np.ndarray, " num_splats"]] = field(default_factory=dict)
+    keypoints_m: Mapping[str, Float[np.ndarray, "3"]] = field(default_factory=dict)
+    """Named points in the root frame."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SemanticScene:
+    """The things of a scene."""
+
+    instances: tuple[Instance, ...]
+    labels: UInt16[np.ndarray, " num_splats"]
+    """Which instance each Gaussian belongs to; 0 is the background."""
+    source: str
+    """Who says so."""
+    remark: str = ""
+    """Why there is nothing, or what was left out; empty when there is nothing to say."""
+
+    def instance(self, number: int) -> Instance:
+        """Return the instance with an id.
+
+        Raises:
+            SemanticsError: When there is none; names those that exist.
+        """
+        for item in self.instances:
+            if item.id == number:
+                return item
+        known = ", ".join(f"{item.id} ({item.label})" for item in self.instances) or "none"
+        message = f"the scene has no instance {number}; it has {known}."
+        raise SemanticsError(message)
