@@ -12,6 +12,7 @@ from bridge.errors import UsageError
 
 _DURATION = re.compile(r"^\s*(\d+(?:\.\d+)?)\s*(s|sec|min|m|h)?\s*$")
 _SECONDS = {None: 1.0, "s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
+MAX_APPEARANCE_STEPS = 6
 
 
 def parse_duration_s(text: str) -> float:
@@ -49,19 +50,44 @@ class FrameConfig:
     """Which frames are used for what."""
 
     max_train_frames: int = 100
-    """Frames to fit, spread evenly over episodes, cameras and time."""
+    """Frames to fit, shared evenly by episodes and cameras."""
+    train_every: int = 0
+    """Learn from every this many frames, whatever they show: a fixed protocol. 0: from the
+    sharpest and stillest frame of each stretch of the camera's path."""
     holdout_every: int = 8
-    """Every this many frames of a camera, one is kept out of initialisation and fit."""
+    """Every this many frames of a camera, one is kept out of everything: initialisation, poses,
+    exposure, fit, objects."""
+    holdout_offset: int | None = None
+    """Which of them, counted from 0; the one in the middle if not given."""
     max_holdout_frames: int = 24
     """Held-out frames to render, spread evenly."""
     max_depth_m: float = 5.0
     """Depth beyond is not trusted."""
+    poses: Literal["auto", "tf", "odometry"] = "auto"
+    """Where cameras are. tf: from /tf; odometry: from the images themselves; auto: odometry for
+    cameras that /tf says nothing about."""
+    check_poses: bool = True
+    """Refuse poses that fit the depth only when read in another convention."""
+    align_poses: bool = False
+    """Lay the depth of each training frame onto all others before the fit, for rough poses."""
 
     def __post_init__(self) -> None:
         """Refuse to hold out every frame, or to learn from none."""
         _refuse_below(2, holdout_every=self.holdout_every)
+        _refuse_below(0, train_every=self.train_every, holdout_offset=self.first_holdout)
         _refuse_below(1, max_train_frames=self.max_train_frames)
         _refuse_below(1, max_holdout_frames=self.max_holdout_frames)
+        if self.first_holdout >= self.holdout_every:
+            message = (
+                f"--holdout-offset {self.first_holdout} lies beyond the first "
+                f"--holdout-every {self.holdout_every} frames; give less."
+            )
+            raise UsageError(message)
+
+    @property
+    def first_holdout(self) -> int:
+        """Index of the first held-out frame of each camera."""
+        return self.holdout_every // 2 if self.holdout_offset is None else self.holdout_offset
 
 
 @Parameter(name="*", group="Initialisation")
@@ -70,7 +96,10 @@ class InitialiseConfig:
     """From depth images to the first Gaussians."""
 
     max_splats: int = 60_000
-    """Budget: voxels grow until the number of Gaussians fits."""
+    """Budget of the whole fit."""
+    growth: float = 0.25
+    """Share of the budget left to the fit, which splits Gaussians where the error is large;
+    voxels grow until the first Gaussians fit in the others."""
     footprint_factor: float = 1.6
     """Voxel size in pixel footprints z/f."""
     flatness: float = 0.1
@@ -81,8 +110,11 @@ class InitialiseConfig:
     """A pixel whose depth differs from a neighbour's by more than this share is dropped."""
 
     def __post_init__(self) -> None:
-        """Refuse an empty budget and an opacity without a logit."""
+        """Refuse an empty budget, a growth of everything, and an opacity without a logit."""
         _refuse_below(1, max_splats=self.max_splats)
+        if not 0 <= self.growth < 1:
+            message = f"--growth {self.growth:g} is no share: 0 up to, not including, 1."
+            raise UsageError(message)
         if not 0 < self.opacity < 1:
             message = f"--opacity {self.opacity:g} does not lie between 0 and 1."
             raise UsageError(message)
@@ -103,14 +135,31 @@ class FitConfig:
     """Weight of the L1 depth term (the paper's lambda_d), relative to depth."""
     coarse_fraction: float = 0.6
     """Share of the budget spent at half resolution."""
+    appearance_steps: int = 4
+    """Conjugate gradient steps whenever the colours are solved in closed form; 0: never. More
+    than six follow the noise."""
+    harmonics: Literal[0, 1] = 1
+    """Degree of the spherical harmonics of colour; 0: one colour from everywhere."""
+    gain: bool = True
+    """Solve a brightness per frame and channel (exposure, white balance); their mean is 1."""
+    densify: bool = True
+    """Split Gaussians where the error is large, drop those that show nothing."""
+    refine_poses: bool = False
+    """Move the cameras too, the first one excepted."""
     seed: int = 0
-    """Order of the frames."""
+    """Order of the frames, and nothing else: the rest leaves nothing to chance."""
     threads: int = 0
     """0: all cores. The result does not depend on it."""
 
     def __post_init__(self) -> None:
         """Refuse a fit that never ends, or never begins."""
         _refuse_below(0, iterations=self.iterations)
+        if not 0 <= self.appearance_steps <= MAX_APPEARANCE_STEPS:
+            message = (
+                f"--appearance-steps {self.appearance_steps} lies outside 0 to "
+                f"{MAX_APPEARANCE_STEPS}: more steps follow the noise."
+            )
+            raise UsageError(message)
         if self.iterations == 0 and not self.budget_s > 0:
             message = f"--budget {self.budget_s:g} s leaves no time to fit; give more than 0."
             raise UsageError(message)
