@@ -1,0 +1,77 @@
+"""The one call of ``rebuild``: say what is what, and write it beside the splats."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from twin.scene.gaussians import GaussianCloud, concatenate
+from twin.scene.raster import RasterConfig, Rasteriser
+from twin.scene.semantics.describe import scene_by_default, scene_from_masks
+from twin.scene.semantics.features import FEATURES_FILE, SceneFeatures, save_features
+from twin.scene.semantics.lift import Viewpoint
+from twin.scene.semantics.result import MaskSet, SemanticScene, SemanticsError
+from twin.scene.semantics.segment import SOURCE
+from twin.scene.semantics.store import BACKGROUND_KEY, SEMANTICS_FILE, write_semantics
+
+MAX_VIEWPOINTS = 24
+"""Frames that count support; more are thinned out evenly."""
+
+
+def add_semantics(
+    folder: Path,
+    background: GaussianCloud,
+    objects: Mapping[str, GaussianCloud],
+    viewpoints: Sequence[Viewpoint],
+    *,
+    masks: Sequence[tuple[Viewpoint, MaskSet]] = (),
+    features: SceneFeatures | None = None,
+    robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
+    threads: int = 0,
+) -> dict[str, Any]:
+    """Segment a scene and write ``semantics.npz`` (and ``features.npz``) into its folder.
+
+    Nothing found, or masks that do not fit, is a remark, not an error: the scene is good without.
+
+    Args:
+        folder: The scene folder.
+        background: What ``background.ply`` holds.
+        objects: What ``objects/<id>/gaussians.ply`` hold, moved to where they were scanned.
+        viewpoints: Training frames, to count in how many an instance shows.
+        masks: Masks of a 2D segmenter; without any the default segmenter looks at the Gaussians.
+        features: Features of the same Gaussians, background first.
+        robot_m: Points on the robot where it stood, to leave it out.
+        threads: For drawing; 0: all cores.
+
+    Returns:
+        What ``scene.json`` says under ``semantics``.
+    """
+    cloud = concatenate([background, *objects.values()])
+    rows = {BACKGROUND_KEY: len(background)} | {key: len(part) for key, part in objects.items()}
+    rasteriser = Rasteriser(RasterConfig(threads=threads))
+    try:
+        if masks:
+            scene = scene_from_masks(cloud, masks, rasteriser)
+        else:
+            step = -(-len(viewpoints) // MAX_VIEWPOINTS) or 1
+            scene = scene_by_default(cloud, viewpoints[::step], rasteriser, robot_m=robot_m)
+    except SemanticsError as error:
+        nothing = np.zeros(len(cloud), dtype=np.uint16)
+        source = masks[0][1].source if masks else SOURCE
+        scene = SemanticScene(instances=(), labels=nothing, source=source, remark=str(error))
+    for name in (SEMANTICS_FILE, FEATURES_FILE):
+        (folder / name).unlink(missing_ok=True)
+    record = write_semantics(folder, scene, rows)
+    if features is not None:
+        if len(features.features) != len(cloud):
+            told = f"features of {len(features.features)} Gaussians for {len(cloud)}: left out"
+            return record | {"features": None, "features_remark": told}
+        record["features"] = {
+            "file": save_features(folder, features).name,
+            "source": features.source,
+            "num_kept": len(features.basis.components),
+            "explained_fraction": round(features.basis.explained_fraction, 4),
+        }
+    return record

@@ -1,0 +1,72 @@
+"""Colours as people see and name them: CIE Lab and a dozen names."""
+
+import numpy as np
+from jaxtyping import Float
+
+_XYZ_FROM_RGB = np.array(
+    [
+        [0.4124564, 0.3575761, 0.1804375],
+        [0.2126729, 0.7151522, 0.0721750],
+        [0.0193339, 0.1191920, 0.9503041],
+    ]
+)
+"""Linear sRGB to XYZ, IEC 61966-2-1."""
+_WHITE = _XYZ_FROM_RGB.sum(axis=1)
+GREY_CHROMA = 11.0
+"""Less colourful is black, grey or white."""
+DULL_CHROMA = 42.0
+"""Warm colours below this are brown or beige."""
+_HUES = (
+    (48.0, "red"),
+    (80.0, "orange"),
+    (115.0, "yellow"),
+    (182.0, "green"),
+    (228.0, "cyan"),
+    (309.0, "blue"),
+    (348.0, "purple"),
+    (360.0, "red"),
+)
+"""Upper end of each name's range of Lab hue [degrees]."""
+COLOUR_NAMES = (
+    "black",
+    "grey",
+    "white",
+    "brown",
+    "beige",
+    "pink",
+    *dict.fromkeys(name for _, name in _HUES),
+)
+
+
+def lab_from_srgb(
+    color: Float[np.ndarray, "*batch 3"],
+) -> Float[np.ndarray, "*batch 3"]:
+    """Turn sRGB (0..1, clipped) into CIE L*a*b* with the D65 white (CIE 15:2004).
+
+    Range: L 0..100; a difference of 2 is just visible.
+    """
+    srgb = np.clip(np.asarray(color, dtype=np.float64), 0.0, 1.0)
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    ratio = linear @ _XYZ_FROM_RGB.T / _WHITE
+    knee = 6.0 / 29.0
+    f = np.where(ratio > knee**3, np.cbrt(ratio), ratio / (3 * knee**2) + 4.0 / 29.0)
+    x, y, z = np.moveaxis(f, -1, 0)
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
+
+
+def colour_name(color: Float[np.ndarray, "3"]) -> str:
+    """Name an sRGB colour (0..1) with one of ``COLOUR_NAMES``."""
+    lightness, a, b = lab_from_srgb(color)
+    chroma = float(np.hypot(a, b))
+    hue = float(np.degrees(np.arctan2(b, a))) % 360.0
+    if chroma < GREY_CHROMA:
+        return "black" if lightness < 25 else "white" if lightness > 82 else "grey"
+    name = next(name for end, name in _HUES if hue <= end)
+    if name in ("red", "purple") and lightness > 65 and chroma < 60:
+        return "pink"
+    if name == "orange" or (name in ("red", "yellow") and 30 < hue < 100 and chroma < DULL_CHROMA):
+        if chroma < DULL_CHROMA and lightness > 62:
+            return "beige"
+        if lightness < 52 or chroma < DULL_CHROMA:
+            return "brown"
+    return name

@@ -1,0 +1,197 @@
+"""From sets of Gaussians to instances: colour, box, parts and keypoints."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt16
+
+from twin.scene.gaussians import GaussianCloud
+from twin.scene.raster import Rasteriser
+from twin.scene.semantics.associate import AssociateConfig, associate
+from twin.scene.semantics.form import measure_form
+from twin.scene.semantics.from_view import points_of, solid_splats
+from twin.scene.semantics.lift import Viewpoint, observe, visible_weight
+from twin.scene.semantics.part_names import PartsConfig, find_parts
+from twin.scene.semantics.result import Instance, MaskSet, SemanticScene
+from twin.scene.semantics.segment import SOURCE, SegmentConfig, segment_points
+from twin.scene.semantics.support import (
+    NoSupportError,
+    SupportConfig,
+    SupportPlane,
+    find_support,
+)
+
+CELL_M = 0.004
+"""Gaussians of a scene lie about this far apart."""
+MIN_SHOWN_PX = 20.0
+"""A frame shows a thing when its Gaussians give this many pixels of the image."""
+
+
+def scene_from_masks(
+    cloud: GaussianCloud,
+    frames: Iterable[tuple[Viewpoint, MaskSet]],
+    rasteriser: Rasteriser,
+    config: AssociateConfig | None = None,
+) -> SemanticScene:
+    """Fuse the masks of a 2D segmenter into the Gaussians of a scene.
+
+    Args:
+        cloud: The scene.
+        frames: Masks with where their cameras stood.
+        rasteriser: What to draw with.
+        config: When masks mean the same thing.
+
+    Raises:
+        SemanticsError: When a mask does not fit its camera.
+    """
+    observations, sources = [], []
+    for viewpoint, masks in frames:
+        observations.append(observe(rasteriser, cloud, viewpoint, masks))
+        sources.append(masks.source)
+    source = ", ".join(dict.fromkeys(sources)) or "no masks"
+    found = associate(observations, len(cloud), config or AssociateConfig())
+    plane = support_of(cloud)
+    instances = tuple(
+        describe(
+            cloud,
+            number=number,
+            mask=track.mask,
+            label=track.label,
+            support=track.support,
+            seen=track.seen,
+            score=track.score,
+            source=source,
+            plane=plane,
+        )
+        for number, track in enumerate(found.tracks, start=1)
+    )
+    num_masks = sum(len(item.labels) for item in observations)
+    remark = (
+        ""
+        if instances
+        else (
+            f"{num_masks} masks in {len(observations)} frames gave no instance: each needs matching "
+            "masks in several frames"
+        )
+    )
+    return SemanticScene(instances=instances, labels=found.labels, source=source, remark=remark)
+
+
+def scene_by_default(
+    cloud: GaussianCloud,
+    viewpoints: Iterable[Viewpoint],
+    rasteriser: Rasteriser,
+    config: SegmentConfig | None = None,
+    robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
+) -> SemanticScene:
+    """Segment the fused Gaussians with the default segmenter.
+
+    Support and seen count the viewpoints that show an instance. A scene without a level plane,
+    or with nothing on it, gives no instances and a remark that says so.
+    """
+    labels = np.zeros(len(cloud), dtype=np.uint16)
+    ids = np.flatnonzero(solid_splats(cloud))
+    try:
+        found = segment_points(points_of(cloud.take(ids)), config or SegmentConfig(), robot_m)
+    except NoSupportError as error:
+        return SemanticScene(instances=(), labels=labels, source=SOURCE, remark=str(error))
+    labels[ids] = found.labels.astype(np.uint16)
+    shown = _num_shown(cloud, labels, len(found.things), viewpoints, rasteriser)
+    instances = tuple(
+        describe(
+            cloud,
+            number=number,
+            mask=labels == number,
+            label=thing.label,
+            support=shown[number],
+            seen=shown[number],
+            score=thing.score,
+            source=SOURCE,
+            plane=found.plane,
+        )
+        for number, thing in enumerate(found.things, start=1)
+    )
+    return SemanticScene(instances=instances, labels=labels, source=SOURCE, remark=found.remark)
+
+
+def _num_shown(
+    cloud: GaussianCloud,
+    labels: UInt16[np.ndarray, " num_splats"],
+    num_things: int,
+    viewpoints: Iterable[Viewpoint],
+    rasteriser: Rasteriser,
+) -> list[int]:
+    """For each label the number of viewpoints that show it."""
+    shown = np.zeros(num_things + 1, dtype=np.int64)
+    if num_things:
+        for viewpoint in viewpoints:
+            weight: Float32[np.ndarray, " num_splats"]
+            weight = visible_weight(rasteriser, cloud, viewpoint)
+            pixels = np.bincount(labels, weights=weight, minlength=num_things + 1)
+            shown += pixels >= MIN_SHOWN_PX
+    return [int(count) for count in shown]
+
+
+def support_of(cloud: GaussianCloud) -> SupportPlane | None:
+    """The plane that things stand on, if there is one."""
+    points = points_of(cloud.take(solid_splats(cloud)))
+    try:
+        return find_support(points.p_m, points.normals, SupportConfig())
+    except NoSupportError:
+        return None
+
+
+def describe(
+    cloud: GaussianCloud,
+    *,
+    number: int,
+    mask: Bool[np.ndarray, " num_splats"],
+    label: str,
+    support: int,
+    seen: int,
+    score: float,
+    source: str,
+    plane: SupportPlane | None,
+) -> Instance:
+    """Measure one instance: colour, box, parts, keypoints.
+
+    Without a plane, or where it lies above the thing, heights count from its lowest Gaussian.
+    """
+    ids = np.flatnonzero(mask)
+    p = cloud.means_m[ids].astype(np.float64)
+    lowest = float(np.quantile(p[:, 2], 0.01))
+    ground = lowest
+    if plane is not None:
+        under = float(np.median(p[:, 2] - plane.height_m(p) / plane.normal[2]))
+        ground = under if -0.02 < lowest - under < 0.05 else lowest
+    xyh = p - np.array([0.0, 0.0, ground])
+    form = measure_form(xyh, CELL_M)
+    parts = find_parts(xyh, label, CELL_M, PartsConfig())
+    up = np.array([0.0, 0.0, ground])
+    T = np.eye(4)
+    T[:2, :2] = [
+        [np.cos(form.yaw_rad), -np.sin(form.yaw_rad)],
+        [np.sin(form.yaw_rad), np.cos(form.yaw_rad)],
+    ]
+    T[:3, 3] = form.centre_m + up
+    color = np.clip(np.rint(np.median(cloud.colors[ids], axis=0) * 255), 0, 255)
+    return Instance(
+        id=number,
+        label=label,
+        mask=mask,
+        support=support,
+        seen=seen,
+        score=score,
+        source=source,
+        color_srgb=(int(color[0]), int(color[1]), int(color[2])),
+        T_base_instance=T,
+        size_m=form.size_m,
+        parts={name: _among(ids, part, len(cloud)) for name, part in parts.masks.items()},
+        keypoints_m={name: point + up for name, point in parts.keypoints.items()},
+    )
+
+
+def _among(ids: np.ndarray, part: np.ndarray, num_splats: int) -> np.ndarray:
+    mask = np.zeros(num_splats, dtype=bool)
+    mask[ids[part]] = True
+    return mask

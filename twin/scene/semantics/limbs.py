@@ -1,0 +1,195 @@
+"""Body, head and limbs of an animal or toy: what is thick, and what sticks out of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from twin.scene.semantics.solid import Solid, fill_solid
+
+CONNECTED = np.ones((3, 3, 3), dtype=bool)
+BODY, HEAD, LIMB = 1, 2, 3
+LEVELS = tuple(np.arange(0.97, 0.5, -0.03))
+"""Thickness, as a share of the largest, at which thick places are told apart."""
+MIN_PROMINENCE = 1.06
+"""A thick place counts when it is this much thicker than the neck to the next."""
+MIN_PIECE = 0.008
+"""What sticks out has at least this share of the solid's cells."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Core:
+    """A thick place: cells thicker than a level, alone up to its neck to the next."""
+
+    region: Bool[np.ndarray, "num_x num_y num_z"]
+    level: float
+    """In cells."""
+
+
+def animal_parts(
+    xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float, limb_ratio: float
+) -> tuple[dict[str, Bool[np.ndarray, " num_points"]], dict[str, Float[np.ndarray, "3"]]]:
+    """Tell body, head and limbs apart by thickness.
+
+    The visible surface is filled to a solid that stands on the plane. Opening it with a ball
+    takes off whatever is thinner than the ball: pieces that come off stick out. Thick places are
+    told apart where a neck separates them. Of those beside the largest, the head is the highest
+    with the least attached to it (nose and ears go with it); a body of two thick places keeps
+    both. With one thick place only, the head is the thickest and highest piece that sticks out.
+
+    Args:
+        xyh_m: Points of the surface: x, y and height above the plane.
+        cell_m: Spacing of the points.
+        limb_ratio: Radius of the ball over the radius of the thickest place.
+
+    Returns:
+        Masks of the parts that are there, and keypoints: the middle of body and head, the tip
+        of each limb.
+    """
+    solid = fill_solid(xyh_m, cell_m)
+    parts, limbs = _label_cells(solid.cells, limb_ratio)
+    nearest = ndimage.distance_transform_edt(
+        parts == 0, return_distances=False, return_indices=True
+    )
+    of_point = parts[tuple(nearest)][solid.cells_of(xyh_m)]
+    masks = {
+        name: of_point == part
+        for name, part in (("body", BODY), ("head", HEAD), ("limbs", LIMB))
+        if (of_point == part).any()
+    }
+    return masks, _keypoints(parts, limbs, solid)
+
+
+def _label_cells(
+    solid: Bool[np.ndarray, "num_x num_y num_z"], limb_ratio: float
+) -> tuple[Int[np.ndarray, "num_x num_y num_z"], list[np.ndarray]]:
+    """Part of each solid cell, and the cells of each limb."""
+    thickness = ndimage.distance_transform_edt(solid)
+    # Distances on a grid come in steps; without smoothing every step would be a thick place.
+    smooth = ndimage.gaussian_filter(thickness, 0.8) * solid
+    most = float(smooth.max())
+    ball = limb_ratio * most
+    thick = solid & _grown(smooth > ball, ball)
+    cores = find_cores(smooth)
+    owner = _nearest_core(cores, thick)
+    pieces = _pieces(solid & ~thick, int(solid.sum()))
+    touches = [_touched(piece, owner, len(cores)) for piece in pieces]
+    parts = np.where(solid, BODY, 0)
+    if len(cores) > 1:
+        head = _head_core(cores, owner, pieces, touches)
+        parts[owner == head + 1] = HEAD
+    elif pieces:
+        head_piece = max(range(len(pieces)), key=lambda k: _headness(pieces[k], thickness))
+        parts[pieces[head_piece]] = HEAD
+        pieces = [piece for k, piece in enumerate(pieces) if k != head_piece]
+        touches = touches[: len(pieces)]  # one core: all touch it
+        head = -1
+    else:
+        head = -1
+    limbs: list[np.ndarray] = []
+    for piece, touched in zip(pieces, touches, strict=True):
+        if touched == head:
+            parts[piece] = HEAD
+        else:
+            parts[piece] = LIMB
+            limbs.append(piece)
+    return parts, limbs
+
+
+def _grown(core: np.ndarray, radius: float) -> np.ndarray:
+    return np.asarray(ndimage.distance_transform_edt(~core) <= radius + 0.7)
+
+
+def find_cores(thickness: Float[np.ndarray, "num_x num_y num_z"]) -> list[Core]:
+    """Thick places that necks separate, thickest first.
+
+    Thresholds come down from the thickest place; components appear, grow and meet. Where two
+    meet, the one that is hardly thicker than the neck was only a bump on the other.
+    """
+    most = float(thickness.max())
+    growing: list[tuple[tuple[int, ...], Core]] = []
+    done: list[Core] = []
+    for level in LEVELS:
+        cells, num = ndimage.label(thickness > level * most, structure=CONNECTED)
+        still: list[tuple[tuple[int, ...], Core]] = []
+        taken = {int(cells[_inside(core)]) for core in done}
+        for number in range(1, num + 1):
+            region = cells == number
+            own = [item for item in growing if cells[item[0]] == number]
+            firm = [item for item in own if thickness[item[0]] > MIN_PROMINENCE * level * most]
+            if number in taken or len(firm) > 1:  # met a finished one earlier, or now
+                done += [core for _, core in firm]
+            else:
+                inside = np.where(region, thickness, 0.0)
+                peak = np.unravel_index(int(inside.argmax()), thickness.shape)
+                grown = Core(region=region, level=level * most)
+                still.append((tuple(int(k) for k in peak), grown))
+        growing = still
+    cores = done + [core for peak, core in growing if thickness[peak] > 0.6 * most]
+    return sorted(cores, key=lambda core: -float(thickness[core.region].max()))
+
+
+def _inside(core: Core) -> tuple[int, ...]:
+    return tuple(int(k) for k in np.argwhere(core.region)[0])
+
+
+def _nearest_core(cores: list[Core], thick: np.ndarray) -> Int[np.ndarray, "num_x num_y num_z"]:
+    """For each thick cell the core whose ball reaches it best, from 1; 0 elsewhere."""
+    gaps = [ndimage.distance_transform_edt(~core.region) - core.level for core in cores]
+    return np.where(thick, np.argmin(gaps, axis=0) + 1, 0)
+
+
+def _pieces(rest: np.ndarray, num_solid: int) -> list[np.ndarray]:
+    """Connected cells that are more than a bump."""
+    cells, num = ndimage.label(rest)
+    counts = np.bincount(cells.ravel(), minlength=num + 1)
+    least = max(8, MIN_PIECE * num_solid)
+    return [cells == piece for piece in range(1, num + 1) if counts[piece] >= least]
+
+
+def _touched(piece: np.ndarray, owner: np.ndarray, num_cores: int) -> int:
+    """The core that most cells around a piece belong to."""
+    around = owner[ndimage.binary_dilation(piece, structure=CONNECTED) & (owner > 0)]
+    return int(np.bincount(around, minlength=num_cores + 1)[1:].argmax())
+
+
+def _head_core(
+    cores: list[Core], owner: np.ndarray, pieces: list[np.ndarray], touches: list[int]
+) -> int:
+    """High up and little attached; never the largest."""
+    sizes = np.bincount(owner.ravel(), minlength=len(cores) + 1)[1:]
+    total = float(sizes.sum())
+    best, best_score = 0, -np.inf
+    for core in range(len(cores)):
+        cells = np.argwhere(owner == core + 1)
+        if core == int(sizes.argmax()) or not len(cells):
+            continue
+        attached = sum(
+            int(piece.sum()) for piece, k in zip(pieces, touches, strict=True) if k == core
+        )
+        score = float(cells[:, 2].mean()) / owner.shape[2] - 5.0 * attached / total
+        if score > best_score:
+            best, best_score = core, score
+    return best
+
+
+def _headness(piece: np.ndarray, thickness: np.ndarray) -> float:
+    """Thick and high."""
+    levels = np.nonzero(piece)[2]
+    return float(thickness[piece].max()) * (1.0 + 0.5 * float(levels.mean()) / piece.shape[2])
+
+
+def _keypoints(
+    parts: Int[np.ndarray, "num_x num_y num_z"], limbs: list[np.ndarray], solid: Solid
+) -> dict[str, Float[np.ndarray, "3"]]:
+    points = {"body": solid.centres_m(parts == BODY).mean(axis=0)}
+    if (parts == HEAD).any():
+        points["head"] = solid.centres_m(parts == HEAD).mean(axis=0)
+    tips = []
+    for limb in limbs:
+        cells = solid.centres_m(limb)
+        away = np.linalg.norm(cells - points["body"], axis=1)
+        tips.append(cells[away >= np.quantile(away, 0.9)].mean(axis=0))
+    around = sorted(tips, key=lambda tip: float(np.arctan2(*(tip - points["body"])[1::-1])))
+    return points | {f"limb {number}": tip for number, tip in enumerate(around, start=1)}

@@ -1,0 +1,169 @@
+"""From words to things: which instances and parts a text means, and who says so."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from twin.scene.semantics.lexicon import (
+    SIZES,
+    colour_of,
+    known_words,
+    names_of,
+    part_of,
+    words_of,
+)
+from twin.scene.semantics.result import Instance, SemanticScene, SemanticsError
+
+CANONICAL = ("object", "thing", "stuff", "texture")
+"""What a text has to beat (LERF, Kerr et al. 2023)."""
+LOGIT_SCALE = 100.0
+"""CLIP's trained temperature: cosines differ by hundredths."""
+LEXICON = "lexicon"
+
+
+class TextEncoder(Protocol):
+    """Turns texts into vectors comparable with the scene's instance embeddings."""
+
+    @property
+    def source(self) -> str:
+        """Which model it is."""
+
+    def encode(self, texts: Sequence[str]) -> Float32[np.ndarray, "num_texts num_dims"]:
+        """One vector for each text, of any length but zero."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Query:
+    """How much each thing and each part is what a text means."""
+
+    text: str
+    objects: Mapping[int, float]
+    """Activation of each instance, 0..1, by its id."""
+    parts: Mapping[tuple[int, str], float]
+    """Activation of each part, by instance and part; empty when the text names no part."""
+    source: str
+    """Who says so: "lexicon" gives 0 or 1, a model something between."""
+    remark: str = ""
+    """Words that were not understood."""
+
+    def best(self) -> int | None:
+        """The instance with the highest activation; None when none has any."""
+        top = max(self.objects, key=lambda number: (self.objects[number], -number), default=None)
+        return top if top is not None and self.objects[top] > 0 else None
+
+
+def query(
+    scene: SemanticScene,
+    text: str,
+    *,
+    embeddings: Float[np.ndarray, "num_instances num_dims"] | None = None,
+    encoder: TextEncoder | None = None,
+) -> Query:
+    """Tell which instances and parts a text means.
+
+    Without embeddings and encoder the lexicon answers: 1 where colour, size and noun fit the
+    instance's label, else 0. With both, the model answers for objects: the softmax of the text
+    against each canonical phrase, the smallest of them. Parts go by name in either case, each
+    with its object's activation ("handle of the basket", "the duck's head").
+
+    Args:
+        scene: What there is.
+        text: An object, optionally with a part of it.
+        embeddings: One vector for each instance, in the order of ``scene.instances``.
+        encoder: The model that made them.
+
+    Raises:
+        SemanticsError: When the text says nothing, or the embeddings do not fit.
+    """
+    words = words_of(text)
+    if not words:
+        message = f"{text!r} names nothing to look for."
+        raise SemanticsError(message)
+    wanted_parts, noun_words = _split_parts(scene, words)
+    if embeddings is None or encoder is None:
+        objects, remark = _by_lexicon(scene, noun_words)
+        source = LEXICON
+    else:
+        phrase = " ".join(noun_words) or text
+        objects, remark = _by_model(scene, phrase, embeddings, encoder), ""
+        source = encoder.source
+    parts = {
+        (item.id, part): objects[item.id]
+        for item in scene.instances
+        for part in item.parts
+        if part in wanted_parts
+    }
+    return Query(text=text, objects=objects, parts=parts, source=source, remark=remark)
+
+
+def _split_parts(scene: SemanticScene, words: list[str]) -> tuple[set[str], list[str]]:
+    """Parts that are named, and the words about the object."""
+    parts = {part for word in words if (part := part_of(word)) is not None}
+    own = {word for item in scene.instances for word in words_of(item.label)}
+    rest = [word for word in words if part_of(word) is None or word in own]
+    return parts, rest
+
+
+def _by_lexicon(scene: SemanticScene, words: list[str]) -> tuple[dict[int, float], str]:
+    own = {word for item in scene.instances for word in words_of(item.label)}
+    known = known_words() | own | set(SIZES)
+    unknown = [word for word in words if word not in known and colour_of(word) is None]
+    objects = {item.id: float(_fits(item, words, scene)) for item in scene.instances}
+    remark = f"not in the lexicon: {', '.join(unknown)}" if unknown else ""
+    return objects, remark
+
+
+def _fits(item: Instance, words: list[str], scene: SemanticScene) -> bool:
+    names = names_of(item.label)
+    colours = {colour_of(word) for word in words_of(item.label)} - {None}
+    for word in words:
+        colour = colour_of(word)
+        if word in SIZES:
+            if not _has_size(item, word, scene):
+                return False
+        elif colour is not None and word not in names:
+            if colour not in colours:
+                return False
+        elif colour is None and word not in names:
+            return False
+    return True
+
+
+def _has_size(item: Instance, word: str, scene: SemanticScene) -> bool:
+    """Sizes compare a thing with the median of the scene; "open" and "flat" with its label."""
+    if word in ("open", "flat"):
+        return word in words_of(item.label)
+    if word == "tall":
+        return item.size_m[2] > 1.2 * max(item.size_m[:2])
+    volumes = [float(np.prod(other.size_m)) for other in scene.instances]
+    volume, middle = float(np.prod(item.size_m)), float(np.median(volumes))
+    return volume < 0.8 * middle if word in ("small", "little", "tiny") else volume > 1.25 * middle
+
+
+def _by_model(
+    scene: SemanticScene,
+    phrase: str,
+    embeddings: Float[np.ndarray, "num_instances num_dims"],
+    encoder: TextEncoder,
+) -> dict[int, float]:
+    vectors = encoder.encode([phrase, *CANONICAL])
+    if embeddings.shape != (len(scene.instances), vectors.shape[1]):
+        message = (
+            f"the scene has {len(scene.instances)} instances and embeddings of shape "
+            f"{embeddings.shape}; {encoder.source} encodes text in {vectors.shape[1]} dimensions. "
+            "Make the embeddings with the same model."
+        )
+        raise SemanticsError(message)
+    cosine = _unit(np.asarray(embeddings, dtype=np.float64)) @ _unit(vectors.astype(np.float64)).T
+    # Two-way softmax of the text against each canonical phrase, the least favourable counts.
+    against = LOGIT_SCALE * (cosine[:, 1:].max(axis=1) - cosine[:, 0])
+    activation = 1.0 / (1.0 + np.exp(np.clip(against, -60.0, 60.0)))
+    return {item.id: float(value) for item, value in zip(scene.instances, activation, strict=True)}
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, 1e-12))

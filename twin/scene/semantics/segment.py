@@ -1,0 +1,244 @@
+"""The default segmenter: no weights, only geometry and colour.
+
+Things are what stands on the largest level plane and hangs together, cut where colour or shape
+says that two things touch. Works on the points of one RGB-D view and on a fused cloud.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from twin.scene.semantics.cluster import (
+    SurfacePoints,
+    Voxels,
+    components,
+    make_voxels,
+    neighbour_pairs,
+)
+from twin.scene.semantics.colour import colour_name, lab_from_srgb
+from twin.scene.semantics.form import Form, measure_form
+from twin.scene.semantics.split import SplitConfig, split_by_colour, split_by_valleys
+from twin.scene.semantics.support import SupportConfig, SupportPlane, find_support
+
+SOURCE = "default segmenter"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentConfig:
+    """What the default segmenter takes for a thing."""
+
+    support: SupportConfig = field(default_factory=SupportConfig)
+    """The plane that things stand on."""
+    split: SplitConfig = field(default_factory=SplitConfig)
+    """When things touch."""
+    min_height_m: float = 0.007
+    """Above the plane; lower points belong to a thing only by colour."""
+    max_height_m: float = 0.6
+    """Higher points belong to the room."""
+    voxel_m: float = 0.004
+    """Finest size of the voxels that hang together; grows with the spacing of the points."""
+    reach_voxels: float = 1.8
+    """Voxels nearer than this hang together (the 26 neighbours)."""
+    min_voxels: int = 25
+    """Smaller groups are noise."""
+    min_size_m: float = 0.012
+    """Things have at least this extent in two directions."""
+    max_size_m: float = 0.45
+    """Larger groups are furniture or the robot."""
+    robot_distance_m: float = 0.015
+    """Points this near to the robot's surface are robot."""
+    foot_colour_gap: float = 16.0
+    """Lab distance up to which low points belong to the thing above them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thing:
+    """One thing the default segmenter found."""
+
+    label: str
+    """Colour and form, for example "red cube"."""
+    form: Form
+    score: float
+    """Share of its points that are firmly above the plane, 0..1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segmentation:
+    """Things among points."""
+
+    labels: Int[np.ndarray, " num_points"]
+    """Index of the thing plus one; 0 is the background."""
+    things: tuple[Thing, ...]
+    """Largest first."""
+    plane: SupportPlane
+    remark: str
+    """Why nothing was found; empty otherwise."""
+
+
+def segment_points(
+    points: SurfacePoints,
+    config: SegmentConfig,
+    robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
+) -> Segmentation:
+    """Find the things that stand on the plane.
+
+    Args:
+        points: What was seen, in a frame whose z points up.
+        config: What counts as a thing.
+        robot_m: Points on the robot's surface where it stood while it was seen, to leave it out.
+
+    Raises:
+        NoSupportError: When there is no level plane to stand on.
+    """
+    plane = find_support(points.p_m, points.normals, config.support)
+    height = plane.height_m(points.p_m)
+    free = plane.under(points.p_m) & (height < config.max_height_m)
+    if robot_m is not None and len(robot_m):
+        distance, _ = cKDTree(robot_m).query(
+            points.p_m, distance_upper_bound=config.robot_distance_m
+        )
+        free &= ~np.isfinite(distance)
+    above = np.flatnonzero(free & (height > config.min_height_m))
+    labels = np.zeros(len(points), dtype=np.int64)
+    voxel_m = max(config.voxel_m, 2.0 * _spacing(points.p_m[above]))
+    labels[above] = _things(points.take(above), height[above], voxel_m, config)
+    labels = _largest_first(labels)
+    low = free & (np.abs(height) <= config.min_height_m)
+    _add_feet(labels, points, low, height, voxel_m, config)
+    things = tuple(
+        _thing(points.take(labels == number), height[labels == number], voxel_m, config)
+        for number in range(1, int(labels.max(initial=0)) + 1)
+    )
+    remark = "" if things else _nothing(plane, len(above))
+    return Segmentation(labels=labels, things=things, plane=plane, remark=remark)
+
+
+def _nothing(plane: SupportPlane, num_above: int) -> str:
+    return (
+        f"nothing stands on the level plane at z = {plane.offset_m / plane.normal[2]:.3f} m "
+        f"({num_above} points above it, none hang together as a thing of 1 to 45 cm)"
+    )
+
+
+def _spacing(p_m: np.ndarray) -> float:
+    """Median distance to the nearest other point."""
+    if len(p_m) < 3:
+        return 0.0
+    some = p_m[:: max(1, len(p_m) // 2000)]
+    distance, _ = cKDTree(p_m).query(some, k=2)
+    return float(np.median(distance[:, 1]))
+
+
+def _things(
+    points: SurfacePoints, height_m: np.ndarray, voxel_m: float, config: SegmentConfig
+) -> np.ndarray:
+    """Number the things among points above the plane from 1; 0 is none."""
+    if len(points) < config.min_voxels:
+        return np.zeros(len(points), dtype=np.int64)
+    voxels = make_voxels(points, voxel_m)
+    height = np.bincount(voxels.of_point, weights=height_m) / voxels.count
+    pairs = neighbour_pairs(voxels.p_m, config.reach_voxels * voxel_m)
+    group = components(len(voxels), pairs)
+    labels = np.zeros(len(voxels), dtype=np.int64)
+    found = 0
+    for number in np.flatnonzero(np.bincount(group) >= config.min_voxels):
+        ids = np.flatnonzero(group == number)
+        if _extent(voxels.p_m[ids])[0] > config.max_size_m:
+            continue
+        for piece in _pieces(voxels, ids, height, pairs, voxel_m, config):
+            extent = _extent(voxels.p_m[piece])
+            if len(piece) >= config.min_voxels and extent[1] >= config.min_size_m:
+                found += 1
+                labels[piece] = found
+    return np.asarray(labels[voxels.of_point])
+
+
+def _extent(p_m: np.ndarray) -> np.ndarray:
+    """Extents along the axes, largest first."""
+    return np.sort(p_m.max(axis=0) - p_m.min(axis=0))[::-1]
+
+
+def _pieces(
+    voxels: Voxels,
+    ids: np.ndarray,
+    height_m: np.ndarray,
+    pairs: np.ndarray,
+    voxel_m: float,
+    config: SegmentConfig,
+) -> list[np.ndarray]:
+    """Cut one connected group by colour, and each piece of it along valleys."""
+    pieces = []
+    by_colour = _within(voxels, ids, pairs)
+    colours = split_by_colour(by_colour[0], height_m[ids], by_colour[1], config.split)
+    for colour in range(int(colours.max()) + 1):
+        part = ids[colours == colour]
+        own, own_pairs = _within(voxels, part, pairs)
+        cut = split_by_valleys(own, height_m[part], own_pairs, voxel_m, config.split)
+        pieces += [part[cut == number] for number in range(int(cut.max()) + 1)]
+    return pieces
+
+
+def _within(voxels: Voxels, ids: np.ndarray, pairs: np.ndarray) -> tuple[Voxels, np.ndarray]:
+    """Some voxels, and the pairs among them in their own numbering."""
+    rank = np.full(len(voxels), -1, dtype=np.int64)
+    rank[ids] = np.arange(len(ids))
+    own = rank[pairs]
+    part = Voxels(
+        p_m=voxels.p_m[ids],
+        normals=voxels.normals[ids],
+        lab=voxels.lab[ids],
+        count=voxels.count[ids],
+        of_point=np.zeros(0, dtype=np.int64),
+    )
+    return part, own[(own >= 0).all(axis=1)]
+
+
+def _largest_first(labels: np.ndarray) -> np.ndarray:
+    counts = np.bincount(labels, minlength=1)[1:]
+    order = np.argsort(-counts, kind="stable")
+    rank = np.zeros(len(counts) + 1, dtype=np.int64)
+    rank[order + 1] = np.arange(1, len(counts) + 1)
+    return np.asarray(rank[labels])
+
+
+def _add_feet(
+    labels: np.ndarray,
+    points: SurfacePoints,
+    low: Bool[np.ndarray, " num_points"],
+    height_m: np.ndarray,
+    voxel_m: float,
+    config: SegmentConfig,
+) -> None:
+    """Give low points to the thing close by whose colour they have and the plane has not."""
+    firm, feet = np.flatnonzero(labels > 0), np.flatnonzero(low)
+    if not len(firm) or not len(feet):
+        return
+    reach = config.min_height_m + 1.5 * voxel_m
+    distance, nearest = cKDTree(points.p_m[firm]).query(
+        points.p_m[feet], distance_upper_bound=reach
+    )
+    near = np.isfinite(distance)
+    feet, thing = feet[near], firm[nearest[near]]
+    plane = np.flatnonzero(low & (np.abs(height_m) < 0.5 * config.min_height_m))
+    if not len(feet) or not len(plane):
+        return
+    lab = lab_from_srgb(points.colors)
+    usual = np.median(lab[plane], axis=0)
+    to_thing = np.linalg.norm(lab[feet] - lab[thing], axis=1)
+    to_plane = np.linalg.norm(lab[feet] - usual, axis=1)
+    # Where thing and plane have one colour, height decides: 2 mm is above the noise.
+    clear = (to_thing < config.foot_colour_gap) & (to_thing < 0.5 * to_plane)
+    mine = clear | ((height_m[feet] > 0.5 * config.min_height_m) & (to_thing < to_plane))
+    labels[feet[mine]] = labels[thing[mine]]
+
+
+def _thing(
+    points: SurfacePoints, height_m: np.ndarray, voxel_m: float, config: SegmentConfig
+) -> Thing:
+    xyh = np.concatenate([points.p_m[:, :2], height_m[:, None]], axis=1)
+    form = measure_form(xyh, voxel_m)
+    color = np.median(points.colors, axis=0).astype(np.float64)
+    firm = float((height_m > 2 * config.min_height_m).mean())
+    return Thing(label=f"{colour_name(color)} {form.word}", form=form, score=firm)

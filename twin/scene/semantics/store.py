@@ -1,0 +1,184 @@
+"""Semantics in the scene folder: ``semantics.npz`` beside the splats, a summary in the record."""
+
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8, UInt16
+
+from bridge.episode import provenance
+from bridge.errors import PathNotFoundError
+from bridge.geometry import se3
+from bridge.whole_file import write_whole
+from twin.scene.semantics.features import read_npz
+from twin.scene.semantics.result import Instance, SemanticScene, SemanticsError
+
+SEMANTICS_FILE = "semantics.npz"
+FORMAT_VERSION = 1
+BACKGROUND_KEY = "background"
+
+
+class UnreadableSemanticsError(SemanticsError):
+    """``semantics.npz`` is damaged, or was made for another scene."""
+
+    def __init__(self, *, path: Path, found: str) -> None:
+        """Remember the file."""
+        self.path = path
+        super().__init__(f"{path}: {found}. Make it again: robot-gst rebuild RUN --force.")
+
+
+def write_semantics(folder: Path, scene: SemanticScene, rows: Mapping[str, int]) -> dict[str, Any]:
+    """Write labels and parts of a scene; return what ``scene.json`` says about it.
+
+    Args:
+        folder: The scene folder.
+        scene: Labels of all Gaussians: those of the background, then of each object.
+        rows: How many Gaussians each of them has, in that order: ``background``, object ids.
+
+    Raises:
+        SemanticsError: When the numbers do not add up.
+    """
+    if sum(rows.values()) != len(scene.labels):
+        message = f"{len(scene.labels)} labels for files with {dict(rows)} Gaussians."
+        raise SemanticsError(message)
+    about = [_about(item, rows) for item in scene.instances]
+    table = {
+        "version": FORMAT_VERSION,
+        "source": scene.source,
+        "remark": scene.remark,
+        "rows": dict(rows),
+        "instances": about,
+    }
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        labels=scene.labels,
+        parts=_part_codes(scene),
+        about=np.frombuffer(json.dumps(table).encode(), dtype=np.uint8),
+    )
+    path = folder / SEMANTICS_FILE
+    write_whole(path, buffer.getvalue())
+    return {
+        "file": SEMANTICS_FILE,
+        "sha256": provenance.hash_file(path),
+        "source": scene.source,
+        "remark": scene.remark,
+        "instances": about,
+    }
+
+
+def _part_codes(scene: SemanticScene) -> UInt8[np.ndarray, " num_splats"]:
+    """Index of each Gaussian's part in its instance's list of parts, from 1; 0 is none."""
+    codes = np.zeros(len(scene.labels), dtype=np.uint8)
+    for item in scene.instances:
+        for number, mask in enumerate(item.parts.values(), start=1):
+            codes[mask] = number
+    return codes
+
+
+def _about(item: Instance, rows: Mapping[str, int]) -> dict[str, Any]:
+    q, p = se3.split(item.T_base_instance)
+    return {
+        "id": item.id,
+        "label": item.label,
+        "object": _object_of(item, rows),
+        "num_splats": int(item.mask.sum()),
+        "support": item.support,
+        "seen": item.seen,
+        "score": round(item.score, 4),
+        "source": item.source,
+        "color_srgb": list(item.color_srgb),
+        "T_base_instance": {"p_m": p.tolist(), "q_wxyz": q.tolist()},
+        "size_m": list(item.size_m),
+        "parts": list(item.parts),
+        "keypoints_m": {name: point.tolist() for name, point in item.keypoints_m.items()},
+    }
+
+
+def _object_of(item: Instance, rows: Mapping[str, int]) -> str | None:
+    """The object most of an instance's Gaussians belong to; None for the background."""
+    first, counts = 0, {}
+    for key, num in rows.items():
+        counts[key] = int(item.mask[first : first + num].sum())
+        first += num
+    most = max(counts, key=lambda key: counts[key])
+    return None if most == BACKGROUND_KEY else most
+
+
+def read_semantics(folder: Path, rows: Mapping[str, int]) -> SemanticScene:
+    """Read what ``write_semantics`` wrote, for files with these numbers of Gaussians.
+
+    Raises:
+        PathNotFoundError: When the scene has none.
+        UnreadableSemanticsError: When the file is damaged or belongs to other splats.
+    """
+    path = folder / SEMANTICS_FILE
+    if not path.is_file():
+        raise PathNotFoundError(
+            path=path, what="semantics", hint="Make them: robot-gst rebuild RUN."
+        )
+    try:
+        arrays = read_npz(path)
+        table = json.loads(arrays["about"].astype(np.uint8).tobytes())
+        if table["version"] != FORMAT_VERSION:
+            message = f"format version {table['version']}, this program knows {FORMAT_VERSION}"
+            raise ValueError(message)
+        if table["rows"] != dict(rows):
+            message = f"made for files with {table['rows']} Gaussians, there are {dict(rows)}"
+            raise ValueError(message)
+        labels, codes = arrays["labels"], arrays["parts"]
+        if labels.dtype != np.uint16 or labels.shape != (sum(rows.values()),):
+            message = f"labels of type {labels.dtype} and shape {labels.shape}"
+            raise ValueError(message)
+        if codes.dtype != np.uint8 or codes.shape != labels.shape:
+            message = f"parts of type {codes.dtype} and shape {codes.shape}"
+            raise ValueError(message)
+        instances = tuple(_instance(item, labels, codes) for item in table["instances"])
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise UnreadableSemanticsError(path=path, found=f"unreadable ({error})") from error
+    return SemanticScene(
+        instances=instances,
+        labels=labels,
+        source=str(table["source"]),
+        remark=str(table["remark"]),
+    )
+
+
+def _instance(
+    about: Mapping[str, Any],
+    labels: UInt16[np.ndarray, " num_splats"],
+    codes: UInt8[np.ndarray, " num_splats"],
+) -> Instance:
+    number = int(about["id"])
+    mask = labels == number
+    red, green, blue = (int(channel) for channel in about["color_srgb"])
+    long, short, height = (float(extent) for extent in about["size_m"])
+    pose = about["T_base_instance"]
+    return Instance(
+        id=number,
+        label=str(about["label"]),
+        mask=mask,
+        support=int(about["support"]),
+        seen=int(about["seen"]),
+        score=float(about["score"]),
+        source=str(about["source"]),
+        color_srgb=(red, green, blue),
+        T_base_instance=se3.transform_from(_vector(pose["q_wxyz"], 4), _vector(pose["p_m"], 3)),
+        size_m=(long, short, height),
+        parts={
+            str(name): mask & (codes == code) for code, name in enumerate(about["parts"], start=1)
+        },
+        keypoints_m={name: _vector(p, 3) for name, p in about["keypoints_m"].items()},
+    )
+
+
+def _vector(values: Any, length: int) -> Float[np.ndarray, " length"]:
+    vector = np.array(values, dtype=np.float64)
+    if vector.shape != (length,) or not np.isfinite(vector).all():
+        message = f"a vector that is none: {values}"
+        raise ValueError(message)
+    return vector
