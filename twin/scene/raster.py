@@ -7,6 +7,7 @@ import importlib
 import os
 from dataclasses import dataclass
 from types import ModuleType
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -64,6 +65,8 @@ class RasterConfig:
     """0: all that OpenMP offers. The result has the same bits for any number."""
     isa: str = "auto"
     """Instruction set: auto, base or v3 (x86-64 with AVX2 and FMA)."""
+    backend: Literal["auto", "cpu", "cuda"] = "cpu"
+    """What ``twin.scene.backend.open_rasteriser`` opens; ``Rasteriser`` itself is the CPU."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,12 +175,16 @@ class Rasteriser:
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> View:
         """Draw what one camera sees."""
-        planes = self.draw_planes(cloud, camera, T_base_camera)
-        alpha = planes[4]
-        solid = alpha >= 0.5
-        depth = np.where(solid, planes[3] / np.where(solid, alpha, 1.0), 0.0)
-        return View(
-            image=np.ascontiguousarray(np.moveaxis(planes[:3], 0, -1)),
-            depth_m=depth.astype(np.float32),
-            alpha=alpha,
-        )
+        return view_of_planes(self.draw_planes(cloud, camera, T_base_camera))
+
+
+def view_of_planes(planes: Float32[np.ndarray, "5 height width"]) -> View:
+    """Turn weighted sums into what a camera sees."""
+    alpha = planes[4]
+    solid = alpha >= 0.5
+    depth = np.where(solid, planes[3] / np.where(solid, alpha, 1.0), 0.0)
+    return View(
+        image=np.ascontiguousarray(np.moveaxis(planes[:3], 0, -1)),
+        depth_m=depth.astype(np.float32),
+        alpha=alpha,
+    )
