@@ -16,7 +16,11 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "video": ("av",),
     "realsense": ("pyrealsense2",),
     "ur": ("example-robot-data",),
+    "foundation": ("transformers", "safetensors"),
+    "gpu": ("gsplat",),
 }
+OPTIONAL = ("foundation", "gpu")
+"""Nothing is wrong without these: all works on a CPU and without weights of others."""
 NATIVE = (
     ("splat rasteriser", "twin.scene._splat", "no place can be rebuilt"),
     ("depth codec", "bridge.media._depth", "slow fallback, for playing back only"),
@@ -49,7 +53,9 @@ def _package(name: str, extra: str) -> Finding:
         found = metadata.version(name)
     except metadata.PackageNotFoundError:
         advice = f"pip install 'robot-gst[{extra}]'" if extra != "base" else "pip install robot-gst"
-        return Finding(what=f"{name} [{extra}]", found="missing", ok=False, advice=advice)
+        is_optional = extra in OPTIONAL
+        found = "missing (optional)" if is_optional else "missing"
+        return Finding(what=f"{name} [{extra}]", found=found, ok=is_optional, advice=advice)
     return Finding(what=f"{name} [{extra}]", found=found, ok=True)
 
 

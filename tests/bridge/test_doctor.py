@@ -20,3 +20,17 @@ def test_each_native_extension_is_built_or_what_goes_without_it_is_said(
             (found,) = [finding for finding in doctor.examine() if finding.what == what]
         assert (found.ok, found.found) == (False, f"not built: {without}")
         assert "make" in found.advice
+
+
+def test_extras_that_nothing_depends_on_are_named_but_not_held_against_a_machine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def nothing_installed(name: str) -> str:
+        raise doctor.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(doctor.metadata, "version", nothing_installed)
+    found = {item.what: item for item in doctor.examine()}
+    for what in ("transformers [foundation]", "safetensors [foundation]", "gsplat [gpu]"):
+        assert (found[what].ok, found[what].found) == (True, "missing (optional)")
+        assert "pip install" in found[what].advice
+    assert not found["torch [twin]"].ok
