@@ -62,6 +62,12 @@ COMMANDS: tuple[tuple[str, str, str, str], ...] = (
     ),
     ("render", "twin.cli:render", "Render the rebuilt scene to PNG.", "runs/monday"),
     (
+        "calibrate",
+        "twin.cli:calibrate",
+        "Where the cameras are, from recorded episodes.",
+        "runs/monday --cameras",
+    ),
+    (
         "replay",
         "twin.cli:replay",
         "Re-live every planned and executed trajectory.",

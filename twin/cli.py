@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from bridge.terminal import Output
+from twin.calibrate.config import CalibrateConfig
 from twin.gate import GateConfig
 from twin.replay.config import ReplayRunConfig
 from twin.scene.settings import RebuildConfig, RenderConfig
@@ -11,6 +12,7 @@ OUTPUT = Output()
 REPLAY = ReplayRunConfig()
 REBUILD = RebuildConfig()
 RENDER = RenderConfig()
+CALIBRATE = CalibrateConfig()
 
 
 def replay(
@@ -104,4 +106,35 @@ def render(
 
     drawn = render_scene(RunFolder.open(run), config)
     output.result(drawn, "\n".join(drawn["files"]))
+    return 0
+
+
+def calibrate(
+    run: Path,
+    /,
+    *,
+    config: CalibrateConfig = CALIBRATE,
+    output: Output = OUTPUT,
+) -> int:
+    """Find out from recorded episodes where the cameras are; writes scene/calibration.json.
+
+    Example: robot-gst calibrate runs/monday --cameras
+
+    Args:
+        run: Run folder.
+        config: Settings.
+        output: How to talk.
+    """
+    from bridge.episode.run import RunFolder
+    from bridge.errors import UsageError
+    from twin.calibrate.cameras import calibrate_cameras, describe_cameras
+
+    if config.physics:
+        message = "--physics is not part of this version: only --cameras can be calibrated yet."
+        raise UsageError(message)
+    if not config.cameras:
+        message = "say what to calibrate: robot-gst calibrate RUN --cameras."
+        raise UsageError(message)
+    record = calibrate_cameras(RunFolder.open(run), config, output)
+    output.result(record, describe_cameras(record))
     return 0

@@ -149,3 +149,24 @@ def look_at(
     T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
     T[:3, 3] = p_world_eye
     return T
+
+
+def rotation_from_vector(
+    turn_rad: Float[np.ndarray, "*batch 3"],
+) -> Float[np.ndarray, "*batch 3 3"]:
+    """Turn rotation vectors, axis times angle [rad], into rotation matrices."""
+    half = np.linalg.norm(turn_rad, axis=-1, keepdims=True) / 2
+    # sin(half) / (2 half), smooth at 0
+    factor = 0.5 * np.sinc(half / np.pi)
+    return rotation_from_quaternion(np.concatenate([np.cos(half), factor * turn_rad], axis=-1))
+
+
+def vector_from_rotation(
+    R: Float[np.ndarray, "*batch 3 3"],
+) -> Float[np.ndarray, "*batch 3"]:
+    """Turn rotation matrices into rotation vectors of length 0..pi [rad]."""
+    q = quaternion_from_rotation(R)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, q[..., :1])
+    tiny = sine < 1e-12
+    return np.asarray(q[..., 1:] * np.where(tiny, 2.0, angle / np.where(tiny, 1.0, sine)))

@@ -1,0 +1,1 @@
+"""What recorded episodes say about the cell: where its cameras are."""

@@ -1,0 +1,168 @@
+"""Pose pairs of a hand-eye calibration: from a JSON or CSV file, or from recorded episodes.
+
+An episode holds the target's pose in the camera on ``/<cell>/cam/<id>/target/pose``
+(geometry_msgs/PoseStamped); the robot's side comes from its joints at the same instant.
+"""
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode import schema
+from bridge.episode.reader import Episode
+from bridge.episode.records import PoseSample
+from bridge.errors import PathNotFoundError, UsageError
+from bridge.geometry import se3
+from twin.robot.model import load_robot
+from twin.robot.posture import PostureTrack, posture_track
+
+TARGET_ENDING = "/target/pose"
+CSV_COLUMNS = tuple(
+    f"{what}_{name}"
+    for what in ("effector", "target")
+    for name in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
+)
+SAME_PLACE_RAD = 0.004
+"""Detections at joints nearer than this belong to one stop of the robot and are averaged."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosePairs:
+    """What robot and camera said at the same instants."""
+
+    Ts_base_effector: Float[np.ndarray, "num_pairs 4 4"]
+    Ts_camera_target: Float[np.ndarray, "num_pairs 4 4"]
+    source: str
+    """File name or episode ids."""
+
+    def __len__(self) -> int:
+        """Return the number of pairs."""
+        return len(self.Ts_base_effector)
+
+
+def read_pairs(path: Path) -> PosePairs:
+    """Read pairs from JSON, ``[[T_base_effector, T_camera_target], ...]`` as 4x4 rows, or CSV.
+
+    The CSV has a header with ``effector_x_m ... effector_qz, target_x_m ... target_qz``: position
+    [m] and quaternion of ``T_base_effector`` and ``T_camera_target``.
+
+    Raises:
+        PathNotFoundError: When the file is not there.
+        UsageError: When it is neither, or holds something that is no pose.
+    """
+    if not path.is_file():
+        raise PathNotFoundError(path=path, what="file of pose pairs", hint="Check the path.")
+    try:
+        rows = _csv_rows(path) if path.suffix.lower() == ".csv" else _json_rows(path)
+        poses = np.array(rows, dtype=np.float64).reshape(-1, 2, 4, 4)
+    except (ValueError, KeyError, TypeError) as error:
+        message = (
+            f"{path} holds no pose pairs ({error!r}). Write JSON [[T_base_effector, "
+            f"T_camera_target], ...] with 4x4 matrices, or CSV with {', '.join(CSV_COLUMNS)}."
+        )
+        raise UsageError(message) from error
+    _refuse_no_poses(path, poses)
+    return PosePairs(Ts_base_effector=poses[:, 0], Ts_camera_target=poses[:, 1], source=path.name)
+
+
+def _json_rows(path: Path) -> list[Any]:
+    rows = json.loads(path.read_text())
+    if not isinstance(rows, list):
+        message = f"a {type(rows).__name__}, not a list"
+        raise TypeError(message)
+    return rows
+
+
+def _csv_rows(path: Path) -> list[np.ndarray]:
+    with path.open(newline="") as stream:
+        table = [[float(row[name]) for name in CSV_COLUMNS] for row in csv.DictReader(stream)]
+    values = np.array(table).reshape(-1, 2, 7)
+    return list(se3.transform_from(values[..., 3:], values[..., :3]))
+
+
+def _refuse_no_poses(path: Path, poses: np.ndarray) -> None:
+    R = poses[..., :3, :3]
+    square = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-1, -2))
+    whole = np.isfinite(poses).all(axis=(-1, -2))
+    whole &= (square < 1e-3) & (np.linalg.det(R) > 0)
+    whole &= np.abs(poses[..., 3, :] - [0, 0, 0, 1]).max(axis=-1) < 1e-6
+    if not whole.all():
+        pair, which = np.argwhere(~whole)[0]
+        name = ("T_base_effector", "T_camera_target")[which]
+        message = f"{path}: {name} of pair {pair + 1} is no rigid transform. Correct or remove it."
+        raise UsageError(message)
+
+
+def target_cameras(episodes: Sequence[Episode]) -> list[str]:
+    """Cameras with recorded target poses; stand-in truth is never among them."""
+    return sorted(
+        {
+            topic.split("/")[-3]
+            for episode in episodes
+            for topic in episode.topics_of_type(schema.POSE_STAMPED)
+            if topic.endswith(TARGET_ENDING) and "/cam/" in topic
+        }
+    )
+
+
+def recorded_pairs(episodes: Sequence[Episode], camera_id: str, link: str) -> PosePairs:
+    """Pair recorded target poses of one camera with the robot's link, robot standing still.
+
+    Raises:
+        EpisodeError: An episode with targets has no joint states.
+        RobotDescriptionError: No usable robot description, or it lacks the link.
+    """
+    hands: list[np.ndarray] = []
+    targets: list[np.ndarray] = []
+    used = []
+    for episode in episodes:
+        topics = [
+            topic
+            for topic in episode.topics_of_type(schema.POSE_STAMPED)
+            if topic.endswith(f"/cam/{camera_id}{TARGET_ENDING}")
+        ]
+        samples = [PoseSample.from_cdr(message.data) for message in episode.messages(topics)]
+        if not samples:
+            continue
+        used.append(episode.info.id)
+        for hand, target in _stops(posture_track(episode), samples, link):
+            hands.append(hand)
+            targets.append(target)
+    empty = np.zeros((0, 4, 4))
+    return PosePairs(
+        Ts_base_effector=np.array(hands) if hands else empty,
+        Ts_camera_target=np.array(targets) if targets else empty,
+        source=", ".join(used),
+    )
+
+
+def _stops(
+    track: PostureTrack, samples: list[PoseSample], link: str
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """One averaged pair for each stop of the robot; detections on the move are left out."""
+    robot = load_robot(track.urdf)
+    groups: list[tuple[np.ndarray, list[np.ndarray]]] = []
+    for sample in sorted(samples, key=lambda item: item.stamp_ns):
+        if not track.is_still(sample.stamp_ns):
+            continue
+        joints = track.at(sample.stamp_ns).joints_rad
+        if groups and np.abs(groups[-1][0] - joints).max() < SAME_PLACE_RAD:
+            groups[-1][1].append(sample.T_frame_body)
+        else:
+            groups.append((joints, [sample.T_frame_body]))
+    return [(robot.T_base_link(link, joints), _mean(np.array(Ts))) for joints, Ts in groups]
+
+
+def _mean(Ts: Float[np.ndarray, "num_samples 4 4"]) -> Float[np.ndarray, "4 4"]:
+    """Mean of nearby poses: positions, and the chordal mean of rotations."""
+    U, _, Vt = np.linalg.svd(Ts[:, :3, :3].sum(axis=0))
+    T = np.eye(4)
+    T[:3, :3] = (U * np.array([1.0, 1.0, np.linalg.det(U @ Vt)])) @ Vt
+    T[:3, 3] = Ts[:, :3, 3].mean(axis=0)
+    return T

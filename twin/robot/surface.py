@@ -1,0 +1,205 @@
+"""The robot's visible surface, link by link, posed by forward kinematics.
+
+Made of the description's collision shapes: every URDF has them, they are light, and unlike most
+visual meshes they load without a reader of COLLADA files. Normals are those of the triangles.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import coal
+import numpy as np
+import open3d
+import pinocchio as pin
+from jaxtyping import Float, Float32, Int, Int64
+
+from twin.robot.description import RobotDescriptionError
+from twin.robot.model import RobotModel
+from twin.robot.posture import Posture
+
+NOT_SEEN = ("ee_link",)
+"""Markers inside other links, not parts of the robot."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkSurface:
+    """Triangles of one shape of a link, in the link's frame."""
+
+    link: str
+    vertices_m: Float[np.ndarray, "num_vertices 3"]
+    triangles: Int[np.ndarray, "num_triangles 3"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nearest:
+    """For each asked point the nearest one of the surface."""
+
+    p_m: Float[np.ndarray, "num_points 3"]
+    normals: Float[np.ndarray, "num_points 3"]
+    """Unit length; outward where the description's triangles are."""
+    distance_m: Float[np.ndarray, " num_points"]
+    link_ids: Int64[np.ndarray, " num_points"]
+
+
+def link_poses(robot: RobotModel, posture: Posture) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """Pose ``T_base_link`` of every frame of the description."""
+    q = robot.configuration(posture.joints_rad, posture.width_m)
+    pin.framesForwardKinematics(robot.model, robot.data, q)
+    return {
+        frame.name: np.array(robot.data.oMf[index].homogeneous)
+        for index, frame in enumerate(robot.model.frames)
+    }
+
+
+def fixed_links(robot: RobotModel) -> frozenset[str]:
+    """Links that no joint moves, such as the base."""
+    return frozenset(frame.name for frame in robot.model.frames if frame.parentJoint == 0)
+
+
+@lru_cache(maxsize=4)
+def link_surfaces(robot: RobotModel) -> tuple[LinkSurface, ...]:
+    """Read the surface of every link once.
+
+    Raises:
+        RobotDescriptionError: When a shape cannot be read or is of an unknown kind, or none is
+            there.
+    """
+    try:
+        geometry = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
+    except (ValueError, RuntimeError) as error:
+        raise RobotDescriptionError(
+            found=f"has collision shapes that cannot be read ({str(error)[:200]})",
+            hint="Check its mesh files.",
+        ) from error
+    surfaces = []
+    for item in geometry.geometryObjects:
+        frame = robot.model.frames[item.parentFrame]
+        if frame.name in NOT_SEEN:
+            continue
+        T = frame.placement.inverse() * item.placement
+        vertices, triangles = _mesh(item)
+        surfaces.append(
+            LinkSurface(
+                link=frame.name,
+                vertices_m=vertices @ T.rotation.T + T.translation,
+                triangles=triangles,
+            )
+        )
+    if not surfaces:
+        raise RobotDescriptionError(
+            found="has no collision shapes", hint="Without them nobody can say how it looks."
+        )
+    return tuple(surfaces)
+
+
+class PosedSurface:
+    """The surface of the whole robot in one posture, in the base frame; answers by ray casting."""
+
+    def __init__(self, robot: RobotModel, posture: Posture) -> None:
+        """Pose all links."""
+        poses = link_poses(robot, posture)
+        self.links: tuple[str, ...] = tuple(item.link for item in link_surfaces(robot))
+        make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
+        self._scene = make()
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        for item in link_surfaces(robot):
+            T = poses[item.link]
+            vertices = item.vertices_m @ T[:3, :3].T + T[:3, 3]
+            low, high = (
+                np.minimum(low, vertices.min(axis=0)),
+                np.maximum(high, vertices.max(axis=0)),
+            )
+            self._scene.add_triangles(
+                _tensor(vertices.astype(np.float32)), _tensor(item.triangles.astype(np.uint32))
+            )
+        self.low_m, self.high_m = low, high
+
+    def near_box(
+        self, p_base: Float[np.ndarray, "num_points 3"], margin_m: float
+    ) -> Int64[np.ndarray, " num_near"]:
+        """Which points lie in the bounding box grown by a margin; the others are far for sure."""
+        inside = (p_base > self.low_m - margin_m) & (p_base < self.high_m + margin_m)
+        return np.flatnonzero(inside.all(axis=1))
+
+    def nearest(self, p_base: Float[np.ndarray, "num_points 3"]) -> Nearest:
+        """Find the nearest surface points."""
+        if not len(p_base):
+            none = np.zeros((0, 3))
+            ids = np.zeros(0, dtype=np.int64)
+            return Nearest(p_m=none, normals=none, distance_m=np.zeros(0), link_ids=ids)
+        found = self._scene.compute_closest_points(_tensor(p_base.astype(np.float32)))
+        p = found["points"].numpy().astype(np.float64)
+        normals = found["primitive_normals"].numpy().astype(np.float64)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        return Nearest(
+            p_m=p,
+            normals=normals,
+            distance_m=np.linalg.norm(p_base - p, axis=1),
+            link_ids=found["geometry_ids"].numpy().astype(np.int64),
+        )
+
+    def depth_along(
+        self,
+        rays_camera: Float[np.ndarray, "*shape 3"],
+        T_base_camera: Float[np.ndarray, "4 4"],
+    ) -> Float32[np.ndarray, "*shape"]:
+        """Depth at which rays with z = 1 in the camera meet the robot; infinite where they miss."""
+        turned = rays_camera @ T_base_camera[:3, :3].T
+        origin = np.broadcast_to(T_base_camera[:3, 3], turned.shape)
+        rays = np.concatenate([origin, turned], axis=-1).astype(np.float32)
+        return np.asarray(self._scene.cast_rays(_tensor(rays))["t_hit"].numpy())
+
+
+def sample_surface(
+    robot: RobotModel, posture: Posture, count: int, seed: int
+) -> Float[np.ndarray, "num_points 3"]:
+    """Points of the posed robot, evenly over its area, in the base frame [m]."""
+    poses = link_poses(robot, posture)
+    corners = np.concatenate(
+        [
+            (item.vertices_m @ poses[item.link][:3, :3].T + poses[item.link][:3, 3])[item.triangles]
+            for item in link_surfaces(robot)
+        ]
+    )
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(len(area), size=count, p=area / area.sum())
+    u, v = rng.uniform(size=(2, count, 1))
+    over = u + v > 1
+    u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
+    return np.asarray(a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen])
+
+
+def _mesh(item: Any) -> tuple[np.ndarray, np.ndarray]:
+    shape = item.geometry
+    if isinstance(shape, coal.Box):
+        corners = np.array(list(product((-1.0, 1.0), repeat=3))) * np.array(shape.halfSide)
+        faces = np.array(
+            [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+        )
+        return corners, np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+    if isinstance(shape, coal.BVHModelBase):
+        mesh = open3d.io.read_triangle_mesh(Path(str(item.meshPath)))
+        vertices = np.asarray(mesh.vertices) * np.array(item.meshScale)
+    elif isinstance(shape, coal.Cylinder):
+        radius, height = float(shape.radius), 2.0 * float(shape.halfLength)
+        mesh = open3d.geometry.TriangleMesh.create_cylinder(radius, height)
+        vertices = np.asarray(mesh.vertices)
+    elif isinstance(shape, coal.Sphere):
+        mesh = open3d.geometry.TriangleMesh.create_sphere(float(shape.radius))
+        vertices = np.asarray(mesh.vertices)
+    else:
+        raise RobotDescriptionError(
+            found=f"has a collision shape {type(shape).__name__} at {item.name}",
+            hint="Known: mesh, box, cylinder, sphere.",
+        )
+    return vertices, np.asarray(mesh.triangles).astype(np.int64)
+
+
+def _tensor(array: np.ndarray) -> Any:
+    make: Any = open3d.core.Tensor  # its stubs leave out that an array alone is enough
+    return make(np.ascontiguousarray(array))

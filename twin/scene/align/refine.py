@@ -1,0 +1,200 @@
+"""The robot's place to the millimetre: robust point-to-plane with the depth scale as an unknown.
+
+Depth cameras measure one or two percent too long or too short. A rigid fit turns that into
+centimetres, because it moves the robot towards or away from each camera. A seventh unknown, the
+scale of the depth about each camera's centre, takes it up (design page on perception, section 5).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from bridge.geometry import se3
+from twin.robot.surface import PosedSurface
+from twin.scene.align.view import RobotView, ViewCloud
+
+FACING = 0.5
+"""Cosine between the measured normal and the description's, below which a match is none."""
+MIN_PER_LINK = 200
+TABLE_M = 0.012
+"""Points this near to the plane of the base are the table, not the robot's foot."""
+SCALE_SIGMA = 0.03
+"""What is known of the depth scale beforehand."""
+BLOCK_M = 0.06
+"""Noise of neighbouring pixels is not independent; resampling keeps blocks of this size whole."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """One annealing step of Tukey's loss."""
+
+    gate_m: float
+    iterations: int
+
+
+COARSE = (Stage(gate_m=0.08, iterations=10), Stage(gate_m=0.03, iterations=6))
+FINE = (
+    Stage(gate_m=0.03, iterations=6),
+    Stage(gate_m=0.02, iterations=6),
+    Stage(gate_m=0.012, iterations=12),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Where the scene lies in the robot's base frame."""
+
+    T_base_source: Float[np.ndarray, "4 4"]
+    depth_scale: float = 1.0
+    """True depth divided by measured depth."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Equations:
+    """Weighted normal equations of matched points, summed in blocks of neighbours."""
+
+    H: Float[np.ndarray, "num_blocks 7 7"]
+    g: Float[np.ndarray, "num_blocks 7"]
+    square_m2: Float[np.ndarray, " num_blocks"]
+    weight: Float[np.ndarray, " num_blocks"]
+    num_points: int
+
+    def residual_m(self) -> float:
+        """Weighted root mean square distance to the surface."""
+        return float(np.sqrt(self.square_m2.sum() / max(self.weight.sum(), 1e-12)))
+
+
+def refine(
+    views: Sequence[RobotView],
+    surfaces: Sequence[PosedSurface],
+    start: Place,
+    *,
+    stages: Sequence[Stage],
+    num_points: int,
+    with_scale: bool = True,
+    seed: int = 0,
+) -> tuple[Place, Equations]:
+    """Lay measured points on the posed surface: Gauss-Newton with Tukey's weights.
+
+    Args:
+        views: Depth images.
+        surfaces: The robot in each view's posture.
+        start: Where to begin, within the first stage's gate.
+        stages: Gates from wide to narrow.
+        num_points: At most this many points of all views, at least 200 of each visible link.
+        with_scale: Whether the depth scale is estimated; otherwise the fit is rigid.
+        seed: Of the choice of points.
+
+    Returns:
+        The place, and the equations of the last iteration.
+    """
+    rng = np.random.default_rng(seed)
+    place = start
+    equations = None
+    for stage in stages:
+        clouds = [
+            _choose(view, surface, place, stage.gate_m, num_points // len(views), rng)
+            for view, surface in zip(views, surfaces, strict=True)
+        ]
+        for _ in range(stage.iterations):
+            equations = _equations(views, clouds, surfaces, place, stage.gate_m)
+            place, step = _stepped(place, equations, with_scale)
+            if np.abs(step).max() < 1e-7:
+                break
+    if equations is None:
+        message = "refining needs at least one stage of one iteration"
+        raise ValueError(message)
+    return place, equations
+
+
+def _choose(
+    view: RobotView,
+    surface: PosedSurface,
+    place: Place,
+    gate_m: float,
+    count: int,
+    rng: np.random.Generator,
+) -> ViewCloud:
+    """Measured points near the robot: proportional to visible area, but enough of each link."""
+    cloud = view.cloud
+    p = se3.apply(place.T_base_source @ view.T_source_camera, place.depth_scale * cloud.p_m)
+    near = surface.near_box(p, gate_m)
+    near = near[rng.permutation(len(near))[: 4 * count]]
+    found = surface.nearest(p[near])
+    kept = found.distance_m < gate_m
+    near, link_ids = near[kept], found.link_ids[kept]
+    order = np.argsort(link_ids, kind="stable")
+    first = np.searchsorted(link_ids[order], link_ids[order])
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order)) - first
+    sure = np.flatnonzero(rank < MIN_PER_LINK)
+    others = np.flatnonzero(rank >= MIN_PER_LINK)[: max(count - len(sure), 0)]
+    return cloud.take(near[np.concatenate([sure, others])])
+
+
+def _equations(
+    views: Sequence[RobotView],
+    clouds: Sequence[ViewCloud],
+    surfaces: Sequence[PosedSurface],
+    place: Place,
+    gate_m: float,
+) -> Equations:
+    rows = [
+        _rows(view, cloud, surface, place, gate_m)
+        for view, cloud, surface in zip(views, clouds, surfaces, strict=True)
+    ]
+    J, r, w = (np.concatenate([row[k] for row in rows]) for k in range(3))
+    keys = np.concatenate([row[3] + (index << 48) for index, row in enumerate(rows)])
+    _, block = np.unique(keys, return_inverse=True)
+    num_blocks = int(block.max()) + 1 if len(block) else 0
+    H, g = np.zeros((num_blocks, 7, 7)), np.zeros((num_blocks, 7))
+    np.add.at(H, block, w[:, None, None] * J[:, :, None] * J[:, None, :])
+    np.add.at(g, block, (w * r)[:, None] * J)
+    return Equations(
+        H=H,
+        g=g,
+        square_m2=np.bincount(block, weights=w * r * r, minlength=num_blocks),
+        weight=np.bincount(block, weights=w, minlength=num_blocks),
+        num_points=int((w > 0).sum()),
+    )
+
+
+def _rows(
+    view: RobotView, cloud: ViewCloud, surface: PosedSurface, place: Place, gate_m: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Int64[np.ndarray, " num_points"]]:
+    """Jacobian (shift, turn, scale), distance, weight and block of each point."""
+    T = place.T_base_source @ view.T_source_camera
+    p = se3.apply(T, place.depth_scale * cloud.p_m)
+    found = surface.nearest(p)
+    n = found.normals
+    r = np.einsum("ij,ij->i", n, p - found.p_m)
+    facing = np.abs(np.einsum("ij,ij->i", n, cloud.normals @ T[:3, :3].T))
+    w = np.where(found.distance_m < gate_m, (1 - (found.distance_m / gate_m) ** 2) ** 2, 0.0)
+    w[(facing < FACING) | (np.abs(p[:, 2]) < TABLE_M)] = 0.0
+    stretch = np.einsum("ij,ij->i", n, cloud.p_m @ T[:3, :3].T)
+    J = np.concatenate([n, np.cross(p, n), stretch[:, None]], axis=1)
+    cell = np.floor(p / BLOCK_M).astype(np.int64) + 512
+    key = (found.link_ids << 32) | (cell[:, 0] << 20) | (cell[:, 1] << 10) | cell[:, 2]
+    return J, r, w, key
+
+
+def _stepped(
+    place: Place, equations: Equations, with_scale: bool
+) -> tuple[Place, Float[np.ndarray, "7"]]:
+    H, g = equations.H.sum(axis=0), equations.g.sum(axis=0)
+    if with_scale:
+        prior = max(equations.residual_m(), 1e-4) ** 2 / SCALE_SIGMA**2
+        H[6, 6] += prior
+        g[6] += prior * (place.depth_scale - 1.0)
+    else:
+        H[6], H[:, 6], g[6], H[6, 6] = 0.0, 0.0, 0.0, 1.0
+    step = -np.linalg.lstsq(H, g, rcond=1e-12)[0]
+    T = np.eye(4)
+    T[:3, :3] = se3.rotation_from_vector(step[3:6])
+    T[:3, 3] = step[:3]
+    moved = Place(
+        T_base_source=T @ place.T_base_source, depth_scale=float(place.depth_scale + step[6])
+    )
+    return moved, step

@@ -1,0 +1,182 @@
+"""``scene/calibration.json``: where the cameras are, as ``robot-gst calibrate`` found out.
+
+Written by ``twin.calibrate``, read by whoever poses frames. Only what was identified is listed
+under ``cameras``; what was not stands under ``not_identified`` with the reason.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bridge.episode import provenance, streams
+from bridge.episode.reader import Episode
+from bridge.episode.records import FrameTransform
+from bridge.episode.run import RunFolder
+from bridge.episode.transforms import TransformTree
+from bridge.geometry import se3
+from bridge.task.robot import BASE_FRAME
+from bridge.whole_file import write_whole
+from twin.errors import TwinError
+from twin.robot.model import load_robot
+from twin.robot.posture import posture_track
+
+CALIBRATION_FILE = "calibration.json"
+CALIBRATION_VERSION = 1
+
+
+class UnreadableCalibrationError(TwinError):
+    """``calibration.json`` is damaged or from a newer version."""
+
+    def __init__(self, *, path: Path, found: str) -> None:
+        """Remember the file."""
+        self.path = path
+        super().__init__(
+            f"{path}: {found}. Remove it, or make it again: robot-gst calibrate RUN --cameras."
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraPlace:
+    """Where one camera is mounted."""
+
+    link: str
+    """Link that carries it; the robot's base for a fixed camera."""
+    stream: str
+    """``color`` or ``depth``: whose optical frame is meant."""
+    T_link_camera: Float[np.ndarray, "4 4"]
+    depth_scale: float = 1.0
+    """True depth divided by measured depth, where that was identified."""
+
+    @property
+    def fixed(self) -> bool:
+        """Whether the camera stands still."""
+        return self.link == BASE_FRAME
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """The content of ``calibration.json``."""
+
+    record: Mapping[str, Any]
+    cameras: Mapping[str, CameraPlace]
+
+    @property
+    def calibration_id(self) -> str:
+        """Eight hexadecimal digits that name it in verdicts and replays."""
+        return str(self.record["calibration_id"])
+
+
+def read_calibration(run: RunFolder) -> Calibration | None:
+    """Read ``scene/calibration.json``, or return None when there is none.
+
+    Raises:
+        UnreadableCalibrationError: When it cannot be understood.
+    """
+    path = run.scene_dir / CALIBRATION_FILE
+    if not path.is_file():
+        return None
+    try:
+        record = json.loads(path.read_text())
+        version = record["schema_version"]
+        if version != CALIBRATION_VERSION:
+            found = f"schema version {version!r}, this program knows {CALIBRATION_VERSION}"
+            raise UnreadableCalibrationError(path=path, found=found)
+        cameras = {key: _place(value) for key, value in record["cameras"].items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UnreadableCalibrationError(path=path, found=f"no calibration ({error!r})") from error
+    return Calibration(record=record, cameras=cameras)
+
+
+def _place(record: Mapping[str, Any]) -> CameraPlace:
+    pose = record["T_link_camera"]
+    q, p = np.array(pose["q_wxyz"], dtype=np.float64), np.array(pose["p_m"], dtype=np.float64)
+    if q.shape != (4,) or p.shape != (3,) or not np.isfinite([*q, *p]).all() or not q.any():
+        message = f"a pose that is none: {pose}"
+        raise ValueError(message)
+    return CameraPlace(
+        link=str(record["link"]),
+        stream=str(record["stream"]),
+        T_link_camera=se3.transform_from(q, p),
+        depth_scale=float(record.get("depth_scale", 1.0)),
+    )
+
+
+def write_calibration(
+    run: RunFolder, cameras: Mapping[str, Any], not_identified: Mapping[str, str]
+) -> dict[str, Any]:
+    """Write ``calibration.json``; cameras identified earlier and not looked at now are kept.
+
+    Args:
+        run: Run folder; ``scene/`` is made where needed.
+        cameras: Per camera what was found, with ``link``, ``stream`` and ``T_link_camera``.
+        not_identified: Per camera why nothing was found.
+    """
+    before = read_calibration(run)
+    kept: dict[str, Any] = {} if before is None else dict(before.record)
+    known = {**kept.get("cameras", {}), **cameras}
+    lost = {**kept.get("not_identified", {}), **not_identified}
+    record = {
+        **kept,
+        "schema_version": CALIBRATION_VERSION,
+        "cameras": {key: known[key] for key in sorted(known)},
+        "not_identified": {key: lost[key] for key in sorted(lost) if key not in known},
+        "software": provenance.software(),
+    }
+    named = {
+        key: value for key, value in record.items() if key not in ("calibration_id", "software")
+    }
+    record["calibration_id"] = provenance.hash_settings(named)
+    run.scene_dir.mkdir(parents=True, exist_ok=True)
+    path = run.scene_dir / CALIBRATION_FILE
+    write_whole(path, (json.dumps(record, indent=2) + "\n").encode())
+    return record
+
+
+def calibrated_tree(
+    episode: Episode,
+    camera_id: str,
+    place: CameraPlace,
+    stamps_ns: Int[np.ndarray, " num_frames"],
+) -> TransformTree:
+    """Pose a camera's colour and depth frames in the robot's base at some instants.
+
+    A camera in the hand follows the recorded joints. How colour and depth lie to each other comes
+    from the recording's own transforms; without them they count as aligned.
+
+    Raises:
+        EpisodeError: A camera in the hand, and no joint states.
+        RobotDescriptionError: A camera in the hand, and no usable robot description.
+    """
+    color, depth = (streams.camera_info(episode, camera_id, s).frame_id for s in ("color", "depth"))
+    tree = streams.transform_tree(episode)
+    T_color_depth = np.eye(4)
+    if color != depth and {color, depth} <= set(tree.frames()):
+        at = int(stamps_ns[0]) if len(stamps_ns) else episode.start_ns
+        T_color_depth = se3.invert(tree.T_root_frame(color, at)) @ tree.T_root_frame(depth, at)
+    T_camera_color = np.eye(4) if place.stream == "color" else se3.invert(T_color_depth)
+    edges = []
+    for stamp, T_base_link in zip(stamps_ns, _links(episode, place, stamps_ns), strict=True):
+        T_base_color = T_base_link @ place.T_link_camera @ T_camera_color
+        edges.append(_edge(color, T_base_color, int(stamp)))
+        if color != depth:
+            edges.append(_edge(depth, T_base_color @ T_color_depth, int(stamp)))
+    return TransformTree(edges)
+
+
+def _links(
+    episode: Episode, place: CameraPlace, stamps_ns: Int[np.ndarray, " num_frames"]
+) -> list[np.ndarray]:
+    if place.fixed:
+        return [np.eye(4)] * len(stamps_ns)
+    track = posture_track(episode)
+    robot = load_robot(track.urdf)
+    return [robot.T_base_link(place.link, track.at(int(stamp)).joints_rad) for stamp in stamps_ns]
+
+
+def _edge(child: str, T: np.ndarray, stamp_ns: int) -> FrameTransform:
+    return FrameTransform(stamp_ns=stamp_ns, parent=BASE_FRAME, child=child, T_parent_child=T)

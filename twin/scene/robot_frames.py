@@ -1,0 +1,160 @@
+"""The robot in a scan's frames: known from its joints, it is kept out of the background.
+
+Pixels that show it are masked, its points go to its links. What it hid in one frame is filled by
+the frames in which it stood elsewhere; nothing is invented.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import binary_dilation
+
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
+from bridge.episode.streams import RgbdFrame
+from bridge.errors import GstError
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from twin.robot.model import RobotModel, load_robot
+from twin.robot.posture import PostureTrack, posture_track
+from twin.robot.surface import PosedSurface, link_poses, link_surfaces
+from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.initialise import NoSurfaceError, fuse
+from twin.scene.points import PointSet
+from twin.scene.robot_splats import surface_owners, write_links
+from twin.scene.settings import InitialiseConfig
+from twin.scene.training_view import Target, TrainingView
+
+IN_FRONT_M = 0.03
+"""A measurement this much nearer than the robot shows something in front of it."""
+GROW_PX = 2
+"""Masks grow by this much at half size: cameras and joints are never quite where they say."""
+MIN_POINTS = 60
+"""A link seen by fewer points is not kept."""
+ROBOT_SHARE = 0.25
+"""Of the budget of Gaussians, for the robot's links."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Tracked:
+    robot: RobotModel
+    track: PostureTrack
+
+
+class RobotFrames:
+    """Tells robot from background in the frames of some episodes, and collects its surface."""
+
+    def __init__(self, episodes: Sequence[Episode]) -> None:
+        """Read joints and descriptions; an episode without them is passed over, with a remark."""
+        self._tracked: dict[str, _Tracked] = {}
+        remarks = []
+        for episode in episodes:
+            try:
+                track = posture_track(episode)
+                robot = load_robot(track.urdf)
+                link_surfaces(robot)
+            except GstError as error:
+                remarks.append(f"{episode.info.id}: {error}")
+                continue
+            self._tracked[str(episode.path)] = _Tracked(robot=robot, track=track)
+        self.remark = "; ".join(remarks)
+        """Why the robot is not told apart in some episodes; empty when it is in all."""
+        self._points: dict[str, list[PointSet]] = {}
+
+    def take_out(
+        self, episode: Episode, frame: RgbdFrame, points: PointSet, view: TrainingView
+    ) -> tuple[PointSet, TrainingView]:
+        """Return a frame's points without the robot's, and its view with the robot masked.
+
+        The robot's points are kept for its links when it stood still.
+        """
+        tracked = self._tracked.get(str(episode.path))
+        if tracked is None or not tracked.track.covers(frame.stamp_ns):
+            return points, view
+        posture = tracked.track.at(frame.stamp_ns)
+        surface = PosedSurface(tracked.robot, posture)
+        owner = surface_owners(
+            tracked.robot,
+            surface,
+            points.p_m.astype(np.float64),
+            points.normals.astype(np.float64),
+        )
+        if tracked.track.is_still(frame.stamp_ns):
+            poses = link_poses(tracked.robot, posture)
+            for link in {surface.links[index] for index in np.unique(owner[owner >= 0])}:
+                mine = np.isin(owner, [i for i, name in enumerate(surface.links) if name == link])
+                moved = _moved(_taken(points, mine), se3.invert(poses[link]))
+                self._points.setdefault(link, []).append(moved)
+        return _taken(points, owner < 0), _masked(view, surface)
+
+    def links(self, config: InitialiseConfig) -> dict[str, GaussianCloud]:
+        """Fuse what was collected of each link, in the link's frame."""
+        total = sum(len(item.p_m) for sets in self._points.values() for item in sets)
+        clouds = {}
+        for link, sets in sorted(self._points.items()):
+            count = sum(len(item.p_m) for item in sets)
+            if count < MIN_POINTS:
+                continue
+            budget = max(int(ROBOT_SHARE * config.max_splats * count / total), 1)
+            try:
+                clouds[link] = fuse(sets, replace(config, max_splats=budget))
+            except NoSurfaceError:
+                continue
+        return clouds
+
+    def write(self, run: RunFolder, config: InitialiseConfig) -> dict[str, Any]:
+        """Write ``robot/<link>.ply`` and return what ``scene.json`` says about the robot."""
+        clouds = self.links(config)
+        return {"robot": {"remark": self.remark, "links": write_links(run, clouds)}}
+
+
+def _taken(points: PointSet, mask: Bool[np.ndarray, " num_points"]) -> PointSet:
+    return PointSet(
+        p_m=points.p_m[mask],
+        normals=points.normals[mask],
+        colors=points.colors[mask],
+        footprint_m=points.footprint_m[mask],
+    )
+
+
+def _moved(points: PointSet, T_link_base: Float[np.ndarray, "4 4"]) -> PointSet:
+    return replace(
+        points,
+        p_m=as_float32(se3.apply(T_link_base, points.p_m.astype(np.float64))),
+        normals=as_float32(points.normals @ T_link_base[:3, :3].T),
+    )
+
+
+def _masked(view: TrainingView, surface: PosedSurface) -> TrainingView:
+    """Mark the pixels that show the robot as not static, at both sizes."""
+    half, full = view.half, view.full
+    hit = robot_mask(surface, half.camera, view.T_base_color, half.depth_m)
+    if not hit.any():
+        return view
+    height, width = full.depth_m.shape
+    doubled = np.repeat(np.repeat(hit, 2, axis=0), 2, axis=1)[:height, :width]
+    return replace(view, half=_without(half, hit), full=_without(full, doubled))
+
+
+def robot_mask(
+    surface: PosedSurface,
+    camera: Camera,
+    T_base_camera: Float[np.ndarray, "4 4"],
+    depth_m: Float[np.ndarray, "height width"],
+) -> Bool[np.ndarray, "height width"]:
+    """Pixels that show the posed robot, grown by two; not those with something in front of it."""
+    expected = surface.depth_along(camera.rays(), T_base_camera)
+    hidden = (depth_m > 0) & (depth_m < expected - IN_FRONT_M)
+    around = np.ones((2 * GROW_PX + 1, 2 * GROW_PX + 1), dtype=bool)
+    return np.asarray(binary_dilation(np.isfinite(expected) & ~hidden, around))
+
+
+def _without(target: Target, hit: Bool[np.ndarray, "height width"]) -> Target:
+    return replace(
+        target,
+        static_mask=target.static_mask & ~hit,
+        depth_m=np.where(hit, np.float32(0.0), target.depth_m),
+    )
