@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 from mcap.reader import make_reader
-from mcap.records import Channel, Message
+from mcap.records import Channel, Message, Schema
+from mcap.stream_reader import StreamReader
 
 from bridge.episode import cdr, schema
 from record.cell import CellSpec, Stream, streams_of
@@ -60,13 +61,23 @@ def read_account(path: Path, *, as_of: Sequence[Stream]) -> dict[str, TopicVerdi
 
 
 def messages_of(files: Sequence[Path]) -> Iterator[tuple[str, Channel, Message]]:
-    """Every message of the bench's topics: type name, channel, message; CRCs are checked."""
+    """Every message of the bench's topics: type name, channel, message; CRCs are checked.
+
+    Record by record: the library's reader by index keeps the chunks of ten minutes in memory.
+    """
     for path in files:
+        schemas: dict[int, str] = {0: ""}
+        channels: dict[int, Channel] = {}
         with path.open("rb") as stream:
-            reader = make_reader(stream, validate_crcs=True)
-            for record, channel, message in reader.iter_messages(log_time_order=False):
-                if channel.topic.startswith("/bench/"):
-                    yield record.name if record else "", channel, message
+            for record in StreamReader(stream, validate_crcs=True).records:
+                if isinstance(record, Schema):
+                    schemas[record.id] = record.name
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+                elif isinstance(record, Message):
+                    channel = channels[record.channel_id]
+                    if channel.topic.startswith("/bench/"):
+                        yield schemas[channel.schema_id], channel, record
 
 
 def verify(files: Sequence[Path], account: Path, spec: CellSpec) -> dict[str, TopicVerdict]:
