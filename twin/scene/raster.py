@@ -10,19 +10,12 @@ from types import ModuleType
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, UInt16
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.errors import TwinError
-from twin.scene.gaussians import (
-    SH_FIRST,
-    GaussianCloud,
-    as_float32,
-    effective_colors,
-    harmonic_basis,
-    view_directions,
-)
+from twin.scene.gaussians import GaussianCloud, as_float32
 
 NUM_PLANES = 5
 """Red, green, blue, sum of weighted depth, sum of weights."""
@@ -64,7 +57,8 @@ class RasterConfig:
     threads: int = 0
     """0: all that OpenMP offers. The result has the same bits for any number."""
     isa: str = "auto"
-    """Instruction set: auto, base or v3 (x86-64 with AVX2 and FMA)."""
+    """Instruction set: auto, base (x86-64-v2, or what the compiler takes for another processor),
+    v3 (AVX2 and FMA) or v4 (AVX-512)."""
     backend: Literal["auto", "cpu", "cuda"] = "cpu"
     """What ``twin.scene.backend.open_rasteriser`` opens; ``Rasteriser`` itself is the CPU."""
 
@@ -79,6 +73,9 @@ class CloudGradient:
     opacities_logit: Float32[np.ndarray, " num_splats"]
     colors: Float32[np.ndarray, "num_splats 3"]
     harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"]
+    T_camera_base: Float[np.ndarray, "3 4"]
+    """With respect to the twelve entries of the upper part of that matrix, the camera centre of
+    the viewing directions being -R^T t of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,8 +104,6 @@ class Rasteriser:
         """Load the native code."""
         self.config = config or RasterConfig()
         self._native = load_native().Rasteriser(self.config.threads, self.config.isa)
-        self._cloud: GaussianCloud | None = None
-        self._centre_m = np.zeros(3)
 
     @property
     def isa(self) -> str:
@@ -119,7 +114,6 @@ class Rasteriser:
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "5 height width"]:
         """Draw red, green, blue, weighted depth [m] and alpha as five planes over black."""
-        self._cloud, self._centre_m = cloud, np.asarray(T_base_camera[:3, 3])
         T_camera_base = as_float32(se3.invert(T_base_camera)[:3])
         intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         planes: np.ndarray = self._native.draw(
@@ -127,11 +121,12 @@ class Rasteriser:
             cloud.quats_wxyz,
             cloud.scales_log,
             cloud.opacities_logit,
-            effective_colors(cloud, T_base_camera[:3, 3]),
+            cloud.colors,
             T_camera_base,
             intrinsics,
             self.config.alpha_cut,
             self.config.transmittance_stop,
+            cloud.harmonics if cloud.num_harmonics else None,
         )
         return planes
 
@@ -141,30 +136,52 @@ class Rasteriser:
         plane_gradients: Float32[np.ndarray, "5 height width"],
     ) -> CloudGradient:
         """Carry a gradient on the planes of the last ``draw_planes`` back to its cloud."""
-        means, quats, scales, opacities, colors = self._native.pull(planes, plane_gradients)
-        harmonics, through_direction = self._harmonic_gradients(colors)
+        means, quats, scales, opacities, colors, harmonics, pose = self._native.pull(
+            planes, plane_gradients
+        )
         return CloudGradient(
-            means_m=means + through_direction,
+            means_m=means,
             quats_wxyz=quats,
             scales_log=scales,
             opacities_logit=opacities,
             colors=colors,
             harmonics=harmonics,
+            T_camera_base=pose,
         )
 
-    def _harmonic_gradients(self, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gradients on harmonics, and on means by way of the viewing direction."""
-        cloud = self._cloud
-        if cloud is None or cloud.num_harmonics == 0:
-            return np.zeros((len(colors), 0, 3), dtype=np.float32), np.zeros_like(colors)
-        directions = view_directions(cloud.means_m, self._centre_m)
-        basis = harmonic_basis(directions)
-        along = np.einsum("nkc,nc->nk", cloud.harmonics, colors)
-        d_direction = SH_FIRST * np.stack([-along[:, 2], -along[:, 0], along[:, 1]], axis=1)
-        across = d_direction - directions * (d_direction * directions).sum(axis=1, keepdims=True)
-        length = np.linalg.norm(cloud.means_m - self._centre_m, axis=1, keepdims=True)
-        harmonics = basis[:, :, None] * colors[:, None, :]
-        return as_float32(harmonics), as_float32(across / np.maximum(length, 1e-12))
+    def draw_features(
+        self, features: Float32[np.ndarray, "num_splats num_channels"]
+    ) -> Float32[np.ndarray, "num_channels height width"]:
+        """Draw any channels with the weights A of the last ``draw_planes``: A F.
+
+        Raises:
+            ValueError: When there is not one row per Gaussian of that drawing.
+        """
+        planes: np.ndarray = self._native.draw_features(as_float32(features))
+        return planes
+
+    def lift(
+        self, maps: Float32[np.ndarray, "num_channels height width"]
+    ) -> Float32[np.ndarray, "num_splats num_channels"]:
+        """Gather maps with the weights A of the last ``draw_planes``: A^T M, not normalised.
+
+        The adjoint of ``draw_features``. A map of ones gives the sum of each Gaussian's weights.
+
+        Raises:
+            ValueError: When the maps are not of that drawing's size.
+        """
+        features: np.ndarray = self._native.lift(as_float32(maps))
+        return features
+
+    def label_map(
+        self, labels: UInt16[np.ndarray, " num_splats"]
+    ) -> tuple[UInt16[np.ndarray, "height width"], Float32[np.ndarray, "height width"]]:
+        """Which label has most weight at each pixel of the last image, and how much.
+
+        Of equal weights the smaller label wins; 0 where nothing was drawn.
+        """
+        ids, weight = self._native.label_map(np.ascontiguousarray(labels))
+        return ids, weight
 
     def visible_mask(self) -> Bool[np.ndarray, " num_splats"]:
         """Say which Gaussians could touch the last image."""

@@ -167,7 +167,7 @@ def test_double_precision_is_refused_instead_of_copied() -> None:
 
 
 def test_an_unknown_instruction_set_is_refused() -> None:
-    with pytest.raises(ValueError, match="'auto', 'base' or 'v3'"):
+    with pytest.raises(ValueError, match="'auto', 'base', 'v3' or 'v4'"):
         Rasteriser(RasterConfig(isa="sparc"))
 
 

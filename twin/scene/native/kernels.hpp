@@ -7,8 +7,9 @@ namespace splat {
 
 constexpr int kBlurRadius = 5;
 
-static constexpr std::int64_t blur_scratch(int width, int height) {
-    return static_cast<std::int64_t>(width) * height + 2 * width + 2 * kBlurRadius;
+// Floats of working memory that ``similarity_band`` needs: rings of eleven blurred rows.
+static constexpr std::int64_t similarity_scratch(int width) {
+    return ((width + 15) / 16 * 16 + 32) * std::int64_t{(2 * kBlurRadius + 1) * 7 + 8};
 }
 
 struct AdamRates {
@@ -16,24 +17,68 @@ struct AdamRates {
     float correction1, correction2;  // 1 - beta^step
 };
 
+// Channels of all Gaussians that are drawn together.
+struct FeatureBlock {
+    const float* values;  // channel of the first Gaussian
+    std::int64_t stride;  // from one Gaussian to the next
+    int count;
+};
+
+// One row of a drawn colour plane and what a camera saw there.
+struct ColorRow {
+    const float* drawn;
+    const std::uint8_t* seen;
+    const std::uint8_t* is_static;  // 0: something moving stood there, do not compare
+    float gain;                     // drawn times gain is compared
+    int width;
+};
+
+struct ColorWeights {
+    float l1;          // times the sign of the difference
+    float squared;     // times twice the difference
+    float similarity;  // times the gradient of the mean similarity, which is taken away
+};
+
+// One row of the drawn depth and alpha planes and what a depth camera measured there.
+struct DepthRow {
+    const float *drawn, *alpha;
+    const float* measured_m;
+    const std::uint8_t* is_static;
+    float weight;  // of the L1 norm
+    int width;
+};
+
 struct Kernels {
     const char* name;
     void (*project)(const Splats&, const Camera&, const Settings&, Projected*, int begin, int end);
-    void (*unproject_gradients)(const Splats&, const Camera&, const Projected&,
-                                const float* pair_sums, const SplatGradients&, int index);
+    void (*unproject_gradients)(const Splats&, const Camera&, const float* pair_sums,
+                                const SplatGradients&, float* d_pose, int index);
     // Returns how many of the job's Gaussians were drawn before the tile was opaque.
     int (*draw_tile)(const Projected*, const TileJob&, const Camera&, const Settings&,
                      float* planes);
     void (*draw_tile_gradients)(const Projected*, const TileJob&, const Camera&, const Settings&,
                                 const float* planes, const float* plane_gradients,
                                 float* pair_gradients);
-    // Separable 11-tap Gaussian window over one plane, zero outside.
-    // ``scratch`` holds blur_scratch(width, height) floats.
-    void (*blur)(const float* in, float* out, float* scratch, int width, int height);
-    // Structural similarity of two planes: returns its sum and fills the three gradient maps.
-    double (*similarity)(const float* mean_x, const float* mean_y, const float* mean_xx,
-                         const float* mean_yy, const float* mean_xy, float* d_mean_x,
-                         float* d_mean_xx, float* d_mean_xy, int count);
+    // ``tile_planes`` is working memory, one tile for each channel.
+    void (*draw_tile_features)(const Projected*, const TileJob&, const Camera&, const Settings&,
+                               const FeatureBlock&, float* tile_planes, float* planes);
+    void (*lift_tile)(const Projected*, const TileJob&, const Camera&, const Settings&,
+                      const float* planes, int num_planes, float* tile_planes, float* pair_sums);
+    // ``slots`` names for each Gaussian of the job the tile of ``label_weights`` it adds to.
+    void (*label_tile)(const Projected*, const TileJob&, const Camera&, const Settings&,
+                       const int* slots, float* label_weights);
+    // Structural similarity of rows y0..y1 of two planes: returns its sum, and fills these rows of
+    // the gradient of ``scale`` times the sum over the whole plane with respect to ``x``.
+    double (*similarity_band)(const float* x, const float* y, float* gradient, float scale,
+                              float* scratch, int width, int height, int y0, int y1);
+    // Fills the two rows to compare; adds the sums of |difference| and difference^2.
+    void (*compare_row)(const ColorRow&, float* compared, float* wanted, double* l1,
+                        double* squared);
+    // ``gradient`` holds that of the similarity and gets that on the plane; returns dL/dgain.
+    float (*color_gradient_row)(const ColorRow&, const float* compared, const float* wanted,
+                                const ColorWeights&, float* gradient);
+    // Fills the gradient on the depth and alpha planes; returns the sum of |residual|.
+    float (*depth_gradient_row)(const DepthRow&, float* d_drawn, float* d_alpha);
     void (*adam)(float* values, const float* gradients, float* first, float* second,
                  const AdamRates&, int count);
 };
@@ -41,8 +86,11 @@ struct Kernels {
 namespace base {
 extern const Kernels kernels;
 }
-#ifdef SPLAT_HAS_V3
+#ifdef SPLAT_HAS_X86
 namespace v3 {
+extern const Kernels kernels;
+}
+namespace v4 {
 extern const Kernels kernels;
 }
 #endif

@@ -6,16 +6,24 @@
 namespace splat::SPLAT_ISA {
 
 void project(const Splats&, const Camera&, const Settings&, Projected*, int begin, int end);
-void unproject_gradients(const Splats&, const Camera&, const Projected&, const float* pair_sums,
-                         const SplatGradients&, int index);
+void unproject_gradients(const Splats&, const Camera&, const float* pair_sums,
+                         const SplatGradients&, float* d_pose, int index);
 int draw_tile(const Projected*, const TileJob&, const Camera&, const Settings&, float* planes);
 void draw_tile_gradients(const Projected*, const TileJob&, const Camera&, const Settings&,
                          const float* planes, const float* plane_gradients,
                          float* pair_gradients);
-void blur(const float* in, float* out, float* scratch, int width, int height);
-double similarity(const float* mean_x, const float* mean_y, const float* mean_xx,
-                  const float* mean_yy, const float* mean_xy, float* d_mean_x, float* d_mean_xx,
-                  float* d_mean_xy, int count);
+void draw_tile_features(const Projected*, const TileJob&, const Camera&, const Settings&,
+                        const FeatureBlock&, float* tile_planes, float* planes);
+void lift_tile(const Projected*, const TileJob&, const Camera&, const Settings&,
+               const float* planes, int num_planes, float* tile_planes, float* pair_sums);
+void label_tile(const Projected*, const TileJob&, const Camera&, const Settings&, const int* slots,
+                float* label_weights);
+double similarity_band(const float* x, const float* y, float* gradient, float scale,
+                       float* scratch, int width, int height, int y0, int y1);
+void compare_row(const ColorRow&, float* compared, float* wanted, double* l1, double* squared);
+float color_gradient_row(const ColorRow&, const float* compared, const float* wanted,
+                         const ColorWeights&, float* gradient);
+float depth_gradient_row(const DepthRow&, float* d_drawn, float* d_alpha);
 void adam(float* values, const float* gradients, float* first, float* second, const AdamRates&,
           int count);
 

@@ -44,6 +44,35 @@ float clamp_to(float value, float low, float high, bool* clamped) {
     return value < low ? low : (value > high ? high : value);
 }
 
+// Unit vector from the camera centre to a mean; returns one over the distance.
+float view_direction(const float* mean, const Camera& camera, float* direction) {
+    float norm2 = 0;
+    for (int i = 0; i < 3; ++i) {
+        direction[i] = mean[i] - camera.centre[i];
+        norm2 += direction[i] * direction[i];
+    }
+    const float inverse = 1.0f / std::sqrt(norm2 > 1e-24f ? norm2 : 1e-24f);
+    for (int i = 0; i < 3; ++i) direction[i] *= inverse;
+    return inverse;
+}
+
+void harmonic_basis(const float* direction, float* basis) {
+    basis[0] = -kHarmonicFactor * direction[1];
+    basis[1] = kHarmonicFactor * direction[2];
+    basis[2] = -kHarmonicFactor * direction[0];
+}
+
+void seen_color(const Splats& in, const Camera& camera, int index, float* rgb) {
+    for (int c = 0; c < 3; ++c) rgb[c] = in.colors[3 * index + c];
+    if (in.harmonics == nullptr) return;
+    float direction[3], basis[kHarmonics];
+    view_direction(in.means + 3 * index, camera, direction);
+    harmonic_basis(direction, basis);
+    const float* h = in.harmonics + 3 * kHarmonics * static_cast<std::int64_t>(index);
+    for (int k = 0; k < kHarmonics; ++k)
+        for (int c = 0; c < 3; ++c) rgb[c] += basis[k] * h[3 * k + c];
+}
+
 bool to_camera(const float* mean, const Camera& camera, float* p) {
     for (int i = 0; i < 3; ++i)
         p[i] = camera.R[3 * i] * mean[0] + camera.R[3 * i + 1] * mean[1] +
@@ -115,7 +144,7 @@ void project_one(const Splats& in, const Camera& camera, const Settings& setting
     out->b = -2.0f * local.xy * half_log2e_over_det;
     out->c = xx * half_log2e_over_det;
     out->log2_opacity = std::log2(opacity);
-    for (int k = 0; k < 3; ++k) out->rgb[k] = in.colors[3 * index + k];
+    seen_color(in, camera, index, out->rgb);
     out->depth = local.p[2];
     const float radius2 = 2.0f * std::log(opacity / settings.alpha_cut);
     const float half_x = std::sqrt(radius2 * xx), half_y = std::sqrt(radius2 * yy);
@@ -171,8 +200,9 @@ CovarianceGradient covariance_gradient(const Local& local, const float* sums) {
     return g;
 }
 
-void mean_gradient(const Local& local, const Camera& camera, const float* sums, const float* dT,
-                   float* out) {
+// Gradient on the centre in the camera frame.
+void point_gradient(const Local& local, const Camera& camera, const float* sums, const float* dT,
+                    float* dp) {
     const float det = image_determinant(local.A) + kMipVariance * (local.xx + local.yy) +
                       kMipVariance * kMipVariance;
     const float kxx = (local.yy + kMipVariance) / det, kxy = -local.xy / det;
@@ -181,8 +211,9 @@ void mean_gradient(const Local& local, const Camera& camera, const float* sums, 
     const float dv = kxy * sums[kEx] + kyy * sums[kEy];
     const float inverse_z = 1.0f / local.p[2];
     const float jx = camera.fx * inverse_z, jy = camera.fy * inverse_z;
-    float dp[3] = {du * jx, dv * jy, sums[kDepth]};
-    dp[2] -= (du * jx * local.p[0] + dv * jy * local.p[1]) * inverse_z;
+    dp[0] = du * jx;
+    dp[1] = dv * jy;
+    dp[2] = sums[kDepth] - (du * jx * local.p[0] + dv * jy * local.p[1]) * inverse_z;
     // T = J W: row 0 is jx (W0 - tx W2), row 1 is jy (W1 - ty W2).
     float d_jx = 0, d_jy = 0, d_tx = 0, d_ty = 0;
     for (int k = 0; k < 3; ++k) {
@@ -200,8 +231,40 @@ void mean_gradient(const Local& local, const Camera& camera, const float* sums, 
         dp[1] += d_ty * inverse_z;
         dp[2] -= d_ty * local.p[1] * inverse_z * inverse_z;
     }
-    for (int k = 0; k < 3; ++k)
-        out[k] = camera.R[k] * dp[0] + camera.R[3 + k] * dp[1] + camera.R[6 + k] * dp[2];
+}
+
+// Fills dL/dharmonics and the gradient on the ray from the camera centre to the mean.
+void harmonic_gradient(const Splats& in, const Camera& camera, const float* d_rgb, int index,
+                       float* d_harmonics, float* d_ray) {
+    float direction[3], basis[kHarmonics], along[kHarmonics];
+    const float inverse = view_direction(in.means + 3 * index, camera, direction);
+    harmonic_basis(direction, basis);
+    const float* h = in.harmonics + 3 * kHarmonics * static_cast<std::int64_t>(index);
+    for (int k = 0; k < kHarmonics; ++k) {
+        along[k] = h[3 * k] * d_rgb[0] + h[3 * k + 1] * d_rgb[1] + h[3 * k + 2] * d_rgb[2];
+        for (int c = 0; c < 3; ++c) d_harmonics[3 * k + c] = basis[k] * d_rgb[c];
+    }
+    const float d_direction[3] = {-kHarmonicFactor * along[2], -kHarmonicFactor * along[0],
+                                  kHarmonicFactor * along[1]};
+    const float radial = d_direction[0] * direction[0] + d_direction[1] * direction[1] +
+                         d_direction[2] * direction[2];
+    for (int i = 0; i < 3; ++i) d_ray[i] = (d_direction[i] - radial * direction[i]) * inverse;
+}
+
+// The camera acts on the centre, on the Jacobian's T = J W and, as -R^T t, on the viewing ray.
+void pose_gradient(const Local& local, const Camera& camera, const float* mean, const float* dp,
+                   const float* dT, const float* d_ray, float* out) {
+    const float jx = camera.fx / local.p[2], jy = camera.fy / local.p[2];
+    for (int k = 0; k < 3; ++k) {
+        const float d0 = jx * dT[k], d1 = jy * dT[3 + k];
+        out[k] = dp[0] * mean[k] + d0 + camera.t[0] * d_ray[k];
+        out[4 + k] = dp[1] * mean[k] + d1 + camera.t[1] * d_ray[k];
+        out[8 + k] =
+            dp[2] * mean[k] - local.tx * d0 - local.ty * d1 + camera.t[2] * d_ray[k];
+    }
+    for (int i = 0; i < 3; ++i)
+        out[4 * i + 3] = dp[i] + camera.R[3 * i] * d_ray[0] + camera.R[3 * i + 1] * d_ray[1] +
+                         camera.R[3 * i + 2] * d_ray[2];
 }
 
 }  // namespace
@@ -212,8 +275,8 @@ void project(const Splats& in, const Camera& camera, const Settings& settings, P
         project_one(in, camera, settings, index, out + index);
 }
 
-void unproject_gradients(const Splats& in, const Camera& camera, const Projected&,
-                         const float* sums, const SplatGradients& out, int index) {
+void unproject_gradients(const Splats& in, const Camera& camera, const float* sums,
+                         const SplatGradients& out, float* d_pose, int index) {
     Local local;
     to_camera(in.means + 3 * index, camera, local.p);
     fill_local(in, camera, index, &local);
@@ -236,7 +299,15 @@ void unproject_gradients(const Splats& in, const Camera& camera, const Projected
         out.scales_log[3 * index + k] = ds * local.s[k];
     }
     quaternion_gradient(local, dR, out.quats + 4 * index);
-    mean_gradient(local, camera, sums, dT, out.means + 3 * index);
+    float dp[3], d_ray[3] = {0, 0, 0};
+    point_gradient(local, camera, sums, dT, dp);
+    if (in.harmonics != nullptr)
+        harmonic_gradient(in, camera, sums + kRed, index,
+                          out.harmonics + 3 * kHarmonics * static_cast<std::int64_t>(index), d_ray);
+    for (int k = 0; k < 3; ++k)
+        out.means[3 * index + k] = camera.R[k] * dp[0] + camera.R[3 + k] * dp[1] +
+                                   camera.R[6 + k] * dp[2] + d_ray[k];
+    pose_gradient(local, camera, in.means + 3 * index, dp, dT, d_ray, d_pose);
     out.opacities[index] = sums[kE] / (1.0f + std::exp(in.opacities[index]));
     for (int k = 0; k < 3; ++k) out.colors[3 * index + k] = sums[kRed + k];
 }

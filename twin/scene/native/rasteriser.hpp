@@ -8,7 +8,8 @@
 
 namespace splat {
 
-// Chooses the copy of the kernels: "auto" asks the processor. Returns nullptr for unknown names.
+// Chooses the copy of the kernels: "auto" asks the processor. Returns nullptr for unknown names,
+// and for those that this processor cannot run.
 const Kernels* kernels_named(const char* name);
 
 class Rasteriser {
@@ -18,11 +19,18 @@ class Rasteriser {
     // Fills ``planes`` (5 x height x width): red, green, blue, sum w depth, sum w.
     void draw(const Splats&, int count, const Camera&, const Settings&, float* planes);
 
-    // Gradients of the last ``draw``; inputs and planes must be those of that call.
+    // Gradients of the last ``draw``; inputs and planes must be those of that call. ``d_pose`` is
+    // with respect to the 3 x 4 matrix [R | t].
     void pull(const Splats&, const float* planes, const float* plane_gradients,
-              const SplatGradients& out);
+              const SplatGradients& out, double* d_pose);
 
-    // Whether each Gaussian touched the last image.
+    // The weights w of the last ``draw`` as a linear map. A: features (count x num) to planes
+    // (num x height x width); its transpose; and the label with the largest sum of weights.
+    void draw_features(const float* features, int num, float* planes);
+    void lift(const float* planes, int num, float* features);
+    void label_map(const std::uint16_t* labels, std::uint16_t* ids, float* weights);
+
+    // Whether each Gaussian could touch the last image.
     bool visible(int index) const { return projected_[index].half_x >= 0; }
     int count() const { return count_; }
     const Camera& camera() const { return camera_; }
@@ -33,9 +41,14 @@ class Rasteriser {
         int x0, y0, x1, y1;  // ends excluded
     };
     TileRange tiles_of(const Projected&) const;
+    void project(const Splats&);
     void sort_by_depth();
     void fill_tiles();
     TileJob job(int tile) const;
+    TileJob drawn_job(int tile) const;
+    float* begin_pair_rows(int tile, int row_floats);
+    void add_pair_rows(int index, int row_floats, float* sums) const;
+    int num_tiles() const { return tiles_x_ * tiles_y_; }
 
     const Kernels& kernels_;
     int threads_;
@@ -44,14 +57,18 @@ class Rasteriser {
     Camera camera_{};
     Settings settings_{};
     std::vector<Projected> projected_;
-    std::vector<std::uint32_t> order_, order_scratch_;  // visible Gaussians, front to back
-    std::vector<std::uint32_t> keys_, keys_scratch_;
+    std::vector<TileRange> ranges_;
+    std::vector<std::uint32_t> order_;                    // visible Gaussians, front to back
+    std::vector<std::uint64_t> entries_, other_entries_;  // depth above, index below
     std::vector<std::int64_t> tile_begin_;
     std::vector<std::uint32_t> tile_ids_;
+    std::vector<std::int64_t> next_;        // where each block of order_ writes in each tile
     std::vector<int> drawn_;                // per tile: Gaussians drawn before it was opaque
-    std::vector<std::int64_t> slot_begin_;  // per entry of order_: its pairs in slots_
+    std::vector<std::int64_t> slot_begin_;  // per Gaussian: its pairs in slots_
     std::vector<std::int64_t> slots_;       // where those pairs stand in tile_ids_
-    std::vector<float> pair_gradients_;
+    std::vector<float> pair_rows_;
+    std::vector<float> tile_planes_;  // working memory of each thread
+    std::vector<double> pose_sums_;   // of each block of Gaussians
 };
 
 }  // namespace splat

@@ -19,7 +19,8 @@ class Similarity {
   private:
     const Kernels& kernels_;
     int threads_;
-    std::vector<float> maps_;
+    std::vector<float> scratch_;  // of each thread
+    std::vector<double> sums_;    // of each band
 };
 
 }  // namespace splat

@@ -7,16 +7,21 @@
 namespace splat {
 
 constexpr int kTile = 16;          // tile edge [px]
+constexpr int kTilePixels = kTile * kTile;
 constexpr int kPlanes = 5;         // red, green, blue, depth, alpha
 constexpr int kPairGradients = 10; // see PairGradient
+constexpr int kPoseEntries = 12;   // a 3 x 4 matrix
+constexpr int kHarmonics = 3;      // real spherical harmonics of degree 1
+constexpr float kHarmonicFactor = 0.4886025119029199f;  // sqrt(3 / (4 pi))
 constexpr float kMaxAlpha = 0.999f;
 constexpr float kMipVariance = 0.1f;     // added to the image covariance [px^2]
 constexpr float kMinMipRatio = 2.5e-5f;  // floor of det/det', bounds its gradient
 constexpr float kNearDepth = 0.02f;      // nothing closer to the camera is drawn [m]
 
 struct Camera {
-    float R[9];  // R_camera_world, row-major
-    float t[3];  // p_camera_world [m]
+    float R[9];       // R_camera_world, row-major
+    float t[3];       // p_camera_world [m]
+    float centre[3];  // p_world_camera = -R^T t [m]
     float fx, fy, cx, cy;
     int width, height;
 };
@@ -33,6 +38,7 @@ struct Splats {
     const float* scales_log;   // n x 3
     const float* opacities;    // n, logits
     const float* colors;       // n x 3
+    const float* harmonics;    // n x 3 x 3, harmonic by colour; null where there are none
 };
 
 struct SplatGradients {
@@ -41,6 +47,7 @@ struct SplatGradients {
     float* scales_log;
     float* opacities;
     float* colors;
+    float* harmonics;  // null where there are none
 };
 
 // What the tile loops need of one projected Gaussian; opacity enters as log2.

@@ -1,0 +1,143 @@
+// The Python face of FitSession. Tables stay NumPy arrays of the caller and are changed in place.
+#include "python.hpp"
+
+#include <cstring>
+#include <vector>
+
+#include "session.hpp"
+#include "threads.hpp"
+
+using namespace nb::literals;
+
+namespace splat {
+
+namespace {
+
+using Bytes = Buffer<std::uint8_t, nb::shape<3, -1, -1>>;
+using Depth = Buffer<float, nb::shape<-1, -1>>;
+using Mask = Buffer<bool, nb::shape<-1, -1>>;
+using Gain = std::tuple<float, float, float>;
+using Loss = std::tuple<bool, float, float>;  // structural, share of L1, weight of depth
+using Rates = std::tuple<float, float, float, float, float, float>;
+
+constexpr std::size_t kColumns[Tables::kCount] = {3, 4, 3, 1, 3, 3 * kHarmonics};
+
+// Means, quaternions, log scales, opacities, colours and, or None, harmonics.
+Tables tables_of(const nb::tuple& arrays, std::size_t count) {
+    if (arrays.size() != Tables::kCount) throw nb::value_error("a cloud has six tables");
+    Tables tables{};
+    for (int i = 0; i < Tables::kCount; ++i) {
+        if (arrays[i].is_none() && i == Tables::kCount - 1) continue;
+        const Values values = nb::cast<Values>(arrays[i], false);
+        if (values.size() != count * kColumns[i])
+            throw nb::value_error("all tables need one row per Gaussian");
+        tables.table[i] = values.data();
+    }
+    return tables;
+}
+
+class PyFitSession {
+  public:
+    PyFitSession(int threads, const std::string& isa)
+        : session_(choose(isa), thread_count(threads)) {}
+
+    nb::tuple step(nb::tuple values, nb::tuple first, nb::tuple second, Pose T_camera_world,
+                   Intrinsics intrinsics, float alpha_cut, float transmittance_stop,
+                   Bytes planes_u8, Depth depth_m, Mask static_mask, Gain gain, Loss loss,
+                   Rates rates, int step) {
+        const Camera camera = make_camera(T_camera_world, intrinsics);
+        const Settings settings = make_settings(alpha_cut, transmittance_stop);
+        const std::size_t rows = camera.height, columns = camera.width;
+        if (planes_u8.shape(1) != rows || planes_u8.shape(2) != columns ||
+            depth_m.shape(0) != rows || depth_m.shape(1) != columns ||
+            static_mask.shape(0) != rows || static_mask.shape(1) != columns || step < 1)
+            throw nb::value_error("a step needs images of the camera's size, and counts from 1");
+        const std::size_t count = nb::cast<Values>(values[0], false).shape(0);
+        Learning learning{tables_of(values, count),
+                          tables_of(first, count),
+                          tables_of(second, count),
+                          {},
+                          0.9f,
+                          0.999f,
+                          1e-15f,
+                          step};
+        std::tie(learning.rates[0], learning.rates[1], learning.rates[2], learning.rates[3],
+                 learning.rates[4], learning.rates[5]) = rates;
+        FitTarget target{planes_u8.data(), depth_m.data(),
+                         reinterpret_cast<const std::uint8_t*>(static_mask.data()), {}};
+        std::tie(target.gain[0], target.gain[1], target.gain[2]) = gain;
+        const LossWeights weights{std::get<0>(loss), std::get<1>(loss), std::get<2>(loss)};
+        count_ = count;
+        has_harmonics_ = learning.values.table[Tables::kCount - 1] != nullptr;
+        StepResult result;
+        {
+            nb::gil_scoped_release unlocked;
+            result = session_.step(static_cast<int>(count), camera, settings, target, weights,
+                                   learning);
+        }
+        return answer(result);
+    }
+
+    // What the last step drew, five planes.
+    NewArray<float> planes() const {
+        const Camera& camera = session_.rasteriser().camera();
+        auto planes = new_array<float>({kPlanes, static_cast<std::size_t>(camera.height),
+                                        static_cast<std::size_t>(camera.width)});
+        std::memcpy(planes.data(), session_.planes().data(),
+                    session_.planes().size() * sizeof(float));
+        return planes;
+    }
+
+    // The six gradients of the last step; harmonics may have no rows.
+    nb::tuple gradients() const {
+        const std::size_t harmonics = has_harmonics_ ? kHarmonics : 0;
+        return nb::make_tuple(copy(0, {count_, 3}), copy(1, {count_, 4}), copy(2, {count_, 3}),
+                              copy(3, {count_}), copy(4, {count_, 3}),
+                              copy(5, {count_, harmonics, 3}));
+    }
+
+    NewArray<bool> visible() const {
+        auto mask = new_array<bool>({count_});
+        for (std::size_t i = 0; i < count_; ++i)
+            mask.data()[i] = session_.rasteriser().visible(static_cast<int>(i));
+        return mask;
+    }
+
+  private:
+    static nb::tuple answer(const StepResult& result) {
+        auto pose = new_array<double>({3, 4});
+        std::memcpy(pose.data(), result.pose, sizeof result.pose);
+        return nb::make_tuple(
+            result.loss, result.squared, result.static_pixels,
+            std::make_tuple(result.gain[0], result.gain[1], result.gain[2]), pose,
+            std::make_tuple(result.draw_s, result.compare_s, result.pull_s, result.learn_s));
+    }
+
+    NewArray<float> copy(int table, std::initializer_list<std::size_t> shape) const {
+        auto rows = new_array<float>(shape);
+        std::size_t size = 1;
+        for (const std::size_t extent : shape) size *= extent;
+        if (size > 0) std::memcpy(rows.data(), session_.gradient(table), size * sizeof(float));
+        return rows;
+    }
+
+    FitSession session_;
+    std::size_t count_ = 0;
+    bool has_harmonics_ = false;
+};
+
+}  // namespace
+
+void add_session(nb::module_& module) {
+    nb::class_<PyFitSession>(module, "FitSession")
+        .def(nb::init<int, const std::string&>(), "threads"_a = 0, "isa"_a = "auto")
+        .def("step", &PyFitSession::step, "values"_a, "first"_a, "second"_a,
+             "T_camera_world"_a.noconvert(), "intrinsics"_a, "alpha_cut"_a,
+             "transmittance_stop"_a, "planes_u8"_a.noconvert(), "depth_m"_a.noconvert(),
+             "static_mask"_a.noconvert(), "gain"_a, "loss"_a, "rates"_a, "step"_a)
+        .def("planes", &PyFitSession::planes)
+        .def("gradients", &PyFitSession::gradients)
+        .def("visible", &PyFitSession::visible);
+}
+
+}  // namespace splat

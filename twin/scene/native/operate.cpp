@@ -1,0 +1,102 @@
+// The drawn image as a linear map of what the Gaussians carry: planes = A values, with A the
+// weights of the last drawing. Here A, its transpose and sums by label, one tile at a time.
+#include "tile.hpp"
+
+namespace splat::SPLAT_ISA {
+
+namespace {
+
+// Weights of one Gaussian in a tile; only rows and chunks within its reach are filled.
+struct alignas(64) Weights {
+    float light[kTilePixels];
+    float weight[kTilePixels];
+};
+
+Reach fill_weights(const Projected& g, const TileJob& job, float log2_cut, Weights* tile) {
+    const Reach reach = reach_of(g, job);
+    const Floats x = columns();
+    for (int y = reach.y0; y < reach.y1; ++y) {
+        const RowShape shape = row_shape(g, job, y);
+        for (int c = reach.c0; c < reach.c1; ++c) {
+            const int at = y * kTile + c * kLanes;
+            const Floats alpha = alpha_of(log2_alpha(g, shape, offsets(g, job, c, x)), log2_cut);
+            const Floats light = load(tile->light + at);
+            const Floats weight = alpha * light;
+            store(tile->light + at, light - weight);
+            store(tile->weight + at, weight);
+        }
+    }
+    return reach;
+}
+
+template <class Visit>
+void each_chunk(const Reach& reach, Visit visit) {
+    for (int y = reach.y0; y < reach.y1; ++y)
+        for (int c = reach.c0; c < reach.c1; ++c) visit(y * kTile + c * kLanes);
+}
+
+}  // namespace
+
+void draw_tile_features(const Projected* projected, const TileJob& job, const Camera& camera,
+                        const Settings& settings, const FeatureBlock& block, float* tile_planes,
+                        float* planes) {
+    Weights tile;
+    start_light(job, camera, tile.light);
+    __builtin_memset(tile_planes, 0, sizeof(float) * block.count * kTilePixels);
+    const float log2_cut = std::log2(settings.alpha_cut);
+    for (int i = 0; i < job.count; ++i) {
+        const Reach reach = fill_weights(projected[job.ids[i]], job, log2_cut, &tile);
+        const float* row = block.values + static_cast<std::int64_t>(job.ids[i]) * block.stride;
+        for (int k = 0; k < block.count; ++k) {
+            float* plane = tile_planes + k * kTilePixels;
+            const float value = row[k];
+            each_chunk(reach, [&](int at) {
+                store(plane + at, load(plane + at) + load(tile.weight + at) * value);
+            });
+        }
+    }
+    const std::int64_t plane_size = static_cast<std::int64_t>(camera.width) * camera.height;
+    each_row(job, camera, [&](int in_tile, int in_image) {
+        for (int k = 0; k < block.count; ++k)
+            planes[k * plane_size + in_image] = tile_planes[k * kTilePixels + in_tile];
+    });
+}
+
+void lift_tile(const Projected* projected, const TileJob& job, const Camera& camera,
+               const Settings& settings, const float* planes, int num_planes, float* tile_planes,
+               float* pair_sums) {
+    Weights tile;
+    start_light(job, camera, tile.light);
+    __builtin_memset(tile_planes, 0, sizeof(float) * num_planes * kTilePixels);
+    const std::int64_t plane_size = static_cast<std::int64_t>(camera.width) * camera.height;
+    each_row(job, camera, [&](int in_tile, int in_image) {
+        for (int k = 0; k < num_planes; ++k)
+            tile_planes[k * kTilePixels + in_tile] = planes[k * plane_size + in_image];
+    });
+    const float log2_cut = std::log2(settings.alpha_cut);
+    for (int i = 0; i < job.count; ++i) {
+        const Reach reach = fill_weights(projected[job.ids[i]], job, log2_cut, &tile);
+        float* row = pair_sums + static_cast<std::int64_t>(i) * num_planes;
+        for (int k = 0; k < num_planes; ++k) {
+            const float* plane = tile_planes + k * kTilePixels;
+            Floats total = Floats{};
+            each_chunk(reach, [&](int at) { total += load(tile.weight + at) * load(plane + at); });
+            row[k] = sum(total);
+        }
+    }
+}
+
+void label_tile(const Projected* projected, const TileJob& job, const Camera& camera,
+                const Settings& settings, const int* slots, float* label_weights) {
+    Weights tile;
+    start_light(job, camera, tile.light);
+    const float log2_cut = std::log2(settings.alpha_cut);
+    for (int i = 0; i < job.count; ++i) {
+        const Reach reach = fill_weights(projected[job.ids[i]], job, log2_cut, &tile);
+        float* plane = label_weights + static_cast<std::int64_t>(slots[i]) * kTilePixels;
+        each_chunk(reach,
+                   [&](int at) { store(plane + at, load(plane + at) + load(tile.weight + at)); });
+    }
+}
+
+}  // namespace splat::SPLAT_ISA

@@ -1,0 +1,82 @@
+// One step of fitting without leaving native code: draw, compare, pull back, Adam.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "rasteriser.hpp"
+#include "similarity.hpp"
+
+namespace splat {
+
+// What a camera saw: planes of 8 bits, metres of depth (0: none), and what may be compared.
+struct FitTarget {
+    const std::uint8_t* planes;     // 3 x height x width
+    const float* depth_m;           // height x width
+    const std::uint8_t* is_static;  // height x width
+    float gain[3];                  // the drawn colours times these are compared
+};
+
+struct LossWeights {
+    bool structural;  // L1 and SSIM, else the squared error
+    float l1_share;   // of L1; the rest is SSIM's
+    float depth;
+};
+
+struct StepResult {
+    double loss, squared;        // squared: sum over static pixels and channels
+    std::int64_t static_pixels;
+    double gain[3];              // dL/dgain
+    double pose[kPoseEntries];   // dL/d[R | t]
+    double draw_s, compare_s, pull_s, learn_s;
+};
+
+// The six tables of a cloud, or of what belongs to each of their entries.
+struct Tables {
+    static constexpr int kCount = 6;
+    float* table[kCount];  // means, quats, scales_log, opacities, colors, harmonics (or null)
+};
+
+struct Learning {
+    Tables values, first, second;
+    float rates[Tables::kCount];  // 0: the table is left as it is
+    float beta1, beta2, epsilon;
+    int step;  // counted from 1
+};
+
+class FitSession {
+  public:
+    FitSession(const Kernels& kernels, int threads)
+        : kernels_(kernels), threads_(threads), rasteriser_(kernels, threads),
+          similarity_(kernels, threads) {}
+
+    StepResult step(int count, const Camera&, const Settings&, const FitTarget&,
+                    const LossWeights&, const Learning&);
+
+    const Rasteriser& rasteriser() const { return rasteriser_; }
+    // Of the last step: what was drawn (5 planes), and the gradient on one of the six tables.
+    const std::vector<float>& planes() const { return planes_; }
+    const float* gradient(int table) const { return gradients_.data() + gradient_begin_[table]; }
+
+  private:
+    void start(int count, const Learning&, std::int64_t pixels);
+    SplatGradients gradient_tables(bool with_harmonics);
+    double compare(const FitTarget&, const LossWeights&, StepResult*);
+    double compare_colors(const FitTarget&, const LossWeights&, StepResult*);
+    double compare_depth(const FitTarget&, const LossWeights&, std::int64_t measured);
+    void learn(int count, const Learning&);
+    ColorRow color_row(const FitTarget&, int channel, int y) const;
+
+    const Kernels& kernels_;
+    int threads_;
+    Rasteriser rasteriser_;
+    Similarity similarity_;
+    std::vector<float> planes_, plane_gradients_;
+    std::vector<float> compared_, wanted_;  // 3 x height x width
+    std::vector<double> row_sums_;
+    std::vector<std::int64_t> row_counts_;
+    std::vector<float> gradients_;
+    std::int64_t gradient_begin_[Tables::kCount + 1] = {0};
+};
+
+}  // namespace splat
