@@ -64,12 +64,15 @@ class FrameConfig:
     max_depth_m: float = 5.0
     """Depth beyond is not trusted."""
     poses: Literal["auto", "tf", "odometry"] = "auto"
-    """Where cameras are. tf: from /tf; odometry: from the images themselves; auto: odometry for
-    cameras that /tf says nothing about."""
+    """Where cameras are. tf: /tf; odometry: from the images themselves; auto: what calibrate found,
+    else /tf, else odometry."""
     check_poses: bool = True
     """Refuse poses that fit the depth only when read in another convention."""
     align_poses: bool = False
     """Lay the depth of each training frame onto all others before the fit, for rough poses."""
+    align_holdout: bool = False
+    """Draw held-out views a second time, with pose and brightness fitted to each of them; numbers
+    made from these are named aligned."""
 
     def __post_init__(self) -> None:
         """Refuse to hold out every frame, or to learn from none."""
