@@ -1,27 +1,37 @@
-"""Fit Gaussians to images: half size first, then full size, for a time or a number of images."""
+"""Fit Gaussians to images: half size first, then full size, for a time or a number of images.
+
+Colours are solved in closed form at the start and on the way (``appearance``); Adam moves
+everything in between; Gaussians are split where the error is large (``densify``).
+"""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float
 
 from bridge.terminal import Advance
-from twin.scene.gaussians import GaussianCloud, arrays
+from twin.scene.adam import adam_step, taken_moments
+from twin.scene.appearance import Observation, solve_appearance, solve_gains
+from twin.scene.camera_correction import correction_gradient
+from twin.scene.densify import densify, score
+from twin.scene.fit_state import Checkpoint, FitState, first_state, load_state, save_state
+from twin.scene.gaussians import NUM_FIRST, GaussianCloud, with_harmonics
 from twin.scene.losses import Loss, psnr_db
-from twin.scene.raster import RasterConfig, Rasteriser, load_native
+from twin.scene.raster import RasterConfig, Rasteriser
 from twin.scene.settings import FitConfig
 from twin.scene.training_view import Target, TrainingView
 
-RATES = {
-    "means_m": 0.18,  # in units of the median Gaussian's size
-    "quats_wxyz": 1.2e-2,
-    "scales_log": 4.5e-2,
-    "opacities_logit": 0.12,
-    "colors": 2.4e-2,
-}
-"""Adam's step sizes at the start; they decay by the factor below."""
 DECAY = 0.05
+"""What is left of Adam's step sizes at the end."""
+SOLVE_AT = (0.0, 0.25)
+"""Shares of the budget at which colours are solved; and once more where full size begins."""
+SPLIT_AT = (0.08, 0.16, 0.24, 0.32, 0.40)
+"""Shares of the budget at which Gaussians are split and dropped."""
+POSES_FROM = 0.15
+"""Cameras are moved only once the scene is good enough to say where to."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,10 +42,18 @@ class FitResult:
     iterations: int
     coarse_iterations: int
     seconds: float
+    """Wall time, that of an interrupted fit before included."""
     cpu_seconds: float
+    """Of this process, this time."""
     train_psnr_db: float | None
     """Over the static pixels of the last images seen, at the size they were fitted at; None when
     there were none."""
+    gains: Float[np.ndarray, "num_views 3"]
+    """Brightness of each training image over that of the scene, per channel; their mean is 1."""
+    Ts_base_color: Float[np.ndarray, "num_views 4 4"]
+    """Where the training views were in the end; as given unless poses were refined."""
+    num_split: int
+    num_pruned: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,51 +61,18 @@ class _Progress:
     """How far along the fit is, 0..1 by time or by images."""
 
     fraction: float
-    step: int
-
-
-def _steps(config: FitConfig, advance: Advance) -> Iterator[_Progress]:
-    start = time.monotonic()
-    step = 0
-    while True:
-        seconds = time.monotonic() - start
-        fraction = step / config.iterations if config.iterations else seconds / config.budget_s
-        if fraction >= 1.0:
-            return
-        step += 1
-        yield _Progress(fraction=fraction, step=step)
-
-
-class _Adam:
-    """Adam (Kingma and Ba 2015) on each array of a cloud, in place."""
-
-    def __init__(self, cloud: GaussianCloud, threads: int) -> None:
-        self.cloud = GaussianCloud(**{name: rows.copy() for name, rows in arrays(cloud)})
-        self._moments = {
-            name: (np.zeros_like(rows), np.zeros_like(rows)) for name, rows in arrays(cloud)
-        }
-        size = float(np.median(np.exp(cloud.scales_log.max(axis=1))))
-        self._rates = RATES | {"means_m": RATES["means_m"] * size}
-        self._threads = threads
-        self._step = load_native().adam_step
-
-    def update(self, gradient: object, at: _Progress) -> None:
-        decay = DECAY**at.fraction
-        for name, rows in arrays(self.cloud):
-            first, second = self._moments[name]
-            self._step(
-                rows,
-                getattr(gradient, name),
-                first,
-                second,
-                at.step,
-                self._rates[name] * decay,
-                threads=self._threads,
-            )
+    seconds: float
 
 
 def fit(
-    cloud: GaussianCloud, views: list[TrainingView], config: FitConfig, advance: Advance
+    cloud: GaussianCloud,
+    views: list[TrainingView],
+    config: FitConfig,
+    advance: Advance,
+    *,
+    max_splats: int | None = None,
+    checkpoint: Checkpoint | None = None,
+    clock: Callable[[], float] = time.monotonic,
 ) -> FitResult:
     """Minimise the loss over the views with Adam; each step draws one image.
 
@@ -95,56 +80,165 @@ def fit(
         cloud: Where to start.
         views: Training images; never the held-out ones.
         config: Budget, loss and seed.
-        advance: Told the percentage done and the recent PSNR.
+        advance: Told the percentage done, the recent PSNR and the time left.
+        max_splats: Budget of Gaussians; none: as many as there are at the start.
+        checkpoint: Where to keep the state; a state of the same key is gone on with.
+        clock: Seconds that the budget is counted in.
     """
-    rng = np.random.default_rng(config.seed)
-    rasteriser = Rasteriser(RasterConfig(threads=config.threads))
-    loss = Loss(config.loss, depth_weight=config.depth_weight, threads=config.threads)
-    adam = _Adam(cloud, config.threads)
-    errors: list[float] = []
-    queue: list[int] = []
-    coarse = 0
-    start, cpu_start = time.monotonic(), time.process_time()
-    at = _Progress(fraction=0.0, step=0)
-    for at in _steps(config, advance):
-        if not queue:
-            queue = rng.permutation(len(views)).tolist()
-        view = views[queue.pop()]
-        half = at.fraction < config.coarse_fraction
-        coarse += half
-        target = view.half if half else view.full
-        error = _step(adam, at, rasteriser, loss, view, target)
-        errors += [] if error is None else [error]
-        recent = _recent_psnr_db(errors, len(views))
-        said = "" if recent is None else f", training PSNR {recent:.2f} dB"
-        advance(round(100 * at.fraction), f"image {at.step}{said}")
+    learner = _Learner(views, config, max_splats or len(cloud))
+    state = None if checkpoint is None else load_state(checkpoint)
+    if state is None:
+        harmonics = NUM_FIRST if config.harmonics else cloud.num_harmonics
+        state = first_state(with_harmonics(cloud, harmonics), len(views))
+    cpu_start, last_saved = time.process_time(), state.seconds
+    for at in _steps(config, state, clock):
+        learner.keep_schedule(state, at)
+        learner.step(state, at)
+        advance(round(100 * at.fraction), _note(state, at, len(views)))
+        if checkpoint is not None and at.seconds - last_saved >= checkpoint.period_s:
+            state.seconds = last_saved = at.seconds
+            save_state(checkpoint, state)
     return FitResult(
-        cloud=adam.cloud,
-        iterations=at.step,
-        coarse_iterations=coarse,
-        seconds=time.monotonic() - start,
+        cloud=state.cloud,
+        iterations=state.step,
+        coarse_iterations=state.coarse_steps,
+        seconds=state.seconds,
         cpu_seconds=time.process_time() - cpu_start,
-        train_psnr_db=_recent_psnr_db(errors, len(views)),
+        train_psnr_db=_recent_psnr_db(state, len(views)),
+        gains=state.gains,
+        Ts_base_color=np.stack([learner.pose(state, index) for index in range(len(views))]),
+        num_split=state.num_split,
+        num_pruned=state.num_pruned,
     )
 
 
-def _recent_psnr_db(errors: list[float], num_views: int) -> float | None:
-    return psnr_db(float(np.mean(errors[-num_views:]))) if errors else None
+def _steps(config: FitConfig, state: FitState, clock: Callable[[], float]) -> Iterator[_Progress]:
+    begin = clock() - state.seconds
+    while True:
+        state.seconds = clock() - begin
+        by_images = config.iterations > 0
+        fraction = state.step / config.iterations if by_images else state.seconds / config.budget_s
+        if fraction >= 1.0:
+            return
+        state.step += 1
+        yield _Progress(fraction=fraction, seconds=state.seconds)
 
 
-def _step(
-    adam: _Adam,
-    at: _Progress,
-    rasteriser: Rasteriser,
-    loss: Loss,
-    view: TrainingView,
-    target: Target,
-) -> float | None:
-    """Draw one image and follow its gradient; returns the mean squared error where it counts."""
-    planes = rasteriser.draw_planes(adam.cloud, target.camera, view.T_base_color)
-    # Where something moving stood, the image is compared with itself: no error, no gradient.
-    wanted = np.where(target.static_mask, target.image(), planes[:3])
-    _, mse, gradient = loss(planes, wanted, target.depth_m)
-    adam.update(rasteriser.pull_back(planes, gradient), at)
-    static = float(target.static_mask.mean())
-    return mse / static if static > 0 else None
+def _recent_psnr_db(state: FitState, num_views: int) -> float | None:
+    return psnr_db(float(np.mean(state.errors[-num_views:]))) if state.errors else None
+
+
+def _note(state: FitState, at: _Progress, num_views: int) -> str:
+    recent = _recent_psnr_db(state, num_views)
+    said = "" if recent is None else f", training PSNR {recent:.2f} dB"
+    left = at.seconds / at.fraction - at.seconds if at.fraction > 0 else None
+    return f"image {state.step}{said}" + ("" if left is None else f", {left:.0f} s left")
+
+
+class _Learner:
+    """One step of the fit, and the events of its schedule."""
+
+    def __init__(self, views: list[TrainingView], config: FitConfig, max_splats: int) -> None:
+        self._views = views
+        self._config = config
+        self._max_splats = max_splats
+        self._rasteriser = Rasteriser(RasterConfig(threads=config.threads))
+        self._loss = Loss(config.loss, depth_weight=config.depth_weight, threads=config.threads)
+
+    def pose(self, state: FitState, index: int) -> np.ndarray:
+        """Where a view is now thought to be."""
+        return state.cameras.pose(index, self._views[index].T_base_color)
+
+    @cached_property
+    def _schedule(self) -> list[tuple[float, Callable[[FitState, bool], None]]]:
+        events: list[tuple[float, Callable[[FitState, bool], None]]] = []
+        if self._config.densify:
+            events += [(at, self._densify) for at in SPLIT_AT]
+        if self._config.appearance_steps:
+            solve_at = {*SOLVE_AT, self._config.coarse_fraction}
+            events += [(at, self._solve_colours) for at in sorted(solve_at) if at < 1]
+        return sorted(events, key=lambda event: event[0])
+
+    def keep_schedule(self, state: FitState, at: _Progress) -> None:
+        """Do what is due; what is already behind is not done again."""
+        while (
+            state.events_done < len(self._schedule)
+            and self._schedule[state.events_done][0] <= at.fraction
+        ):
+            coarse = at.fraction < self._config.coarse_fraction
+            self._schedule[state.events_done][1](state, coarse)
+            state.events_done += 1
+
+    def _observations(self, state: FitState, coarse: bool) -> list[Observation]:
+        return [
+            Observation(
+                target=view.half if coarse else view.full,
+                T_base_camera=self.pose(state, index),
+                gain=state.gains[index],
+            )
+            for index, view in enumerate(self._views)
+        ]
+
+    def _solve_colours(self, state: FitState, coarse: bool) -> None:
+        if self._config.gain:
+            observations = self._observations(state, coarse)
+            state.gains = solve_gains(state.cloud, observations, self._rasteriser)
+        solved = solve_appearance(
+            state.cloud,
+            self._observations(state, coarse),
+            self._rasteriser,
+            steps=self._config.appearance_steps,
+        )
+        state.cloud = solved.cloud
+
+    def _densify(self, state: FitState, coarse: bool) -> None:
+        scores = score(state.cloud, self._observations(state, coarse), self._rasteriser)
+        left = sum(1 for _, event in self._schedule[state.events_done :] if event == self._densify)
+        room = self._max_splats - len(state.cloud)
+        done = densify(
+            state.cloud, scores, max_splats=self._max_splats, most=-(-max(room, 0) // left)
+        )
+        state.cloud = done.cloud
+        state.moments = taken_moments(state.moments, done.parents)
+        state.num_split += done.num_split
+        state.num_pruned += done.num_pruned
+
+    def step(self, state: FitState, at: _Progress) -> None:
+        """Draw one image and follow its gradient."""
+        epoch, place = divmod(state.step - 1, len(self._views))
+        order = np.random.default_rng([self._config.seed, epoch]).permutation(len(self._views))
+        index = int(order[place])
+        coarse = at.fraction < self._config.coarse_fraction
+        state.coarse_steps += coarse
+        view = self._views[index]
+        mse = self._descend(state, index, view.half if coarse else view.full, at)
+        if mse is not None:
+            state.errors = [*state.errors[-len(self._views) :], mse]
+
+    def _descend(self, state: FitState, index: int, target: Target, at: _Progress) -> float | None:
+        """Follow one image's gradient; returns the mean squared error where it counts."""
+        pose = self.pose(state, index)
+        planes = self._rasteriser.draw_planes(state.cloud, target.camera, pose)
+        gain = state.gains[index].astype(np.float32)[:, None, None]
+        bright = planes.copy()
+        bright[:3] *= gain
+        # Where something moving stood, the image is compared with itself: no error, no gradient.
+        wanted = np.where(target.static_mask, target.image(), bright[:3])
+        _, mse, d_planes = self._loss(bright, wanted, target.depth_m)
+        d_planes[:3] *= gain
+        gradient = self._rasteriser.pull_back(planes, d_planes)
+        decay = DECAY**at.fraction
+        adam_step(
+            state.cloud,
+            gradient,
+            state.moments,
+            step=state.step,
+            rates=state.rates,
+            decay=decay,
+            threads=self._config.threads,
+        )
+        if self._config.refine_poses and at.fraction >= POSES_FROM:
+            pulled = correction_gradient(gradient.T_camera_base, pose)
+            state.cameras.update(index, pulled, decay)
+        static = float(target.static_mask.mean())
+        return mse / static if static > 0 else None

@@ -1,7 +1,7 @@
 """The first Gaussians: depth points fused in voxels as large as the pixels that saw them."""
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float, Float32, Int8
 
 from twin.errors import TwinError
 from twin.scene.gaussians import GaussianCloud, as_float32, morton_order
@@ -25,28 +25,34 @@ def fuse(points: list[PointSet], config: InitialiseConfig) -> GaussianCloud:
 
     Voxel sizes are powers of two times a base size, so that near surfaces keep detail and far
     ones do not waste Gaussians. A coarse voxel gives way where finer ones cover it. All voxels
-    grow together until the budget holds.
+    grow together until the budget, less what is left to the fit, holds.
 
     Raises:
         NoSurfaceError: When no voxel has two points.
     """
-    p = np.concatenate([item.p_m for item in points]).astype(np.float64)
+    p = np.concatenate([item.p_m for item in points])
     if len(p) < MIN_POINTS:
         raise NoSurfaceError(_no_surface(len(p)))
-    normals = np.concatenate([item.normals for item in points])
-    colors = np.concatenate([item.colors for item in points])
-    wanted = config.footprint_factor * np.concatenate([item.footprint_m for item in points])
+    p -= p.min(axis=0)
+    wanted = np.float32(config.footprint_factor) * np.concatenate(
+        [item.footprint_m for item in points]
+    )
     base = float(np.quantile(wanted, 0.05))
-    level = np.clip(np.rint(np.log2(wanted / base)), 0, MAX_LEVEL).astype(np.int64)
+    level = np.clip(np.rint(np.log2(wanted / np.float32(base))), 0, MAX_LEVEL).astype(np.int8)
+    budget = max(round(config.max_splats * (1 - config.growth)), 1)
     inverse, kept, sizes = _voxels(p, level, base)
-    while kept.sum() > config.max_splats:
-        base *= 1.05 * float(np.sqrt(kept.sum() / config.max_splats))
+    while kept.sum() > budget:
+        base *= 1.05 * float(np.sqrt(kept.sum() / budget))
         inverse, kept, sizes = _voxels(p, level, base)
     if not kept.any():
         raise NoSurfaceError(_no_surface(len(p)))
+    del p, wanted, level
     count = np.bincount(inverse, minlength=len(kept))[kept]
-    mean = [_average(values, inverse, kept, count) for values in (p, normals, colors)]
-    cloud = _flat_gaussians(mean[0], mean[1], mean[2], sizes[kept], config)
+    means, normals, colors = (
+        _average([getattr(item, name) for item in points], inverse, kept, count)
+        for name in ("p_m", "normals", "colors")
+    )
+    cloud = _flat_gaussians(means, normals, colors, sizes[kept], config)
     return cloud.take(morton_order(cloud.means_m))
 
 
@@ -59,15 +65,20 @@ def _no_surface(num_points: int) -> str:
 
 
 def _voxels(
-    p: np.ndarray, level: Int64[np.ndarray, " num_points"], base_m: float
+    p: Float32[np.ndarray, "num_points 3"], level: Int8[np.ndarray, " num_points"], base_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Voxel of each point, which voxels to keep, and their sizes [m]."""
-    size = base_m * 2.0**level
-    cell = np.floor((p - p.min(axis=0)) / size[:, None]).astype(np.int64)
-    key, inverse, count = np.unique(_pack(cell, level), return_inverse=True, return_counts=True)
+    """Voxel of each point (from a corner), which voxels to keep, and their sizes [m]."""
+    inverse_size = np.float32(1 / base_m) * np.exp2(-level.astype(np.float32))
+    keys = level.astype(np.int64)
+    for axis in range(3):
+        cell = (p[:, axis] * inverse_size).astype(np.int32)
+        keys <<= INDEX_BITS
+        keys |= np.minimum(cell, (1 << INDEX_BITS) - 1)
+    key, inverse, count = np.unique(keys, return_inverse=True, return_counts=True)
     kept = count >= MIN_POINTS
     covered = _covered_by_finer(key, kept)
-    return inverse, kept & ~covered, base_m * 2.0 ** (key >> (3 * INDEX_BITS))
+    sizes = base_m * 2.0 ** (key >> (3 * INDEX_BITS))
+    return inverse.astype(np.int32), kept & ~covered, sizes
 
 
 def _pack(cell: np.ndarray, level: np.ndarray) -> np.ndarray:
@@ -92,10 +103,14 @@ def _covered_by_finer(key: np.ndarray, kept: np.ndarray) -> np.ndarray:
 
 
 def _average(
-    values: np.ndarray, inverse: np.ndarray, kept: np.ndarray, count: np.ndarray
-) -> np.ndarray:
-    sums = [np.bincount(inverse, weights=column, minlength=len(kept))[kept] for column in values.T]
-    return np.asarray(np.stack(sums, axis=1) / count[:, None])
+    tables: list[np.ndarray], inverse: np.ndarray, kept: np.ndarray, count: np.ndarray
+) -> Float[np.ndarray, "num_kept 3"]:
+    """Mean of three columns in each voxel that is kept, one column in memory at a time."""
+    means = np.empty((len(count), 3))
+    for axis in range(3):
+        column = np.concatenate([table[:, axis] for table in tables])
+        means[:, axis] = np.bincount(inverse, weights=column, minlength=len(kept))[kept] / count
+    return means
 
 
 def _flat_gaussians(

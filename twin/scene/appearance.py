@@ -1,0 +1,198 @@
+"""Colours in closed form: with the geometry fixed, an image is linear in them.
+
+A view is A c with A = alpha T, the weight of each Gaussian in each pixel (paper Eq. 2 with the
+product transmittance). All views together make a least-squares problem that a few steps of
+conjugate gradients solve; A is never stored, only drawn (A c) and lifted (A^T image).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from twin.scene.gaussians import (
+    NUM_FIRST,
+    GaussianCloud,
+    as_float32,
+    harmonic_basis,
+    view_directions,
+)
+from twin.scene.raster import Rasteriser
+from twin.scene.training_view import Target
+
+RIDGE_COLOR = 0.05
+"""Pull of a colour towards its start, in squared weights of a pixel."""
+RIDGE_HARMONICS = 0.5
+"""Stronger: a Gaussian seen from few directions says little about the others."""
+SATURATED = 250 / 255
+"""A channel brighter than this no longer follows the exposure."""
+GAIN_PRIOR = 1e-3
+"""Pull of a gain towards 1, as a mean squared brightness: decides only black images."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observation:
+    """One image at one size, where it was seen from, and how bright it came out."""
+
+    target: Target
+    T_base_camera: Float[np.ndarray, "4 4"]
+    gain: Float[np.ndarray, "3"]
+    """Recorded over drawn brightness, per channel."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Appearance:
+    """The outcome of one closed-form solution."""
+
+    cloud: GaussianCloud
+    mse_before: float
+    """Mean squared colour error of the start, over the pixels that count."""
+    steps: int
+
+
+def solve_appearance(
+    cloud: GaussianCloud,
+    observations: Sequence[Observation],
+    rasteriser: Rasteriser,
+    *,
+    steps: int,
+) -> Appearance:
+    """Minimise sum |g A (c + sum_k Y_k h_k) - I|^2 + ridge |x - x_start|^2 over colours x = (c, h).
+
+    Conjugate gradients with a diagonal preconditioner, the three channels side by side. The
+    diagonal is A^T A 1, which bounds A^T A from above. Pixels outside a static mask do not enter,
+    Gaussians that no pixel shows keep their colours.
+
+    Args:
+        cloud: Where to start; its harmonics are solved too if it has any.
+        observations: Images with their gains.
+        rasteriser: Draws and lifts.
+        steps: Conjugate gradient steps, at most; more than six follow the noise.
+    """
+    model = _ImageModel(cloud, observations, rasteriser)
+    start = np.concatenate([cloud.colors[:, None], cloud.harmonics], axis=1)
+    right, diagonal, mse = model.right_side(start)
+    change, done = conjugate_gradients(model.normal, right, diagonal, steps=steps)
+    solved = start + change
+    painted = replace(cloud, colors=as_float32(solved[:, 0]), harmonics=as_float32(solved[:, 1:]))
+    return Appearance(cloud=painted, mse_before=mse, steps=done)
+
+
+def solve_gains(
+    cloud: GaussianCloud, observations: Sequence[Observation], rasteriser: Rasteriser
+) -> Float[np.ndarray, "num_views 3"]:
+    """Brightness of each image relative to the drawn one, per channel; their mean is 1.
+
+    Least squares over static pixels that are not saturated. The mean is the gauge: all images
+    twice as bright and all colours half as bright would look the same.
+    """
+    gains = np.ones((len(observations), 3))
+    for index, item in enumerate(observations):
+        drawn = rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)[:3]
+        gains[index] = gain_between(drawn, item.target)
+    return gains / gains.mean(axis=0)
+
+
+def gain_between(
+    drawn: Float32[np.ndarray, "3 height width"], target: Target
+) -> Float[np.ndarray, "3"]:
+    """The factor per channel that brings a drawn image closest to the recorded one."""
+    wanted = target.image()
+    usable = target.static_mask & (wanted < SATURATED).all(axis=0)
+    recorded, own = wanted[:, usable].astype(np.float64), drawn[:, usable].astype(np.float64)
+    prior = GAIN_PRIOR * max(int(usable.sum()), 1)
+    both = (recorded * own).sum(axis=1) + prior
+    return np.asarray(both / (np.square(own).sum(axis=1) + prior))
+
+
+def conjugate_gradients(
+    apply: Callable[[np.ndarray], np.ndarray],
+    right: Float32[np.ndarray, "num_splats num_terms channels"],
+    diagonal: Float32[np.ndarray, "num_splats num_terms channels"],
+    *,
+    steps: int,
+) -> tuple[Float32[np.ndarray, "num_splats num_terms channels"], int]:
+    """Solve ``apply(x) = right`` from zero, each channel a system of its own.
+
+    Hestenes and Stiefel 1952 with a diagonal preconditioner. Returns x and the steps taken.
+    """
+    x = np.zeros_like(right)
+    residual = right.copy()
+    scaled = residual / diagonal
+    direction = scaled.copy()
+    size = _dots(residual, scaled)
+    enough = 1e-12 * size
+    for step in range(steps):
+        if np.all(size <= enough):
+            return x, step
+        applied = apply(direction)
+        length = size / np.maximum(_dots(direction, applied), 1e-30)
+        x += length.astype(np.float32) * direction
+        residual -= length.astype(np.float32) * applied
+        scaled = residual / diagonal
+        before, size = size, _dots(residual, scaled)
+        direction = scaled + (size / np.maximum(before, 1e-30)).astype(np.float32) * direction
+    return x, steps
+
+
+def _dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Inner product per channel; summed in double precision."""
+    return np.asarray(np.einsum("nkc,nkc->c", a, b, dtype=np.float64))
+
+
+class _ImageModel:
+    """The normal equations of all images, one image in memory at a time."""
+
+    def __init__(
+        self, cloud: GaussianCloud, observations: Sequence[Observation], rasteriser: Rasteriser
+    ) -> None:
+        self._cloud = replace(cloud, harmonics=np.zeros((len(cloud), 0, 3), dtype=np.float32))
+        self._observations = observations
+        self._rasteriser = rasteriser
+        ridge = [RIDGE_COLOR] + [RIDGE_HARMONICS] * (NUM_FIRST if cloud.num_harmonics else 0)
+        self._ridge = np.array(ridge, dtype=np.float32)[None, :, None]
+
+    def right_side(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Pull of all images on the start, the preconditioner, and the mean squared error."""
+        right, diagonal = np.zeros_like(start), np.zeros_like(start)
+        diagonal += self._ridge
+        error, count = 0.0, 0
+        for item in self._observations:
+            gain = item.gain.astype(np.float32)[:, None, None]
+            mask = item.target.static_mask
+            basis = self._basis(item)
+            planes = self._draw(start, basis, item)
+            missing = (item.target.image() - gain * planes[:3]) * mask
+            error += float(np.square(missing, dtype=np.float64).sum())
+            count += 3 * int(mask.sum())
+            maps = np.concatenate([gain * missing, (planes[4] * mask)[None]])
+            lifted = self._rasteriser.lift(maps)
+            right += basis[:, :, None] * lifted[:, None, :3]
+            squared = np.square(item.gain).astype(np.float32) * lifted[:, 3:]
+            diagonal += np.square(basis)[:, :, None] * squared[:, None, :]
+        return right, diagonal, error / max(count, 1)
+
+    def normal(self, x: np.ndarray) -> np.ndarray:
+        """Carry a change of colours into all images and back: (A^T A + ridge) x."""
+        total = self._ridge * x
+        for item in self._observations:
+            basis = self._basis(item)
+            squared = np.square(item.gain).astype(np.float32)[:, None, None]
+            drawn = self._draw(x, basis, item)[:3]
+            lifted = self._rasteriser.lift(squared * drawn * item.target.static_mask)
+            total += basis[:, :, None] * lifted[:, None, :]
+        return np.asarray(total)
+
+    def _basis(self, item: Observation) -> np.ndarray:
+        """Value of each unknown's harmonic along the ray, (num_splats, 1 or 4)."""
+        one = np.ones((len(self._cloud), 1), dtype=np.float32)
+        if self._ridge.shape[1] == 1:
+            return one
+        towards = view_directions(self._cloud.means_m, item.T_base_camera[:3, 3])
+        return np.concatenate([one, harmonic_basis(towards.astype(np.float32))], axis=1)
+
+    def _draw(self, x: np.ndarray, basis: np.ndarray, item: Observation) -> np.ndarray:
+        colors = as_float32(np.einsum("nk,nkc->nc", basis, x))
+        cloud = replace(self._cloud, colors=colors)
+        return self._rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)
