@@ -69,7 +69,7 @@ def load(folder: Path) -> CleanTabletop:
         np.savez(path, images=images, depths=depths)
     with np.load(path, allow_pickle=False) as stored:
         images, depths = stored["images"], stored["depths"]
-    frames = [_frame(index, images[index], depths[index]) for index in range(NUM_VIEWS)]
+    frames = [frame_of(index, images[index], depths[index]) for index in range(NUM_VIEWS)]
     return CleanTabletop(train=frames[::2], held_out=frames[1::2])
 
 
@@ -99,7 +99,8 @@ def look_at_table(along: float) -> np.ndarray:
     return se3.look_at(eye, np.array([0.05, 0.0, 0.66]), np.array([0.0, 0.0, 1.0]))
 
 
-def _frame(index: int, image_u8: np.ndarray, depth_m: np.ndarray) -> RgbdFrame:
+def frame_of(index: int, image_u8: np.ndarray, depth_m: np.ndarray) -> RgbdFrame:
+    """One view as a recording would give it."""
     T = camera_pose(index)
     return RgbdFrame(
         camera_id="clean",

@@ -1,11 +1,16 @@
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pytest
 import textured_room
 
+from bridge.geometry import se3
+from twin.scene.camera_correction import corrected_pose
 from twin.scene.fit import fit
+from twin.scene.fit_state import Checkpoint
 from twin.scene.gaussians import GaussianCloud, arrays
 from twin.scene.initialise import fuse
 from twin.scene.losses import Loss, psnr_db
@@ -15,6 +20,9 @@ from twin.scene.training_view import TrainingView, training_view
 
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 Kind = Literal["3dgs", "paper"]
+ADAM_ALONE = FitConfig(
+    iterations=1, threads=1, appearance_steps=0, harmonics=0, gain=False, densify=False
+)
 
 
 @pytest.mark.parametrize("kind", ["3dgs", "paper"])
@@ -68,13 +76,143 @@ def test_fitting_improves_the_images(
     room: tuple[GaussianCloud, list[TrainingView]], kind: Kind
 ) -> None:
     seen: list[str] = []
-    config = FitConfig(iterations=40, loss=kind, threads=1)
+    config = replace(ADAM_ALONE, iterations=40, loss=kind)
     fitted = fit(*room, config, lambda done, note: seen.append(note))
     barely = fit(*room, replace(config, iterations=4), lambda *_: None)
     assert fitted.iterations == 40
     assert fitted.coarse_iterations == 24
     assert fitted.train_psnr_db > barely.train_psnr_db + 1.0
     assert "PSNR" in seen[-1]
+    assert "s left" in seen[-1]
+
+
+def test_solved_colours_are_ahead_of_adam_alone(
+    room: tuple[GaussianCloud, list[TrainingView]],
+) -> None:
+    alone = fit(*room, replace(ADAM_ALONE, iterations=8), lambda *_: None)
+    solved = fit(*room, replace(ADAM_ALONE, iterations=8, appearance_steps=4), lambda *_: None)
+    assert solved.train_psnr_db > alone.train_psnr_db + 0.5
+
+
+def test_frames_of_different_exposure_are_told_from_the_scene(
+    room: tuple[GaussianCloud, list[TrainingView]],
+) -> None:
+    start, views = room
+    gains = np.array([0.7, 0.9, 0.8, 0.6])
+    exposed = [
+        replace(
+            view,
+            half=replace(view.half, planes_u8=(view.half.planes_u8 * gain).astype(np.uint8)),
+            full=replace(view.full, planes_u8=(view.full.planes_u8 * gain).astype(np.uint8)),
+        )
+        for view, gain in zip(views, gains, strict=True)
+    ]
+    config = FitConfig(iterations=30, threads=1, densify=False)
+    told = fit(start, exposed, config, lambda *_: None)
+    untold = fit(start, exposed, replace(config, gain=False), lambda *_: None)
+    assert told.train_psnr_db > untold.train_psnr_db + 2.0
+    np.testing.assert_allclose(told.gains.mean(axis=0), 1.0, rtol=1e-9)
+    np.testing.assert_allclose(told.gains / gains[:, None] * gains.mean(), 1.0, atol=0.06)
+    np.testing.assert_array_equal(untold.gains, 1.0)
+
+
+def test_gaussians_are_added_within_their_budget_and_only_if_wanted(
+    room: tuple[GaussianCloud, list[TrainingView]],
+) -> None:
+    start, views = room
+    most = len(start) + 120
+    config = FitConfig(iterations=20, threads=1)
+    grown = fit(start, views, config, lambda *_: None, max_splats=most)
+    assert len(start) < len(grown.cloud) <= most
+    assert grown.num_split - grown.num_pruned == len(grown.cloud) - len(start)
+    fixed = fit(start, views, replace(config, densify=False), lambda *_: None, max_splats=most)
+    assert len(fixed.cloud) == len(start)
+    assert len(fit(start, views, config, lambda *_: None).cloud) <= len(start)
+
+
+def test_refining_poses_brings_shaken_cameras_back(
+    room: tuple[GaussianCloud, list[TrainingView]],
+) -> None:
+    start, views = room
+    rng = np.random.default_rng(1)
+    shaken = [views[0]]
+    for view in views[1:]:
+        correction = np.concatenate([rng.normal(0, 0.004, 3), rng.normal(0, 0.004, 3)])
+        pose = corrected_pose(view.T_base_color, correction)
+        shaken.append(replace(view, T_base_color=pose))
+    config = FitConfig(iterations=160, threads=1, refine_poses=True, densify=False)
+    fitted = fit(start, shaken, config, lambda *_: None)
+
+    def off(poses: np.ndarray) -> float:
+        apart = [poses[i] @ se3.invert(view.T_base_color) for i, view in enumerate(views)]
+        return float(np.mean([se3.rotation_angle_rad(T[:3, :3]) for T in apart]))
+
+    before = off(np.stack([view.T_base_color for view in shaken]))
+    assert off(fitted.Ts_base_color) < 0.7 * before
+    np.testing.assert_array_equal(fitted.Ts_base_color[0], views[0].T_base_color)
+    still = fit(start, shaken, replace(config, iterations=4, refine_poses=False), lambda *_: None)
+    np.testing.assert_array_equal(still.Ts_base_color[2], shaken[2].T_base_color)
+
+
+class StopError(Exception):
+    """The power went out."""
+
+
+def stop_after(count: int) -> Callable[[int, str], None]:
+    def advance(done: int, note: str) -> None:
+        if note.startswith(f"image {count},"):
+            raise StopError
+
+    return advance
+
+
+def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(
+    room: tuple[GaussianCloud, list[TrainingView]], tmp_path: Path
+) -> None:
+    start, views = room
+    config = FitConfig(iterations=14, threads=1, refine_poses=True)
+    most = len(start) + 50
+    whole = fit(start, views, config, lambda *_: None, max_splats=most)
+    kept = Checkpoint(path=tmp_path / "fit.npz", key="this fit", period_s=0.0)
+    with pytest.raises(StopError):
+        fit(start, views, config, stop_after(9), max_splats=most, checkpoint=kept)
+    steps: list[str] = []
+    resumed = fit(
+        start,
+        views,
+        config,
+        lambda done, note: steps.append(note),
+        max_splats=most,
+        checkpoint=kept,
+    )
+    assert len(steps) == 14 - 8
+    for name, rows in arrays(whole.cloud):
+        np.testing.assert_array_equal(rows, getattr(resumed.cloud, name))
+    np.testing.assert_array_equal(whole.Ts_base_color, resumed.Ts_base_color)
+    assert whole.train_psnr_db == resumed.train_psnr_db
+
+
+def test_a_state_of_other_settings_or_a_damaged_one_is_not_used(
+    room: tuple[GaussianCloud, list[TrainingView]], tmp_path: Path
+) -> None:
+    start, views = room
+    path = tmp_path / "fit.npz"
+    config = replace(ADAM_ALONE, iterations=3)
+    done: list[int] = []
+
+    def run(key: str) -> int:
+        done.clear()
+        checkpoint = Checkpoint(path=path, key=key, period_s=0.0)
+        fit(start, views, config, lambda *_: done.append(1), checkpoint=checkpoint)
+        return len(done)
+
+    assert run("one") == 3
+    assert run("one") == 0
+    assert run("another") == 3
+    path.write_bytes(path.read_bytes()[:5000])
+    assert run("another") == 3
+    path.write_bytes(b"no archive")
+    assert run("another") == 3
 
 
 def test_a_number_of_images_repeats_bit_for_bit_with_any_threads(
@@ -113,7 +251,7 @@ def test_pixels_that_are_passed_over_do_not_make_the_fit_look_better(
     room: tuple[GaussianCloud, list[TrainingView]],
 ) -> None:
     start, views = room
-    config = FitConfig(iterations=1, coarse_fraction=0.0, threads=1)
+    config = replace(ADAM_ALONE, coarse_fraction=0.0)
 
     def masked(view: TrainingView, shown: slice) -> TrainingView:
         mask = np.zeros_like(view.full.static_mask)
