@@ -70,8 +70,8 @@ def scene_from_masks(
         ""
         if instances
         else (
-            f"{num_masks} masks in {len(observations)} frames gave no instance: each needs matching "
-            "masks in several frames"
+            f"{num_masks} masks in {len(observations)} frames gave no instance: each needs "
+            "matching masks in several frames"
         )
     )
     return SemanticScene(instances=instances, labels=found.labels, source=source, remark=remark)

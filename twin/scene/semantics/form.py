@@ -123,8 +123,7 @@ def measure_form(xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float) -> For
     low, high = np.quantile(xyh_m, [0.005, 0.995], axis=0)
     extent = float((high - low).max())
     heights = height_map(xyh_m, max(cell_m, extent / 48))
-    flat = [*_rectangle(xyh_m[:, :2])]
-    centre_xy, sides, yaw, fill = flat
+    centre_xy, sides, yaw, fill = _rectangle(xyh_m[:, :2])
     top = float(high[2])
     solid = float(heights.top_m.sum()) * heights.cell_m**2
     ratio = _hull_volume(xyh_m) / max(solid, 1e-12)
@@ -190,8 +189,8 @@ def _word(
     if cavity is not None and ratio > CONTAINER_RATIO:
         return "open container"
     long, short, height = size_m
-    plateau = float((heights.top_m[heights.footprint] > 0.8 * height).mean())
-    if plateau > 0.6:
+    plateau = float((heights.top_m[heights.footprint] > 0.85 * height).mean())
+    if plateau > 0.68:
         if fill > 0.88 or long > 1.25 * short:
             if height < 0.35 * short:
                 return "flat box"

@@ -19,7 +19,6 @@ from twin.scene.semantics.result import FeatureMap, MaskSet, SemanticsError
 
 MIN_WEIGHT = 0.05
 """A Gaussian that gives a frame less than this share of one pixel is not seen in it."""
-CHANNELS_AT_ONCE = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,28 +82,8 @@ def _transposed(
     maps: Float32[np.ndarray, "num_channels height width"],
 ) -> Float32[np.ndarray, "num_splats num_channels"]:
     """A^T of one view on any number of channels."""
-    plain = without_colour(cloud)
-    planes = rasteriser.draw_planes(plain, viewpoint.camera, viewpoint.T_base_camera)
-    lifted = []
-    for first in range(0, len(maps), CHANNELS_AT_ONCE):
-        block = maps[first : first + CHANNELS_AT_ONCE]
-        upstream = np.zeros_like(planes)
-        upstream[: len(block)] = block
-        lifted.append(rasteriser.pull_back(planes, upstream).colors[:, : len(block)])
-    return as_float32(np.concatenate(lifted, axis=1))
-
-
-def without_colour(
-    cloud: GaussianCloud, colors: Float32[np.ndarray, "num_splats 3"] | None = None
-) -> GaussianCloud:
-    """The same Gaussians in other colours (black when None) that no direction changes."""
-    return GaussianCloud(
-        means_m=cloud.means_m,
-        quats_wxyz=cloud.quats_wxyz,
-        scales_log=cloud.scales_log,
-        opacities_logit=cloud.opacities_logit,
-        colors=np.zeros_like(cloud.means_m) if colors is None else as_float32(colors),
-    )
+    rasteriser.draw_planes(cloud, viewpoint.camera, viewpoint.T_base_camera)
+    return rasteriser.lift(maps)
 
 
 def lift_features(
@@ -176,34 +155,10 @@ def render_labels(
     viewpoint: Viewpoint,
 ) -> UInt16[np.ndarray, "height width"]:
     """Per pixel the label that gives it most; 0 also where empty space gives more."""
-    present = [int(label) for label in np.unique(labels) if label]
-    shape = (viewpoint.camera.height, viewpoint.camera.width)
-    best = np.zeros(shape, dtype=np.uint16)
-    if not present:
-        return best
-    shares = [
-        (labels[:, None] == np.array([*block, *[0] * (CHANNELS_AT_ONCE - len(block))]))
-        & (np.arange(CHANNELS_AT_ONCE) < len(block))
-        for block in _blocks(present)
-    ]
-    drawn = []
-    for share in shares:
-        tinted = without_colour(cloud, share.astype(np.float32))
-        planes = rasteriser.draw_planes(tinted, viewpoint.camera, viewpoint.T_base_camera)
-        drawn.append(planes[:CHANNELS_AT_ONCE])
-    weight = np.concatenate(drawn)[: len(present)]
-    other = 1.0 - weight.sum(axis=0)
-    winner = weight.argmax(axis=0)
-    wins = weight.max(axis=0) > other
-    best[wins] = np.array(present, dtype=np.uint16)[winner[wins]]
-    return best
-
-
-def _blocks(present: list[int]) -> list[list[int]]:
-    return [
-        present[first : first + CHANNELS_AT_ONCE]
-        for first in range(0, len(present), CHANNELS_AT_ONCE)
-    ]
+    planes = rasteriser.draw_planes(cloud, viewpoint.camera, viewpoint.T_base_camera)
+    ids, weight = rasteriser.label_map(labels)
+    ids[weight <= 1.0 - planes[4]] = 0
+    return ids
 
 
 def visible_weight(

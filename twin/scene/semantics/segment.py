@@ -23,6 +23,7 @@ from twin.scene.semantics.split import SplitConfig, split_by_colour, split_by_va
 from twin.scene.semantics.support import SupportConfig, SupportPlane, find_support
 
 SOURCE = "default segmenter"
+MAX_FOOT_ROUNDS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,27 +212,31 @@ def _add_feet(
     voxel_m: float,
     config: SegmentConfig,
 ) -> None:
-    """Give low points to the thing close by whose colour they have and the plane has not."""
-    firm, feet = np.flatnonzero(labels > 0), np.flatnonzero(low)
-    if not len(firm) or not len(feet):
-        return
-    reach = config.min_height_m + 1.5 * voxel_m
-    distance, nearest = cKDTree(points.p_m[firm]).query(
-        points.p_m[feet], distance_upper_bound=reach
-    )
-    near = np.isfinite(distance)
-    feet, thing = feet[near], firm[nearest[near]]
-    plane = np.flatnonzero(low & (np.abs(height_m) < 0.5 * config.min_height_m))
-    if not len(feet) or not len(plane):
+    """Give low points to the thing close by whose colour they have and the plane has not.
+
+    Repeated, so that the floor of a box is reached from its walls.
+    """
+    plane = low & (np.abs(height_m) < 0.5 * config.min_height_m)
+    if not plane.any():
         return
     lab = lab_from_srgb(points.colors)
-    usual = np.median(lab[plane], axis=0)
-    to_thing = np.linalg.norm(lab[feet] - lab[thing], axis=1)
-    to_plane = np.linalg.norm(lab[feet] - usual, axis=1)
-    # Where thing and plane have one colour, height decides: 2 mm is above the noise.
-    clear = (to_thing < config.foot_colour_gap) & (to_thing < 0.5 * to_plane)
-    mine = clear | ((height_m[feet] > 0.5 * config.min_height_m) & (to_thing < to_plane))
-    labels[feet[mine]] = labels[thing[mine]]
+    to_plane = np.linalg.norm(lab - np.median(lab[plane], axis=0), axis=1)
+    reach = config.min_height_m + 1.5 * voxel_m
+    for _ in range(MAX_FOOT_ROUNDS):
+        firm, feet = np.flatnonzero(labels > 0), np.flatnonzero(low & (labels == 0))
+        if not len(firm) or not len(feet):
+            return
+        gap, nearest = cKDTree(points.p_m[firm]).query(points.p_m[feet], distance_upper_bound=reach)
+        near = np.isfinite(gap)
+        feet, thing = feet[near], firm[nearest[near]]
+        to_thing = np.linalg.norm(lab[feet] - lab[thing], axis=1)
+        clear = (to_thing < config.foot_colour_gap) & (to_thing < 0.5 * to_plane[feet])
+        # Where thing and plane look alike, height decides: half the least height is no noise.
+        raised = (height_m[feet] > 0.5 * config.min_height_m) & (to_thing < to_plane[feet])
+        mine = clear | raised
+        if not mine.any():
+            return
+        labels[feet[mine]] = labels[thing[mine]]
 
 
 def _thing(

@@ -22,8 +22,8 @@ class SplitConfig:
 
     max_colours: int = 4
     """Colours to look for in one group."""
-    lightness_weight: float = 0.5
-    """Shading changes lightness more than hue."""
+    lightness_weight: float = 0.3
+    """Shading changes lightness, not the ratios of a and b to it."""
     colour_noise: float = 5.0
     """Spread of one colour, in Lab units; groups tighter than this gain nothing by a cut."""
     min_colour_gap: float = 20.0
@@ -56,7 +56,7 @@ def split_by_colour(
     pieces of one colour. A piece much smaller than its neighbour is a marking (a beak, a label)
     and joins it, unless it lies in the neighbour's cavity.
     """
-    colour = voxels.lab * np.array([config.lightness_weight, 1.0, 1.0])
+    colour = _without_shading(voxels.lab, config.lightness_weight)
     classes = _colour_classes(colour, config)
     if classes.max(initial=0) == 0:
         return classes
@@ -67,6 +67,15 @@ def split_by_colour(
         if small is None:
             return numbered(pieces)
         pieces = np.where(pieces == small[0], small[1], pieces)
+
+
+def _without_shading(lab: np.ndarray, lightness_weight: float) -> np.ndarray:
+    """Lab as it would be at lightness 50, and a little of the lightness itself.
+
+    Light that is s times as strong multiplies a, b and L + 16 by the cube root of s.
+    """
+    strength = np.maximum(lab[:, :1] + 16.0, 25.0) / 66.0
+    return np.concatenate([lightness_weight * lab[:, :1], lab[:, 1:] / strength], axis=1)
 
 
 def _colour_classes(colour: np.ndarray, config: SplitConfig) -> np.ndarray:

@@ -1,0 +1,171 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import table_scene
+from table_scene import World, iou
+
+from bridge.geometry.camera import Camera
+from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.raster import RasterConfig, Rasteriser
+from twin.scene.semantics.describe import scene_from_masks
+from twin.scene.semantics.lift import (
+    Viewpoint,
+    lift_features,
+    mask_iou,
+    observe,
+    render_labels,
+    visible_weight,
+)
+from twin.scene.semantics.result import FeatureMap, Mask, MaskSet, SemanticsError
+
+SMALL = Viewpoint(
+    camera=Camera(width=24, height=16, fx=20.0, fy=20.0, cx=12.0, cy=8.0), T_base_camera=np.eye(4)
+)
+
+
+def few_gaussians(count: int = 30) -> GaussianCloud:
+    rng = np.random.default_rng(0)
+    return GaussianCloud(
+        means_m=as_float32(rng.uniform([-0.5, -0.35, 0.8], [0.5, 0.35, 1.6], (count, 3))),
+        quats_wxyz=as_float32(rng.normal(size=(count, 4))),
+        scales_log=as_float32(np.log(rng.uniform(0.02, 0.1, (count, 3)))),
+        opacities_logit=as_float32(rng.normal(0.5, 1.0, count)),
+        colors=as_float32(rng.uniform(size=(count, 3))),
+    )
+
+
+def drawing_matrix(rasteriser: Rasteriser, cloud: GaussianCloud) -> np.ndarray:
+    """A by its definition: what each Gaussian alone gives each pixel, one drawing for each."""
+    columns = []
+    for index in range(len(cloud)):
+        tint = np.zeros((len(cloud), 3), dtype=np.float32)
+        tint[index, 0] = 1.0
+        planes = rasteriser.draw_planes(
+            replace(cloud, colors=tint), SMALL.camera, SMALL.T_base_camera
+        )
+        columns.append(planes[0].ravel())
+    return np.stack(columns, axis=1)
+
+
+@pytest.fixture
+def rasteriser() -> Rasteriser:
+    return Rasteriser(RasterConfig(threads=1))
+
+
+@pytest.mark.parity
+def test_lifting_is_the_transpose_of_drawing(rasteriser: Rasteriser) -> None:
+    cloud = few_gaussians()
+    A = drawing_matrix(rasteriser, cloud).astype(np.float64)
+    values = np.random.default_rng(1).normal(size=(7, 16, 24)).astype(np.float32)
+    features, weight = lift_features(
+        rasteriser, cloud, [(SMALL, FeatureMap(values=values, stride=1))]
+    )
+    np.testing.assert_allclose(weight, A.sum(axis=0), rtol=1e-4, atol=1e-4)
+    seen = weight > 0.01
+    expected = (A.T @ values.reshape(7, -1).T) / A.sum(axis=0)[:, None]
+    np.testing.assert_allclose(features[seen], expected[seen], rtol=2e-3, atol=2e-3)
+
+
+def test_a_constant_map_gives_every_gaussian_that_is_seen_the_constant(
+    rasteriser: Rasteriser,
+) -> None:
+    values = np.full((5, 4, 6), 0.7, dtype=np.float32)
+    features, weight = lift_features(
+        rasteriser, few_gaussians(), [(SMALL, FeatureMap(values=values, stride=4))] * 2
+    )
+    np.testing.assert_allclose(features[weight > 0], 0.7, rtol=1e-4)
+    assert (weight > 0).sum() > 20
+
+
+def test_features_of_two_frames_are_their_weighted_mean(rasteriser: Rasteriser) -> None:
+    cloud, rng = few_gaussians(), np.random.default_rng(2)
+    maps = [
+        FeatureMap(values=rng.normal(size=(4, 16, 24)).astype(np.float32), stride=1)
+        for _ in range(2)
+    ]
+    (a, wa), (b, wb) = (lift_features(rasteriser, cloud, [(SMALL, item)]) for item in maps)
+    both, weight = lift_features(rasteriser, cloud, [(SMALL, item) for item in maps])
+    seen = (wa > 0.01) & (wb > 0.01)
+    np.testing.assert_allclose(weight, wa + wb, rtol=1e-5, atol=1e-3)
+    mean = (a * wa[:, None] + b * wb[:, None])[seen] / weight[seen, None]
+    np.testing.assert_allclose(both[seen], mean, rtol=1e-3, atol=1e-3)
+
+
+def test_a_map_that_does_not_fit_its_camera_is_refused(rasteriser: Rasteriser) -> None:
+    wrong = FeatureMap(values=np.zeros((2, 5, 5), dtype=np.float32), stride=2)
+    with pytest.raises(SemanticsError, match="5 x 5 cells, 2 pixels each, does not fit"):
+        lift_features(rasteriser, few_gaussians(), [(SMALL, wrong)])
+    with pytest.raises(SemanticsError, match="no frame"):
+        lift_features(rasteriser, few_gaussians(), [])
+
+
+def test_a_mask_of_another_size_is_refused(rasteriser: Rasteriser) -> None:
+    masks = MaskSet(
+        camera_id="c", stamp_ns=5, masks=[Mask(image=np.ones((3, 4), dtype=bool), label="cup")]
+    )
+    with pytest.raises(SemanticsError, match=r"'cup'.*4 x 3 pixels.*24 x 16"):
+        observe(rasteriser, few_gaussians(), SMALL, masks)
+
+
+def test_colours_and_harmonics_of_the_scene_do_not_touch_lifting(rasteriser: Rasteriser) -> None:
+    cloud = few_gaussians()
+    dark = replace(cloud, colors=np.zeros_like(cloud.colors))
+    np.testing.assert_array_equal(
+        visible_weight(rasteriser, cloud, SMALL), visible_weight(rasteriser, dark, SMALL)
+    )
+
+
+def test_labels_of_one_gaussian_each_win_where_it_is_brightest(rasteriser: Rasteriser) -> None:
+    cloud = few_gaussians(9)
+    A = drawing_matrix(rasteriser, cloud)
+    ids = render_labels(rasteriser, cloud, np.arange(1, 10, dtype=np.uint16), SMALL).ravel()
+    empty = 1.0 - A.sum(axis=1)
+    clear = np.abs(A.max(axis=1) - empty) > 1e-4
+    expected = np.where(A.max(axis=1) > empty, A.argmax(axis=1) + 1, 0)
+    np.testing.assert_array_equal(ids[clear], expected[clear])
+    assert len(set(ids.tolist())) > 4
+
+
+def test_iou_of_nothing_with_nothing_is_undefined() -> None:
+    nothing, some = np.zeros((2, 2), dtype=bool), np.ones((2, 2), dtype=bool)
+    assert mask_iou(nothing, nothing) is None
+    assert mask_iou(some, nothing) == 0.0
+    assert mask_iou(some, some) == 1.0
+
+
+def test_lifting_perfect_masks_returns_them(tabletop: World, rasteriser: Rasteriser) -> None:
+    frames = [(shot.viewpoint, tabletop.masks(shot)) for shot in tabletop.train]
+    scene = scene_from_masks(tabletop.cloud, frames, rasteriser)
+    assert {item.label for item in scene.instances} == set(tabletop.names.values())
+    assert scene.source == "truth"
+    for shot in tabletop.held_out:
+        ids = render_labels(rasteriser, tabletop.cloud, scene.labels, shot.viewpoint)
+        for item in scene.instances:
+            number = next(k for k, name in tabletop.names.items() if name == item.label)
+            assert iou(ids == item.id, shot.instance == number) > 0.9
+
+
+def test_instances_know_their_box_colour_and_support(
+    tabletop: World, rasteriser: Rasteriser
+) -> None:
+    frames = [(shot.viewpoint, tabletop.masks(shot)) for shot in tabletop.train]
+    scene = scene_from_masks(tabletop.cloud, frames, rasteriser)
+    cube = next(item for item in scene.instances if item.label == "red cube")
+    assert cube.support == cube.seen == len(tabletop.train)
+    np.testing.assert_allclose(cube.T_base_instance[:3, 3], [-0.13, -0.10, 0.02], atol=0.004)
+    np.testing.assert_allclose(cube.size_m, [0.04, 0.04, 0.04], atol=0.007)
+    assert cube.color_srgb[0] > 2 * cube.color_srgb[1]
+    np.testing.assert_allclose(cube.keypoints_m["top"], [-0.13, -0.10, 0.04], atol=0.005)
+
+
+def test_no_masks_give_no_instance_and_say_so(tabletop: World, rasteriser: Rasteriser) -> None:
+    shot = tabletop.train[0]
+    scene = scene_from_masks(tabletop.cloud, [(shot.viewpoint, tabletop.masks(shot))], rasteriser)
+    assert scene.instances == ()
+    assert "4 masks in 1 frames gave no instance" in scene.remark
+
+
+def test_the_truth_of_this_folder_is_what_was_built(tabletop: World) -> None:
+    assert set(np.unique(tabletop.true_instances())) == {0, 1, 2, 3, 4}
+    assert isinstance(tabletop, table_scene.World)

@@ -1,0 +1,134 @@
+import numpy as np
+import pytest
+import table_scene
+from table_scene import BLUE, GREEN, RED, World, box, duck, ellipsoid, iou, make_world, table
+
+from twin.scene.raster import RasterConfig, Rasteriser
+from twin.scene.semantics.describe import scene_by_default
+from twin.scene.semantics.from_view import masks_from_labels, points_of, segment_frame
+from twin.scene.semantics.segment import Segmentation, SegmentConfig, segment_points
+from twin.scene.semantics.support import NoSupportError
+
+
+def segmented(pieces: list[table_scene.Piece], num: int = 8) -> tuple[World, Segmentation]:
+    world = make_world(pieces, num_train=num, num_held_out=0)
+    return world, segment_points(points_of(world.cloud), SegmentConfig())
+
+
+def matched(world: World, found: Segmentation) -> dict[int, tuple[str, float]]:
+    """Best label and IoU of each true instance."""
+    truth = world.true_instances()
+    best = {}
+    for number in sorted(set(truth.tolist()) - {0}):
+        scores = [iou(found.labels == k + 1, truth == number) for k in range(len(found.things))]
+        top = int(np.argmax(scores))
+        best[number] = (found.things[top].label, scores[top])
+    return best
+
+
+def test_everything_on_the_table_is_found_and_named(tabletop: World) -> None:
+    found = segment_points(points_of(tabletop.cloud), SegmentConfig())
+    best = matched(tabletop, found)
+    assert {number: label for number, (label, _) in best.items()} == tabletop.names
+    assert all(score > 0.85 for _, score in best.values())
+    assert len(found.things) == 4
+
+
+def test_one_view_is_enough_for_masks(tabletop: World) -> None:
+    shot = tabletop.train[0]
+    masks = segment_frame(shot.frame)
+    assert masks.source == "default segmenter"
+    for number in tabletop.names:
+        truth = shot.instance == number
+        assert max(iou(mask.image, truth) for mask in masks.masks) > 0.7
+
+
+def test_the_fused_scene_gives_masks_of_every_frame(tabletop: World) -> None:
+    rasteriser = Rasteriser(RasterConfig(threads=1))
+    viewpoints = [shot.viewpoint for shot in tabletop.train]
+    scene = scene_by_default(tabletop.cloud, viewpoints, rasteriser)
+    assert all(item.support == len(viewpoints) for item in scene.instances)
+    names = [item.label for item in scene.instances]
+    shot = tabletop.held_out[0]
+    masks = masks_from_labels(rasteriser, tabletop.cloud, scene.labels, names, shot.viewpoint)
+    for mask in masks.masks:
+        number = next(k for k, name in tabletop.names.items() if name == mask.label)
+        assert iou(mask.image, shot.instance == number) > 0.8
+
+
+@pytest.mark.slow
+def test_ducks_that_touch_are_two_and_keep_their_heads() -> None:
+    world, found = segmented([table(), *duck(1, 0.0, 0.036, 0.3), *duck(2, 0.0, -0.036, 2.8)])
+    best = matched(world, found)
+    assert len(found.things) == 2
+    assert all(score > 0.85 and label == "yellow toy" for label, score in best.values())
+
+
+@pytest.mark.slow
+def test_a_cube_on_a_cube_of_another_colour_is_its_own_thing() -> None:
+    pieces = [
+        table(),
+        box(1, [0, 0, 0.025], [0.05, 0.05, 0.05], BLUE),
+        box(2, [0, 0, 0.07], [0.04, 0.04, 0.04], RED),
+        box(3, [0.051, 0, 0.02], [0.05, 0.05, 0.04], GREEN),
+    ]
+    world, found = segmented(pieces)
+    best = matched(world, found)
+    assert len(found.things) == 3
+    assert [label.split()[0] for label, _ in best.values()] == ["blue", "red", "green"]
+    assert all(score > 0.8 for _, score in best.values())
+
+
+@pytest.mark.slow
+def test_a_thing_in_a_box_is_not_the_box() -> None:
+    pieces = [
+        table(),
+        *table_scene.open_box(1, 0, 0, BLUE),
+        ellipsoid(2, [0, 0, 0.03], [0.024] * 3, RED),
+    ]
+    world, found = segmented(pieces, num=10)
+    best = matched(world, found)
+    assert [label for label, _ in best.values()] == ["blue open container", "red ball"]
+    assert all(score > 0.75 for _, score in best.values())
+
+
+def test_points_of_the_robot_are_left_out(tabletop: World) -> None:
+    points = points_of(tabletop.cloud)
+    near = np.linalg.norm(points.p_m - [-0.13, -0.10, 0.02], axis=1) < 0.06
+    robot = points.p_m[near & (points.p_m[:, 2] > 0.01)]
+    found = segment_points(points, SegmentConfig(), robot_m=robot)
+    assert sorted(thing.label for thing in found.things) == sorted(
+        set(tabletop.names.values()) - {"red cube"}
+    )
+
+
+def test_an_empty_table_gives_one_sentence() -> None:
+    _, found = segmented([table()], num=4)
+    assert found.things == ()
+    assert found.remark.startswith("nothing stands on the level plane at z = ")
+
+
+def test_without_a_level_plane_it_says_what_is_missing() -> None:
+    rng = np.random.default_rng(0)
+    cloud = make_world([table()], num_train=3, num_held_out=0).cloud
+    ball = points_of(cloud)
+    p = rng.normal(size=(len(ball), 3))
+    p /= np.linalg.norm(p, axis=1, keepdims=True)
+    with pytest.raises(NoSupportError, match="z up in the root frame"):
+        segment_points(type(ball)(p_m=5.0 * p, normals=p, colors=ball.colors), SegmentConfig())
+
+
+def test_the_answer_does_not_depend_on_where_the_table_stands(tabletop: World) -> None:
+    points = points_of(tabletop.cloud)
+    angle = 0.7
+    turn = np.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]]
+    )
+    moved = type(points)(
+        p_m=points.p_m @ turn.T + [1.5, -0.4, 0.8],
+        normals=points.normals @ turn.T,
+        colors=points.colors,
+    )
+    first, second = (segment_points(item, SegmentConfig()) for item in (points, moved))
+    assert [t.label for t in first.things] == [t.label for t in second.things]
+    assert (first.labels == second.labels).mean() > 0.99
