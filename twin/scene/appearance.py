@@ -16,7 +16,6 @@ from twin.scene.gaussians import (
     GaussianCloud,
     as_float32,
     harmonic_basis,
-    view_directions,
 )
 from twin.scene.raster import Rasteriser
 from twin.scene.training_view import Target
@@ -147,7 +146,7 @@ class _ImageModel:
     def __init__(
         self, cloud: GaussianCloud, observations: Sequence[Observation], rasteriser: Rasteriser
     ) -> None:
-        self._cloud = replace(cloud, harmonics=np.zeros((len(cloud), 0, 3), dtype=np.float32))
+        self._cloud = cloud
         self._observations = observations
         self._rasteriser = rasteriser
         ridge = [RIDGE_COLOR] + [RIDGE_HARMONICS] * (NUM_FIRST if cloud.num_harmonics else 0)
@@ -162,7 +161,7 @@ class _ImageModel:
             gain = item.gain.astype(np.float32)[:, None, None]
             mask = item.target.static_mask
             basis = self._basis(item)
-            planes = self._draw(start, basis, item)
+            planes = self._draw(start, item)
             missing = (item.target.image() - gain * planes[:3]) * mask
             error += float(np.square(missing, dtype=np.float64).sum())
             count += 3 * int(mask.sum())
@@ -179,20 +178,20 @@ class _ImageModel:
         for item in self._observations:
             basis = self._basis(item)
             squared = np.square(item.gain).astype(np.float32)[:, None, None]
-            drawn = self._draw(x, basis, item)[:3]
+            drawn = self._draw(x, item)[:3]
             lifted = self._rasteriser.lift(squared * drawn * item.target.static_mask)
             total += basis[:, :, None] * lifted[:, None, :]
         return np.asarray(total)
 
-    def _basis(self, item: Observation) -> np.ndarray:
-        """Value of each unknown's harmonic along the ray, (num_splats, 1 or 4)."""
-        one = np.ones((len(self._cloud), 1), dtype=np.float32)
-        if self._ridge.shape[1] == 1:
-            return one
-        towards = view_directions(self._cloud.means_m, item.T_base_camera[:3, 3])
-        return np.concatenate([one, harmonic_basis(towards.astype(np.float32))], axis=1)
+    def _basis(self, item: Observation) -> Float32[np.ndarray, "num_splats num_terms"]:
+        """Value of each unknown's harmonic along the ray to each Gaussian; 1 for the colour."""
+        basis = np.ones((len(self._cloud), self._ridge.shape[1]), dtype=np.float32)
+        if basis.shape[1] > 1:
+            ray = self._cloud.means_m - item.T_base_camera[:3, 3].astype(np.float32)
+            ray /= np.sqrt(np.einsum("ni,ni->n", ray, ray))[:, None] + np.float32(1e-12)
+            basis[:, 1:] = harmonic_basis(ray)
+        return basis
 
-    def _draw(self, x: np.ndarray, basis: np.ndarray, item: Observation) -> np.ndarray:
-        colors = as_float32(np.einsum("nk,nkc->nc", basis, x))
-        cloud = replace(self._cloud, colors=colors)
+    def _draw(self, x: np.ndarray, item: Observation) -> np.ndarray:
+        cloud = replace(self._cloud, colors=as_float32(x[:, 0]), harmonics=as_float32(x[:, 1:]))
         return self._rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)
