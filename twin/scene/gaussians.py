@@ -105,7 +105,7 @@ def harmonic_basis(
     In the order and with the signs of 3D Gaussian splatting files: sqrt(3 / (4 pi)) (-y, z, -x).
     """
     x, y, z = np.moveaxis(directions, -1, 0)
-    return np.stack([-y, z, -x], axis=-1) * np.asarray(SH_FIRST, dtype=directions.dtype)
+    return np.asarray(np.stack([-y, z, -x], axis=-1) * directions.dtype.type(SH_FIRST))
 
 
 def effective_colors(
