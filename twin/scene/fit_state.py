@@ -13,6 +13,8 @@ from twin.scene.adam import Moments, Rates, no_moments, own_copy
 from twin.scene.camera_correction import CameraCorrections
 from twin.scene.gaussians import GaussianCloud, arrays
 
+FIT_STATE = "fit.npz"
+"""In the scene folder while a fit runs, or after one that was interrupted."""
 STATE_VERSION = 1
 SCALARS = ("step", "coarse_steps", "events_done", "num_split", "num_pruned")
 CAMERA_ARRAYS = ("values", "first", "second", "counts")

@@ -13,6 +13,7 @@ from bridge.errors import UsageError
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
 from twin.scene.fit import fit
+from twin.scene.fit_state import FIT_STATE, Checkpoint
 from twin.scene.frames import (
     FrameChoice,
     NoFramesError,
@@ -39,7 +40,7 @@ from twin.scene.store import (
 from twin.scene.training_view import TrainingView, training_view
 from twin.scene.views import ViewsJob, views_path, write_views
 
-METHOD_VERSION = 6
+METHOD_VERSION = 7
 """Counts changes of method that make older scenes out of date."""
 MAX_POINTS = 3_000_000
 """Depth points to fuse; more change nothing but the time."""
@@ -79,9 +80,19 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     output.detail(f"{len(learnt.moving.keys)} voxels hold something that moved")
     first = fuse(learnt.points, config.initialise)
     output.say(f"{len(first)} Gaussians from {len(learnt.views)} training frames")
-    with output.progress("fit", 100) as advance:
-        fitted = fit(first, learnt.views, config.fit, advance)
     run.scene_dir.mkdir(parents=True, exist_ok=True)
+    kept = Checkpoint(path=run.scene_dir / FIT_STATE, key=key)
+    if config.force:
+        kept.path.unlink(missing_ok=True)
+    with output.progress("fit", 100) as advance:
+        fitted = fit(
+            first,
+            learnt.views,
+            config.fit,
+            advance,
+            max_splats=config.initialise.max_splats,
+            checkpoint=kept,
+        )
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     apart = take_apart(sources, fitted.cloud, choices)
     if apart.remark:
@@ -112,6 +123,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     )
     record |= apart.write(run)
     write_record(run, record)
+    kept.path.unlink(missing_ok=True)
     return record
 
 
