@@ -1,7 +1,7 @@
 """The frames of an episode over time: ``/tf`` and ``/tf_static`` as one tree."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from bridge.episode.records import FrameTransform
 from bridge.errors import BridgeError
@@ -82,9 +82,15 @@ class TransformTree:
             FrameNotFoundError: When no transform names the frame; lists those that exist.
             AmbiguousFrameError: When transforms lead to several places.
         """
+        return self.Ts_root_frame(frame, np.array([stamp_ns], dtype=np.int64))[0]
+
+    def Ts_root_frame(
+        self, frame: str, stamps_ns: Int[np.ndarray, " num_stamps"]
+    ) -> Float[np.ndarray, "num_stamps 4 4"]:
+        """Poses of a frame in its root at many instants; raises as ``T_root_frame``."""
         root = self.root_of(frame)
-        T = np.eye(4)
+        Ts = np.broadcast_to(np.eye(4), (len(stamps_ns), 4, 4))
         while frame != root:
-            T = self._tracks[frame].at(np.array([stamp_ns])).transforms()[0] @ T
+            Ts = self._tracks[frame].at(stamps_ns).transforms() @ Ts
             frame = self._parents[frame]
-        return T
+        return np.array(Ts)

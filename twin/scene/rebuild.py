@@ -1,4 +1,8 @@
-"""Episodes in, scene out: choose frames, fuse, fit, render what was held out, store."""
+"""Episodes in, scene out: choose frames, fuse, fit, render what was held out, store.
+
+The order of things is here; each stage lives in a module of its own. Nothing that is learnt from
+sees a held-out frame, and ``scene.json`` is written last: it vouches for all the rest.
+"""
 
 import time
 from collections.abc import Sequence
@@ -12,23 +16,18 @@ from bridge.episode.run import RunFolder
 from bridge.errors import UsageError
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
-from twin.scene.fit import fit
+from twin.scene.calibration import Calibration, read_calibration
+from twin.scene.fit import FitResult, fit
 from twin.scene.fit_state import FIT_STATE, Checkpoint
-from twin.scene.frames import (
-    FrameChoice,
-    NoFramesError,
-    Sources,
-    choose_frames,
-    find_sources,
-    load,
-)
+from twin.scene.frames import FrameChoice, Sources, choose_frames, find_sources
+from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, with_harmonics
 from twin.scene.initialise import fuse
-from twin.scene.moving import MovingVoxels, Witness, choose_witnesses, find_moving
-from twin.scene.parts import episode_of_task, take_apart
+from twin.scene.learn import Learnt, learn, limits_of, with_fitted_poses
+from twin.scene.objects import moved_cloud
+from twin.scene.parts import TakenApart, episode_of_task, take_apart
 from twin.scene.ply import write_ply
-from twin.scene.points import DepthLimits, FrameSurface, PointSet
 from twin.scene.raster import RasterConfig, load_native
-from twin.scene.record import make_record, summarise_views
+from twin.scene.record import Cost, make_record, protocol_of
 from twin.scene.settings import RebuildConfig
 from twin.scene.store import (
     BACKGROUND,
@@ -37,23 +36,24 @@ from twin.scene.store import (
     read_record,
     write_record,
 )
-from twin.scene.training_view import TrainingView, training_view
+from twin.scene.view_numbers import summarise_views
 from twin.scene.views import ViewsJob, views_path, write_views
 
-METHOD_VERSION = 7
+METHOD_VERSION = 8
 """Counts changes of method that make older scenes out of date."""
-MAX_POINTS = 3_000_000
-"""Depth points to fuse; more change nothing but the time."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Learnt:
-    """What the training frames gave."""
+class _Clock:
+    """When the rebuild began."""
 
-    points: list[PointSet]
-    views: list[TrainingView]
-    moving: MovingVoxels
-    witnesses: list[Witness]
+    wall: float
+    cpu: float
+
+    def cost(self) -> Cost:
+        return Cost(
+            seconds=time.monotonic() - self.wall, cpu_seconds=time.process_time() - self.cpu
+        )
 
 
 def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, Any]:
@@ -62,30 +62,60 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     Work already done with the same inputs and settings is not repeated unless forced.
 
     Raises:
-        NoFramesError: When the run has no posed RGB-D frames.
+        NoFramesError: When the run has no RGB-D frames.
+        LostError: When a camera without poses cannot be followed.
+        NoDepthError: When the depth images hold nothing usable.
+        PoseConventionError: When poses fit the depth only if read in another convention.
         SplatExtensionMissingError: When the native code is not built.
     """
     load_native()
     sources = find_sources(run)
     if sources.remark:
         output.say(sources.remark)
-    key = _key(sources, config)
+    calibration = read_calibration(run)
+    key = _key(sources, config, calibration)
     done = None if config.force else _already_done(run, key)
     if done is not None:
         output.say("the scene is up to date (same episodes, same settings); --force redoes it")
         return done
-    start = time.monotonic()
-    choices = choose_frames(sources, config.frames)
-    learnt = _learn(choices, config, output)
-    output.detail(f"{len(learnt.moving.keys)} voxels hold something that moved")
-    first = fuse(learnt.points, config.initialise)
-    output.say(f"{len(first)} Gaussians from {len(learnt.views)} training frames")
+    clock = _Clock(wall=time.monotonic(), cpu=time.process_time())
+    choices = choose_frames(sources, config.frames, output, calibration)
+    learnt = learn(choices, config, output)
     run.scene_dir.mkdir(parents=True, exist_ok=True)
     kept = Checkpoint(path=run.scene_dir / FIT_STATE, key=key)
     if config.force:
         kept.path.unlink(missing_ok=True)
+    fitted = _fit(learnt, config, kept, output)
+    learnt = with_fitted_poses(learnt, fitted.Ts_base_color)
+    (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
+    apart = take_apart(sources, fitted.cloud, learnt.choices)
+    if apart.remark:
+        output.say(apart.remark)
+    write_ply(run.scene_dir / BACKGROUND, apart.background)
+    views = _hold_out(run, learnt, fitted, apart, config, clock, output)
+    extras = apart.write(run, learnt.views)
+    record = make_record(
+        key=key,
+        scene_hash=background_hash(run),
+        sources=sources,
+        learnt=learnt,
+        config=config,
+        fitted=fitted,
+        views=views,
+        num_background=len(apart.background),
+        cost=clock.cost(),
+    )
+    record |= extras
+    write_record(run, record)
+    kept.path.unlink(missing_ok=True)
+    return record
+
+
+def _fit(learnt: Learnt, config: RebuildConfig, kept: Checkpoint, output: Output) -> FitResult:
+    first = fuse(learnt.points, config.initialise)
+    output.say(f"{len(first)} Gaussians from {len(learnt.views)} training frames")
     with output.progress("fit", 100) as advance:
-        fitted = fit(
+        return fit(
             first,
             learnt.views,
             config.fit,
@@ -93,41 +123,54 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
             max_splats=config.initialise.max_splats,
             checkpoint=kept,
         )
-    (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
-    apart = take_apart(sources, fitted.cloud, choices)
-    if apart.remark:
-        output.say(apart.remark)
-    write_ply(run.scene_dir / BACKGROUND, apart.background)
-    scene_hash = background_hash(run)
+
+
+def _hold_out(
+    run: RunFolder,
+    learnt: Learnt,
+    fitted: FitResult,
+    apart: TakenApart,
+    config: RebuildConfig,
+    clock: _Clock,
+    output: Output,
+) -> dict[str, Any]:
+    """Render what was held out, and say how well it came out."""
+    choices = learnt.choices
     job = ViewsJob(
-        scene_hash=scene_hash,
+        scene_hash=background_hash(run),
         cloud=fitted.cloud,
         witnesses=learnt.witnesses,
-        limits=_limits(config),
-        holdout_every=config.frames.holdout_every,
+        limits=limits_of(config),
         raster=RasterConfig(threads=config.fit.threads),
+        protocol=protocol_of(choices, fitted, config, clock.cost()),
+        marked=_marked_objects(apart),
+        align=config.frames.align_holdout,
     )
-    with output.progress("render held-out views", _num_holdout(choices)) as advance:
+    total = sum(len(choice.holdout_ns) for choice in choices)
+    with output.progress("render held-out views", total) as advance:
         numbers = write_views(run, choices, job, advance)
-    files = _remove_stale_views(run, choices, scene_hash)
-    record = make_record(
-        key=key,
-        scene_hash=scene_hash,
-        sources=sources,
-        choices=choices,
-        config=config,
-        fitted=fitted,
-        views=summarise_views(numbers, files),
-        num_background=len(apart.background),
-        seconds=time.monotonic() - start,
+    return summarise_views(numbers, _remove_stale_views(run, choices, job.scene_hash))
+
+
+def _marked_objects(apart: TakenApart) -> GaussianCloud | None:
+    """The scene with its objects white and all else black: where they show in a view."""
+    objects = {} if apart.parts is None else apart.parts.objects
+    if not objects:
+        return None
+    placed = [moved_cloud(item.cloud, item.T_base_object) for item in objects.values()]
+    cloud = with_harmonics(concatenate([apart.background, *placed]), 0)
+    colors = np.ones((len(cloud), 3))
+    colors[: len(apart.background)] = 0.0
+    return GaussianCloud(
+        means_m=cloud.means_m,
+        quats_wxyz=cloud.quats_wxyz,
+        scales_log=cloud.scales_log,
+        opacities_logit=cloud.opacities_logit,
+        colors=as_float32(colors),
     )
-    record |= apart.write(run)
-    write_record(run, record)
-    kept.path.unlink(missing_ok=True)
-    return record
 
 
-def _key(sources: Sources, config: RebuildConfig) -> str:
+def _key(sources: Sources, config: RebuildConfig, calibration: Calibration | None) -> str:
     settings = asdict(config)
     settings.pop("force")
     settings["fit"].pop("threads")
@@ -138,6 +181,7 @@ def _key(sources: Sources, config: RebuildConfig) -> str:
             "episodes": hashes,
             "settings": settings,
             "task": _task_content(sources),
+            "calibration": None if calibration is None else calibration.calibration_id,
         }
     )
 
@@ -164,45 +208,6 @@ def _already_done(run: RunFolder, key: str) -> dict[str, Any] | None:
     ]
     whole = all(path.is_file() for path in needed)
     return record if whole and background_hash(run) == record["scene_hash"] else None
-
-
-def _learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output) -> _Learnt:
-    total = sum(len(choice.train_ns) for choice in choices)
-    points: list[PointSet] = []
-    views: list[TrainingView] = []
-    with output.progress("read frames", total) as advance:
-        for choice in choices:
-            for frame in load(choice, choice.train_ns):
-                surface = FrameSurface(frame, _limits(config))
-                points.append(surface.points(_stride(total, frame.depth_m.size)))
-                views.append(training_view(surface))
-                advance(len(views), f"camera {frame.camera_id}")
-    if not views:
-        message = "no frame of this run has colour, depth and a pose together. Record it again."
-        raise NoFramesError(message)
-    witnesses = choose_witnesses(views)
-    moving = find_moving(points, witnesses)
-    return _Learnt(
-        points=[moving.drop_from(item) for item in points],
-        views=[moving.mask_in(view) for view in views],
-        moving=moving,
-        witnesses=witnesses,
-    )
-
-
-def _stride(num_frames: int, num_pixels: int) -> int:
-    """Use every n-th pixel of every n-th row so that all frames together stay within bounds."""
-    return max(1, round(float(np.sqrt(num_frames * num_pixels / MAX_POINTS))))
-
-
-def _limits(config: RebuildConfig) -> DepthLimits:
-    return DepthLimits(
-        max_depth_m=config.frames.max_depth_m, flying_fraction=config.initialise.flying_fraction
-    )
-
-
-def _num_holdout(choices: Sequence[FrameChoice]) -> int:
-    return sum(len(choice.holdout_ns) for choice in choices)
 
 
 def _remove_stale_views(

@@ -1,23 +1,42 @@
 """What ``scene.json`` says: where the scene came from, how it was made, how good it is."""
 
+import resource
+import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
-
 from bridge.episode import provenance, streams
+from twin.scene.camera_poses import SAYS
 from twin.scene.fit import FitResult
-from twin.scene.frames import FrameChoice, Sources
-from twin.scene.settings import RebuildConfig
+from twin.scene.frames import FrameChoice, Sources, root_frame
+from twin.scene.learn import Learnt
+from twin.scene.settings import FrameConfig, RebuildConfig
 from twin.scene.store import BACKGROUND, SCENE_VERSION
-from twin.scene.views import ViewNumbers
 
-VIEWS_NOTE = (
-    "held out from initialisation and fit; means of the images' values; native resolution, "
-    "no colour alignment; static_psnr_db leaves out pixels that show something that moved; "
-    "the evaluator computes the official numbers from the views episode"
-)
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """What a rebuild took so far."""
+
+    seconds: float
+    """Wall time."""
+    cpu_seconds: float
+    """Of all threads."""
+
+    def to_record(self) -> dict[str, Any]:
+        """What ``scene.json`` says."""
+        return {
+            "seconds": round(self.seconds, 2),
+            "cpu_seconds": round(self.cpu_seconds, 2),
+            "peak_memory_mb": round(peak_memory_mb()),
+        }
+
+
+def peak_memory_mb() -> float:
+    """Most memory this process ever held resident, in 10^6 bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
 
 def make_record(
@@ -25,12 +44,12 @@ def make_record(
     key: str,
     scene_hash: str,
     sources: Sources,
-    choices: Sequence[FrameChoice],
+    learnt: Learnt,
     config: RebuildConfig,
     fitted: FitResult,
     views: Mapping[str, Any],
     num_background: int,
-    seconds: float,
+    cost: Cost,
 ) -> dict[str, Any]:
     """Put together the content of ``scene.json``."""
     settings = asdict(config)
@@ -39,17 +58,19 @@ def make_record(
         "schema_version": SCENE_VERSION,
         "key": key,
         "scene_hash": scene_hash,
-        "frame": _root_frame(choices),
+        "frame": root_frame(learnt.choices[0]),
         "units": {"length": "m", "colour": "sRGB", "quaternion": "wxyz"},
         "remark": sources.remark,
         "stand_in": any(episode.info.stand_in for episode in sources.episodes),
         "sources": [
             {"id": e.info.id, "kind": e.info.kind, "sha256": e.sha256()} for e in sources.episodes
         ],
-        "cameras": [_camera_record(choice) for choice in choices],
+        "cameras": [camera_record(choice) for choice in learnt.choices],
+        "scan": learnt.report.to_record(),
         "settings": settings,
         "background": {"file": BACKGROUND, "num_splats": num_background},
         "fit": {
+            "num_splats": len(fitted.cloud),
             "iterations": fitted.iterations,
             "coarse_iterations": fitted.coarse_iterations,
             "seconds": round(fitted.seconds, 2),
@@ -59,44 +80,58 @@ def make_record(
             else round(fitted.train_psnr_db, 3),
         },
         "views": dict(views),
-        "seconds": round(seconds, 2),
+        "cost": cost.to_record(),
+        "seconds": round(cost.seconds, 2),
         "software": provenance.software(),
     }
 
 
-def summarise_views(numbers: Sequence[ViewNumbers], files: Sequence[str]) -> dict[str, Any]:
-    """Average the held-out views; cameras that stand still are kept apart."""
-    moving = [item for item in numbers if not item.still_camera]
-    still = [item for item in numbers if item.still_camera]
+def protocol_of(
+    choices: Sequence[FrameChoice], fitted: FitResult, config: RebuildConfig, cost: Cost
+) -> dict[str, Any]:
+    """How the scene was made, as far as whoever rates its views must know."""
+    frames = config.frames
     return {
-        "files": list(files),
-        "note": VIEWS_NOTE,
-        "psnr_db": _mean([item.psnr_db for item in moving]),
-        "static_psnr_db": _mean([item.static_psnr_db for item in moving]),
-        "psnr_db_still_cameras": _mean([item.psnr_db for item in still]),
-        "static_psnr_db_still_cameras": _mean([item.static_psnr_db for item in still]),
-        "depth_mean_abs_m": _mean([item.depth_mean_abs_m for item in numbers]),
-        "images": [asdict(item) for item in numbers],
+        "holdout": holdout_text(frames),
+        "training": training_text(frames),
+        "train_frames": sum(len(choice.train_ns) for choice in choices),
+        "cameras_from": sorted({SAYS[choice.poses.source] for choice in choices}),
+        "poses_refined": frames.align_poses or config.fit.refine_poses,
+        "num_splats": len(fitted.cloud),
+        "fit_seconds": round(fitted.seconds, 2),
+        "fit_cpu_seconds": round(fitted.cpu_seconds, 2),
+        "rebuild_seconds": round(cost.seconds, 2),
+        "rebuild_cpu_seconds": round(cost.cpu_seconds, 2),
+        "peak_memory_mb": round(peak_memory_mb()),
     }
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return round(float(np.mean(known)), 4) if known else None
+def holdout_text(frames: FrameConfig) -> str:
+    """Which frames were held out, in words."""
+    return (
+        f"frame {frames.first_holdout} and every {frames.holdout_every}th after it of each camera, "
+        f"at most {frames.max_holdout_frames} in all"
+    )
 
 
-def _root_frame(choices: Sequence[FrameChoice]) -> str:
-    choice = choices[0]
-    info = streams.camera_info(choice.episode, choice.camera_id)
-    return streams.transform_tree(choice.episode).root_of(info.frame_id)
+def training_text(frames: FrameConfig) -> str:
+    """Which frames were learnt from, in words."""
+    if frames.train_every:
+        return f"frame 0 and every {frames.train_every}th after it, but no held-out one"
+    return "of the others the stillest and sharpest of each stretch of the camera's path"
 
 
-def _camera_record(choice: FrameChoice) -> dict[str, Any]:
+def camera_record(choice: FrameChoice) -> dict[str, Any]:
+    """What ``scene.json`` says about one camera of one episode."""
     camera = streams.camera_info(choice.episode, choice.camera_id).camera
     return {
         "episode": choice.episode.info.id,
         "id": choice.camera_id,
         "still": choice.still,
+        "poses_from": choice.poses.source,
+        "poses_quality": dict(choice.poses.quality),
+        "poses_corrected": len(choice.corrections),
+        "frames_without_pose": len(choice.poses.unposed_ns),
         "train_frames": len(choice.train_ns),
         "holdout_frames": len(choice.holdout_ns),
         "color": asdict(camera),
@@ -105,7 +140,7 @@ def _camera_record(choice: FrameChoice) -> dict[str, Any]:
 
 def describe_scene(record: Mapping[str, Any]) -> str:
     """Say in a few lines what was rebuilt and how well."""
-    views, fitted = record["views"], record["fit"]
+    fitted, cost = record["fit"], record["cost"]
     lines = [
         f"scene {record['scene_hash']}: {record['background']['num_splats']} Gaussians"
         + (" (stand-in)" if record["stand_in"] else ""),
@@ -115,19 +150,39 @@ def describe_scene(record: Mapping[str, Any]) -> str:
             if fitted["train_psnr_db"] is None
             else f", training PSNR {fitted['train_psnr_db']:.2f} dB where nothing moved"
         ),
+        f"took {cost['seconds']:.0f} s, {cost['cpu_seconds']:.0f} CPU seconds, "
+        f"{cost['peak_memory_mb']} MB at most",
     ]
+    lines += [
+        f"camera {item['id']} of {item['episode']}: {item['train_frames']} frames learnt, "
+        f"{item['holdout_frames']} held out; poses from {SAYS[item['poses_from']]}"
+        for item in record["cameras"]
+    ]
+    lines += _view_lines(record["views"])
+    lines += record["scan"]["remarks"]
+    if record["remark"]:
+        lines.append(record["remark"])
+    return "\n".join(lines)
+
+
+def _view_lines(views: Mapping[str, Any]) -> list[str]:
+    lines = []
     for ending, what in (
         ("", "held-out views of moving cameras"),
         ("_still_cameras", "held-out images of cameras that stand still (no new viewpoint)"),
     ):
         if views[f"psnr_db{ending}"] is None:
             continue
-        line = f"{what}: PSNR {views[f'psnr_db{ending}']:.2f} dB"
+        count, raw, gain = (
+            views[f"{name}{ending}"] for name in ("num_images", "psnr_db", "gain_psnr_db")
+        )
+        line = f"{what} ({count}): PSNR {raw:.2f} dB raw, {gain:.2f} dB with a gain per channel"
         if views[f"static_psnr_db{ending}"] is not None:
-            line += f", {views[f'static_psnr_db{ending}']:.2f} dB where nothing moved"
+            line += f", {views[f'static_psnr_db{ending}']:.2f} dB raw where nothing moved"
+        line += f"; SSIM {views[f'ssim{ending}']:.3f}"
+        if views[f"depth_mean_abs_m{ending}"] is not None:
+            line += f"; depth off by {1e3 * views[f'depth_mean_abs_m{ending}']:.1f} mm on average"
         lines.append(line)
     if not views["images"]:
         lines.append("no frame could be held out: too few frames")
-    if record["remark"]:
-        lines.append(record["remark"])
-    return "\n".join(lines)
+    return lines

@@ -2,15 +2,20 @@
 
 Topics, all with the stamp of the recorded frame and the frame id of its colour camera:
 ``/<cell>/views/cam/<id>/{recorded,rendered}/image`` (PNG), ``.../rendered/depth`` (16UC1),
-``.../recorded/depth`` where depth and colour come from the same camera, and ``.../color/info``.
+``.../recorded/depth`` where depth and colour come from the same camera and
+``.../recorded/depth_in_color`` where it was carried over, ``.../mask/{static,objects}`` (PNG, white
+inside) where there is something to mask, ``.../pose_aligned/image`` (PNG) where pose and brightness
+were fitted to the recorded image, and ``.../color/info``.
 """
 
 import io
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from bridge.episode import schema, streams
 from bridge.episode.metadata import Derived
@@ -20,34 +25,17 @@ from bridge.episode.run import RunFolder
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.writer import EpisodeWriter
 from bridge.terminal import Advance
+from twin.scene.camera_correction import align_view
 from twin.scene.frames import FrameChoice, load
 from twin.scene.gaussians import GaussianCloud
-from twin.scene.losses import psnr_db
 from twin.scene.moving import Witness, find_moving
 from twin.scene.points import DepthLimits, FrameSurface
 from twin.scene.raster import RasterConfig, Rasteriser, View
-from twin.scene.training_view import training_view
+from twin.scene.training_view import TrainingView, training_view
+from twin.scene.view_numbers import ViewNumbers, rate_view
 
-
-@dataclass(frozen=True, kw_only=True)
-class ViewNumbers:
-    """How one held-out view came out."""
-
-    episode: str
-    camera_id: str
-    stamp_ns: int
-    still_camera: bool
-    """The camera does not move, so training frames show the same view."""
-    psnr_db: float
-    """Over the whole image, as recorded: a robot in view counts as error."""
-    static_psnr_db: float | None
-    """Over the pixels that show nothing that moved; None when there are none."""
-    static_fraction: float
-    """Share of those pixels."""
-    depth_mean_abs_m: float | None
-    """Against the recorded depth, where both exist and the cameras coincide."""
-    coverage_fraction: float
-    """Mean alpha of the rendered image."""
+OBJECT_SHARE = 0.5
+"""A pixel shows an object when this share of its light comes from it."""
 
 
 def views_path(run: RunFolder, episode: Episode, scene_hash: str) -> Path:
@@ -63,17 +51,35 @@ class ViewsJob:
     cloud: GaussianCloud
     witnesses: Sequence[Witness]
     limits: DepthLimits
-    holdout_every: int
     raster: RasterConfig
+    protocol: Mapping[str, Any]
+    """How the scene was made: kept with the images, for whoever rates them."""
+    marked: GaussianCloud | None = None
+    """The same scene with objects white and everything else black; None without objects."""
+    align: bool = False
+    """Also draw each view where it fits the recorded image best."""
 
-    def settings(self) -> dict[str, object]:
+    def settings(self) -> dict[str, Any]:
         """What the derived episode records about how its views were made."""
         return {
-            "holdout": f"every {self.holdout_every}th frame of each camera",
+            **self.protocol,
             "resolution": "native colour camera",
-            "masks": "none",
+            "masks": "as separate topics; none applied",
             "alpha_cut": self.raster.alpha_cut,
         }
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldOut:
+    """One held-out frame with everything that is said about it."""
+
+    choice: FrameChoice
+    frame: RgbdFrame
+    recorded: TrainingView
+    """The frame with what moved masked; nothing is trained on it."""
+    view: View
+    masks: Mapping[str, Bool[np.ndarray, "height width"]] = field(default_factory=dict)
+    aligned_u8: np.ndarray | None = None
 
 
 def write_views(
@@ -100,25 +106,49 @@ def write_views(
                 ),
             )
             for choice in own:
-                for frame, view in _rendered(choice, rasteriser, job.cloud):
-                    _write_view(writer, choice, frame, view)
-                    numbers.append(_numbers(choice, frame, view, _static_mask(frame, job)))
+                for item in _rendered(choice, rasteriser, job):
+                    _write_view(writer, item)
+                    numbers.append(
+                        rate_view(
+                            item.frame,
+                            item.recorded,
+                            item.view,
+                            item.masks["static"],
+                            episode=choice.episode.info.id,
+                            still=choice.still,
+                        )
+                    )
                     advance(len(numbers), f"{numbers[-1].psnr_db:.1f} dB")
     return numbers
 
 
-def _rendered(
-    choice: FrameChoice, rasteriser: Rasteriser, cloud: GaussianCloud
-) -> Iterator[tuple[RgbdFrame, View]]:
+def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Iterator[HeldOut]:
     for frame in load(choice, choice.holdout_ns):
-        yield frame, rasteriser.view(cloud, frame.color_camera, frame.T_base_color)
+        camera, T = frame.color_camera, frame.T_base_color
+        recorded = _recorded(frame, job)
+        masks = {"static": recorded.full.static_mask}
+        if job.marked is not None:
+            planes = rasteriser.draw_planes(job.marked, camera, T)
+            masks["objects"] = planes[0] > OBJECT_SHARE
+        aligned = None
+        if job.align:
+            fitted = align_view(job.cloud, recorded.half, recorded.full, T, rasteriser)
+            aligned = _u8(np.moveaxis(fitted.image, 0, -1))
+        yield HeldOut(
+            choice=choice,
+            frame=frame,
+            recorded=recorded,
+            view=rasteriser.view(job.cloud, camera, T),
+            masks=masks,
+            aligned_u8=aligned,
+        )
 
 
-def _static_mask(frame: RgbdFrame, job: ViewsJob) -> np.ndarray:
-    """Pixels of a held-out frame that no training frame looks through."""
+def _recorded(frame: RgbdFrame, job: ViewsJob) -> TrainingView:
+    """A held-out frame without the pixels that training frames look through."""
     surface = FrameSurface(frame, job.limits)
     moving = find_moving([surface.points()], job.witnesses)
-    return moving.mask_in(training_view(surface)).full.static_mask
+    return moving.mask_in(training_view(surface))
 
 
 def one_camera(frame: RgbdFrame) -> bool:
@@ -128,7 +158,8 @@ def one_camera(frame: RgbdFrame) -> bool:
     )
 
 
-def _write_view(writer: EpisodeWriter, choice: FrameChoice, frame: RgbdFrame, view: View) -> None:
+def _write_view(writer: EpisodeWriter, item: HeldOut) -> None:
+    choice, frame = item.choice, item.frame
     cell = choice.episode.info.cell or "cell"
     topic = f"/{cell}/views/cam/{frame.camera_id}"
     frame_id = streams.camera_info(choice.episode, frame.camera_id).frame_id
@@ -139,44 +170,40 @@ def _write_view(writer: EpisodeWriter, choice: FrameChoice, frame: RgbdFrame, vi
             f"{topic}/{tail}", data, type_name=type_name, log_time_ns=stamp, publish_time_ns=stamp
         )
 
-    def png(image_u8: np.ndarray) -> bytes:
-        return CompressedColor(
+    def png(tail: str, image_u8: np.ndarray) -> None:
+        color = CompressedColor(
             stamp_ns=stamp, frame_id=frame_id, format="png", data=encode_png(image_u8)
-        ).to_cdr()
+        )
+        put(tail, color.to_cdr(), schema.COMPRESSED_IMAGE)
 
-    def depth(depth_m: np.ndarray) -> bytes:
+    def depth(tail: str, depth_m: np.ndarray) -> None:
         millimetres = np.clip(np.rint(depth_m * 1e3), 0, 65535).astype(np.uint16)
-        return DepthImage(stamp_ns=stamp, frame_id=frame_id, depth_mm=millimetres).to_cdr()
+        image = DepthImage(stamp_ns=stamp, frame_id=frame_id, depth_mm=millimetres)
+        put(tail, image.to_cdr(), schema.IMAGE)
 
     info = CameraInfo(stamp_ns=stamp, frame_id=frame_id, camera=frame.color_camera)
     put("color/info", info.to_cdr(), schema.CAMERA_INFO)
-    put("recorded/image", png(frame.image_u8), schema.COMPRESSED_IMAGE)
-    put("rendered/image", png(view.image_u8()), schema.COMPRESSED_IMAGE)
-    put("rendered/depth", depth(view.depth_m), schema.IMAGE)
+    png("recorded/image", frame.image_u8)
+    png("rendered/image", item.view.image_u8())
+    depth("rendered/depth", item.view.depth_m)
     if one_camera(frame):
-        put("recorded/depth", depth(frame.depth_m), schema.IMAGE)
+        depth("recorded/depth", np.nan_to_num(frame.depth_m, posinf=0.0))
+    else:
+        depth("recorded/depth_in_color", training_depth(item))
+    for name, mask in item.masks.items():
+        if not mask.all():
+            png(f"mask/{name}", np.repeat(mask[..., None], 3, axis=2).astype(np.uint8) * 255)
+    if item.aligned_u8 is not None:
+        png("pose_aligned/image", item.aligned_u8)
 
 
-def _numbers(
-    choice: FrameChoice, frame: RgbdFrame, view: View, static_mask: np.ndarray
-) -> ViewNumbers:
-    squared = np.square((view.image_u8().astype(np.float64) - frame.image_u8) / 255.0)
-    depth_error = None
-    if one_camera(frame):
-        both = (frame.depth_m > 0) & (view.depth_m > 0)
-        if both.any():
-            depth_error = float(np.abs(frame.depth_m[both] - view.depth_m[both]).mean())
-    return ViewNumbers(
-        episode=choice.episode.info.id,
-        camera_id=frame.camera_id,
-        stamp_ns=frame.stamp_ns,
-        still_camera=choice.still,
-        psnr_db=psnr_db(float(squared.mean())),
-        static_psnr_db=psnr_db(float(squared[static_mask].mean())) if static_mask.any() else None,
-        static_fraction=float(static_mask.mean()),
-        depth_mean_abs_m=depth_error,
-        coverage_fraction=float(view.alpha.mean()),
-    )
+def training_depth(item: HeldOut) -> np.ndarray:
+    """Recorded depth as the colour camera sees it; 0 where unknown or where something moved."""
+    return item.recorded.full.depth_m
+
+
+def _u8(image: np.ndarray) -> np.ndarray:
+    return np.asarray(np.rint(np.clip(image, 0.0, 1.0) * 255.0), dtype=np.uint8)
 
 
 def encode_png(image_u8: np.ndarray) -> bytes:

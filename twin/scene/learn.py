@@ -1,0 +1,116 @@
+"""Read the training frames once: points, views, what moved, and whether the scan makes sense."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry import se3
+from bridge.terminal import Output
+from twin.scene.frames import FrameChoice, NoFramesError, load
+from twin.scene.moving import MovingVoxels, Witness, choose_witnesses, find_moving
+from twin.scene.points import DepthLimits, FrameSurface, PointSet
+from twin.scene.refine_poses import refine_poses
+from twin.scene.scan_check import CameraCheck, ScanReport, check_scan
+from twin.scene.settings import RebuildConfig
+from twin.scene.thumb import Thumb, thumb_of
+from twin.scene.training_view import TrainingView, training_view
+
+MAX_POINTS = 3_000_000
+"""Depth points to fuse; more change nothing but the time."""
+THUMB_PX = 120
+
+
+@dataclass(frozen=True, kw_only=True)
+class Learnt:
+    """What the training frames gave; nothing in it has seen a held-out frame."""
+
+    choices: list[FrameChoice]
+    """With the poses the views have now."""
+    points: list[PointSet]
+    """Static surface points of each training frame."""
+    views: list[TrainingView]
+    owners: list[int]
+    """Index of each view's choice."""
+    moving: MovingVoxels
+    witnesses: list[Witness]
+    report: ScanReport
+
+
+def limits_of(config: RebuildConfig) -> DepthLimits:
+    """Which depth is trusted."""
+    return DepthLimits(
+        max_depth_m=config.frames.max_depth_m, flying_fraction=config.initialise.flying_fraction
+    )
+
+
+def learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output) -> Learnt:
+    """Read every training frame, check the scan, and set aside what moved.
+
+    Raises:
+        NoFramesError: When no frame has colour, depth and a pose together.
+        NoDepthError: When no depth image holds anything usable.
+        PoseConventionError: When the poses fit only if read in another convention.
+    """
+    total = sum(len(choice.train_ns) for choice in choices)
+    points: list[PointSet] = []
+    views: list[TrainingView] = []
+    owners: list[int] = []
+    cameras: list[CameraCheck] = []
+    with output.progress("read frames", total) as advance:
+        for index, choice in enumerate(choices):
+            thumbs: list[Thumb] = []
+            trusted = []
+            for frame in load(choice, choice.train_ns):
+                surface = FrameSurface(frame, limits_of(config))
+                points.append(surface.points(_stride(total, frame.depth_m.size)))
+                views.append(training_view(surface))
+                owners.append(index)
+                thumbs.append(thumb_of(frame, THUMB_PX))
+                trusted.append(float(surface.trusted.mean()))
+                advance(len(views), f"camera {frame.camera_id}")
+            cameras.append(CameraCheck(choice=choice, thumbs=thumbs, trusted=trusted))
+    if not views:
+        message = "no frame of this run has colour, depth and a pose together. Record it again."
+        raise NoFramesError(message)
+    report = check_scan(cameras, config.frames)
+    moved = list(choices)
+    if config.frames.align_poses:
+        points, views, moved = refine_poses(points, views, choices, owners, output)
+    witnesses = choose_witnesses(views)
+    moving = find_moving(points, witnesses)
+    static = [moving.drop_from(item) for item in points]
+    gone = 1.0 - sum(len(p.p_m) for p in static) / max(sum(len(p.p_m) for p in points), 1)
+    report = replace(report, moving_fraction=round(gone, 4))
+    for remark in report.remarks():
+        output.say(remark)
+    return Learnt(
+        choices=moved,
+        points=static,
+        views=[moving.mask_in(view) for view in views],
+        owners=owners,
+        moving=moving,
+        witnesses=witnesses,
+        report=report,
+    )
+
+
+def with_fitted_poses(learnt: Learnt, Ts_base_color: Float[np.ndarray, "num_views 4 4"]) -> Learnt:
+    """Carry the poses the fit ended with into views and choices, for all that comes after."""
+    found: list[dict[int, np.ndarray]] = [dict(choice.corrections) for choice in learnt.choices]
+    views = list(learnt.views)
+    for index, (owner, T) in enumerate(zip(learnt.owners, Ts_base_color, strict=True)):
+        view = views[index]
+        if np.allclose(T, view.T_base_color, atol=1e-9):
+            continue
+        before = found[owner].get(view.stamp_ns, np.eye(4))
+        found[owner][view.stamp_ns] = T @ se3.invert(view.T_base_color) @ before
+        views[index] = replace(view, T_base_color=T)
+    choices = [replace(c, corrections=T) for c, T in zip(learnt.choices, found, strict=True)]
+    return replace(learnt, views=views, choices=choices)
+
+
+def _stride(num_frames: int, num_pixels: int) -> int:
+    """Use every n-th pixel of every n-th row so that all frames together stay within bounds."""
+    return max(1, round(float(np.sqrt(num_frames * num_pixels / MAX_POINTS))))
