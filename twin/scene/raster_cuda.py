@@ -112,7 +112,7 @@ class CudaRasteriser:
         }
         T = se3.invert(T_base_camera).astype(np.float32)
         T_camera_base = torch.tensor(T, device=self._device, requires_grad=True)
-        centre = torch.tensor(T_base_camera[:3, 3].astype(np.float32), device=self._device)
+        centre = -T_camera_base[:3, :3].T @ T_camera_base[:3, 3]
         colors = self._colors(leaves, centre)
         image, alpha, about = self._rasterise(leaves, colors, T_camera_base, camera, "RGB+D")
         planes = torch.cat([image[0], alpha[0]], dim=-1).permute(2, 0, 1)

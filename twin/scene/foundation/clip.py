@@ -72,8 +72,8 @@ class ClipEmbedder:
 
     def embed_masked(
         self,
-        images_u8: Sequence[UInt8[np.ndarray, "height width 3"]],
-        masks: Sequence[Bool[np.ndarray, "height width"]],
+        images_u8: Sequence[UInt8[np.ndarray, "_ _ 3"]],
+        masks: Sequence[Bool[np.ndarray, "_ _"]],
     ) -> Float32[np.ndarray, "num_masks num_channels"]:
         """Unit vectors of what the masks cut out, each cropped to its square on a neutral ground.
 
@@ -104,8 +104,8 @@ class ClipEmbedder:
 
 
 def masked_crop(
-    image_u8: UInt8[np.ndarray, "height width 3"],
-    mask: Bool[np.ndarray, "height width"],
+    image_u8: UInt8[np.ndarray, "_ _ 3"],
+    mask: Bool[np.ndarray, "_ _"],
     ground_u8: UInt8[np.ndarray, "3"],
 ) -> UInt8[np.ndarray, "side side 3"]:
     """The square around a mask with a margin; all but the mask has the ground's colour.

@@ -58,7 +58,7 @@ class DinoFeatures:
 
     def features(
         self,
-        images_u8: Sequence[UInt8[np.ndarray, "height width 3"]],
+        images_u8: Sequence[UInt8[np.ndarray, "_ _ 3"]],
         *,
         stride: int | None = None,
     ) -> list[FeatureMap]:

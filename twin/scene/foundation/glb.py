@@ -18,7 +18,7 @@ MAX_JSON_BYTES = 64_000_000
 MAX_VERTICES = 20_000_000
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _TRIANGLES = 4
-_TYPES = {
+_TYPES: dict[int, np.dtype[Any]] = {
     5120: np.dtype("i1"),
     5121: np.dtype("u1"),
     5122: np.dtype("<i2"),

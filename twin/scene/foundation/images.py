@@ -29,7 +29,7 @@ def import_torch() -> Any:
 
 
 def network_input(
-    images_u8: Sequence[UInt8[np.ndarray, "height width 3"]],
+    images_u8: Sequence[UInt8[np.ndarray, "_ _ 3"]],
     size: tuple[int, int],
     normalisation: Normalisation,
     *,

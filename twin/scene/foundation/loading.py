@@ -64,7 +64,9 @@ def import_transformers() -> Any:
             raise MissingDependencyError(
                 package=package, extra="foundation", purpose="a foundation model"
             ) from error
-    return importlib.import_module("transformers")
+    transformers = importlib.import_module("transformers")
+    transformers.utils.logging.disable_progress_bar()
+    return transformers
 
 
 def load_model(folder: Path, kind: WeightsKind, class_name: str, placement: Placement) -> Any:

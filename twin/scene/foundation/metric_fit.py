@@ -283,7 +283,7 @@ def _distances(current: _Similarity, problem: _Problem) -> np.ndarray:
     normals = problem.normals[near] @ current.R.T
     along = np.abs(((moved[near] - problem.points) * normals).sum(axis=1))
     spacing = 3.0 * float(np.linalg.norm(np.ptp(moved, axis=0))) / np.sqrt(len(moved))
-    return np.where(distance < spacing, along, distance)
+    return np.asarray(np.where(distance < spacing, along, distance))
 
 
 def _cost(current: _Similarity, problem: _Problem) -> float:

@@ -55,7 +55,7 @@ class FeatureBasis:
         return {
             "basis_mean": self.mean,
             "basis_components": self.components,
-            "basis_explained_fraction": np.float32(self.explained_fraction),
+            "basis_explained_fraction": np.array(self.explained_fraction, dtype=np.float32),
         }
 
     @staticmethod
