@@ -11,6 +11,7 @@ from bridge.geometry.camera import Camera
 MIP_VARIANCE_PX2 = 0.1
 MAX_ALPHA = 0.999
 MIN_MIP_RATIO = 2.5e-5
+SH_FIRST = (3 / (4 * np.pi)) ** 0.5
 NEAR_M = 0.02
 
 
@@ -41,18 +42,17 @@ def _jacobian(camera: Camera, p: torch.Tensor) -> torch.Tensor:
     return torch.stack([row_x, row_y], 1)
 
 
-def draw(
+def weights(
     means: torch.Tensor,
     quats: torch.Tensor,
     scales_log: torch.Tensor,
     opacities_logit: torch.Tensor,
-    colors: torch.Tensor,
     camera: Camera,
-    T_camera_base: np.ndarray,
+    T_camera_base: torch.Tensor,
     alpha_cut: float,
-) -> torch.Tensor:
-    """Return planes (5, height, width): rgb, weighted depth, alpha."""
-    T = torch.as_tensor(np.asarray(T_camera_base), dtype=means.dtype)
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return what each Gaussian adds to each pixel (num, height, width), and its depth."""
+    T = T_camera_base
     p = means @ T[:3, :3].T + T[:3, 3]
     front = p[:, 2] > NEAR_M
     p = torch.where(front[:, None], p, torch.tensor([0.0, 0.0, 1.0], dtype=p.dtype))
@@ -79,6 +79,35 @@ def draw(
     alpha = alpha[order]
     light = torch.cumprod(1 - alpha, dim=0)
     light = torch.cat([torch.ones_like(light[:1]), light[:-1]])
-    weight = alpha * light
-    channels = torch.cat([colors, p[:, 2:3], torch.ones_like(p[:, 2:3])], dim=1)[order]
+    return (alpha * light)[torch.argsort(order)], p[:, 2]
+
+
+def seen_colors(
+    means: torch.Tensor, colors: torch.Tensor, harmonics: torch.Tensor, T_camera_base: torch.Tensor
+) -> torch.Tensor:
+    """Colours along the rays from the camera centre -R^T t; harmonics (num, 3, 3) of degree 1."""
+    ray = means + T_camera_base[:3, 3] @ T_camera_base[:3, :3]
+    x, y, z = (ray / ray.norm(dim=1, keepdim=True)).unbind(1)
+    basis = SH_FIRST * torch.stack([-y, z, -x], dim=1)
+    return colors + torch.einsum("nk,nkc->nc", basis, harmonics)
+
+
+def draw(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales_log: torch.Tensor,
+    opacities_logit: torch.Tensor,
+    colors: torch.Tensor,
+    harmonics: torch.Tensor | None = None,
+    *,
+    camera: Camera,
+    T_camera_base: np.ndarray | torch.Tensor,
+    alpha_cut: float,
+) -> torch.Tensor:
+    """Return planes (5, height, width): rgb, weighted depth, alpha."""
+    T = torch.as_tensor(T_camera_base, dtype=means.dtype)
+    weight, depth = weights(means, quats, scales_log, opacities_logit, camera, T, alpha_cut)
+    if harmonics is not None:
+        colors = seen_colors(means, colors, harmonics, T)
+    channels = torch.cat([colors, depth[:, None], torch.ones_like(depth)[:, None]], dim=1)
     return torch.einsum("nhw,nc->chw", weight, channels)

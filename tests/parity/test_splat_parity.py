@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32
-from twin.scene.raster import RasterConfig, Rasteriser
+from twin.scene.raster import RasterConfig, Rasteriser, available_isas
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.parity
@@ -22,10 +23,11 @@ splat_reference = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(splat_reference)
 
 CAMERA = Camera(width=45, height=37, fx=50.0, fy=48.0, cx=21.3, cy=19.1)
+ISAS = available_isas()
 FINE = RasterConfig(alpha_cut=2.0**-24, transmittance_stop=0.0, threads=1)
 
 
-def random_cloud(rng: np.random.Generator, count: int) -> GaussianCloud:
+def random_cloud(rng: np.random.Generator, count: int, *, shiny: bool = True) -> GaussianCloud:
     means = rng.uniform([-0.6, -0.5, 0.8], [0.6, 0.5, 2.5], size=(count, 3))
     return GaussianCloud(
         means_m=as_float32(means),
@@ -33,6 +35,7 @@ def random_cloud(rng: np.random.Generator, count: int) -> GaussianCloud:
         scales_log=as_float32(np.log(rng.uniform(0.01, 0.12, size=(count, 3)))),
         opacities_logit=as_float32(rng.normal(size=count)),
         colors=as_float32(rng.uniform(size=(count, 3))),
+        harmonics=as_float32(rng.normal(scale=0.2, size=(count, 3 if shiny else 0, 3))),
     )
 
 
@@ -44,31 +47,41 @@ def tilted_pose() -> np.ndarray:
 
 def reference_planes(
     cloud: GaussianCloud, T_base_camera: np.ndarray, alpha_cut: float
-) -> tuple[list[Any], Any]:
+) -> tuple[list[Any], Any, Any]:
     tensors = [
         torch.tensor(rows, dtype=torch.float64, requires_grad=True) for _, rows in arrays(cloud)
     ]
-    T_camera_base = as_float32(se3.invert(T_base_camera))
-    return tensors, splat_reference.draw(*tensors, CAMERA, T_camera_base, alpha_cut)
+    T = as_float32(se3.invert(T_base_camera))[:3]
+    T_camera_base = torch.tensor(T, dtype=torch.float64, requires_grad=True)
+    planes = splat_reference.draw(
+        *tensors, camera=CAMERA, T_camera_base=T_camera_base, alpha_cut=alpha_cut
+    )
+    return tensors, T_camera_base, planes
 
 
-@pytest.mark.parametrize("isa", ["base", "auto"])
-def test_images_agree_with_the_reference(isa: str) -> None:
-    cloud = random_cloud(np.random.default_rng(1), 60)
+def relative_error(found: np.ndarray, wanted: np.ndarray) -> float:
+    return float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))
+
+
+@pytest.mark.parametrize("isa", ISAS)
+@pytest.mark.parametrize("shiny", [False, True])
+def test_images_agree_with_the_reference(isa: str, shiny: bool) -> None:
+    cloud = random_cloud(np.random.default_rng(1), 60, shiny=shiny)
     config = RasterConfig(alpha_cut=1 / 255, transmittance_stop=0.0, threads=1, isa=isa)
     planes = Rasteriser(config).draw_planes(cloud, CAMERA, tilted_pose())
-    _, expected = reference_planes(cloud, tilted_pose(), 1 / 255)
-    error = np.abs(planes - expected.detach().numpy())
+    expected = reference_planes(cloud, tilted_pose(), 1 / 255)[-1].detach().numpy()
+    error = np.abs(planes - expected)
     # At the cut a contribution of 1/255 may fall to either side in float32: a few pixels.
     assert np.quantile(error, 0.995) < 2e-4
     assert error.max() < 2 * 2.5 / 255
-    assert expected.detach().numpy()[4].max() > 0.9  # the scene is not empty
+    assert expected[4].max() > 0.9  # the scene is not empty
 
 
-@pytest.mark.parametrize("isa", ["base", "auto"])
-def test_gradients_agree_with_autograd(isa: str) -> None:
+@pytest.mark.parametrize("isa", ISAS)
+@pytest.mark.parametrize("shiny", [False, True])
+def test_gradients_agree_with_autograd(isa: str, shiny: bool) -> None:
     rng = np.random.default_rng(2)
-    cloud = random_cloud(rng, 60)
+    cloud = random_cloud(rng, 60, shiny=shiny)
     rasteriser = Rasteriser(
         RasterConfig(alpha_cut=2.0**-24, transmittance_stop=0.0, threads=1, isa=isa)
     )
@@ -76,13 +89,17 @@ def test_gradients_agree_with_autograd(isa: str) -> None:
     upstream = rng.normal(size=planes.shape).astype(np.float32)
     gradient = rasteriser.pull_back(planes, upstream)
 
-    tensors, expected = reference_planes(cloud, tilted_pose(), 2.0**-24)
+    tensors, T_camera_base, expected = reference_planes(cloud, tilted_pose(), 2.0**-24)
     (expected * torch.tensor(upstream, dtype=torch.float64)).sum().backward()
     for (name, _), tensor in zip(arrays(cloud), tensors, strict=True):
-        found, wanted = getattr(gradient, name), tensor.grad.numpy()
-        relative = np.linalg.norm(found - wanted) / np.linalg.norm(wanted)
         # float32 sums over a few thousand pixels, some behind almost opaque Gaussians
-        assert relative < 5e-4, name
+        assert relative_error(getattr(gradient, name), tensor.grad.numpy()) < 5e-4, name
+    assert relative_error(gradient.T_camera_base, T_camera_base.grad.numpy()) < 5e-4
+    assert gradient.harmonics.shape == cloud.harmonics.shape
+
+
+def scalar_of(planes: np.ndarray, upstream: np.ndarray) -> float:
+    return float((planes.astype(np.float64) * upstream).sum())
 
 
 def test_gradients_agree_with_finite_differences() -> None:
@@ -99,20 +116,89 @@ def test_gradients_agree_with_finite_differences() -> None:
         for sign in (1, -1):
             moved = as_float32(rows + sign * step * direction)
             shifted = GaussianCloud(**(dict(arrays(cloud)) | {name: moved}))
-            drawn = rasteriser.draw_planes(shifted, CAMERA, tilted_pose()).astype(np.float64)
-            values.append(float((drawn * upstream).sum()))
+            drawn = rasteriser.draw_planes(shifted, CAMERA, tilted_pose())
+            values.append(scalar_of(drawn, upstream))
         numeric = (values[0] - values[1]) / (2 * step)
         analytic = float((getattr(gradient, name) * direction).sum())
         # float32 images differenced over 4e-4: about three digits remain
         assert numeric == pytest.approx(analytic, rel=2e-2, abs=2e-2), name
 
 
-def test_the_two_instruction_sets_agree() -> None:
+@pytest.mark.parametrize("axis", range(6))
+def test_the_pose_gradient_agrees_with_finite_differences(axis: int) -> None:
+    rng = np.random.default_rng(7)
+    cloud = random_cloud(rng, 12)
+    rasteriser = Rasteriser(FINE)
+    T_camera_base = se3.invert(tilted_pose())
+    planes = rasteriser.draw_planes(cloud, CAMERA, tilted_pose())
+    upstream = rng.normal(size=planes.shape).astype(np.float32)
+    gradient = rasteriser.pull_back(planes, upstream).T_camera_base
+    # A small turn or shift of the camera in its own axes: dT = [[w]x, v; 0] T.
+    twist = np.zeros((4, 4))
+    if axis < 3:
+        twist[:3, :3] = np.cross(np.eye(3), np.eye(3)[axis])
+    else:
+        twist[axis - 3, 3] = 1.0
+    step = 2e-4
+    values = [
+        scalar_of(
+            rasteriser.draw_planes(
+                cloud, CAMERA, se3.invert(expm(sign * step * twist) @ T_camera_base)
+            ),
+            upstream,
+        )
+        for sign in (1, -1)
+    ]
+    analytic = float((gradient * (twist @ T_camera_base)[:3]).sum())
+    assert (values[0] - values[1]) / (2 * step) == pytest.approx(analytic, rel=2e-2, abs=2e-2)
+
+
+@pytest.mark.parametrize("isa", ISAS)
+def test_features_lift_and_labels_agree_with_the_reference(isa: str) -> None:
+    rng = np.random.default_rng(8)
+    cloud = random_cloud(rng, 60)
+    rasteriser = Rasteriser(
+        RasterConfig(alpha_cut=2.0**-24, transmittance_stop=0.0, threads=1, isa=isa)
+    )
+    rasteriser.draw_planes(cloud, CAMERA, tilted_pose())
+    tensors = [torch.tensor(rows, dtype=torch.float64) for _, rows in arrays(cloud)][:4]
+    T = torch.tensor(as_float32(se3.invert(tilted_pose())), dtype=torch.float64)
+    weight, _ = splat_reference.weights(*tensors, CAMERA, T, 2.0**-24)
+    A = weight.numpy()
+
+    features = as_float32(rng.normal(size=(60, 37)))
+    drawn = np.einsum("nhw,nd->dhw", A, features)
+    np.testing.assert_allclose(rasteriser.draw_features(features), drawn, atol=2e-5)
+    maps = as_float32(rng.normal(size=(37, CAMERA.height, CAMERA.width)))
+    lifted = np.einsum("nhw,dhw->nd", A, maps)
+    np.testing.assert_allclose(rasteriser.lift(maps), lifted, atol=2e-4)
+
+    labels = rng.integers(0, 5, size=60).astype(np.uint16) * 1000
+    by_label = np.stack([A[labels == label].sum(axis=0) for label in range(0, 5000, 1000)])
+    ids, best = rasteriser.label_map(labels)
+    np.testing.assert_allclose(best, by_label.max(axis=0), atol=2e-5)
+    first, second = np.sort(by_label, axis=0)[-1], np.sort(by_label, axis=0)[-2]
+    clear = first - second > 1e-4  # float32 may choose either of two equals
+    np.testing.assert_array_equal(ids[clear], 1000 * by_label.argmax(axis=0)[clear])
+    assert len(np.unique(ids)) > 3
+
+
+@pytest.mark.parametrize("isa", ISAS)
+def test_all_instruction_sets_agree(isa: str) -> None:
     cloud = random_cloud(np.random.default_rng(4), 200)
     pose = tilted_pose()
-    base = Rasteriser(RasterConfig(isa="base", threads=1)).draw_planes(cloud, CAMERA, pose)
-    best = Rasteriser(RasterConfig(isa="auto", threads=1)).draw_planes(cloud, CAMERA, pose)
-    assert np.quantile(np.abs(base - best), 0.99) < 1e-4
+    results = []
+    for name in ("base", isa):
+        rasteriser = Rasteriser(RasterConfig(isa=name, threads=1))
+        assert rasteriser.isa == name
+        planes = rasteriser.draw_planes(cloud, CAMERA, pose)
+        gradient = rasteriser.pull_back(planes, np.ones_like(planes))
+        results.append((planes, gradient))
+    assert np.quantile(np.abs(results[0][0] - results[1][0]), 0.99) < 1e-4
+    for name, _ in arrays(cloud):
+        first, second = (getattr(gradient, name) for _, gradient in results)
+        # Contributions near the cut may fall to either side.
+        assert relative_error(second, first) < 2e-2, name
 
 
 def test_ssim_agrees_with_a_torch_convolution() -> None:
