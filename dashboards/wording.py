@@ -172,5 +172,6 @@ def condition_word(condition: str) -> str:
 def image_title(measurement: Measurement) -> str:
     """Name an image number ``views.<part>.<metric>`` as its metric and part."""
     _, part, metric = [*measurement.id.split(".", 2), "", ""][:3]
-    name = metric.removesuffix("_db").upper() or measurement.id
+    word, _, how = metric.removesuffix("_db").removesuffix("_m").replace("_", " ").partition(" ")
+    name = " ".join(filter(None, (word.upper(), how))) or measurement.id
     return name if part == "all" else f"{name}, {part}"

@@ -1,48 +1,28 @@
 """Score rendered views against the held-out recorded images they stand for.
 
-A ``views`` episode carries rendered images on ``.../cam/<id>/rendered/image`` and, beside them,
-the recorded ones on ``.../cam/<id>/recorded/image`` (or, in its source episode,
-``.../color/image``); equal stamps belong together.
+``view_images`` pairs and scores the images of one episode; here the newest views of each recorded
+episode are found, and their scores become measurements, each with its protocol.
 """
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from bridge.episode import schema
 from bridge.episode.reader import Episode
-from bridge.episode.records import CompressedColor
 from bridge.errors import GstError
-from bridge.media.color import decode_color
 from evaluator.compare.measure import measured, slug
 from evaluator.compare.replays import DerivedFile
+from evaluator.compare.view_images import VARIANTS, ViewScore, score_views
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.image import (
-    LPIPS_NOT_COMPUTED,
-    PSNR_PROTOCOL,
-    SSIM_PROTOCOL,
-    ImageScore,
-    score_image,
-)
-from evaluator.result import Exclusion, Measurement, Table
+from evaluator.metrics.depth import DEPTH_PROTOCOL
+from evaluator.metrics.image import LPIPS_NOT_COMPUTED, PSNR_PROTOCOL, SSIM_PROTOCOL
+from evaluator.result import Cell, Exclusion, Measurement, Table
 
-_RENDERED = re.compile(r"/cam/([^/]+)/(?:color/)?(?:rendered|replayed)(?:/image)?$")
-_RECORDED = re.compile(r"/cam/([^/]+)/(?:color|recorded)(?:/image)?$")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewScore:
-    """One held-out image."""
-
-    camera_id: str
-    stamp_ns: int
-    score: ImageScore
-    jpeg: bool
-    """The rendered image was stored lossily."""
+MASKED = "only the pixels of the views' own mask {name!r}, no colour alignment"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,14 +33,6 @@ class ViewReport:
     tables: tuple[Table, ...] = ()
     exclusions: tuple[Exclusion, ...] = ()
     missing: tuple[str, ...] = ()
-
-
-@dataclass(kw_only=True)
-class _Images:
-    """Undecoded images by camera and stamp."""
-
-    rendered: dict[tuple[str, int], bytes] = field(default_factory=dict)
-    recorded: dict[tuple[str, int], bytes] = field(default_factory=dict)
 
 
 def compare_views(
@@ -85,21 +57,22 @@ def compare_views(
     sources = {episode.info.id: episode for episode in recorded}
     tables: list[Table] = []
     found: dict[str, list[ViewScore]] = {}
+    of: dict[str, DerivedFile] = {}
     for file in views:
         name = file.path.stem
         source = file.derived.source_episode
         try:
-            scores, reasons = _scores(file, sources.get(source))
+            scores, reasons = score_views(file.episode, sources.get(source))
         except GstError as error:
             left_out.append(Exclusion(episode=file.path.name, scope="views", reason=str(error)))
             continue
         left_out += [Exclusion(episode=name, scope="views", reason=reason) for reason in reasons]
-        found[source] = scores
+        found[source], of[source] = scores, file
         tables.append(_table(f"views_{len(tables)}", name, scores))
     everything = [score for scores in found.values() for score in scores]
-    measurements = _measure("all", list(found), everything)
+    measurements = _measure("all", list(found), everything, _protocol(of.values()))
     for source, scores in found.items() if len(found) > 1 else ():
-        measurements += _measure(slug(source), [source], scores)
+        measurements += _measure(slug(source), [source], scores, _protocol([of[source]]))
     return ViewReport(
         measurements=tuple(measurements), tables=tuple(tables), exclusions=tuple(left_out)
     )
@@ -135,73 +108,20 @@ def _newest(views: Sequence[DerivedFile]) -> tuple[list[DerivedFile], list[Exclu
     return kept, left_out
 
 
-def _scores(file: DerivedFile, source: Episode | None) -> tuple[list[ViewScore], list[str]]:
-    images = _Images()
-    _collect(file.episode, images)
-    if source is not None and not images.recorded:
-        _collect(source, images, wanted={stamp for _, stamp in images.rendered})
-    scores, reasons = [], []
-    for (camera_id, stamp_ns), rendered in sorted(images.rendered.items()):
-        recorded = images.recorded.get((camera_id, stamp_ns))
-        where = f"camera {camera_id} at {stamp_ns} ns"
-        if recorded is None:
-            reasons.append(f"{where}: no recorded image with this stamp")
-            continue
-        try:
-            score = score_image(decode_color(recorded), decode_color(rendered))
-        except GstError as error:
-            reasons.append(f"{where}: {error}")
-            continue
-        scores.append(
-            ViewScore(
-                camera_id=camera_id,
-                stamp_ns=stamp_ns,
-                score=score,
-                jpeg=rendered.startswith(b"\xff\xd8"),
-            )
-        )
-    if not images.rendered:
-        reasons.append("no topic .../cam/<id>/rendered/image in it")
-    return scores, reasons
-
-
-def _collect(episode: Episode, images: _Images, wanted: set[int] | None = None) -> None:
-    topics: dict[str, tuple[dict[tuple[str, int], bytes], str]] = {}
-    for topic in episode.topics_of_type(schema.COMPRESSED_IMAGE):
-        for pattern, target in ((_RENDERED, images.rendered), (_RECORDED, images.recorded)):
-            match = pattern.search(topic)
-            if match and not (wanted is not None and target is images.rendered):
-                topics[topic] = (target, match.group(1))
-                break
-    for message in episode.messages(topics):
-        image = CompressedColor.from_cdr(message.data)
-        if wanted is None or image.stamp_ns in wanted:
-            target, camera_id = topics[message.topic]
-            target[(camera_id, image.stamp_ns)] = image.data
-
-
-def _measure(part: str, episodes: Sequence[str], scores: Sequence[ViewScore]) -> list[Measurement]:
-    psnr = [s.score.psnr_db for s in scores if s.score.psnr_db is not None]
-    ssim = [s.score.ssim for s in scores if s.score.ssim is not None]
+def _measure(
+    part: str, episodes: Sequence[str], scores: Sequence[ViewScore], protocol: str
+) -> list[Measurement]:
+    """All numbers about some views; the raw ones first."""
     stored = "rendered images stored as JPEG" if any(s.jpeg for s in scores) else "stored lossless"
-    stamp = f"full frame, no mask, no colour alignment, {stored}; mean of per-image values"
-    return [
-        *(
-            measured(
-                f"views.{part}.{name}",
-                partial(_mean, statistic, values),
-                unit=unit,
-                definition=f"{protocol}; {stamp}",
-                n=len(values),
-                counted="image",
-                reason_without_interval="the per-image list is in the table",
-                episodes=episodes,
-            )
-            for name, statistic, unit, protocol, values in (
-                ("psnr_db", "PSNR", "dB", PSNR_PROTOCOL, psnr),
-                ("ssim", "SSIM", "1", SSIM_PROTOCOL, ssim),
-            )
-        ),
+    after = f"{stored}; mean of per-image values{protocol}"
+    found = list(dict.fromkeys(name for score in scores for name in score.scores))
+    variants = ["raw", *(name for name in found if name != "raw")]
+    measurements = []
+    for variant in variants:
+        stamp = f"{VARIANTS.get(variant) or MASKED.format(name=variant)}, {after}"
+        measurements += _measure_images(part, variant, episodes, scores, stamp)
+    measurements += _measure_depth(part, episodes, scores, after)
+    measurements.append(
         Measurement(
             id=f"views.{part}.lpips",
             value=None,
@@ -209,8 +129,78 @@ def _measure(part: str, episodes: Sequence[str], scores: Sequence[ViewScore]) ->
             definition="learned perceptual image patch similarity",
             reason_if_undefined=LPIPS_NOT_COMPUTED,
             episodes=tuple(episodes),
-        ),
+        )
+    )
+    return measurements
+
+
+def _measure_images(
+    part: str, variant: str, episodes: Sequence[str], scores: Sequence[ViewScore], stamp: str
+) -> list[Measurement]:
+    mine = [score.scores[variant] for score in scores if variant in score.scores]
+    psnr = [s.psnr_db for s in mine if s.psnr_db is not None]
+    ssim = [s.ssim for s in mine if s.ssim is not None]
+    name = "" if variant == "raw" else f"_{variant}"
+    return [
+        measured(
+            f"views.{part}.{measurement}",
+            partial(_mean, statistic, values),
+            unit=unit,
+            definition=f"{protocol}; {stamp}",
+            n=len(values),
+            counted="image",
+            reason_without_interval="the per-image list is in the table",
+            episodes=episodes,
+        )
+        for measurement, statistic, unit, protocol, values in (
+            (f"psnr{name}_db", "PSNR", "dB", PSNR_PROTOCOL, psnr),
+            (f"ssim{name}", "SSIM", "1", SSIM_PROTOCOL, ssim),
+        )
     ]
+
+
+def _measure_depth(
+    part: str, episodes: Sequence[str], scores: Sequence[ViewScore], after: str
+) -> list[Measurement]:
+    depths = [score.depth for score in scores if score.depth is not None]
+    if not depths:
+        return []
+    return [
+        measured(
+            f"views.{part}.{name}",
+            partial(_mean, statistic, values),
+            unit="m",
+            definition=f"{statistic}, {DEPTH_PROTOCOL}; {after}",
+            n=len(values),
+            counted="image",
+            reason_without_interval="the per-image list is in the table",
+            episodes=episodes,
+        )
+        for name, statistic, values in (
+            ("depth_mean_abs_m", "mean absolute depth error", [d.mean_abs_m for d in depths]),
+            ("depth_rmse_m", "root mean square depth error", [d.rmse_m for d in depths]),
+        )
+    ]
+
+
+def _protocol(files: Iterable[DerivedFile]) -> str:
+    """What the views say about how their scenes were made, where they agree."""
+    said: list[Mapping[str, Any]] = [file.derived.settings for file in files]
+    parts = []
+    for name, text in (
+        ("holdout", "held out: {}"),
+        ("training", "learnt from: {}"),
+        ("train_frames", "{} training frames"),
+        ("cameras_from", "cameras from {}"),
+        ("num_splats", "{} Gaussians"),
+        ("fit_cpu_seconds", "fitted in {} CPU seconds"),
+        ("peak_memory_mb", "at most {} MB"),
+    ):
+        values = [settings.get(name) for settings in said]
+        if values and values[0] is not None and all(value == values[0] for value in values):
+            value = values[0]
+            parts.append(text.format(", ".join(value) if isinstance(value, list) else value))
+    return f"; {'; '.join(parts)}" if parts else ""
 
 
 def _mean(statistic: str, values: Iterable[float]) -> float:
@@ -224,16 +214,28 @@ def _table(table_id: str, name: str, scores: Sequence[ViewScore]) -> Table:
     return Table(
         id=table_id,
         title=f"Held-out views: {name}",
-        columns=("camera", "stamp_ns", "PSNR (dB)", "SSIM", "pixels"),
+        columns=(
+            *("camera", "stamp_ns", "PSNR (dB)", "SSIM", "pixels"),
+            *("PSNR gain (dB)", "PSNR affine (dB)", "PSNR pose and gain (dB)", "depth (mm)"),
+        ),
         rows=tuple(
             (
                 s.camera_id,
                 s.stamp_ns,
-                None if s.score.psnr_db is None else round(s.score.psnr_db, 3),
-                None if s.score.ssim is None else round(s.score.ssim, 4),
-                s.score.num_pixels,
+                _rounded(s.scores["raw"].psnr_db, 3),
+                _rounded(s.scores["raw"].ssim, 4),
+                s.scores["raw"].num_pixels,
+                *(
+                    _rounded(s.scores[variant].psnr_db, 3) if variant in s.scores else None
+                    for variant in ("gain", "affine", "pose_gain")
+                ),
+                None if s.depth is None else round(1e3 * s.depth.mean_abs_m, 2),
             )
             for s in scores
         ),
         note=f"{PSNR_PROTOCOL}. {SSIM_PROTOCOL}. LPIPS {LPIPS_NOT_COMPUTED}.",
     )
+
+
+def _rounded(value: float | None, digits: int) -> Cell:
+    return None if value is None else round(value, digits)

@@ -6,6 +6,7 @@ protocol is not a result.
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -26,6 +27,20 @@ SSIM_PROTOCOL = (
 LPIPS_NOT_COMPUTED = (
     "not computed: no backbone (its weights are not shipped and nothing is downloaded)"
 )
+Alignment = Literal["raw", "gain", "affine"]
+"""How a replayed image was brightened before it was scored."""
+ALIGNMENTS: dict[Alignment, str] = {
+    "raw": "no colour alignment",
+    "gain": (
+        "after one gain per image and channel (least squares on the recorded image, "
+        "then clipped to 0..1)"
+    ),
+    "affine": (
+        "after one gain and offset per image and channel (least squares on the recorded image, "
+        "then clipped to 0..1)"
+    ),
+}
+"""In words, for definitions. Alignment looks at the recorded image, so numbers are named by it."""
 
 
 class ImageShapeError(EvaluatorError):
@@ -121,19 +136,46 @@ def ssim(
     return float(values.mean())
 
 
-def score_image(
+def aligned(
     recorded_u8: UInt8[np.ndarray, "height width 3"],
     replayed_u8: UInt8[np.ndarray, "replayed_height replayed_width 3"],
-    *,
-    mask: Bool[np.ndarray, "height width"] | None = None,
-) -> ImageScore:
-    """Return both scores of one pair; what is undefined is None.
+    alignment: Alignment,
+) -> Float[np.ndarray, "height width 3"]:
+    """Brighten the replayed image, channel by channel, as near to the recorded one as it gets.
 
     Raises:
         ImageShapeError: When the sizes differ.
     """
     _same_shape(recorded_u8, replayed_u8)
-    recorded, replayed = image_from_u8(recorded_u8), image_from_u8(replayed_u8)
+    replayed = image_from_u8(replayed_u8)
+    if alignment == "raw":
+        return replayed
+    recorded = image_from_u8(recorded_u8)
+    channels = []
+    for a, b in zip(np.moveaxis(replayed, -1, 0), np.moveaxis(recorded, -1, 0), strict=True):
+        shift_a, shift_b = (a.mean(), b.mean()) if alignment == "affine" else (0.0, 0.0)
+        power = float(np.square(a - shift_a).sum())
+        gain = float(((a - shift_a) * (b - shift_b)).sum()) / power if power > 0 else 1.0
+        channels.append(gain * (a - shift_a) + shift_b)
+    return np.clip(np.stack(channels, axis=-1), 0.0, 1.0)
+
+
+def score_image(
+    recorded_u8: UInt8[np.ndarray, "height width 3"],
+    replayed_u8: UInt8[np.ndarray, "replayed_height replayed_width 3"],
+    *,
+    mask: Bool[np.ndarray, "height width"] | None = None,
+    alignment: Alignment = "raw",
+) -> ImageScore:
+    """Return both scores of one pair; what is undefined is None.
+
+    With an alignment, the whole images decide it, whatever the mask.
+
+    Raises:
+        ImageShapeError: When the sizes differ.
+    """
+    recorded = image_from_u8(recorded_u8)
+    replayed = aligned(recorded_u8, replayed_u8, alignment)
     try:
         psnr: float | None = psnr_db(recorded, replayed, mask=mask)
     except UndefinedStatisticError:

@@ -18,8 +18,11 @@ HEADLINES: tuple[tuple[str, str], ...] = (
     ("paired.mcnemar_p_mid.recorded", "Replanning, paired starts (McNemar mid-p)"),
     ("tcp.planned.position_mean_m", "Tool: recorded to planned replay"),
     ("tcp.executed.position_mean_m", "Tool: recorded to executed replay"),
-    ("views.all.psnr_db", "PSNR of held-out views"),
+    ("views.all.psnr_db", "PSNR of held-out views, raw"),
+    ("views.all.psnr_gain_db", "The same after a gain per image and channel"),
+    ("views.all.psnr_pose_gain_db", "The same after pose and gain fitted per image"),
     ("views.all.ssim", "SSIM of held-out views"),
+    ("views.all.depth_mean_abs_m", "Depth of held-out views, mean error"),
     ("views.all.lpips", "LPIPS of held-out views"),
 )
 
