@@ -29,6 +29,7 @@ from bridge.terminal import Output, stop_signals
 from bridge.wire.config import DEFAULT_ENDPOINT, WireConfig
 from twin.errors import TwinError
 from twin.replay.config import ReplayConfig
+from twin.replay.scene import refuse_soft
 from twin.scene.settings import convert_duration
 
 ENGINE_NONE = "none"
@@ -186,6 +187,7 @@ class Gate:
 
     def _check(self, plan: Plan) -> str:
         """Refuse plans this gate cannot judge; return the robot description."""
+        refuse_soft(self._task)
         if plan.task and plan.task != self._task.name:
             raise UndecidedError(
                 f"plan {plan.id} is for task {plan.task!r}; this gate judges {self._task.name!r}. "

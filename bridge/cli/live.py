@@ -93,6 +93,7 @@ def publish_standin(
     SIGINT or SIGTERM finish the open episode.
     Example: robot-gst publish standin --trials 3 --seed 1
     Scan only: robot-gst publish standin --trials 0
+    Soft toys: robot-gst publish standin --task sloth_into_basket --conditions without_replanning
 
     Args:
         config: What the session does.

@@ -16,6 +16,7 @@ TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 STRING = "std_msgs/msg/String"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 PLAN = "gst/Plan"
 VERDICT = "gst/Verdict"
@@ -119,6 +120,7 @@ _TOPIC_RULES: tuple[tuple[str, str], ...] = (
     (r"/event$", EVENT),
     (r"/verdict$", VERDICT),
     (r"/object/[^/]+/pose$", POSE_STAMPED),
+    (r"/object/[^/]+/nodes$", POINT_CLOUD),
     (r"/localisation$", LOCALISATION),
     (r"^/recorder/drops$", DROPS),
 )

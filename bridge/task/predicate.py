@@ -5,7 +5,7 @@ Errata resolution 9 and 10: the predicate reads the settled final state x_{T+1};
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,8 @@ class Rollout:
     Ts_base_object: Mapping[str, Float[np.ndarray, "num_steps 4 4"]]
     finger_contact: Mapping[str, Bool[np.ndarray, " num_steps"]]
     """Per object: whether a finger touches it. An object may be missing: unknown."""
+    extents_m: Mapping[str, Float[np.ndarray, "num_steps 3"]] = field(default_factory=dict)
+    """Per soft object: its extents along its own axes [m]. May be missing: unknown."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +35,8 @@ class Finding:
     kind: str
     value: bool | None
     detail: str
+    object_id: str = ""
+    """The object it is about."""
 
 
 def evaluate_success(task: Task, rollout: Rollout) -> list[Finding]:
@@ -68,8 +72,13 @@ def _evaluate(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
         raise UsageError(message)
     object_id = spec["object"]
     if object_id not in rollout.Ts_base_object:
-        return Finding(kind=spec["kind"], value=None, detail=f"{object_id} was not localised")
-    return rule(spec, task, rollout)
+        return Finding(
+            kind=spec["kind"],
+            value=None,
+            detail=f"{object_id} was not localised",
+            object_id=object_id,
+        )
+    return replace(rule(spec, task, rollout), object_id=object_id)
 
 
 def _inside(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
@@ -121,8 +130,33 @@ def _no_finger_contact(spec: Mapping[str, Any], task: Task, rollout: Rollout) ->
     return Finding(kind="no_finger_contact", value=not touching, detail=detail)
 
 
+def _shape(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
+    object_id = spec["object"]
+    model = task.objects[object_id]
+    if model.soft is None:
+        return Finding(kind="shape", value=True, detail=f"{object_id} is rigid")
+    extents = rollout.extents_m.get(object_id)
+    if extents is None:
+        return Finding(kind="shape", value=None, detail=f"the shape of {object_id} is not known")
+    change = float(np.max(np.abs(extents[-1] / np.array(model.size_m) - 1.0)))
+    return Finding(
+        kind="shape",
+        value=bool(change <= spec["tolerance_fraction"]),
+        detail=f"an extent of {object_id} differs by {change:.0%} from rest",
+    )
+
+
+def objects_done(findings: list[Finding], manipulated: tuple[str, ...]) -> dict[str, bool | None]:
+    """Per manipulated object: whether everything asked of it holds."""
+    return {
+        key: all_hold([finding for finding in findings if finding.object_id == key])
+        for key in manipulated
+    }
+
+
 _RULES: dict[str, Callable[[Mapping[str, Any], Task, Rollout], Finding]] = {
     "inside": _inside,
     "settled": _settled,
     "no_finger_contact": _no_finger_contact,
+    "shape": _shape,
 }

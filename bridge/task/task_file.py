@@ -11,8 +11,26 @@ from jaxtyping import Float
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.task.data import dataset_file
+from bridge.task.meshes.toys import DESIGNS
 
 SCHEMA_VERSION = 1
+BASKET = "basket"
+MESHES = (*sorted(DESIGNS), BASKET)
+"""Names an object of shape ``mesh`` may give."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoftMaterial:
+    """What a soft object is made of; nominal values."""
+
+    young_pa: float
+    """Young's modulus of the whole body [Pa]."""
+    poisson: float
+    """Poisson's ratio, 0 to below 0.5."""
+    damping_s: float
+    """Rayleigh damping: the stiffness times this resists the speed of deformation [s]."""
+    cell_m: float
+    """Edge of the cells its inside is divided into [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +39,7 @@ class ObjectModel:
 
     id: str
     shape: str
-    """box (origin at the centre) or open_box (origin under the floor)."""
+    """box, mesh (origin at the centre), open_box, mesh "basket" (origin under the floor)."""
     size_m: tuple[float, float, float]
     """Outer extents."""
     color_srgb: tuple[int, int, int]
@@ -29,17 +47,41 @@ class ObjectModel:
     mass_kg: float = 0.1
     fixed: bool = False
     symmetry: str = "none"
+    mesh: str | None = None
+    """Which mesh of ``bridge.task.meshes`` it is; None for boxes."""
+    soft: SoftMaterial | None = None
+    """None: rigid."""
+    grasp_m: tuple[float, float, float] = (0.0, 0.0, 0.004)
+    """Where a gripper takes it, in the object frame, closing along its y axis."""
 
     @property
     def inner_m(self) -> tuple[float, float, float]:
-        """Extents of the cavity of an open box."""
+        """Extents of the cavity of an open box or a basket."""
         x, y, z = self.size_m
         return x - 2 * self.wall_m, y - 2 * self.wall_m, z - self.wall_m
 
+    @property
+    def origin_at_centre(self) -> bool:
+        """Whether the origin is the middle of the outer extents; else it is under the floor."""
+        return self.shape == "box" or (self.shape == "mesh" and self.mesh != BASKET)
+
+    @property
+    def rest_height_m(self) -> float:
+        """Height of the origin above what the object stands on [m]."""
+        return self.size_m[2] / 2 if self.origin_at_centre else 0.0
+
+    @property
+    def grasp_turn_rad(self) -> float:
+        """Turn about the vertical after which a gripper can take it in the same way."""
+        return np.pi / 2 if self.symmetry == "cube" else np.pi
+
     def panels(self) -> list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]:
-        """Solid boxes the object is made of: (centre, extents) in the object frame [m]."""
+        """Solid boxes the object is made of: (centre, extents) in the object frame [m].
+
+        A mesh is stood in for: a toy by the box around it, a basket by floor and straight walls.
+        """
         size = np.array(self.size_m)
-        if self.shape == "box":
+        if self.origin_at_centre:
             return [(np.zeros(3), size)]
         x, y, z = size
         wall = self.wall_m
@@ -74,18 +116,24 @@ class Task:
     start: dict[str, StartRange]
     stages: tuple[dict[str, Any], ...]
     success: tuple[dict[str, Any], ...]
+    cell: str = "standin"
+    """Cell file the task was made for."""
 
     def draw_start(self, rng: np.random.Generator) -> dict[str, Float[np.ndarray, "4 4"]]:
         """Draw ``T_base_object`` for every object, resting on the table top z = 0."""
         poses = {}
         for object_id, limits in self.start.items():
             yaw = rng.uniform(*limits.yaw_rad)
-            model = self.objects[object_id]
-            height = model.size_m[2] / 2 if model.shape == "box" else 0.0
+            height = self.objects[object_id].rest_height_m
             p = np.array([rng.uniform(*limits.x_m), rng.uniform(*limits.y_m), height])
             q = np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
             poses[object_id] = se3.transform_from(q, p)
         return poses
+
+    @property
+    def soft_objects(self) -> tuple[str, ...]:
+        """Objects that deform."""
+        return tuple(key for key, model in self.objects.items() if model.soft is not None)
 
 
 def load_task(name: str) -> Task:
@@ -125,29 +173,44 @@ def _task_from(table: dict[str, Any]) -> Task:
         start={key: _start_from(value) for key, value in table["start"].items()},
         stages=tuple(table["stages"]),
         success=tuple(table["success"]),
+        cell=table.get("cell", "standin"),
     )
 
 
 def _object_from(object_id: str, table: dict[str, Any]) -> ObjectModel:
-    if table["shape"] == "open_box":
+    shape, mesh = table["shape"], table.get("mesh")
+    if shape not in ("box", "open_box", "mesh"):
+        message = f"objects.{object_id}.shape {shape!r}; known: box, open_box, mesh"
+        raise ValueError(message)
+    if (shape == "mesh") != (mesh is not None) or (mesh is not None and mesh not in MESHES):
+        message = (
+            f"objects.{object_id}: shape {shape!r} with mesh {mesh!r}; "
+            f'shape "mesh" takes one of {", ".join(MESHES)}, other shapes take none'
+        )
+        raise ValueError(message)
+    wall = 0.0
+    if shape == "open_box" or mesh == BASKET:
         wall = table["wall_m"]
         x, y, z = table["inner_m"]
         size = (x + 2 * wall, y + 2 * wall, z + wall)
-    elif table["shape"] == "box":
-        wall = 0.0
-        size = tuple(table["size_m"])
     else:
-        message = f"objects.{object_id}.shape {table['shape']!r}; known: box, open_box"
+        size = tuple(table["size_m"])
+    # The cell moves boxes as rigid bodies and toys as soft ones; nothing else is modelled.
+    if (mesh is not None and mesh != BASKET) != ("soft" in table):
+        message = f"objects.{object_id}: toys need a soft table, boxes and baskets have none"
         raise ValueError(message)
     return ObjectModel(
         id=object_id,
-        shape=table["shape"],
+        shape=shape,
         size_m=size,
         wall_m=wall,
         color_srgb=tuple(table["color_srgb"]),
         mass_kg=table.get("mass_kg", 0.1),
         fixed=table.get("fixed", False),
         symmetry=table.get("symmetry", "none"),
+        mesh=mesh,
+        soft=SoftMaterial(**table["soft"]) if "soft" in table else None,
+        grasp_m=tuple(table.get("grasp_m", (0.0, 0.0, 0.004))),
     )
 
 

@@ -15,6 +15,7 @@ from bridge.task.task_file import load_task
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
 from twin.replay.job import ReplayJob, row_of_existing, run_job
+from twin.replay.scene import refuse_soft
 from twin.replay.starts import localised_starts
 from twin.scene.store import scene_hash_of
 
@@ -94,9 +95,9 @@ def _jobs_of(
         output.detail(f"{episode_id}: {episode.info.kind} with {len(plans)} plan(s), not replayed")
         return []
     task_name = episode.info.task or plans[0][1].task
-    starts = localised_starts(
-        run, episode, load_task(task_name), scene_hash=scene_hash, force=config.relocalise
-    )
+    task = load_task(task_name)
+    refuse_soft(task)
+    starts = localised_starts(run, episode, task, scene_hash=scene_hash, force=config.relocalise)
     digest = episode.sha256()
     jobs = []
     for index, (stamp_ns, plan) in enumerate(plans):

@@ -16,16 +16,19 @@ from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.render import Layer, Renderer
 from bridge.sources.standin.sensor import measure_color, measure_depth
 from bridge.sources.standin.streams import Streams
-from bridge.sources.standin.surfaces import object_surfaces, robot_surfaces, room_surfaces
+from bridge.sources.standin.surfaces import (
+    clutter_surfaces,
+    object_surfaces,
+    robot_surfaces,
+    room_surfaces,
+)
 from bridge.sources.standin.world import World
-from bridge.sources.standin.world_model import STEP_S
 from bridge.task.predicate import Rollout
 from bridge.task.robot import MAX_WIDTH_M, ur5_with_gripper_urdf
 from bridge.task.task_file import Task
 
-STEPS_PER_TICK = 4
-TICK_NS = ns_from_s(STEP_S * STEPS_PER_TICK)
-"""8 ms: the robot's 125 Hz."""
+TICK_NS = ns_from_s(0.008)
+"""The robot's 125 Hz."""
 GRIPPER_NS = ns_from_s(1 / 50)
 FRAMES_NS = ns_from_s(1 / 60)
 """Of ``/tf``; the wrist camera moves less than a millimetre off a straight line in between."""
@@ -63,12 +66,15 @@ class TruthLog:
     stamps_ns: list[int] = field(default_factory=list)
     poses: dict[str, list[Float[np.ndarray, "4 4"]]] = field(default_factory=dict)
     contact: dict[str, list[bool]] = field(default_factory=dict)
+    extents_m: dict[str, list[Float[np.ndarray, "3"]]] = field(default_factory=dict)
+    """Of soft objects."""
 
     def clear(self) -> None:
         """Forget."""
         self.stamps_ns.clear()
         self.poses.clear()
         self.contact.clear()
+        self.extents_m.clear()
 
     def rollout(self) -> Rollout:
         """Return the record in the form the predicates read."""
@@ -76,6 +82,7 @@ class TruthLog:
             stamps_ns=np.array(self.stamps_ns, dtype=np.int64),
             Ts_base_object={key: np.array(rows) for key, rows in self.poses.items()},
             finger_contact={key: np.array(rows, dtype=bool) for key, rows in self.contact.items()},
+            extents_m={key: np.array(rows) for key, rows in self.extents_m.items()},
         )
 
 
@@ -99,7 +106,8 @@ class StandinCell:
         """Build the laboratory and wait at home."""
         self.file, self.task, self.hidden, self.streams = cell, task, hidden, streams
         self.config = config
-        self.world = World(task, hidden)
+        self.world = World(task, hidden, cell.clutter)
+        self._steps_per_tick = round(TICK_NS * 1e-9 / self.world.step_s)
         self.kinematics = arm_kinematics()
         home = tool_down(np.array(cell.home_m), 0.0)
         self.home_rad = self.kinematics.joints_for(home, np.array(HOME_SEED_RAD))
@@ -123,7 +131,7 @@ class StandinCell:
     @cached_property
     def _renderer(self) -> Renderer:
         """Made with the first picture; a cell that takes none saves a second."""
-        room = room_surfaces(self._seed)
+        room = [*room_surfaces(self._seed), *clutter_surfaces(self.file.clutter)]
         return Renderer([*robot_surfaces(), *object_surfaces(self.task), *room])
 
     def reset(self, Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]) -> None:
@@ -181,7 +189,7 @@ class StandinCell:
         # The controller closes its loop on encoder readings, which are off by a constant.
         true_target = self._target_rad - self.hidden.joint_offset_rad
         self.world.command(true_target, self._width_m)
-        for _ in range(STEPS_PER_TICK):
+        for _ in range(self._steps_per_tick):
             self.world.step()
         self.now_ns += TICK_NS
         self._publish_robot()
@@ -230,6 +238,10 @@ class StandinCell:
             self.streams.truth_object(object_id, T, self.now_ns)
             self.truth.poses.setdefault(object_id, []).append(T)
             self.truth.contact.setdefault(object_id, []).append(contact[object_id])
+        for object_id in self.task.soft_objects:
+            self.streams.truth_nodes(object_id, self.world.lattice_m(object_id), self.now_ns)
+            extents = self.world.extents_m(object_id, self.truth.poses[object_id][-1])
+            self.truth.extents_m.setdefault(object_id, []).append(extents)
 
     def true_camera(self, camera_id: str) -> Float[np.ndarray, "4 4"]:
         """Where a camera really is: true joints, true mounting."""
@@ -243,6 +255,7 @@ class StandinCell:
     def capture(self) -> None:
         """Take and publish one frame of every camera, now."""
         bodies = {**self.world.Ts_base_link(), **self.world.Ts_base_object()}
+        skins = self.world.skins_m()
         for camera_id, camera in self._cameras.items():
             T_base_camera = self.true_camera(camera_id)
             backdrop = None
@@ -251,7 +264,7 @@ class StandinCell:
                 if backdrop is None:
                     backdrop = self._renderer.backdrop(camera, T_base_camera)
                     self._backdrops[camera_id] = backdrop
-            picture = self._renderer.render(camera, T_base_camera, bodies, backdrop)
+            picture = self._renderer.render(camera, T_base_camera, bodies, backdrop, skins)
             depth = measure_depth(picture, self.file.sensors, self.hidden, self._rng)
             color = measure_color(picture, self.file.sensors, self.hidden, self._rng)
             self.streams.frame(camera_id, color, depth, self.now_ns)

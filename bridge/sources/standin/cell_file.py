@@ -1,6 +1,6 @@
 """The cell file: what the laboratory publishes of itself, and the ranges of what it hides."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.data import dataset_file
+from bridge.task.meshes.toys import DESIGNS
 from bridge.task.task_file import read_tables
 
 SCHEMA_VERSION = 1
@@ -65,6 +66,17 @@ class PlannerNoise:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Clutter:
+    """Something on the table that no task is about: a box, or a mesh by its name."""
+
+    shape: str
+    size_m: tuple[float, float, float]
+    T_base_clutter: Float[np.ndarray, "4 4"]
+    """Origin in the middle."""
+    color_srgb: tuple[int, int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
 class CellFile:
     """One ``datasets/cells/*.toml``."""
 
@@ -78,6 +90,14 @@ class CellFile:
     planner: PlannerNoise
     test_seeds: tuple[int, int]
     development_seeds: tuple[int, int]
+    clutter: tuple[Clutter, ...] = ()
+    """What else stands on the table."""
+    planner_of: dict[str, PlannerNoise] = field(default_factory=dict)
+    """Tasks the planner is differently wrong at."""
+
+    def noise_for(self, task_name: str) -> PlannerNoise:
+        """Return how wrong the scripted planner is at a task."""
+        return self.planner_of.get(task_name, self.planner)
 
 
 def load_cell(name: str) -> CellFile:
@@ -103,6 +123,7 @@ def _cell_from(table: dict[str, Any]) -> CellFile:
         message = f"schema_version {table['schema_version']} is newer than {SCHEMA_VERSION}"
         raise ValueError(message)
     x, y, z = table["robot"]["home_m"]
+    planner, planner_of = _planners(table["planner"])
     return CellFile(
         name=table["name"],
         home_m=(x, y, z),
@@ -111,9 +132,34 @@ def _cell_from(table: dict[str, Any]) -> CellFile:
         uniform={key: (low, high) for key, (low, high) in table["hidden"]["uniform"].items()},
         normal=dict(table["hidden"]["normal"]),
         sensors=SensorModel(**table["sensors"]),
-        planner=PlannerNoise(**table["planner"]),
+        planner=planner,
         test_seeds=_pair(table["seeds"]["test"]),
         development_seeds=_pair(table["seeds"]["development"]),
+        clutter=tuple(_clutter_from(item) for item in table.get("clutter", [])),
+        planner_of=planner_of,
+    )
+
+
+def _planners(table: dict[str, Any]) -> tuple[PlannerNoise, dict[str, PlannerNoise]]:
+    """Read the common table, and for each task named in it what differs there."""
+    common = {key: value for key, value in table.items() if not isinstance(value, dict)}
+    noise = PlannerNoise(**common)
+    differing = {key: value for key, value in table.items() if isinstance(value, dict)}
+    return noise, {key: replace(noise, **value) for key, value in differing.items()}
+
+
+def _clutter_from(table: dict[str, Any]) -> Clutter:
+    shape = table["shape"]
+    if shape != "box" and shape not in DESIGNS:
+        message = f"clutter shape {shape!r}; known: box, {', '.join(sorted(DESIGNS))}"
+        raise ValueError(message)
+    yaw = table["yaw_rad"]
+    q = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+    return Clutter(
+        shape=shape,
+        size_m=tuple(table["size_m"]),
+        T_base_clutter=se3.transform_from(q, np.array(table["p_m"])),
+        color_srgb=tuple(table.get("color_srgb", (128, 128, 128))),
     )
 
 

@@ -30,10 +30,14 @@ class HiddenParameters:
     """Encoder reading minus true angle."""
     camera_errors: dict[str, Float[np.ndarray, "4 4"]]
     """Per camera ``T_nominal_true``: the true camera seen from where it is believed to be."""
+    stiffness_scale: float | None = None
+    """Times the nominal stiffness of soft objects; None in a cell that has none."""
 
     def to_record(self) -> dict[str, Any]:
         """Return plain numbers for the truth topic."""
         record = asdict(self)
+        if self.stiffness_scale is None:
+            del record["stiffness_scale"]
         record["joint_offset_rad"] = self.joint_offset_rad.tolist()
         record["camera_errors"] = {
             key: T.round(9).tolist() for key, T in self.camera_errors.items()

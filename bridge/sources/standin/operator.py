@@ -16,7 +16,7 @@ from bridge.sources.standin.execution import execute_plan
 from bridge.sources.standin.label import OPERATOR, label_trial, void_trial
 from bridge.sources.standin.planner import (
     POLICY_NAME,
-    draw_error,
+    draw_errors,
     perceive,
     plan_pick_and_place,
 )
@@ -78,7 +78,7 @@ class Operator:
 
     def start_poses(self, start_seed: int, condition: str) -> dict[str, Float[np.ndarray, "4 4"]]:
         """The declared start as a person puts it down: a little off, differently each time."""
-        noise = self._cell.file.planner
+        noise = self._cell.file.noise_for(self._cell.task.name)
         poses = self._cell.task.draw_start(np.random.default_rng(start_seed))
         index = CONDITIONS.index(condition) if condition in CONDITIONS else len(CONDITIONS)
         rng = np.random.default_rng([RESET_STREAM, start_seed, index])
@@ -149,7 +149,7 @@ class Operator:
         else:
             cell.wait(LOOK_S)
         if decision.void:
-            outcome = void_trial(decision.remark)
+            outcome = void_trial(cell.task, decision.remark)
         else:
             executed = decision.plan is not None
             outcome = label_trial(cell.task, cell.truth, executed=executed, remark=decision.remark)
@@ -206,11 +206,11 @@ class Operator:
         self, info: EpisodeInfo, start_seed: int, round_: int, parent: Plan | None
     ) -> Plan:
         cell = self._cell
-        noise = cell.file.planner
+        noise = cell.file.noise_for(cell.task.name)
         return plan_pick_and_place(
             cell.task,
             perceive(cell.world.Ts_base_object(), noise, start_seed=start_seed),
-            draw_error(noise, start_seed=start_seed, round_=round_),
+            draw_errors(noise, len(cell.task.manipulated), start_seed=start_seed, round_=round_),
             kinematics=cell.kinematics,
             joints_start_rad=cell.home_rad,
             max_joint_speed_rad_s=cell.file.max_joint_speed_rad_s,
@@ -266,7 +266,7 @@ class Operator:
         """Close an episode that was interrupted, if one is open, or throw it away."""
         self._cell.cameras_running = False
         if self._open:
-            self._end(void_trial("interrupted"), discard=discard)
+            self._end(void_trial(self._cell.task, "interrupted"), discard=discard)
 
     def _control(self, verb: str, request: Mapping[str, Any]) -> dict[str, Any]:
         key = f"rec/{self._config.recorder}/ctl/{verb}"

@@ -7,23 +7,24 @@ start begin with the same idea.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from bridge.clock import ns_from_s
+from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.sources.standin.cell_file import PlannerNoise
-from bridge.sources.standin.kinematics import Kinematics, slerp_poses, tool_down, wrap_rad, yaw_of
-from bridge.task.plan import Plan, Stage, Waypoint
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M, ROBOT_NAME
-from bridge.task.task_file import Task
+from bridge.sources.standin.kinematics import Kinematics, tool_down, wrap_rad, yaw_of
+from bridge.sources.standin.trajectory import Leg, follow_legs
+from bridge.task.plan import Plan, Stage
+from bridge.task.robot import ARM_JOINTS, BASE_FRAME, ROBOT_NAME
+from bridge.task.task_file import ObjectModel, Task
 
 PLANNER_NAME = "standin_scripted"
 POLICY_NAME = "scripted"
 GROUNDING = "stand-in: true poses with seeded noise"
 PLANNER_STREAM = 202
-WAYPOINT_S = 0.05
 HOVER_M = 0.13
 """Height of the tool above the object's centre before the descent."""
 CARRY_M = 0.24
@@ -32,7 +33,6 @@ RELEASE_CLEARANCE_M = 0.018
 """Between the underside of the held object and the top of the container's walls."""
 LOWEST_TOOL_M = 0.016
 """The tips reach 10 mm below the tool frame."""
-GRASP_ABOVE_CENTRE_M = 0.004
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,19 +50,19 @@ NO_ERROR = GraspError(along_m=0.0, across_m=0.0, yaw_rad=0.0, height_m=0.0, rele
 
 
 @dataclass(frozen=True, kw_only=True)
-class Leg:
-    """One movement of the tool, or a wait when it stays where it is."""
+class _StageIds:
+    """The stages of a task that one object goes through."""
 
-    name: str
-    stage: str
-    T_base_tcp: Float[np.ndarray, "4 4"]
-    duration_s: float
-    g: int
+    pick: str
+    carry: str
+    place: str
 
 
-def draw_error(noise: PlannerNoise, *, start_seed: int, round_: int) -> GraspError:
-    """Draw how a candidate is wrong; the same start and round give the same error."""
-    rng = np.random.default_rng([PLANNER_STREAM, start_seed, round_])
+def draw_error(noise: PlannerNoise, *, start_seed: int, round_: int, index: int = 0) -> GraspError:
+    """Draw how a candidate is wrong; the same start, round and object give the same error."""
+    # The first object's stream has no index: a task with one object draws what it always drew.
+    more = [index] if index else []
+    rng = np.random.default_rng([PLANNER_STREAM, start_seed, round_, *more])
     release = rng.normal(0.0, noise.release_m, 2)
     return GraspError(
         along_m=float(rng.normal(0.0, noise.grasp_along_m)),
@@ -70,6 +70,16 @@ def draw_error(noise: PlannerNoise, *, start_seed: int, round_: int) -> GraspErr
         yaw_rad=float(rng.normal(0.0, noise.grasp_yaw_rad)),
         height_m=float(rng.normal(0.0, noise.grasp_height_m)),
         release_m=(float(release[0]), float(release[1])),
+    )
+
+
+def draw_errors(
+    noise: PlannerNoise, count: int, *, start_seed: int, round_: int
+) -> tuple[GraspError, ...]:
+    """Draw an error for each of several objects."""
+    return tuple(
+        draw_error(noise, start_seed=start_seed, round_=round_, index=index)
+        for index in range(count)
     )
 
 
@@ -95,7 +105,7 @@ def perceive(
 def plan_pick_and_place(
     task: Task,
     seen: Mapping[str, Float[np.ndarray, "4 4"]],
-    error: GraspError,
+    error: GraspError | Sequence[GraspError],
     *,
     kinematics: Kinematics,
     joints_start_rad: Float[np.ndarray, "6"],
@@ -106,15 +116,36 @@ def plan_pick_and_place(
     parent_id: str | None = None,
     round_: int = 0,
 ) -> Plan:
-    """Plan one attempt: pregrasp, grasp, close, lift, carry, lower, open, retreat, home.
+    """Plan one attempt: each object in turn is grasped, carried to its slot and let go; then home.
+
+    Args:
+        task: Objects and stages.
+        seen: Poses ``T_base_object`` as perceived.
+        error: How the attempt misses, one for all objects or one per manipulated object.
+        kinematics: The arm's.
+        joints_start_rad: Where it starts and ends.
+        max_joint_speed_rad_s: No joint moves faster.
+        plan_id: Name of the plan.
+        condition: Of the trial.
+        start_id: Of the trial.
+        parent_id: The plan that was refused before.
+        round_: How many were refused before.
 
     Raises:
         UnreachablePoseError: When the arm cannot follow.
     """
-    object_id, container_id = task.manipulated[0], task.containers[0]
+    count = len(task.manipulated)
+    errors = [error] * count if isinstance(error, GraspError) else list(error)
+    container = task.containers[0]
     T_home = kinematics.T_base_tcp(joints_start_rad)
-    legs = _legs(task, seen[object_id], seen[container_id], T_home, error)
-    tau, bounds = _trajectory(legs, T_home, joints_start_rad, kinematics, max_joint_speed_rad_s)
+    slots = release_slots(count, task.objects[container])
+    legs_of = {
+        key: _legs(task, key, seen[key], seen[container], errors[index], slots[index])
+        for index, key in enumerate(task.manipulated)
+    }
+    legs = [leg for mine in legs_of.values() for leg in mine]
+    legs.append(Leg(name="home", stage=legs[-1].stage, T_base_tcp=T_home, duration_s=1.4, g=0))
+    tau, bounds = follow_legs(legs, T_home, joints_start_rad, kinematics, max_joint_speed_rad_s)
     return Plan(
         id=plan_id,
         parent_id=parent_id,
@@ -129,26 +160,44 @@ def plan_pick_and_place(
         instruction=task.instruction,
         grounding_source=GROUNDING,
         entities={key: _pose_record(T) for key, T in seen.items()},
-        keypoints_m=tuple(_point(seen[key][:3, 3]) for key in (object_id, container_id)),
+        keypoints_m=tuple(_point(seen[key][:3, 3]) for key in (*task.manipulated, container)),
         joint_names=ARM_JOINTS,
-        stages=_stages(task, legs, bounds, seen),
+        stages=_stages(task, legs_of, bounds, seen),
         tau=tau,
     )
 
 
+def release_slots(count: int, container: ObjectModel) -> list[Float[np.ndarray, "2"]]:
+    """Where in a container several objects go: two rows along its x axis, in its frame [m].
+
+    An odd last one lies between the rows; a single one goes to the middle.
+    """
+    x, y, _ = container.inner_m
+    columns = -(-count // 2)
+    slots = []
+    for index in range(count):
+        alone = index == count - 1 and count % 2 == 1
+        across = 0.0 if alone else (index % 2 - 0.5) * y / 2
+        slots.append(np.array([x * ((index // 2 + 0.5) / columns - 0.5), across]))
+    return slots
+
+
 def _legs(
     task: Task,
+    object_id: str,
     T_base_object: Float[np.ndarray, "4 4"],
     T_base_container: Float[np.ndarray, "4 4"],
-    T_home: Float[np.ndarray, "4 4"],
     error: GraspError,
+    slot_m: Float[np.ndarray, "2"],
 ) -> list[Leg]:
+    model, container = task.objects[object_id], task.objects[task.containers[0]]
     # A cube looks the same after a quarter turn: take the grasp that turns the wrist least.
-    quarter = np.pi / 2
+    turn = model.grasp_turn_rad
     yaw = yaw_of(T_base_object)
-    yaw = min((wrap_rad(yaw + k * quarter) for k in range(4)), key=abs) + error.yaw_rad
-    model, container = task.objects[task.manipulated[0]], task.objects[task.containers[0]]
-    p = T_base_object[:3, 3] + np.array([0.0, 0.0, GRASP_ABOVE_CENTRE_M + error.height_m])
+    turns = range(round(2 * np.pi / turn))
+    yaw = min((wrap_rad(yaw + k * turn) for k in turns), key=abs) + error.yaw_rad
+    p = T_base_object[:3, 3] + np.array([0.0, 0.0, model.grasp_m[2] + error.height_m])
+    p[:2] += T_base_object[:2, :2] @ np.array(model.grasp_m[:2])
     R = tool_down(p, yaw)[:3, :3]
     p = p + R[:, 0] * error.along_m + R[:, 1] * error.across_m
     p[2] = max(p[2], LOWEST_TOOL_M)
@@ -156,113 +205,57 @@ def _legs(
     above[2] = p[2] + HOVER_M
     carried[2] = CARRY_M
     over = T_base_container[:3, 3] + np.array([*error.release_m, 0.0])
+    over[:2] += T_base_container[:2, :2] @ slot_m
     over[2] = CARRY_M
     low = over.copy()
     below_tool = p[2] - (T_base_object[2, 3] - model.size_m[2] / 2)
     low[2] = T_base_container[2, 3] + container.size_m[2] + below_tool + RELEASE_CLEARANCE_M
-    grasp, place = _stage_ids(task)
+    ids = _stage_ids(task, object_id)
+    moves = (
+        ("pregrasp", ids.pick, above, 1.5, 0),
+        ("grasp", ids.pick, p, 0.9, 0),
+        ("settle", ids.pick, p, 0.2, 0),
+        ("close", ids.pick, p, 0.7, 1),
+        ("lift", ids.pick, carried, 0.9, 1),
+        ("carry", ids.carry, over, 1.6, 1),
+        ("lower", ids.place, low, 0.8, 1),
+        ("settle", ids.place, low, 0.2, 1),
+        ("open", ids.place, low, 0.5, 0),
+        ("retreat", ids.place, over, 0.7, 0),
+    )
     return [
-        Leg(name="pregrasp", stage=grasp, T_base_tcp=tool_down(above, yaw), duration_s=1.5, g=0),
-        Leg(name="grasp", stage=grasp, T_base_tcp=tool_down(p, yaw), duration_s=0.9, g=0),
-        Leg(name="settle", stage=grasp, T_base_tcp=tool_down(p, yaw), duration_s=0.2, g=0),
-        Leg(name="close", stage=grasp, T_base_tcp=tool_down(p, yaw), duration_s=0.7, g=1),
-        Leg(name="lift", stage=grasp, T_base_tcp=tool_down(carried, yaw), duration_s=0.9, g=1),
-        Leg(name="carry", stage=place, T_base_tcp=tool_down(over, yaw), duration_s=1.6, g=1),
-        Leg(name="lower", stage=place, T_base_tcp=tool_down(low, yaw), duration_s=0.8, g=1),
-        Leg(name="settle", stage=place, T_base_tcp=tool_down(low, yaw), duration_s=0.2, g=1),
-        Leg(name="open", stage=place, T_base_tcp=tool_down(low, yaw), duration_s=0.5, g=0),
-        Leg(name="retreat", stage=place, T_base_tcp=tool_down(over, yaw), duration_s=0.7, g=0),
-        Leg(name="home", stage=place, T_base_tcp=T_home, duration_s=1.4, g=0),
+        Leg(name=name, stage=stage, T_base_tcp=tool_down(to, yaw), duration_s=seconds, g=g)
+        for name, stage, to, seconds, g in moves
     ]
 
 
-def _stage_ids(task: Task) -> tuple[str, str]:
-    """The stages that grasp and release in the task file."""
-    grasp = next(stage["id"] for stage in task.stages if stage.get("grasp"))
-    place = next(stage["id"] for stage in task.stages if stage.get("release"))
-    return grasp, place
+def _stage_ids(task: Task, object_id: str) -> _StageIds:
+    """The stages that grasp, carry and release an object; placing may cover the carrying."""
 
+    def of(verb: str) -> str | None:
+        return next((stage["id"] for stage in task.stages if stage.get(verb) == object_id), None)
 
-def _trajectory(
-    legs: Sequence[Leg],
-    T_start: Float[np.ndarray, "4 4"],
-    joints_start_rad: Float[np.ndarray, "6"],
-    kinematics: Kinematics,
-    max_joint_speed_rad_s: float,
-) -> tuple[tuple[Waypoint, ...], dict[str, tuple[int, int]]]:
-    """Sample straight lines at 20 Hz with smooth speed, slower where a joint would race."""
-    T_from, joints, t_ns = T_start, joints_start_rad, 0
-    tau = [_waypoint(0, T_start, joints_start_rad, legs[0].g)]
-    bounds: dict[str, tuple[int, int]] = {}
-    for leg in legs:
-        count = max(round(leg.duration_s / WAYPOINT_S), 1)
-        while True:
-            Ts, rows = _sample_leg(T_from, leg.T_base_tcp, joints, count, kinematics)
-            steps = np.abs(np.diff(np.vstack([joints, rows]), axis=0))
-            speed = float(steps.max()) / WAYPOINT_S
-            if speed <= max_joint_speed_rad_s:
-                break
-            count = int(np.ceil(count * 1.02 * speed / max_joint_speed_rad_s))
-        begin_ns = t_ns
-        for T, row in zip(Ts, rows, strict=True):
-            t_ns += ns_from_s(WAYPOINT_S)
-            tau.append(_waypoint(t_ns, T, row, leg.g))
-        bounds[leg.stage] = (bounds.get(leg.stage, (begin_ns, 0))[0], t_ns)
-        T_from, joints = leg.T_base_tcp, rows[-1]
-    return tuple(tau), bounds
-
-
-def _sample_leg(
-    T_from: Float[np.ndarray, "4 4"],
-    T_to: Float[np.ndarray, "4 4"],
-    joints_rad: Float[np.ndarray, "6"],
-    count: int,
-    kinematics: Kinematics,
-) -> tuple[Float[np.ndarray, "num_poses 4 4"], Float[np.ndarray, "num_poses 6"]]:
-    s = np.arange(1, count + 1) / count
-    # Minimum-jerk time law (Flash and Hogan 1985): at rest at both ends.
-    Ts = slerp_poses(T_from, T_to, s**3 * (10 - 15 * s + 6 * s**2))
-    rows = []
-    for T in Ts:
-        joints_rad = kinematics.joints_for(T, joints_rad)
-        rows.append(joints_rad)
-    return Ts, np.array(rows)
-
-
-def _waypoint(
-    t_ns: int, T: Float[np.ndarray, "4 4"], joints_rad: Float[np.ndarray, "6"], g: int
-) -> Waypoint:
-    q, p = se3.split(T)
-    w, x, y, z = (float(value) for value in q)
-    return Waypoint(
-        t_ns=t_ns,
-        p_m=_point(p),
-        q_wxyz=(w, x, y, z),
-        g=g,
-        width_m=0.0 if g else MAX_WIDTH_M,
-        joints_rad=tuple(float(value) for value in joints_rad),
-    )
+    pick, carry, place = of("grasp"), of("carry"), of("release")
+    if pick is None or place is None:
+        message = (
+            f"task {task.name} has no stage that grasps {object_id} or none that releases it: "
+            "the scripted planner needs both. See docs/tasks.md."
+        )
+        raise UsageError(message)
+    return _StageIds(pick=pick, carry=carry or place, place=place)
 
 
 def _stages(
     task: Task,
-    legs: Sequence[Leg],
+    legs_of: Mapping[str, Sequence[Leg]],
     bounds: Mapping[str, tuple[int, int]],
     seen: Mapping[str, Float[np.ndarray, "4 4"]],
 ) -> tuple[Stage, ...]:
-    object_id, container_id = task.manipulated[0], task.containers[0]
-    lifted, inside = seen[object_id].copy(), seen[object_id].copy()
-    close = next(leg for leg in legs if leg.name == "close")
-    lift = next(leg for leg in legs if leg.name == "lift")
-    lifted[:3, 3] += lift.T_base_tcp[:3, 3] - close.T_base_tcp[:3, 3]
-    low = next(leg for leg in legs if leg.name == "open").T_base_tcp
-    floor_m = task.objects[container_id].wall_m + task.objects[object_id].size_m[2] / 2
-    inside[:2, 3] = low[:2, 3]
-    inside[2, 3] = seen[container_id][2, 3] + floor_m
     stages = []
     for index, table in enumerate(task.stages):
         last = index == len(task.stages) - 1
-        predicted = inside if table.get("release") else lifted
+        object_id = _object_of(task, table)
+        predicted = _predicted(task, object_id, legs_of[object_id], seen, table)
         start_ns, end_ns = bounds[table["id"]]
         stages.append(
             Stage(
@@ -278,6 +271,38 @@ def _stages(
             )
         )
     return tuple(stages)
+
+
+def _object_of(task: Task, stage: Mapping[str, Any]) -> str:
+    """The object a stage handles."""
+    for verb in ("grasp", "carry", "release"):
+        if stage.get(verb) in task.manipulated:
+            return str(stage[verb])
+    message = (
+        f"stage {stage['id']} of task {task.name} grasps, carries and releases nothing: the "
+        "scripted planner cannot plan it. See docs/tasks.md."
+    )
+    raise UsageError(message)
+
+
+def _predicted(
+    task: Task,
+    object_id: str,
+    legs: Sequence[Leg],
+    seen: Mapping[str, Float[np.ndarray, "4 4"]],
+    table: Mapping[str, Any],
+) -> Float[np.ndarray, "4 4"]:
+    """Where a stage leaves its object: lifted, over the container, or on the container's floor."""
+    place = {leg.name: leg.T_base_tcp[:3, 3] for leg in legs}
+    T = seen[object_id].copy()
+    if table.get("release"):
+        container_id = task.containers[0]
+        floor_m = task.objects[container_id].wall_m + task.objects[object_id].size_m[2] / 2
+        T[:2, 3] = place["open"][:2]
+        T[2, 3] = seen[container_id][2, 3] + floor_m
+    else:
+        T[:3, 3] += place["carry" if table.get("carry") else "lift"] - place["close"]
+    return T
 
 
 def _point(p: Float[np.ndarray, "3"]) -> tuple[float, float, float]:

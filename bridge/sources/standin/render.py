@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import open3d
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt32
 
 from bridge.geometry.camera import Camera
-from bridge.sources.standin.surfaces import Surface
+from bridge.sources.standin.surfaces import Surface, smooth_normals
 
 AMBIENT = 0.50
 SKY = 0.10
@@ -73,10 +73,11 @@ class Renderer:
         self._colors = np.array([item.color for item in surfaces], dtype=np.float32)
         self._room = [k for k, item in enumerate(surfaces) if item.body == ""]
         self._moving = [k for k, item in enumerate(surfaces) if item.body != ""]
+        self._painted = [k for k, item in enumerate(surfaces) if item.paint is not None]
 
     def backdrop(self, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]) -> Layer:
         """See the room without the bodies in it, for ``render`` from the same place."""
-        posed = self._pose(T_base_camera, {}, self._room)
+        posed = self._pose(T_base_camera, {}, self._room, {})
         seen = self._look(posed, _rays(camera, T_base_camera))
         return replace(seen, colors=self._smooth_edges(posed, seen, camera, T_base_camera))
 
@@ -86,10 +87,11 @@ class Renderer:
         T_base_camera: Float[np.ndarray, "4 4"],
         Ts_base_body: Mapping[str, Float[np.ndarray, "4 4"]],
         backdrop: Layer | None = None,
+        skins_m: Mapping[str, Float[np.ndarray, "num_vertices 3"]] | None = None,
     ) -> Picture:
-        """Take a picture of the bodies where they are."""
+        """Take a picture of the bodies where they are, the soft ones by their skins."""
         which = self._moving if backdrop is not None else [*self._room, *self._moving]
-        posed = self._pose(T_base_camera, Ts_base_body, which)
+        posed = self._pose(T_base_camera, Ts_base_body, which, skins_m or {})
         seen = self._look(posed, _rays(camera, T_base_camera))
         if backdrop is not None:
             seen = _nearer(seen, backdrop)
@@ -127,15 +129,21 @@ class Renderer:
         T_base_camera: Float[np.ndarray, "4 4"],
         Ts_base_body: Mapping[str, Float[np.ndarray, "4 4"]],
         which: list[int],
+        skins_m: Mapping[str, Float[np.ndarray, "num_vertices 3"]],
     ) -> _Posed:
         scene = open3d.t.geometry.RaycastingScene(nthreads=1)
         normals, counts = [], [0]
         for index in which:
             item = self._surfaces[index]
-            T = (np.eye(4) if item.body == "" else Ts_base_body[item.body]).astype(np.float32)
-            vertices = np.ascontiguousarray(item.vertices_m @ T[:3, :3].T + T[:3, 3])
+            if item.soft and item.body in skins_m:
+                vertices = skins_m[item.body].astype(np.float32)
+                normals.append(smooth_normals(vertices, item.triangles))
+            else:
+                T = np.eye(4) if item.body == "" else Ts_base_body[item.body]
+                T = T.astype(np.float32)
+                vertices = np.ascontiguousarray(item.vertices_m @ T[:3, :3].T + T[:3, 3])
+                normals.append(item.corner_normals @ T[:3, :3].T)
             scene.add_triangles(_tensor(vertices), _tensor(item.triangles))
-            normals.append(item.corner_normals @ T[:3, :3].T)
             counts.append(len(item.triangles))
         return _Posed(
             scene=scene,
@@ -152,14 +160,17 @@ class Renderer:
         depth = hits["t_hit"].numpy()
         hit = np.flatnonzero(np.isfinite(depth))
         local_ids = hits["geometry_ids"].numpy()[hit].astype(np.intp)
-        triangles = posed.first[local_ids] + hits["primitive_ids"].numpy()[hit]
-        normals = _interpolate(posed.corner_normals[triangles], hits["primitive_uvs"].numpy()[hit])
+        own_ids = hits["primitive_ids"].numpy()[hit]
+        uvs = hits["primitive_uvs"].numpy()[hit]
+        normals = _interpolate(posed.corner_normals[posed.first[local_ids] + own_ids], uvs)
         near = rays[hit]
         facing = -np.einsum("ij,ij->i", normals, near)
         normals[facing < 0] *= -1.0
         points = posed.eye_m + near * depth[hit][:, None]
         surface_ids = posed.indices[local_ids]
-        shaded = self._albedo(surface_ids, points) * _shade(normals)[:, None]
+        albedo = self._albedo(surface_ids, points)
+        self._paint(albedo, surface_ids, own_ids, uvs)
+        shaded = albedo * _shade(normals)[:, None]
         layer = Layer(
             colors=np.tile(NOTHING, (count, 1)),
             depth_m=depth,
@@ -185,6 +196,24 @@ class Renderer:
                 where = points[mine][:, [u, v]] - np.array(item.texture_shift_m, dtype=np.float32)
                 colors[mine] = item.texture.sample(where)
         return np.asarray(colors)
+
+    def _paint(
+        self,
+        albedo: Float[np.ndarray, "num_hits 3"],
+        surface_ids: Int[np.ndarray, " num_hits"],
+        triangle_ids: UInt32[np.ndarray, " num_hits"],
+        uvs: Float[np.ndarray, "num_hits 2"],
+    ) -> None:
+        """Colour painted surfaces by where on the undeformed surface each ray arrived."""
+        for index in self._painted:
+            item = self._surfaces[index]
+            mine = np.flatnonzero(surface_ids == index)
+            if len(mine) == 0 or item.paint is None or item.paint_vertices_m is None:
+                continue
+            corners = item.paint_vertices_m[item.triangles[triangle_ids[mine]]]
+            u, v = uvs[mine, :1], uvs[mine, 1:]
+            places = corners[:, 0] * (1 - u - v) + corners[:, 1] * u + corners[:, 2] * v
+            albedo[mine] = item.paint(places.astype(np.float64))
 
 
 def _rays(

@@ -37,7 +37,8 @@ def run_session(
     Returns:
         Per condition how many trials had which outcome, and whether the session was stopped.
     """
-    file, task = load_cell(config.cell_file), load_task(config.task)
+    task = load_task(config.task)
+    file = load_cell(config.cell_file or task.cell)
     cell = StandinCell(
         file,
         task,
@@ -68,8 +69,12 @@ def run_session(
 
 def _summary(operator: Operator, config: SessionConfig, *, stopped: bool) -> dict[str, Any]:
     counts: dict[str, Counter[str]] = {}
+    objects: dict[str, dict[str, int]] = {}
     for info, outcome in operator.results:
         counts.setdefault(info.condition, Counter())[outcome.result] += 1
+        if outcome.unit == "object":
+            sums = objects.setdefault(info.condition, {"k": 0, "n": 0})
+            sums["k"], sums["n"] = sums["k"] + outcome.k, sums["n"] + outcome.n
     return {
         "stand_in": True,
         "cell": config.cell,
@@ -77,6 +82,7 @@ def _summary(operator: Operator, config: SessionConfig, *, stopped: bool) -> dic
         "seed": config.seed,
         "scan": operator.scanned,
         "outcomes": {condition: dict(counter) for condition, counter in counts.items()},
+        "objects": objects,
         "stopped": stopped,
     }
 
@@ -87,7 +93,9 @@ def describe(summary: dict[str, Any]) -> str:
     for condition, counts in summary["outcomes"].items():
         total = sum(counts.values())
         listed = ", ".join(f"{count} {result}" for result, count in sorted(counts.items()))
-        lines.append(f"  {condition}: {total} trials, {listed}")
+        sums = summary["objects"].get(condition)
+        told = f"; {sums['k']} of {sums['n']} objects" if sums else ""
+        lines.append(f"  {condition}: {total} trials, {listed}{told}")
     if summary["stopped"]:
         lines.append("  stopped before the end")
     return "\n".join(lines)

@@ -13,10 +13,11 @@ class SessionConfig:
 
     cell: str = "standin"
     """Name of the cell in topics."""
-    cell_file: str = "standin"
-    """Cell file: a name in datasets/cells or a path."""
+    cell_file: str = ""
+    """Cell file: a name in datasets/cells or a path; empty: the one the task names."""
     task: str = "cube_into_box"
-    """Task file: a name in datasets/tasks or a path."""
+    """Task file: a name in datasets/tasks (cube_into_box, sloth_into_basket,
+    five_ducks_into_basket) or a path."""
     seed: int = 0
     """Draws the hidden laboratory and the starts; same seed, same session."""
     scan: bool = True

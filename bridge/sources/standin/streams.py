@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8, UInt16
 
 from bridge.clock import split_ns
 from bridge.episode import schema
+from bridge.episode.point_cloud import PointCloudSample
 from bridge.episode.records import (
     CameraInfo,
     CompressedColor,
@@ -171,6 +172,14 @@ class Streams:
         """Publish a true pose, for tests and the evaluator's perception metrics only."""
         sample = PoseSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=T_base_object)
         topic = f"{schema.TRUTH_PREFIX}object/{object_id}/pose"
+        self._put(topic, sample.to_cdr(), stamp_ns)
+
+    def truth_nodes(
+        self, object_id: str, points_m: Float[np.ndarray, "num_points 3"], stamp_ns: int
+    ) -> None:
+        """Publish where the points of a soft object really are, in ``base_link``."""
+        sample = PointCloudSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, points_m=points_m)
+        topic = f"{schema.TRUTH_PREFIX}object/{object_id}/nodes"
         self._put(topic, sample.to_cdr(), stamp_ns)
 
     def truth_parameters(self, record: Mapping[str, Any], stamp_ns: int) -> None:

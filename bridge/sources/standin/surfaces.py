@@ -1,6 +1,7 @@
 """What the cameras can see: triangles, smooth normals and colours of every body."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -9,11 +10,14 @@ import open3d
 from jaxtyping import Float, Int, UInt32
 
 from bridge.geometry import se3
+from bridge.sources.standin.cell_file import Clutter
 from bridge.sources.standin.links import LinkShape, robot_links
 from bridge.sources.standin.textures import Texture, room_texture, table_texture
 from bridge.sources.standin.world_model import TABLE_CENTRE_M, TABLE_SIZE_M
+from bridge.task.meshes.catalogue import ToyMesh, object_mesh, toy_mesh
+from bridge.task.meshes.toys import Paint
 from bridge.task.robot import FINGER_LINKS
-from bridge.task.task_file import Task
+from bridge.task.task_file import ObjectModel, Task
 
 CREASE_COSINE = 0.8
 """Faces that meet at a sharper angle keep an edge."""
@@ -36,6 +40,12 @@ class Surface:
     texture_axes: tuple[int, int] = (0, 1)
     """Which coordinates of the body lie along the texture's columns and rows."""
     texture_shift_m: tuple[float, float] = (0.0, 0.0)
+    paint: Paint | None = None
+    """Colour by place in ``paint_vertices_m``; finer than the triangles."""
+    paint_vertices_m: Float[np.ndarray, "num_vertices 3"] | None = None
+    """The vertices at rest, in the frame the paint is given in."""
+    soft: bool = False
+    """Its vertices move on their own: a picture takes them from elsewhere."""
 
 
 def box_surface(
@@ -119,10 +129,76 @@ def object_surfaces(task: Task) -> list[Surface]:
     """The task's objects in their declared colours."""
     surfaces = []
     for object_id, model in task.objects.items():
+        if model.mesh is not None:
+            surfaces.append(_painted_surface(model))
+            continue
         red, green, blue = (channel / 255 for channel in model.color_srgb)
         for centre, size in model.panels():
             surfaces.append(box_surface(object_id, centre, size, (red, green, blue)))
     return surfaces
+
+
+def _painted_surface(model: ObjectModel) -> Surface:
+    surface = _mesh_surface(model.id, object_mesh(model))
+    return replace(surface, soft=model.soft is not None)
+
+
+def _mesh_surface(body: str, mesh: ToyMesh) -> Surface:
+    """A closed mesh with smooth normals, painted."""
+    vertices = mesh.vertices_m.astype(np.float32)
+    return Surface(
+        body=body,
+        vertices_m=vertices,
+        triangles=mesh.triangles.astype(np.uint32),
+        corner_normals=smooth_normals(vertices, mesh.triangles),
+        color=(0.5, 0.5, 0.5),
+        paint=mesh.paint,
+        paint_vertices_m=vertices,
+    )
+
+
+def smooth_normals(
+    vertices_m: Float[np.ndarray, "num_vertices 3"], triangles: np.ndarray
+) -> Float[np.ndarray, "num_triangles 3 3"]:
+    """Normals at the corners of triangles, weighted by area, without creases."""
+    a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
+    weighted = np.cross(b - a, c - a)
+    total = np.stack(
+        [
+            np.bincount(
+                triangles.ravel(), np.repeat(weighted[:, axis], 3), minlength=len(vertices_m)
+            )
+            for axis in range(3)
+        ],
+        axis=1,
+    )
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.asarray((total / np.maximum(length, 1e-12))[triangles], dtype=np.float32)
+
+
+def clutter_surfaces(clutter: Sequence[Clutter]) -> list[Surface]:
+    """What stands about on the table, as part of the room."""
+    surfaces = []
+    for item in clutter:
+        if item.shape == "box":
+            red, green, blue = (channel / 255 for channel in item.color_srgb)
+            box = box_surface("", np.zeros(3), np.array(item.size_m), (red, green, blue))
+            surfaces.append(_placed(box, item.T_base_clutter))
+        else:
+            surface = _mesh_surface("", toy_mesh(item.shape, item.size_m))
+            surfaces.append(_placed(surface, item.T_base_clutter))
+    return surfaces
+
+
+def _placed(surface: Surface, T_base_body: Float[np.ndarray, "4 4"]) -> Surface:
+    """Bring a surface of the room from its own frame to where it stands."""
+    vertices = se3.apply(T_base_body, surface.vertices_m.astype(np.float64))
+    normals = surface.corner_normals @ T_base_body[:3, :3].T
+    return replace(
+        surface,
+        vertices_m=vertices.astype(np.float32),
+        corner_normals=normals.astype(np.float32),
+    )
 
 
 def room_surfaces(seed: int) -> list[Surface]:

@@ -1,5 +1,6 @@
 """The MuJoCo model of the laboratory: robot, gripper, table, task objects."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -7,8 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
+from bridge.sources.standin.cell_file import Clutter
 from bridge.sources.standin.hidden import HiddenParameters
 from bridge.sources.standin.links import LinkModel, LinkShape, robot_links
+from bridge.sources.standin.soft import soft_model_xml
+from bridge.task.meshes.basket import BoxPart, basket_parts
 from bridge.task.robot import (
     ARM_JOINTS,
     BASE_FRAME,
@@ -17,9 +21,11 @@ from bridge.task.robot import (
     MAX_WIDTH_M,
     TCP_FRAME,
 )
-from bridge.task.task_file import ObjectModel, Task
+from bridge.task.task_file import BASKET, ObjectModel, Task
 
 STEP_S = 0.002
+SOFT_STEP_S = 0.004
+"""With soft objects: their integrator is implicit in position, and each step costs more."""
 TABLE_SIZE_M = (1.3, 1.3, 0.04)
 TABLE_CENTRE_M = (0.35, 0.0)
 # Servo gains: stiff and critically damped on the large joints, softer on the wrist.
@@ -40,18 +46,31 @@ _ROBOT_BITS = {"contype": 1, "conaffinity": 2}
 _WORLD_BITS = {"contype": 2, "conaffinity": 3}
 
 
-def build_model(task: Task, hidden: HiddenParameters) -> Any:
+def step_s_of(task: Task) -> float:
+    """Return the length of one physics step of a task [s]."""
+    return SOFT_STEP_S if task.soft_objects else STEP_S
+
+
+def build_model(task: Task, hidden: HiddenParameters, clutter: Sequence[Clutter] = ()) -> Any:
     """Compile the laboratory with its true parameters into an ``mjModel``."""
-    spec = mujoco.MjSpec()
-    spec.option.timestep = STEP_S
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    if task.soft_objects:
+        spec = mujoco.MjSpec.from_string(soft_model_xml(task, hidden))
+        # The only integrator that takes the elasticity of flexes.
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    else:
+        spec = mujoco.MjSpec()
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.timestep = step_s_of(task)
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0  # friction held stiffly: no creep of a grasped object
     spec.compiler.degree = False
     _add_robot(spec, hidden)
     _add_table(spec)
+    for index, item in enumerate(clutter):
+        _add_clutter(spec, item, index)
     for model in task.objects.values():
-        _add_object(spec, model, hidden)
+        if model.soft is None:
+            _add_object(spec, model, hidden)
     _add_actuators(spec, hidden)
     spec.add_exclude(bodyname1="table", bodyname2=BASE_FRAME)
     return spec.compile()
@@ -136,15 +155,16 @@ def _add_table(spec: Any) -> None:
 
 def _add_object(spec: Any, model: ObjectModel, hidden: HiddenParameters) -> None:
     body = spec.worldbody.add_body(name=model.id, mocap=model.fixed, pos=[0, 0, 0.5])
-    panels = model.panels()
-    volume = sum(float(np.prod(size)) for _, size in panels)
-    for index, (centre, size) in enumerate(panels):
-        mass = model.mass_kg * hidden.mass_scale * float(np.prod(size)) / volume
+    parts = solid_parts(model)
+    volume = sum(float(np.prod(part.size_m)) for part in parts)
+    for index, part in enumerate(parts):
+        mass = model.mass_kg * hidden.mass_scale * float(np.prod(part.size_m)) / volume
         body.add_geom(
             name=f"{model.id}_{index}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=centre,
-            size=_half(size),
+            pos=part.centre_m,
+            quat=part.q_wxyz,
+            size=_half(part.size_m),
             mass=mass,
             priority=1,
             condim=4,
@@ -153,6 +173,29 @@ def _add_object(spec: Any, model: ObjectModel, hidden: HiddenParameters) -> None
         )
     if not model.fixed:
         body.add_freejoint(name=model.id)
+
+
+def solid_parts(model: ObjectModel) -> list[BoxPart]:
+    """The boxes a rigid object collides with."""
+    if model.mesh == BASKET:
+        return basket_parts(model.inner_m, model.wall_m)
+    straight = np.array([1.0, 0.0, 0.0, 0.0])
+    return [
+        BoxPart(centre_m=centre, size_m=size, q_wxyz=straight) for centre, size in model.panels()
+    ]
+
+
+def _add_clutter(spec: Any, item: Clutter, index: int) -> None:
+    """A box around the thing; nothing is meant to touch it."""
+    q, p = se3.split(item.T_base_clutter)
+    spec.worldbody.add_geom(
+        name=f"clutter_{index}",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=p,
+        quat=q,
+        size=_half(np.array(item.size_m)),
+        **_WORLD_BITS,
+    )
 
 
 def _half(size: Float[np.ndarray, "3"]) -> list[float]:

@@ -1,0 +1,113 @@
+"""Soft objects in MuJoCo: trilinear flexes, and what their cages say about pose and shape.
+
+A flex with ``dof="trilinear"`` has eight nodes at the corners of the box around it; each is a body
+with three slide joints along the world axes. Everything inside follows by trilinear interpolation.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bridge.geometry import se3
+from bridge.sources.standin.hidden import HiddenParameters
+from bridge.task.meshes.catalogue import object_mesh
+from bridge.task.meshes.lattice import CORNERS, cage_nodes, cage_weights, make_lattice
+from bridge.task.task_file import ObjectModel, Task
+
+FLEX_RADIUS_M = 0.0005
+"""Of the tetrahedra: keeps neighbouring contacts from jumping as faces slide over edges."""
+FLEX_SOLREF = (0.008, 1.0)
+
+
+def soft_model_xml(task: Task, hidden: HiddenParameters) -> str:
+    """Return a MuJoCo model with nothing but the task's soft objects, each at its own origin.
+
+    Args:
+        task: Its soft objects become flexes named by their ids.
+        hidden: Friction, mass and stiffness.
+    """
+    bodies = "".join(
+        _flex_xml(model, hidden) for model in task.objects.values() if model.soft is not None
+    )
+    return f"<mujoco><worldbody>{bodies}</worldbody></mujoco>"
+
+
+def _flex_xml(model: ObjectModel, hidden: HiddenParameters) -> str:
+    soft = model.soft
+    if soft is None:
+        return ""
+    lattice = make_lattice(object_mesh(model), soft.cell_m)
+    young = soft.young_pa * (1.0 if hidden.stiffness_scale is None else hidden.stiffness_scale)
+    points = " ".join(repr(float(value)) for value in lattice.points_m.ravel())
+    elements = " ".join(str(int(value)) for value in lattice.tetrahedra.ravel())
+    return (
+        f'<body name="{model.id}"><flexcomp name="{model.id}" type="direct" dim="3" '
+        f'dof="trilinear" radius="{FLEX_RADIUS_M}" mass="{model.mass_kg * hidden.mass_scale!r}" '
+        f'point="{points}" element="{elements}">'
+        f'<elasticity young="{young!r}" poisson="{soft.poisson}" damping="{soft.damping_s}"/>'
+        f'<contact contype="2" conaffinity="3" condim="4" priority="1" selfcollide="none" '
+        f'friction="{hidden.object_friction!r} 0.005 0.0001" '
+        f'solref="{FLEX_SOLREF[0]} {FLEX_SOLREF[1]}"/>'
+        "</flexcomp></body>"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoftBody:
+    """Where the nodes of one soft object are kept, and how it is shaped at rest."""
+
+    body_ids: Int[np.ndarray, "8"]
+    """Bodies of the nodes, in the order of ``CORNERS``."""
+    addresses: Int[np.ndarray, "8 3"]
+    """Of their slide joints in qpos."""
+    dofs: Int[np.ndarray, "8 3"]
+    rest_nodes_m: Float[np.ndarray, "8 3"]
+    """In the object frame."""
+    skin_weights: Float[np.ndarray, "num_vertices 8"]
+    """From the nodes to the vertices of the object's mesh."""
+    lattice_weights: Float[np.ndarray, "num_points 8"]
+    """From the nodes to the points of the lattice."""
+
+    def qpos_at(self, T_base_object: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "8 3"]:
+        """Joint positions that put the undeformed body somewhere."""
+        return np.asarray(se3.apply(T_base_object, self.rest_nodes_m) - self.rest_nodes_m)
+
+    def pose_of(self, nodes_m: Float[np.ndarray, "8 3"]) -> Float[np.ndarray, "4 4"]:
+        """Rigid pose that comes nearest to where the nodes are: Kabsch (1976)."""
+        rest_middle, middle = self.rest_nodes_m.mean(axis=0), nodes_m.mean(axis=0)
+        cross = (nodes_m - middle).T @ (self.rest_nodes_m - rest_middle)
+        left, _, right = np.linalg.svd(cross)
+        flip = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))])
+        T = np.eye(4)
+        T[:3, :3] = left @ flip @ right
+        T[:3, 3] = middle - T[:3, :3] @ rest_middle
+        return T
+
+    def extents_m(
+        self, nodes_m: Float[np.ndarray, "8 3"], T_base_object: Float[np.ndarray, "4 4"]
+    ) -> Float[np.ndarray, "3"]:
+        """Outer extents of the deformed surface along the axes of its pose."""
+        local = (self.skin_weights @ nodes_m - T_base_object[:3, 3]) @ T_base_object[:3, :3]
+        return np.asarray(np.ptp(local, axis=0))
+
+
+def soft_body(model: ObjectModel, mujoco_model: Any) -> SoftBody:
+    """Find the nodes of a soft object in a compiled model."""
+    if model.soft is None:
+        message = f"{model.id} is not soft"
+        raise ValueError(message)
+    mesh = object_mesh(model)
+    lattice = make_lattice(mesh, model.soft.cell_m)
+    low, high = lattice.points_m.min(axis=0), lattice.points_m.max(axis=0)
+    ids = [int(mujoco_model.body(f"{model.id}_{i}_{j}_{k}").id) for i, j, k in CORNERS]
+    joints = [int(mujoco_model.body_jntadr[body]) + np.arange(3) for body in ids]
+    return SoftBody(
+        body_ids=np.array(ids),
+        addresses=np.array([mujoco_model.jnt_qposadr[three] for three in joints]).astype(np.int64),
+        dofs=np.array([mujoco_model.jnt_dofadr[three] for three in joints]).astype(np.int64),
+        rest_nodes_m=cage_nodes(low, high),
+        skin_weights=cage_weights(mesh.vertices_m, low, high),
+        lattice_weights=cage_weights(lattice.points_m, low, high),
+    )

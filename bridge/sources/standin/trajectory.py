@@ -1,0 +1,87 @@
+"""From tool poses to a timed joint trajectory: straight lines at 20 Hz within the joints' speed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.clock import ns_from_s
+from bridge.geometry import se3
+from bridge.sources.standin.kinematics import Kinematics, slerp_poses
+from bridge.task.plan import Waypoint
+from bridge.task.robot import MAX_WIDTH_M
+
+WAYPOINT_S = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Leg:
+    """One movement of the tool, or a wait when it stays where it is."""
+
+    name: str
+    stage: str
+    T_base_tcp: Float[np.ndarray, "4 4"]
+    duration_s: float
+    g: int
+
+
+def follow_legs(
+    legs: Sequence[Leg],
+    T_start: Float[np.ndarray, "4 4"],
+    joints_start_rad: Float[np.ndarray, "6"],
+    kinematics: Kinematics,
+    max_joint_speed_rad_s: float,
+) -> tuple[tuple[Waypoint, ...], dict[str, tuple[int, int]]]:
+    """Sample straight lines at 20 Hz with smooth speed, slower where a joint would race."""
+    T_from, joints, t_ns = T_start, joints_start_rad, 0
+    tau = [_waypoint(0, T_start, joints_start_rad, legs[0].g)]
+    bounds: dict[str, tuple[int, int]] = {}
+    for leg in legs:
+        count = max(round(leg.duration_s / WAYPOINT_S), 1)
+        while True:
+            Ts, rows = _sample_leg(T_from, leg.T_base_tcp, joints, count, kinematics)
+            steps = np.abs(np.diff(np.vstack([joints, rows]), axis=0))
+            speed = float(steps.max()) / WAYPOINT_S
+            if speed <= max_joint_speed_rad_s:
+                break
+            count = int(np.ceil(count * 1.02 * speed / max_joint_speed_rad_s))
+        begin_ns = t_ns
+        for T, row in zip(Ts, rows, strict=True):
+            t_ns += ns_from_s(WAYPOINT_S)
+            tau.append(_waypoint(t_ns, T, row, leg.g))
+        bounds[leg.stage] = (bounds.get(leg.stage, (begin_ns, 0))[0], t_ns)
+        T_from, joints = leg.T_base_tcp, rows[-1]
+    return tuple(tau), bounds
+
+
+def _sample_leg(
+    T_from: Float[np.ndarray, "4 4"],
+    T_to: Float[np.ndarray, "4 4"],
+    joints_rad: Float[np.ndarray, "6"],
+    count: int,
+    kinematics: Kinematics,
+) -> tuple[Float[np.ndarray, "num_poses 4 4"], Float[np.ndarray, "num_poses 6"]]:
+    s = np.arange(1, count + 1) / count
+    # Minimum-jerk time law (Flash and Hogan 1985): at rest at both ends.
+    Ts = slerp_poses(T_from, T_to, s**3 * (10 - 15 * s + 6 * s**2))
+    rows = []
+    for T in Ts:
+        joints_rad = kinematics.joints_for(T, joints_rad)
+        rows.append(joints_rad)
+    return Ts, np.array(rows)
+
+
+def _waypoint(
+    t_ns: int, T: Float[np.ndarray, "4 4"], joints_rad: Float[np.ndarray, "6"], g: int
+) -> Waypoint:
+    q, p = se3.split(T)
+    w, x, y, z = (float(value) for value in q)
+    return Waypoint(
+        t_ns=t_ns,
+        p_m=(float(p[0]), float(p[1]), float(p[2])),
+        q_wxyz=(w, x, y, z),
+        g=g,
+        width_m=0.0 if g else MAX_WIDTH_M,
+        joints_rad=tuple(float(value) for value in joints_rad),
+    )

@@ -1,0 +1,168 @@
+"""A duck, a sloth and what stands about on the table: solids and paint in their natural size.
+
+Natural frames: x forwards, z up, the origin somewhere inside; ``catalogue`` centres and scales.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.task.meshes import solids
+from bridge.task.meshes.solids import Solid
+
+Paint = Callable[[Float[np.ndarray, "num_points 3"]], Float[np.ndarray, "num_points 3"]]
+"""Colour (sRGB, 0..1) of points of the surface."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Design:
+    """One shape as drawn: where its surface is, what colour it has, and where to look for it."""
+
+    solid: Solid
+    paint: Paint
+    low_m: tuple[float, float, float]
+    high_m: tuple[float, float, float]
+    spacing_m: float
+
+
+def duck_solid(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
+    """A bath duck: body with a flat underside, tail, wings, head and beak."""
+    body = solids.ellipsoid(p, (-0.004, 0.0, -0.008), (0.031, 0.0235, 0.0205))
+    tail = solids.capsule(p, (-0.026, 0.0, 0.000), (-0.034, 0.0, 0.010), 0.008, 0.004)
+    wings = [
+        solids.ellipsoid(p, (-0.008, side * 0.0215, -0.004), (0.016, 0.0045, 0.010))
+        for side in (-1.0, 1.0)
+    ]
+    head = solids.ellipsoid(p, (0.016, 0.0, 0.0205), (0.0150, 0.0145, 0.0145))
+    beak = solids.ellipsoid(p, (0.0315, 0.0, 0.0170), (0.0085, 0.0085, 0.0038))
+    whole = solids.blend_all([body, tail, *wings], 0.006)
+    whole = solids.blend(whole, head, 0.012)
+    whole = solids.blend(whole, beak, 0.003)
+    return solids.cut(whole, p[:, 2] + 0.0245, 0.004)
+
+
+def duck_paint(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_points 3"]:
+    """Yellow, darker wings, an orange beak and black eyes with a white spot."""
+    colors = np.tile([0.96, 0.80, 0.14], (len(p), 1))
+    wing = np.abs(p[:, 1]) > 0.0225
+    feather = np.sin(p[:, 0] * 700.0 + p[:, 2] * 350.0) > 0.2
+    colors[wing] = [0.90, 0.66, 0.08]
+    colors[wing & feather] = [0.80, 0.54, 0.06]
+    colors[p[:, 0] > 0.0295] = [0.92, 0.42, 0.08]
+    for side in (-1.0, 1.0):
+        far = np.linalg.norm(p - np.array([0.0255, side * 0.0090, 0.0255]), axis=1)
+        colors[far < 0.0042] = [0.97, 0.97, 0.95]
+        colors[far < 0.0031] = [0.05, 0.05, 0.06]
+    return colors
+
+
+def sloth_solid(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
+    """A plush sloth on its belly, limbs spread, with a waist to take it by."""
+    chest = solids.ellipsoid(p, (0.027, 0.0, 0.000), (0.024, 0.0260, 0.0225))
+    hips = solids.ellipsoid(p, (-0.040, 0.0, 0.000), (0.026, 0.0280, 0.0225))
+    waist = solids.capsule(p, (0.027, 0.0, -0.001), (-0.040, 0.0, -0.001), 0.0155, 0.0155)
+    head = solids.ellipsoid(p, (0.060, 0.0, 0.0085), (0.0220, 0.0240, 0.0235))
+    nose = solids.ellipsoid(p, (0.0815, 0.0, 0.0050), (0.0060, 0.0085, 0.0065))
+    limbs = []
+    for side in (-1.0, 1.0):
+        shoulder, hip = (0.026, side * 0.018, -0.006), (-0.043, side * 0.018, -0.008)
+        limbs.append(solids.capsule(p, shoulder, (0.050, side * 0.0415, -0.0115), 0.0120, 0.0100))
+        limbs.append(solids.capsule(p, hip, (-0.066, side * 0.0400, -0.0110), 0.0130, 0.0110))
+    whole = solids.blend_all([chest, hips, waist, *limbs], 0.010)
+    whole = solids.blend(whole, solids.blend(head, nose, 0.005), 0.010)
+    return solids.cut(whole, p[:, 2] + 0.0205, 0.004)
+
+
+def sloth_paint(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_points 3"]:
+    """Brown fur in strands, a light face with dark patches at the eyes, and dark claws."""
+    strand = np.sin(p[:, 0] * 620.0 + 3.0 * np.sin(p[:, 1] * 260.0)) * np.sin(p[:, 1] * 540.0)
+    colors = np.array([0.56, 0.43, 0.31]) * (1.0 + 0.13 * strand)[:, None]
+    back = np.abs(p[:, 1] - 0.004 * np.sin(p[:, 0] * 130.0)) < 0.005
+    colors[back & (p[:, 0] < 0.030) & (p[:, 2] > 0.0)] *= 0.62
+    face = np.linalg.norm((p - np.array([0.078, 0.0, 0.008])) / [0.016, 0.019, 0.017], axis=1) < 1
+    colors[face] = [0.88, 0.79, 0.64]
+    for side in (-1.0, 1.0):
+        eye = np.array([0.0775, side * 0.0110, 0.0130])
+        patch = np.linalg.norm((p - eye) / [0.009, 0.0065, 0.0055], axis=1) < 1
+        colors[patch] = [0.26, 0.18, 0.13]
+        pupil = eye + np.array([0.0020, 0.0, 0.0010])
+        colors[np.linalg.norm(p - pupil, axis=1) < 0.0030] = 0.03
+    tip = np.linalg.norm(p - np.array([0.0870, 0.0, 0.0075]), axis=1) < 0.0052
+    colors[tip] = [0.10, 0.07, 0.06]
+    reach = np.abs(p[:, 1]) > 0.0440
+    comb = np.abs(((p[:, 0] * 260.0) % 1.0) - 0.5) < 0.32
+    colors[reach & comb] = [0.20, 0.16, 0.13]
+    return np.clip(colors, 0.0, 1.0)
+
+
+def mug_solid(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
+    """A mug with one handle."""
+    wall = solids.cylinder(p, 0.040, -0.047, 0.047)
+    handle = solids.ring(p, (0.0, -0.043, 0.0), 0, 0.024, 0.0065)
+    handle = np.maximum(handle, -solids.cylinder(p, 0.038, -0.06, 0.06))
+    whole = solids.blend(wall, handle, 0.006)
+    return solids.cut(whole, solids.cylinder(p, 0.035, -0.040, 0.080), 0.003)
+
+
+def mug_paint(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_points 3"]:
+    """Petrol with white dots outside, off-white inside."""
+    colors = np.tile([0.12, 0.40, 0.44], (len(p), 1))
+    turn = np.arctan2(p[:, 1], p[:, 0]) * 6 / np.pi
+    row = p[:, 2] / 0.021
+    dot = np.hypot((turn + 0.5 * np.floor(row)) % 1.0 - 0.5, row % 1.0 - 0.5) < 0.27
+    colors[dot] = [0.93, 0.92, 0.88]
+    colors[(np.hypot(p[:, 0], p[:, 1]) < 0.0375) & (p[:, 2] > -0.043)] = [0.90, 0.88, 0.82]
+    return colors
+
+
+def can_solid(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
+    """A tin with a bead at either end."""
+    body = solids.cylinder(p, 0.036, -0.054, 0.054)
+    beads = [solids.ring(p, (0.0, 0.0, end * 0.053), 2, 0.0355, 0.0022) for end in (-1.0, 1.0)]
+    return solids.blend_all([body, *beads], 0.002)
+
+
+def can_paint(p: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "num_points 3"]:
+    """Tin ends, a red label with a cream band and a row of squares."""
+    colors = np.tile([0.66, 0.67, 0.69], (len(p), 1))
+    label = (np.abs(p[:, 2]) < 0.049) & (np.hypot(p[:, 0], p[:, 1]) > 0.0352)
+    colors[label] = [0.68, 0.12, 0.10]
+    band = label & (np.abs(p[:, 2] - 0.006) < 0.018)
+    colors[band] = [0.93, 0.88, 0.74]
+    turn = (np.arctan2(p[:, 1], p[:, 0]) * 5 / np.pi) % 1.0
+    colors[band & (np.abs(p[:, 2] - 0.006) < 0.010) & (turn < 0.55)] = [0.16, 0.34, 0.22]
+    return colors
+
+
+DESIGNS: dict[str, Design] = {
+    "duck": Design(
+        solid=duck_solid,
+        paint=duck_paint,
+        low_m=(-0.046, -0.033, -0.034),
+        high_m=(0.048, 0.033, 0.044),
+        spacing_m=0.0030,
+    ),
+    "sloth": Design(
+        solid=sloth_solid,
+        paint=sloth_paint,
+        low_m=(-0.088, -0.062, -0.032),
+        high_m=(0.100, 0.062, 0.044),
+        spacing_m=0.0042,
+    ),
+    "mug": Design(
+        solid=mug_solid,
+        paint=mug_paint,
+        low_m=(-0.052, -0.088, -0.060),
+        high_m=(0.052, 0.052, 0.060),
+        spacing_m=0.0035,
+    ),
+    "can": Design(
+        solid=can_solid,
+        paint=can_paint,
+        low_m=(-0.048, -0.048, -0.068),
+        high_m=(0.048, 0.048, 0.068),
+        spacing_m=0.0040,
+    ),
+}
