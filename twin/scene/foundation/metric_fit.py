@@ -24,8 +24,12 @@ class MetricFitConfig:
     """Points spread over the shape's surface."""
     max_points: int = 3000
     """Measured points that take part, spread evenly over those given."""
-    reach_fractions: tuple[float, ...] = (0.5, 0.2, 0.08, 0.03)
-    """Tukey's cut in the rounds of the fit, in extents of the measured points."""
+    rounds: tuple[tuple[float, float], ...] = ((0.5, 0.2), (0.2, 0.2), (0.08, 0.05), (0.03, 0.01))
+    """Of each round: Tukey's cut in extents of the measured points, and the weight of the pull of
+    the visible surface towards the points. That pull fixes the size roughly and is a little off
+    wherever visibility is, so it fades."""
+    num_coarse_rounds: int = 2
+    """Rounds that every start goes through; only the best goes on."""
     iterations: int = 15
     """Steps of each round."""
     yaw_starts_rad: tuple[float, ...] = (0.0, 0.35, -0.35, 0.8, -0.8)
@@ -92,6 +96,7 @@ class _Problem:
     normals: np.ndarray
     vertices: np.ndarray
     points: np.ndarray
+    points_tree: cKDTree
     centres_m: np.ndarray
     support_z_m: float | None
     extent_m: float
@@ -131,17 +136,14 @@ def fit_metric(
     config = config or MetricFitConfig()
     problem = _problem(vertices, faces, points_m, camera_centres_m, support_z_m, config)
     guess = _Similarity(R=T_base_shape[:3, :3], t=T_base_shape[:3, 3], scale=scale)
-    best, best_cost = None, np.inf
+    pivot = guess.apply(problem.samples).mean(axis=0)
+    coarse = []
     for yaw in config.yaw_starts_rad:
-        pivot = guess.apply(problem.samples).mean(axis=0)
         start = guess.after(np.array([0.0, 0.0, yaw]), np.zeros(3), 0.0, pivot)
-        found = _solve(_adapt(start, problem), problem)
-        cost = _cost(found, problem)
-        if cost < best_cost - 1e-12:
-            best, best_cost = found, cost
-    if best is None:
-        message = "the shape cannot be laid onto the measured points; no start converged."
-        raise MetricFitError(message)
+        found = _solve(_adapt(start, problem), problem, config.rounds[: config.num_coarse_rounds])
+        coarse.append((_cost(found, problem), found))
+    best = min(coarse, key=lambda pair: pair[0])[1]
+    best = _solve(best, problem, config.rounds[config.num_coarse_rounds :])
     return _judge(best, guess, problem)
 
 
@@ -169,6 +171,7 @@ def _problem(
         normals=normals,
         vertices=vertices[np.unique(faces)],
         points=points,
+        points_tree=cKDTree(points),
         centres_m=np.stack(camera_centres_m),
         support_z_m=support_z_m,
         extent_m=float(np.linalg.norm(high - low)),
@@ -197,13 +200,15 @@ def _visible(current: _Similarity, problem: _Problem) -> np.ndarray:
     return visible_mask(moved, normals, problem.centres_m, max(size, 1e-6) / 40.0)
 
 
-def _solve(start: _Similarity, problem: _Problem) -> _Similarity:
+def _solve(
+    start: _Similarity, problem: _Problem, rounds: Sequence[tuple[float, float]]
+) -> _Similarity:
     current = start
-    for fraction in problem.config.reach_fractions:
+    for fraction, pull in rounds:
         reach = max(fraction * problem.extent_m, 0.002)
         seen = _visible(current, problem)
         for _ in range(problem.config.iterations):
-            step = _step(current, seen, reach, problem)
+            step = _step(current, seen, reach, pull, problem)
             if step is None:
                 break
             current = step[0]
@@ -213,7 +218,7 @@ def _solve(start: _Similarity, problem: _Problem) -> _Similarity:
 
 
 def _step(
-    current: _Similarity, seen: np.ndarray, reach: float, problem: _Problem
+    current: _Similarity, seen: np.ndarray, reach: float, pull: float, problem: _Problem
 ) -> tuple[_Similarity, float] | None:
     """One Gauss-Newton step on (turn, shift, log scale) about the centre of what is visible."""
     surface = current.apply(problem.samples[seen])
@@ -226,16 +231,23 @@ def _step(
     weight = _tukey(distance, reach) / len(problem.points)
     gap = ((surface[near] - problem.points) * normals[near]).sum(axis=1)
     _add(H, g, surface[near] - pivot, normals[near], gap, weight)
-    distance, near = cKDTree(problem.points).query(surface)
+    distance, near = problem.points_tree.query(surface)
     weight = _tukey(distance, reach) / len(surface)
     for axis in np.eye(3):  # point to point: the outline holds the size
         gap = (surface - problem.points[near]) @ axis
-        _add(H, g, surface - pivot, np.broadcast_to(axis, surface.shape), gap, 0.2 * weight)
+        _add(H, g, surface - pivot, np.broadcast_to(axis, surface.shape), gap, pull * weight)
     if problem.support_z_m is not None:
-        lowest = _lowest(current, problem)
+        lowest = _lowest(current.apply(problem.samples))
         up = np.array([[0.0, 0.0, 1.0]])
         gap = np.array([lowest[2] - problem.support_z_m])
-        _add(H, g, (lowest - pivot)[None], up, gap, _tukey(np.abs(gap), 2 * reach))
+        _add(
+            H,
+            g,
+            (lowest - pivot)[None],
+            up,
+            gap,
+            _tukey(np.abs(gap), 2 * problem.config.max_snap_m),
+        )
     # Angles count in radians, shifts in metres: the extent makes them alike.
     unit = np.array([1.0] * 3 + [problem.extent_m] * 3 + [1.0])
     scaled = H * unit[:, None] * unit[None, :]
@@ -269,9 +281,8 @@ def _tukey(distance: np.ndarray, cut: float) -> np.ndarray:
     return np.asarray(np.maximum(1.0 - (distance / cut) ** 2, 0.0) ** 2)
 
 
-def _lowest(current: _Similarity, problem: _Problem) -> np.ndarray:
-    """Centre of the lowest hundredth of the vertices: one spike does not carry the shape."""
-    moved = current.apply(problem.vertices)
+def _lowest(moved: np.ndarray) -> np.ndarray:
+    """Centre of the lowest hundredth of the points: one spike does not carry the shape."""
     count = max(1, len(moved) // 100)
     return np.asarray(moved[np.argpartition(moved[:, 2], count - 1)[:count]].mean(axis=0))
 
@@ -291,7 +302,7 @@ def _cost(current: _Similarity, problem: _Problem) -> float:
     cap = 0.1 * problem.extent_m
     there = np.minimum(_distances(current, problem), cap).mean()
     surface = current.apply(problem.samples[_visible(current, problem)])
-    back = np.minimum(cKDTree(problem.points).query(surface)[0], cap).mean()
+    back = np.minimum(problem.points_tree.query(surface)[0], cap).mean()
     return float(there + 0.5 * back) / problem.extent_m
 
 
@@ -299,7 +310,7 @@ def _judge(best: _Similarity, guess: _Similarity, problem: _Problem) -> MetricFi
     config = problem.config
     gap_m, is_snapped = None, False
     if problem.support_z_m is not None:
-        gap_m = float(_lowest(best, problem)[2] - problem.support_z_m)
+        gap_m = float(_lowest(best.apply(problem.vertices))[2] - problem.support_z_m)
         if abs(gap_m) <= config.max_snap_m:
             shift = np.array([0.0, 0.0, -gap_m])
             best = best.after(np.zeros(3), shift, 0.0, np.zeros(3))
