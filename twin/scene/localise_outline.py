@@ -39,7 +39,7 @@ class Outline:
 def corners(model: ObjectModel) -> Float[np.ndarray, "8 3"]:
     """Outer corners in the object frame [m]."""
     half = np.array(model.size_m) / 2
-    centre = np.array([0.0, 0.0, 0.0 if model.shape == "box" else half[2]])
+    centre = np.array([0.0, 0.0, 0.0 if model.origin_at_centre else half[2]])
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     return centre + signs * half
 

@@ -19,7 +19,7 @@ def pose_of(state: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4 4"]:
 
 def rest_height_m(model: ObjectModel) -> float:
     """Height of the object's origin when it stands on the table [m]."""
-    return model.size_m[2] / 2 if model.shape == "box" else 0.0
+    return model.rest_height_m
 
 
 def yaw_period_rad(model: ObjectModel) -> float:
@@ -32,7 +32,7 @@ def starts(
 ) -> list[Float[np.ndarray, "4"]]:
     """Candidate states: where a side is cut off, the known size is laid along either end."""
     z = rest_height_m(model)
-    if model.shape == "box":
+    if model.origin_at_centre:
         z = float(np.percentile(points[:, 2], 95)) - model.size_m[2] / 2
     yaw = rectangle_yaw_rad(points[:, :2])
     turns = np.arange(0.0, yaw_period_rad(model) - 1e-9, np.pi / 2)
