@@ -1,7 +1,8 @@
 """Objects as parts of their own: their Gaussians taken out of the scene, and their mesh.
 
 The scene is the background plus objects in their own frames, so an object can be put anywhere.
-Gaussians are cut where the localised shape is; the mesh is the known shape itself.
+Gaussians are cut where the localised shape is. The mesh is reconstructed from the views where they
+allow it; otherwise it is the known shape of the task file, and ``shape_source`` says so.
 """
 
 import json
@@ -24,8 +25,11 @@ from twin.scene.localise_colour import ColourConfig, likeness, linear_from_srgb
 from twin.scene.localise_fit import FitConfig, refine_on_points
 from twin.scene.localise_shape import surface_distances
 from twin.scene.ply import write_ply
+from twin.scene.shape.files import MESH, remove_shape, write_shape
+from twin.scene.shape.mesh import mesh_ply
+from twin.scene.shape.reconstruct import ObjectShape
 
-OBJECT_VERSION = 1
+OBJECT_VERSION = 2
 MIN_SPLATS_TO_REFINE = 50
 
 
@@ -205,8 +209,20 @@ def write_objects(
     parts: SceneParts,
     localised: Mapping[str, LocalisedObject],
     task: Task,
+    shapes: Mapping[str, ObjectShape | str] | None = None,
 ) -> dict[str, Any]:
-    """Write ``objects/<id>/{object.json, mesh.ply, gaussians.ply}`` below a scene folder.
+    """Write ``objects/<id>/`` below a scene folder: Gaussians, mesh, ``object.json``.
+
+    A reconstructed object also gets ``sdf.npz``, ``collision/*.obj`` and, when it is soft,
+    ``soft.npz``, all in the object frame.
+
+    Args:
+        folder: The scene folder.
+        parts: Their Gaussians.
+        localised: Where they were found.
+        task: Their known shapes.
+        shapes: Reconstructed shapes in the object frame, or why there is none; the known shape
+            is written for objects that are not listed, too.
 
     Returns:
         What ``scene.json`` says about the objects: files with their SHA-256, poses, counts.
@@ -216,22 +232,39 @@ def write_objects(
         model, place = task.objects[key], folder / "objects" / key
         place.mkdir(parents=True, exist_ok=True)
         write_ply(place / "gaussians.ply", item.cloud)
-        write_whole(place / "mesh.ply", _mesh_ply(*shape_mesh(model)))
-        about = _object_record(model, item, localised[key])
+        shape = "the views were not looked at" if shapes is None else shapes.get(key, "not seen")
+        names, geometry = _write_geometry(place, model, shape)
+        about = _object_record(model, item, localised[key]) | geometry
         about["files"] = {
-            name: provenance.hash_file(place / name) for name in ("gaussians.ply", "mesh.ply")
+            name: provenance.hash_file(place / name) for name in ("gaussians.ply", *names)
         }
         write_whole(place / "object.json", (json.dumps(about, indent=2) + "\n").encode())
         record[key] = {
             "folder": f"objects/{key}",
             "num_splats": len(item.cloud),
             "T_base_object": about["T_base_object"],
+            "shape_source": about["shape_source"],
             "files": {
                 **about["files"],
                 "object.json": provenance.hash_file(place / "object.json"),
             },
         }
     return record
+
+
+def _write_geometry(
+    place: Path, model: ObjectModel, shape: ObjectShape | str
+) -> tuple[list[str], dict[str, Any]]:
+    """Write the reconstructed shape, or the known one with the reason why."""
+    remove_shape(place)
+    if not isinstance(shape, str):
+        names, geometry = write_shape(
+            place, shape, model.id, soft=getattr(model, "soft", None) is not None
+        )
+        source = f"reconstructed from {shape.num_views} views"
+        return names, {"shape_source": source, "geometry": geometry}
+    write_whole(place / MESH, mesh_ply(*shape_mesh(model)))
+    return [MESH], {"shape_source": "task file", "shape_remark": shape}
 
 
 def _object_record(
@@ -246,8 +279,7 @@ def _object_record(
         "color_srgb": list(model.color_srgb),
         "symmetry": model.symmetry,
         "fixed": model.fixed,
-        "shape_source": "task file",
-        "frame": "gaussians.ply and mesh.ply are in the object frame",
+        "frame": "all files of this folder are in the object frame",
         "num_splats": len(item.cloud),
         "T_base_object": _pose_record(item.T_base_object),
         "localisation": localised.to_record(),
@@ -257,21 +289,3 @@ def _object_record(
 def _pose_record(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
     q, p = se3.split(T)
     return {"p_m": p.tolist(), "q_wxyz": q.tolist()}
-
-
-def _mesh_ply(
-    vertices: Float[np.ndarray, "num_vertices 3"], faces: Int[np.ndarray, "num_faces 3"]
-) -> bytes:
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(vertices)}",
-        *(f"property float {axis}" for axis in "xyz"),
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-        "",
-    ]
-    rows = np.zeros(len(faces), dtype=[("count", "u1"), ("ids", "<i4", 3)])
-    rows["count"], rows["ids"] = 3, faces
-    return "\n".join(header).encode() + vertices.astype("<f4").tobytes() + rows.tobytes()

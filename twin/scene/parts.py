@@ -26,7 +26,9 @@ from twin.scene.objects import (
     write_objects,
 )
 from twin.scene.ply import read_ply
+from twin.scene.shape.from_training import shapes_of, write_static
 from twin.scene.store import UnreadableSceneError
+from twin.scene.training_view import TrainingView
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,16 +42,30 @@ class TakenApart:
     localised: Mapping[str, LocalisedObject] | None = None
     task: Task | None = None
 
-    def write(self, run: RunFolder) -> dict[str, Any]:
-        """Write ``objects/`` and return what ``scene.json`` says about it."""
+    def write(self, run: RunFolder, views: Sequence[TrainingView] = ()) -> dict[str, Any]:
+        """Write ``objects/`` and ``sdf.npz``, and return what ``scene.json`` says about them.
+
+        Args:
+            run: Whose scene folder is written.
+            views: What the scene was fitted to; shapes are made from them.
+        """
+        static = write_static(run.scene_dir, views, self.task, self.places)
         if self.parts is None or self.localised is None or self.task is None:
-            return {"objects": {}, "objects_remark": self.remark}
-        objects = write_objects(run.scene_dir, self.parts, self.localised, self.task)
+            return {"objects": {}, "objects_remark": self.remark, "sdf": static}
+        shapes = shapes_of(views, self.task.objects, self.places)
+        objects = write_objects(run.scene_dir, self.parts, self.localised, self.task, shapes)
         return {
             "objects": objects,
             "objects_remark": self.remark,
             "filled_splats": len(self.parts.filling),
+            "sdf": static,
         }
+
+    @property
+    def places(self) -> dict[str, Float[np.ndarray, "4 4"]]:
+        """Poses of the objects that were taken out."""
+        objects = {} if self.parts is None else self.parts.objects
+        return {key: item.T_base_object for key, item in objects.items()}
 
 
 def episode_of_task(sources: Sources) -> Episode | None:

@@ -1,0 +1,132 @@
+"""Ideal or noisy depth views of known shapes on a table, by ray casting (Open3D)."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import open3d as o3d
+
+from bridge.geometry.camera import Camera
+from bridge.task.task_file import load_task
+from twin.scene.objects import shape_mesh
+from twin.scene.shape.isosurface import isosurface
+from twin.scene.shape.masked_view import MaskedView
+
+CAMERA = Camera(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
+Mesh = tuple[np.ndarray, np.ndarray]
+TASK = load_task("cube_into_box")
+
+
+def table(z_m: float = 0.0, half_m: float = 1.0) -> Mesh:
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * half_m
+    return corners + np.array([0, 0, z_m]), np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def cube_mesh() -> Mesh:
+    """4 cm cube standing on z = 0."""
+    vertices, faces = shape_mesh(TASK.objects["cube"])
+    return vertices + np.array([0, 0, TASK.objects["cube"].size_m[2] / 2]), faces
+
+
+def open_box_mesh() -> Mesh:
+    return shape_mesh(TASK.objects["box"])
+
+
+def solid_mesh(
+    distance: Callable[[np.ndarray], np.ndarray],
+    low: Sequence[float],
+    high: Sequence[float],
+    step: float,
+) -> Mesh:
+    """Mesh of a signed distance function."""
+    axes = [np.arange(a, b + step, step) for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    values = distance(points.reshape(-1, 3)).reshape(points.shape[:3])
+    return isosurface(values.astype(np.float32), np.array(low, dtype=np.float64), step)
+
+
+def figure_distance(p: np.ndarray) -> np.ndarray:
+    """A figure with a body, a head and a flat underside on z = 0: not convex."""
+    body = np.linalg.norm((p - [0, 0, 0.025]) / [0.035, 0.026, 0.030], axis=1) - 1
+    head = np.linalg.norm(p - [0.026, 0, 0.062], axis=1) - 0.017
+    return np.maximum(np.minimum(body * 0.026, head), -p[:, 2])
+
+
+def figure_mesh() -> Mesh:
+    return solid_mesh(figure_distance, (-0.045, -0.035, -0.005), (0.055, 0.035, 0.09), 0.001)
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T[:3, 3] = eye
+    return T
+
+
+def around(centre: Sequence[float], num: int, distance_m: float = 0.5) -> list[np.ndarray]:
+    """Camera poses on a spiral over the upper half sphere, from 25 to 80 degrees up."""
+    poses = []
+    for index in range(num):
+        up = np.radians(25 + 55 * (index + 0.5) / num)
+        turn = index * np.pi * (3 - np.sqrt(5))
+        way = [np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)]
+        poses.append(look_at(np.array(centre) + distance_m * np.array(way), np.array(centre)))
+    return poses
+
+
+def ray_scene(meshes: Sequence[Mesh]) -> o3d.t.geometry.RaycastingScene:
+    scene = o3d.t.geometry.RaycastingScene()
+    for vertices, faces in meshes:
+        scene.add_triangles(
+            o3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
+            o3d.core.Tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
+        )
+    return scene
+
+
+def cast(
+    meshes: Sequence[Mesh],
+    poses: Sequence[np.ndarray],
+    *,
+    noise: float = 0.0,
+    camera: Camera = CAMERA,
+    seed: int = 0,
+) -> list[MaskedView]:
+    """Views of meshes; the mask shows the first of them. Noise is sigma = noise * z^2 [1/m]."""
+    rng = np.random.default_rng(seed)
+    scene = ray_scene(meshes)
+    rays = camera.rays().reshape(-1, 3)
+    views = []
+    for T in poses:
+        directions = rays @ T[:3, :3].T
+        origins = np.broadcast_to(T[:3, 3], directions.shape)
+        hit = scene.cast_rays(
+            o3d.core.Tensor(np.concatenate([origins, directions], 1).astype(np.float32))
+        )
+        depth = hit["t_hit"].numpy().astype(np.float64)
+        depth[~np.isfinite(depth)] = 0.0
+        depth += (depth > 0) * noise * depth**2 * rng.standard_normal(len(depth))
+        shape = (camera.height, camera.width)
+        views.append(
+            MaskedView(
+                camera=camera,
+                T_base_camera=T,
+                depth_m=depth.reshape(shape),
+                mask=(hit["geometry_ids"].numpy() == 0).reshape(shape),
+            )
+        )
+    return views
+
+
+def mean_error_m(mesh: Mesh, reference: Mesh, *, num: int = 4000) -> tuple[float, float]:
+    """Mean and 95th percentile of the distances of the reference's surface to a mesh [m]."""
+    surface = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(reference[0]),
+        o3d.utility.Vector3iVector(np.asarray(reference[1], dtype=np.int32)),
+    )
+    o3d.utility.random.seed(0)
+    points = np.asarray(surface.sample_points_uniformly(num).points)
+    away = ray_scene([mesh]).compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
+    return float(away.mean()), float(np.percentile(away, 95))

@@ -1,0 +1,82 @@
+"""The surface of a grid: closed, facing outwards, where the values say."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skimage.measure import marching_cubes
+
+from twin.scene.shape.isosurface import isosurface
+from twin.scene.shape.mesh import face_normals, is_watertight, mesh_obj, volume_m3
+
+
+def sphere(radius_m: float, step_m: float) -> tuple[np.ndarray, np.ndarray]:
+    axis = np.arange(-radius_m - 3 * step_m, radius_m + 3 * step_m, step_m)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    values = (np.linalg.norm(points, axis=-1) - radius_m).astype(np.float32)
+    return isosurface(values, np.full(3, axis[0]), step_m)
+
+
+def test_a_sphere_is_closed_has_its_volume_and_faces_outwards() -> None:
+    vertices, faces = sphere(0.05, 0.002)
+    assert is_watertight(faces)
+    assert volume_m3(vertices, faces) == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=2e-3)
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.05, atol=1e-4)
+    normals, _ = face_normals(vertices, faces)
+    outwards = np.einsum("ni,ni->n", normals, vertices[faces].mean(axis=1))
+    assert np.all(outwards > 0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000), share=st.floats(0.05, 0.95))
+def test_any_values_whatever_give_a_closed_surface(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    values = (rng.random((7, 6, 5)) - share).astype(np.float32)
+    vertices, faces = isosurface(values, np.zeros(3), 1.0)
+    if (values < 0).any():
+        assert is_watertight(faces)
+        assert volume_m3(vertices, faces) > 0
+        assert vertices.min() > -1.0
+
+
+@pytest.mark.parity
+def test_the_surface_lies_where_scikit_image_puts_it() -> None:
+    axis = np.linspace(-1, 1, 24)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    ring = (np.hypot(np.hypot(x, y) - 0.55, z) - 0.27).astype(np.float32)
+    step = axis[1] - axis[0]
+    vertices, faces = isosurface(ring, np.full(3, -1.0), step)
+    theirs, their_faces, _, _ = marching_cubes(ring, 0.0, spacing=(step,) * 3)
+    assert is_watertight(faces)
+    assert len(vertices) == len(theirs)
+    ours = vertices[np.lexsort(vertices.round(5).T)]
+    np.testing.assert_allclose(ours, (theirs - 1.0)[np.lexsort((theirs - 1.0).round(5).T)],
+                               atol=0.02 * step)  # fmt: skip
+    their_volume = abs(volume_m3(theirs.astype(np.float64), their_faces.astype(np.int64)))
+    assert volume_m3(vertices, faces) == pytest.approx(their_volume, rel=5e-3)
+
+
+def test_a_solid_that_fills_the_grid_is_closed_at_its_border() -> None:
+    vertices, faces = isosurface(np.full((4, 4, 4), -1.0, np.float32), np.zeros(3), 1.0)
+    assert is_watertight(faces)
+    assert volume_m3(vertices, faces) == pytest.approx(4.0**3, rel=0.15)
+
+
+def test_an_open_mesh_a_flipped_face_and_no_mesh_are_not_watertight() -> None:
+    _, faces = sphere(0.05, 0.01)
+    assert is_watertight(faces)
+    assert not is_watertight(faces[1:])
+    flipped = faces.copy()
+    flipped[0] = flipped[0][::-1]
+    assert not is_watertight(flipped)
+    assert not is_watertight(np.concatenate([faces, faces[:1]]))
+    assert not is_watertight(np.zeros((0, 3), dtype=np.int64))
+    degenerate = faces.copy()
+    degenerate[0, 1] = degenerate[0, 0]
+    assert not is_watertight(degenerate)
+
+
+def test_an_obj_file_counts_from_one() -> None:
+    text = mesh_obj(np.eye(3), np.array([[0, 1, 2]])).decode()
+    assert text.splitlines()[-1] == "f 1 2 3"
+    assert text.splitlines()[0] == "v 1 0 0"

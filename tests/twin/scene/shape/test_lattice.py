@@ -1,0 +1,103 @@
+"""The lattice of a soft body: inside, connected, filling the volume, no spring across a gap."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from test_collision import ball_shape, grid, shape_of
+
+from twin.scene.shape.lattice import Lattice, LatticeConfig, lattice, tet_volumes_m3
+from twin.scene.shape.masked_view import ShapeError
+from twin.scene.shape.npz import UnreadableArraysError, write_npz
+from twin.scene.shape.reconstruct import ObjectShape
+
+
+@pytest.fixture(scope="module")
+def ball() -> ObjectShape:
+    return ball_shape()
+
+
+@pytest.fixture(scope="module")
+def inside(ball: ObjectShape) -> Lattice:
+    return lattice(ball)
+
+
+def test_nodes_lie_in_the_solid(ball: ObjectShape, inside: Lattice) -> None:
+    away = ball.sdf.distance(inside.nodes_m.astype(np.float64))
+    assert away.max() < 0.004
+    assert (away > 0.001).mean() < 0.15
+    assert len(inside.nodes_m) > 100
+
+
+def test_tetrahedra_are_positive_and_fill_the_shape(ball: ObjectShape, inside: Lattice) -> None:
+    volumes = tet_volumes_m3(inside.nodes_m.astype(np.float64), inside.tets)
+    assert np.all(volumes > 0)
+    assert volumes.sum() == pytest.approx(ball.volume_m3, rel=0.15)
+    assert inside.mass_fraction.sum() == pytest.approx(1.0, abs=1e-5)
+    assert np.all(inside.mass_fraction > 0)
+    centre = inside.mass_fraction @ inside.nodes_m
+    np.testing.assert_allclose(centre, ball.vertices_m.mean(axis=0), atol=0.001)
+
+
+def test_every_inner_face_belongs_to_two_tetrahedra(inside: Lattice) -> None:
+    faces = np.concatenate(
+        [inside.tets[:, c] for c in ([0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3])]
+    )
+    _, counts = np.unique(np.sort(faces, axis=1), axis=0, return_counts=True)
+    assert set(counts.tolist()) == {1, 2}
+    # Tetrahedra that did not fit together would leave their faces single.
+    assert (counts == 2).sum() > (counts == 1).sum()
+
+
+def test_springs_tie_all_nodes_together_and_have_their_length(inside: Lattice) -> None:
+    num = len(inside.nodes_m)
+    ones = np.ones(len(inside.springs))
+    graph = coo_matrix((ones, inside.springs.T), shape=(num, num))
+    assert connected_components(graph, directed=False)[0] == 1
+    assert np.all(inside.springs[:, 0] < inside.springs[:, 1])
+    assert len(np.unique(inside.springs, axis=0)) == len(inside.springs)
+    a, b = inside.nodes_m[inside.springs[:, 0]], inside.nodes_m[inside.springs[:, 1]]
+    np.testing.assert_allclose(np.linalg.norm(a - b, axis=1), inside.rest_lengths_m, atol=1e-6)
+    assert np.bincount(inside.springs.ravel()).min() >= 3
+
+
+def test_no_spring_ties_two_legs_together() -> None:
+    x, y, z = grid(40)
+    legs = (np.abs(y) < 8) & (np.abs(x) < 16) & (np.abs(z) < 16)
+    legs &= ~((np.abs(x) < 3) & (z < 6))
+    shape = shape_of(legs, 0.002)
+    inside = lattice(shape, LatticeConfig(spacing_m=0.008))
+    middle = inside.nodes_m[inside.springs].astype(np.float64).mean(axis=1)
+    assert shape.sdf.distance(middle).max() < 0.006
+    gap = shape.sdf.origin_m + 0.002 * np.array([19.5, 19.5, 10.0])
+    assert np.linalg.norm(middle - gap, axis=1).min() > 0.004
+
+
+def test_a_lattice_is_read_back(inside: Lattice, tmp_path: Path) -> None:
+    path = tmp_path / "soft.npz"
+    inside.save(path)
+    again = Lattice.load(path)
+    for name in ("nodes_m", "springs", "tets", "mass_fraction", "rest_lengths_m"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(inside, name))
+    assert again.spacing_m == inside.spacing_m
+    arrays = {name: np.asarray(value) for name, value in vars(inside).items()}
+    for change in (
+        {"springs": inside.springs + 10**6},
+        {"tets": inside.tets.astype(np.float64)},
+        {"nodes_m": inside.nodes_m[:, :2]},
+    ):
+        write_npz(path, arrays | change)
+        with pytest.raises(UnreadableArraysError):
+            Lattice.load(path)
+
+
+def test_a_shape_thinner_than_the_lattice_says_so() -> None:
+    x, y, z = grid(30)
+    wedge = (np.abs(x) < 10) & (np.abs(y) < 10) & (np.abs(z - np.abs(x)) < 0.6)
+    shape = shape_of(wedge | ((np.abs(x) < 1) & (np.abs(y) < 10) & (z > 8) & (z < 10)), 0.001)
+    hollow = replace(shape, sdf=replace(shape.sdf, values_m=np.abs(shape.sdf.values_m) + 1e-4))
+    with pytest.raises(ShapeError, match="finer lattice"):
+        lattice(hollow)

@@ -1,0 +1,183 @@
+"""Training views and localised objects in, one shape per object out.
+
+An object's pixels are those whose measured point lies at its localised surface. The shape is made
+in the object's own frame, so walls of a box lie along the voxels.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bridge.episode import provenance
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.task.task_file import ObjectModel, Task
+from twin.errors import TwinError
+from twin.scene.localise_shape import surface_distances
+from twin.scene.shape.masked_view import MaskedView
+from twin.scene.shape.reconstruct import ObjectShape, ShapeConfig, reconstruct
+from twin.scene.shape.static import static_sdf
+from twin.scene.training_view import TrainingView
+
+STATIC_FILE = "sdf.npz"
+MASK_MARGIN_M = 0.008
+"""A measured point this near to the known surface is the object's."""
+TABLE_M = 0.003
+"""Lower points may be the table's."""
+STANDING_M = 0.008
+"""An object whose underside is at most this far from the table stands on it."""
+UPRIGHT_COSINE = 0.999
+
+Poses = Mapping[str, Float[np.ndarray, "4 4"]]
+
+
+def shapes_of(
+    views: Sequence[TrainingView],
+    models: Mapping[str, ObjectModel],
+    Ts_base_object: Poses,
+    config: ShapeConfig | None = None,
+) -> dict[str, ObjectShape | str]:
+    """Reconstruct each object in its own frame, or say why not.
+
+    Args:
+        views: What the scene was fitted to, in ``base_link`` whose z = 0 is the table.
+        models: Known shapes: they say which pixels are the object's, nothing more.
+        Ts_base_object: Where the objects were; others are left out.
+        config: Settings; the defaults, with one round of view alignment, when None.
+    """
+    config = ShapeConfig(align_rounds=1) if config is None else config
+    found: dict[str, ObjectShape | str] = {}
+    for key, T in Ts_base_object.items():
+        if T[2, 2] < UPRIGHT_COSINE:
+            found[key] = f"{key} does not stand upright, so its underside cannot be closed"
+            continue
+        masked = [masked_view(view, key, models, Ts_base_object) for view in views]
+        try:
+            found[key] = reconstruct(
+                [view for view in masked if view.mask.any()], _support_z_m(models[key], T), config
+            )
+        except TwinError as error:
+            found[key] = str(error)
+    return found
+
+
+def _support_z_m(model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]) -> float | None:
+    """Height of the table in the object's frame, None when the object does not stand on it."""
+    underside = float(min((centre - extents / 2)[2] for centre, extents in model.panels()))
+    table = -float(T_base_object[2, 3])
+    return table if abs(underside - table) <= STANDING_M else None
+
+
+def masked_view(
+    view: TrainingView, key: str, models: Mapping[str, ObjectModel], Ts_base_object: Poses
+) -> MaskedView:
+    """One training view in an object's frame, with the pixels that show the object.
+
+    A pixel belongs to the object whose surface is nearest to its point.
+    """
+    target = view.full
+    depth = np.where(target.static_mask, target.depth_m, np.float32(0.0))
+    camera = target.camera
+    model, T = models[key], Ts_base_object[key]
+    reach = float(np.linalg.norm(model.size_m)) + MASK_MARGIN_M
+    rows, columns = _window(camera, se3.invert(view.T_base_color) @ T[:, 3], reach)
+    row, column = np.nonzero(depth[rows, columns] > 0)
+    row, column = row + rows.start, column + columns.start
+    z = depth[row, column].astype(np.float64)
+    p_camera = np.stack(
+        [(column + 0.5 - camera.cx) / camera.fx * z, (row + 0.5 - camera.cy) / camera.fy * z, z], 1
+    )
+    p_base = se3.apply(view.T_base_color, p_camera)
+    near = np.flatnonzero(np.linalg.norm(p_base - T[:3, 3], axis=1) < reach)
+    near = near[p_base[near, 2] > TABLE_M]
+    own = _away(p_base[near], model, T)
+    mine: Bool[np.ndarray, " num_near"] = own < MASK_MARGIN_M
+    for other, T_other in Ts_base_object.items():
+        if other != key and np.linalg.norm(T_other[:3, 3] - T[:3, 3]) < 2 * reach:
+            mine &= own <= _away(p_base[near], models[other], T_other)
+    mask = np.zeros(depth.shape, dtype=bool)
+    mask[row[near[mine]], column[near[mine]]] = True
+    return MaskedView(
+        camera=camera,
+        T_base_camera=se3.invert(T) @ view.T_base_color,
+        depth_m=depth,
+        mask=mask,
+    )
+
+
+def _window(
+    camera: Camera, p_camera: Float[np.ndarray, "4"], reach_m: float
+) -> tuple[slice, slice]:
+    """Rows and columns that can show something within reach of a point; none behind the camera."""
+    x, y, z = p_camera[:3]
+    if z + reach_m <= 0:
+        return slice(0, 0), slice(0, 0)
+    nearest = max(z - reach_m, 1e-3)
+    spans = []
+    for centre, focal, middle, size in (
+        (y, camera.fy, camera.cy, camera.height),
+        (x, camera.fx, camera.cx, camera.width),
+    ):
+        ends = [
+            side / depth * focal + middle
+            for side in (centre - reach_m, centre + reach_m)
+            for depth in (nearest, z + reach_m)
+        ]
+        first, last = np.clip([np.floor(min(ends)), np.ceil(max(ends))], 0, size).astype(int)
+        spans.append(slice(int(first), int(last)))
+    return spans[0], spans[1]
+
+
+def _away(
+    points: Float[np.ndarray, "num_points 3"],
+    model: ObjectModel,
+    T_base_object: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, " num_points"]:
+    """Distance to the known surface; inside the box around a mesh nothing is known, so 0."""
+    distance, _ = surface_distances(points, model, T_base_object)
+    rough = model.shape not in ("box", "open_box")
+    return np.asarray(np.maximum(distance, 0.0) if rough else np.abs(distance))
+
+
+def write_static(
+    folder: Path,
+    views: Sequence[TrainingView],
+    task: Task | None,
+    Ts_base_object: Poses,
+) -> dict[str, Any]:
+    """Write ``sdf.npz``, the static scene without the objects, and return its record.
+
+    Only a task says that z = 0 is a table; without one nothing closes the scene below.
+
+    Args:
+        folder: The scene folder.
+        views: What the scene was fitted to.
+        task: Whose objects were taken out; None when there is none.
+        Ts_base_object: Where they were.
+    """
+    path = folder / STATIC_FILE
+    path.unlink(missing_ok=True)
+    objects = [
+        partial(_from_outside, model=task.objects[key], T_base_object=T)
+        for key, T in Ts_base_object.items()
+        if task is not None
+    ]
+    try:
+        static = static_sdf(views, None if task is None else 0.0, objects)
+    except TwinError as error:
+        return {"file": None, "remark": str(error)}
+    static.save(path)
+    return {"file": STATIC_FILE, "sha256": provenance.hash_file(path), **static.to_record()}
+
+
+def _from_outside(
+    points: Float[np.ndarray, "num_points 3"],
+    model: ObjectModel,
+    T_base_object: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, " num_points"]:
+    distance, _ = surface_distances(points, model, T_base_object)
+    return np.asarray(distance)

@@ -1,0 +1,77 @@
+"""Arrays in a file: NumPy's npz, the same bytes for the same arrays, and no surprise on reading."""
+
+import io
+import math
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from bridge.whole_file import write_whole
+from twin.errors import TwinError
+
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+"""The earliest time a zip file can say; the real one would change the file's hash."""
+
+
+class UnreadableArraysError(TwinError):
+    """An npz file is damaged, too large, or not what was expected."""
+
+    def __init__(self, *, path: Path, found: str) -> None:
+        """Remember the file."""
+        self.path = path
+        super().__init__(f"{path}: {found}. Make it again: robot-gst rebuild RUN --force.")
+
+
+def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays, whole or not at all."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, rows in arrays.items():
+            body = io.BytesIO()
+            np.lib.format.write_array(body, np.asarray(rows, order="C"), allow_pickle=False)
+            about = zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH)
+            archive.writestr(about, body.getvalue(), compress_type=zipfile.ZIP_DEFLATED)
+    write_whole(path, stream.getvalue())
+
+
+def read_npz(path: Path, names: Sequence[str], max_bytes: int) -> dict[str, np.ndarray]:
+    """Read named arrays; sizes are checked before anything is unpacked, pickles are refused.
+
+    Raises:
+        UnreadableArraysError: When the file is none, lacks an array, or holds too much.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            sizes = {about.filename: about.file_size for about in archive.infolist()}
+            wanted = [f"{name}.npy" for name in names]
+            missing = [name for name in wanted if name not in sizes]
+            if missing:
+                raise UnreadableArraysError(path=path, found=f"without {', '.join(missing)}")
+            total = sum(sizes[name] for name in wanted)
+            if total > max_bytes:
+                found = f"holds {total} bytes, more than the {max_bytes} that are allowed"
+                raise UnreadableArraysError(path=path, found=found)
+            return {name: _array(archive.read(f"{name}.npy")) for name in names}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise UnreadableArraysError(path=path, found=f"not a file of arrays ({error})") from error
+
+
+def _array(data: bytes) -> np.ndarray:
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    if version != (1, 0):
+        message = f"array format {version} is not known"
+        raise ValueError(message)
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    if dtype.hasobject:
+        message = "an array of objects is refused"
+        raise ValueError(message)
+    body = data[stream.tell() :]
+    if len(body) != math.prod(shape) * dtype.itemsize:
+        message = f"an array of shape {shape} has {len(body)} bytes"
+        raise ValueError(message)
+    rows = np.frombuffer(body, dtype=dtype).reshape(shape, order="F" if fortran else "C")
+    return rows.copy()

@@ -1,0 +1,264 @@
+"""Depth images with masks in, one closed metric shape out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bridge.errors import refuse_outside
+from twin.scene.shape.carve import Evidence, gather, solid_of
+from twin.scene.shape.cavity import Cavity, find_cavity
+from twin.scene.shape.isosurface import isosurface
+from twin.scene.shape.masked_view import MaskedView, ShapeError
+from twin.scene.shape.mesh import Faces, Vertices, face_normals, is_watertight, volume_m3
+from twin.scene.shape.sdf import SdfGrid, distances_of_solid, smoothed
+from twin.scene.shape.voxels import VoxelBox
+
+PAD_VOXELS = 4
+"""Free voxels around the object, so that distances are known a little beyond it."""
+MIN_POINTS = 30
+"""Measured object pixels that make a view count."""
+MIN_SPREAD_RAD = 0.2
+"""Directions that differ by less see the same side; their free space carves nothing."""
+CELL_M = 0.004
+"""A measured point counts for the extent when two views measured one in the same cell."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapeConfig:
+    """How a shape is made."""
+
+    min_voxel_m: float = 0.0015
+    """Finest voxel."""
+    voxels_along: int = 64
+    """Voxels along the longest side, unless that makes them too fine."""
+    truncation_voxels: float = 4.0
+    """Depth within this many voxels of a surface says how far the surface is."""
+    min_truncation_m: float = 0.006
+    """At least this: a few standard deviations of the camera's noise."""
+    min_free_views: int = 2
+    """Views that must look through a voxel before it is free."""
+    smoothing_voxels: float = 0.8
+    """Standard deviation of the mean over distances that takes the stairs off."""
+    max_views: int = 40
+    """More views than this are thinned out evenly."""
+    align_rounds: int = 0
+    """How often every view is shifted onto the shape that all of them make, and carved again."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot make a shape."""
+        refuse_outside(
+            self,
+            {
+                "min_voxel_m": (1e-4, 0.1),
+                "voxels_along": (8, 256),
+                "truncation_voxels": (1.0, 20.0),
+                "min_truncation_m": (0.0, 0.1),
+                "min_free_views": (1, 20),
+                "smoothing_voxels": (0.3, 2.0),
+                "max_views": (2, 1000),
+                "align_rounds": (0, 5),
+            },
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectShape:
+    """A closed shape in the frame of the views' poses."""
+
+    vertices_m: Float[np.ndarray, "num_vertices 3"]
+    faces: Faces
+    """Counter-clockwise seen from outside."""
+    sdf: SdfGrid
+    completed: Bool[np.ndarray, " num_faces"]
+    """Faces that no view saw: the underside on the plane, and whatever was hidden."""
+    completed_fraction: float
+    """Their share of the area."""
+    unseen_top_m2: float
+    """Area of completed faces that look up: there may be an opening nobody looked into."""
+    is_watertight: bool
+    volume_m3: float
+    cavity: Cavity | None
+    num_views: int
+    truncation_m: float
+    view_shift_m: float = 0.0
+    """Root mean square of the shifts that laid the views onto each other; 0 without rounds."""
+
+
+def reconstruct(
+    views: Sequence[MaskedView], support_z_m: float | None, config: ShapeConfig | None = None
+) -> ObjectShape:
+    """Carve an object out of the views that see it, close it, and mesh it.
+
+    Args:
+        views: Depth with masks, in one frame whose z axis points up.
+        support_z_m: Height of the plane the object stands on: its unseen underside is closed
+            there. None when it does not stand on one.
+        config: Settings; the defaults when None.
+
+    Raises:
+        ShapeError: When fewer than two views show the object, all from one side, or nothing
+            is left after carving.
+    """
+    config = ShapeConfig() if config is None else config
+    useful = _useful(views, config.max_views)
+    shape = _carved(useful, support_z_m, config)
+    for _ in range(config.align_rounds):
+        moved = [_aligned(view, shape) for view in useful]
+        shifts = np.stack(
+            [
+                after.T_base_camera[:3, 3] - before.T_base_camera[:3, 3]
+                for after, before in zip(moved, useful, strict=True)
+            ]
+        )
+        # All together may not move: nothing but the poses says where the object is.
+        mean = shifts.mean(axis=0)
+        useful = [_shifted(view, -mean) for view in moved]
+        spread = float(np.sqrt(np.square(shifts - mean).sum(axis=-1).mean()))
+        shape = replace(_carved(useful, support_z_m, config), view_shift_m=spread)
+    return shape
+
+
+def _useful(views: Sequence[MaskedView], max_views: int) -> list[MaskedView]:
+    """Views with enough measured pixels of the object; says what is wrong when too few."""
+    if not any(view.mask.any() for view in views):
+        message = f"none of {len(views)} views shows the object: all masks are empty."
+        raise ShapeError(message)
+    useful = [v for v in views if int((v.mask & (v.known_depth_m() > 0)).sum()) >= MIN_POINTS]
+    if len(useful) < 2:
+        message = (
+            f"{len(useful)} of {len(views)} views measured at least {MIN_POINTS} pixels of the "
+            "object, and at least 2 from different directions are needed. Scan it from more sides."
+        )
+        raise ShapeError(message)
+    if len(useful) > max_views:
+        ids = np.linspace(0, len(useful) - 1, max_views).round().astype(int)
+        useful = [useful[index] for index in ids]
+    middle = np.mean([view.points_m().mean(axis=0) for view in useful], axis=0)
+    rays = np.array([view.T_base_camera[:3, 3] - middle for view in useful])
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
+    spread = float(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0)).max())
+    if spread < MIN_SPREAD_RAD:
+        message = (
+            f"all {len(useful)} views see the object from within {np.degrees(spread):.0f} degrees; "
+            f"at least {np.degrees(MIN_SPREAD_RAD):.0f} are needed. Scan it from more sides."
+        )
+        raise ShapeError(message)
+    return useful
+
+
+def _carved(
+    views: Sequence[MaskedView], support_z_m: float | None, config: ShapeConfig
+) -> ObjectShape:
+    low, high = _extent(views)
+    if support_z_m is not None:
+        low[2] = support_z_m
+        if high[2] <= low[2]:
+            message = f"all measured points lie below the plane z = {support_z_m:.4f} m."
+            raise ShapeError(message)
+    size = float((high - low).max())
+    voxel = max(config.min_voxel_m, size / config.voxels_along)
+    truncation = max(config.truncation_voxels * voxel, config.min_truncation_m)
+    # Faces between voxels lie on the plane: half a voxel above and below it are the centres.
+    origin = low - (PAD_VOXELS - 0.5) * voxel
+    num_x, num_y, num_z = (np.ceil((high - low) / voxel).astype(int) + 2 * PAD_VOXELS).tolist()
+    box = VoxelBox(origin_m=origin, voxel_m=voxel, counts=(num_x, num_y, num_z))
+    evidence = gather(box, views, truncation, config.min_free_views)
+    solid = solid_of(evidence, support_z_m, low - voxel, high + voxel)
+    distances = distances_of_solid(solid, voxel)
+    values = smoothed(distances, voxel, config.smoothing_voxels)
+    grid = SdfGrid(values_m=values, origin_m=box.origin_m, voxel_m=voxel)
+    return _described(grid, evidence, solid, len(views), truncation)
+
+
+def _described(
+    grid: SdfGrid,
+    evidence: Evidence,
+    solid: Bool[np.ndarray, "num_x num_y num_z"],
+    num_views: int,
+    truncation_m: float,
+) -> ObjectShape:
+    vertices, faces = isosurface(grid.values_m, grid.origin_m, grid.voxel_m)
+    completed = ~_observed(vertices, faces, evidence)
+    normals, areas = face_normals(vertices, faces)
+    return ObjectShape(
+        vertices_m=vertices,
+        faces=faces,
+        sdf=grid,
+        completed=completed,
+        completed_fraction=float(areas[completed].sum() / areas.sum()),
+        unseen_top_m2=float(areas[completed & (normals[:, 2] > 0.5)].sum()),
+        is_watertight=is_watertight(faces),
+        volume_m3=volume_m3(vertices, faces),
+        cavity=find_cavity(solid, evidence.empty, evidence.box),
+        num_views=num_views,
+        truncation_m=truncation_m,
+    )
+
+
+def _observed(
+    vertices: Vertices, faces: Faces, evidence: Evidence
+) -> Bool[np.ndarray, " num_faces"]:
+    """Faces in whose voxel, or just outside of it, some view saw the object's surface."""
+    box = evidence.box
+    normals, _ = face_normals(vertices, faces)
+    centre = vertices[faces].mean(axis=1)
+    seen = np.zeros(len(faces), dtype=bool)
+    for out in (0.0, 1.0):
+        place = centre + out * box.voxel_m * normals
+        index = np.rint((place - box.origin_m) / box.voxel_m).astype(np.int64)
+        index = np.clip(index, 0, np.array(box.counts) - 1)
+        seen |= evidence.weight[tuple(index.T)] > 0
+    return seen
+
+
+def _extent(
+    views: Sequence[MaskedView],
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Corners of the box of points that two views agree on; flying pixels are on their own."""
+    cells = [np.floor(view.points_m() / CELL_M).astype(np.int64) for view in views]
+    first = np.min([c.min(axis=0) for c in cells], axis=0)
+    spans = np.max([c.max(axis=0) for c in cells], axis=0) - first + 1
+    keys = [np.unique(np.ravel_multi_index((c - first).T, spans)) for c in cells]
+    each, count = np.unique(np.concatenate(keys), return_counts=True)
+    kept = first + np.stack(np.unravel_index(each[count >= 2], spans), axis=1)
+    if len(kept) == 0:
+        message = (
+            f"no two of {len(views)} views measured the object at the same place: the poses do "
+            "not fit together. Check the camera poses."
+        )
+        raise ShapeError(message)
+    return kept.min(axis=0) * CELL_M, (kept.max(axis=0) + 1) * CELL_M
+
+
+def _shifted(view: MaskedView, way_m: Float[np.ndarray, "3"]) -> MaskedView:
+    T = view.T_base_camera.copy()
+    T[:3, 3] += way_m
+    return replace(view, T_base_camera=T)
+
+
+def _aligned(view: MaskedView, shape: ObjectShape) -> MaskedView:
+    """Shift a view so that its points lie on the shape: point to plane, robust, one step.
+
+    Directions that the view's points do not determine are held by a weak pull to zero.
+    """
+    points = view.points_m()
+    points = points[:: max(1, len(points) // 2000)]
+    distance = shape.sdf.distance(points)
+    near = np.abs(distance) < shape.truncation_m
+    if int(near.sum()) < MIN_POINTS:
+        return view
+    slope = shape.sdf.gradient(points[near])
+    scale = max(float(np.median(np.abs(distance[near]))), 1e-4)
+    weight = 1.0 / (1.0 + (distance[near] / (2 * scale)) ** 2)
+    A = (slope * weight[:, None]).T @ slope + 0.05 * weight.sum() * np.eye(3)
+    way = -np.linalg.solve(A, slope.T @ (weight * distance[near]))
+    return _shifted(view, np.clip(way, -shape.truncation_m, shape.truncation_m))
+
+
+def moved_views(
+    views: Sequence[MaskedView], T_new_base: Float[np.ndarray, "4 4"]
+) -> list[MaskedView]:
+    """The same views in another frame."""
+    return [replace(v, T_base_camera=T_new_base @ v.T_base_camera) for v in views]

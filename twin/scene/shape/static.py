@@ -1,0 +1,245 @@
+"""Signed distances to everything that stands still: the scene without its objects.
+
+Three kinds of place: free (at least two views looked through it), surface (measured, or below the
+table), and unseen: no view looked through it and none measured a surface there, because it is
+behind something, or in no image at all. Two grids answer two questions. The conservative one takes
+the unseen for solid; the observed one takes it for free. Beyond the grid nothing is known.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from bridge.errors import refuse_outside
+from twin.scene.shape.carve import Evidence, gather
+from twin.scene.shape.masked_view import MaskedView, ShapeError
+from twin.scene.shape.npz import UnreadableArraysError, read_npz, write_npz
+from twin.scene.shape.sdf import MAX_VOXELS, SdfGrid, distances_of_solid
+from twin.scene.shape.voxels import VoxelBox
+from twin.scene.training_view import TrainingView
+
+FREE, SURFACE, UNSEEN = 0, 1, 2
+MIN_POINTS = 100
+POINTS_PER_VIEW = 2000
+OBJECT_MARGIN_VOXELS = 1.5
+"""Voxels this near to an object were seen as the object; the scene is free of them."""
+
+Distance = Callable[[Float[np.ndarray, "num_points 3"]], Float[np.ndarray, " num_points"]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StaticConfig:
+    """Size and fineness of the static scene's grid."""
+
+    voxel_m: float = 0.008
+    """Wanted voxel; larger when the scene would need too many."""
+    max_voxels: int = 1_000_000
+    """Most voxels: bounds memory and time."""
+    height_m: float = 0.7
+    """How far above the table the grid reaches."""
+    below_m: float = 0.04
+    """How far below the table."""
+    max_side_m: float = 2.0
+    """Longest side of the grid, around the middle of what was seen."""
+    truncation_voxels: float = 3.0
+    """Depth within this many voxels of a surface says how far the surface is."""
+    max_views: int = 40
+    """More views than this are thinned out evenly."""
+
+    def __post_init__(self) -> None:
+        """Refuse grids that are none."""
+        refuse_outside(
+            self,
+            {
+                "voxel_m": (1e-3, 0.2),
+                "max_voxels": (1000, MAX_VOXELS),
+                "height_m": (0.01, 5.0),
+                "below_m": (0.0, 1.0),
+                "max_side_m": (0.1, 20.0),
+                "truncation_voxels": (1.0, 20.0),
+                "max_views": (1, 1000),
+            },
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StaticSdf:
+    """The static scene as distances."""
+
+    conservative: SdfGrid
+    """What nobody saw counts as solid."""
+    observed: SdfGrid
+    """What nobody saw counts as free."""
+    state: UInt8[np.ndarray, "num_x num_y num_z"]
+    """FREE, SURFACE or UNSEEN."""
+    truncation_m: float
+    table_z_m: float | None
+    """Everything below is solid; None when no table is known."""
+
+    def save(self, path: Path) -> None:
+        """Write an npz file; ``SdfGrid.load`` finds the conservative grid in it."""
+        table = np.nan if self.table_z_m is None else self.table_z_m
+        extra = {
+            "observed_m": self.observed.values_m,
+            "state": self.state,
+            "truncation_m": np.array(self.truncation_m),
+            "table_z_m": np.array(table),
+        }
+        write_npz(path, self.conservative.arrays() | extra)
+
+    @staticmethod
+    def load(path: Path) -> "StaticSdf":
+        """Read what ``save`` wrote.
+
+        Raises:
+            UnreadableArraysError: When it is damaged, too large, or no static scene.
+        """
+        grid = SdfGrid.load(path)
+        names = ("observed_m", "state", "truncation_m", "table_z_m")
+        found = read_npz(path, names, MAX_VOXELS * 5 + 4096)
+        values, state = found["observed_m"], found["state"]
+        if not values.shape == state.shape == grid.values_m.shape or state.dtype != np.uint8:
+            raise UnreadableArraysError(path=path, found="grids of different sizes")
+        table = float(found["table_z_m"])
+        return StaticSdf(
+            conservative=grid,
+            observed=SdfGrid(
+                values_m=values, origin_m=grid.origin_m, voxel_m=grid.voxel_m, closed=False
+            ),
+            state=state,
+            truncation_m=float(found["truncation_m"]),
+            table_z_m=None if np.isnan(table) else table,
+        )
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what ``scene.json`` says of it."""
+        shares = np.bincount(self.state.ravel(), minlength=3) / self.state.size
+        return {
+            "voxel_m": self.conservative.voxel_m,
+            "size": list(self.state.shape),
+            "origin_m": self.conservative.origin_m.tolist(),
+            "truncation_m": self.truncation_m,
+            "table_z_m": self.table_z_m,
+            "free": round(float(shares[FREE]), 4),
+            "surface": round(float(shares[SURFACE]), 4),
+            "unseen": round(float(shares[UNSEEN]), 4),
+            "note": "values_m: unseen is solid; observed_m: unseen is free; beyond: unknown",
+        }
+
+
+def static_sdf(
+    views: Sequence[TrainingView],
+    table_z_m: float | None,
+    objects: Sequence[Distance] = (),
+    config: StaticConfig | None = None,
+) -> StaticSdf:
+    """Fuse the training views into signed distances to what stands still.
+
+    Args:
+        views: What the scene was fitted to; pixels that show something moving are left out.
+        table_z_m: Height of the table: all below is solid. None when there is none.
+        objects: Distances to the things that may be moved: the scene is made free of them.
+        config: Settings; the defaults when None.
+
+    Raises:
+        ShapeError: When the views measured next to nothing.
+    """
+    config = StaticConfig() if config is None else config
+    masked = [_everything(view) for view in _thinned(views, config.max_views)]
+    box = _box(masked, table_z_m, config)
+    truncation = config.truncation_voxels * box.voxel_m
+    evidence = gather(box, masked, truncation, min_free_views=2)
+    free = evidence.empty.ravel()
+    _clear_objects(box, free, objects)
+    free = free.reshape(box.counts)
+    if table_z_m is not None:
+        free[:, :, box.axis_m(2) < table_z_m] = False
+    surface = ~free & _is_surface(box, evidence, table_z_m)
+    state = np.where(free, FREE, np.where(surface, SURFACE, UNSEEN)).astype(np.uint8)
+    return StaticSdf(
+        conservative=_grid(box, state != FREE),
+        observed=_grid(box, state == SURFACE),
+        state=state,
+        truncation_m=truncation,
+        table_z_m=table_z_m,
+    )
+
+
+def _thinned(views: Sequence[TrainingView], max_views: int) -> list[TrainingView]:
+    ids = np.linspace(0, len(views) - 1, min(len(views), max_views)).round().astype(int)
+    return [views[index] for index in np.unique(ids)]
+
+
+def _everything(view: TrainingView) -> MaskedView:
+    target = view.full
+    depth = np.where(target.static_mask, target.depth_m, np.float32(0.0))
+    return MaskedView(
+        camera=target.camera,
+        T_base_camera=view.T_base_color,
+        depth_m=depth,
+        mask=np.ones(depth.shape, dtype=bool),
+    )
+
+
+def _is_surface(
+    box: VoxelBox, evidence: Evidence, table_z_m: float | None
+) -> Bool[np.ndarray, "num_x num_y num_z"]:
+    surface = evidence.weight > 0
+    if table_z_m is not None:
+        surface[:, :, box.axis_m(2) < table_z_m] = True
+    return np.asarray(surface)
+
+
+def _clear_objects(
+    box: VoxelBox, free: Bool[np.ndarray, " num_voxels"], objects: Sequence[Distance]
+) -> None:
+    if not objects:
+        return
+    taken = np.flatnonzero(~free)
+    places = box.centres_m(taken)
+    for distance in objects:
+        free[taken[distance(places) < OBJECT_MARGIN_VOXELS * box.voxel_m]] = True
+
+
+def _box(views: Sequence[MaskedView], table_z_m: float | None, config: StaticConfig) -> VoxelBox:
+    """The box of what was seen, without the outermost hundredth, in voxels that fit the budget."""
+    points = [view.points_m() for view in views]
+    rows = [p[:: max(1, len(p) // POINTS_PER_VIEW)] for p in points if len(p)]
+    seen = np.concatenate(rows) if rows else np.zeros((0, 3))
+    if table_z_m is not None:
+        height = seen[:, 2] - table_z_m
+        seen = seen[(height > -config.below_m) & (height < config.height_m)]
+    if len(seen) < MIN_POINTS:
+        message = (
+            f"{len(views)} views measured {len(seen)} points of the static scene, at least "
+            f"{MIN_POINTS} are needed: no distances to it."
+        )
+        raise ShapeError(message)
+    low, high = np.percentile(seen, [1, 99], axis=0)
+    if table_z_m is not None:
+        low[2], high[2] = table_z_m - config.below_m, table_z_m + config.height_m
+    middle, half = (low + high) / 2, np.minimum((high - low) / 2, config.max_side_m / 2)
+    half = np.maximum(half, 2 * config.voxel_m)
+    voxel = max(config.voxel_m, float(np.cbrt(np.prod(2 * half) / config.max_voxels)))
+    counts = np.maximum(np.floor(2 * half / voxel), 2).astype(int)
+    origin = middle - half + voxel / 2
+    if table_z_m is not None:
+        # The table top is a face between two layers, not the middle of one.
+        layers = np.floor(config.below_m / voxel)
+        origin[2] = table_z_m - (layers - 0.5) * voxel
+    num_x, num_y, num_z = counts.tolist()
+    return VoxelBox(origin_m=origin, voxel_m=voxel, counts=(num_x, num_y, num_z))
+
+
+def _grid(box: VoxelBox, solid: Bool[np.ndarray, "num_x num_y num_z"]) -> SdfGrid:
+    if solid.all() or not solid.any():
+        # Nothing to be far from: as far as the grid is large, on the side that is there.
+        far = float(np.linalg.norm(box.counts)) * box.voxel_m
+        values = np.full(box.counts, -far if solid.all() else far, dtype=np.float32)
+    else:
+        values = distances_of_solid(solid, box.voxel_m)
+    return SdfGrid(values_m=values, origin_m=box.origin_m, voxel_m=box.voxel_m, closed=False)
