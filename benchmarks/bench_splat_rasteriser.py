@@ -1,0 +1,181 @@
+"""The rasteriser's speed: against a scalar numba reference, against torch, and with two threads."""
+
+import statistics
+import sys
+
+import numpy as np
+from measure import ROOT, Target, cpu_seconds, report_targets
+
+from bridge.geometry.camera import Camera
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32, morton_order
+from twin.scene.raster import FitSession, RasterConfig, Rasteriser, available_isas
+from twin.scene.training_view import Target as Seen
+
+VGA = Camera(width=640, height=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
+SMALL = Camera(width=160, height=120, fx=160.0, fy=160.0, cx=80.0, cy=60.0)
+COUNTS = (50_000, 200_000)
+SMALL_COUNT = 2_000
+NUMBA_FACTOR, TORCH_FACTOR, THREADS_FACTOR = 8.0, 100.0, 1.8
+RATES = {
+    "means_m": 1e-4,
+    "quats_wxyz": 1e-3,
+    "scales_log": 1e-3,
+    "opacities_logit": 1e-3,
+    "colors": 1e-3,
+}
+
+
+def surface_cloud(camera: Camera, count: int) -> GaussianCloud:
+    """Flat Gaussians on all a camera sees of a wavy surface with a step, as fused depth gives."""
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-0.05, 1.05, count) * camera.width
+    v = rng.uniform(-0.05, 1.05, count) * camera.height
+    z = 1.2 + 0.5 * np.sin(7 * u / camera.width) * np.cos(7 * v / camera.height)
+    z += 0.4 * (v > 0.55 * camera.height)
+    ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(count)], 1)
+    spacing_px = np.sqrt(1.21 * camera.width * camera.height / count)
+    sigma = 0.62 * spacing_px * z / camera.fx
+    quats = rng.normal(scale=0.15, size=(count, 4)) + np.array([1.0, 0.0, 0.0, 0.0])
+    cloud = GaussianCloud(
+        means_m=as_float32(ray * z[:, None]),
+        quats_wxyz=as_float32(quats),
+        scales_log=as_float32(np.log(np.stack([sigma, sigma, 0.1 * sigma], axis=1))),
+        opacities_logit=as_float32(rng.normal(1.0, 1.0, count)),
+        colors=as_float32(rng.uniform(size=(count, 3))),
+    )
+    return cloud.take(morton_order(cloud.means_m))
+
+
+def native(cloud: GaussianCloud, camera: Camera, rasteriser: Rasteriser) -> tuple[np.ndarray, ...]:
+    planes = rasteriser.draw_planes(cloud, camera, np.eye(4))
+    gradient = rasteriser.pull_back(planes, np.ones_like(planes))
+    return planes, gradient.colors
+
+
+def against_numba(counts: tuple[int, ...], repeats: int) -> list[Target]:
+    import splat_numba
+
+    wide = "v3" if "v3" in available_isas() else "auto"
+    targets = []
+    for count in counts:
+        cloud = surface_cloud(VGA, count)
+        ellipses = splat_numba.project(cloud, VGA)
+        upstream = np.ones((5, VGA.height, VGA.width), dtype=np.float32)
+        planes, gradient = splat_numba.draw_and_pull(ellipses, VGA, upstream)
+        rasteriser = Rasteriser(RasterConfig(threads=1, isa=wide))
+        own_planes, own_colors = native(cloud, VGA, rasteriser)
+        # Speeds are only compared of two that draw the same.
+        difference = float(np.quantile(np.abs(planes - own_planes), 0.999))
+        scale = float(np.abs(own_colors).max())
+        wrong = float(np.abs(gradient[:, 6:9] - own_colors[ellipses.index]).max()) / scale
+        if difference > 2e-3 or wrong > 2e-2:
+            message = f"the reference draws something else: {difference:g}, gradients {wrong:g}"
+            raise RuntimeError(message)
+        reference = statistics.median(
+            cpu_seconds(
+                lambda e=ellipses, g=upstream: splat_numba.draw_and_pull(e, VGA, g),
+                repeats=max(2, repeats // 4),
+            )
+        )
+        for isa in dict.fromkeys([wide, *available_isas()]):
+            one = Rasteriser(RasterConfig(threads=1, isa=isa))
+            own = statistics.median(
+                cpu_seconds(lambda c=cloud, r=one: native(c, VGA, r), repeats=repeats)
+            )
+            limit = NUMBA_FACTOR if isa == wide else 0.0
+            targets.append(
+                Target(
+                    what=f"{count // 1000}k Gaussians, {isa}, faster than numba",
+                    measured=reference / own,
+                    limit=limit,
+                    unit="x",
+                    at_most=False,
+                    reference=f"numba {reference * 1e3:.0f} ms, native {own * 1e3:.1f} ms",
+                )
+            )
+    return targets
+
+
+def against_torch(repeats: int) -> Target:
+    import torch
+
+    sys.path.insert(0, str(ROOT / "tests" / "parity"))
+    import splat_reference
+
+    torch.set_num_threads(1)
+    cloud = surface_cloud(SMALL, SMALL_COUNT)
+
+    def reference() -> None:
+        tensors = [torch.tensor(rows, requires_grad=True) for _, rows in arrays(cloud)]
+        drawn = splat_reference.draw(
+            *tensors, camera=SMALL, T_camera_base=np.eye(4), alpha_cut=1 / 255
+        )
+        drawn.sum().backward()
+
+    wide = "v3" if "v3" in available_isas() else "auto"
+    rasteriser = Rasteriser(RasterConfig(threads=1, isa=wide))
+    slow = statistics.median(cpu_seconds(reference, repeats=2))
+    own = statistics.median(cpu_seconds(lambda: native(cloud, SMALL, rasteriser), repeats=repeats))
+    return Target(
+        what=f"{SMALL_COUNT} Gaussians, {SMALL.width} x {SMALL.height}, faster than torch",
+        measured=slow / own,
+        limit=TORCH_FACTOR,
+        unit="x",
+        at_most=False,
+        reference=f"torch {slow * 1e3:.0f} ms, native {own * 1e3:.2f} ms",
+    )
+
+
+def iterations(count: int, threads: int, repeats: int) -> tuple[float, dict[str, float]]:
+    """Wall time of a whole fit step and of its stages, medians [s]."""
+    rng = np.random.default_rng(1)
+    size = (VGA.height, VGA.width)
+    target = Seen(
+        camera=VGA,
+        planes_u8=rng.integers(0, 256, (3, *size), dtype=np.uint8),
+        depth_m=rng.uniform(0.8, 2.0, size).astype(np.float32),
+        static_mask=np.ones(size, dtype=bool),
+    )
+    session = FitSession(surface_cloud(VGA, count), RasterConfig(threads=threads))
+    session.step(target, np.eye(4), RATES)
+    reports = [session.step(target, np.eye(4), RATES) for _ in range(repeats)]
+    stages = {
+        name: statistics.median(report.seconds[name] for report in reports)
+        for name in reports[0].seconds
+    }
+    return statistics.median(sum(report.seconds.values()) for report in reports), stages
+
+
+def with_threads(count: int, repeats: int) -> tuple[Target, dict[str, dict[str, float]]]:
+    one, stages_one = iterations(count, 1, repeats)
+    two, stages_two = iterations(count, 2, repeats)
+    print(f"fit step, {count} Gaussians, 640 x 480, wall time [ms]")
+    print("  threads  " + "".join(f"{name:>9}" for name in stages_one) + "      all")
+    for threads, total, stages in ((1, one, stages_one), (2, two, stages_two)):
+        row = "".join(f"{seconds * 1e3:9.2f}" for seconds in stages.values())
+        print(f"  {threads:7d}  {row}{total * 1e3:9.2f}")
+    target = Target(
+        what=f"fit step, {count // 1000}k Gaussians, two threads faster than one",
+        measured=one / two,
+        limit=THREADS_FACTOR,
+        unit="x",
+        at_most=False,
+        reference=f"{one * 1e3:.1f} ms, {two * 1e3:.1f} ms wall",
+    )
+    return target, {"1": stages_one, "2": stages_two}
+
+
+def main() -> None:
+    """Measure; ``quick`` as the first argument takes fewer repeats."""
+    quick = "quick" in sys.argv[1:]
+    repeats = 5 if quick else 15
+    targets = against_numba(COUNTS[:1] if quick else COUNTS, repeats)
+    target, stages = with_threads(COUNTS[0], repeats)
+    targets.append(target)
+    targets.append(against_torch(repeats))
+    note = "640 x 480 unless said, forward and backward, CPU time of one thread unless said wall"
+    report_targets("splat_rasteriser", targets, note=note, stages_s=stages)
+
+
+if __name__ == "__main__":
+    main()
