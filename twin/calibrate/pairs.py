@@ -87,11 +87,11 @@ def _csv_rows(path: Path) -> list[np.ndarray]:
 
 
 def _refuse_no_poses(path: Path, poses: np.ndarray) -> None:
-    R = poses[..., :3, :3]
+    finite = np.isfinite(poses).all(axis=(-1, -2))
+    R = np.where(finite[..., None, None], poses, 0.0)[..., :3, :3]
     square = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-1, -2))
-    whole = np.isfinite(poses).all(axis=(-1, -2))
-    whole &= (square < 1e-3) & (np.linalg.det(R) > 0)
-    whole &= np.abs(poses[..., 3, :] - [0, 0, 0, 1]).max(axis=-1) < 1e-6
+    whole = finite & (square < 1e-3) & (np.linalg.det(R) > 0)
+    whole &= (poses[..., 3, :] == [0, 0, 0, 1]).all(axis=-1)
     if not whole.all():
         pair, which = np.argwhere(~whole)[0]
         name = ("T_base_effector", "T_camera_target")[which]

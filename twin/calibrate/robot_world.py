@@ -20,6 +20,8 @@ MIN_TURN_RAD = 0.05
 OUTLIER = 5.0
 """Misfits far beyond this many standard deviations lose their say (Geman and McClure's loss)."""
 REFUSED_WEIGHT = 0.05
+RESCALED = 8
+"""Iterations after which the scales of the misfits stay, so that the others converge."""
 NUM_RESAMPLES = 200
 MEDIAN_OF_THREE = 1.538
 """Median length of three standard normal numbers."""
@@ -72,8 +74,9 @@ def solve(
 ) -> RobotWorld:
     """Find X and Z with A X = Z B.
 
-    Starts from the better of two closed forms, minimises Geman and McClure's loss of the misfits
-    by Gauss-Newton, and repeats that on resampled pairs for the intervals.
+    Starts from the better of two closed forms and minimises Geman and McClure's loss of the
+    misfits by Gauss-Newton. Intervals come from resampled pairs (Efron, 1979), each solved by one
+    more step.
 
     Args:
         Ts_a: Poses from the robot.
@@ -88,15 +91,10 @@ def solve(
     scales = _scales(misfits(Ts_a, Ts_b, X, Z))
     distance, angle = _lengths(misfits(Ts_a, Ts_b, X, Z))
     outliers = int((_weights(misfits(Ts_a, Ts_b, X, Z), scales) < REFUSED_WEIGHT).sum())
-    rng = np.random.default_rng(seed)
-    medians, xs = [], []
-    for _ in range(NUM_RESAMPLES):
-        ids = rng.integers(len(Ts_a), size=len(Ts_a))
-        X_again, _ = _refined(Ts_a[ids], Ts_b[ids], X, Z, iterations=4, scales=scales)
-        medians.append([float(np.median(v[ids])) for v in (distance, angle)])
-        xs.append(X_again)
-    low, high = np.quantile(medians, [0.025, 0.975], axis=0)
-    change = se3.invert(X) @ np.array(xs)
+    drawn = np.random.default_rng(seed).integers(len(Ts_a), size=(NUM_RESAMPLES, len(Ts_a)))
+    medians = np.stack([np.median(values[drawn], axis=1) for values in (distance, angle)])
+    low, high = np.quantile(medians, [0.025, 0.975], axis=1)
+    steps = _steps(Ts_a, Ts_b, X, Z, scales, drawn)
     return RobotWorld(
         X=X,
         Z=Z,
@@ -104,8 +102,8 @@ def solve(
         num_outliers=outliers,
         residual_m=_interval(distance, low[0], high[0]),
         residual_rad=_interval(angle, low[1], high[1]),
-        x_sigma_m=_spread(change[:, :3, 3]),
-        x_sigma_rad=_spread(se3.vector_from_rotation(change[:, :3, :3])),
+        x_sigma_m=_spread(steps[:, :3]),
+        x_sigma_rad=_spread(steps[:, 3:6]),
         second_turn_rad=turn,
     )
 
@@ -162,27 +160,46 @@ def _middle(Ts: Float[np.ndarray, "num_pairs 4 4"]) -> Float[np.ndarray, "4 4"]:
 
 
 def _refined(
+    Ts_a: np.ndarray, Ts_b: np.ndarray, X: np.ndarray, Z: np.ndarray, *, iterations: int
+) -> tuple[np.ndarray, np.ndarray]:
+    scales = (FLOOR, FLOOR)
+    for iteration in range(iterations):
+        if iteration < RESCALED:
+            scales = _scales(misfits(Ts_a, Ts_b, X, Z))
+        H, g = _equations(Ts_a, Ts_b, X, Z, scales)
+        step, *_ = np.linalg.lstsq(H.sum(axis=0), -g.sum(axis=0), rcond=1e-12)
+        X, Z = X @ _moved(step[:6]), Z @ _moved(step[6:])
+        if np.abs(step).max() < 1e-10:
+            break
+    return X, Z
+
+
+def _equations(
+    Ts_a: np.ndarray, Ts_b: np.ndarray, X: np.ndarray, Z: np.ndarray, scales: tuple[float, float]
+) -> tuple[Float[np.ndarray, "num_pairs 12 12"], Float[np.ndarray, "num_pairs 12"]]:
+    """Weighted normal equations of each pair, in units of the standard deviations."""
+    r = misfits(Ts_a, Ts_b, X, Z)
+    inverse = np.repeat(1.0 / np.array(scales), 3)
+    J = _jacobian(Ts_b, Z, r) * inverse[:, None]
+    weighted = np.swapaxes(J, 1, 2) * _weights(r, scales)[:, None, None]
+    return weighted @ J, (weighted @ (r * inverse)[..., None])[..., 0]
+
+
+def _steps(
     Ts_a: np.ndarray,
     Ts_b: np.ndarray,
     X: np.ndarray,
     Z: np.ndarray,
-    *,
-    iterations: int,
-    scales: tuple[float, float] | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    for _ in range(iterations):
-        r = misfits(Ts_a, Ts_b, X, Z)
-        used = _scales(r) if scales is None else scales
-        inverse = np.repeat(1.0 / np.array(used), 3)
-        J = _jacobian(Ts_b, Z, r) * inverse[:, None]
-        weighted = J * _weights(r, used)[:, None, None]
-        H = np.einsum("nij,nik->jk", weighted, J)
-        g = np.einsum("nij,ni->j", weighted, r * inverse)
-        step, *_ = np.linalg.lstsq(H, -g, rcond=1e-12)
-        X, Z = X @ _moved(step[:6]), Z @ _moved(step[6:])
-        if np.abs(step).max() < 1e-11:
-            break
-    return X, Z
+    scales: tuple[float, float],
+    drawn: np.ndarray,
+) -> Float[np.ndarray, "num_resamples 12"]:
+    """How far each resample pulls the solution: one Gauss-Newton step of its own equations."""
+    H, g = _equations(Ts_a, Ts_b, X, Z, scales)
+    counts = np.stack([np.bincount(ids, minlength=len(H)) for ids in drawn]).astype(np.float64)
+    left = np.einsum("sn,nij->sij", counts, H)
+    # A resample of few distinct pairs may determine nothing; a thousandth of all pairs holds it.
+    left += 1e-3 * H.sum(axis=0)
+    return np.asarray(-np.linalg.solve(left, (counts @ g)[..., None])[..., 0])
 
 
 def _jacobian(

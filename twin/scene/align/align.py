@@ -18,7 +18,7 @@ from twin.scene.align.search import APART_M, APART_RAD, search
 from twin.scene.align.view import RobotView
 
 COARSE_POINTS = 1500
-MAX_COARSE = 8
+MAX_COARSE = 6
 NUM_SURFACE = 400
 
 

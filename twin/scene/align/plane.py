@@ -14,8 +14,8 @@ NUM_TRIALS = 400
 NEAR_M = 0.008
 NEAR_FRACTION = 0.006
 """A point within 8 mm + 0.6 % of its distance to the camera lies on the plane."""
-MIN_SHARE = 0.04
-"""Of the points still unexplained; smaller planes are parts of things."""
+MIN_SHARE = 0.05
+"""Of all points; smaller planes are parts of things."""
 MAX_PLANES = 3
 UPRIGHT = 0.2
 LOOKING_DOWN = 0.9
@@ -55,7 +55,7 @@ def find_planes(views: Sequence[RobotView], *, seed: int = 0) -> list[LevelPlane
         if left.sum() < 50 or len(planes) == MAX_PLANES:
             break
         normal, offset, on = _largest(p, range_m, left, eye, rng)
-        if on.sum() < MIN_SHARE * left.sum():
+        if on.mean() < MIN_SHARE:
             break
         left &= ~on
         if normal @ up > UPRIGHT or normal @ back > LOOKING_DOWN:

@@ -24,7 +24,10 @@ MARGIN_M = 0.15
 """The base may stand this far outside of what is seen of the surface."""
 NUM_SAMPLES = 250
 MAX_VIEWS = 3
-CAP_M = 0.08
+CAP_M, FINE_CAP_M = 0.08, 0.04
+"""Depth differences beyond are worth nothing; the first on the grid, then around its best."""
+NUM_NEAR = 7
+"""Yaws and places to each side of a hypothesis, tried in finer steps."""
 SEEN_THROUGH = 0.3
 """What a point costs that the camera looks through, in units of a point that fits."""
 APART_RAD = 0.35
@@ -60,14 +63,37 @@ def _on_plane(
 ) -> list[Hypothesis]:
     places = _grid(plane)
     yaws = np.arange(NUM_YAWS) * 2 * np.pi / NUM_YAWS
-    scores = np.zeros((NUM_YAWS, len(places)))
+    scores = _scores(views, samples, plane, yaws, places, CAP_M)
+    near_yaws = np.linspace(-0.5, 0.5, NUM_NEAR) * 2 * (yaws[1] - yaws[0])
+    step = np.linspace(-STEP_M, STEP_M, NUM_NEAR)
+    near_places = np.stack([*np.meshgrid(step, step), np.zeros((NUM_NEAR,) * 2)], axis=-1)
+    found = []
+    for yaw, place in _distinct(scores, yaws, places):
+        around = place + near_places.reshape(-1, 3)
+        finer = _scores(views, samples, plane, yaw + near_yaws, around, FINE_CAP_M)
+        i, k = np.unravel_index(int(np.argmax(finer)), finer.shape)
+        T_level_base = _place(float(yaw + near_yaws[i]), around[k])
+        T_base_source = se3.invert(T_level_base) @ plane.T_level_source
+        found.append(Hypothesis(T_base_source=T_base_source, score=float(finer[i, k])))
+    return found
+
+
+def _scores(
+    views: Sequence[RobotView],
+    samples: Sequence[np.ndarray],
+    plane: LevelPlane,
+    yaws: Float[np.ndarray, " num_yaws"],
+    places: Float[np.ndarray, "num_places 3"],
+    cap_m: float,
+) -> Float[np.ndarray, "num_yaws num_places"]:
+    scores = np.zeros((len(yaws), len(places)))
     for view, p_base in zip(views, samples, strict=True):
         T_camera_level = se3.invert(plane.T_level_source @ view.T_source_camera)
         shifts = places @ T_camera_level[:3, :3].T
         for index, yaw in enumerate(yaws):
-            p_camera = se3.apply(T_camera_level @ _place(yaw, np.zeros(3)), p_base)
-            scores[index] += _score(view, p_camera, shifts)
-    return _distinct(scores / len(views), yaws, places, plane)
+            p_camera = se3.apply(T_camera_level @ _place(float(yaw), np.zeros(3)), p_base)
+            scores[index] += _credit(view, p_camera, shifts, cap_m)
+    return np.asarray(scores / len(views))
 
 
 def _grid(plane: LevelPlane) -> Float[np.ndarray, "num_places 3"]:
@@ -78,10 +104,11 @@ def _grid(plane: LevelPlane) -> Float[np.ndarray, "num_places 3"]:
     return np.asarray(grid.reshape(-1, 3))
 
 
-def _score(
+def _credit(
     view: RobotView,
     p_camera: Float[np.ndarray, "num_points 3"],
     shifts_m: Float[np.ndarray, "num_places 3"],
+    cap_m: float,
 ) -> Float[np.ndarray, " num_places"]:
     """Mean credit of the points, moved by each shift."""
     camera = view.camera
@@ -95,7 +122,7 @@ def _score(
     index = np.where(inside, row * camera.width + column, 0).astype(np.int64)
     behind = view.depth_m.astype(np.float32).ravel()[index] - z
     known = inside & (behind > -z)  # depth 0 is unknown
-    credit = np.maximum(0.0, 1.0 - np.abs(behind) / CAP_M) - SEEN_THROUGH * (behind > CAP_M)
+    credit = np.maximum(0.0, 1.0 - np.abs(behind) / cap_m) - SEEN_THROUGH * (behind > cap_m)
     return np.asarray(np.where(known, credit, 0.0).mean(axis=1), dtype=np.float64)
 
 
@@ -103,22 +130,15 @@ def _distinct(
     scores: Float[np.ndarray, "num_yaws num_places"],
     yaws: Float[np.ndarray, " num_yaws"],
     places: Float[np.ndarray, "num_places 3"],
-    plane: LevelPlane,
-) -> list[Hypothesis]:
-    """The best hypotheses none of which is another's neighbour."""
+) -> list[tuple[float, Float[np.ndarray, "3"]]]:
+    """Yaw and place of the best hypotheses none of which is another's neighbour."""
     left = scores.copy()
     found = []
     for _ in range(PER_PLANE):
         yaw, place = np.unravel_index(int(np.argmax(left)), left.shape)
         if not np.isfinite(left[yaw, place]):
             break
-        T_level_base = _place(float(yaws[yaw]), places[place])
-        found.append(
-            Hypothesis(
-                T_base_source=se3.invert(T_level_base) @ plane.T_level_source,
-                score=float(scores[yaw, place]),
-            )
-        )
+        found.append((float(yaws[yaw]), places[place]))
         turn = np.abs((yaws - yaws[yaw] + np.pi) % (2 * np.pi) - np.pi)
         shift = np.linalg.norm(places - places[place], axis=1)
         left[(turn[:, None] < APART_RAD) & (shift[None] < APART_M)] = -np.inf

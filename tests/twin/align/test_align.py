@@ -1,0 +1,201 @@
+"""Laws of laying a scene onto the robot's description; truth from the stand-in cell's geometry."""
+
+from dataclasses import replace
+
+import cell_views
+import numpy as np
+import pytest
+
+from bridge.geometry import se3
+from twin.robot.posture import Posture
+from twin.robot.surface import PosedSurface, sample_surface
+from twin.scene.align.align import AlignConfig, RobotNotAlignedError, align_robot
+from twin.scene.align.judge import look
+from twin.scene.align.plane import find_planes
+from twin.scene.align.refine import Place, Stage, refine
+from twin.scene.align.search import search
+from twin.scene.align.view import RobotView
+
+TWO = cell_views.POSTURES[:2]
+BIASED = cell_views.CellErrors(depth_scale=1.01)
+
+
+def surface_points(posture: Posture) -> np.ndarray:
+    return sample_surface(cell_views.robot(), posture, 500, seed=3)
+
+
+@pytest.fixture(scope="module")
+def exact() -> list[RobotView]:
+    return cell_views.views(TWO, np.eye(4), cell_views.CellErrors(noise=False))
+
+
+@pytest.fixture(scope="module")
+def biased() -> list[RobotView]:
+    return cell_views.views(TWO, np.eye(4), BIASED)
+
+
+def moved(views: list[RobotView], T_source_base: np.ndarray) -> list[RobotView]:
+    return [replace(v, T_source_camera=T_source_base @ v.T_source_camera) for v in views]
+
+
+def nearby(seed: int, metres: float = 0.02, radians: float = 0.03) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3] = se3.rotation_from_vector(rng.normal(size=3) * radians / np.sqrt(3))
+    T[:3, 3] = rng.normal(size=3) * metres / np.sqrt(3)
+    return T
+
+
+def test_the_posed_surface_is_where_forward_kinematics_says() -> None:
+    """Independent: the stand-in cell's ray caster reads the URDF on its own."""
+    (view,) = cell_views.views(TWO[:1], np.eye(4), cell_views.CellErrors(noise=False))
+    surface = PosedSurface(cell_views.robot(), view.posture)
+    expected = surface.depth_along(view.camera.rays(), view.T_source_camera)
+    both = np.isfinite(expected) & (view.depth_m > 0)
+    assert both.sum() > 1500
+    assert np.quantile(np.abs(expected - view.depth_m)[both], 0.9) < 0.001
+
+
+def test_nearest_points_lie_on_the_surface_at_the_distance_that_is_said() -> None:
+    posture = Posture(joints_rad=np.array(TWO[0]), width_m=0.03)
+    surface = PosedSurface(cell_views.robot(), posture)
+    p = surface_points(posture) + np.random.default_rng(0).normal(0, 0.02, (500, 3))
+    found = surface.nearest(p)
+    np.testing.assert_allclose(np.linalg.norm(p - found.p_m, axis=1), found.distance_m, atol=1e-6)
+    assert surface.nearest(found.p_m).distance_m.max() < 1e-5
+    off_surface = found.distance_m > 1e-3
+    gap = (p - found.p_m)[off_surface] / found.distance_m[off_surface, None]
+    along = np.abs(np.einsum("ij,ij->i", gap, found.normals[off_surface]))
+    assert np.median(along) > 0.999  # most lie over a face, some beside an edge
+
+
+def test_the_table_is_found_and_is_level(biased: list[RobotView]) -> None:
+    T_source_base = cell_views.anywhere(1)
+    planes = find_planes(moved(biased, T_source_base))
+    heights, tilts = [], []
+    for plane in planes:
+        T_level_base = plane.T_level_source @ T_source_base
+        tilts.append(np.degrees(np.arccos(np.clip(T_level_base[2, 2], -1, 1))))
+        heights.append(T_level_base[2, 3])
+    assert any(t < 1.0 and abs(h) < 0.02 for t, h in zip(tilts, heights, strict=True))
+
+
+def test_the_search_proposes_the_right_place(biased: list[RobotView]) -> None:
+    T_source_base = cell_views.anywhere(2)
+    views = moved(biased, T_source_base)
+    found = search(views, cell_views.robot(), find_planes(views))
+    errors = []
+    for item in found[:8]:
+        change = item.T_base_source @ T_source_base
+        errors.append((np.linalg.norm(change[:3, 3]), se3.rotation_angle_rad(change[:3, :3])))
+    assert any(shift < 0.12 and turn < 0.2 for shift, turn in errors), errors
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_refining_undoes_a_small_wrong_pose(exact: list[RobotView], seed: int) -> None:
+    T_source_base = cell_views.anywhere(seed)
+    start = nearby(seed) @ se3.invert(T_source_base)
+    found = align_robot(moved(exact, T_source_base), cell_views.robot(), start=start)
+    points = surface_points(exact[0].posture)
+    assert cell_views.surface_error_m(found.T_base_source, T_source_base, points) < 0.0015
+    assert abs(found.depth_scale - 1.0) < 0.002
+    assert found.margin is None
+
+
+def test_the_depth_scale_is_recovered_where_a_rigid_fit_goes_astray(
+    biased: list[RobotView],
+) -> None:
+    points = surface_points(biased[0].posture)
+    rigid = align_robot(
+        biased,
+        cell_views.robot(),
+        start=nearby(5),
+        config=AlignConfig(with_scale=False, max_residual_m=0.05, min_fitness=0.0),
+    )
+    free = align_robot(biased, cell_views.robot(), start=nearby(5))
+    assert free.depth_scale == pytest.approx(1 / 1.01, abs=0.002)
+    error = cell_views.surface_error_m(free.T_base_source, np.eye(4), points)
+    assert error < 0.002
+    assert cell_views.surface_error_m(rigid.T_base_source, np.eye(4), points) > 3 * error
+
+
+def test_the_frame_of_the_scene_does_not_matter(biased: list[RobotView]) -> None:
+    """Same images, same start, another root frame: the same robot in the same place."""
+    T_source_base = cell_views.anywhere(4)
+    first = align_robot(biased, cell_views.robot(), start=nearby(1))
+    second = align_robot(
+        moved(biased, T_source_base),
+        cell_views.robot(),
+        start=nearby(1) @ se3.invert(T_source_base),
+    )
+    points = surface_points(biased[0].posture)
+    a = se3.apply(first.T_base_source, points)
+    b = se3.apply(second.T_base_source @ T_source_base, points)
+    assert np.linalg.norm(a - b, axis=1).max() < 2e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 7])
+def test_the_robot_is_found_anywhere_with_a_biased_depth(
+    biased: list[RobotView], seed: int
+) -> None:
+    T_source_base = cell_views.anywhere(seed)
+    found = align_robot(moved(biased, T_source_base), cell_views.robot())
+    points = surface_points(biased[0].posture)
+    assert cell_views.surface_error_m(found.T_base_source, T_source_base, points) < 0.002
+    assert found.margin is not None
+    assert found.margin > 1.3
+    assert found.sureness.displacement_m < 0.003
+    assert found.sureness.residual_low_m <= found.residual_m <= found.sureness.residual_high_m
+
+
+def test_a_scene_without_the_robot_is_refused(biased: list[RobotView]) -> None:
+    surface = PosedSurface(cell_views.robot(), biased[0].posture)
+    view = biased[0]
+    hit = np.isfinite(surface.depth_along(view.camera.rays(), view.T_source_camera))
+    table_only = np.where(hit, 0.0, view.depth_m)
+    with pytest.raises(RobotNotAlignedError, match="posture"):
+        align_robot([replace(view, depth_m=table_only)], cell_views.robot(), start=np.eye(4))
+
+
+def test_a_robot_in_another_posture_than_was_said_is_refused(biased: list[RobotView]) -> None:
+    wrong = replace(biased[0], posture=Posture(joints_rad=np.array(cell_views.POSTURES[2])))
+    with pytest.raises(RobotNotAlignedError, match="cannot be aligned"):
+        align_robot([wrong], cell_views.robot(), start=np.eye(4))
+
+
+def test_no_images_are_refused() -> None:
+    with pytest.raises(RobotNotAlignedError, match="no depth image"):
+        align_robot([], cell_views.robot())
+
+
+def test_two_places_that_fit_alike_are_refused(
+    biased: list[RobotView], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a margin no scene can give, the sentence asks for another posture."""
+    with pytest.raises(RobotNotAlignedError, match=r"another place fits.*another posture"):
+        align_robot(biased, cell_views.robot(), config=AlignConfig(min_margin=1e6))
+
+
+def test_a_place_that_shows_little_does_not_win(exact: list[RobotView]) -> None:
+    surfaces = [PosedSurface(cell_views.robot(), view.posture) for view in exact]
+    right = look(exact, surfaces, Place(T_base_source=np.eye(4)))
+    away = np.eye(4)
+    away[:3, 3] = (0.0, 0.0, 30.0)
+    wrong = look(exact, surfaces, Place(T_base_source=away))
+    least = len(right.errors_m) // 2
+    assert right.fitness > 0.95
+    assert wrong.fitness == 0.0
+    assert right.cost_m(least) < 0.2 * wrong.cost_m(least)
+
+
+def test_the_equations_are_the_derivative_of_the_residual(exact: list[RobotView]) -> None:
+    """Broken derivatives converge slowly: one narrow stage must reach the optimum in few steps."""
+    surfaces = [PosedSurface(cell_views.robot(), view.posture) for view in exact]
+    start = Place(T_base_source=nearby(9, metres=0.004, radians=0.004), depth_scale=1.003)
+    stages = (Stage(gate_m=0.02, iterations=5),)
+    place, _ = refine(exact, surfaces, start, stages=stages, num_points=3000)
+    again, _ = refine(exact, surfaces, place, stages=stages, num_points=3000)
+    change = se3.invert(place.T_base_source) @ again.T_base_source
+    assert np.linalg.norm(change[:3, 3]) < 1e-4
+    assert abs(again.depth_scale - place.depth_scale) < 1e-4
