@@ -90,7 +90,7 @@ def solve_gains(
     for index, item in enumerate(observations):
         drawn = rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)[:3]
         gains[index] = gain_between(drawn, item.target)
-    return gains / gains.mean(axis=0)
+    return np.asarray(gains / gains.mean(axis=0))
 
 
 def gain_between(

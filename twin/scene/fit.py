@@ -13,19 +13,28 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.terminal import Advance
-from twin.scene.adam import adam_step, taken_moments
 from twin.scene.appearance import Observation, solve_appearance, solve_gains
 from twin.scene.camera_correction import correction_gradient
 from twin.scene.densify import densify, score
+from twin.scene.fit_session import FitSession
 from twin.scene.fit_state import Checkpoint, FitState, first_state, load_state, save_state
 from twin.scene.gaussians import NUM_FIRST, GaussianCloud, with_harmonics
-from twin.scene.losses import Loss, psnr_db
+from twin.scene.losses import psnr_db
 from twin.scene.raster import RasterConfig, Rasteriser
 from twin.scene.settings import FitConfig
-from twin.scene.training_view import Target, TrainingView
+from twin.scene.training_view import TrainingView
 
+RATES = {
+    "means_m": 0.18,  # in units of the median Gaussian's size
+    "quats_wxyz": 1.2e-2,
+    "scales_log": 4.5e-2,
+    "opacities_logit": 0.12,
+    "colors": 2.4e-2,
+    "harmonics": 3e-3,
+}
+"""Adam's step sizes at the start."""
 DECAY = 0.05
-"""What is left of Adam's step sizes at the end."""
+"""What is left of them at the end."""
 SOLVE_AT = (0.0, 0.25)
 """Shares of the budget at which colours are solved; and once more where full size begins."""
 SPLIT_AT = (0.08, 0.16, 0.24, 0.32, 0.40)
@@ -86,10 +95,10 @@ def fit(
         clock: Seconds that the budget is counted in.
     """
     learner = _Learner(views, config, max_splats or len(cloud))
-    state = None if checkpoint is None else load_state(checkpoint)
+    state = None if checkpoint is None else load_state(checkpoint, learner.session)
     if state is None:
         harmonics = NUM_FIRST if config.harmonics else cloud.num_harmonics
-        state = first_state(with_harmonics(cloud, harmonics), len(views))
+        state = first_state(learner.session(with_harmonics(cloud, harmonics)), len(views))
     cpu_start, last_saved = time.process_time(), state.seconds
     for at in _steps(config, state, clock):
         learner.keep_schedule(state, at)
@@ -99,8 +108,8 @@ def fit(
             state.seconds = last_saved = at.seconds
             save_state(checkpoint, state)
     return FitResult(
-        cloud=state.cloud,
-        iterations=state.step,
+        cloud=state.session.cloud,
+        iterations=state.session.steps,
         coarse_iterations=state.coarse_steps,
         seconds=state.seconds,
         cpu_seconds=time.process_time() - cpu_start,
@@ -117,10 +126,10 @@ def _steps(config: FitConfig, state: FitState, clock: Callable[[], float]) -> It
     while True:
         state.seconds = clock() - begin
         by_images = config.iterations > 0
-        fraction = state.step / config.iterations if by_images else state.seconds / config.budget_s
+        seen = state.session.steps
+        fraction = seen / config.iterations if by_images else state.seconds / config.budget_s
         if fraction >= 1.0:
             return
-        state.step += 1
         yield _Progress(fraction=fraction, seconds=state.seconds)
 
 
@@ -132,7 +141,7 @@ def _note(state: FitState, at: _Progress, num_views: int) -> str:
     recent = _recent_psnr_db(state, num_views)
     said = "" if recent is None else f", training PSNR {recent:.2f} dB"
     left = at.seconds / at.fraction - at.seconds if at.fraction > 0 else None
-    return f"image {state.step}{said}" + ("" if left is None else f", {left:.0f} s left")
+    return f"image {state.session.steps}{said}" + ("" if left is None else f", {left:.0f} s left")
 
 
 class _Learner:
@@ -143,7 +152,15 @@ class _Learner:
         self._config = config
         self._max_splats = max_splats
         self._rasteriser = Rasteriser(RasterConfig(threads=config.threads))
-        self._loss = Loss(config.loss, depth_weight=config.depth_weight, threads=config.threads)
+
+    def session(self, cloud: GaussianCloud) -> FitSession:
+        """What draws, compares and learns, from a cloud on."""
+        return FitSession(
+            cloud,
+            self._rasteriser.config,
+            loss=self._config.loss,
+            depth_weight=self._config.depth_weight,
+        )
 
     def pose(self, state: FitState, index: int) -> np.ndarray:
         """Where a view is now thought to be."""
@@ -182,63 +199,42 @@ class _Learner:
     def _solve_colours(self, state: FitState, coarse: bool) -> None:
         if self._config.gain:
             observations = self._observations(state, coarse)
-            state.gains = solve_gains(state.cloud, observations, self._rasteriser)
+            state.gains = solve_gains(state.session.cloud, observations, self._rasteriser)
         solved = solve_appearance(
-            state.cloud,
+            state.session.cloud,
             self._observations(state, coarse),
             self._rasteriser,
             steps=self._config.appearance_steps,
         )
-        state.cloud = solved.cloud
+        state.session.cloud.colors[:] = solved.cloud.colors
+        state.session.cloud.harmonics[:] = solved.cloud.harmonics
 
     def _densify(self, state: FitState, coarse: bool) -> None:
-        scores = score(state.cloud, self._observations(state, coarse), self._rasteriser)
+        cloud = state.session.cloud
+        scores = score(cloud, self._observations(state, coarse), self._rasteriser)
         left = sum(1 for _, event in self._schedule[state.events_done :] if event == self._densify)
-        room = self._max_splats - len(state.cloud)
-        done = densify(
-            state.cloud, scores, max_splats=self._max_splats, most=-(-max(room, 0) // left)
-        )
-        state.cloud = done.cloud
-        state.moments = taken_moments(state.moments, done.parents)
+        room = self._max_splats - len(cloud)
+        done = densify(cloud, scores, max_splats=self._max_splats, most=-(-max(room, 0) // left))
+        state.session.rearrange(done.cloud, done.parents)
         state.num_split += done.num_split
         state.num_pruned += done.num_pruned
 
     def step(self, state: FitState, at: _Progress) -> None:
         """Draw one image and follow its gradient."""
-        epoch, place = divmod(state.step - 1, len(self._views))
+        epoch, place = divmod(state.session.steps, len(self._views))
         order = np.random.default_rng([self._config.seed, epoch]).permutation(len(self._views))
         index = int(order[place])
         coarse = at.fraction < self._config.coarse_fraction
         state.coarse_steps += coarse
-        view = self._views[index]
-        mse = self._descend(state, index, view.half if coarse else view.full, at)
-        if mse is not None:
-            state.errors = [*state.errors[-len(self._views) :], mse]
-
-    def _descend(self, state: FitState, index: int, target: Target, at: _Progress) -> float | None:
-        """Follow one image's gradient; returns the mean squared error where it counts."""
-        pose = self.pose(state, index)
-        planes = self._rasteriser.draw_planes(state.cloud, target.camera, pose)
-        gain = state.gains[index].astype(np.float32)[:, None, None]
-        bright = planes.copy()
-        bright[:3] *= gain
-        # Where something moving stood, the image is compared with itself: no error, no gradient.
-        wanted = np.where(target.static_mask, target.image(), bright[:3])
-        _, mse, d_planes = self._loss(bright, wanted, target.depth_m)
-        d_planes[:3] *= gain
-        gradient = self._rasteriser.pull_back(planes, d_planes)
+        view, pose = self._views[index], self.pose(state, index)
         decay = DECAY**at.fraction
-        adam_step(
-            state.cloud,
-            gradient,
-            state.moments,
-            step=state.step,
-            rates=state.rates,
-            decay=decay,
-            threads=self._config.threads,
+        rates = {name: rate * decay for name, rate in RATES.items()}
+        rates["means_m"] *= state.size_m
+        report = state.session.step(
+            view.half if coarse else view.full, pose, rates, state.gains[index]
         )
         if self._config.refine_poses and at.fraction >= POSES_FROM:
-            pulled = correction_gradient(gradient.T_camera_base, pose)
+            pulled = correction_gradient(report.T_camera_base, pose)
             state.cameras.update(index, pulled, decay)
-        static = float(target.static_mask.mean())
-        return mse / static if static > 0 else None
+        if report.mse is not None:
+            state.errors = [*state.errors[-len(self._views) :], report.mse]

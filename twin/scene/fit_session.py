@@ -18,6 +18,8 @@ NAMES = ("means_m", "quats_wxyz", "scales_log", "opacities_logit", "colors", "ha
 STAGES = ("draw", "compare", "pull", "learn")
 UNIT_GAIN = (1.0, 1.0, 1.0)
 
+Moments = Mapping[str, tuple[np.ndarray, np.ndarray]]
+
 
 @dataclass(frozen=True, kw_only=True)
 class StepReport:
@@ -59,6 +61,22 @@ class FitSession:
         self._cloud = _own_copy(cloud)
         self._first = {name: np.zeros_like(rows) for name, rows in arrays(cloud)}
         self._second = {name: np.zeros_like(rows) for name, rows in arrays(cloud)}
+
+    @property
+    def moments(self) -> Moments:
+        """Adam's running means of the gradient and of its square, by array; they change too."""
+        return {name: (self._first[name], self._second[name]) for name in self._first}
+
+    def resume(self, moments: Moments, steps: int) -> None:
+        """Take up a fit where another session of the same cloud left it.
+
+        Args:
+            moments: Copied.
+            steps: How many steps that session had made.
+        """
+        self._first = {name: as_float32(first).copy() for name, (first, _) in moments.items()}
+        self._second = {name: as_float32(second).copy() for name, (_, second) in moments.items()}
+        self.steps = steps
 
     @property
     def cloud(self) -> GaussianCloud:

@@ -2,6 +2,7 @@
 
 import io
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,14 +10,14 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.whole_file import write_whole
-from twin.scene.adam import Moments, Rates, no_moments, own_copy
 from twin.scene.camera_correction import CameraCorrections
+from twin.scene.fit_session import FitSession
 from twin.scene.gaussians import GaussianCloud, arrays
 
 FIT_STATE = "fit.npz"
 """In the scene folder while a fit runs, or after one that was interrupted."""
 STATE_VERSION = 1
-SCALARS = ("step", "coarse_steps", "events_done", "num_split", "num_pruned")
+SCALARS = ("coarse_steps", "events_done", "num_split", "num_pruned")
 CAMERA_ARRAYS = ("values", "first", "second", "counts")
 
 
@@ -24,15 +25,14 @@ CAMERA_ARRAYS = ("values", "first", "second", "counts")
 class FitState:
     """A fit between two steps; the only thing that changes while fitting."""
 
-    cloud: GaussianCloud
-    moments: Moments
-    rates: Rates
+    session: FitSession
+    """The cloud, the moments of Adam and the number of images seen."""
+    size_m: float
+    """Median size of the first Gaussians; positions move in units of it."""
     gains: Float[np.ndarray, "num_views 3"]
     cameras: CameraCorrections
     seconds: float = 0.0
     """Time spent so far."""
-    step: int = 0
-    """Images seen so far."""
     coarse_steps: int = 0
     events_done: int = 0
     """How much of the schedule of colour solutions and splits is behind."""
@@ -53,13 +53,11 @@ class Checkpoint:
     """At most this much is lost."""
 
 
-def first_state(cloud: GaussianCloud, num_views: int) -> FitState:
+def first_state(session: FitSession, num_views: int) -> FitState:
     """Before the first image."""
-    own = own_copy(cloud)
     return FitState(
-        cloud=own,
-        moments=no_moments(own),
-        rates=Rates.for_cloud(own),
+        session=session,
+        size_m=float(np.median(np.exp(session.cloud.scales_log.max(axis=1)))),
         gains=np.ones((num_views, 3)),
         cameras=CameraCorrections.none(num_views),
     )
@@ -71,46 +69,54 @@ def save_state(checkpoint: Checkpoint, state: FitState) -> None:
         "key": np.array(checkpoint.key),
         "version": np.array(STATE_VERSION),
         "seconds": np.array(state.seconds),
-        "size_m": np.array(state.rates.size_m),
+        "size_m": np.array(state.size_m),
+        "steps": np.array(state.session.steps),
         "errors": np.array(state.errors, dtype=np.float64),
         "gains": state.gains,
     }
     content |= {name: np.array(getattr(state, name)) for name in SCALARS}
     content |= {f"cameras.{name}": getattr(state.cameras, name) for name in CAMERA_ARRAYS}
-    for name, rows in arrays(state.cloud):
+    moments = state.session.moments
+    for name, rows in arrays(state.session.cloud):
         content[f"cloud.{name}"] = rows
-        content[f"first.{name}"], content[f"second.{name}"] = state.moments[name]
+        content[f"first.{name}"], content[f"second.{name}"] = moments[name]
     buffer = io.BytesIO()
     np.savez(buffer, **content)  # type: ignore[arg-type]  # numpy's stub takes the names for options
     write_whole(checkpoint.path, buffer.getvalue())
 
 
-def load_state(checkpoint: Checkpoint) -> FitState | None:
+def load_state(
+    checkpoint: Checkpoint, make_session: Callable[[GaussianCloud], FitSession]
+) -> FitState | None:
     """Read the state of an interrupted fit of the same inputs and settings; None if there is none.
 
     A damaged file, or one of another version, is none.
     """
     try:
-        with np.load(checkpoint.path, allow_pickle=False) as stored:
+        whole = io.BytesIO(checkpoint.path.read_bytes())
+        with np.load(whole, allow_pickle=False) as stored:
             content = {name: stored[name] for name in stored.files}
         if str(content["key"]) != checkpoint.key or int(content["version"]) != STATE_VERSION:
             return None
-        return _state_from(content)
+        return _state_from(content, make_session)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
 
 
-def _state_from(content: dict[str, np.ndarray]) -> FitState:
+def _state_from(
+    content: dict[str, np.ndarray], make_session: Callable[[GaussianCloud], FitSession]
+) -> FitState:
     def part(prefix: str) -> dict[str, np.ndarray]:
         begin = len(prefix)
         return {name[begin:]: rows for name, rows in content.items() if name.startswith(prefix)}
 
-    cloud = GaussianCloud(**part("cloud."))
+    session = make_session(GaussianCloud(**part("cloud.")))
     second = part("second.")
+    moments = {name: (rows, second[name]) for name, rows in part("first.").items()}
+    session.resume(moments, int(content["steps"]))
     return FitState(
-        cloud=cloud,
-        moments={name: (rows, second[name]) for name, rows in part("first.").items()},
-        rates=Rates(size_m=float(content["size_m"])),
+        session=session,
+        size_m=float(content["size_m"]),
         gains=content["gains"],
         cameras=CameraCorrections(**part("cameras.")),
         seconds=float(content["seconds"]),

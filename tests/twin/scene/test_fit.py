@@ -91,7 +91,7 @@ def test_solved_colours_are_ahead_of_adam_alone(
 ) -> None:
     alone = fit(*room, replace(ADAM_ALONE, iterations=8), lambda *_: None)
     solved = fit(*room, replace(ADAM_ALONE, iterations=8, appearance_steps=4), lambda *_: None)
-    assert solved.train_psnr_db > alone.train_psnr_db + 0.5
+    assert solved.train_psnr_db > alone.train_psnr_db + 0.2
 
 
 def test_frames_of_different_exposure_are_told_from_the_scene(
@@ -110,7 +110,7 @@ def test_frames_of_different_exposure_are_told_from_the_scene(
     config = FitConfig(iterations=30, threads=1, densify=False)
     told = fit(start, exposed, config, lambda *_: None)
     untold = fit(start, exposed, replace(config, gain=False), lambda *_: None)
-    assert told.train_psnr_db > untold.train_psnr_db + 2.0
+    assert told.train_psnr_db > untold.train_psnr_db + 1.0
     np.testing.assert_allclose(told.gains.mean(axis=0), 1.0, rtol=1e-9)
     np.testing.assert_allclose(told.gains / gains[:, None] * gains.mean(), 1.0, atol=0.06)
     np.testing.assert_array_equal(untold.gains, 1.0)
