@@ -1,4 +1,4 @@
-// Drawing one tile and the gradients of one tile, front to back; a row of pixels is a vector.
+// Drawing one tile and the gradients of one tile, front to back; a block of pixels is a vector.
 //
 // Paper Eq. 2 with the product transmittance of the errata: w_i = alpha_i prod_{j<i}(1 - alpha_j).
 // Planes: sum w rgb, sum w depth, sum w.
@@ -25,12 +25,12 @@ bool opaque(const float* light, float stop) {
 
 void draw_gaussian(const Projected& g, const TileJob& job, float log2_cut, Tile* tile) {
     const Reach reach = reach_of(g, job);
-    const Floats x = columns();
+    const Grid grid = block_grid();
     for (int y = reach.y0; y < reach.y1; ++y) {
-        const RowShape shape = row_shape(g, job, y);
-        for (int c = reach.c0; c < reach.c1; ++c) {
-            const int at = y * kTile + c * kLanes;
-            const Floats dx = offsets(g, job, c, x);
+        const RowShape shape = row_shape(g, job, y, grid);
+        for (int x = reach.x0; x < reach.x1; ++x) {
+            const int at = block_at(y, x);
+            const Floats dx = offsets(g, job, x, grid);
             const Floats alpha = alpha_of(log2_alpha(g, shape, dx), log2_cut);
             const Floats light = load(tile->light + at);
             const Floats weight = alpha * light;
@@ -56,14 +56,14 @@ struct Limits {
 void pull_gaussian(const Projected& g, const TileJob& job, Limits limits, GradientTile* tile,
                    float* out) {
     const Reach reach = reach_of(g, job);
-    const Floats x = columns();
+    const Grid grid = block_grid();
     Floats e0{}, ex{}, ey{}, exx{}, exy{}, eyy{}, red{}, green{}, blue{}, depth{};
     for (int y = reach.y0; y < reach.y1; ++y) {
-        const RowShape shape = row_shape(g, job, y);
+        const RowShape shape = row_shape(g, job, y, grid);
         Floats row_e{}, row_ex{};
-        for (int c = reach.c0; c < reach.c1; ++c) {
-            const int at = y * kTile + c * kLanes;
-            const Floats dx = offsets(g, job, c, x);
+        for (int x = reach.x0; x < reach.x1; ++x) {
+            const int at = block_at(y, x);
+            const Floats dx = offsets(g, job, x, grid);
             const Floats power = log2_alpha(g, shape, dx);
             const Floats alpha = alpha_of(power, limits.log2_cut);
             const Floats light = load(tile->light + at);
@@ -114,9 +114,9 @@ int draw_tile(const Projected* projected, const TileJob& job, const Camera& came
         if (drawn % kStopPeriod == 0 && opaque(tile.light, settings.transmittance_stop)) break;
     }
     const std::int64_t plane_size = static_cast<std::int64_t>(camera.width) * camera.height;
-    each_row(job, camera, [&](int in_tile, int in_image) {
+    each_four(job, camera, [&](int in_tile, int in_image, int count) {
         for (int k = 0; k < kPlanes; ++k)
-            planes[k * plane_size + in_image] = tile.planes[k][in_tile];
+            copy_four(planes + k * plane_size + in_image, tile.planes[k] + in_tile, count);
     });
     return drawn;
 }
@@ -129,12 +129,16 @@ void draw_tile_gradients(const Projected* projected, const TileJob& job, const C
     __builtin_memset(tile.planes, 0, sizeof tile.planes);
     __builtin_memset(tile.behind, 0, sizeof tile.behind);
     const std::int64_t plane_size = static_cast<std::int64_t>(camera.width) * camera.height;
-    each_row(job, camera, [&](int in_tile, int in_image) {
+    each_four(job, camera, [&](int in_tile, int in_image, int count) {
+        Floats4 behind = Floats4{};
         for (int k = 0; k < kPlanes; ++k) {
             const std::int64_t at = k * plane_size + in_image;
-            tile.planes[k][in_tile] = plane_gradients[at];
-            tile.behind[in_tile] += plane_gradients[at] * planes[at];
+            float drawn[kBlockWidth] = {0, 0, 0, 0};
+            copy_four(tile.planes[k] + in_tile, plane_gradients + at, count);
+            copy_four(drawn, planes + at, count);
+            behind += load_four(tile.planes[k] + in_tile) * load_four(drawn);
         }
+        store_four(tile.behind + in_tile, behind);
     });
     const Limits limits{std::log2(settings.alpha_cut), std::log2(kMaxAlpha)};
     for (int i = 0; i < job.count; ++i)

@@ -50,6 +50,7 @@ struct DepthRow {
 
 struct Kernels {
     const char* name;
+    int block_height;  // of the tiles that ``label_tile`` fills, see tile_index
     void (*project)(const Splats&, const Camera&, const Settings&, Projected*, int begin, int end);
     void (*unproject_gradients)(const Splats&, const Camera&, const float* pair_sums,
                                 const SplatGradients&, float* d_pose, int index);

@@ -1,7 +1,5 @@
 // Adam, and the table of this instruction set's copies of all kernels.
-#include <cmath>
-
-#include "kernels_isa.hpp"
+#include "tile.hpp"
 
 namespace splat::SPLAT_ISA {
 
@@ -20,12 +18,19 @@ void adam(float* __restrict values, const float* __restrict gradients, float* __
 #define SPLAT_TEXT_OF(name) #name
 #define SPLAT_TEXT(name) SPLAT_TEXT_OF(name)
 
-extern const Kernels kernels = {SPLAT_TEXT(SPLAT_ISA), project,
-                                unproject_gradients,   draw_tile,
-                                draw_tile_gradients,   draw_tile_features,
-                                lift_tile,             label_tile,
-                                similarity_band,       compare_row,
-                                color_gradient_row,    depth_gradient_row,
+extern const Kernels kernels = {SPLAT_TEXT(SPLAT_ISA),
+                                kTall,
+                                project,
+                                unproject_gradients,
+                                draw_tile,
+                                draw_tile_gradients,
+                                draw_tile_features,
+                                lift_tile,
+                                label_tile,
+                                similarity_band,
+                                compare_row,
+                                color_gradient_row,
+                                depth_gradient_row,
                                 adam};
 
 }  // namespace splat::SPLAT_ISA

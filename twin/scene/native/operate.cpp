@@ -6,7 +6,7 @@ namespace splat::SPLAT_ISA {
 
 namespace {
 
-// Weights of one Gaussian in a tile; only rows and chunks within its reach are filled.
+// Weights of one Gaussian in a tile; only blocks within its reach are filled.
 struct alignas(64) Weights {
     float light[kTilePixels];
     float weight[kTilePixels];
@@ -14,12 +14,12 @@ struct alignas(64) Weights {
 
 Reach fill_weights(const Projected& g, const TileJob& job, float log2_cut, Weights* tile) {
     const Reach reach = reach_of(g, job);
-    const Floats x = columns();
+    const Grid grid = block_grid();
     for (int y = reach.y0; y < reach.y1; ++y) {
-        const RowShape shape = row_shape(g, job, y);
-        for (int c = reach.c0; c < reach.c1; ++c) {
-            const int at = y * kTile + c * kLanes;
-            const Floats alpha = alpha_of(log2_alpha(g, shape, offsets(g, job, c, x)), log2_cut);
+        const RowShape shape = row_shape(g, job, y, grid);
+        for (int x = reach.x0; x < reach.x1; ++x) {
+            const int at = block_at(y, x);
+            const Floats alpha = alpha_of(log2_alpha(g, shape, offsets(g, job, x, grid)), log2_cut);
             const Floats light = load(tile->light + at);
             const Floats weight = alpha * light;
             store(tile->light + at, light - weight);
@@ -30,9 +30,9 @@ Reach fill_weights(const Projected& g, const TileJob& job, float log2_cut, Weigh
 }
 
 template <class Visit>
-void each_chunk(const Reach& reach, Visit visit) {
+void each_block(const Reach& reach, Visit visit) {
     for (int y = reach.y0; y < reach.y1; ++y)
-        for (int c = reach.c0; c < reach.c1; ++c) visit(y * kTile + c * kLanes);
+        for (int x = reach.x0; x < reach.x1; ++x) visit(block_at(y, x));
 }
 
 }  // namespace
@@ -50,15 +50,16 @@ void draw_tile_features(const Projected* projected, const TileJob& job, const Ca
         for (int k = 0; k < block.count; ++k) {
             float* plane = tile_planes + k * kTilePixels;
             const float value = row[k];
-            each_chunk(reach, [&](int at) {
+            each_block(reach, [&](int at) {
                 store(plane + at, load(plane + at) + load(tile.weight + at) * value);
             });
         }
     }
     const std::int64_t plane_size = static_cast<std::int64_t>(camera.width) * camera.height;
-    each_row(job, camera, [&](int in_tile, int in_image) {
+    each_four(job, camera, [&](int in_tile, int in_image, int count) {
         for (int k = 0; k < block.count; ++k)
-            planes[k * plane_size + in_image] = tile_planes[k * kTilePixels + in_tile];
+            copy_four(planes + k * plane_size + in_image, tile_planes + k * kTilePixels + in_tile,
+                      count);
     });
 }
 
@@ -69,9 +70,10 @@ void lift_tile(const Projected* projected, const TileJob& job, const Camera& cam
     start_light(job, camera, tile.light);
     __builtin_memset(tile_planes, 0, sizeof(float) * num_planes * kTilePixels);
     const std::int64_t plane_size = static_cast<std::int64_t>(camera.width) * camera.height;
-    each_row(job, camera, [&](int in_tile, int in_image) {
+    each_four(job, camera, [&](int in_tile, int in_image, int count) {
         for (int k = 0; k < num_planes; ++k)
-            tile_planes[k * kTilePixels + in_tile] = planes[k * plane_size + in_image];
+            copy_four(tile_planes + k * kTilePixels + in_tile, planes + k * plane_size + in_image,
+                      count);
     });
     const float log2_cut = std::log2(settings.alpha_cut);
     for (int i = 0; i < job.count; ++i) {
@@ -80,7 +82,7 @@ void lift_tile(const Projected* projected, const TileJob& job, const Camera& cam
         for (int k = 0; k < num_planes; ++k) {
             const float* plane = tile_planes + k * kTilePixels;
             Floats total = Floats{};
-            each_chunk(reach, [&](int at) { total += load(tile.weight + at) * load(plane + at); });
+            each_block(reach, [&](int at) { total += load(tile.weight + at) * load(plane + at); });
             row[k] = sum(total);
         }
     }
@@ -94,7 +96,7 @@ void label_tile(const Projected* projected, const TileJob& job, const Camera& ca
     for (int i = 0; i < job.count; ++i) {
         const Reach reach = fill_weights(projected[job.ids[i]], job, log2_cut, &tile);
         float* plane = label_weights + static_cast<std::int64_t>(slots[i]) * kTilePixels;
-        each_chunk(reach,
+        each_block(reach,
                    [&](int at) { store(plane + at, load(plane + at) + load(tile.weight + at)); });
     }
 }

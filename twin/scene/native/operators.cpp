@@ -105,7 +105,7 @@ void Rasteriser::label_map(const std::uint16_t* labels, std::uint16_t* ids, floa
             for (int x = 0; x < width; ++x) {
                 const std::int64_t at =
                     static_cast<std::int64_t>(drawn.y0 + y) * camera_.width + drawn.x0 + x;
-                found.winner(y * kTile + x, ids + at, weights + at);
+                found.winner(tile_index(x, y, kernels_.block_height), ids + at, weights + at);
             }
     }
 }

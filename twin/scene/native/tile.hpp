@@ -1,4 +1,7 @@
 // What all walks over one tile share: which pixels a Gaussian can touch, and how opaque it is there.
+//
+// A vector is a block of 4 x kTall pixels, and a tile is stored block by block: small Gaussians
+// touch fewer blocks than they would touch rows.
 #pragma once
 
 #include <cmath>
@@ -8,8 +11,11 @@
 
 namespace splat::SPLAT_ISA {
 
+constexpr int kTall = kLanes / kBlockWidth;
+constexpr int kBlocksAcross = kTile / kBlockWidth;
+
 struct Reach {
-    int y0, y1, c0, c1;  // rows and chunks of the tile that a Gaussian can touch, ends excluded
+    int y0, y1, x0, x1;  // blocks of the tile that a Gaussian can touch, ends excluded
 };
 
 static inline int floor_int(float value, int low, int high) {
@@ -20,40 +26,43 @@ static inline int floor_int(float value, int low, int high) {
 static inline Reach reach_of(const Projected& g, const TileJob& job) {
     const float u = g.u - job.x0 - 0.5f, v = g.v - job.y0 - 0.5f;
     Reach reach;
-    reach.y0 = floor_int(v - g.half_y + 1.0f, 0, kTile);
-    reach.y1 = floor_int(v + g.half_y, -1, kTile - 1) + 1;
-    reach.c0 = floor_int(u - g.half_x + 1.0f, 0, kTile) / kLanes;
-    reach.c1 = (floor_int(u + g.half_x, -1, kTile - 1) + kLanes) / kLanes;
+    reach.y0 = floor_int(v - g.half_y + 1.0f, 0, kTile) / kTall;
+    reach.y1 = (floor_int(v + g.half_y, -1, kTile - 1) + kTall) / kTall;
+    reach.x0 = floor_int(u - g.half_x + 1.0f, 0, kTile) / kBlockWidth;
+    reach.x1 = (floor_int(u + g.half_x, -1, kTile - 1) + kBlockWidth) / kBlockWidth;
     return reach;
 }
 
-// Transmittance in front of everything: 1 in the image, 0 in the part of a tile beyond its border.
-static inline void start_light(const TileJob& job, const Camera& camera, float* light) {
-    for (int y = 0; y < kTile; ++y)
-        for (int x = 0; x < kTile; ++x)
-            light[y * kTile + x] =
-                job.x0 + x < camera.width && job.y0 + y < camera.height ? 1.0f : 0.0f;
-}
+static inline int block_at(int row, int column) { return (row * kBlocksAcross + column) * kLanes; }
 
-static inline Floats columns() {
-    Floats x;
-    for (int i = 0; i < kLanes; ++i) x[i] = static_cast<float>(i);
-    return x;
-}
-
-// One row of a Gaussian in a tile: log2(alpha) = row - dx (a dx + b_dy).
-struct RowShape {
-    float dy, b_dy;
-    Floats row;
+// Column and row of each pixel in its block.
+struct Grid {
+    Floats x, y;
 };
 
-static inline RowShape row_shape(const Projected& g, const TileJob& job, int y) {
-    const float dy = job.y0 + y + 0.5f - g.v;
-    return {dy, g.b * dy, all(g.log2_opacity - g.c * dy * dy)};
+static inline Grid block_grid() {
+    Grid grid;
+    for (int i = 0; i < kLanes; ++i) {
+        grid.x[i] = static_cast<float>(i % kBlockWidth);
+        grid.y[i] = static_cast<float>(i / kBlockWidth);
+    }
+    return grid;
 }
 
-static inline Floats offsets(const Projected& g, const TileJob& job, int chunk, Floats columns) {
-    return columns + (job.x0 + chunk * kLanes + 0.5f - g.u);
+// One row of blocks: log2(alpha) = row - dx (a dx + b_dy).
+struct RowShape {
+    Floats dy, b_dy, row;
+};
+
+static inline RowShape row_shape(const Projected& g, const TileJob& job, int row,
+                                 const Grid& grid) {
+    const Floats dy = grid.y + (job.y0 + row * kTall + 0.5f - g.v);
+    return {dy, g.b * dy, g.log2_opacity - g.c * dy * dy};
+}
+
+static inline Floats offsets(const Projected& g, const TileJob& job, int column,
+                             const Grid& grid) {
+    return grid.x + (job.x0 + column * kBlockWidth + 0.5f - g.u);
 }
 
 static inline Floats log2_alpha(const Projected& g, const RowShape& shape, Floats dx) {
@@ -64,14 +73,41 @@ static inline Floats alpha_of(Floats power, float log2_cut) {
     return keep(power >= log2_cut, smaller(exp2(power), all(kMaxAlpha)));
 }
 
-// Copy between a tile and planes of the whole image, honouring the image border.
-template <class Move>
-static inline void each_row(const TileJob& job, const Camera& camera, Move move) {
+static inline Floats4 load_four(const float* at) {
+    Floats4 value;
+    __builtin_memcpy(&value, at, sizeof value);
+    return value;
+}
+
+static inline void store_four(float* at, Floats4 value) {
+    __builtin_memcpy(at, &value, sizeof value);
+}
+
+// Visit the pixels of a tile that lie in the image, four in a row or fewer at its right border:
+// ``visit(where in the tile, where in the image, how many)``.
+template <class Visit>
+static inline void each_four(const TileJob& job, const Camera& camera, Visit visit) {
     const int width = camera.width - job.x0 < kTile ? camera.width - job.x0 : kTile;
     const int height = camera.height - job.y0 < kTile ? camera.height - job.y0 : kTile;
     for (int y = 0; y < height; ++y)
-        for (int x = 0; x < width; ++x)
-            move(y * kTile + x, (job.y0 + y) * camera.width + job.x0 + x);
+        for (int x = 0; x < width; x += kBlockWidth)
+            visit(tile_index(x, y, kTall), (job.y0 + y) * camera.width + job.x0 + x,
+                  width - x < kBlockWidth ? width - x : kBlockWidth);
+}
+
+static inline void copy_four(float* to, const float* from, int count) {
+    if (count == kBlockWidth)
+        __builtin_memcpy(to, from, kBlockWidth * sizeof(float));
+    else
+        for (int i = 0; i < count; ++i) to[i] = from[i];
+}
+
+// Transmittance in front of everything: 1 in the image, 0 in the part of a tile beyond its border.
+static inline void start_light(const TileJob& job, const Camera& camera, float* light) {
+    __builtin_memset(light, 0, sizeof(float) * kTilePixels);
+    each_four(job, camera, [&](int in_tile, int, int count) {
+        for (int i = 0; i < count; ++i) light[in_tile + i] = 1.0f;
+    });
 }
 
 }  // namespace splat::SPLAT_ISA

@@ -8,6 +8,7 @@ namespace splat {
 
 constexpr int kTile = 16;          // tile edge [px]
 constexpr int kTilePixels = kTile * kTile;
+constexpr int kBlockWidth = 4;     // a tile is stored in blocks of 4 x tall pixels
 constexpr int kPlanes = 5;         // red, green, blue, depth, alpha
 constexpr int kPairGradients = 10; // see PairGradient
 constexpr int kPoseEntries = 12;   // a 3 x 4 matrix
@@ -17,6 +18,12 @@ constexpr float kMaxAlpha = 0.999f;
 constexpr float kMipVariance = 0.1f;     // added to the image covariance [px^2]
 constexpr float kMinMipRatio = 2.5e-5f;  // floor of det/det', bounds its gradient
 constexpr float kNearDepth = 0.02f;      // nothing closer to the camera is drawn [m]
+
+// Where a pixel of a tile is stored; ``tall`` rows make a block.
+static inline int tile_index(int x, int y, int tall) {
+    const int block = y / tall * (kTile / kBlockWidth) + x / kBlockWidth;
+    return (block * tall + y % tall) * kBlockWidth + x % kBlockWidth;
+}
 
 struct Camera {
     float R[9];       // R_camera_world, row-major
