@@ -9,6 +9,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 CONTAINER_RATIO = 1.8
 """Convex hull over filled volume; more, with a cavity that opens upwards, is a container."""
+CONTAINER = "open container"
 NUM_LEVELS = 48
 
 
@@ -102,14 +103,16 @@ def find_cavity(heights: HeightMap, min_depth_fraction: float = 0.2) -> Cavity |
     if not areas.any():
         return None
     last = int(np.flatnonzero(areas >= 0.5 * areas.max())[-1])
-    pool = np.asarray(pools[last])
     rim = float(levels[last])
+    # A handle or a gap may drain a part of it just below the rim: look from half its depth on.
+    lowest = float(heights.top_m[pools[last]].min())
+    pool = np.any([pools[k] for k in range(last + 1) if levels[k] >= (rim + lowest) / 2], axis=0)
     floor = float(np.quantile(heights.top_m[pool], 0.3))
     deep = rim - floor > max(min_depth_fraction * height, 0.006)
     wide = pool.sum() > 0.15 * heights.footprint.sum()
     if not (deep and wide):
         return None
-    volume = float((rim - heights.top_m[pool]).sum()) * heights.cell_m**2
+    volume = float(np.maximum(rim - heights.top_m[pool], 0.0).sum()) * heights.cell_m**2
     return Cavity(mask=pool, rim_m=rim, floor_m=floor, volume_m3=volume)
 
 
@@ -187,7 +190,7 @@ def _word(
     cavity: Cavity | None,
 ) -> str:
     if cavity is not None and ratio > CONTAINER_RATIO:
-        return "open container"
+        return CONTAINER
     long, short, height = size_m
     plateau = float((heights.top_m[heights.footprint] > 0.85 * height).mean())
     if plateau > 0.68:

@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, UInt16
+from jaxtyping import Float, Int, UInt16
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
@@ -20,6 +21,8 @@ MIN_OPACITY = 0.3
 MAX_SPLAT_M = 0.04
 """Larger Gaussians are walls or fog."""
 MIN_MASK_PX = 20
+SILHOUETTE_M = 0.012
+"""A measured point this near to a trusted one belongs to the same surface."""
 VIEW_LIMITS = DepthLimits(max_depth_m=3.0, flying_fraction=0.03)
 
 
@@ -68,21 +71,39 @@ def segment_frame(
         colors=cloud.colors.astype(np.float64),
     )
     found = segment_points(points, config or SegmentConfig(), robot_m)
-    camera = frame.color_camera
-    p_camera = se3.apply(se3.invert(frame.T_base_color), points.p_m)
-    uv, _ = camera.project(p_camera)
-    column, row = np.floor(uv).astype(np.int64).T
+    painted = _painted(frame, points, found.labels)
     masks = []
     for number, thing in enumerate(found.things, start=1):
-        own = found.labels == number
-        image = np.zeros((camera.height, camera.width), dtype=bool)
-        image[row[own], column[own]] = True
-        # Depth has holes and another resolution than colour, and its edges were not trusted.
-        image = ndimage.binary_fill_holes(ndimage.binary_closing(image, iterations=3) | image)
+        image = painted == number
+        # Depth has holes, and it may be coarser than colour.
+        image = ndimage.binary_fill_holes(ndimage.binary_closing(image, iterations=2) | image)
         masks.append(Mask(image=np.asarray(image), label=thing.label, score=thing.score))
     return MaskSet(
         camera_id=frame.camera_id, stamp_ns=frame.stamp_ns, masks=tuple(masks), source=SOURCE
     )
+
+
+def _painted(
+    frame: RgbdFrame, points: SurfacePoints, labels: Int[np.ndarray, " num_points"]
+) -> Int[np.ndarray, "height width"]:
+    """Label of each colour pixel: every depth pixel takes that of the trusted point beside it.
+
+    Silhouettes have no trusted points, because their normals would mix two surfaces.
+    """
+    camera = frame.color_camera
+    depth = np.where(np.isfinite(frame.depth_m), frame.depth_m, 0.0).astype(np.float64)
+    measured = (depth > 0) & (depth < VIEW_LIMITS.max_depth_m)
+    p = se3.apply(frame.T_base_depth, frame.depth_camera.unproject(depth)[measured])
+    gap, nearest = cKDTree(points.p_m).query(p, distance_upper_bound=SILHOUETTE_M)
+    near = np.isfinite(gap)
+    near[near] = labels[nearest[near]] > 0
+    p_camera = se3.apply(se3.invert(frame.T_base_color), p[near])
+    uv, _ = camera.project(p_camera)
+    column, row = np.floor(uv).astype(np.int64).T
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    painted = np.zeros((camera.height, camera.width), dtype=np.int64)
+    painted[row[inside], column[inside]] = labels[nearest[near]][inside]
+    return painted
 
 
 def masks_from_labels(

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from twin.scene.semantics.solid import Solid, fill_solid
+from twin.scene.semantics.solid import MARGIN_CELLS, Solid, fill_solid
 
 CONNECTED = np.ones((3, 3, 3), dtype=bool)
 BODY, HEAD, LIMB = 1, 2, 3
@@ -28,7 +28,7 @@ class Core:
 
 
 def animal_parts(
-    xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float, limb_ratio: float
+    xyh_m: Float[np.ndarray, "num_points 3"], limb_ratio: float
 ) -> tuple[dict[str, Bool[np.ndarray, " num_points"]], dict[str, Float[np.ndarray, "3"]]]:
     """Tell body, head and limbs apart by thickness.
 
@@ -40,15 +40,14 @@ def animal_parts(
 
     Args:
         xyh_m: Points of the surface: x, y and height above the plane.
-        cell_m: Spacing of the points.
         limb_ratio: Radius of the ball over the radius of the thickest place.
 
     Returns:
         Masks of the parts that are there, and keypoints: the middle of body and head, the tip
         of each limb.
     """
-    solid = fill_solid(xyh_m, cell_m)
-    parts, limbs = _label_cells(solid.cells, limb_ratio)
+    solid = fill_solid(xyh_m)
+    parts, limbs = _label_cells(solid.cells, thickness_of(solid.cells), limb_ratio)
     nearest = ndimage.distance_transform_edt(
         parts == 0, return_distances=False, return_indices=True
     )
@@ -62,10 +61,11 @@ def animal_parts(
 
 
 def _label_cells(
-    solid: Bool[np.ndarray, "num_x num_y num_z"], limb_ratio: float
+    solid: Bool[np.ndarray, "num_x num_y num_z"],
+    thickness: Float[np.ndarray, "num_x num_y num_z"],
+    limb_ratio: float,
 ) -> tuple[Int[np.ndarray, "num_x num_y num_z"], list[np.ndarray]]:
     """Part of each solid cell, and the cells of each limb."""
-    thickness = ndimage.distance_transform_edt(solid)
     # Distances on a grid come in steps; without smoothing every step would be a thick place.
     smooth = ndimage.gaussian_filter(thickness, 0.8) * solid
     most = float(smooth.max())
@@ -95,6 +95,21 @@ def _label_cells(
             parts[piece] = LIMB
             limbs.append(piece)
     return parts, limbs
+
+
+def thickness_of(
+    solid: Bool[np.ndarray, "num_x num_y num_z"],
+) -> Float[np.ndarray, "num_x num_y num_z"]:
+    """Distance to the outside, in cells; the plane is no outside, but a mirror.
+
+    Otherwise a body that rests on the plane would have thin edges all around its foot.
+    """
+    above = solid[:, :, MARGIN_CELLS:]
+    mirrored = np.concatenate([np.flip(above, axis=2), above], axis=2)
+    distance = np.zeros(solid.shape)
+    num = above.shape[2]
+    distance[:, :, MARGIN_CELLS:] = ndimage.distance_transform_edt(mirrored)[:, :, num:]
+    return distance
 
 
 def _grown(core: np.ndarray, radius: float) -> np.ndarray:

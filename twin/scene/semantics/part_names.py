@@ -31,7 +31,7 @@ class PartsConfig:
 
     rim_fraction: float = 0.1
     """Points within this share of the height of the rim's height are rim."""
-    floor_fraction: float = 0.25
+    floor_fraction: float = 0.12
     """Points in the lowest share of the cavity's depth are its floor."""
     handle_fraction: float = 0.08
     """Points this share of the height above the rim are handle."""
@@ -72,7 +72,7 @@ def find_parts(
             masks = _container(xyh_m, heights, cavity, float(high[2]), config)
             keypoints |= _container_points(xyh_m, heights, cavity, masks)
     elif kind == "animal":
-        masks, places = animal_parts(xyh_m, cell_m, config.limb_ratio)
+        masks, places = animal_parts(xyh_m, config.limb_ratio)
         keypoints |= places
     least = MIN_SHARE * len(xyh_m)
     return Parts(
@@ -84,13 +84,14 @@ def find_parts(
 def _container(
     xyh_m: np.ndarray, heights: HeightMap, cavity: Cavity, top_m: float, config: PartsConfig
 ) -> dict[str, np.ndarray]:
-    over = cavity.mask[heights.cells(xyh_m)]
+    over = ndimage.binary_dilation(cavity.mask)[heights.cells(xyh_m)]
     height, depth = xyh_m[:, 2], cavity.rim_m - cavity.floor_m
     span = config.rim_fraction * cavity.rim_m
     margin = max(config.handle_fraction * cavity.rim_m, heights.cell_m)
     handle = (height > cavity.rim_m + margin) & (top_m > cavity.rim_m + 2 * margin)
     handle |= _sticking_out(xyh_m, heights, cavity)
-    floor = ~handle & over & (height < cavity.floor_m + config.floor_fraction * depth)
+    thick = max(config.floor_fraction * depth, 0.004)
+    floor = ~handle & over & (height < cavity.floor_m + thick)
     rim = ~handle & ~floor & (height > cavity.rim_m - span)
     return {
         "rim": rim,

@@ -19,11 +19,18 @@ from twin.scene.semantics.cluster import (
 )
 from twin.scene.semantics.colour import colour_name, lab_from_srgb
 from twin.scene.semantics.form import Form, measure_form
-from twin.scene.semantics.split import SplitConfig, split_by_colour, split_by_valleys
+from twin.scene.semantics.split import (
+    SplitConfig,
+    joined_by_outline,
+    split_by_colour,
+    split_by_valleys,
+)
 from twin.scene.semantics.support import SupportConfig, SupportPlane, find_support
 
 SOURCE = "default segmenter"
 MAX_FOOT_ROUNDS = 8
+MIN_FRAGMENT = 8
+"""Voxels of the smallest fragment that may be joined to a thing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,16 +150,17 @@ def _things(
     pairs = neighbour_pairs(voxels.p_m, config.reach_voxels * voxel_m)
     group = components(len(voxels), pairs)
     labels = np.zeros(len(voxels), dtype=np.int64)
-    found = 0
-    for number in np.flatnonzero(np.bincount(group) >= config.min_voxels):
+    pieces: list[np.ndarray] = []
+    for number in np.flatnonzero(np.bincount(group) >= MIN_FRAGMENT):
         ids = np.flatnonzero(group == number)
-        if _extent(voxels.p_m[ids])[0] > config.max_size_m:
-            continue
-        for piece in _pieces(voxels, ids, height, pairs, voxel_m, config):
-            extent = _extent(voxels.p_m[piece])
-            if len(piece) >= config.min_voxels and extent[1] >= config.min_size_m:
-                found += 1
-                labels[piece] = found
+        if _extent(voxels.p_m[ids])[0] <= config.max_size_m:
+            pieces += _pieces(voxels, ids, height, pairs, voxel_m, config)
+    found = 0
+    for piece in joined_by_outline(pieces, voxels, height, voxel_m, config.split):
+        extent = _extent(voxels.p_m[piece])
+        if len(piece) >= config.min_voxels and extent[1] >= config.min_size_m:
+            found += 1
+            labels[piece] = found
     return np.asarray(labels[voxels.of_point])
 
 

@@ -1,5 +1,7 @@
 """Cut things that touch: by colour, and along valleys where both sides stand on their own."""
 
+import heapq
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +15,7 @@ from twin.scene.semantics.cluster import (
     means_of,
     numbered,
 )
-from twin.scene.semantics.form import find_cavity, height_map
+from twin.scene.semantics.form import find_cavity, height_map, measure_form
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,12 +185,93 @@ def split_by_valleys(
     away = p[links[:, 1]] - p[links[:, 0]]
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
     bend = ((normals[links[:, 1]] - normals[links[:, 0]]) * away).sum(axis=1)
-    pieces = components(len(p), links[bend > -config.valley])[patch]
+    pieces = _merged(len(p), links, bend, -config.valley)[patch]
     while True:
         merge = _first_dependent(pieces, voxels.p_m, height_m, pairs, config)
         if merge is None:
             return numbered(pieces)
         pieces = np.where(pieces == merge[0], merge[1], pieces)
+
+
+def _merged(
+    num_patches: int,
+    links: Int[np.ndarray, "num_links 2"],
+    bend: Float[np.ndarray, " num_links"],
+    least: float,
+) -> Int[np.ndarray, " num_patches"]:
+    """Join neighbours, the most convex border first, until every border is a valley.
+
+    A border counts by the mean of its links: one convex link, where noise bridges a valley, does
+    not join what the rest of the border tells apart.
+    """
+    borders: list[dict[int, tuple[float, int]]] = [{} for _ in range(num_patches)]
+    for (a, b), value in zip(links.tolist(), bend.tolist(), strict=True):
+        borders[a][b] = borders[b][a] = (value, 1)
+    queue = [(-value, a, b) for (a, b), value in zip(links.tolist(), bend.tolist(), strict=True)]
+    heapq.heapify(queue)
+    owner = list(range(num_patches))
+    while queue and -queue[0][0] > least:
+        cost, a, b = heapq.heappop(queue)
+        total, count = borders[a].get(b, (np.nan, 1))
+        if -cost != total / count:
+            continue  # an older state of this border
+        if len(borders[a]) < len(borders[b]):
+            a, b = b, a
+        owner[b] = a
+        for other, (value, number) in borders[b].items():
+            del borders[other][b]
+            if other != a:
+                old = borders[a].get(other, (0.0, 0))
+                new = (old[0] + value, old[1] + number)
+                borders[a][other] = borders[other][a] = new
+                heapq.heappush(queue, (-new[0] / new[1], a, other))
+        borders[b] = {}
+    for patch in range(num_patches):
+        root = patch
+        while owner[root] != root:
+            root = owner[root]
+        owner[patch] = root
+    return numbered(np.array(owner, dtype=np.int64))
+
+
+def joined_by_outline(
+    pieces: Sequence[Int[np.ndarray, " _"]],
+    voxels: Voxels,
+    height_m: Float[np.ndarray, " num_voxels"],
+    voxel_m: float,
+    config: SplitConfig,
+) -> list[Int[np.ndarray, " _"]]:
+    """Join pieces of one colour of which one lies over the other, or that make a container.
+
+    What one camera sees of a thing may fall into pieces: the far wall of a box behind the near
+    one, a head in front of its body.
+    """
+    xyh = np.concatenate([voxels.p_m[:, :2], height_m[:, None]], axis=1)
+    left = sorted(pieces, key=len)
+    colours = [
+        np.median(_without_shading(voxels.lab[ids], config.lightness_weight), axis=0)
+        for ids in left
+    ]
+    joined: list[np.ndarray] = []
+    for index, ids in enumerate(left):
+        for other in range(index + 1, len(left)):
+            alike = np.linalg.norm(colours[index] - colours[other]) < config.min_colour_gap
+            if alike and _belong_together(xyh[ids], xyh[left[other]], voxel_m, config):
+                left[other] = np.concatenate([left[other], ids])
+                break
+        else:
+            joined.append(ids)
+    return joined
+
+
+def _belong_together(a: np.ndarray, b: np.ndarray, voxel_m: float, config: SplitConfig) -> bool:
+    """Whether one lies over the other, or both are beside each other and hold a cavity."""
+    if _overlap(a, b) > config.max_overlap_fraction:
+        return True
+    gap = np.maximum(a.min(axis=0), b.min(axis=0)) - np.minimum(a.max(axis=0), b.max(axis=0))
+    if max(gap[:2]) > 2 * voxel_m:
+        return False
+    return measure_form(np.concatenate([a, b]), voxel_m).cavity is not None
 
 
 def _first_dependent(

@@ -164,7 +164,8 @@ def open_box(
     """12 x 12 x 6 cm outside."""
     half, top = 0.06, 0.06
     side = half - wall_m / 2
-    pieces = [box(instance, [x, y, wall_m / 2], [2 * half, 2 * half, wall_m], color, "floor")]
+    inner = 2 * (half - wall_m)
+    pieces = [box(instance, [x, y, wall_m / 2], [inner, inner, wall_m], color, "floor")]
     for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         size = [wall_m if dx else 2 * half, wall_m if dy else 2 * half, top]
         pieces.append(box(instance, [x + dx * side, y + dy * side, top / 2], size, color, "walls"))

@@ -143,7 +143,7 @@ def test_lifting_perfect_masks_returns_them(tabletop: World, rasteriser: Rasteri
         ids = render_labels(rasteriser, tabletop.cloud, scene.labels, shot.viewpoint)
         for item in scene.instances:
             number = next(k for k, name in tabletop.names.items() if name == item.label)
-            assert iou(ids == item.id, shot.instance == number) > 0.9
+            assert iou(ids == item.id, shot.instance == number) > 0.87
 
 
 def test_instances_know_their_box_colour_and_support(

@@ -38,9 +38,11 @@ def test_one_view_is_enough_for_masks(tabletop: World) -> None:
     shot = tabletop.train[0]
     masks = segment_frame(shot.frame)
     assert masks.source == "default segmenter"
-    for number in tabletop.names:
+    for number, name in tabletop.names.items():
         truth = shot.instance == number
-        assert max(iou(mask.image, truth) for mask in masks.masks) > 0.7
+        # Of an open box one camera sees two halves with nothing in between.
+        least = 0.5 if "container" in name else 0.85
+        assert max(iou(mask.image, truth) for mask in masks.masks) > least
 
 
 def test_the_fused_scene_gives_masks_of_every_frame(tabletop: World) -> None:
