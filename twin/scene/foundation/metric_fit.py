@@ -6,25 +6,36 @@ and Medioni 1992), Tukey's weights, one scale, and the lowest point set on what 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from twin.scene.foundation.surface import MetricFitError, sample_surface, visible_mask
+from twin.scene.foundation.surface import (
+    MetricFitError,
+    sample_surface,
+    surface_area,
+    visible_mask,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MetricFitConfig:
     """How a shape is laid onto points, and when the result counts."""
 
-    num_samples: int = 3000
-    """Points spread over the shape's surface."""
+    num_samples: int = 8000
+    """Points spread over the shape's surface; the coarse rounds use a quarter of them."""
     max_points: int = 3000
     """Measured points that take part, spread evenly over those given."""
-    rounds: tuple[tuple[float, float], ...] = ((0.5, 0.2), (0.2, 0.2), (0.08, 0.05), (0.03, 0.01))
+    rounds: tuple[tuple[float, float], ...] = (
+        (0.5, 0.2),
+        (0.2, 0.2),
+        (0.08, 0.05),
+        (0.03, 0.0),
+        (0.015, 0.0),
+    )
     """Of each round: Tukey's cut in extents of the measured points, and the weight of the pull of
     the visible surface towards the points. That pull fixes the size roughly and is a little off
     wherever visibility is, so it fades."""
@@ -94,6 +105,8 @@ class _Problem:
 
     samples: np.ndarray
     normals: np.ndarray
+    spacing: float
+    """Between neighbouring samples, in units of the shape."""
     vertices: np.ndarray
     points: np.ndarray
     points_tree: cKDTree
@@ -137,11 +150,12 @@ def fit_metric(
     problem = _problem(vertices, faces, points_m, camera_centres_m, support_z_m, config)
     guess = _Similarity(R=T_base_shape[:3, :3], t=T_base_shape[:3, 3], scale=scale)
     pivot = guess.apply(problem.samples).mean(axis=0)
+    rough = _thinned(problem, 4)
     coarse = []
     for yaw in config.yaw_starts_rad:
         start = guess.after(np.array([0.0, 0.0, yaw]), np.zeros(3), 0.0, pivot)
-        found = _solve(_adapt(start, problem), problem, config.rounds[: config.num_coarse_rounds])
-        coarse.append((_cost(found, problem), found))
+        found = _solve(_adapt(start, rough), rough, config.rounds[: config.num_coarse_rounds])
+        coarse.append((_cost(found, rough), found))
     best = min(coarse, key=lambda pair: pair[0])[1]
     best = _solve(best, problem, config.rounds[config.num_coarse_rounds :])
     return _judge(best, guess, problem)
@@ -169,6 +183,7 @@ def _problem(
     return _Problem(
         samples=samples,
         normals=normals,
+        spacing=float(np.sqrt(surface_area(vertices, faces) / config.num_samples)),
         vertices=vertices[np.unique(faces)],
         points=points,
         points_tree=cKDTree(points),
@@ -176,6 +191,17 @@ def _problem(
         support_z_m=support_z_m,
         extent_m=float(np.linalg.norm(high - low)),
         config=config,
+    )
+
+
+def _thinned(problem: _Problem, factor: int) -> _Problem:
+    """The same with fewer samples; they stand in random order."""
+    count = len(problem.samples) // factor
+    return replace(
+        problem,
+        samples=problem.samples[:count],
+        normals=problem.normals[:count],
+        spacing=problem.spacing * float(np.sqrt(factor)),
     )
 
 
@@ -228,8 +254,10 @@ def _step(
     pivot = surface.mean(axis=0)
     H, g = np.zeros((7, 7)), np.zeros(7)
     distance, near = cKDTree(surface).query(problem.points)
-    weight = _tukey(distance, reach) / len(problem.points)
     gap = ((surface[near] - problem.points) * normals[near]).sum(axis=1)
+    # Between samples a point lies on the surface all the same: only the gap counts.
+    is_near = distance < reach + 2.0 * problem.spacing * current.scale
+    weight = _tukey(gap, reach) * is_near / len(problem.points)
     _add(H, g, surface[near] - pivot, normals[near], gap, weight)
     distance, near = problem.points_tree.query(surface)
     weight = _tukey(distance, reach) / len(surface)
@@ -293,8 +321,8 @@ def _distances(current: _Similarity, problem: _Problem) -> np.ndarray:
     distance, near = cKDTree(moved).query(problem.points)
     normals = problem.normals[near] @ current.R.T
     along = np.abs(((moved[near] - problem.points) * normals).sum(axis=1))
-    spacing = 3.0 * float(np.linalg.norm(np.ptp(moved, axis=0))) / np.sqrt(len(moved))
-    return np.asarray(np.where(distance < spacing, along, distance))
+    is_between = distance < 2.0 * problem.spacing * current.scale
+    return np.asarray(np.where(is_between, along, distance))
 
 
 def _cost(current: _Similarity, problem: _Problem) -> float:

@@ -67,3 +67,11 @@ def visible_mask(
         allowed = 1.5 * cell_m / np.maximum(slant, 0.3)
         seen |= distance <= nearest[key] + allowed
     return seen
+
+
+def surface_area(
+    vertices: Float[np.ndarray, "num_vertices 3"], faces: Int[np.ndarray, "num_faces 3"]
+) -> float:
+    """Of all triangles, in squared units of the vertices."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)

@@ -11,7 +11,7 @@ from twin.scene.foundation.surface import MetricFitError, sample_surface, visibl
 
 SCALE = 0.1
 """Metres per unit: the thing is about 10 x 6 x 9 cm."""
-QUICK = MetricFitConfig(num_samples=1000, max_points=450, yaw_starts_rad=(0.0,))
+QUICK = MetricFitConfig(num_samples=2000, max_points=450, yaw_starts_rad=(0.0,))
 
 
 def measured(T_base_shape: np.ndarray, noise_m: float = 0.001, seed: int = 0) -> np.ndarray:
@@ -55,10 +55,10 @@ def test_size_and_place_are_found_again(factor: float, angle_rad: float, shift_m
         support_z_m=T_true[2, 3],
     )
     size, angle, apart = errors(found, T_true)
-    # 1 mm of noise on some 900 pixels of 4 mm: their edges decide, not their mean.
-    assert size < 0.01
-    assert angle < 0.02
-    assert apart < 0.002
+    # 1 mm of noise on some 900 pixels, of which the planes take the mean.
+    assert size < 0.005
+    assert angle < 0.005
+    assert apart < 0.0005
     assert found.inlier_fraction > 0.95
     assert found.residual_m < 0.002
 
