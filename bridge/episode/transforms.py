@@ -82,7 +82,8 @@ class TransformTree:
             FrameNotFoundError: When no transform names the frame; lists those that exist.
             AmbiguousFrameError: When transforms lead to several places.
         """
-        return self.Ts_root_frame(frame, np.array([stamp_ns], dtype=np.int64))[0]
+        T: Float[np.ndarray, "4 4"] = self.Ts_root_frame(frame, np.array([stamp_ns]))[0]
+        return T
 
     def Ts_root_frame(
         self, frame: str, stamps_ns: Int[np.ndarray, " num_stamps"]

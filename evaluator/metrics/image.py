@@ -157,7 +157,7 @@ def aligned(
         power = float(np.square(a - shift_a).sum())
         gain = float(((a - shift_a) * (b - shift_b)).sum()) / power if power > 0 else 1.0
         channels.append(gain * (a - shift_a) + shift_b)
-    return np.clip(np.stack(channels, axis=-1), 0.0, 1.0)
+    return np.asarray(np.clip(np.stack(channels, axis=-1), 0.0, 1.0))
 
 
 def score_image(

@@ -6,7 +6,7 @@ pose graph is solved (Choi, Zhou, Koltun 2015). The gauge is the first keyframe.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,9 @@ from bridge.geometry.camera import Camera
 from bridge.terminal import Advance
 from twin.errors import TwinError
 from twin.scene.thumb import Thumb, colors_in_depth, meet, thumb_of
+
+SURE = 0.9
+"""A frame that fits this nearly as well as the one before needs no second guess."""
 
 
 class LostError(TwinError):
@@ -40,11 +43,15 @@ class TrackConfig:
     """A camera that has come this far from its keyframe gets a new one."""
     min_overlap: float = 0.3
     min_agreement: float = 0.5
-    """A pose is believed when two depth images meet and agree by these shares."""
+    min_likeness: float = 0.6
+    """A pose is believed when two images meet and agree by these shares, and their brightness
+    correlates: depth alone lets a plane slide along itself."""
+    pyramid: tuple[int, ...] = (20, 20, 10, 5)
+    """Iterations per level, the coarsest first."""
     loop_shift_m: float = 0.6
     loop_turn_rad: float = 0.6
     """Keyframes nearer to each other than both are tied."""
-    max_loops: int = 60
+    max_loops: int = 30
     min_placed: float = 0.5
     """With a smaller share of frames placed, the camera counts as lost."""
 
@@ -65,6 +72,8 @@ class Step:
 
     T_target_source: Float[np.ndarray, "4 4"]
     information: Float[np.ndarray, "6 6"]
+    score: float
+    """Agreement of depth times likeness of brightness."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,18 +96,23 @@ class Aligner:
                 package="open3d", extra="twin", purpose="following a camera without poses"
             ) from error
         self.config = config
-        self.open3d = open3d
+        self.open3d: Any = open3d
         self._term = open3d.pipelines.odometry.RGBDOdometryJacobianFromHybridTerm()
         self._option = open3d.pipelines.odometry.OdometryOption(
-            depth_diff_max=config.depth_difference_m, depth_min=0.05, depth_max=config.max_depth_m
+            iteration_number_per_pyramid_level=open3d.utility.IntVector(config.pyramid),
+            depth_diff_max=config.depth_difference_m,
+            depth_min=0.05,
+            depth_max=config.max_depth_m,
         )
 
     def look(self, frame: RgbdFrame) -> Look:
         """Thin a frame; colour is looked up for each depth pixel."""
         thumb = thumb_of(frame, self.config.width_px)
         step = round(frame.depth_camera.fx / thumb.camera.fx)
+        colors = np.ascontiguousarray(colors_in_depth(frame, step))
+        thumb = replace(thumb, grey=colors.mean(axis=2, dtype=np.float32))
         image = self.open3d.geometry.RGBDImage.create_from_color_and_depth(
-            self.open3d.geometry.Image(np.ascontiguousarray(colors_in_depth(frame, step))),
+            self.open3d.geometry.Image(colors),
             self.open3d.geometry.Image(np.ascontiguousarray(thumb.depth_m)),
             depth_scale=1.0,
             depth_trunc=self.config.max_depth_m,
@@ -106,10 +120,8 @@ class Aligner:
         )
         return Look(thumb=thumb, image=image)
 
-    def lay(
-        self, source: Look, target: Look, T_guess: Float[np.ndarray, "4 4"], min_agreement: float
-    ) -> Step | None:
-        """Lay one frame onto another, from a guess; None when their depths then disagree."""
+    def lay(self, source: Look, target: Look, T_guess: Float[np.ndarray, "4 4"]) -> Step | None:
+        """Lay one frame onto another, from a guess; None when they then disagree."""
         success, T, information = self.open3d.pipelines.odometry.compute_rgbd_odometry(
             source.image,
             target.image,
@@ -122,9 +134,13 @@ class Aligner:
         if not success or not np.isfinite(T).all():
             return None
         met = meet(source.thumb, target.thumb, T)
-        if met.overlap < self.config.min_overlap or met.agreement < min_agreement:
+        config = self.config
+        if met.overlap < config.min_overlap or met.agreement < config.min_agreement:
             return None
-        return Step(T_target_source=T, information=np.array(information))
+        if met.likeness < config.min_likeness:
+            return None
+        score = met.agreement * met.likeness
+        return Step(T_target_source=T, information=np.array(information), score=score)
 
     def _pinhole(self, camera: Camera) -> Any:
         fx, fy, cx, cy = camera.to_ros()
@@ -183,17 +199,24 @@ class _Follower:
 
     def _place(self, look: Look, *, may_promote: bool) -> Step | None:
         """Lay a frame onto the keyframe, or else onto the last frame, made a keyframe."""
-        limit = self.aligner.config.min_agreement
         last = np.eye(4) if self._last is None else self._last[1].T_target_source
-        key = self.keys[-1].look
-        for guess in (last @ self._motion, last):
-            step = self.aligner.lay(look, key, guess, limit)
-            if step is not None:
-                return step
-        if not may_promote or self._last is None:
-            return None
+        best = self._best(look, (last @ self._motion, last))
+        if best is not None or not may_promote or self._last is None:
+            return best
         self._promote()
-        return self.aligner.lay(look, self.keys[-1].look, np.eye(4), limit)
+        return self._best(look, (self._motion, np.eye(4)))
+
+    def _best(self, look: Look, guesses: tuple[np.ndarray, ...]) -> Step | None:
+        """The better of what several guesses lead to: with the motion so far, and without."""
+        usual = 0.0 if self._last is None else SURE * self._last[1].score
+        found = []
+        for guess in guesses:
+            step = self.aligner.lay(look, self.keys[-1].look, guess)
+            if step is not None:
+                found.append(step)
+                if 0.0 < usual <= step.score:
+                    break
+        return max(found, key=lambda step: step.score) if found else None
 
     def _promote(self) -> None:
         """Make the last frame a keyframe."""
@@ -286,7 +309,7 @@ def _find_loops(keys: list[Keyframe], aligner: Aligner) -> list[_Loop]:
     near.sort(key=lambda item: item[:3])
     loops = []
     for _, source, target, guess in near[: config.max_loops]:
-        step = aligner.lay(keys[source].look, keys[target].look, guess, config.min_agreement)
+        step = aligner.lay(keys[source].look, keys[target].look, guess)
         if step is not None:
             loops.append(_Loop(source=source, target=target, step=step))
     return loops

@@ -104,7 +104,7 @@ class PoseReport:
         if self.better is not None and self.better_agreement is not None:
             return (
                 f"only {100 * (self.agreement or 0.0):.0f} % of the depth agrees between views, "
-                f"but {100 * self.better_agreement:.0f} % would if {self.better.describe()}"
+                f"but {100 * self.better_agreement:.0f} % would under another reading: {self.better.describe()}"
             )
         if self.agreement is not None and not self.fits:
             return (

@@ -23,6 +23,8 @@ class Thumb:
     depth_m: Float32[np.ndarray, "height width"]
     """0 where nothing was measured."""
     T_base_depth: Float[np.ndarray, "4 4"]
+    grey: Float32[np.ndarray, "height width"] | None = None
+    """Brightness of the same pixels, where it was looked up."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +35,8 @@ class Meeting:
     """Share of the first image's measurements that fall on measurements of the second."""
     agreement: float
     """Share of those whose depth is the same; 0 without any."""
+    likeness: float = 0.0
+    """Correlation of their brightness where depth agrees; 0 without greys."""
 
 
 def thumb_of(frame: RgbdFrame, width_px: int) -> Thumb:
@@ -74,7 +78,7 @@ def colors_in_depth(frame: RgbdFrame, step: int) -> UInt8[np.ndarray, "height wi
 
 
 def meet(first: Thumb, second: Thumb, T_second_first: Float[np.ndarray, "4 4"]) -> Meeting:
-    """Carry the first image's points into the second and compare depths."""
+    """Carry the first image's points into the second and compare depths, and greys if there."""
     measured = first.depth_m > 0
     p = first.camera.unproject(first.depth_m.astype(np.float64))[measured]
     p_second = se3.apply(T_second_first, p)
@@ -86,7 +90,19 @@ def meet(first: Thumb, second: Thumb, T_second_first: Float[np.ndarray, "4 4"]) 
     if num_met == 0:
         return Meeting(overlap=0.0, agreement=0.0)
     near = np.abs(z[met] - found[met]) <= TOLERANCE_M + TOLERANCE_FRACTION * z[met]
-    return Meeting(overlap=num_met / len(p), agreement=float(near.mean()))
+    likeness = 0.0
+    if first.grey is not None and second.grey is not None and near.any():
+        mine = first.grey[measured][inside][met][near]
+        theirs = second.grey[row[inside], column[inside]][met][near]
+        likeness = _correlation(mine, theirs)
+    return Meeting(overlap=num_met / len(p), agreement=float(near.mean()), likeness=likeness)
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Pearson's; exposure that changes does not matter. 0 for images without any texture."""
+    a, b = a - a.mean(), b - b.mean()
+    power = float(np.sqrt(np.square(a).sum() * np.square(b).sum()))
+    return float((a * b).sum()) / power if power > 0 else 0.0
 
 
 def _lookup(

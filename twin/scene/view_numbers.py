@@ -82,7 +82,7 @@ def brightened(
     """Multiply each channel by the factor that brings it nearest to the recorded one."""
     a, b = rendered.astype(np.float64), wanted.astype(np.float64)
     power = np.maximum(np.square(a).sum(axis=(0, 1)), 1e-12)
-    return np.clip(a * ((a * b).sum(axis=(0, 1)) / power), 0.0, 1.0)
+    return np.asarray(np.clip(a * ((a * b).sum(axis=(0, 1)) / power), 0.0, 1.0))
 
 
 def _similarity(rendered: np.ndarray, wanted: np.ndarray) -> float:
