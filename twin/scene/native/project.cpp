@@ -6,12 +6,11 @@
 #include <cmath>
 
 #include "kernels_isa.hpp"
+#include "scalar.hpp"
 
 namespace splat::SPLAT_ISA {
 
 namespace {
-
-constexpr float kLog2E = 1.4426950408889634f;
 
 struct Local {
     float p[3];        // centre in the camera frame [m]
@@ -87,7 +86,7 @@ void fill_local(const Splats& in, const Camera& camera, int index, Local* out) {
     out->q_inverse_norm = 1.0f / std::sqrt(norm2);
     for (int i = 0; i < 4; ++i) out->q[i] = quat[i] * out->q_inverse_norm;
     rotation(out->q, out->R);
-    for (int i = 0; i < 3; ++i) out->s[i] = std::exp(in.scales_log[3 * index + i]);
+    for (int i = 0; i < 3; ++i) out->s[i] = exp_of(in.scales_log[3 * index + i]);
 
     const float inverse_z = 1.0f / out->p[2];
     // Far outside the image the affine approximation explodes; hold it at 30 % beyond the border.
@@ -121,7 +120,11 @@ float image_determinant(const float* A) {
     return n0 * n0 + n1 * n1 + n2 * n2;
 }
 
-void project_one(const Splats& in, const Camera& camera, const Settings& settings, int index,
+struct Cut {
+    float alpha, log2_alpha;
+};
+
+void project_one(const Splats& in, const Camera& camera, const Cut& cut, int index,
                  Projected* out) {
     out->half_x = -1.0f;
     Local local;
@@ -133,8 +136,8 @@ void project_one(const Splats& in, const Camera& camera, const Settings& setting
     if (!(det > 0.0f) || !(det < 1e30f)) return;
     const float ratio = det_raw / det;
     const float compensation = std::sqrt(ratio > kMinMipRatio ? ratio : kMinMipRatio);
-    const float opacity = compensation / (1.0f + std::exp(-in.opacities[index]));
-    if (!(opacity > settings.alpha_cut)) return;
+    const float opacity = compensation / (1.0f + exp_of(-in.opacities[index]));
+    if (!(opacity > cut.alpha)) return;
 
     const float inverse_z = 1.0f / local.p[2];
     out->u = camera.fx * local.p[0] * inverse_z + camera.cx;
@@ -143,10 +146,12 @@ void project_one(const Splats& in, const Camera& camera, const Settings& setting
     out->a = yy * half_log2e_over_det;
     out->b = -2.0f * local.xy * half_log2e_over_det;
     out->c = xx * half_log2e_over_det;
-    out->log2_opacity = std::log2(opacity);
+    out->log2_opacity = log2_of(opacity);
     seen_color(in, camera, index, out->rgb);
     out->depth = local.p[2];
-    const float radius2 = 2.0f * std::log(opacity / settings.alpha_cut);
+    // exp(-r^2 / 2) = cut / opacity
+    const float above = out->log2_opacity - cut.log2_alpha;
+    const float radius2 = above > 0 ? 2.0f / kLog2E * above : 0.0f;
     const float half_x = std::sqrt(radius2 * xx), half_y = std::sqrt(radius2 * yy);
     const float sum = out->u + out->v + out->a + out->b + out->c + out->log2_opacity + half_x +
                       half_y + out->rgb[0] + out->rgb[1] + out->rgb[2];
@@ -175,40 +180,47 @@ void quaternion_gradient(const Local& local, const float* dR, float* out) {
         out[i] = (d[i] - along * local.q[i]) * local.q_inverse_norm;
 }
 
+// Inverse K of the image covariance with the low-pass, and of its determinant without.
+struct Inverse {
+    float xx, xy, yy;
+    float raw;  // 1 / det; 0 where the mip compensation is held at its floor
+};
+
+Inverse inverse_of(const Local& local) {
+    const float det_raw = image_determinant(local.A);
+    const float det = det_raw + kMipVariance * (local.xx + local.yy) + kMipVariance * kMipVariance;
+    const float inverse = 1.0f / det;
+    return {(local.yy + kMipVariance) * inverse, -local.xy * inverse,
+            (local.xx + kMipVariance) * inverse,
+            det_raw > kMinMipRatio * det ? 1.0f / det_raw : 0.0f};
+}
+
 struct CovarianceGradient {
     float xx, xy, yy;  // symmetric matrix [[xx, xy], [xy, yy]]
 };
 
 // Through the inverse and through the mip compensation of the opacity.
-CovarianceGradient covariance_gradient(const Local& local, const float* sums) {
-    const float det_raw = image_determinant(local.A);
-    const float det = det_raw + kMipVariance * (local.xx + local.yy) + kMipVariance * kMipVariance;
-    const float inverse = 1.0f / det;
-    const float kxx = (local.yy + kMipVariance) * inverse, kxy = -local.xy * inverse;
-    const float kyy = (local.xx + kMipVariance) * inverse;
+CovarianceGradient covariance_gradient(const Local& local, const Inverse& K, const float* sums) {
     // dL/dK = -1/2 sum e d d^T, and dL/dcov = -K (dL/dK) K.
     const float gxx = 0.5f * sums[kExx], gxy = 0.5f * sums[kExy], gyy = 0.5f * sums[kEyy];
-    const float hxx = kxx * gxx + kxy * gxy, hxy = kxx * gxy + kxy * gyy;
-    const float hyx = kxy * gxx + kyy * gxy, hyy = kxy * gxy + kyy * gyy;
-    CovarianceGradient g{hxx * kxx + hxy * kxy, hxx * kxy + hxy * kyy, hyx * kxy + hyy * kyy};
-    if (det_raw > kMinMipRatio * det) {
-        const float half_e = 0.5f * sums[kE], inverse_raw = 1.0f / det_raw;
-        g.xx += half_e * (local.yy * inverse_raw - kxx);
-        g.xy += half_e * (-local.xy * inverse_raw - kxy);
-        g.yy += half_e * (local.xx * inverse_raw - kyy);
+    const float hxx = K.xx * gxx + K.xy * gxy, hxy = K.xx * gxy + K.xy * gyy;
+    const float hyx = K.xy * gxx + K.yy * gxy, hyy = K.xy * gxy + K.yy * gyy;
+    CovarianceGradient g{hxx * K.xx + hxy * K.xy, hxx * K.xy + hxy * K.yy,
+                         hyx * K.xy + hyy * K.yy};
+    if (K.raw > 0) {
+        const float half_e = 0.5f * sums[kE];
+        g.xx += half_e * (local.yy * K.raw - K.xx);
+        g.xy += half_e * (-local.xy * K.raw - K.xy);
+        g.yy += half_e * (local.xx * K.raw - K.yy);
     }
     return g;
 }
 
 // Gradient on the centre in the camera frame.
-void point_gradient(const Local& local, const Camera& camera, const float* sums, const float* dT,
-                    float* dp) {
-    const float det = image_determinant(local.A) + kMipVariance * (local.xx + local.yy) +
-                      kMipVariance * kMipVariance;
-    const float kxx = (local.yy + kMipVariance) / det, kxy = -local.xy / det;
-    const float kyy = (local.xx + kMipVariance) / det;
-    const float du = kxx * sums[kEx] + kxy * sums[kEy];
-    const float dv = kxy * sums[kEx] + kyy * sums[kEy];
+void point_gradient(const Local& local, const Camera& camera, const Inverse& K, const float* sums,
+                    const float* dT, float* dp) {
+    const float du = K.xx * sums[kEx] + K.xy * sums[kEy];
+    const float dv = K.xy * sums[kEx] + K.yy * sums[kEy];
     const float inverse_z = 1.0f / local.p[2];
     const float jx = camera.fx * inverse_z, jy = camera.fy * inverse_z;
     dp[0] = du * jx;
@@ -271,8 +283,8 @@ void pose_gradient(const Local& local, const Camera& camera, const float* mean, 
 
 void project(const Splats& in, const Camera& camera, const Settings& settings, Projected* out,
              int begin, int end) {
-    for (int index = begin; index < end; ++index)
-        project_one(in, camera, settings, index, out + index);
+    const Cut cut{settings.alpha_cut, log2_of(settings.alpha_cut)};
+    for (int index = begin; index < end; ++index) project_one(in, camera, cut, index, out + index);
 }
 
 void unproject_gradients(const Splats& in, const Camera& camera, const float* sums,
@@ -281,7 +293,8 @@ void unproject_gradients(const Splats& in, const Camera& camera, const float* su
     to_camera(in.means + 3 * index, camera, local.p);
     fill_local(in, camera, index, &local);
 
-    const CovarianceGradient g = covariance_gradient(local, sums);
+    const Inverse K = inverse_of(local);
+    const CovarianceGradient g = covariance_gradient(local, K, sums);
     float dA[6], dT[6] = {0, 0, 0, 0, 0, 0}, dR[9];
     for (int k = 0; k < 3; ++k) {
         dA[k] = 2 * (g.xx * local.A[k] + g.xy * local.A[3 + k]);
@@ -300,7 +313,7 @@ void unproject_gradients(const Splats& in, const Camera& camera, const float* su
     }
     quaternion_gradient(local, dR, out.quats + 4 * index);
     float dp[3], d_ray[3] = {0, 0, 0};
-    point_gradient(local, camera, sums, dT, dp);
+    point_gradient(local, camera, K, sums, dT, dp);
     if (in.harmonics != nullptr)
         harmonic_gradient(in, camera, sums + kRed, index,
                           out.harmonics + 3 * kHarmonics * static_cast<std::int64_t>(index), d_ray);
@@ -308,7 +321,7 @@ void unproject_gradients(const Splats& in, const Camera& camera, const float* su
         out.means[3 * index + k] = camera.R[k] * dp[0] + camera.R[3 + k] * dp[1] +
                                    camera.R[6 + k] * dp[2] + d_ray[k];
     pose_gradient(local, camera, in.means + 3 * index, dp, dT, d_ray, d_pose);
-    out.opacities[index] = sums[kE] / (1.0f + std::exp(in.opacities[index]));
+    out.opacities[index] = sums[kE] / (1.0f + exp_of(in.opacities[index]));
     for (int k = 0; k < 3; ++k) out.colors[3 * index + k] = sums[kRed + k];
 }
 
