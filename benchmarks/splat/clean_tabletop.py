@@ -1,7 +1,7 @@
 """A fixed tabletop without any noise: what a fit reaches when only the fit is to blame.
 
 pybullet's software renderer draws its own models (wooden table, KUKA arm, tray, duck, teddy,
-bricks and blocks on a chequered floor) with exact poses and depth. 59 views on two turns around
+bricks and blocks on a chequered floor) with exact poses and depth. 59 views on a wavy turn around
 the table; every second one trains (30), those between are held out (29). The numbers below are
 the generator: change one and it is another scene.
 """
@@ -88,14 +88,15 @@ def camera() -> Camera:
 
 def camera_pose(index: int) -> np.ndarray:
     """Pose ``T_base_camera`` of one view."""
-    return look_at_table(index / (NUM_VIEWS - 1))
+    return look_at_table(index / NUM_VIEWS)
 
 
 def look_at_table(along: float) -> np.ndarray:
-    """Pose on a path that winds twice around the table and rises; ``along`` goes from 0 to 1."""
-    turn = 4 * np.pi * along
-    radius = 0.95 - 0.12 * along
-    eye = np.array([0.05 + radius * np.cos(turn), radius * np.sin(turn), 1.55 + 0.25 * along])
+    """Pose on a wavy path once around the table; ``along`` goes from 0 to 1."""
+    turn = 2 * np.pi * along
+    radius = 0.9 - 0.08 * np.sin(3 * turn)
+    height = 1.65 + 0.15 * np.sin(3 * turn)
+    eye = np.array([0.05 + radius * np.cos(turn), radius * np.sin(turn), height])
     return se3.look_at(eye, np.array([0.05, 0.0, 0.66]), np.array([0.0, 0.0, 1.0]))
 
 

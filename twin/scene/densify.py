@@ -21,7 +21,7 @@ from twin.scene.gaussians import (
 )
 from twin.scene.raster import Rasteriser
 
-MAX_SCORED_VIEWS = 40
+MAX_SCORED_VIEWS = 20
 """Views that errors are gathered from; more only cost time."""
 TRANSPARENT = 0.03
 """Gaussians with less opacity go."""

@@ -35,9 +35,9 @@ RATES = {
 """Adam's step sizes at the start."""
 DECAY = 0.05
 """What is left of them at the end."""
-SOLVE_AT = (0.0, 0.25)
-"""Shares of the budget at which colours are solved; and once more where full size begins."""
-SPLIT_AT = (0.08, 0.16, 0.24, 0.32, 0.40)
+SOLVE_AT = (0.0, 0.3)
+"""Shares of the budget at which colours are solved."""
+SPLIT_AT = (0.1, 0.2, 0.3)
 """Shares of the budget at which Gaussians are split and dropped."""
 POSES_FROM = 0.15
 """Cameras are moved only once the scene is good enough to say where to."""
@@ -172,8 +172,7 @@ class _Learner:
         if self._config.densify:
             events += [(at, self._densify) for at in SPLIT_AT]
         if self._config.appearance_steps:
-            solve_at = {*SOLVE_AT, self._config.coarse_fraction}
-            events += [(at, self._solve_colours) for at in sorted(solve_at) if at < 1]
+            events += [(at, self._solve_colours) for at in SOLVE_AT]
         return sorted(events, key=lambda event: event[0])
 
     def keep_schedule(self, state: FitState, at: _Progress) -> None:
