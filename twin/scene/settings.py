@@ -168,6 +168,38 @@ class FitConfig:
             raise UsageError(message)
 
 
+@Parameter(name="*", group="Foundation models")
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig:
+    """Which large models to ask, see docs/foundation_models.md; none by default.
+
+    Each is a local folder of weights. Nothing is ever downloaded.
+    """
+
+    segmenter: str = ""
+    """Find things in images with sam3:FOLDER instead of the default segmenter."""
+    prompt: tuple[str, ...] = ()
+    """What the segmenter looks for, once for each; default: the names of the task's objects."""
+    features: str = ""
+    """Put features of dinov3:FOLDER on the Gaussians."""
+    feature_channels: int = 16
+    """Principal components that are kept of each feature."""
+    feature_stride: int | None = None
+    """Image pixels per feature; default: the model's own, 16 or 32. Less costs more."""
+    clip: Path | None = None
+    """Folder of CLIP: things are found by meaning, not by the words of the lexicon."""
+    model_frames: int = 12
+    """Training frames the models look at, spread evenly."""
+    device: str = "auto"
+    """Where they run: cpu, cuda, cuda:1; auto takes a GPU if there is one."""
+
+    def __post_init__(self) -> None:
+        """Refuse to look at nothing."""
+        _refuse_below(1, feature_channels=self.feature_channels, model_frames=self.model_frames)
+        if self.feature_stride is not None:
+            _refuse_below(1, feature_stride=self.feature_stride)
+
+
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class RebuildConfig:

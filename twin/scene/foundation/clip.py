@@ -54,7 +54,7 @@ class ClipEmbedder:
         tokenizer = Tokenizer(folder, KIND, model.config.text_config.max_position_embeddings)
         return ClipEmbedder(model, tokenizer, folder)
 
-    def embed_texts(self, texts: Sequence[str]) -> Float32[np.ndarray, "num_texts num_channels"]:
+    def encode(self, texts: Sequence[str]) -> Float32[np.ndarray, "num_texts num_channels"]:
         """Unit vectors of words.
 
         Raises:

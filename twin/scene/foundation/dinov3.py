@@ -64,8 +64,9 @@ class DinoFeatures:
     ) -> list[FeatureMap]:
         """Compute one map for each image; images of one size go through the network together.
 
-        A map covers its whole image: cell (i, j) of a map of ``m`` rows lies over the image rows
-        ``i h / m`` to ``(i + 1) h / m``. A stride below the network's own enlarges the image first.
+        Cell (i, j) lies over the ``stride`` image rows from ``i * stride`` on and the columns from
+        ``j * stride`` on; where the last cells reach over the edge, the edge is repeated. A stride
+        below the network's own enlarges the image first.
 
         Args:
             images_u8: sRGB images of one size.
@@ -83,7 +84,7 @@ class DinoFeatures:
             )
             raise UsageError(message)
         step = self.cell_px if stride is None else stride
-        rows, columns = round(height / step) if step > 0 else 0, round(width / max(step, 1))
+        rows, columns = (-(-side // step) if step > 0 else 0 for side in (height, width))
         if not 0 < rows * columns <= MAX_CELLS:
             message = (
                 f"an image of {width} x {height} pixels with stride {step} gives "
@@ -91,7 +92,9 @@ class DinoFeatures:
             )
             raise UsageError(message)
         size = (rows * self.cell_px, columns * self.cell_px)
-        pixels = network_input(images_u8, size, self._normalisation, mode="bicubic")
+        over = ((0, rows * step - height), (0, columns * step - width), (0, 0))
+        whole = [np.pad(image, over, mode="edge") for image in images_u8]
+        pixels = network_input(whole, size, self._normalisation, mode="bicubic")
         values = self._run(pixels).reshape(len(images_u8), rows, columns, self.num_channels)
         maps = np.ascontiguousarray(np.moveaxis(values, -1, 1))
         return [FeatureMap(values=item, stride=step) for item in maps]

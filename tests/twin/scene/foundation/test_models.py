@@ -138,6 +138,8 @@ def test_dino_maps_cover_the_image_and_a_batch_is_as_good_as_one_by_one(
         np.testing.assert_allclose(alone.values, found.values, atol=1e-5)
     (finer,) = source.features(images[:1], stride=8)
     assert finer.values.shape == (32, 12, 16)
+    (ragged,) = source.features([picture(97, 128)])  # the last row of cells reaches over the edge
+    assert ragged.values.shape == (32, 96 // cell + 1, 128 // cell)
     assert source.features([]) == []
 
 
@@ -188,10 +190,10 @@ def test_clip_gives_unit_vectors_and_a_batch_is_as_good_as_one_by_one(
     saved: Callable[[str], Path],
 ) -> None:
     embedder = open_clip(saved("clip"), CPU)
-    texts = embedder.embed_texts(["red cube", "a yellow duck", "robot"])
+    texts = embedder.encode(["red cube", "a yellow duck", "robot"])
     assert texts.shape == (3, embedder.num_channels) == (3, 16)
     np.testing.assert_allclose(np.linalg.norm(texts, axis=1), 1.0, atol=1e-5)
-    np.testing.assert_allclose(embedder.embed_texts(["a yellow duck"])[0], texts[1], atol=1e-5)
+    np.testing.assert_allclose(embedder.encode(["a yellow duck"])[0], texts[1], atol=1e-5)
     assert np.abs(texts[0] - texts[1]).max() > 1e-3
     masks = [np.zeros((60, 80), dtype=bool) for _ in range(2)]
     masks[0][10:30, 20:60] = True
@@ -201,7 +203,7 @@ def test_clip_gives_unit_vectors_and_a_batch_is_as_good_as_one_by_one(
     alone = embedder.embed_masked([picture()], masks[1:])
     np.testing.assert_allclose(alone[0], pieces[1], atol=1e-5)
     assert 0.0 < embedder.temperature <= 1.0
-    assert embedder.embed_texts([]).shape == embedder.embed_masked([], []).shape == (0, 16)
+    assert embedder.encode([]).shape == embedder.embed_masked([], []).shape == (0, 16)
 
 
 def test_clip_sees_only_what_the_mask_shows(saved: Callable[[str], Path]) -> None:
@@ -261,7 +263,7 @@ def test_code_in_a_folder_is_never_run(saved: Callable[[str], Path], tmp_path: P
         content["auto_map"] = {"AutoModel": "evil.Model", "AutoTokenizer": ["evil.T", "evil.T"]}
         (tmp_path / name).write_text(json.dumps(content))
     with contextlib.suppress(WeightsError):  # refusing them is as good as ignoring the code
-        open_clip(tmp_path, CPU).embed_texts(["duck"])
+        open_clip(tmp_path, CPU).encode(["duck"])
     assert not (tmp_path / "ran").exists()
 
 

@@ -1,0 +1,264 @@
+"""What ``rebuild`` asks the models: masks and features of training frames, vectors of things."""
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from bridge.episode.streams import RgbdFrame
+from bridge.errors import UsageError
+from bridge.task.task_file import Task
+from twin.scene.foundation import clip, dinov3, sam3
+from twin.scene.foundation.clip import ClipEmbedder
+from twin.scene.foundation.loading import Placement
+from twin.scene.foundation.open import (
+    FEATURES,
+    SEGMENTERS,
+    open_clip,
+    open_features,
+    open_segmenter,
+    split_spec,
+)
+from twin.scene.foundation.sam3 import Sam3Segmenter
+from twin.scene.foundation.weights import WeightsKind, check_folder, weights_hash
+from twin.scene.gaussians import GaussianCloud
+from twin.scene.raster import RasterConfig, Rasteriser
+from twin.scene.semantics.features import (
+    FeatureBasis,
+    SceneFeatures,
+    fit_basis,
+    lift_reduced,
+    save_features,
+)
+from twin.scene.semantics.lift import Viewpoint, render_labels
+from twin.scene.semantics.result import MaskSet, SemanticScene
+from twin.scene.settings import ModelConfig
+
+MIN_SHOWN_PX = 64
+"""A thing is cut out of frames that show at least this much of it."""
+MAX_CROPS = 5
+"""Frames whose vectors of one thing are averaged: those that show most of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelFindings:
+    """What the models say about the frames."""
+
+    masks: list[tuple[Viewpoint, MaskSet]]
+    """Empty without a segmenter."""
+    features: SceneFeatures | None
+    """None without a feature model."""
+
+
+def model_hashes(config: ModelConfig) -> dict[str, str]:
+    """Check every folder of weights that is named, before anything slow begins.
+
+    Returns:
+        SHA-256 of each model's weights, by its option.
+
+    Raises:
+        UsageError: When an option or a folder cannot be used.
+    """
+    named: list[tuple[str, Path, WeightsKind]] = []
+    if config.segmenter:
+        _, folder = split_spec(config.segmenter, "--segmenter", SEGMENTERS)
+        named.append(("segmenter", folder, sam3.KIND))
+    if config.features:
+        _, folder = split_spec(config.features, "--features", FEATURES)
+        named.append(("features", folder, dinov3.KIND))
+    if config.clip is not None:
+        named.append(("clip", config.clip.expanduser(), clip.KIND))
+    hashes = {}
+    for option, folder, kind in named:
+        check_folder(folder, kind)
+        hashes[option] = weights_hash(folder, kind)
+    return hashes
+
+
+def prompts_of(config: ModelConfig, task: Task | None) -> list[str]:
+    """What to look for: the prompts given, else the names of the task's objects.
+
+    Raises:
+        UsageError: When there is neither.
+    """
+    if config.prompt:
+        return list(config.prompt)
+    names = [] if task is None else [re.sub(r"[_\d]+", " ", key).strip() for key in task.objects]
+    prompts = list(dict.fromkeys(name for name in names if name))
+    if not prompts:
+        message = (
+            "--segmenter needs words to look for, and the run's episodes name no task with "
+            "objects. Give some: --prompt 'red cube' --prompt box."
+        )
+        raise UsageError(message)
+    return prompts
+
+
+def ask_models(
+    config: ModelConfig,
+    frames: Sequence[RgbdFrame],
+    cloud: GaussianCloud,
+    task: Task | None,
+    *,
+    threads: int = 0,
+    advance: Callable[[int], object] = lambda done: None,
+) -> ModelFindings:
+    """Run segmenter and feature model over frames, one model in memory at a time.
+
+    Args:
+        config: Which models.
+        frames: Training frames, see ``spread``.
+        cloud: The Gaussians that features are lifted to, in the frames' root frame.
+        task: Names what to look for when no prompts are given.
+        threads: For lifting; 0: all cores.
+        advance: Told how many frames are done, over both models.
+
+    Raises:
+        UsageError: When a folder, prompt or device cannot be used.
+        MissingDependencyError: When the extra ``foundation`` is not installed.
+    """
+    placement = Placement(device=config.device)
+    masks: list[tuple[Viewpoint, MaskSet]] = []
+    if config.segmenter:
+        segmenter = open_segmenter(config.segmenter, placement)
+        for done, item in enumerate(_segmented(segmenter, frames, prompts_of(config, task)), 1):
+            masks.append(item)
+            advance(done)
+        del segmenter
+    features = None
+    if config.features and frames:
+        source = open_features(config.features, placement)
+        maps = []
+        for done, frame in enumerate(frames, 1):
+            maps += source.features([frame.image_u8], stride=config.feature_stride)
+            advance(len(masks) + done)
+        basis = fit_basis(maps, config.feature_channels)
+        pairs = zip((viewpoint_of(frame) for frame in frames), maps, strict=True)
+        rasteriser = Rasteriser(RasterConfig(threads=threads))
+        features = lift_reduced(rasteriser, cloud, pairs, basis, source=source.source)
+    return ModelFindings(masks=masks, features=features)
+
+
+def _segmented(
+    segmenter: Sam3Segmenter, frames: Sequence[RgbdFrame], prompts: Sequence[str]
+) -> Iterable[tuple[Viewpoint, MaskSet]]:
+    for frame in frames:
+        found = segmenter.segment(
+            frame.image_u8, prompts, camera_id=frame.camera_id, stamp_ns=frame.stamp_ns
+        )
+        yield viewpoint_of(frame), found
+
+
+def embed_things(
+    folder: Path,
+    scene: SemanticScene,
+    cloud: GaussianCloud,
+    frames: Sequence[RgbdFrame],
+    features: SceneFeatures | None,
+    config: ModelConfig,
+    *,
+    threads: int = 0,
+) -> dict[str, Any]:
+    """Give every thing of a scene its CLIP vector and write ``features.npz``.
+
+    Args:
+        folder: The scene folder.
+        scene: The things, labelled over ``cloud``.
+        cloud: All Gaussians of the scene.
+        frames: Where the things are cut out of.
+        features: What ``ask_models`` found, written along; None: vectors only.
+        config: Names the folder of CLIP.
+        threads: For drawing; 0: all cores.
+
+    Returns:
+        What ``scene.json`` says about the vectors.
+
+    Raises:
+        UsageError: When the folder or device cannot be used, or none is named.
+    """
+    if config.clip is None:
+        message = "no folder of CLIP is named; give --clip FOLDER."
+        raise UsageError(message)
+    embedder = open_clip(config.clip, Placement(device=config.device))
+    rasteriser = Rasteriser(RasterConfig(threads=threads))
+    vectors, shown = thing_vectors(embedder, scene, cloud, frames, rasteriser)
+    held = features or _no_features(len(cloud))
+    sources = [name for name in (held.source, embedder.source) if name]
+    with_vectors = replace(
+        held,
+        instance_ids=np.array([item.id for item in scene.instances], dtype=np.int32),
+        instance_embeddings=vectors,
+        source=", ".join(sources),
+    )
+    path = save_features(folder, with_vectors)
+    unseen = [item.label for item, count in zip(scene.instances, shown, strict=True) if not count]
+    return {
+        "file": path.name,
+        "source": embedder.source,
+        "num_channels": embedder.num_channels,
+        "never_shown": unseen,
+    }
+
+
+def thing_vectors(
+    embedder: ClipEmbedder,
+    scene: SemanticScene,
+    cloud: GaussianCloud,
+    frames: Sequence[RgbdFrame],
+    rasteriser: Rasteriser,
+) -> tuple[Float32[np.ndarray, "num_instances num_channels"], list[int]]:
+    """One unit vector for each instance, the mean over the frames that show most of it.
+
+    Returns:
+        Vectors in the order of the instances, zero where no frame shows one; how many frames each
+        was cut out of.
+    """
+    seen: dict[int, list[tuple[int, int, np.ndarray]]] = {item.id: [] for item in scene.instances}
+    for index, frame in enumerate(frames):
+        ids = render_labels(rasteriser, cloud, scene.labels, viewpoint_of(frame))
+        for number, found in seen.items():
+            mask = ids == number
+            count = int(mask.sum())
+            if count >= MIN_SHOWN_PX:
+                found.append((count, index, mask))
+    vectors = np.zeros((len(scene.instances), embedder.num_channels), dtype=np.float32)
+    shown = []
+    for row, item in enumerate(scene.instances):
+        best = sorted(seen[item.id], key=lambda entry: (-entry[0], entry[1]))[:MAX_CROPS]
+        shown.append(len(best))
+        if best:
+            images = [frames[index].image_u8 for _, index, _ in best]
+            mean = embedder.embed_masked(images, [mask for _, _, mask in best]).mean(axis=0)
+            vectors[row] = mean / max(float(np.linalg.norm(mean)), 1e-12)
+    return vectors, shown
+
+
+def viewpoint_of(frame: RgbdFrame) -> Viewpoint:
+    """Where a frame's colour camera stood."""
+    return Viewpoint(camera=frame.color_camera, T_base_camera=frame.T_base_color)
+
+
+def spread(stamps_ns: Sequence[int], count: int) -> list[int]:
+    """At most ``count`` of some stamps, evenly, first and last included."""
+    chosen = np.linspace(0, len(stamps_ns) - 1, min(count, len(stamps_ns))).round().astype(int)
+    return [stamps_ns[index] for index in dict.fromkeys(chosen.tolist())]
+
+
+def _no_features(num_splats: int) -> SceneFeatures:
+    basis = FeatureBasis(
+        mean=np.zeros(0, dtype=np.float32),
+        components=np.zeros((0, 0), dtype=np.float32),
+        explained_fraction=1.0,
+    )
+    return SceneFeatures(
+        basis=basis,
+        features=np.zeros((num_splats, 0), dtype=np.float32),
+        weight=np.zeros(num_splats, dtype=np.float32),
+        instance_ids=np.zeros(0, dtype=np.int32),
+        instance_embeddings=np.zeros((0, 0), dtype=np.float32),
+        source="",
+    )
