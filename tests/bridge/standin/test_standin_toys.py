@@ -1,0 +1,401 @@
+"""Soft toys in the stand-in cell: physics, plans, pictures, truth, and what the operator says."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.episode import schema
+from bridge.episode.metadata import Outcome
+from bridge.episode.point_cloud import PointCloudSample
+from bridge.episode.records import PoseSample
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.sources.standin.cell import CellConfig, StandinCell, TruthLog
+from bridge.sources.standin.cell_file import CellFile, load_cell
+from bridge.sources.standin.execution import execute_plan
+from bridge.sources.standin.hidden import HiddenParameters, draw_hidden, nominal_hidden
+from bridge.sources.standin.kinematics import arm_kinematics, tool_down, yaw_of
+from bridge.sources.standin.label import label_trial, void_trial
+from bridge.sources.standin.operator import Operator
+from bridge.sources.standin.planner import (
+    NO_ERROR,
+    draw_error,
+    draw_errors,
+    plan_pick_and_place,
+    release_slots,
+)
+from bridge.sources.standin.render import Renderer
+from bridge.sources.standin.session import describe, run_session
+from bridge.sources.standin.settings import SessionConfig
+from bridge.sources.standin.soft import SoftBody
+from bridge.sources.standin.streams import Streams
+from bridge.sources.standin.surfaces import clutter_surfaces, object_surfaces, room_surfaces
+from bridge.sources.standin.world import World
+from bridge.sources.standin.world_model import TABLE_CENTRE_M, TABLE_SIZE_M
+from bridge.task.plan import Plan
+from bridge.task.task_file import Task, load_task
+from bridge.terminal import Output
+
+SEED = 9_000_000
+HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
+TOYS = ("sloth_into_basket", "five_ducks_into_basket")
+
+
+@pytest.fixture(scope="module")
+def toys_cell() -> CellFile:
+    return load_cell("standin_toys")
+
+
+@pytest.fixture(scope="module")
+def sloth() -> Task:
+    return load_task("sloth_into_basket")
+
+
+@pytest.fixture(scope="module")
+def ducks() -> Task:
+    return load_task("five_ducks_into_basket")
+
+
+def only(task: Task, kept: tuple[str, ...]) -> Task:
+    """The same task with fewer toys; a trial of five takes a quarter of a minute."""
+    keys = (*kept, *task.containers)
+    return replace(
+        task,
+        objects={key: task.objects[key] for key in keys},
+        manipulated=kept,
+        start={key: task.start[key] for key in keys},
+        stages=tuple(
+            stage
+            for stage in task.stages
+            if any(stage.get(verb) in kept for verb in ("grasp", "carry", "release"))
+        ),
+        success=tuple(spec for spec in task.success if spec["object"] in kept),
+    )
+
+
+def plan_of(task: Task, Ts: dict[str, np.ndarray], error: Any = NO_ERROR) -> Plan:
+    return plan_pick_and_place(
+        task,
+        Ts,
+        error,
+        kinematics=arm_kinematics(),
+        joints_start_rad=HOME,
+        max_joint_speed_rad_s=1.6,
+        plan_id="plan_0",
+        condition="without_replanning",
+        start_id=f"{task.name}/{SEED}",
+    )
+
+
+def trial(task: Task, file: CellFile, session: Any) -> tuple[Outcome, StandinCell]:
+    cell = StandinCell(
+        file,
+        task,
+        draw_hidden(file, SEED),
+        Streams(session, "standin"),
+        config=CellConfig(rate_hz=0.0),
+        seed=SEED,
+        start_ns=0,
+    )
+    Ts = task.draw_start(np.random.default_rng(SEED))
+    cell.reset(Ts)
+    cell.wait(0.2)
+    execute_plan(cell, plan_of(task, Ts))
+    return label_trial(task, cell.truth, executed=True), cell
+
+
+@pytest.mark.slow
+def test_a_sloth_taken_at_its_waist_ends_up_in_the_basket_in_its_own_shape(
+    sloth: Task, toys_cell: CellFile, make_session: Callable[..., Any]
+) -> None:
+    session = make_session()
+    outcome, cell = trial(sloth, toys_cell, session)
+    assert (outcome.result, outcome.unit, outcome.k, outcome.n) == ("success", "trial", 1, 1)
+    assert [stage["result"] for stage in outcome.stages] == ["success"] * 3
+    squeezed = min(float(extents[1]) for extents in cell.truth.extents_m["sloth"])
+    assert squeezed < 0.098, "the grip deforms it"
+    assert max(cell.truth.contact["sloth"]), "and is noticed"
+    # Truth: pose and points at 30 Hz, the points around the pose.
+    poses = session.of("truth/object/sloth/pose")
+    clouds = session.of("truth/object/sloth/nodes")
+    assert len(poses) == len(clouds) == len(cell.truth.stamps_ns)
+    assert {item.type_name for item in clouds} == {schema.POINT_CLOUD}
+    for pose, cloud in list(zip(poses, clouds, strict=True))[::60]:
+        T = PoseSample.from_cdr(pose.data).T_frame_body
+        local = se3.apply(se3.invert(T), PointCloudSample.from_cdr(cloud.data).points_m)
+        assert np.abs(local).max() < 0.1
+        assert np.linalg.norm(local.mean(axis=0)) < 0.02
+
+
+@pytest.mark.slow
+def test_two_ducks_go_into_the_basket_one_after_the_other_and_are_counted(
+    ducks: Task, toys_cell: CellFile, make_session: Callable[..., Any]
+) -> None:
+    outcome, cell = trial(only(ducks, ("duck_3", "duck_5")), toys_cell, make_session())
+    assert (outcome.result, outcome.unit, outcome.k, outcome.n) == ("success", "object", 2, 2)
+    assert len(outcome.stages) == 6
+    apart = cell.truth.poses["duck_3"][-1] - cell.truth.poses["duck_5"][-1]
+    assert np.linalg.norm(apart[:3, 3]) > 0.03, "each lies in its own place"
+
+
+@pytest.mark.parametrize("end", [0, 1])
+@pytest.mark.parametrize("name", TOYS)
+def test_toys_stand_still_and_stay_finite_at_either_end_of_every_range(
+    name: str, end: int, toys_cell: CellFile
+) -> None:
+    task = load_task(name)
+    limits = {key: pair[end] for key, pair in toys_cell.uniform.items()}
+    world = World(task, replace(nominal_hidden(toys_cell), **limits), toys_cell.clutter)
+    starts = task.draw_start(np.random.default_rng(SEED))
+    world.reset(HOME, starts)
+    for _ in range(60):
+        world.step()
+    for key, T in world.Ts_base_object().items():
+        assert np.isfinite(T).all()
+        assert np.abs(T - starts[key]).max() < 0.02
+    for key in task.soft_objects:
+        extents = world.extents_m(key, world.Ts_base_object()[key])
+        np.testing.assert_allclose(extents, task.objects[key].size_m, rtol=0.05)
+    assert not any(world.finger_contact().values())
+
+
+def test_a_finger_driven_into_a_toy_leaves_the_physics_finite(
+    sloth: Task, toys_cell: CellFile
+) -> None:
+    world = World(sloth, nominal_hidden(toys_cell))
+    kinematics = arm_kinematics()
+    over = tool_down(np.array([0.45, -0.0425 - 0.006, 0.12]), 0.0)
+    joints = kinematics.joints_for(over, HOME)
+    starts = {"sloth": np.eye(4), "basket": np.eye(4)}
+    starts["sloth"][:3, 3] = [0.45, 0.0, 0.03]
+    starts["basket"][:3, 3] = [0.48, 0.3, 0.0]
+    world.reset(joints, starts)
+    down = over.copy()
+    down[2, 3] = 0.015
+    world.command(kinematics.joints_for(down, joints), 0.085)
+    touched = False
+    for _ in range(150):
+        world.step()
+        touched |= world.finger_contact()["sloth"]
+    assert touched
+    assert np.isfinite(world.nodes_m("sloth")).all()
+    assert np.abs(world.nodes_m("sloth")).max() < 1.5
+
+
+def test_the_same_seed_gives_the_same_squeeze(
+    toys_cell: CellFile, ducks: Task, make_session: Callable[..., Any]
+) -> None:
+    task = only(ducks, ("duck_5",))
+
+    def log(seed: int) -> str:
+        session = make_session()
+        cell = StandinCell(
+            toys_cell,
+            task,
+            draw_hidden(toys_cell, seed),
+            Streams(session, "standin"),
+            config=CellConfig(),
+            seed=seed,
+            start_ns=0,
+        )
+        cell.reset(task.draw_start(np.random.default_rng(SEED)))
+        cell.wait(0.2)
+        return hashlib.sha256(b"".join(item.data for item in session.of("/nodes"))).hexdigest()
+
+    assert log(9_000_001) == log(9_000_001)
+    assert log(9_000_001) != log(9_000_002)
+
+
+def test_a_soft_body_tells_the_pose_it_was_given(sloth: Task, toys_cell: CellFile) -> None:
+    world = World(sloth, nominal_hidden(toys_cell))
+    body: SoftBody = world._soft["sloth"]
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        q = rng.normal(size=4)
+        T = se3.transform_from(q / np.linalg.norm(q), rng.uniform(-0.5, 0.5, 3))
+        nodes = body.rest_nodes_m + body.qpos_at(T)
+        np.testing.assert_allclose(body.pose_of(nodes), T, atol=1e-9)
+        np.testing.assert_allclose(
+            body.extents_m(nodes, T), sloth.objects["sloth"].size_m, atol=1e-9
+        )
+
+
+@pytest.mark.parametrize("name", TOYS)
+def test_a_plan_goes_through_every_stage_and_ends_at_home(name: str) -> None:
+    task = load_task(name)
+    Ts = task.draw_start(np.random.default_rng(SEED))
+    plan = plan_of(task, Ts)
+    assert [stage.id for stage in plan.stages] == [stage["id"] for stage in task.stages]
+    assert plan.stages[0].t_start_ns == 0
+    for before, after in zip(plan.stages, plan.stages[1:], strict=False):
+        assert before.t_end_ns == after.t_start_ns
+    assert plan.stages[-1].t_end_ns == plan.tau[-1].t_ns
+    np.testing.assert_allclose(plan.tau[-1].joints_rad, HOME, atol=1e-3)
+    assert Plan.from_json(plan.to_json()).stages == plan.stages
+    closes = sum(a.g == 0 and b.g == 1 for a, b in zip(plan.tau, plan.tau[1:], strict=False))
+    assert closes == len(task.manipulated)
+    for stage in plan.stages:
+        (object_id,) = stage.predicted_objects
+        assert object_id in task.manipulated
+
+
+def test_the_gripper_closes_across_the_long_axis_of_the_sloth(sloth: Task) -> None:
+    Ts = sloth.draw_start(np.random.default_rng(SEED))
+    closed = next(waypoint for waypoint in plan_of(sloth, Ts).tau if waypoint.g == 1)
+    T = se3.transform_from(np.array(closed.q_wxyz), np.array(closed.p_m))
+    turn = (yaw_of(T) - np.pi - yaw_of(Ts["sloth"])) % np.pi
+    assert min(turn, np.pi - turn) < 1e-6
+    at = se3.apply(se3.invert(Ts["sloth"]), T[:3, 3])
+    np.testing.assert_allclose(at, sloth.objects["sloth"].grasp_m, atol=1e-9)
+
+
+def test_a_turn_the_wrist_cannot_make_is_made_the_other_way_round(sloth: Task) -> None:
+    Ts = sloth.draw_start(np.random.default_rng(SEED))
+    turned = -1.4  # over the basket the wrist would pass its limit with this turn
+    Ts["sloth"][:2, :2] = [[np.cos(turned), -np.sin(turned)], [np.sin(turned), np.cos(turned)]]
+    closed = next(waypoint for waypoint in plan_of(sloth, Ts).tau if waypoint.g == 1)
+    T = se3.transform_from(np.array(closed.q_wxyz), np.array(closed.p_m))
+    assert yaw_of(T @ np.diag([-1.0, 1.0, -1.0, 1.0])) == pytest.approx(turned + np.pi, abs=1e-6)
+
+
+def test_each_object_has_its_own_error_and_the_first_keeps_the_old_one(
+    toys_cell: CellFile,
+) -> None:
+    noise = toys_cell.noise_for("five_ducks_into_basket")
+    errors = draw_errors(noise, 5, start_seed=SEED, round_=1)
+    assert errors[0] == draw_error(noise, start_seed=SEED, round_=1)
+    assert len({error.along_m for error in errors}) == 5
+    assert noise.release_m < toys_cell.noise_for("sloth_into_basket").release_m
+
+
+def test_slots_lie_apart_in_the_cavity(ducks: Task) -> None:
+    basket = ducks.objects["basket"]
+    slots = np.array(release_slots(5, basket))
+    assert (np.abs(slots) < np.array(basket.inner_m[:2]) / 2 - 0.03).all()
+    distance = np.linalg.norm(slots[:, None] - slots[None], axis=2)[~np.eye(5, dtype=bool)]
+    assert distance.min() > 0.07
+    assert release_slots(1, basket)[0].tolist() == [0.0, 0.0]
+
+
+def test_a_duck_beside_the_basket_costs_one_of_five(ducks: Task) -> None:
+    truth = TruthLog()
+    basket = np.eye(4)
+    basket[:3, 3] = [0.48, 0.22, 0.0]
+    for step in range(40):
+        truth.stamps_ns.append(step * 33_000_000)
+        truth.poses.setdefault("basket", []).append(basket)
+        for key in ducks.manipulated:
+            T = basket.copy()
+            T[2, 3] = 0.04 if step != 20 else 0.2
+            if key == "duck_4":
+                T[0, 3] += 0.3
+            truth.poses.setdefault(key, []).append(T)
+            truth.contact.setdefault(key, []).append(False)
+            size = np.array(ducks.objects[key].size_m)
+            truth.extents_m.setdefault(key, []).append(size)
+    outcome = label_trial(ducks, truth, executed=True)
+    assert (outcome.result, outcome.unit, outcome.k, outcome.n) == ("failure", "object", 4, 5)
+    assert outcome.detail is not None
+    assert "duck_4" in outcome.detail
+    assert "duck_1" not in outcome.detail
+    results = {stage["id"]: stage["result"] for stage in outcome.stages}
+    assert results["pick_4"] == "success"
+    assert results["carry_4"] == results["release_4"] == "failure"
+    assert results["carry_1"] == results["release_1"] == "success"
+    assert (void_trial(ducks, "nobody").unit, void_trial(ducks, "nobody").n) == ("object", 5)
+
+
+def test_a_camera_sees_the_toys_where_and_how_they_are(sloth: Task, toys_cell: CellFile) -> None:
+    world = World(sloth, nominal_hidden(toys_cell), toys_cell.clutter)
+    Ts = sloth.draw_start(np.random.default_rng(SEED))
+    world.reset(HOME, Ts)
+    camera = Camera(width=80, height=60, fx=120.0, fy=120.0, cx=40.0, cy=30.0)
+    p = Ts["sloth"][:3, 3]
+    eye = p + np.array([0.0, -0.001, 0.4])
+    T = se3.look_at(eye, p, np.array([0.0, 0.0, 1.0]))
+    room = [*room_surfaces(SEED), *clutter_surfaces(toys_cell.clutter)]
+    renderer = Renderer([*object_surfaces(sloth), *room])
+    skins = world.skins_m()
+    seen = renderer.render(camera, T, world.Ts_base_object(), None, skins)
+    assert 0.33 < seen.depth_m[30, 40] < 0.39, "on the sloth's back"
+    lifted = {"sloth": skins["sloth"] + [0.0, 0.0, 0.1]}
+    higher = renderer.render(camera, T, world.Ts_base_object(), None, lifted)
+    assert seen.depth_m[30, 40] - higher.depth_m[30, 40] == pytest.approx(0.1, abs=0.005)
+    wide = {"sloth": (skins["sloth"] - p) * [1.0, 1.3, 1.0] + p}
+    stretched = renderer.render(camera, T, world.Ts_base_object(), None, wide)
+    assert (stretched.depth_m < 0.395).sum() > 1.15 * (seen.depth_m < 0.395).sum()
+
+
+def test_clutter_stands_on_the_table_and_out_of_the_way(toys_cell: CellFile) -> None:
+    assert len(toys_cell.clutter) >= 5
+    assert load_cell("standin").clutter == ()
+    reach = [load_task(name).start for name in TOYS]
+    for item in toys_cell.clutter:
+        p = item.T_base_clutter[:3, 3]
+        radius = float(np.hypot(*item.size_m[:2])) / 2
+        assert np.all(np.abs(p[:2] - TABLE_CENTRE_M) + radius < np.array(TABLE_SIZE_M[:2]) / 2)
+        for start in reach:
+            for limits in start.values():
+                x = np.clip(p[0], *limits.x_m)
+                y = np.clip(p[1], *limits.y_m)
+                assert np.hypot(p[0] - x, p[1] - y) > radius + 0.13
+
+
+def test_toys_need_their_own_cell_and_a_session_takes_the_one_its_task_names(
+    make_session: Callable[..., Any],
+) -> None:
+    assert load_task("cube_into_box").cell == "standin"
+    assert {load_task(name).cell for name in TOYS} == {"standin_toys"}
+    session = make_session()
+    config = SessionConfig(task="sloth_into_basket", seed=9_000, scan=False, trials=1, rate_hz=0.0)
+    stop_after = 200
+    summary = run_session(
+        session, config, Output(quiet=True), should_stop=lambda: len(session.sent) > stop_after
+    )
+    assert summary["task"] == "sloth_into_basket"
+    parameters = session.of("truth/parameters")
+    assert "stiffness_scale" in parameters[0].data.decode(errors="replace")
+    assert session.control[-1][1]["outcome"]["unit"] == "trial"
+
+
+def test_a_summary_counts_objects_where_they_are_the_unit() -> None:
+    summary = {
+        "cell": "standin",
+        "scan": False,
+        "outcomes": {"without_replanning": {"failure": 2}},
+        "objects": {"without_replanning": {"k": 7, "n": 10}},
+        "stopped": False,
+    }
+    assert "2 trials, 2 failure; 7 of 10 objects" in describe(json.loads(json.dumps(summary)))
+
+
+def test_the_operator_puts_toys_down_a_little_off(
+    toys_cell: CellFile, sloth: Task, make_session: Callable[..., Any]
+) -> None:
+    session = make_session()
+    cell = StandinCell(
+        toys_cell,
+        sloth,
+        nominal_hidden(toys_cell),
+        Streams(session, "standin"),
+        config=CellConfig(),
+        seed=SEED,
+        start_ns=0,
+    )
+    operator = Operator(cell, session, SessionConfig(task=sloth.name, seed=9_000))
+    declared = sloth.draw_start(np.random.default_rng(SEED))
+    for key, T in operator.start_poses(SEED, "without_replanning").items():
+        assert 0 < np.linalg.norm(T[:3, 3] - declared[key][:3, 3]) < 0.01
+
+
+def test_hidden_stiffness_is_drawn_only_where_a_cell_has_it(toys_cell: CellFile) -> None:
+    drawn: HiddenParameters = draw_hidden(toys_cell, SEED)
+    assert drawn.stiffness_scale is not None
+    assert 0.6 <= drawn.stiffness_scale <= 1.6
+    assert "stiffness_scale" in drawn.to_record()
+    assert "stiffness_scale" not in draw_hidden(load_cell("standin"), SEED).to_record()
