@@ -15,8 +15,14 @@ from jaxtyping import Float
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.sources.standin.cell_file import PlannerNoise
-from bridge.sources.standin.kinematics import Kinematics, tool_down, wrap_rad, yaw_of
-from bridge.sources.standin.trajectory import Leg, follow_legs
+from bridge.sources.standin.kinematics import (
+    Kinematics,
+    UnreachablePoseError,
+    tool_down,
+    wrap_rad,
+    yaw_of,
+)
+from bridge.sources.standin.trajectory import Leg, Track, follow_legs
 from bridge.task.plan import Plan, Stage
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME, ROBOT_NAME
 from bridge.task.task_file import ObjectModel, Task
@@ -139,13 +145,14 @@ def plan_pick_and_place(
     container = task.containers[0]
     T_home = kinematics.T_base_tcp(joints_start_rad)
     slots = release_slots(count, task.objects[container])
-    legs_of = {
-        key: _legs(task, key, seen[key], seen[container], errors[index], slots[index])
-        for index, key in enumerate(task.manipulated)
-    }
-    legs = [leg for mine in legs_of.values() for leg in mine]
-    legs.append(Leg(name="home", stage=legs[-1].stage, T_base_tcp=T_home, duration_s=1.4, g=0))
-    tau, bounds = follow_legs(legs, T_home, joints_start_rad, kinematics, max_joint_speed_rad_s)
+    track = Track.at_rest(T_home, joints_start_rad)
+    legs_of: dict[str, list[Leg]] = {}
+    for index, key in enumerate(task.manipulated):
+        choices = _ways(task, key, seen[key], seen[container], errors[index], slots[index])
+        track, legs_of[key] = _first_reachable(track, choices, kinematics, max_joint_speed_rad_s)
+    last = legs_of[task.manipulated[-1]][-1].stage
+    home = Leg(name="home", stage=last, T_base_tcp=T_home, duration_s=1.4, g=0)
+    track = follow_legs(track, [home], kinematics, max_joint_speed_rad_s)
     return Plan(
         id=plan_id,
         parent_id=parent_id,
@@ -162,8 +169,8 @@ def plan_pick_and_place(
         entities={key: _pose_record(T) for key, T in seen.items()},
         keypoints_m=tuple(_point(seen[key][:3, 3]) for key in (*task.manipulated, container)),
         joint_names=ARM_JOINTS,
-        stages=_stages(task, legs_of, bounds, seen),
-        tau=tau,
+        stages=_stages(task, legs_of, track.bounds, seen),
+        tau=track.tau,
     )
 
 
@@ -182,20 +189,51 @@ def release_slots(count: int, container: ObjectModel) -> list[Float[np.ndarray, 
     return slots
 
 
-def _legs(
+def _first_reachable(
+    track: Track,
+    choices: Sequence[list[Leg]],
+    kinematics: Kinematics,
+    max_joint_speed_rad_s: float,
+) -> tuple[Track, list[Leg]]:
+    """Take the first way the arm can follow; the last one's error when there is none."""
+    for legs in choices[:-1]:
+        try:
+            return follow_legs(track, legs, kinematics, max_joint_speed_rad_s), legs
+        except UnreachablePoseError:
+            continue
+    return follow_legs(track, choices[-1], kinematics, max_joint_speed_rad_s), choices[-1]
+
+
+def _ways(
     task: Task,
     object_id: str,
     T_base_object: Float[np.ndarray, "4 4"],
     T_base_container: Float[np.ndarray, "4 4"],
     error: GraspError,
     slot_m: Float[np.ndarray, "2"],
-) -> list[Leg]:
-    model, container = task.objects[object_id], task.objects[task.containers[0]]
+) -> list[list[Leg]]:
+    """The movements for each turn of the wrist that takes the object alike, least turned first."""
     # A cube looks the same after a quarter turn: take the grasp that turns the wrist least.
-    turn = model.grasp_turn_rad
+    turn = task.objects[object_id].grasp_turn_rad
     yaw = yaw_of(T_base_object)
     turns = range(round(2 * np.pi / turn))
-    yaw = min((wrap_rad(yaw + k * turn) for k in turns), key=abs) + error.yaw_rad
+    yaws = sorted((wrap_rad(yaw + k * turn) for k in turns), key=abs)
+    return [
+        _legs(task, object_id, T_base_object, T_base_container, each + error.yaw_rad, error, slot_m)
+        for each in yaws
+    ]
+
+
+def _legs(
+    task: Task,
+    object_id: str,
+    T_base_object: Float[np.ndarray, "4 4"],
+    T_base_container: Float[np.ndarray, "4 4"],
+    yaw: float,
+    error: GraspError,
+    slot_m: Float[np.ndarray, "2"],
+) -> list[Leg]:
+    model, container = task.objects[object_id], task.objects[task.containers[0]]
     p = T_base_object[:3, 3] + np.array([0.0, 0.0, model.grasp_m[2] + error.height_m])
     p[:2] += T_base_object[:2, :2] @ np.array(model.grasp_m[:2])
     R = tool_down(p, yaw)[:3, :3]

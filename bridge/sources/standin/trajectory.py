@@ -1,6 +1,6 @@
 """From tool poses to a timed joint trajectory: straight lines at 20 Hz within the joints' speed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,17 +26,36 @@ class Leg:
     g: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class Track:
+    """What has been planned so far: waypoints, and when each stage begins and ends."""
+
+    tau: tuple[Waypoint, ...]
+    bounds: Mapping[str, tuple[int, int]]
+    T_base_tcp: Float[np.ndarray, "4 4"]
+    """Where the tool is at the end."""
+
+    @staticmethod
+    def at_rest(
+        T_base_tcp: Float[np.ndarray, "4 4"], joints_rad: Float[np.ndarray, "6"]
+    ) -> "Track":
+        """Start with an open gripper."""
+        return Track(
+            tau=(_waypoint(0, T_base_tcp, joints_rad, 0),), bounds={}, T_base_tcp=T_base_tcp
+        )
+
+
 def follow_legs(
-    legs: Sequence[Leg],
-    T_start: Float[np.ndarray, "4 4"],
-    joints_start_rad: Float[np.ndarray, "6"],
-    kinematics: Kinematics,
-    max_joint_speed_rad_s: float,
-) -> tuple[tuple[Waypoint, ...], dict[str, tuple[int, int]]]:
-    """Sample straight lines at 20 Hz with smooth speed, slower where a joint would race."""
-    T_from, joints, t_ns = T_start, joints_start_rad, 0
-    tau = [_waypoint(0, T_start, joints_start_rad, legs[0].g)]
-    bounds: dict[str, tuple[int, int]] = {}
+    before: Track, legs: Sequence[Leg], kinematics: Kinematics, max_joint_speed_rad_s: float
+) -> Track:
+    """Go on along straight lines at 20 Hz with smooth speed, slower where a joint would race.
+
+    Raises:
+        UnreachablePoseError: When the arm cannot follow.
+    """
+    tau, bounds = list(before.tau), dict(before.bounds)
+    T_from, t_ns = before.T_base_tcp, tau[-1].t_ns
+    joints = np.array(tau[-1].joints_rad, dtype=np.float64)
     for leg in legs:
         count = max(round(leg.duration_s / WAYPOINT_S), 1)
         while True:
@@ -52,7 +71,7 @@ def follow_legs(
             tau.append(_waypoint(t_ns, T, row, leg.g))
         bounds[leg.stage] = (bounds.get(leg.stage, (begin_ns, 0))[0], t_ns)
         T_from, joints = leg.T_base_tcp, rows[-1]
-    return tuple(tau), bounds
+    return Track(tau=tuple(tau), bounds=bounds, T_base_tcp=T_from)
 
 
 def _sample_leg(
