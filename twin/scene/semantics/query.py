@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -24,6 +24,7 @@ LOGIT_SCALE = 100.0
 LEXICON = "lexicon"
 
 
+@runtime_checkable
 class TextEncoder(Protocol):
     """Turns texts into vectors comparable with the scene's instance embeddings."""
 
