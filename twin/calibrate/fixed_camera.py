@@ -13,12 +13,9 @@ from bridge.episode.transforms import TransformTree
 from bridge.errors import BridgeError
 from bridge.task.robot import BASE_FRAME
 from twin.robot.model import load_robot
-from twin.robot.posture import Posture, PostureTrack, posture_track
+from twin.robot.posture import Posture, PostureTrack, far_apart, posture_track
 from twin.scene.align.align import AlignConfig, Alignment, RobotNotAlignedError, align_robot
 from twin.scene.align.view import RobotView
-
-MIN_APART_RAD = 0.15
-"""Postures of which no joint differs by more tell nothing new."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +63,8 @@ def find_fixed_camera(
             found=f"camera {camera_id} has no depth image with the robot standing still",
             hint="Stop the robot for half a second at each of several postures while recording.",
         )
-    chosen = spread_postures(seen, max_postures)
+    joints = np.array([item.posture.joints_rad for item in seen])
+    chosen = [seen[index] for index in far_apart(joints, max_postures)]
     views = [view for episode in episodes for view in _load(episode, camera_id, chosen)]
     robot = load_robot(tracks[str(chosen[0].episode.path)].urdf)
     believed = _believed(chosen[0], camera_id)
@@ -85,17 +83,6 @@ def find_fixed_camera(
         T_base_believed=believed,
         episodes=tuple(dict.fromkeys(item.episode.info.id for item in chosen)),
     )
-
-
-def spread_postures(seen: Sequence[_Seen], count: int) -> list[_Seen]:
-    """Choose postures far from each other, farthest first, until none is new."""
-    joints = np.array([item.posture.joints_rad for item in seen])
-    chosen = [0]
-    far = np.abs(joints - joints[0]).max(axis=1)
-    while len(chosen) < count and far.max() > MIN_APART_RAD:
-        chosen.append(int(np.argmax(far)))
-        far = np.minimum(far, np.abs(joints - joints[chosen[-1]]).max(axis=1))
-    return [seen[index] for index in sorted(chosen)]
 
 
 def _still(episode: Episode, camera_id: str, track: PostureTrack) -> Iterator[_Seen]:

@@ -15,6 +15,8 @@ BEFORE_NS, AFTER_NS = 100_000_000, 40_000_000
 STILL_RAD = 0.002
 """A robot whose joints vary less than this from a tenth of a second before to 40 ms after an image
 stands still; camera and joints then need not be synchronised better than that."""
+APART_RAD = 0.15
+"""Postures of which no joint differs by more tell nothing new."""
 MAX_GAP_NS = 500_000_000
 """Joints farther away in time say nothing."""
 
@@ -57,6 +59,16 @@ class PostureTrack:
             return False
         around = self.arm.at(np.array([stamp_ns - BEFORE_NS, stamp_ns, stamp_ns + AFTER_NS]))
         return bool(np.ptp(around, axis=0).max() < STILL_RAD)
+
+
+def far_apart(joints_rad: Float[np.ndarray, "num_postures num_joints"], count: int) -> list[int]:
+    """Choose at most so many postures far from each other, farthest first, until none is new."""
+    chosen = [0]
+    far = np.abs(joints_rad - joints_rad[0]).max(axis=1)
+    while len(chosen) < count and far.max() > APART_RAD:
+        chosen.append(int(np.argmax(far)))
+        far = np.minimum(far, np.abs(joints_rad - joints_rad[chosen[-1]]).max(axis=1))
+    return sorted(chosen)
 
 
 def posture_track(episode: Episode) -> PostureTrack:

@@ -44,6 +44,8 @@ class FrameChoice:
     holdout_ns: frozenset[int]
     """Nothing is learnt from these, the objects' places included."""
     poses: CameraPoses
+    spare_ns: frozenset[int] = frozenset()
+    """Neither chosen nor held out: the background does not need them, the robot may."""
     corrections: Mapping[int, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     """``T_new_old`` in the root frame for frames whose pose was improved, by stamp."""
 
@@ -185,6 +187,7 @@ def _choose(
         train_ns=frozenset(train.tolist()),
         holdout_ns=frozenset(spread(held, holdout_count).tolist()),
         poses=poses,
+        spare_ns=frozenset(np.setdiff1d(rest, train).tolist()),
     )
 
 

@@ -11,7 +11,8 @@ from bridge.terminal import Output
 from twin.scene.frames import FrameChoice, NoFramesError, load
 from twin.scene.moving import MovingVoxels, Witness, choose_witnesses, find_moving
 from twin.scene.points import DepthLimits, FrameSurface, PointSet
-from twin.scene.refine_poses import refine_poses
+from twin.scene.refine_poses import refine_poses, with_corrections
+from twin.scene.robot_stage import MAX_POSTURES, FoundRobot, find_robot, look_closer
 from twin.scene.scan_check import CameraCheck, ScanReport, check_scan
 from twin.scene.settings import RebuildConfig
 from twin.scene.thumb import Thumb, thumb_of
@@ -36,6 +37,7 @@ class Learnt:
     moving: MovingVoxels
     witnesses: list[Witness]
     report: ScanReport
+    robot: FoundRobot
 
 
 def limits_of(config: RebuildConfig) -> DepthLimits:
@@ -58,14 +60,20 @@ def learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output)
     views: list[TrainingView] = []
     owners: list[int] = []
     cameras: list[CameraCheck] = []
+    robot = find_robot(choices, output)
     with output.progress("read frames", total) as advance:
         for index, choice in enumerate(choices):
             thumbs: list[Thumb] = []
             trusted = []
             for frame in load(choice, choice.train_ns):
                 surface = FrameSurface(frame, limits_of(config))
-                points.append(surface.points(_stride(total, frame.depth_m.size)))
-                views.append(training_view(surface))
+                seen = surface.points(_stride(total, frame.depth_m.size))
+                view = training_view(surface)
+                static_points, static_view = robot.frames.take_out(
+                    choice.episode, frame, seen, view
+                )
+                points.append(static_points)
+                views.append(static_view)
                 owners.append(index)
                 thumbs.append(thumb_of(frame, THUMB_PX))
                 trusted.append(float(surface.trusted.mean()))
@@ -74,10 +82,14 @@ def learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output)
     if not views:
         message = "no frame of this run has colour, depth and a pose together. Record it again."
         raise NoFramesError(message)
+    still_stride = _stride(MAX_POSTURES, views[0].full.depth_m.size)
+    look_closer(robot, choices, limits_of(config), still_stride)
     report = check_scan(cameras, config.frames)
     moved = list(choices)
     if config.frames.align_poses:
-        points, views, moved = refine_poses(points, views, choices, owners, output)
+        refined = refine_poses(points, views, output)
+        points, views = refined.points, refined.views
+        moved = with_corrections(choices, owners, views, refined.corrections)
     witnesses = choose_witnesses(views)
     moving = find_moving(points, witnesses)
     static = [moving.drop_from(item) for item in points]
@@ -93,6 +105,7 @@ def learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output)
         moving=moving,
         witnesses=witnesses,
         report=report,
+        robot=robot,
     )
 
 

@@ -5,7 +5,7 @@ sees a held-out frame, and ``scene.json`` is written last: it vouches for all th
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -28,6 +28,7 @@ from twin.scene.parts import TakenApart, episode_of_task, take_apart
 from twin.scene.ply import write_ply
 from twin.scene.raster import RasterConfig, load_native
 from twin.scene.record import Cost, make_record, protocol_of
+from twin.scene.robot_stage import DrivenRobot, write_robot
 from twin.scene.settings import RebuildConfig
 from twin.scene.store import (
     BACKGROUND,
@@ -39,7 +40,7 @@ from twin.scene.store import (
 from twin.scene.view_numbers import summarise_views
 from twin.scene.views import ViewsJob, views_path, write_views
 
-METHOD_VERSION = 8
+METHOD_VERSION = 9
 """Counts changes of method that make older scenes out of date."""
 
 
@@ -92,8 +93,9 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     if apart.remark:
         output.say(apart.remark)
     write_ply(run.scene_dir / BACKGROUND, apart.background)
-    views = _hold_out(run, learnt, fitted, apart, config, clock, output)
-    extras = apart.write(run, learnt.views)
+    links = learnt.robot.frames.links(config.initialise)
+    views = _hold_out(run, learnt, fitted, apart, links, config, clock, output)
+    extras = apart.write(run, learnt.views) | write_robot(run, learnt.robot, links)
     record = make_record(
         key=key,
         scene_hash=background_hash(run),
@@ -130,6 +132,7 @@ def _hold_out(
     learnt: Learnt,
     fitted: FitResult,
     apart: TakenApart,
+    links: Mapping[str, GaussianCloud],
     config: RebuildConfig,
     clock: _Clock,
     output: Output,
@@ -144,6 +147,7 @@ def _hold_out(
         raster=RasterConfig(threads=config.fit.threads),
         protocol=protocol_of(choices, fitted, config, clock.cost()),
         marked=_marked_objects(apart),
+        robot=DrivenRobot(frames=learnt.robot.frames, links=links),
         align=config.frames.align_holdout,
     )
     total = sum(len(choice.holdout_ns) for choice in choices)
@@ -206,6 +210,8 @@ def _already_done(run: RunFolder, key: str) -> dict[str, Any] | None:
         for item in record.get("objects", {}).values()
         for name in item["files"]
     ]
+    links = record.get("robot", {}).get("links", {})
+    needed += [run.scene_dir / item["file"] for item in links.values()]
     whole = all(path.is_file() for path in needed)
     return record if whole and background_hash(run) == record["scene_hash"] else None
 

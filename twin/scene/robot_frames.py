@@ -4,16 +4,14 @@ Pixels that show it are masked, its points go to its links. What it hid in one f
 the frames in which it stood elsewhere; nothing is invented.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from scipy.ndimage import binary_dilation
 
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
 from bridge.episode.streams import RgbdFrame
 from bridge.errors import GstError
 from bridge.geometry import se3
@@ -21,10 +19,11 @@ from bridge.geometry.camera import Camera
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import PostureTrack, posture_track
 from twin.robot.surface import PosedSurface, link_poses, link_surfaces
-from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.gaussians import GaussianCloud, as_float32, concatenate
 from twin.scene.initialise import NoSurfaceError, fuse
+from twin.scene.objects import moved_cloud
 from twin.scene.points import PointSet
-from twin.scene.robot_splats import surface_owners, write_links
+from twin.scene.robot_splats import posed, surface_owners
 from twin.scene.settings import InitialiseConfig
 from twin.scene.training_view import Target, TrainingView
 
@@ -47,8 +46,18 @@ class _Tracked:
 class RobotFrames:
     """Tells robot from background in the frames of some episodes, and collects its surface."""
 
-    def __init__(self, episodes: Sequence[Episode]) -> None:
-        """Read joints and descriptions; an episode without them is passed over, with a remark."""
+    def __init__(
+        self,
+        episodes: Sequence[Episode],
+        T_base_root: Float[np.ndarray, "4 4"] | None = None,
+    ) -> None:
+        """Read joints and descriptions; an episode without them is passed over, with a remark.
+
+        Args:
+            episodes: Whose frames will be given.
+            T_base_root: Where the frames' root lies in the robot's base; None: it is the base.
+        """
+        self.T_base_root = np.eye(4) if T_base_root is None else T_base_root
         self._tracked: dict[str, _Tracked] = {}
         remarks = []
         for episode in episodes:
@@ -71,24 +80,53 @@ class RobotFrames:
 
         The robot's points are kept for its links when it stood still.
         """
-        tracked = self._tracked.get(str(episode.path))
-        if tracked is None or not tracked.track.covers(frame.stamp_ns):
+        surface = self._surface(episode, frame.stamp_ns)
+        if surface is None:
             return points, view
-        posture = tracked.track.at(frame.stamp_ns)
-        surface = PosedSurface(tracked.robot, posture)
+        owner = self._keep(episode, frame.stamp_ns, surface, points)
+        masked = _masked(view, surface, self.T_base_root @ view.T_base_color)
+        return _taken(points, owner < 0), masked
+
+    def collect(self, episode: Episode, stamp_ns: int, points: PointSet) -> None:
+        """Keep the robot's points of a frame that the background does not need."""
+        surface = self._surface(episode, stamp_ns)
+        if surface is not None:
+            self._keep(episode, stamp_ns, surface, points)
+
+    def still_postures(
+        self, episode: Episode, stamps_ns: Iterable[int]
+    ) -> dict[int, Float[np.ndarray, " num_joints"]]:
+        """Joints at those of some instants at which the robot of an episode stood still [rad]."""
+        tracked = self._tracked.get(str(episode.path))
+        if tracked is None:
+            return {}
+        track = tracked.track
+        return {t: track.at(t).joints_rad for t in sorted(stamps_ns) if track.is_still(t)}
+
+    def _surface(self, episode: Episode, stamp_ns: int) -> PosedSurface | None:
+        tracked = self._tracked.get(str(episode.path))
+        if tracked is None or not tracked.track.covers(stamp_ns):
+            return None
+        return PosedSurface(tracked.robot, tracked.track.at(stamp_ns))
+
+    def _keep(
+        self, episode: Episode, stamp_ns: int, surface: PosedSurface, points: PointSet
+    ) -> Int64[np.ndarray, " num_points"]:
+        """Keep the robot's points if it stood still; return which shape owns each point, or -1."""
+        tracked, T = self._tracked[str(episode.path)], self.T_base_root
         owner = surface_owners(
             tracked.robot,
             surface,
-            points.p_m.astype(np.float64),
-            points.normals.astype(np.float64),
+            se3.apply(T, points.p_m.astype(np.float64)),
+            points.normals.astype(np.float64) @ T[:3, :3].T,
         )
-        if tracked.track.is_still(frame.stamp_ns):
-            poses = link_poses(tracked.robot, posture)
+        if tracked.track.is_still(stamp_ns):
+            poses = link_poses(tracked.robot, tracked.track.at(stamp_ns))
             for link in {surface.links[index] for index in np.unique(owner[owner >= 0])}:
                 mine = np.isin(owner, [i for i, name in enumerate(surface.links) if name == link])
-                moved = _moved(_taken(points, mine), se3.invert(poses[link]))
+                moved = _moved(_taken(points, mine), se3.invert(poses[link]) @ T)
                 self._points.setdefault(link, []).append(moved)
-        return _taken(points, owner < 0), _masked(view, surface)
+        return owner
 
     def links(self, config: InitialiseConfig) -> dict[str, GaussianCloud]:
         """Fuse what was collected of each link, in the link's frame."""
@@ -105,10 +143,27 @@ class RobotFrames:
                 continue
         return clouds
 
-    def write(self, run: RunFolder, config: InitialiseConfig) -> dict[str, Any]:
-        """Write ``robot/<link>.ply`` and return what ``scene.json`` says about the robot."""
-        clouds = self.links(config)
-        return {"robot": {"remark": self.remark, "links": write_links(run, clouds)}}
+    def joined(
+        self,
+        cloud: GaussianCloud,
+        links: Mapping[str, GaussianCloud],
+        episode: Episode,
+        stamp_ns: int,
+    ) -> GaussianCloud:
+        """Put the robot into a scene as it stood at an instant of an episode.
+
+        Args:
+            cloud: The scene, in the frames' root.
+            links: Per link its Gaussians, in the link's frame.
+            episode: Whose joints count.
+            stamp_ns: When.
+        """
+        tracked = self._tracked.get(str(episode.path))
+        if tracked is None or not links or not tracked.track.covers(stamp_ns):
+            return cloud
+        posture = tracked.track.at(stamp_ns)
+        robot = posed(links, posture.joints_rad, tracked.track.urdf, width_m=posture.width_m)
+        return concatenate([cloud, moved_cloud(robot, se3.invert(self.T_base_root))])
 
 
 def _taken(points: PointSet, mask: Bool[np.ndarray, " num_points"]) -> PointSet:
@@ -128,10 +183,12 @@ def _moved(points: PointSet, T_link_base: Float[np.ndarray, "4 4"]) -> PointSet:
     )
 
 
-def _masked(view: TrainingView, surface: PosedSurface) -> TrainingView:
+def _masked(
+    view: TrainingView, surface: PosedSurface, T_base_camera: Float[np.ndarray, "4 4"]
+) -> TrainingView:
     """Mark the pixels that show the robot as not static, at both sizes."""
     half, full = view.half, view.full
-    hit = robot_mask(surface, half.camera, view.T_base_color, half.depth_m)
+    hit = robot_mask(surface, half.camera, T_base_camera, half.depth_m)
     if not hit.any():
         return view
     height, width = full.depth_m.shape

@@ -31,6 +31,7 @@ from twin.scene.gaussians import GaussianCloud
 from twin.scene.moving import Witness, find_moving
 from twin.scene.points import DepthLimits, FrameSurface
 from twin.scene.raster import RasterConfig, Rasteriser, View
+from twin.scene.robot_stage import DrivenRobot
 from twin.scene.training_view import TrainingView, training_view
 from twin.scene.view_numbers import ViewNumbers, rate_view
 
@@ -56,6 +57,8 @@ class ViewsJob:
     """How the scene was made: kept with the images, for whoever rates them."""
     marked: GaussianCloud | None = None
     """The same scene with objects white and everything else black; None without objects."""
+    robot: DrivenRobot | None = None
+    """Drawn where it stood at each frame; the cloud holds only what is static."""
     align: bool = False
     """Also draw each view where it fits the recorded image best."""
 
@@ -125,6 +128,9 @@ def write_views(
 def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Iterator[HeldOut]:
     for frame in load(choice, choice.holdout_ns):
         camera, T = frame.color_camera, frame.T_base_color
+        cloud = job.cloud
+        if job.robot is not None:
+            cloud = job.robot.joined(cloud, choice.episode, frame.stamp_ns)
         recorded = _recorded(frame, job)
         masks = {"static": recorded.full.static_mask}
         if job.marked is not None:
@@ -132,13 +138,13 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
             masks["objects"] = planes[0] > OBJECT_SHARE
         aligned = None
         if job.align:
-            fitted = align_view(job.cloud, recorded.half, recorded.full, T, rasteriser)
+            fitted = align_view(cloud, recorded.half, recorded.full, T, rasteriser)
             aligned = _u8(np.moveaxis(fitted.image, 0, -1))
         yield HeldOut(
             choice=choice,
             frame=frame,
             recorded=recorded,
-            view=rasteriser.view(job.cloud, camera, T),
+            view=rasteriser.view(cloud, camera, T),
             masks=masks,
             aligned_u8=aligned,
         )
