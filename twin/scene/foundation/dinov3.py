@@ -84,7 +84,8 @@ class DinoFeatures:
             )
             raise UsageError(message)
         step = self.cell_px if stride is None else stride
-        rows, columns = (-(-side // step) if step > 0 else 0 for side in (height, width))
+        fits = 0 < step <= min(height, width)
+        rows, columns = (-(-side // step) if fits else 0 for side in (height, width))
         if not 0 < rows * columns <= MAX_CELLS:
             message = (
                 f"an image of {width} x {height} pixels with stride {step} gives "

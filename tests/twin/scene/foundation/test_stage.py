@@ -1,0 +1,215 @@
+"""What a rebuild asks the models, on a table with a red and a blue heap drawn by ourselves."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.episode.streams import RgbdFrame
+from bridge.errors import UsageError
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.task.task_file import load_task
+from twin.scene.foundation.clip import ClipEmbedder
+from twin.scene.foundation.stage import (
+    ask_models,
+    embed_things,
+    model_hashes,
+    prompts_of,
+    spread,
+    thing_vectors,
+    viewpoint_of,
+)
+from twin.scene.foundation.weights import WeightsError
+from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.raster import Rasteriser
+from twin.scene.semantics.features import load_features
+from twin.scene.semantics.query import query
+from twin.scene.semantics.result import Instance, SemanticScene
+from twin.scene.settings import ModelConfig
+
+CAMERA = Camera(width=96, height=80, fx=90.0, fy=90.0, cx=48.0, cy=40.0)
+COLOURS = {1: (0.9, 0.1, 0.1), 2: (0.1, 0.1, 0.9)}
+
+
+def heaps() -> tuple[GaussianCloud, np.ndarray]:
+    """A grey table and two heaps on it, with the label of each Gaussian."""
+    rng = np.random.default_rng(0)
+    table = np.stack(np.meshgrid(np.arange(-0.3, 0.3, 0.02), np.arange(-0.3, 0.3, 0.02)), -1)
+    flat = np.concatenate([table.reshape(-1, 2), np.zeros((table[..., 0].size, 1))], axis=1)
+    red = rng.uniform([-0.14, -0.05, 0.0], [-0.04, 0.05, 0.08], size=(300, 3))
+    blue = rng.uniform([0.05, -0.04, 0.0], [0.13, 0.04, 0.06], size=(300, 3))
+    labels = np.repeat(np.array([0, 1, 2], dtype=np.uint16), [len(flat), 300, 300])
+    means = np.concatenate([flat, red, blue])
+    colors = np.array([(0.5, 0.5, 0.5), COLOURS[1], COLOURS[2]])[labels]
+    sigma = np.where(labels == 0, 0.015, 0.008)
+    cloud = GaussianCloud(
+        means_m=as_float32(means),
+        quats_wxyz=as_float32(np.tile([1.0, 0, 0, 0], (len(means), 1))),
+        scales_log=as_float32(np.log(np.repeat(sigma[:, None], 3, axis=1))),
+        opacities_logit=as_float32(np.full(len(means), 4.0)),
+        colors=as_float32(colors),
+    )
+    return cloud, labels
+
+
+def things(labels: np.ndarray) -> SemanticScene:
+    def thing(number: int, label: str) -> Instance:
+        return Instance(
+            id=number,
+            label=label,
+            mask=labels == number,
+            support=3,
+            seen=3,
+            score=1.0,
+            source="test",
+            color_srgb=(0, 0, 0),
+            T_base_instance=np.eye(4),
+            size_m=(0.1, 0.1, 0.08),
+        )
+
+    instances = (thing(1, "red heap"), thing(2, "blue heap"), thing(9, "hidden thing"))
+    return SemanticScene(instances=instances, labels=labels, source="test")
+
+
+def frames_of(cloud: GaussianCloud, count: int = 3) -> list[RgbdFrame]:
+    frames = []
+    for index in range(count):
+        angle = 0.5 * index - 0.5
+        eye = np.array([0.5 * np.sin(angle), -0.5 * np.cos(angle), 0.4])
+        T = se3.look_at(eye, np.array([0.0, 0.0, 0.02]), np.array([0.0, 0.0, 1.0]))
+        view = Rasteriser().view(cloud, CAMERA, T)
+        frames.append(
+            RgbdFrame(
+                camera_id="wrist",
+                stamp_ns=index * 1000,
+                image_u8=view.image_u8(),
+                depth_m=view.depth_m.astype(np.float64),
+                color_camera=CAMERA,
+                depth_camera=CAMERA,
+                T_base_color=T,
+                T_base_depth=T,
+            )
+        )
+    return frames
+
+
+class MeanColour(ClipEmbedder):
+    """Stands in for CLIP: the vector of a piece is its mean colour."""
+
+    source = "mean colour"
+    num_channels = 3
+
+    def __init__(self) -> None:  # noqa: D107 (loads nothing)
+        pass
+
+    def embed_masked(self, images_u8: Any, masks: Any) -> np.ndarray:
+        means = [image[mask].mean(axis=0) for image, mask in zip(images_u8, masks, strict=True)]
+        vectors = np.array(means)
+        return as_float32(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def test_things_get_vectors_of_what_the_frames_show_of_them() -> None:
+    cloud, labels = heaps()
+    embedder = MeanColour()
+    vectors, shown = thing_vectors(embedder, things(labels), cloud, frames_of(cloud), Rasteriser())
+    assert shown == [3, 3, 0]
+    for row, number in enumerate((1, 2)):
+        wanted = np.array(COLOURS[number]) / np.linalg.norm(COLOURS[number])
+        assert vectors[row] @ wanted > 0.99
+        assert np.linalg.norm(vectors[row]) == pytest.approx(1.0, abs=1e-5)
+    assert not vectors[2].any()
+    many, shown = thing_vectors(embedder, things(labels), cloud, frames_of(cloud, 8), Rasteriser())
+    assert shown[:2] == [5, 5]  # only those that show most
+    np.testing.assert_allclose(many[:2], vectors[:2], atol=0.02)
+
+
+def test_prompts_are_those_given_or_the_names_of_the_task_s_objects() -> None:
+    ducks = load_task("five_ducks_into_basket")
+    assert prompts_of(ModelConfig(), ducks)[:1] == ["duck"]
+    assert len(prompts_of(ModelConfig(), ducks)) == len(set(prompts_of(ModelConfig(), ducks)))
+    assert prompts_of(ModelConfig(prompt=("red cube", "box")), ducks) == ["red cube", "box"]
+    with pytest.raises(UsageError, match="--prompt"):
+        prompts_of(ModelConfig(), None)
+
+
+def test_frames_are_spread_evenly() -> None:
+    assert spread(list(range(100)), 5) == [0, 25, 50, 74, 99]
+    assert spread([7, 8], 5) == [7, 8]
+    assert spread([], 5) == []
+    assert spread([3], 1) == [3]
+
+
+def test_bad_options_are_refused_before_anything_slow(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--segmenter 'sam2:x'"):
+        model_hashes(ModelConfig(segmenter="sam2:x"))
+    with pytest.raises(WeightsError, match="no such folder"):
+        model_hashes(ModelConfig(clip=tmp_path / "nothing"))
+    with pytest.raises(UsageError, match="--model-frames 0"):
+        ModelConfig(model_frames=0)
+    with pytest.raises(UsageError, match="--feature-stride 0"):
+        ModelConfig(feature_stride=0)
+    assert model_hashes(ModelConfig()) == {}
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Callable[[str], Path]:
+    pytest.importorskip("transformers", reason="the extra [foundation] is not installed")
+    import tiny_models
+
+    def folder(name: str) -> Path:
+        getattr(tiny_models, f"save_{name}")(tmp_path / name)
+        return tmp_path / name
+
+    return folder
+
+
+@pytest.mark.slow
+def test_all_three_models_are_asked_and_what_they_say_is_kept(
+    saved: Callable[[str], Path], tmp_path: Path
+) -> None:
+    config = ModelConfig(
+        segmenter=f"sam3:{saved('sam3')}",
+        features=f"dinov3:{saved('dino_vit')}",
+        feature_channels=4,
+        clip=saved("clip"),
+        device="cpu",
+    )
+    hashes = model_hashes(config)
+    assert sorted(hashes) == ["clip", "features", "segmenter"]
+    assert len(set(hashes.values())) == 3
+    cloud, labels = heaps()
+    frames, seen = frames_of(cloud), []
+    task = load_task("five_ducks_into_basket")
+    found = ask_models(config, frames, cloud, task, advance=seen.append)
+    assert seen == [1, 2, 3, 4, 5, 6]
+    assert [masks.stamp_ns for _, masks in found.masks] == [0, 1000, 2000]
+    np.testing.assert_array_equal(
+        found.masks[1][0].T_base_camera, viewpoint_of(frames[1]).T_base_camera
+    )
+    assert found.features is not None
+    assert found.features.features.shape == (len(cloud), 4)
+    assert found.features.weight[labels > 0].max() > 0
+    scene = things(labels)
+    record = embed_things(tmp_path, scene, cloud, frames, found.features, config)
+    assert record["never_shown"] == ["hidden thing"]
+    again = load_features(tmp_path / "features.npz", len(cloud))
+    assert again.instance_ids.tolist() == [1, 2, 9]
+    assert again.instance_embeddings.shape == (3, 16)
+    assert again.source == "DINOv3, CLIP"
+    answer = query(
+        scene,
+        "red duck",
+        embeddings=again.instance_embeddings,
+        encoder=ClipEmbedder.load(saved("clip")),
+    )
+    assert answer.source == "CLIP"
+    assert all(0.0 <= value <= 1.0 for value in answer.objects.values())
+    alone = embed_things(tmp_path, scene, cloud, frames, None, config)
+    assert alone["source"] == "CLIP"
+    assert load_features(tmp_path / "features.npz", len(cloud)).features.shape == (len(cloud), 0)
+    with pytest.raises(UsageError, match="--clip FOLDER"):
+        embed_things(tmp_path, scene, cloud, frames, None, replace(config, clip=None))
