@@ -5,7 +5,7 @@ the same surface the depths must be equal; with a pose read in the wrong convent
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -23,6 +23,8 @@ STILL_AGREEMENT = 0.7
 GOOD = 0.5
 """With this share of the overlap agreeing, poses and depth belong together."""
 CLEARLY_BETTER = 0.2
+SHIFT_MATTERS = 0.05
+"""A unit under which cameras move less must fit better than cameras that only turn."""
 MIN_OVERLAP = 0.05
 """With less, depth says nothing about the poses."""
 SOLID_OVERLAP = 0.2
@@ -104,7 +106,8 @@ class PoseReport:
         if self.better is not None and self.better_agreement is not None:
             return (
                 f"only {100 * (self.agreement or 0.0):.0f} % of the depth agrees between views, "
-                f"but {100 * self.better_agreement:.0f} % would under another reading: {self.better.describe()}"
+                f"but {100 * self.better_agreement:.0f} % would under another reading: "
+                f"{self.better.describe()}"
             )
         if self.agreement is not None and not self.fits:
             return (
@@ -135,6 +138,10 @@ def check_poses(thumbs: Sequence[Thumb]) -> PoseReport:
     best, score = _best(pairs)
     if score < GOOD or score < (recorded if overlap >= MIN_OVERLAP else 0.0) + CLEARLY_BETTER:
         return plain
+    if best.depth_scale > 1.0:
+        turned_only, _ = _score(pairs, replace(best, depth_scale=1e9))
+        if score < turned_only + SHIFT_MATTERS:
+            return plain
     return PoseReport(
         num_pairs=len(pairs),
         agreement=recorded,

@@ -37,8 +37,8 @@ DEPTH_SIGMA_M = 0.004
 """Noise of one depth measurement, and ..."""
 INDEPENDENT = 0.02
 """... the share of measurements that say something new: neighbours err together."""
-CELL_PX = 4
-"""Model points are looked up in cells of this many half-size pixels."""
+COLUMNS = 80
+"""Model points are looked up in a grid of about this many cells across the image."""
 MIN_POINTS = 200
 
 
@@ -50,24 +50,25 @@ class Surface:
     normals: Float[np.ndarray, "num_points 3"]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Refined:
+    """Training frames under better poses."""
+
+    points: list[PointSet]
+    views: list[TrainingView]
+    corrections: list[Float[np.ndarray, "4 4"]]
+    """``T_new_old`` of each view in the root frame."""
+
+
 def refine_poses(
-    points: Sequence[PointSet],
-    views: Sequence[TrainingView],
-    choices: Sequence[FrameChoice],
-    owners: Sequence[int],
-    output: Output,
-) -> tuple[list[PointSet], list[TrainingView], list[FrameChoice]]:
+    points: Sequence[PointSet], views: Sequence[TrainingView], output: Output
+) -> Refined:
     """Improve the poses of training views by their depth; held-out frames keep theirs.
 
     Args:
         points: Surface points of each view.
         views: Training views, in the order of ``points``.
-        choices: Where the views come from.
-        owners: Index of each view's choice.
         output: Told how far the cameras moved.
-
-    Returns:
-        Points and views under the new poses, and choices whose ``corrections`` say the same.
     """
     corrections = [np.eye(4) for _ in views]
     with output.progress("align poses", ROUNDS * len(views)) as advance:
@@ -88,12 +89,27 @@ def refine_poses(
         f"poses aligned by depth: cameras moved by {1e3 * np.mean(shifts):.1f} mm and "
         f"{np.degrees(np.mean(turns)):.2f} degrees on average"
     )
-    new_points = [_moved_points(p, T) for p, T in zip(points, corrections, strict=True)]
-    new_views = [
-        replace(view, T_base_color=T @ view.T_base_color)
-        for view, T in zip(views, corrections, strict=True)
-    ]
-    return new_points, new_views, _with_corrections(choices, owners, views, corrections)
+    return Refined(
+        points=[_moved_points(p, T) for p, T in zip(points, corrections, strict=True)],
+        views=[
+            replace(view, T_base_color=T @ view.T_base_color)
+            for view, T in zip(views, corrections, strict=True)
+        ],
+        corrections=corrections,
+    )
+
+
+def with_corrections(
+    choices: Sequence[FrameChoice],
+    owners: Sequence[int],
+    views: Sequence[TrainingView],
+    corrections: Sequence[np.ndarray],
+) -> list[FrameChoice]:
+    """Write the corrections of views into the choices they come from, for later readers."""
+    found: list[dict[int, np.ndarray]] = [{} for _ in choices]
+    for owner, view, T in zip(owners, views, corrections, strict=True):
+        found[owner][view.stamp_ns] = T
+    return [replace(c, corrections=mine) for c, mine in zip(choices, found, strict=True)]
 
 
 def surface_of(cloud: GaussianCloud) -> Surface:
@@ -162,11 +178,12 @@ class _Lookup:
     def __init__(self, model: Surface, camera: Camera, T_base_camera: np.ndarray) -> None:
         self._camera = camera
         self._T_camera_base = se3.invert(T_base_camera)
-        self._columns = camera.width // CELL_PX + 1
+        self._cell_px = max(1, round(camera.width / COLUMNS))
+        self._columns = camera.width // self._cell_px + 1
         cell, z, inside = self._cells(model.p_m)
         ids = np.flatnonzero(inside)
         order = ids[np.lexsort((-z[ids],))]  # the nearest is written last and stays
-        self._nearest = np.full(self._columns * (camera.height // CELL_PX + 1), -1)
+        self._nearest = np.full(self._columns * (camera.height // self._cell_px + 1), -1)
         self._nearest[cell[order]] = order
 
     def nearest(self, p_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -181,8 +198,8 @@ class _Lookup:
         u = camera.fx * p[:, 0] / z + camera.cx
         v = camera.fy * p[:, 1] / z + camera.cy
         inside = (p[:, 2] > 0.05) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        row = np.where(inside, v, 0.0).astype(np.int64) // CELL_PX
-        column = np.where(inside, u, 0.0).astype(np.int64) // CELL_PX
+        row = np.where(inside, v, 0.0).astype(np.int64) // self._cell_px
+        column = np.where(inside, u, 0.0).astype(np.int64) // self._cell_px
         return row * self._columns + column, p[:, 2], inside
 
 
@@ -236,15 +253,3 @@ def _moved_points(points: PointSet, T: np.ndarray) -> PointSet:
 
 def _float32(values: np.ndarray) -> Float32[np.ndarray, "num_points 3"]:
     return np.ascontiguousarray(values, dtype=np.float32)
-
-
-def _with_corrections(
-    choices: Sequence[FrameChoice],
-    owners: Sequence[int],
-    views: Sequence[TrainingView],
-    corrections: Sequence[np.ndarray],
-) -> list[FrameChoice]:
-    found: list[dict[int, np.ndarray]] = [{} for _ in choices]
-    for owner, view, T in zip(owners, views, corrections, strict=True):
-        found[owner][view.stamp_ns] = T
-    return [replace(c, corrections=mine) for c, mine in zip(choices, found, strict=True)]

@@ -9,8 +9,8 @@ from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 
-TOLERANCE_M = 0.01
-TOLERANCE_FRACTION = 0.02
+TOLERANCE_M = 0.004
+TOLERANCE_FRACTION = 0.025
 """Depths that differ by less than both together agree."""
 
 
