@@ -14,6 +14,14 @@ LEVELS = tuple(np.arange(0.97, 0.5, -0.03))
 """Thickness, as a share of the largest, at which thick places are told apart."""
 MIN_PROMINENCE = 1.06
 """A thick place counts when it is this much thicker than the neck to the next."""
+LOW_FRACTION = 0.35
+"""Of the whole height: what sticks out of a head below that is an arm before it."""
+MAX_ATTACHED = 0.04
+"""Share of the whole that may stick out of a head: nose and ears, not a pair of legs."""
+MIN_CORE = 0.3
+"""Thickness of a thick place, as a share of the largest."""
+CUTS = (0.0, 0.3, 0.45, 0.6)
+"""Heights above which thick places are looked for, as shares of the whole."""
 MIN_PIECE = 0.008
 """What sticks out has at least this share of the solid's cells."""
 
@@ -66,30 +74,26 @@ def _label_cells(
     limb_ratio: float,
 ) -> tuple[Int[np.ndarray, "num_x num_y num_z"], list[np.ndarray]]:
     """Part of each solid cell, and the cells of each limb."""
-    # Distances on a grid come in steps; without smoothing every step would be a thick place.
-    smooth = ndimage.gaussian_filter(thickness, 0.8) * solid
+    smooth = _smooth(thickness)
     most = float(smooth.max())
     ball = limb_ratio * most
     thick = solid & _grown(smooth > ball, ball)
-    cores = find_cores(smooth)
-    owner = _nearest_core(cores, thick)
     pieces = _pieces(solid & ~thick, int(solid.sum()))
-    touches = [_touched(piece, owner, len(cores)) for piece in pieces]
     parts = np.where(solid, BODY, 0)
-    if len(cores) > 1:
-        head = _head_core(cores, owner, pieces, touches)
+    owner, touches, head = _find_head(solid, thick, pieces, most)
+    if head >= 0:
         parts[owner == head + 1] = HEAD
     elif pieces:
         head_piece = max(range(len(pieces)), key=lambda k: _headness(pieces[k], thickness))
         parts[pieces[head_piece]] = HEAD
         pieces = [piece for k, piece in enumerate(pieces) if k != head_piece]
-        touches = touches[: len(pieces)]  # one core: all touch it
-        head = -1
-    else:
-        head = -1
+        touches = [0] * len(pieces)
     limbs: list[np.ndarray] = []
+    low = MARGIN_CELLS + LOW_FRACTION * (
+        int(np.flatnonzero(solid.any(axis=(0, 1))).max()) - MARGIN_CELLS
+    )
     for piece, touched in zip(pieces, touches, strict=True):
-        if touched == head:
+        if touched == head and float(np.nonzero(piece)[2].mean()) > low:
             parts[piece] = HEAD
         else:
             parts[piece] = LIMB
@@ -98,18 +102,58 @@ def _label_cells(
 
 
 def thickness_of(
-    solid: Bool[np.ndarray, "num_x num_y num_z"],
+    solid: Bool[np.ndarray, "num_x num_y num_z"], level: int = MARGIN_CELLS
 ) -> Float[np.ndarray, "num_x num_y num_z"]:
-    """Distance to the outside, in cells; the plane is no outside, but a mirror.
+    """Distance to the outside, in cells; the plane (or a higher level) is a mirror.
 
-    Otherwise a body that rests on the plane would have thin edges all around its foot.
+    Otherwise a body that rests on the plane would have thin edges all around its foot. Below the
+    level it is zero.
     """
-    above = solid[:, :, MARGIN_CELLS:]
+    above = solid[:, :, level:]
     mirrored = np.concatenate([np.flip(above, axis=2), above], axis=2)
     distance = np.zeros(solid.shape)
-    num = above.shape[2]
-    distance[:, :, MARGIN_CELLS:] = ndimage.distance_transform_edt(mirrored)[:, :, num:]
+    distance[:, :, level:] = ndimage.distance_transform_edt(mirrored)[:, :, above.shape[2] :]
     return distance
+
+
+def _smooth(thickness: np.ndarray) -> np.ndarray:
+    """Distances on a grid come in steps; as they are every step would be a thick place."""
+    return np.asarray(ndimage.gaussian_filter(thickness, 0.8) * (thickness > 0))
+
+
+def _find_head(
+    solid: np.ndarray, thick: np.ndarray, pieces: list[np.ndarray], most: float
+) -> tuple[np.ndarray, list[int], int]:
+    """Owner of each thick cell, the core each piece touches, and which core is the head (or -1).
+
+    Near the plane a chin and two arms fill the gap that is a clear neck from above. So where the
+    best head has much attached to it, thick places are looked for again above some height; if
+    there are more of them, the highest is the head.
+    """
+    found: list[tuple[np.ndarray, list[int], int]] = []
+    num_cores = 0
+    top = int(np.flatnonzero(solid.any(axis=(0, 1))).max())
+    for fraction in CUTS:
+        smooth = _smooth(thickness_of(solid, MARGIN_CELLS + int(fraction * (top - MARGIN_CELLS))))
+        cores = [
+            core
+            for core in find_cores(smooth)
+            if float(smooth[core.region].max()) > MIN_CORE * most
+        ]
+        owner = _nearest_core(cores, thick)
+        touches = [_touched(piece, owner, len(cores)) for piece in pieces]
+        if len(cores) < 2 and not found:
+            return owner, touches, -1
+        if found and len(cores) > num_cores:
+            heights = [int(np.nonzero(core.region)[2].max()) for core in cores]
+            return owner, touches, int(np.argmax(heights))
+        if not found:
+            num_cores, head = len(cores), _head_core(cores, owner, pieces, touches)
+            found.append((owner, touches, head))
+            attached = [piece.sum() for piece, k in zip(pieces, touches, strict=True) if k == head]
+            if sum(attached) < MAX_ATTACHED * solid.sum():
+                break
+    return found[0]
 
 
 def _grown(core: np.ndarray, radius: float) -> np.ndarray:
