@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bridge.episode.run import RunFolder
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
@@ -19,6 +20,8 @@ from twin.scene.backend import open_rasteriser
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32
 from twin.scene.raster import RasterConfig, Rasteriser
 from twin.scene.raster_cuda import CudaMissingError, CudaRasteriser
+from twin.scene.render import render
+from twin.scene.settings import RenderConfig
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.parity
@@ -193,12 +196,14 @@ def test_the_configuration_chooses_the_backend(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_without_a_device_or_without_gsplat_one_sentence_says_so(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(CudaMissingError, match=r"needs an NVIDIA GPU.*robot-gst\[gpu\]") as caught:
         open_rasteriser(RasterConfig(backend="cuda"))
     assert isinstance(caught.value, MissingDependencyError)
+    with pytest.raises(CudaMissingError, match="Use the backend cpu"):
+        render(RunFolder.create(tmp_path / "run"), RenderConfig(backend="cuda"))
     monkeypatch.setitem(sys.modules, "gsplat", None)  # importing it now fails
     with pytest.raises(MissingDependencyError, match=r"gsplat is not installed.*\[gpu\]"):
         CudaRasteriser(device="cpu")

@@ -11,8 +11,9 @@ from bridge.episode.run import RunFolder
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from twin.scene.backend import open_rasteriser
 from twin.scene.parts import put_together, read_objects
-from twin.scene.raster import Rasteriser
+from twin.scene.raster import RasterConfig
 from twin.scene.settings import RenderConfig
 from twin.scene.store import Scene, read_scene
 from twin.scene.views import encode_png
@@ -26,13 +27,15 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
 
     Raises:
         UsageError: When the episode or camera is unknown; lists those that exist.
+        MissingDependencyError: When the backend cuda was asked for and cannot run here.
     """
+    rasteriser = open_rasteriser(RasterConfig(backend=config.backend))
     scene = read_scene(run)
     episode = _episode(run, scene, config.episode)
     camera_id = _camera_id(episode, config.camera)
     camera, T_base_camera = _view_of(episode, camera_id, config)
     cloud = put_together(scene.background, read_objects(run, scene.record))
-    view = Rasteriser().view(cloud, camera, T_base_camera)
+    view = rasteriser.view(cloud, camera, T_base_camera)
     path = config.out or run.results_dir / "render.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encode_png(view.image_u8()))

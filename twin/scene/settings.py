@@ -232,5 +232,7 @@ class RenderConfig:
     """Look at this point, in metres in the scene's frame."""
     depth: bool = False
     """Write a second image with the depth, in millimetres."""
+    backend: Literal["auto", "cpu", "cuda"] = "cpu"
+    """What draws: our own code, or gsplat on a CUDA device; auto takes a GPU if there is one."""
     out: Path | None = None
     """File to write; default: RUN/results/render.png."""
