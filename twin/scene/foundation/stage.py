@@ -1,7 +1,7 @@
 """What ``rebuild`` asks the models: masks and features of training frames, vectors of things."""
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from jaxtyping import Float32
 from bridge.episode.streams import RgbdFrame
 from bridge.errors import UsageError
 from bridge.task.task_file import Task
+from bridge.terminal import Advance
 from twin.scene.foundation import clip, dinov3, sam3
 from twin.scene.foundation.clip import ClipEmbedder
 from twin.scene.foundation.loading import Placement
@@ -105,7 +106,7 @@ def ask_models(
     task: Task | None,
     *,
     threads: int = 0,
-    advance: Callable[[int], object] = lambda done: None,
+    advance: Advance = lambda done, note: None,
 ) -> ModelFindings:
     """Run segmenter and feature model over frames, one model in memory at a time.
 
@@ -127,7 +128,7 @@ def ask_models(
         segmenter = open_segmenter(config.segmenter, placement)
         for done, item in enumerate(_segmented(segmenter, frames, prompts_of(config, task)), 1):
             masks.append(item)
-            advance(done)
+            advance(done, segmenter.source)
         del segmenter
     features = None
     if config.features and frames:
@@ -135,7 +136,7 @@ def ask_models(
         maps = []
         for done, frame in enumerate(frames, 1):
             maps += source.features([frame.image_u8], stride=config.feature_stride)
-            advance(len(masks) + done)
+            advance(len(masks) + done, source.source)
         basis = fit_basis(maps, config.feature_channels)
         pairs = zip((viewpoint_of(frame) for frame in frames), maps, strict=True)
         rasteriser = Rasteriser(RasterConfig(threads=threads))

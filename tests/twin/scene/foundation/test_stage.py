@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bridge.episode.run import RunFolder
 from bridge.episode.streams import RgbdFrame
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.task_file import load_task
+from bridge.terminal import Output
 from twin.scene.foundation.clip import ClipEmbedder
+from twin.scene.foundation.consult import consult, training_frames
 from twin.scene.foundation.stage import (
     ask_models,
     embed_things,
@@ -24,12 +27,13 @@ from twin.scene.foundation.stage import (
     viewpoint_of,
 )
 from twin.scene.foundation.weights import WeightsError
+from twin.scene.frames import choose_frames, find_sources
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster import Rasteriser
 from twin.scene.semantics.features import load_features
 from twin.scene.semantics.query import query
 from twin.scene.semantics.result import Instance, SemanticScene
-from twin.scene.settings import ModelConfig
+from twin.scene.settings import FrameConfig, ModelConfig
 
 CAMERA = Camera(width=96, height=80, fx=90.0, fy=90.0, cx=48.0, cy=40.0)
 COLOURS = {1: (0.9, 0.1, 0.1), 2: (0.1, 0.1, 0.9)}
@@ -184,7 +188,7 @@ def test_all_three_models_are_asked_and_what_they_say_is_kept(
     cloud, labels = heaps()
     frames, seen = frames_of(cloud), []
     task = load_task("five_ducks_into_basket")
-    found = ask_models(config, frames, cloud, task, advance=seen.append)
+    found = ask_models(config, frames, cloud, task, advance=lambda done, _: seen.append(done))
     assert seen == [1, 2, 3, 4, 5, 6]
     assert [masks.stamp_ns for _, masks in found.masks] == [0, 1000, 2000]
     np.testing.assert_array_equal(
@@ -213,3 +217,25 @@ def test_all_three_models_are_asked_and_what_they_say_is_kept(
     assert load_features(tmp_path / "features.npz", len(cloud)).features.shape == (len(cloud), 0)
     with pytest.raises(UsageError, match="--clip FOLDER"):
         embed_things(tmp_path, scene, cloud, frames, None, replace(config, clip=None))
+
+
+def test_without_any_model_nothing_is_read_or_asked() -> None:
+    consulted = consult(ModelConfig(), [], heaps()[0], None, Output(quiet=True))
+    assert (consulted.frames, consulted.findings.masks) == ([], [])
+    assert consulted.findings.features is None
+    assert consulted.give_vectors(Path("nowhere"), {}, heaps()[0]) == {}
+
+
+def test_training_frames_are_spread_over_what_is_learnt_from(tmp_path: Path) -> None:
+    import textured_room  # beside the tests one folder up, see conftest there
+
+    run = RunFolder.create(tmp_path)
+    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=16)
+    choices = choose_frames(find_sources(run), FrameConfig(holdout_every=4))
+    stamps = sorted(choices[0].train_ns)
+    found = [frame.stamp_ns for frame in training_frames(choices, 4)]
+    assert len(found) == 4
+    assert found[0] == stamps[0]
+    assert found[-1] == stamps[-1]
+    assert set(found) <= set(stamps)
+    assert len(training_frames(choices, 100)) == len(stamps)
