@@ -2,10 +2,11 @@
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -92,6 +93,17 @@ def plan_of(task: Task, Ts: dict[str, np.ndarray], error: Any = NO_ERROR) -> Pla
     )
 
 
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Without the checks of shapes in calls: in a whole trial they cost four times the physics.
+
+    The short tests of this file make the same calls with the checks.
+    """
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
 def trial(task: Task, file: CellFile, session: Any) -> tuple[Outcome, StandinCell]:
     cell = StandinCell(
         file,
@@ -110,6 +122,7 @@ def trial(task: Task, file: CellFile, session: Any) -> tuple[Outcome, StandinCel
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
 def test_a_sloth_taken_at_its_waist_ends_up_in_the_basket_in_its_own_shape(
     sloth: Task, toys_cell: CellFile, make_session: Callable[..., Any]
 ) -> None:
@@ -133,6 +146,7 @@ def test_a_sloth_taken_at_its_waist_ends_up_in_the_basket_in_its_own_shape(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
 def test_two_ducks_go_into_the_basket_one_after_the_other_and_are_counted(
     ducks: Task, toys_cell: CellFile, make_session: Callable[..., Any]
 ) -> None:
