@@ -52,8 +52,11 @@ struct Kernels {
     const char* name;
     int block_height;  // of the tiles that ``label_tile`` fills, see tile_index
     void (*project)(const Splats&, const Camera&, const Settings&, Projected*, int begin, int end);
+    // ``pair_sums`` (kPairGradients each) and ``shown`` (0 or 1) begin with Gaussian ``begin``.
+    // Gradients of those not shown are zero; ``d_pose`` gets the sum over the others.
     void (*unproject_gradients)(const Splats&, const Camera&, const float* pair_sums,
-                                const SplatGradients&, float* d_pose, int index);
+                                const float* shown, const SplatGradients&, float* d_pose,
+                                int begin, int end);
     // Returns how many of the job's Gaussians were drawn before the tile was opaque.
     int (*draw_tile)(const Projected*, const TileJob&, const Camera&, const Settings&,
                      float* planes);

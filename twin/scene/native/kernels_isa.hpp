@@ -7,7 +7,8 @@ namespace splat::SPLAT_ISA {
 
 void project(const Splats&, const Camera&, const Settings&, Projected*, int begin, int end);
 void unproject_gradients(const Splats&, const Camera&, const float* pair_sums,
-                         const SplatGradients&, float* d_pose, int index);
+                         const float* shown, const SplatGradients&, float* d_pose, int begin,
+                         int end);
 int draw_tile(const Projected*, const TileJob&, const Camera&, const Settings&, float* planes);
 void draw_tile_gradients(const Projected*, const TileJob&, const Camera&, const Settings&,
                          const float* planes, const float* plane_gradients,

@@ -15,7 +15,7 @@ namespace splat {
 namespace {
 
 constexpr int kProjectBlock = 2048;
-constexpr int kGatherBlock = 1024;  // Gaussians whose pose gradients are added together
+constexpr int kGatherBlock = 128;  // Gaussians whose gradients are gathered together
 constexpr int kDigitBits = 11;
 constexpr int kDigits = 1 << kDigitBits;
 constexpr int kPasses = 3;
@@ -172,20 +172,6 @@ void Rasteriser::add_pair_rows(int index, int row_floats, float* sums) const {
     }
 }
 
-namespace {
-
-void clear_gradients(const SplatGradients& out, std::int64_t index) {
-    std::memset(out.means + 3 * index, 0, 3 * sizeof(float));
-    std::memset(out.quats + 4 * index, 0, 4 * sizeof(float));
-    std::memset(out.scales_log + 3 * index, 0, 3 * sizeof(float));
-    std::memset(out.opacities + index, 0, sizeof(float));
-    std::memset(out.colors + 3 * index, 0, 3 * sizeof(float));
-    if (out.harmonics != nullptr)
-        std::memset(out.harmonics + 3 * kHarmonics * index, 0, 3 * kHarmonics * sizeof(float));
-}
-
-}  // namespace
-
 void Rasteriser::pull(const Splats& splats, const float* planes, const float* plane_gradients,
                       const SplatGradients& out, double* d_pose) {
     pair_rows_.resize(tile_ids_.size() * kPairGradients);
@@ -195,21 +181,18 @@ void Rasteriser::pull(const Splats& splats, const float* planes, const float* pl
                                      planes, plane_gradients,
                                      begin_pair_rows(tile, kPairGradients));
     const int num_blocks = (count_ + kGatherBlock - 1) / kGatherBlock;
-    pose_sums_.assign(static_cast<std::size_t>(num_blocks) * kPoseEntries, 0.0);
-#pragma omp parallel for schedule(dynamic, 1) num_threads(threads_)
+    pose_sums_.resize(static_cast<std::size_t>(num_blocks) * kPoseEntries);
+#pragma omp parallel for schedule(static) num_threads(threads_)
     for (int block = 0; block < num_blocks; ++block) {
-        double* pose_sum = pose_sums_.data() + static_cast<std::int64_t>(block) * kPoseEntries;
-        const int end = std::min((block + 1) * kGatherBlock, count_);
-        for (int index = block * kGatherBlock; index < end; ++index) {
-            if (slot_begin_[index] == slot_begin_[index + 1]) {
-                clear_gradients(out, index);
-                continue;
-            }
-            float sums[kPairGradients] = {0}, pose[kPoseEntries];
-            add_pair_rows(index, kPairGradients, sums);
-            kernels_.unproject_gradients(splats, camera_, sums, out, pose, index);
-            for (int k = 0; k < kPoseEntries; ++k) pose_sum[k] += pose[k];
+        float sums[kGatherBlock * kPairGradients] = {0}, shown[kGatherBlock];
+        const int begin = block * kGatherBlock, end = std::min(begin + kGatherBlock, count_);
+        for (int index = begin; index < end; ++index) {
+            shown[index - begin] = slot_begin_[index] < slot_begin_[index + 1] ? 1.0f : 0.0f;
+            add_pair_rows(index, kPairGradients, sums + (index - begin) * kPairGradients);
         }
+        kernels_.unproject_gradients(
+            splats, camera_, sums, shown, out,
+            pose_sums_.data() + static_cast<std::int64_t>(block) * kPoseEntries, begin, end);
     }
     std::fill(d_pose, d_pose + kPoseEntries, 0.0);
     for (std::size_t i = 0; i < pose_sums_.size(); ++i) d_pose[i % kPoseEntries] += pose_sums_[i];

@@ -68,7 +68,7 @@ class Rasteriser {
     std::vector<std::int64_t> slots_;       // where those pairs stand in tile_ids_
     std::vector<float> pair_rows_;
     std::vector<float> tile_planes_;  // working memory of each thread
-    std::vector<double> pose_sums_;   // of each block of Gaussians
+    std::vector<float> pose_sums_;    // of each block of Gaussians
 };
 
 }  // namespace splat
