@@ -72,7 +72,8 @@ def find_poses(
     tree = streams.transform_tree(episode)
     if config.poses == "tf" or (config.poses == "auto" and places_camera(tree, episode, camera_id)):
         frame = streams.camera_info(episode, camera_id).frame_id
-        broken = ~np.isfinite(tree.Ts_root_frame(frame, stamps_ns)).all(axis=(1, 2))
+        with np.errstate(invalid="ignore"):
+            broken = ~np.isfinite(tree.Ts_root_frame(frame, stamps_ns)).all(axis=(1, 2))
         unposed = frozenset(stamps_ns[broken].tolist())
         if unposed:
             output.say(
@@ -88,7 +89,7 @@ def find_poses(
             TrackConfig(max_depth_m=config.max_depth_m),
             advance,
         )
-    lost = frozenset(stamps_ns.tolist()) - path.Ts_first_depth.keys()
+    lost = frozenset(set(stamps_ns.tolist()) - path.Ts_first_depth.keys())
     output.say(f"camera {camera_id} of {episode.info.id}: {_describe(path, len(lost))}")
     return CameraPoses(
         tree=_tree_of(path, bare, episode, camera_id),

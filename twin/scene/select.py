@@ -24,6 +24,8 @@ TYPICAL_DEPTH_M = 0.7
 EXPOSURE_S = 0.01
 SMEAR_PX = 0.5
 """Smear in one exposure below this cannot be seen."""
+UNKNOWN_PX = 1e6
+"""Instead of a smear that cannot be known."""
 MOTION_SLACK = 1.5
 """Frames this many times as fast as the slowest of a stretch are still considered."""
 MAX_LOOKS = 3
@@ -83,11 +85,13 @@ def smear_px(
     tree: TransformTree, frame_id: str, stamps_ns: Int[np.ndarray, " num_frames"], focal_px: float
 ) -> Float[np.ndarray, " num_frames"]:
     """How far the image of something at a typical distance moves during one exposure [px]."""
-    before = tree.Ts_root_frame(frame_id, stamps_ns - MOTION_WINDOW_NS)
-    after = tree.Ts_root_frame(frame_id, stamps_ns + MOTION_WINDOW_NS)
-    turn = se3.rotation_angle_rad(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
-    shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1) / TYPICAL_DEPTH_M
-    return np.asarray(focal_px * (turn + shift) * EXPOSURE_S / (2e-9 * MOTION_WINDOW_NS))
+    with np.errstate(invalid="ignore"):  # a pose beside one that is not finite: motion unknown
+        before = tree.Ts_root_frame(frame_id, stamps_ns - MOTION_WINDOW_NS)
+        after = tree.Ts_root_frame(frame_id, stamps_ns + MOTION_WINDOW_NS)
+        turn = se3.rotation_angle_rad(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+        shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1) / TYPICAL_DEPTH_M
+    found = focal_px * (turn + shift) * EXPOSURE_S / (2e-9 * MOTION_WINDOW_NS)
+    return np.nan_to_num(found, nan=UNKNOWN_PX, posinf=UNKNOWN_PX)
 
 
 def robot_smear_px(
