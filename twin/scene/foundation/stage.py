@@ -15,7 +15,7 @@ from bridge.task.task_file import Task
 from bridge.terminal import Advance
 from twin.scene.foundation import clip, dinov3, sam3
 from twin.scene.foundation.clip import ClipEmbedder
-from twin.scene.foundation.loading import Placement
+from twin.scene.foundation.loading import Placement, import_transformers
 from twin.scene.foundation.open import (
     FEATURES,
     SEGMENTERS,
@@ -55,17 +55,19 @@ class ModelFindings:
     """None without a feature model."""
 
 
-def model_hashes(config: ModelConfig) -> dict[str, str]:
-    """Check every folder of weights that is named, before anything slow begins.
+def check_models(config: ModelConfig, task: Task | None) -> dict[str, str]:
+    """Check all that the models need, before anything slow begins.
 
     Returns:
         SHA-256 of each model's weights, by its option.
 
     Raises:
-        UsageError: When an option or a folder cannot be used.
+        UsageError: When an option or a folder cannot be used, or nothing says what to look for.
+        MissingDependencyError: When the extra ``foundation`` is not installed.
     """
     named: list[tuple[str, Path, WeightsKind]] = []
     if config.segmenter:
+        prompts_of(config, task)
         _, folder = split_spec(config.segmenter, "--segmenter", SEGMENTERS)
         named.append(("segmenter", folder, sam3.KIND))
     if config.features:
@@ -77,6 +79,9 @@ def model_hashes(config: ModelConfig) -> dict[str, str]:
     for option, folder, kind in named:
         check_folder(folder, kind)
         hashes[option] = weights_hash(folder, kind)
+    if hashes:
+        Placement(device=config.device).resolve()
+        import_transformers()
     return hashes
 
 

@@ -19,8 +19,8 @@ from twin.scene.foundation.clip import ClipEmbedder
 from twin.scene.foundation.consult import consult, training_frames
 from twin.scene.foundation.stage import (
     ask_models,
+    check_models,
     embed_things,
-    model_hashes,
     prompts_of,
     spread,
     thing_vectors,
@@ -149,14 +149,16 @@ def test_frames_are_spread_evenly() -> None:
 
 def test_bad_options_are_refused_before_anything_slow(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--segmenter 'sam2:x'"):
-        model_hashes(ModelConfig(segmenter="sam2:x"))
+        check_models(ModelConfig(segmenter="sam2:x", prompt=("box",)), None)
     with pytest.raises(WeightsError, match="no such folder"):
-        model_hashes(ModelConfig(clip=tmp_path / "nothing"))
+        check_models(ModelConfig(clip=tmp_path / "nothing"), None)
     with pytest.raises(UsageError, match="--model-frames 0"):
         ModelConfig(model_frames=0)
     with pytest.raises(UsageError, match="--feature-stride 0"):
         ModelConfig(feature_stride=0)
-    assert model_hashes(ModelConfig()) == {}
+    with pytest.raises(UsageError, match="--prompt"):
+        check_models(ModelConfig(segmenter="sam3:x"), None)
+    assert check_models(ModelConfig(), None) == {}
 
 
 @pytest.fixture
@@ -182,7 +184,7 @@ def test_all_three_models_are_asked_and_what_they_say_is_kept(
         clip=saved("clip"),
         device="cpu",
     )
-    hashes = model_hashes(config)
+    hashes = check_models(config, load_task("five_ducks_into_basket"))
     assert sorted(hashes) == ["clip", "features", "segmenter"]
     assert len(set(hashes.values())) == 3
     cloud, labels = heaps()
