@@ -17,7 +17,7 @@ from twin.scene.shape.voxels import VoxelBox, look
 
 FREE_TRUNCATIONS = 0.6
 """A voxel this many truncations in front of a surface is seen through."""
-MIN_FREE_SHARE = 0.1
+MIN_FREE_SHARE = 0.3
 MIN_OTHER_SHARE = 0.5
 """Shares of the views that see a voxel at all: to be free, it must be seen through in the first;
 or seen through, or at or before something else than the object, in the second."""
@@ -42,27 +42,37 @@ class Evidence:
 
 
 def gather(
-    box: VoxelBox, views: Sequence[MaskedView], truncation_m: float, min_free_views: int
+    box: VoxelBox,
+    views: Sequence[MaskedView],
+    truncation_m: float,
+    min_free_views: int,
 ) -> Evidence:
-    """Let every view say which voxels it sees through and which lie at the object's surface."""
+    """Let every view say which voxels it sees through and which lie at the object's surface.
+
+    Args:
+        box: The voxels.
+        views: Depth with masks.
+        truncation_m: So near to a surface a view says how far it is.
+        min_free_views: So many must look through a voxel before it is free.
+    """
     total = np.zeros(box.num_voxels, dtype=np.float32)
     weight = np.zeros(box.num_voxels, dtype=np.float32)
     free, other, seen = (np.zeros(box.num_voxels, dtype=np.int16) for _ in range(3))
-    behind_m = np.float32(BEHIND_VOXELS * box.voxel_m)
+    behind = np.float32(BEHIND_VOXELS * box.voxel_m)
     for view in views:
         sight = look(box, view)
-        hit = sight.on_object & (sight.gap_m > -behind_m) & (sight.gap_m < truncation_m)
+        hit = sight.on_object & (sight.gap_m > -behind) & (sight.gap_m < truncation_m)
         # Full weight down to half the reach, then fading.
-        trust = np.minimum(2.0 + 2.0 * sight.gap_m[hit] / behind_m, 1.0)
+        trust = np.minimum(2.0 + 2.0 * sight.gap_m[hit] / behind, 1.0)
         ids = sight.ids[hit]
         total[ids] += trust * sight.gap_m[hit] / np.float32(truncation_m)
         weight[ids] += trust
         through = sight.clear_m > FREE_TRUNCATIONS * truncation_m
         # At another surface as well: nothing behind an object is seen beside the object.
-        at_other = ~sight.near_object & (sight.gap_m > -behind_m)
+        at_other = ~sight.near_object & (sight.gap_m > -behind)
         free[sight.ids] += through
         other[sight.ids] += through | at_other
-        seen[sight.ids] += sight.gap_m > -behind_m
+        seen[sight.ids] += sight.gap_m > -behind
     tsdf = total / np.maximum(weight, 1e-6)
     is_free = _at_least(free, seen, min_free_views, MIN_FREE_SHARE)
     empty = is_free | _at_least(other, seen, min_free_views, MIN_OTHER_SHARE)

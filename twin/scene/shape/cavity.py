@@ -12,6 +12,8 @@ MIN_SHARE = 0.05
 """Of the volume with the cavity filled; less is a dent."""
 MIN_VOXELS = 30
 MAX_POINTS = 400
+LEAK_VOXELS = 2
+"""Gaps in a wall up to twice this are closed before looking for the room behind it."""
 CLEARANCE_VOXELS = 2.0
 """Sample points keep this distance from the walls."""
 
@@ -39,7 +41,8 @@ def find_cavity(
     """
     in_layer = ndimage.generate_binary_structure(3, 1)
     in_layer[:, :, [0, 2]] = False
-    filled = ndimage.binary_fill_holes(solid, structure=in_layer)
+    tight = ndimage.binary_closing(solid, structure=in_layer, iterations=LEAK_VOXELS)
+    filled = ndimage.binary_fill_holes(tight | solid, structure=in_layer)
     room = filled & ~solid & free
     pieces, count = ndimage.label(room)
     if count == 0:

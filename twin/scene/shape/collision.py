@@ -133,12 +133,12 @@ def _cut_up(shape: ObjectShape, config: CollisionConfig) -> tuple[ConvexPart, ..
         for worst in order:
             if worst.blocked == 0 and worst.excess < MIN_EXCESS * len(voxels):
                 continue
-            cut = _best_cut(worst, free, config.max_parts - len(pieces) + 1, len(voxels))
-            if cut is None or not _worth_it(worst, cut, len(voxels)):
-                continue
-            changed = [p for p in pieces if p is not worst] + cut
-            if sum(len(piece.voxels) for piece in changed) >= kept:
-                pieces = changed
+            others = [p for p in pieces if p is not worst]
+            spare = sum(len(p.voxels) for p in pieces) - kept
+            room = config.max_parts - len(others)
+            cut = _best_cut(worst, free, room, min(CRUMB * len(voxels), spare))
+            if cut is not None and _worth_it(worst, cut, len(voxels)):
+                pieces = others + cut
                 break
         else:
             break
@@ -160,19 +160,20 @@ def _piece(voxels: Voxels, free: Float[np.ndarray, "num_free 3"]) -> _Piece:
 
 
 def _best_cut(
-    piece: _Piece, free: Float[np.ndarray, "num_free 3"], max_pieces: int, num_voxels: int
+    piece: _Piece, free: Float[np.ndarray, "num_free 3"], max_pieces: int, spare: float
 ) -> list[_Piece] | None:
     """Of all candidate planes, the one whose halves' hulls hold least; None without one.
 
     Of cuts that save alike, that where the cross-section jumps most, then the evenest: floor and
-    walls of a box come apart where they meet although the first cut saves nothing.
+    walls of a box come apart where they meet although the first cut saves nothing. At most
+    ``spare`` voxels of crumbs may be left out.
     """
     best: tuple[int, float, float] | None = None
     chosen: list[_Piece] | None = None
     for jump, side in _candidate_cuts(piece.voxels):
-        least = CRUMB * num_voxels
-        groups = [*_connected(piece.voxels[side], least), *_connected(piece.voxels[~side], least)]
-        if not 1 <= len(groups) <= max_pieces:
+        groups = [*_connected(piece.voxels[side], spare), *_connected(piece.voxels[~side], spare)]
+        left = len(piece.voxels) - sum(len(group) for group in groups)
+        if not 1 <= len(groups) <= max_pieces or left > max(spare, 0.0):
             continue
         halves = [_piece(group, free) for group in groups]
         volume = sum(half.hull.volume_m3 for half in halves)

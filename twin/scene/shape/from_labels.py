@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
 from twin.scene.semantics.result import Instance
+from twin.scene.shape.from_training import ALIGN_ROUNDS
 from twin.scene.shape.masked_view import MaskedView
 from twin.scene.shape.reconstruct import ObjectShape, ShapeConfig, reconstruct
 from twin.scene.training_view import TrainingView
@@ -38,7 +39,7 @@ def shape_of_instance(
         instance: The one that is wanted.
         support_z_m: Height in the root frame of what it stands on; None when it stands on
             nothing.
-        config: Settings; the defaults, with one round of view alignment, when None.
+        config: Settings; the defaults, with six rounds of view alignment, when None.
 
     Raises:
         ShapeError: When the views do not suffice.
@@ -75,5 +76,5 @@ def shape_of_instance(
             )
         )
     support = None if support_z_m is None else support_z_m - float(instance.T_base_instance[2, 3])
-    config = ShapeConfig(align_rounds=1) if config is None else config
+    config = ShapeConfig(align_rounds=ALIGN_ROUNDS) if config is None else config
     return reconstruct([view for view in masked if view.mask.any()], support, config)

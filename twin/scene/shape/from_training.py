@@ -5,6 +5,7 @@ in the object's own frame, so walls of a box lie along the voxels.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from twin.errors import TwinError
 from twin.scene.localise_shape import surface_distances
 from twin.scene.shape.masked_view import MaskedView
 from twin.scene.shape.reconstruct import ObjectShape, ShapeConfig, reconstruct
-from twin.scene.shape.static import static_sdf
+from twin.scene.shape.static import StaticConfig, static_sdf
 from twin.scene.training_view import TrainingView
 
 STATIC_FILE = "sdf.npz"
@@ -31,6 +32,12 @@ TABLE_M = 0.003
 STANDING_M = 0.008
 """An object whose underside is at most this far from the table stands on it."""
 UPRIGHT_COSINE = 0.999
+ALIGN_ROUNDS = 6
+TABLE_REACH_M = 0.012
+"""A point this near to z = 0 is taken for the table's."""
+MIN_TABLE_POINTS = 200
+MIN_POSES = 6
+"""A camera that saw the table from fewer poses keeps its depth: its pose may be to blame."""
 
 Poses = Mapping[str, Float[np.ndarray, "4 4"]]
 
@@ -47,9 +54,10 @@ def shapes_of(
         views: What the scene was fitted to, in ``base_link`` whose z = 0 is the table.
         models: Known shapes: they say which pixels are the object's, nothing more.
         Ts_base_object: Where the objects were; others are left out.
-        config: Settings; the defaults, with one round of view alignment, when None.
+        config: Settings; the defaults, with six rounds of view alignment, when None.
     """
-    config = ShapeConfig(align_rounds=1) if config is None else config
+    config = ShapeConfig(align_rounds=ALIGN_ROUNDS) if config is None else config
+    views = without_depth_offset(views)
     found: dict[str, ObjectShape | str] = {}
     for key, T in Ts_base_object.items():
         if T[2, 2] < UPRIGHT_COSINE:
@@ -63,6 +71,47 @@ def shapes_of(
         except TwinError as error:
             found[key] = str(error)
     return found
+
+
+def without_depth_offset(views: Sequence[TrainingView]) -> list[TrainingView]:
+    """Correct the depth of cameras that see the table too near or too far from everywhere.
+
+    Errors of single poses differ in sign; what is left in the median over many poses is the
+    camera's own: depth that reads long, or a mount that is off along the optical axis. Without
+    this, carving makes things smaller or larger by it on every side. z = 0 is the table.
+    """
+    errors: dict[str, list[float]] = {}
+    for view in views:
+        error = _table_depth_error_m(view)
+        if error is not None:
+            errors.setdefault(view.camera_id, []).append(error)
+    offsets = {key: float(np.median(e)) for key, e in errors.items() if len(e) >= MIN_POSES}
+    corrected = []
+    for view in views:
+        offset = np.float32(offsets.get(view.camera_id, 0.0))
+        depth = view.full.depth_m
+        full = replace(view.full, depth_m=np.where(depth > 0, depth - offset, depth))
+        corrected.append(replace(view, full=full))
+    return corrected
+
+
+def _table_depth_error_m(view: TrainingView) -> float | None:
+    """By how much the table reads too far along the optical axis, by the median of its points."""
+    target = view.full
+    row, column = np.nonzero(target.static_mask & (target.depth_m > 0))
+    step = max(1, len(row) // 20_000)
+    row, column = row[::step], column[::step]
+    depth = target.depth_m[row, column].astype(np.float64)
+    camera, T = target.camera, view.T_base_color
+    rays = np.stack(
+        [(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy], axis=1
+    )
+    down = rays @ T[2, :2] + T[2, 2]
+    height = T[2, 3] + depth * down
+    table = (np.abs(height) < TABLE_REACH_M) & (down < -0.2)
+    if int(table.sum()) < MIN_TABLE_POINTS:
+        return None
+    return float(np.median(height[table] / down[table]))
 
 
 def _support_z_m(model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]) -> float | None:
@@ -148,6 +197,7 @@ def write_static(
     views: Sequence[TrainingView],
     task: Task | None,
     Ts_base_object: Poses,
+    config: StaticConfig | None = None,
 ) -> dict[str, Any]:
     """Write ``sdf.npz``, the static scene without the objects, and return its record.
 
@@ -158,6 +208,7 @@ def write_static(
         views: What the scene was fitted to.
         task: Whose objects were taken out; None when there is none.
         Ts_base_object: Where they were.
+        config: Settings; the defaults when None.
     """
     path = folder / STATIC_FILE
     path.unlink(missing_ok=True)
@@ -167,7 +218,7 @@ def write_static(
         if task is not None
     ]
     try:
-        static = static_sdf(views, None if task is None else 0.0, objects)
+        static = static_sdf(views, None if task is None else 0.0, objects, config)
     except TwinError as error:
         return {"file": None, "remark": str(error)}
     static.save(path)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bridge.errors import refuse_outside
+from twin.scene.shape.agree import laid_together
 from twin.scene.shape.carve import Evidence, gather, solid_of
 from twin.scene.shape.cavity import Cavity, find_cavity
 from twin.scene.shape.isosurface import isosurface
@@ -31,7 +32,7 @@ class ShapeConfig:
 
     min_voxel_m: float = 0.0015
     """Finest voxel."""
-    voxels_along: int = 64
+    voxels_along: int = 80
     """Voxels along the longest side, unless that makes them too fine."""
     truncation_voxels: float = 4.0
     """Depth within this many voxels of a surface says how far the surface is."""
@@ -44,7 +45,7 @@ class ShapeConfig:
     max_views: int = 40
     """More views than this are thinned out evenly."""
     align_rounds: int = 0
-    """How often every view is shifted onto the shape that all of them make, and carved again."""
+    """Steps in which every view is shifted onto what the others saw."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot make a shape."""
@@ -58,7 +59,7 @@ class ShapeConfig:
                 "min_free_views": (1, 20),
                 "smoothing_voxels": (0.3, 2.0),
                 "max_views": (2, 1000),
-                "align_rounds": (0, 5),
+                "align_rounds": (0, 50),
             },
         )
 
@@ -83,7 +84,7 @@ class ObjectShape:
     num_views: int
     truncation_m: float
     view_shift_m: float = 0.0
-    """Root mean square of the shifts that laid the views onto each other; 0 without rounds."""
+    """Root mean square of the shifts that laid the views together; 0 without rounds."""
 
 
 def reconstruct(
@@ -103,21 +104,8 @@ def reconstruct(
     """
     config = ShapeConfig() if config is None else config
     useful = _useful(views, config.max_views)
-    shape = _carved(useful, support_z_m, config)
-    for _ in range(config.align_rounds):
-        moved = [_aligned(view, shape) for view in useful]
-        shifts = np.stack(
-            [
-                after.T_base_camera[:3, 3] - before.T_base_camera[:3, 3]
-                for after, before in zip(moved, useful, strict=True)
-            ]
-        )
-        # All together may not move: nothing but the poses says where the object is.
-        mean = shifts.mean(axis=0)
-        useful = [_shifted(view, -mean) for view in moved]
-        spread = float(np.sqrt(np.square(shifts - mean).sum(axis=-1).mean()))
-        shape = replace(_carved(useful, support_z_m, config), view_shift_m=spread)
-    return shape
+    useful, shift = laid_together(useful, support_z_m, config.align_rounds)
+    return replace(_carved(useful, support_z_m, config), view_shift_m=shift)
 
 
 def _useful(views: Sequence[MaskedView], max_views: int) -> list[MaskedView]:
@@ -151,25 +139,26 @@ def _useful(views: Sequence[MaskedView], max_views: int) -> list[MaskedView]:
 def _carved(
     views: Sequence[MaskedView], support_z_m: float | None, config: ShapeConfig
 ) -> ObjectShape:
-    low, high = _extent(views)
-    if support_z_m is not None:
-        low[2] = support_z_m
-        if high[2] <= low[2]:
-            message = f"all measured points lie below the plane z = {support_z_m:.4f} m."
-            raise ShapeError(message)
-    size = float((high - low).max())
-    voxel = max(config.min_voxel_m, size / config.voxels_along)
+    low, high = _extent(views, support_z_m)
+    box, truncation = _box(low, high, config)
+    evidence = gather(box, views, truncation, config.min_free_views)
+    solid = solid_of(evidence, support_z_m, low - box.voxel_m, high + box.voxel_m)
+    distances = distances_of_solid(solid, box.voxel_m)
+    values = smoothed(distances, box.voxel_m, config.smoothing_voxels)
+    grid = SdfGrid(values_m=values, origin_m=box.origin_m, voxel_m=box.voxel_m)
+    return _described(grid, evidence, solid, len(views), truncation)
+
+
+def _box(
+    low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], config: ShapeConfig
+) -> tuple[VoxelBox, float]:
+    """Voxels around an extent, and the truncation that goes with their size [m]."""
+    voxel = max(config.min_voxel_m, float((high - low).max()) / config.voxels_along)
     truncation = max(config.truncation_voxels * voxel, config.min_truncation_m)
     # Faces between voxels lie on the plane: half a voxel above and below it are the centres.
     origin = low - (PAD_VOXELS - 0.5) * voxel
     num_x, num_y, num_z = (np.ceil((high - low) / voxel).astype(int) + 2 * PAD_VOXELS).tolist()
-    box = VoxelBox(origin_m=origin, voxel_m=voxel, counts=(num_x, num_y, num_z))
-    evidence = gather(box, views, truncation, config.min_free_views)
-    solid = solid_of(evidence, support_z_m, low - voxel, high + voxel)
-    distances = distances_of_solid(solid, voxel)
-    values = smoothed(distances, voxel, config.smoothing_voxels)
-    grid = SdfGrid(values_m=values, origin_m=box.origin_m, voxel_m=voxel)
-    return _described(grid, evidence, solid, len(views), truncation)
+    return VoxelBox(origin_m=origin, voxel_m=voxel, counts=(num_x, num_y, num_z)), truncation
 
 
 def _described(
@@ -200,12 +189,12 @@ def _described(
 def _observed(
     vertices: Vertices, faces: Faces, evidence: Evidence
 ) -> Bool[np.ndarray, " num_faces"]:
-    """Faces in whose voxel, or just outside of it, some view saw the object's surface."""
+    """Faces just outside of which some view saw the object's surface."""
     box = evidence.box
     normals, _ = face_normals(vertices, faces)
     centre = vertices[faces].mean(axis=1)
     seen = np.zeros(len(faces), dtype=bool)
-    for out in (0.0, 1.0):
+    for out in (0.6, 1.2):
         place = centre + out * box.voxel_m * normals
         index = np.rint((place - box.origin_m) / box.voxel_m).astype(np.int64)
         index = np.clip(index, 0, np.array(box.counts) - 1)
@@ -214,9 +203,12 @@ def _observed(
 
 
 def _extent(
-    views: Sequence[MaskedView],
+    views: Sequence[MaskedView], support_z_m: float | None
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Corners of the box of points that two views agree on; flying pixels are on their own."""
+    """Corners of the box of points that two views agree on; flying pixels are on their own.
+
+    The plane, when there is one, closes it below.
+    """
     cells = [np.floor(view.points_m() / CELL_M).astype(np.int64) for view in views]
     first = np.min([c.min(axis=0) for c in cells], axis=0)
     spans = np.max([c.max(axis=0) for c in cells], axis=0) - first + 1
@@ -229,32 +221,13 @@ def _extent(
             "not fit together. Check the camera poses."
         )
         raise ShapeError(message)
-    return kept.min(axis=0) * CELL_M, (kept.max(axis=0) + 1) * CELL_M
-
-
-def _shifted(view: MaskedView, way_m: Float[np.ndarray, "3"]) -> MaskedView:
-    T = view.T_base_camera.copy()
-    T[:3, 3] += way_m
-    return replace(view, T_base_camera=T)
-
-
-def _aligned(view: MaskedView, shape: ObjectShape) -> MaskedView:
-    """Shift a view so that its points lie on the shape: point to plane, robust, one step.
-
-    Directions that the view's points do not determine are held by a weak pull to zero.
-    """
-    points = view.points_m()
-    points = points[:: max(1, len(points) // 2000)]
-    distance = shape.sdf.distance(points)
-    near = np.abs(distance) < shape.truncation_m
-    if int(near.sum()) < MIN_POINTS:
-        return view
-    slope = shape.sdf.gradient(points[near])
-    scale = max(float(np.median(np.abs(distance[near]))), 1e-4)
-    weight = 1.0 / (1.0 + (distance[near] / (2 * scale)) ** 2)
-    A = (slope * weight[:, None]).T @ slope + 0.05 * weight.sum() * np.eye(3)
-    way = -np.linalg.solve(A, slope.T @ (weight * distance[near]))
-    return _shifted(view, np.clip(way, -shape.truncation_m, shape.truncation_m))
+    low, high = kept.min(axis=0) * CELL_M, (kept.max(axis=0) + 1) * CELL_M
+    if support_z_m is not None:
+        low[2] = support_z_m
+        if high[2] <= low[2]:
+            message = f"all measured points lie below the plane z = {support_z_m:.4f} m."
+            raise ShapeError(message)
+    return low, high
 
 
 def moved_views(
