@@ -201,13 +201,15 @@ def test_all_instruction_sets_agree(isa: str) -> None:
         assert relative_error(second, first) < 2e-2, name
 
 
-def test_ssim_agrees_with_a_torch_convolution() -> None:
+@pytest.mark.parametrize("isa", ISAS)
+@pytest.mark.parametrize(("height", "width"), [(23, 31), (3, 2), (171, 133), (80, 270)])
+def test_ssim_agrees_with_a_torch_convolution(isa: str, height: int, width: int) -> None:
     from twin.scene.raster import load_native
 
     rng = np.random.default_rng(5)
-    x = rng.uniform(size=(3, 23, 31)).astype(np.float32)
+    x = rng.uniform(size=(3, height, width)).astype(np.float32)
     y = np.clip(x + 0.1 * rng.normal(size=x.shape), 0, 1).astype(np.float32)
-    value, gradient = load_native().Similarity(1, "auto").mean(x, y)
+    value, gradient = load_native().Similarity(1, isa).mean(x, y)
 
     offsets = torch.arange(11, dtype=torch.float64) - 5
     tap = torch.exp(-(offsets**2) / (2 * 1.5**2))
