@@ -1,0 +1,152 @@
+"""Held-out views: raw, brightened, masked and by depth, each against an independent calculation."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from skimage.metrics import peak_signal_noise_ratio
+
+from bridge.episode import schema
+from bridge.episode.metadata import Derived, EpisodeInfo
+from bridge.episode.records import CompressedColor, DepthImage
+from bridge.episode.writer import EpisodeWriter
+from evaluator.compare.run import compare_run
+from evaluator.errors import UndefinedStatisticError
+from evaluator.metrics.depth import score_depth
+from evaluator.metrics.image import ImageShapeError, aligned, score_image
+
+STAMP = 5_000
+SIZE = (36, 44)
+
+
+def png(image_u8: np.ndarray) -> bytes:
+    import io
+
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(image_u8).save(buffer, format="png")
+    return buffer.getvalue()
+
+
+def pair(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A recorded image, and the same darker, with noise."""
+    rng = np.random.default_rng(seed)
+    recorded = rng.integers(40, 250, (*SIZE, 3)).astype(np.float64)
+    rendered = 0.8 * recorded + rng.normal(0, 4, recorded.shape)
+    return recorded.astype(np.uint8), np.clip(rendered, 0, 255).astype(np.uint8)
+
+
+def test_a_gain_is_the_least_squares_solution_of_each_channel() -> None:
+    recorded, rendered = pair()
+    found = aligned(recorded, rendered, "gain")
+    for channel in range(3):
+        a, b = (image[..., channel].ravel() / 255.0 for image in (rendered, recorded))
+        (gain,), *_ = np.linalg.lstsq(a[:, None], b, rcond=None)
+        np.testing.assert_allclose(found[..., channel].ravel(), np.clip(gain * a, 0, 1), atol=1e-12)
+
+
+def test_gain_and_offset_are_the_least_squares_solution_of_each_channel() -> None:
+    recorded, rendered = pair()
+    found = aligned(recorded, rendered, "affine")
+    for channel in range(3):
+        a, b = (image[..., channel].ravel() / 255.0 for image in (rendered, recorded))
+        design = np.stack([a, np.ones_like(a)], axis=1)
+        solution, *_ = np.linalg.lstsq(design, b, rcond=None)
+        expected = np.clip(design @ solution, 0, 1)
+        np.testing.assert_allclose(found[..., channel].ravel(), expected, atol=1e-12)
+
+
+def test_alignment_helps_against_exposure_and_never_happens_unasked() -> None:
+    recorded, rendered = pair()
+    raw, gain = (score_image(recorded, rendered, alignment=how) for how in ("raw", "gain"))
+    assert raw == score_image(recorded, rendered)
+    assert raw.psnr_db == pytest.approx(
+        peak_signal_noise_ratio(recorded / 255.0, rendered / 255.0, data_range=1.0), abs=1e-9
+    )
+    assert gain.psnr_db is not None
+    assert raw.psnr_db is not None
+    assert gain.psnr_db > raw.psnr_db + 6
+
+
+def test_a_black_image_stays_black() -> None:
+    recorded, _ = pair()
+    assert aligned(recorded, np.zeros_like(recorded), "gain").max() == 0.0
+
+
+def test_depth_errors_are_those_of_pixels_that_both_have() -> None:
+    recorded = np.array([[1.0, 0.0, 2.0, 3.0]])
+    rendered = np.array([[1.1, 5.0, 0.0, 2.8]])
+    score = score_depth(recorded, rendered)
+    assert score.num_pixels == 2
+    assert score.mean_abs_m == pytest.approx(0.15)
+    assert score.rmse_m == pytest.approx(np.sqrt((0.01 + 0.04) / 2))
+    with pytest.raises(UndefinedStatisticError, match="no pixel"):
+        score_depth(recorded, np.zeros_like(recorded))
+    with pytest.raises(ImageShapeError):
+        score_depth(recorded, rendered.T)
+
+
+def write_views(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    recorded, rendered = pair()
+    mask = np.zeros(SIZE, dtype=bool)
+    mask[10:30, 12:40] = True
+    with EpisodeWriter(folder / "scan.views.x.mcap") as writer:
+        writer.describe(
+            EpisodeInfo(id="scan-views-x", kind="scan"),
+            derived=Derived(
+                kind="views",
+                source_episode="scan",
+                source_sha256="",
+                settings={"holdout": "every 8th frame", "num_splats": 1234},
+            ),
+        )
+        white = np.repeat(mask[..., None], 3, axis=2).astype(np.uint8) * 255
+        images = {
+            "recorded/image": recorded,
+            "rendered/image": rendered,
+            "pose_aligned/image": recorded,
+            "mask/objects": white,
+        }
+        for tail, image in images.items():
+            color = CompressedColor(stamp_ns=STAMP, frame_id="c", format="png", data=png(image))
+            writer.write(
+                f"/room/views/cam/wrist/{tail}",
+                color.to_cdr(),
+                type_name=schema.COMPRESSED_IMAGE,
+                log_time_ns=STAMP,
+            )
+        for tail, depth_mm in (("recorded/depth_in_color", 1000), ("rendered/depth", 1010)):
+            depth = DepthImage(
+                stamp_ns=STAMP, frame_id="c", depth_mm=np.full(SIZE, depth_mm, dtype=np.uint16)
+            )
+            writer.write(
+                f"/room/views/cam/wrist/{tail}",
+                depth.to_cdr(),
+                type_name=schema.IMAGE,
+                log_time_ns=STAMP,
+            )
+    return recorded, rendered, mask
+
+
+def test_every_variant_of_a_view_is_measured_and_named(maker: Any) -> None:
+    maker.run.derived_dir.mkdir(parents=True, exist_ok=True)
+    recorded, rendered, mask = write_views(maker.run.derived_dir)
+    results = compare_run(maker.run).results()
+    raw = results.get("views.all.psnr_db")
+    assert "no colour alignment" in raw.definition
+    assert "held out: every 8th frame; 1234 Gaussians" in raw.definition
+    assert "one gain per image and channel" in results.get("views.all.psnr_gain_db").definition
+    posed = results.get("views.all.psnr_pose_gain_db")
+    assert posed.value is None  # the aligned image is the recorded one: no error, no finite PSNR
+    assert "not strictly held out" in posed.definition
+    objects = results.get("views.all.psnr_objects_db")
+    difference = (recorded[mask] / 255.0 - rendered[mask] / 255.0) ** 2
+    assert objects.value == pytest.approx(-10 * np.log10(difference.mean()), abs=1e-9)
+    assert "mask 'objects'" in objects.definition
+    assert results.get("views.all.depth_mean_abs_m").value == pytest.approx(0.01)
+    (table,) = (t for t in results.tables if t.id == "views_0")
+    row = dict(zip(table.columns, table.rows[0], strict=True))
+    assert row["depth (mm)"] == 10.0
+    assert row["PSNR gain (dB)"] > row["PSNR (dB)"]
