@@ -169,6 +169,7 @@ def test_no_images_are_refused() -> None:
         align_robot([], cell_views.robot())
 
 
+@pytest.mark.slow
 def test_two_places_that_fit_alike_are_refused(
     biased: list[RobotView], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,0 +1,292 @@
+"""``robot-gst calibrate``: what it finds, what it writes, and what it says when it cannot."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import robot_gst
+from bridge.episode import schema
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.records import (
+    CameraInfo,
+    DepthImage,
+    FrameTransform,
+    JointSample,
+    PoseSample,
+    string_to_cdr,
+    transforms_to_cdr,
+)
+from bridge.episode.run import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
+from twin.calibrate.pairs import recorded_pairs
+from twin.calibrate.placement import placement
+from twin.robot.model import load_robot
+from twin.scene.calibration import (
+    UnreadableCalibrationError,
+    calibrated_tree,
+    read_calibration,
+    write_calibration,
+)
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "align"))
+import cell_views
+
+URDF = ur5_with_gripper_urdf()
+SECOND = 1_000_000_000
+CAMERA = Camera(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
+T_TOOL_CAMERA = se3.transform_from(np.array([0.7, 0.1, 0.1, 0.7]), np.array([-0.09, 0.01, 0.02]))
+T_BASE_TARGET = se3.transform_from(np.array([1.0, 0.0, 0.2, 0.0]), np.array([0.5, 0.1, 0.0]))
+
+
+class Recording:
+    """Writes an episode in which the robot stops at postures, for a second each."""
+
+    def __init__(self, path: Path, postures: np.ndarray) -> None:
+        """Open the file and write description and joints."""
+        self.path, self.postures = path, postures
+        self.writer = EpisodeWriter(path)
+        self.writer.describe(EpisodeInfo(id=path.stem, kind="probe", cell="c", stand_in=True))
+        self.put("/robot_description", string_to_cdr(URDF), schema.STRING, 1)
+        for index, joints in enumerate(postures):
+            for part in (-0.45, -0.2, 0.0, 0.2, 0.45):
+                self.joints(joints, self.stamp(index) + round(part * SECOND))
+
+    def stamp(self, index: int) -> int:
+        """The middle of a stop."""
+        return 2 * (index + 1) * SECOND
+
+    def put(self, topic: str, data: bytes, type_name: str, stamp_ns: int) -> None:
+        self.writer.write(topic, data, type_name=type_name, log_time_ns=stamp_ns)
+
+    def joints(self, joints: np.ndarray, stamp_ns: int) -> None:
+        for topic, names, values in (
+            ("/c/joint_states", ARM_JOINTS, joints),
+            ("/c/gripper/state", ("gripper_width",), np.array([0.06])),
+        ):
+            none = np.zeros(0)
+            sample = JointSample(
+                stamp_ns=stamp_ns, names=tuple(names), position=values, velocity=none, effort=none
+            )
+            self.put(topic, sample.to_cdr(), schema.JOINT_STATE, stamp_ns)
+
+    def target(self, camera_id: str, T_camera_target: np.ndarray, stamp_ns: int) -> None:
+        sample = PoseSample(stamp_ns=stamp_ns, frame_id="cam", T_frame_body=T_camera_target)
+        topic = f"/c/cam/{camera_id}/target/pose"
+        self.put(topic, sample.to_cdr(), schema.POSE_STAMPED, stamp_ns)
+
+    def depth(self, camera_id: str, depth_m: np.ndarray, stamp_ns: int) -> None:
+        image = DepthImage(
+            stamp_ns=stamp_ns,
+            frame_id=f"{camera_id}_optical",
+            depth_mm=np.rint(depth_m * 1e3).astype(np.uint16),
+        )
+        self.put(f"/c/cam/{camera_id}/depth/image", image.to_cdr(), schema.IMAGE, stamp_ns)
+
+    def intrinsics(self, camera_id: str) -> None:
+        info = CameraInfo(stamp_ns=1, frame_id=f"{camera_id}_optical", camera=CAMERA)
+        for stream in ("color", "depth"):
+            self.put(f"/c/cam/{camera_id}/{stream}/info", info.to_cdr(), schema.CAMERA_INFO, 1)
+
+    def transform(self, camera_id: str, T_base_camera: np.ndarray, stamp_ns: int) -> None:
+        item = FrameTransform(
+            stamp_ns=stamp_ns,
+            parent="base_link",
+            child=f"{camera_id}_optical",
+            T_parent_child=T_base_camera,
+        )
+        self.put("/tf", transforms_to_cdr([item]), schema.TF_MESSAGE, stamp_ns)
+
+
+def some_postures(count: int) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return np.array(cell_views.POSTURES[0]) + rng.uniform(-0.5, 0.5, (count, 6))
+
+
+def record_targets(run: RunFolder, count: int = 12) -> None:
+    """A camera in the hand sees a target from several stops, and once on the move."""
+    robot, rng = load_robot(URDF), np.random.default_rng(1)
+    recording = Recording(run.episodes_dir / "probe_1.mcap", some_postures(count))
+    for index, joints in enumerate(recording.postures):
+        T_base_camera = robot.T_base_link("tool0", joints) @ T_TOOL_CAMERA
+        for late in (0, 50_000_000, 100_000_000):
+            noise = np.eye(4)
+            noise[:3, 3] = rng.normal(size=3) * 5e-4
+            seen = se3.invert(T_base_camera) @ T_BASE_TARGET @ noise
+            recording.target("wrist", seen, recording.stamp(index) + late)
+    recording.target("wrist", np.eye(4), recording.stamp(0) + SECOND)
+    recording.writer.close()
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    return RunFolder.create(tmp_path / "run")
+
+
+def calibrate(run: RunFolder, *arguments: str) -> int:
+    return robot_gst.run(["calibrate", str(run.path), *arguments])
+
+
+def test_a_target_seen_from_the_hand_gives_the_camera(
+    run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record_targets(run)
+    assert calibrate(run, "--cameras") == 0
+    assert "residual" in capsys.readouterr().out
+    found = read_calibration(run)
+    assert found is not None
+    place = found.cameras["wrist"]
+    assert place.link == "tool0"
+    assert np.linalg.norm(place.T_link_camera[:3, 3] - T_TOOL_CAMERA[:3, 3]) < 1e-3
+    item = found.record["cameras"]["wrist"]
+    assert item["mount"] == "hand"
+    assert item["num_pairs"] == 12
+    assert item["sources"] == ["probe_1"]
+    assert item["residual_m"]["low"] <= item["residual_m"]["value"] <= item["residual_m"]["high"]
+
+
+def test_detections_of_one_stop_are_averaged_and_those_on_the_move_left_out(
+    run: RunFolder,
+) -> None:
+    record_targets(run, count=5)
+    pairs = recorded_pairs([Episode.open(path) for path in run.episodes()], "wrist", "tool0")
+    assert len(pairs) == 5
+
+
+def test_a_calibrated_camera_in_the_hand_follows_the_joints(run: RunFolder) -> None:
+    recording = Recording(run.episodes_dir / "probe_1.mcap", some_postures(3))
+    recording.intrinsics("wrist")
+    recording.writer.close()
+    pose = {"p_m": T_TOOL_CAMERA[:3, 3].tolist(), "q_wxyz": se3.split(T_TOOL_CAMERA)[0].tolist()}
+    write_calibration(
+        run, {"wrist": {"link": "tool0", "stream": "color", "T_link_camera": pose}}, {}
+    )
+    calibration = read_calibration(run)
+    assert calibration is not None
+    stamps = np.array([recording.stamp(index) for index in range(3)])
+    episode = Episode.open(run.episodes()[0])
+    tree = calibrated_tree(episode, "wrist", calibration.cameras["wrist"], stamps)
+    for stamp, joints in zip(stamps, recording.postures, strict=True):
+        expected = load_robot(URDF).T_base_link("tool0", joints) @ T_TOOL_CAMERA
+        np.testing.assert_allclose(
+            tree.T_root_frame("wrist_optical", int(stamp)), expected, atol=1e-9
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("believed", [True, False])
+def test_the_robot_seen_by_a_fixed_camera_gives_the_camera(run: RunFolder, believed: bool) -> None:
+    recording = Recording(run.episodes_dir / "scan.mcap", np.array(cell_views.POSTURES[:2]))
+    recording.intrinsics("side")
+    errors = cell_views.CellErrors(depth_scale=1.01)
+    for index, joints in enumerate(cell_views.POSTURES[:2]):
+        depth_m = cell_views.take(joints, errors, seed=index)
+        recording.depth("side", depth_m, recording.stamp(index))
+    truth = cell_views.side_camera_pose()
+    if believed:
+        wrong = truth.copy()
+        wrong[:3, 3] += (0.01, -0.02, 0.01)
+        recording.transform("side", wrong, 1)
+    recording.writer.close()
+    assert calibrate(run, "--cameras") == 0
+    found = read_calibration(run)
+    assert found is not None
+    change = se3.invert(truth) @ found.cameras["side"].T_link_camera
+    assert np.linalg.norm(change[:3, 3]) < 0.003
+    assert se3.rotation_angle_rad(change[:3, :3]) < 0.003
+    assert found.cameras["side"].depth_scale == pytest.approx(1 / 1.01, abs=0.003)
+    item = found.record["cameras"]["side"]
+    assert (item["yaw_margin"] is None) == believed
+    assert ("correction_m" in item) == believed
+
+
+def test_a_run_without_data_says_what_is_missing(
+    run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with EpisodeWriter(run.episodes_dir / "t.mcap") as writer:
+        writer.describe(EpisodeInfo(id="t", kind="trial"))
+    assert calibrate(run, "--cameras") == 2
+    assert "target poses or depth images" in capsys.readouterr().err
+    assert read_calibration(run) is None
+
+
+def test_a_camera_that_moves_asks_for_target_poses(
+    run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = Recording(run.episodes_dir / "scan.mcap", some_postures(3))
+    recording.intrinsics("wrist")
+    for index in range(3):
+        T = np.eye(4)
+        T[0, 3] = 0.1 * index
+        recording.transform("wrist", T, recording.stamp(index))
+        recording.depth("wrist", np.ones((240, 320)), recording.stamp(index))
+    recording.writer.close()
+    assert placement([Episode.open(run.episodes()[0])]) == {"wrist": "moving"}
+    assert calibrate(run, "--cameras") == 2
+    assert "cam/wrist/target/pose" in capsys.readouterr().err
+
+
+def test_turning_about_one_axis_is_said_in_one_sentence(
+    run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = []
+    for turn in np.linspace(-1, 1, 8):
+        T = np.eye(4)
+        T[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, turn]))
+        T[0, 3] = turn
+        rows.append([T.tolist(), se3.invert(T).tolist()])
+    path = tmp_path / "pairs.json"
+    path.write_text(json.dumps(rows))
+    code = calibrate(run, "--cameras", "--camera", "wrist", "--pairs", str(path))
+    error = capsys.readouterr().err
+    assert code == 1
+    assert "one axis only" in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "found"),
+    [
+        ((), "say what to calibrate"),
+        (("--physics",), "not part of this version"),
+        (("--cameras", "--pairs", "x.json"), "--pairs needs --camera"),
+        (("--cameras", "--camera", "front"), "camera front has neither"),
+        (("--cameras", "--max-postures", "0"), "--max-postures 0"),
+    ],
+)
+def test_wrong_use_is_exit_code_two(
+    run: RunFolder, arguments: tuple[str, ...], found: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert calibrate(run, *arguments) == 2
+    assert found in capsys.readouterr().err
+
+
+def place_record(link: str) -> dict[str, object]:
+    pose = {"p_m": [0.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}
+    return {"link": link, "stream": "depth", "T_link_camera": pose}
+
+
+def test_a_later_calibration_keeps_what_it_did_not_look_at(run: RunFolder) -> None:
+    first = write_calibration(run, {"a": place_record("tool0")}, {"b": "not seen"})
+    second = write_calibration(run, {"b": place_record("base_link")}, {"a": "not seen today"})
+    assert set(second["cameras"]) == {"a", "b"}
+    assert second["not_identified"] == {}
+    assert first["calibration_id"] != second["calibration_id"]
+    assert write_calibration(run, {}, {})["calibration_id"] == second["calibration_id"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["{", "[]", '{"schema_version": 9}', '{"schema_version": 1, "cameras": {"a": {}}}'],
+)
+def test_a_damaged_calibration_is_refused(run: RunFolder, text: str) -> None:
+    run.scene_dir.mkdir(parents=True)
+    (run.scene_dir / "calibration.json").write_text(text)
+    with pytest.raises(UnreadableCalibrationError, match=r"calibration\.json"):
+        read_calibration(run)
