@@ -294,3 +294,47 @@ def test_without_the_package_the_extra_is_named(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(loading.importlib, "import_module", missing)
     with pytest.raises(MissingDependencyError, match=r"robot-gst\[foundation\]"):
         loading.import_transformers()
+
+
+def test_sam3_is_read_in_the_form_it_is_published_in(
+    saved: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """As the detector inside a model for videos, whose other parts are left out."""
+    import json
+
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    for path in saved("sam3").iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    inner = json.loads((tmp_path / "config.json").read_text())
+    outer = {"model_type": "sam3_video", "detector_config": inner}
+    (tmp_path / "config.json").write_text(json.dumps(outer))
+    tensors = load_file(tmp_path / "model.safetensors")
+    named = {f"detector_model.{name}": values for name, values in tensors.items()}
+    named |= {"tracker_model.a": torch.zeros(3), "tracker_neck.b": torch.zeros(2)}
+    save_file(named, tmp_path / "model.safetensors", metadata={"format": "pt"})
+    where = {"camera_id": "c", "stamp_ns": 0}
+    plain, video = (
+        Sam3Segmenter.load(folder, CPU, ALL_QUERIES).segment(picture(), ["duck"], **where)
+        for folder in (saved("sam3"), tmp_path)
+    )
+    for one, other in zip(plain.masks, video.masks, strict=True):
+        assert one.score == other.score
+        np.testing.assert_array_equal(one.image, other.image)
+
+
+def test_half_precision_gives_nearly_the_same_as_float32(saved: Callable[[str], Path]) -> None:
+    half = Placement(device="cpu", dtype="bfloat16")
+    image = picture(64, 64)
+    (exact,) = DinoFeatures.load(saved("dino_vit"), CPU).features([image])
+    (rough,) = DinoFeatures.load(saved("dino_vit"), half).features([image])
+    assert rough.values.dtype == np.float32
+    apart = np.linalg.norm(rough.values - exact.values) / np.linalg.norm(exact.values)
+    assert 0.0 < apart < 0.05  # eight bits of mantissa
+    words = [ClipEmbedder.load(saved("clip"), at).encode(["red cube"]) for at in (CPU, half)]
+    assert float(words[0][0] @ words[1][0]) > 0.999
+    masks = Sam3Segmenter.load(saved("sam3"), half, ALL_QUERIES).segment(
+        image, ["duck"], camera_id="c", stamp_ns=0
+    )
+    assert len(masks.masks) == 10
