@@ -29,6 +29,7 @@ from twin.scene.ply import write_ply
 from twin.scene.raster import RasterConfig, load_native
 from twin.scene.record import Cost, make_record, protocol_of
 from twin.scene.robot_stage import DrivenRobot, write_robot
+from twin.scene.semantics.stage import write_scene_semantics
 from twin.scene.settings import RebuildConfig
 from twin.scene.store import (
     BACKGROUND,
@@ -40,7 +41,7 @@ from twin.scene.store import (
 from twin.scene.view_numbers import summarise_views
 from twin.scene.views import ViewsJob, views_path, write_views
 
-METHOD_VERSION = 9
+METHOD_VERSION = 10
 """Counts changes of method that make older scenes out of date."""
 
 
@@ -96,6 +97,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     links = learnt.robot.frames.links(config.initialise)
     views = _hold_out(run, learnt, fitted, apart, links, config, clock, output)
     extras = apart.write(run, learnt.views) | write_robot(run, learnt.robot, links)
+    extras |= write_scene_semantics(run.scene_dir, apart, learnt.views, config.fit.threads, output)
     record = make_record(
         key=key,
         scene_hash=background_hash(run),
@@ -212,6 +214,8 @@ def _already_done(run: RunFolder, key: str) -> dict[str, Any] | None:
     ]
     links = record.get("robot", {}).get("links", {})
     needed += [run.scene_dir / item["file"] for item in links.values()]
+    if "semantics" in record:
+        needed.append(run.scene_dir / record["semantics"]["file"])
     whole = all(path.is_file() for path in needed)
     return record if whole and background_hash(run) == record["scene_hash"] else None
 

@@ -182,7 +182,12 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
         message = f"claims {size} bytes"
         raise ValueError(message)
     with np.load(path, allow_pickle=False) as archive:
-        return {name: archive[name] for name in archive.files}
+        arrays = {name: archive[name] for name in archive.files}
+    foreign = [name for name, values in arrays.items() if not isinstance(values, np.ndarray)]
+    if foreign:
+        message = f"{foreign[0]} is no array"
+        raise ValueError(message)
+    return arrays
 
 
 def _features_from(arrays: dict[str, np.ndarray]) -> SceneFeatures:

@@ -236,7 +236,8 @@ def _head_core(
 def _headness(piece: np.ndarray, thickness: np.ndarray) -> float:
     """Thick and high."""
     levels = np.nonzero(piece)[2]
-    return float(thickness[piece].max()) * (1.0 + 0.5 * float(levels.mean()) / piece.shape[2])
+    height = float(levels.mean()) / piece.shape[2]
+    return float(thickness[piece].max() * (1.0 + 0.5 * height))
 
 
 def _keypoints(
@@ -250,5 +251,9 @@ def _keypoints(
         cells = solid.centres_m(limb)
         away = np.linalg.norm(cells - points["body"], axis=1)
         tips.append(cells[away >= np.quantile(away, 0.9)].mean(axis=0))
-    around = sorted(tips, key=lambda tip: float(np.arctan2(*(tip - points["body"])[1::-1])))
+    around = sorted(tips, key=lambda tip: _bearing(tip - points["body"]))
     return points | {f"limb {number}": tip for number, tip in enumerate(around, start=1)}
+
+
+def _bearing(away: np.ndarray) -> float:
+    return float(np.arctan2(away[1], away[0]))

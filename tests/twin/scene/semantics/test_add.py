@@ -1,0 +1,109 @@
+"""What rebuild calls: files in the scene folder, and the record that names them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from table_scene import World, make_world, table
+
+from twin.scene.semantics.add import add_semantics
+from twin.scene.semantics.features import FeatureBasis, SceneFeatures, load_features
+from twin.scene.semantics.query import query
+from twin.scene.semantics.result import Mask, MaskSet
+from twin.scene.semantics.store import UnreadableSemanticsError, read_semantics
+
+
+def added(folder: Path, world: World, **options: object) -> dict[str, object]:
+    """Take the red cube out as an object, as rebuild does."""
+    cube = world.true_instances() == 1
+    return add_semantics(
+        folder,
+        world.cloud.take(~cube),
+        {"red_cube": world.cloud.take(cube)},
+        [shot.viewpoint for shot in world.train],
+        threads=1,
+        **options,  # type: ignore[arg-type]
+    )
+
+
+def rows_of(world: World) -> dict[str, int]:
+    cube = int((world.true_instances() == 1).sum())
+    return {"background": len(world.cloud) - cube, "red_cube": cube}
+
+
+def test_what_is_written_comes_back(tabletop: World, tmp_path: Path) -> None:
+    record = added(tmp_path, tabletop)
+    scene = read_semantics(tmp_path, rows_of(tabletop))
+    assert {item.label for item in scene.instances} == set(tabletop.names.values())
+    assert record["source"] == scene.source == "default segmenter"
+    about = {item["label"]: item for item in record["instances"]}  # type: ignore[attr-defined]
+    assert about["red cube"]["object"] == "red_cube"
+    assert about["green ball"]["object"] is None
+    box = next(item for item in scene.instances if item.label == "blue open container")
+    assert set(box.parts) == {"rim", "floor", "walls"}
+    assert not any((mask & ~box.mask).any() for mask in box.parts.values())
+    np.testing.assert_allclose(box.keypoints_m["opening"][:2], [0.10, 0.08], atol=0.005)
+    assert query(scene, "rim of the box").parts == {(box.id, "rim"): 1.0}
+    np.testing.assert_allclose(
+        box.T_base_instance[:3, :3] @ box.T_base_instance[:3, :3].T, np.eye(3), atol=1e-9
+    )
+
+
+def test_semantics_of_other_splats_are_refused(tabletop: World, tmp_path: Path) -> None:
+    added(tmp_path, tabletop)
+    rows = rows_of(tabletop)
+    with pytest.raises(UnreadableSemanticsError, match="made for files with"):
+        read_semantics(tmp_path, {**rows, "red_cube": rows["red_cube"] + 1})
+    path = tmp_path / "semantics.npz"
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(UnreadableSemanticsError, match="unreadable"):
+        read_semantics(tmp_path, rows)
+
+
+def test_an_empty_table_is_a_remark_not_an_error(tmp_path: Path) -> None:
+    world = make_world([table()], num_train=4, num_held_out=0)
+    record = add_semantics(tmp_path, world.cloud, {}, [], threads=1)
+    assert record["instances"] == []
+    assert str(record["remark"]).startswith("nothing stands on the level plane")
+    scene = read_semantics(tmp_path, {"background": len(world.cloud)})
+    assert not scene.labels.any()
+
+
+def test_an_empty_scene_is_a_remark_too(tabletop: World, tmp_path: Path) -> None:
+    nothing = tabletop.cloud.take(np.zeros(0, dtype=int))
+    record = add_semantics(tmp_path, nothing, {}, [tabletop.train[0].viewpoint], threads=1)
+    assert "no level plane among 0 points" in str(record["remark"])
+
+
+def test_masks_that_do_not_fit_are_a_remark(tabletop: World, tmp_path: Path) -> None:
+    masks = MaskSet(
+        camera_id="scan",
+        stamp_ns=0,
+        masks=[Mask(image=np.ones((5, 5), dtype=bool), label="cup")],
+        source="made model",
+    )
+    record = added(tmp_path, tabletop, masks=[(tabletop.train[0].viewpoint, masks)])
+    assert record["instances"] == []
+    assert record["source"] == "made model"
+    assert "5 x 5 pixels" in str(record["remark"])
+
+
+def test_features_lie_beside_the_labels(tabletop: World, tmp_path: Path) -> None:
+    num = len(tabletop.cloud)
+    features = SceneFeatures(
+        basis=FeatureBasis(
+            mean=np.zeros(4, dtype=np.float32),
+            components=np.eye(2, 4, dtype=np.float32),
+            explained_fraction=0.9,
+        ),
+        features=np.ones((num, 2), dtype=np.float32),
+        weight=np.ones(num, dtype=np.float32),
+        instance_ids=np.zeros(0, dtype=np.int32),
+        instance_embeddings=np.zeros((0, 0), dtype=np.float32),
+        source="made model",
+    )
+    record = added(tmp_path, tabletop, features=features)
+    assert record["features"]["num_kept"] == 2  # type: ignore[index]
+    assert load_features(tmp_path / "features.npz", num).source == "made model"
+    added(tmp_path, tabletop)
+    assert not (tmp_path / "features.npz").exists()

@@ -1,0 +1,157 @@
+import io
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.errors import PathNotFoundError
+from twin.scene.semantics.features import (
+    FeatureBasis,
+    SceneFeatures,
+    UnreadableFeaturesError,
+    fit_basis,
+    load_features,
+    save_features,
+)
+from twin.scene.semantics.result import FeatureMap, SemanticsError
+
+
+def low_rank_maps(channels: int = 12, rank: int = 3, seed: int = 0) -> list[FeatureMap]:
+    rng = np.random.default_rng(seed)
+    mixing, offset = rng.normal(size=(channels, rank)), rng.normal(size=(channels, 1))
+    return [
+        FeatureMap(
+            values=(mixing @ rng.normal(size=(rank, 80)) + offset)
+            .reshape(channels, 8, 10)
+            .astype(np.float32),
+            stride=4,
+        )
+        for _ in range(4)
+    ]
+
+
+def some_features(num_splats: int = 30) -> SceneFeatures:
+    rng = np.random.default_rng(1)
+    return SceneFeatures(
+        basis=fit_basis(low_rank_maps(), 3),
+        features=rng.normal(size=(num_splats, 3)).astype(np.float32),
+        weight=rng.uniform(size=num_splats).astype(np.float32),
+        instance_ids=np.array([1, 2], dtype=np.int32),
+        instance_embeddings=rng.normal(size=(2, 5)).astype(np.float32),
+        source="made model",
+    )
+
+
+def test_a_basis_of_the_true_rank_loses_nothing() -> None:
+    maps = low_rank_maps()
+    basis = fit_basis(maps, 3)
+    assert basis.explained_fraction == pytest.approx(1.0, abs=1e-6)
+    np.testing.assert_allclose(basis.components @ basis.components.T, np.eye(3), atol=1e-5)
+    reduced = basis.reduce(maps[0]).values.reshape(3, -1)
+    back = basis.components.T @ reduced + basis.mean[:, None]
+    np.testing.assert_allclose(back, maps[0].values.reshape(12, -1), atol=1e-4)
+
+
+@pytest.mark.parity
+def test_the_basis_is_that_of_a_singular_value_decomposition() -> None:
+    rng = np.random.default_rng(2)
+    values = rng.normal(size=(6, 10, 12)) * np.arange(1, 7)[:, None, None]
+    basis = fit_basis([FeatureMap(values=values.astype(np.float32), stride=1)], 2)
+    rows = values.reshape(6, -1).T
+    _, singular, axes = np.linalg.svd(rows - rows.mean(axis=0), full_matrices=False)
+    np.testing.assert_allclose(np.abs(basis.components @ axes[:2].T), np.eye(2), atol=1e-4)
+    explained = float((singular[:2] ** 2).sum() / (singular**2).sum())
+    assert basis.explained_fraction == pytest.approx(explained, abs=1e-4)
+
+
+def test_the_order_of_maps_does_not_change_the_basis() -> None:
+    maps = low_rank_maps()
+    first, second = fit_basis(maps, 3), fit_basis(maps[::-1], 3)
+    np.testing.assert_allclose(first.components, second.components, atol=1e-4)
+
+
+def test_what_is_saved_comes_back(tmp_path: Path) -> None:
+    saved = some_features()
+    loaded = load_features(save_features(tmp_path, saved), 30)
+    np.testing.assert_allclose(loaded.features, saved.features, rtol=1e-3, atol=1e-3)
+    np.testing.assert_array_equal(loaded.basis.components, saved.basis.components)
+    np.testing.assert_array_equal(loaded.instance_embeddings, saved.instance_embeddings)
+    assert loaded.instance_ids.tolist() == [1, 2]
+    assert loaded.source == "made model"
+
+
+def test_the_same_features_are_the_same_bytes(tmp_path: Path) -> None:
+    path = save_features(tmp_path, some_features())
+    first = path.read_bytes()
+    assert save_features(tmp_path, some_features()).read_bytes() == first
+
+
+def test_features_of_another_scene_are_refused(tmp_path: Path) -> None:
+    path = save_features(tmp_path, some_features())
+    with pytest.raises(UnreadableFeaturesError, match="of 30 Gaussians for a scene of 31"):
+        load_features(path, 31)
+
+
+def test_a_file_that_is_not_there_says_how_to_make_it(tmp_path: Path) -> None:
+    with pytest.raises(PathNotFoundError, match="rebuild"):
+        load_features(tmp_path / "features.npz", 3)
+
+
+def rewritten(path: Path, **changes: np.ndarray) -> None:
+    with np.load(path) as archive:
+        arrays = {name: archive[name] for name in archive.files} | changes
+    np.savez(path, **arrays)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"version": np.array(9)}, "format version 9"),
+        ({"weight": np.zeros(3, dtype=np.float32)}, "do not fit together"),
+        ({"features": np.full((30, 3), np.nan, dtype=np.float16)}, "not finite"),
+        ({"features": np.zeros((30, 4), dtype=np.float16)}, "do not fit together"),
+    ],
+)
+def test_a_file_that_contradicts_itself_is_refused(
+    tmp_path: Path, change: dict[str, np.ndarray], words: str
+) -> None:
+    path = save_features(tmp_path, some_features())
+    rewritten(path, **change)
+    with pytest.raises(UnreadableFeaturesError, match=words):
+        load_features(path, 30)
+
+
+def test_a_pickle_in_the_file_is_never_opened(tmp_path: Path) -> None:
+    path = save_features(tmp_path, some_features())
+    rewritten(path, weight=np.array([{"an": "object"}] * 30, dtype=object))
+    with pytest.raises(UnreadableFeaturesError, match="unreadable"):
+        load_features(path, 30)
+
+
+@pytest.mark.parametrize("cut", [0, 1, 20, 200])
+def test_a_cut_file_is_refused(tmp_path: Path, cut: int) -> None:
+    path = save_features(tmp_path, some_features())
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(UnreadableFeaturesError, match="unreadable"):
+        load_features(path, 30)
+
+
+def test_an_archive_without_the_arrays_is_refused(tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        archive.writestr("hello.txt", "hello")
+    path = tmp_path / "features.npz"
+    path.write_bytes(stream.getvalue())
+    with pytest.raises(UnreadableFeaturesError, match="unreadable"):
+        load_features(path, 30)
+
+
+def test_a_map_of_another_model_is_refused() -> None:
+    basis: FeatureBasis = fit_basis(low_rank_maps(), 3)
+    other = replace(low_rank_maps(channels=7)[0])
+    with pytest.raises(SemanticsError, match="7 channels, the basis 12"):
+        basis.reduce(other)
+    with pytest.raises(SemanticsError, match="at least one"):
+        fit_basis([], 3)
