@@ -7,10 +7,8 @@ namespace splat {
 
 constexpr int kBlurRadius = 5;
 
-// Floats of working memory that ``similarity_band`` needs: rings of eleven blurred rows.
-static constexpr std::int64_t similarity_scratch(int width) {
-    return ((width + 15) / 16 * 16 + 32) * std::int64_t{(2 * kBlurRadius + 1) * 7 + 8};
-}
+constexpr int kStripColumns = 96;  // of an image whose similarity is taken at once
+constexpr int kStripRow = kStripColumns + 4 * kBlurRadius + 28;  // with borders and whole vectors
 
 struct AdamRates {
     float rate, beta1, beta2, epsilon;
@@ -71,10 +69,11 @@ struct Kernels {
     // ``slots`` names for each Gaussian of the job the tile of ``label_weights`` it adds to.
     void (*label_tile)(const Projected*, const TileJob&, const Camera&, const Settings&,
                        const int* slots, float* label_weights);
-    // Structural similarity of rows y0..y1 of two planes: returns its sum, and fills these rows of
-    // the gradient of ``scale`` times the sum over the whole plane with respect to ``x``.
-    double (*similarity_band)(const float* x, const float* y, float* gradient, float scale,
-                              float* scratch, int width, int height, int y0, int y1);
+    // Structural similarity of the columns from x0 on (at most kStripColumns) of two planes:
+    // returns its sum, and fills these columns of the gradient of ``scale`` times the sum over the
+    // whole plane with respect to ``x``.
+    double (*similarity_strip)(const float* x, const float* y, float* gradient, float scale,
+                               int width, int height, int x0);
     // Fills the two rows to compare; adds the sums of |difference| and difference^2.
     void (*compare_row)(const ColorRow&, float* compared, float* wanted, double* l1,
                         double* squared);

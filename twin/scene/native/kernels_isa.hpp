@@ -19,8 +19,8 @@ void lift_tile(const Projected*, const TileJob&, const Camera&, const Settings&,
                const float* planes, int num_planes, float* tile_planes, float* pair_sums);
 void label_tile(const Projected*, const TileJob&, const Camera&, const Settings&, const int* slots,
                 float* label_weights);
-double similarity_band(const float* x, const float* y, float* gradient, float scale,
-                       float* scratch, int width, int height, int y0, int y1);
+double similarity_strip(const float* x, const float* y, float* gradient, float scale, int width,
+                        int height, int x0);
 void compare_row(const ColorRow&, float* compared, float* wanted, double* l1, double* squared);
 float color_gradient_row(const ColorRow&, const float* compared, const float* wanted,
                          const ColorWeights&, float* gradient);

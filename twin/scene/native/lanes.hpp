@@ -25,7 +25,6 @@ static inline Floats load(const float* at) {
     __builtin_memcpy(&value, at, sizeof value);
     return value;
 }
-
 static inline void store(float* at, Floats value) { __builtin_memcpy(at, &value, sizeof value); }
 
 // The first ``count`` lanes (at most all of them), zeros beyond.
@@ -34,12 +33,6 @@ static inline Floats load_some(const float* at, int count) {
     Floats value = Floats{};
     for (int i = 0; i < count; ++i) value[i] = at[i];
     return value;
-}
-
-static inline Ints first_lanes(int count) {
-    Ints lane;
-    for (int i = 0; i < kLanes; ++i) lane[i] = i;
-    return lane < count;
 }
 
 static inline void store_some(float* at, Floats value, int count) {

@@ -19,8 +19,7 @@ class Similarity {
   private:
     const Kernels& kernels_;
     int threads_;
-    std::vector<float> scratch_;  // of each thread
-    std::vector<double> sums_;    // of each band
+    std::vector<double> sums_;  // of each strip
 };
 
 }  // namespace splat

@@ -1,9 +1,9 @@
 // Structural similarity (Wang et al. 2004: 11 x 11 Gaussian window, sigma 1.5 px) and its gradient.
 //
-// Zero padding, so that the adjoint of the blur is the blur. A band of rows streams through rings
-// of eleven blurred rows that stay in the cache: means of x, y, x^2 + y^2 and xy give the
-// similarity of the row five above, its derivatives by the means are blurred again and give the
-// gradient of the row ten above.
+// Zero padding, so that the adjoint of the blur is the blur. A strip of columns runs down the image
+// through rings of eleven blurred rows that stay in the nearest cache: means of x, y, x^2 + y^2 and
+// xy give the similarity of the row five above, its derivatives by the means are blurred again and
+// give the gradient of the row ten above.
 #include <cmath>
 
 #include "kernels_isa.hpp"
@@ -30,29 +30,33 @@ struct Window {
     }
 };
 
-struct Band {
+// Rows hold columns from ten (pixels) or five (means, derivatives before they are blurred) to the
+// left of the strip on, so that a blurred row begins five columns further right than its source.
+struct Strip {
     const float *x, *y;
     int width, height;
-    int blocks;  // vectors in a row
-    int stride;  // floats of a row in the rings
+    int x0, columns;           // of the gradient
+    int blocks, wide_blocks;   // vectors of a row of gradients, of means
     const float* tap;
-    float *means, *derivatives;  // rings: map by slot by column
-    float* padded;               // rows with a margin on both sides, zero there
+    float means[kMeans][kTaps][kStripRow];
+    float derivatives[kDerivatives][kTaps][kStripRow];
+    float row[kMeans][kStripRow];  // before it is blurred along
 };
 
-float* ring_row(float* ring, int map, int row, const Band& band) {
-    const int slot = (row + 2 * kTaps) % kTaps;  // rows start at -10
-    return ring + static_cast<std::int64_t>(map * kTaps + slot) * band.stride;
+// Values of a row of the image from ``column`` on, zero outside.
+Floats load_inside(const float* row, int column, int width) {
+    if (column >= 0 && column + kLanes <= width) return load(row + column);
+    Floats value = Floats{};
+    for (int i = 0; i < kLanes; ++i)
+        if (column + i >= 0 && column + i < width) value[i] = row[column + i];
+    return value;
 }
 
-float* padded_row(const Band& band, int map) {
-    return band.padded + static_cast<std::int64_t>(map) * (band.stride + 16) + 16;
-}
+int slot_of(int row) { return (row + 2 * kTaps) % kTaps; }  // rows begin at -10
 
-void blur_along(const float* row, float* out, const Band& band) {
-    const float* t = band.tap;
-    for (int i = 0; i < band.blocks; ++i) {
-        const float* at = row + i * kLanes;
+void blur_along(const float* row, float* out, int blocks, const float* t) {
+    for (int i = 0; i < blocks; ++i) {
+        const float* at = row + i * kLanes + kBlurRadius;
         Floats total = load(at) * t[0];
         for (int k = 1; k <= kBlurRadius; ++k) total += (load(at - k) + load(at + k)) * t[k];
         store(out + i * kLanes, total);
@@ -61,9 +65,8 @@ void blur_along(const float* row, float* out, const Band& band) {
 
 struct Column {
     const float* rows[kTaps];
-    Column(float* ring, int map, int middle, const Band& band) {
-        for (int k = 0; k < kTaps; ++k)
-            rows[k] = ring_row(ring, map, middle + k - kBlurRadius, band);
+    Column(const float (*ring)[kStripRow], int middle) {
+        for (int k = 0; k < kTaps; ++k) rows[k] = ring[slot_of(middle + k - kBlurRadius)];
     }
     Floats blurred(int at, const float* t) const {
         Floats total = load(rows[kBlurRadius] + at) * t[0];
@@ -73,40 +76,50 @@ struct Column {
     }
 };
 
-void clear(float* ring, int num_maps, int row, const Band& band) {
-    for (int map = 0; map < num_maps; ++map)
-        __builtin_memset(ring_row(ring, map, row, band), 0, sizeof(float) * band.stride);
-}
-
-void push_pixels(int row, const Band& band) {
-    if (row < 0 || row >= band.height) return clear(band.means, kMeans, row, band);
-    const std::int64_t start = static_cast<std::int64_t>(row) * band.width;
-    for (int i = 0; i < band.blocks; ++i) {
-        const int at = i * kLanes, left = band.width - at;
-        const Floats x = load_some(band.x + start + at, left);
-        const Floats y = load_some(band.y + start + at, left);
-        store(padded_row(band, kX) + at, x);
-        store(padded_row(band, kY) + at, y);
-        store(padded_row(band, kSquares) + at, x * x + y * y);
-        store(padded_row(band, kProduct) + at, x * y);
+void push_pixels(int row, Strip* strip) {
+    const int slot = slot_of(row);
+    if (row < 0 || row >= strip->height) {
+        for (auto& ring : strip->means) __builtin_memset(ring[slot], 0, sizeof ring[slot]);
+        return;
+    }
+    const std::int64_t start = static_cast<std::int64_t>(row) * strip->width;
+    const int left = strip->x0 - 2 * kBlurRadius;
+    const int source_blocks = (strip->columns + 4 * kBlurRadius + kLanes - 1) / kLanes;
+    for (int i = 0; i < source_blocks; ++i) {
+        const int at = i * kLanes;
+        const Floats x = load_inside(strip->x + start, left + at, strip->width);
+        const Floats y = load_inside(strip->y + start, left + at, strip->width);
+        store(strip->row[kX] + at, x);
+        store(strip->row[kY] + at, y);
+        store(strip->row[kSquares] + at, x * x + y * y);
+        store(strip->row[kProduct] + at, x * y);
     }
     for (int map = 0; map < kMeans; ++map)
-        blur_along(padded_row(band, map), ring_row(band.means, map, row, band), band);
+        blur_along(strip->row[map], strip->means[map][slot], strip->wide_blocks, strip->tap);
+}
+
+// Which lanes lie in first..last, the first of them being ``at``.
+Ints between(int at, int first, int last) {
+    Ints lane;
+    for (int i = 0; i < kLanes; ++i) lane[i] = i;
+    lane += at;
+    return (lane >= first) & (lane < last);
 }
 
 // Returns the sum of the similarity over one row, and blurs its derivatives along it.
-double push_similarity(int row, const Band& band) {
-    if (row < 0 || row >= band.height) {
-        clear(band.derivatives, kDerivatives, row, band);
+double push_similarity(int row, Strip* strip) {
+    const int slot = slot_of(row);
+    if (row < 0 || row >= strip->height) {
+        for (auto& ring : strip->derivatives) __builtin_memset(ring[slot], 0, sizeof ring[slot]);
         return 0;
     }
-    const Column xs(band.means, kX, row, band), ys(band.means, kY, row, band);
-    const Column squares(band.means, kSquares, row, band);
-    const Column products(band.means, kProduct, row, band);
-    const float* t = band.tap;
+    const Column xs(strip->means[kX], row), ys(strip->means[kY], row);
+    const Column squares(strip->means[kSquares], row), products(strip->means[kProduct], row);
+    const float* t = strip->tap;
+    const int left = strip->x0 - kBlurRadius;
     Floats total = Floats{};
-    for (int i = 0; i < band.blocks; ++i) {
-        const int at = i * kLanes, left = band.width - at;
+    for (int i = 0; i < strip->wide_blocks; ++i) {
+        const int at = i * kLanes;
         const Floats mx = xs.blurred(at, t), my = ys.blurred(at, t);
         const Floats mean_squares = mx * mx + my * my;
         const Floats a1 = 2.0f * mx * my + kC1;
@@ -119,51 +132,52 @@ double push_similarity(int row, const Band& band) {
         const Floats by_product = 2.0f * a1 * inverse;
         const Floats by_x =
             2.0f * (my * (a2 - a1) * inverse - mx * (value * b2 * inverse + by_squares));
-        const Ints inside = first_lanes(left);
-        total += keep(inside, value);
-        store(padded_row(band, kByX) + at, keep(inside, by_x));
-        store(padded_row(band, kBySquares) + at, keep(inside, by_squares));
-        store(padded_row(band, kByProduct) + at, keep(inside, by_product));
+        total += keep(between(left + at, strip->x0, strip->x0 + strip->columns), value);
+        const Ints inside = between(left + at, 0, strip->width);
+        store(strip->row[kByX] + at, keep(inside, by_x));
+        store(strip->row[kBySquares] + at, keep(inside, by_squares));
+        store(strip->row[kByProduct] + at, keep(inside, by_product));
     }
     for (int map = 0; map < kDerivatives; ++map)
-        blur_along(padded_row(band, map), ring_row(band.derivatives, map, row, band), band);
+        blur_along(strip->row[map], strip->derivatives[map][slot], strip->blocks, t);
     return sum(total);
 }
 
-void write_gradient(int row, const Band& band, float scale, float* gradient) {
-    const Column by_x(band.derivatives, kByX, row, band);
-    const Column by_squares(band.derivatives, kBySquares, row, band);
-    const Column by_product(band.derivatives, kByProduct, row, band);
-    const std::int64_t start = static_cast<std::int64_t>(row) * band.width;
-    for (int i = 0; i < band.blocks; ++i) {
-        const int at = i * kLanes, left = band.width - at;
-        const Floats x = load_some(band.x + start + at, left);
-        const Floats y = load_some(band.y + start + at, left);
-        const Floats d = by_x.blurred(at, band.tap) + 2.0f * x * by_squares.blurred(at, band.tap) +
-                         y * by_product.blurred(at, band.tap);
+void write_gradient(int row, const Strip& strip, float scale, float* gradient) {
+    const Column by_x(strip.derivatives[kByX], row);
+    const Column by_squares(strip.derivatives[kBySquares], row);
+    const Column by_product(strip.derivatives[kByProduct], row);
+    const std::int64_t start = static_cast<std::int64_t>(row) * strip.width + strip.x0;
+    for (int i = 0; i < strip.blocks; ++i) {
+        const int at = i * kLanes, left = strip.columns - at;
+        const Floats x = load_some(strip.x + start + at, left);
+        const Floats y = load_some(strip.y + start + at, left);
+        const Floats d = by_x.blurred(at, strip.tap) +
+                         2.0f * x * by_squares.blurred(at, strip.tap) +
+                         y * by_product.blurred(at, strip.tap);
         store_some(gradient + start + at, d * scale, left);
     }
 }
 
 }  // namespace
 
-double similarity_band(const float* x, const float* y, float* gradient, float scale,
-                       float* scratch, int width, int height, int y0, int y1) {
+double similarity_strip(const float* x, const float* y, float* gradient, float scale, int width,
+                        int height, int x0) {
     static const Window window;
-    Band band{x, y, width, height, (width + kLanes - 1) / kLanes, (width + 15) / 16 * 16 + 16,
-              window.tap, scratch, nullptr, nullptr};
-    band.derivatives = band.means + static_cast<std::int64_t>(kMeans) * kTaps * band.stride;
-    band.padded = band.derivatives + static_cast<std::int64_t>(kDerivatives) * kTaps * band.stride;
-    __builtin_memset(band.padded, 0, sizeof(float) * kMeans * (band.stride + 16));
+    Strip strip;  // rows of the rings are written before they are read
+    strip.x = x, strip.y = y, strip.width = width, strip.height = height, strip.x0 = x0;
+    strip.columns = width - x0 < kStripColumns ? width - x0 : kStripColumns;
+    strip.blocks = (strip.columns + kLanes - 1) / kLanes;
+    strip.wide_blocks = (strip.columns + 2 * kBlurRadius + kLanes - 1) / kLanes;
+    strip.tap = window.tap;
+    __builtin_memset(strip.row, 0, sizeof strip.row);
     double total = 0;
-    for (int row = y0 - 2 * kBlurRadius; row < y1 + 2 * kBlurRadius; ++row) {
-        push_pixels(row, band);
-        const int middle = row - kBlurRadius;
-        if (middle < y0 - kBlurRadius) continue;
-        const double value = push_similarity(middle, band);
-        if (middle >= y0 && middle < y1) total += value;
+    for (int row = -2 * kBlurRadius; row < height + 2 * kBlurRadius; ++row) {
+        push_pixels(row, &strip);
+        if (row < 0) continue;
+        total += push_similarity(row - kBlurRadius, &strip);
         const int done = row - 2 * kBlurRadius;
-        if (done >= y0) write_gradient(done, band, scale, gradient);
+        if (done >= 0) write_gradient(done, strip, scale, gradient);
     }
     return total;
 }
