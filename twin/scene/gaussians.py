@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from jaxtyping import Float, Float32
 
+from twin.errors import TwinError
+
 SH_DC = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi)); PLY files store (c - 0.5) / SH_DC."""
 
@@ -42,7 +44,17 @@ class GaussianCloud:
     harmonics of degree 1, none or three of them (``harmonic_basis``) for each colour."""
 
     def __post_init__(self) -> None:
-        """A cloud made without harmonics has rows of none."""
+        """A cloud made without harmonics has rows of none.
+
+        Raises:
+            TwinError: When there are neither none nor all three of degree 1.
+        """
+        if self.harmonics.shape[1] not in (0, NUM_FIRST):
+            message = (
+                f"a cloud with {self.harmonics.shape[1]} harmonics per colour: give none or the "
+                f"{NUM_FIRST} of degree 1."
+            )
+            raise TwinError(message)
         if len(self.harmonics) == 0 and len(self.means_m) > 0:
             none = np.zeros((len(self.means_m), 0, 3), dtype=np.float32)
             object.__setattr__(self, "harmonics", none)

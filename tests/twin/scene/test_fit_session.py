@@ -216,3 +216,13 @@ def test_an_image_of_another_size_is_refused() -> None:
     session = FitSession(some_cloud(10), RasterConfig(threads=1))
     with pytest.raises(ValueError, match="camera's size"):
         session.step(other, a_pose(), RATES)
+
+
+def test_an_empty_cloud_is_a_black_image() -> None:
+    empty = some_cloud().take(np.zeros(0, dtype=int))
+    session = FitSession(empty, RasterConfig(threads=1))
+    report = session.step(some_target(), a_pose(), RATES)
+    assert np.isfinite(report.loss)
+    assert not session.planes().any()
+    assert not report.T_camera_base.any()
+    assert len(session.gradient(report).means_m) == 0

@@ -6,6 +6,7 @@ from scipy.special import sph_harm_y
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from twin.errors import TwinError
 from twin.scene.gaussians import (
     GaussianCloud,
     arrays,
@@ -52,6 +53,11 @@ def test_a_cloud_made_without_harmonics_has_none() -> None:
     assert [name for name, _ in arrays(cloud)][-1] == "colors"
     assert cloud.take(np.arange(5)).harmonics.shape == (5, 0, 3)
     assert effective_colors(cloud, np.zeros(3)) is cloud.colors
+
+
+def test_two_harmonics_are_refused() -> None:
+    with pytest.raises(TwinError, match="2 harmonics per colour"):
+        with_harmonics(plain_cloud(), 2)
 
 
 def test_harmonics_follow_selection_and_concatenation() -> None:
