@@ -14,11 +14,12 @@ import numpy as np
 from bridge.episode import provenance
 from bridge.episode.run import RunFolder
 from bridge.errors import UsageError
-from bridge.task.task_file import load_task
+from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output
 from twin.scene.calibration import Calibration, read_calibration
 from twin.scene.fit import FitResult, fit
 from twin.scene.fit_state import FIT_STATE, Checkpoint
+from twin.scene.foundation.stage import check_models
 from twin.scene.frames import FrameChoice, Sources, choose_frames, find_sources
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, with_harmonics
 from twin.scene.initialise import fuse
@@ -69,6 +70,8 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         NoDepthError: When the depth images hold nothing usable.
         PoseConventionError: When poses fit the depth only if read in another convention.
         SplatExtensionMissingError: When the native code is not built.
+        UsageError: When a model that was named cannot be used.
+        MissingDependencyError: When the extra ``foundation`` is needed and not installed.
     """
     load_native()
     sources = find_sources(run)
@@ -97,7 +100,16 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     links = learnt.robot.frames.links(config.initialise)
     views = _hold_out(run, learnt, fitted, apart, links, config, clock, output)
     extras = apart.write(run, learnt.views) | write_robot(run, learnt.robot, links)
-    extras |= write_scene_semantics(run.scene_dir, apart, learnt.views, config.fit.threads, output)
+    extras |= write_scene_semantics(
+        run.scene_dir,
+        apart,
+        learnt.views,
+        config.fit.threads,
+        output,
+        models=config.models,
+        choices=learnt.choices,
+        task=_task(sources),
+    )
     record = make_record(
         key=key,
         scene_hash=background_hash(run),
@@ -180,23 +192,26 @@ def _key(sources: Sources, config: RebuildConfig, calibration: Calibration | Non
     settings = asdict(config)
     settings.pop("force")
     settings["fit"].pop("threads")
+    settings["models"].pop("device")
     hashes = {str(e.path.name): e.sha256() for e in sources.episodes}
+    task = _task(sources)
     return provenance.hash_settings(
         {
             "method": METHOD_VERSION,
             "episodes": hashes,
             "settings": settings,
-            "task": _task_content(sources),
+            "models": check_models(config.models, task),
+            "task": None if task is None else asdict(task),
             "calibration": None if calibration is None else calibration.calibration_id,
         }
     )
 
 
-def _task_content(sources: Sources) -> dict[str, Any] | None:
+def _task(sources: Sources) -> Task | None:
     """Shapes and colours decide the objects; a task that cannot be read gives none."""
     episode = episode_of_task(sources)
     try:
-        return None if episode is None else asdict(load_task(episode.info.task))
+        return None if episode is None else load_task(episode.info.task)
     except UsageError:
         return None
 
@@ -215,7 +230,9 @@ def _already_done(run: RunFolder, key: str) -> dict[str, Any] | None:
     links = record.get("robot", {}).get("links", {})
     needed += [run.scene_dir / item["file"] for item in links.values()]
     if "semantics" in record:
-        needed.append(run.scene_dir / record["semantics"]["file"])
+        about = record["semantics"]
+        named = [about, about.get("features") or {}, about.get("vectors") or {}]
+        needed += [run.scene_dir / item["file"] for item in named if "file" in item]
     whole = all(path.is_file() for path in needed)
     return record if whole and background_hash(run) == record["scene_hash"] else None
 

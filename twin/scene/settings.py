@@ -186,7 +186,7 @@ class ModelConfig:
     """Principal components that are kept of each feature."""
     feature_stride: int | None = None
     """Image pixels per feature; default: the model's own, 16 or 32. Less costs more."""
-    clip: Path | None = None
+    clip: str = ""
     """Folder of CLIP: things are found by meaning, not by the words of the lexicon."""
     model_frames: int = 12
     """Training frames the models look at, spread evenly."""
@@ -211,6 +211,8 @@ class RebuildConfig:
     """From depth images to the first Gaussians."""
     fit: FitConfig = FitConfig()
     """How the Gaussians are fitted to the images."""
+    models: ModelConfig = ModelConfig()
+    """Which large models to ask."""
     force: bool = False
     """Redo work that is already done."""
 

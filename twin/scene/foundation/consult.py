@@ -38,7 +38,7 @@ class Consulted:
         Returns:
             What ``scene.json`` says about it, under ``vectors``; nothing without CLIP.
         """
-        if self.config.clip is None:
+        if not self.config.clip:
             return {}
         scene = read_semantics(folder, rows)
         features = self.findings.features
@@ -72,7 +72,7 @@ def consult(
         MissingDependencyError: When the extra ``foundation`` is not installed.
     """
     num_models = bool(config.segmenter) + bool(config.features)
-    if not num_models and config.clip is None:
+    if not num_models and not config.clip:
         nothing = ModelFindings(masks=[], features=None)
         return Consulted(config=config, frames=[], findings=nothing)
     frames = training_frames(choices, config.model_frames)

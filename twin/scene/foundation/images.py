@@ -46,7 +46,7 @@ def network_input(
     torch = import_torch()
     rows = []
     for image in images_u8:
-        pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float()
+        pixels = torch.from_numpy(np.array(image)).permute(2, 0, 1)[None].float()
         if tuple(pixels.shape[2:]) != size:
             pixels = torch.nn.functional.interpolate(
                 pixels, size=size, mode=mode, align_corners=False, antialias=True

@@ -73,8 +73,8 @@ def check_models(config: ModelConfig, task: Task | None) -> dict[str, str]:
     if config.features:
         _, folder = split_spec(config.features, "--features", FEATURES)
         named.append(("features", folder, dinov3.KIND))
-    if config.clip is not None:
-        named.append(("clip", config.clip.expanduser(), clip.KIND))
+    if config.clip:
+        named.append(("clip", Path(config.clip).expanduser(), clip.KIND))
     hashes = {}
     for option, folder, kind in named:
         check_folder(folder, kind)
@@ -186,10 +186,10 @@ def embed_things(
     Raises:
         UsageError: When the folder or device cannot be used, or none is named.
     """
-    if config.clip is None:
+    if not config.clip:
         message = "no folder of CLIP is named; give --clip FOLDER."
         raise UsageError(message)
-    embedder = open_clip(config.clip, Placement(device=config.device))
+    embedder = open_clip(Path(config.clip), Placement(device=config.device))
     rasteriser = Rasteriser(RasterConfig(threads=threads))
     vectors, shown = thing_vectors(embedder, scene, cloud, frames, rasteriser)
     held = features or _no_features(len(cloud))

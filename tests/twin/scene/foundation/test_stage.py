@@ -1,5 +1,6 @@
 """What a rebuild asks the models, on a table with a red and a blue heap drawn by ourselves."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -30,10 +31,11 @@ from twin.scene.foundation.weights import WeightsError
 from twin.scene.frames import choose_frames, find_sources
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster import Rasteriser
+from twin.scene.rebuild import rebuild
 from twin.scene.semantics.features import load_features
 from twin.scene.semantics.query import query
 from twin.scene.semantics.result import Instance, SemanticScene
-from twin.scene.settings import FrameConfig, ModelConfig
+from twin.scene.settings import FitConfig, FrameConfig, InitialiseConfig, ModelConfig, RebuildConfig
 
 CAMERA = Camera(width=96, height=80, fx=90.0, fy=90.0, cx=48.0, cy=40.0)
 COLOURS = {1: (0.9, 0.1, 0.1), 2: (0.1, 0.1, 0.9)}
@@ -151,7 +153,7 @@ def test_bad_options_are_refused_before_anything_slow(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--segmenter 'sam2:x'"):
         check_models(ModelConfig(segmenter="sam2:x", prompt=("box",)), None)
     with pytest.raises(WeightsError, match="no such folder"):
-        check_models(ModelConfig(clip=tmp_path / "nothing"), None)
+        check_models(ModelConfig(clip=str(tmp_path / "nothing")), None)
     with pytest.raises(UsageError, match="--model-frames 0"):
         ModelConfig(model_frames=0)
     with pytest.raises(UsageError, match="--feature-stride 0"):
@@ -181,7 +183,7 @@ def test_all_three_models_are_asked_and_what_they_say_is_kept(
         segmenter=f"sam3:{saved('sam3')}",
         features=f"dinov3:{saved('dino_vit')}",
         feature_channels=4,
-        clip=saved("clip"),
+        clip=str(saved("clip")),
         device="cpu",
     )
     hashes = check_models(config, load_task("five_ducks_into_basket"))
@@ -218,7 +220,7 @@ def test_all_three_models_are_asked_and_what_they_say_is_kept(
     assert alone["source"] == "CLIP"
     assert load_features(tmp_path / "features.npz", len(cloud)).features.shape == (len(cloud), 0)
     with pytest.raises(UsageError, match="--clip FOLDER"):
-        embed_things(tmp_path, scene, cloud, frames, None, replace(config, clip=None))
+        embed_things(tmp_path, scene, cloud, frames, None, replace(config, clip=""))
 
 
 def test_without_any_model_nothing_is_read_or_asked() -> None:
@@ -241,3 +243,39 @@ def test_training_frames_are_spread_over_what_is_learnt_from(tmp_path: Path) -> 
     assert found[-1] == stamps[-1]
     assert set(found) <= set(stamps)
     assert len(training_frames(choices, 100)) == len(stamps)
+
+
+@pytest.mark.slow
+def test_a_rebuild_asks_the_models_it_is_given(
+    saved: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import textured_room
+
+    run = RunFolder.create(tmp_path / "run")
+    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=16)
+    models = ModelConfig(
+        segmenter=f"sam3:{saved('sam3')}",
+        prompt=("red cube",),
+        features=f"dinov3:{saved('dino_vit')}",
+        clip=str(saved("clip")),
+        model_frames=3,
+        device="cpu",
+    )
+    config = RebuildConfig(
+        fit=FitConfig(iterations=10, threads=1),
+        initialise=InitialiseConfig(max_splats=800, flying_fraction=0.1),
+        models=models,
+    )
+    record = rebuild(run, config, Output(quiet=True))["semantics"]
+    assert record["source"] == "SAM 3"
+    assert record["features"]["source"] == "DINOv3"
+    assert record["vectors"]["source"] == "CLIP"
+    json.dumps(record)  # it is part of scene.json
+    monkeypatch.setattr("twin.scene.rebuild.learn", None)  # nothing is learnt a second time
+    rebuild(run, config, Output(quiet=True))
+    (run.scene_dir / "features.npz").unlink()
+    with pytest.raises(TypeError):
+        rebuild(run, config, Output(quiet=True))
+    no_words = replace(config, models=replace(models, prompt=()))
+    with pytest.raises(UsageError, match="--prompt"):
+        rebuild(run, no_words, Output(quiet=True))
