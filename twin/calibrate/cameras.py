@@ -15,7 +15,7 @@ from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.fixed_camera import FixedCamera, find_fixed_camera
 from twin.calibrate.pairs import PosePairs, read_pairs, recorded_pairs, target_cameras
-from twin.calibrate.placement import MOVING, NO_DEPTH, placement
+from twin.calibrate.placement import MOVING, NO_DEPTH, depth_cameras, placement
 from twin.calibrate.target import TargetCamera, find_camera
 from twin.scene.calibration import CALIBRATION_FILE, write_calibration
 
@@ -36,11 +36,12 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
         RobotNotAlignedError: The same, from the robot it sees.
     """
     episodes = [Episode.open(path) for path in run.episodes()]
+    where = {} if config.pairs is not None else placement(episodes)
     found: dict[str, Any] = {}
     reasons: dict[str, str] = {}
-    for camera_id in _wanted(episodes, config):
+    for camera_id in _wanted(episodes, where, config):
         try:
-            found[camera_id] = _camera(episodes, camera_id, config)
+            found[camera_id] = _camera(episodes, camera_id, where.get(camera_id, NO_DEPTH), config)
         except GstError as error:
             if config.camera:
                 raise
@@ -51,21 +52,24 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
     return write_calibration(run, found, reasons)
 
 
-def _wanted(episodes: Sequence[Episode], config: CalibrateConfig) -> list[str]:
+def _wanted(
+    episodes: Sequence[Episode], where: Mapping[str, str], config: CalibrateConfig
+) -> list[str]:
     if config.pairs is not None and not config.camera:
         message = "--pairs needs --camera: which camera do the pose pairs belong to?"
         raise UsageError(message)
     if config.camera:
         return [config.camera]
-    return sorted({*placement(episodes), *target_cameras(episodes)})
+    return sorted({*where, *target_cameras(episodes)})
 
 
-def _camera(episodes: Sequence[Episode], camera_id: str, config: CalibrateConfig) -> dict[str, Any]:
+def _camera(
+    episodes: Sequence[Episode], camera_id: str, where: str, config: CalibrateConfig
+) -> dict[str, Any]:
     if config.pairs is not None:
         return _from_target(read_pairs(config.pairs), config)
     if camera_id in target_cameras(episodes):
         return _from_target(recorded_pairs(episodes, camera_id, config.link), config)
-    where = placement(episodes).get(camera_id, NO_DEPTH)
     if where == NO_DEPTH:
         message = (
             f"camera {camera_id} has neither target poses (topic .../cam/{camera_id}/target/pose) "
@@ -79,7 +83,7 @@ def _camera(episodes: Sequence[Episode], camera_id: str, config: CalibrateConfig
             "FILE."
         )
         raise NothingToCalibrateError(message)
-    with_depth = [episode for episode in episodes if camera_id in placement([episode])]
+    with_depth = [episode for episode in episodes if camera_id in depth_cameras(episode)]
     found = find_fixed_camera(
         with_depth, camera_id, max_postures=config.max_postures, seed=config.seed
     )

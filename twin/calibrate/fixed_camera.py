@@ -10,7 +10,7 @@ from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.records import DepthImage
 from bridge.episode.transforms import TransformTree
-from bridge.errors import BridgeError
+from bridge.errors import BridgeError, GstError
 from bridge.task.robot import BASE_FRAME
 from twin.robot.model import load_robot
 from twin.robot.posture import Posture, PostureTrack, far_apart, posture_track
@@ -52,10 +52,11 @@ def find_fixed_camera(
         EpisodeError: No joint states.
         RobotDescriptionError: No usable robot description.
     """
-    tracks = {str(episode.path): posture_track(episode) for episode in episodes}
+    tracks = _tracks(episodes)
     seen = [
         item
         for episode in episodes
+        if str(episode.path) in tracks
         for item in _still(episode, camera_id, tracks[str(episode.path)])
     ]
     if not seen:
@@ -83,6 +84,20 @@ def find_fixed_camera(
         T_base_believed=believed,
         episodes=tuple(dict.fromkeys(item.episode.info.id for item in chosen)),
     )
+
+
+def _tracks(episodes: Sequence[Episode]) -> dict[str, PostureTrack]:
+    """Postures of the episodes that have them; when none has, the first one's reason."""
+    tracks: dict[str, PostureTrack] = {}
+    reasons: list[GstError] = []
+    for episode in episodes:
+        try:
+            tracks[str(episode.path)] = posture_track(episode)
+        except GstError as error:
+            reasons.append(error)
+    if not tracks and reasons:
+        raise reasons[0]
+    return tracks
 
 
 def _still(episode: Episode, camera_id: str, track: PostureTrack) -> Iterator[_Seen]:

@@ -21,14 +21,15 @@ def placement(episodes: Sequence[Episode]) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for episode in episodes:
-        for camera_id in _depth_cameras(episode):
+        for camera_id in depth_cameras(episode):
             moves = _moves(episode, camera_id)
             if moves or found.get(camera_id) != MOVING:
                 found[camera_id] = MOVING if moves else FIXED
     return found
 
 
-def _depth_cameras(episode: Episode) -> list[str]:
+def depth_cameras(episode: Episode) -> list[str]:
+    """Cameras of an episode with depth images and their intrinsics, never those of truth."""
     topics = {topic for topic in episode.topics() if not schema.is_truth(topic)}
     ending = "/depth/image"
     stems = [topic.removesuffix(ending) for topic in topics if topic.endswith(ending)]

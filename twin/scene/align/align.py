@@ -17,7 +17,7 @@ from twin.scene.align.refine import COARSE, FINE, Equations, Place, refine
 from twin.scene.align.search import APART_M, APART_RAD, search
 from twin.scene.align.view import RobotView
 
-COARSE_POINTS = 1500
+COARSE_POINTS = 1000
 MAX_COARSE = 6
 NUM_SURFACE = 400
 

@@ -22,6 +22,8 @@ TABLE_M = 0.012
 """Points this near to the plane of the base are the table, not the robot's foot."""
 SCALE_SIGMA = 0.03
 """What is known of the depth scale beforehand."""
+STOP = 5e-6
+"""Metres, radians and share of the depth: steps below change nothing that can be measured."""
 BLOCK_M = 0.06
 """Noise of neighbouring pixels is not independent; resampling keeps blocks of this size whole."""
 
@@ -101,7 +103,7 @@ def refine(
         for _ in range(stage.iterations):
             equations = _equations(views, clouds, surfaces, place, stage.gate_m)
             place, step = _stepped(place, equations, with_scale)
-            if np.abs(step).max() < 1e-7:
+            if np.abs(step).max() < STOP:
                 break
     if equations is None:
         message = "refining needs at least one stage of one iteration"
@@ -147,11 +149,15 @@ def _equations(
     ]
     J, r, w = (np.concatenate([row[k] for row in rows]) for k in range(3))
     keys = np.concatenate([row[3] + (index << 48) for index, row in enumerate(rows)])
-    _, block = np.unique(keys, return_inverse=True)
-    num_blocks = int(block.max()) + 1 if len(block) else 0
-    H, g = np.zeros((num_blocks, 7, 7)), np.zeros((num_blocks, 7))
-    np.add.at(H, block, w[:, None, None] * J[:, :, None] * J[:, None, :])
-    np.add.at(g, block, (w * r)[:, None] * J)
+    order = np.argsort(keys)
+    J, r, w = J[order], r[order], w[order]
+    _, first, block = np.unique(keys[order], return_index=True, return_inverse=True)
+    num_blocks = len(first)
+    if num_blocks == 0:
+        H, g = np.zeros((0, 7, 7)), np.zeros((0, 7))
+    else:
+        H = np.add.reduceat(w[:, None, None] * J[:, :, None] * J[:, None, :], first, axis=0)
+        g = np.add.reduceat((w * r)[:, None] * J, first, axis=0)
     return Equations(
         H=H,
         g=g,
