@@ -37,7 +37,7 @@ class StaticConfig:
 
     voxel_m: float = 0.008
     """Wanted voxel; larger when the scene would need too many."""
-    max_voxels: int = 1_000_000
+    max_voxels: int = 2_000_000
     """Most voxels: bounds memory and time."""
     height_m: float = 0.7
     """How far above the table the grid reaches."""
