@@ -38,6 +38,9 @@ class DemoConfig:
     """Ten trials per condition, the number the paper used, and a longer rebuild."""
     seed: int = 1
     """Start positions and grasp errors of the trials; the cell's hidden parameters too."""
+    task: str = "cube_into_box"
+    """Task of the trials: cube_into_box, sloth_into_basket or five_ducks_into_basket. The twin
+    does not replay soft objects yet and says so."""
     serve: bool | None = None
     """Keep the dashboard running until Ctrl-C. Default: only on a terminal."""
     port: int = 0
@@ -136,6 +139,7 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> None:
     logs = run.notes_dir / "logs"
     logs.mkdir(parents=True, exist_ok=True)
     standin = ["publish", "standin", "--connect", endpoint, "--seed", str(config.seed)]
+    standin += ["--task", config.task]
     output.say("1/6 starting the recorder (zenoh on the loopback address)")
     recorder = _start(["record", path, "--listen", endpoint], logs / "record.log")
     gate: Background | None = None
@@ -144,7 +148,8 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> None:
         _step(output, "2/6 the stand-in cell scans its table", [*standin, "--trials", "0"])
         rebuild = ["rebuild", path, "--budget", config.budget]
         _step(output, f"3/6 rebuilding the scene ({config.budget})", rebuild)
-        gate = _start(["gate", path, "--connect", endpoint], logs / "gate.log")
+        judge = ["gate", path, "--connect", endpoint, "--task", config.task]
+        gate = _start(judge, logs / "gate.log")
         gate.wait_until(lambda: "ready" in (logs / "gate.log").read_text(errors="replace"))
         trials = [*standin, "--no-scan", "--ask-always", "--trials", str(config.trials)]
         label = f"4/6 {2 * config.trials} trials: {config.trials} without and with replanning"
