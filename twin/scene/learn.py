@@ -93,7 +93,8 @@ def learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output)
     witnesses = choose_witnesses(views)
     moving = find_moving(points, witnesses)
     static = [moving.drop_from(item) for item in points]
-    gone = 1.0 - sum(len(p.p_m) for p in static) / max(sum(len(p.p_m) for p in points), 1)
+    total_points = max(sum(len(p.p_m) for p in points), 1)
+    gone = sum(len(p.p_m) - len(s.p_m) for p, s in zip(points, static, strict=True)) / total_points
     report = replace(report, moving_fraction=round(gone, 4))
     for remark in report.remarks():
         output.say(remark)

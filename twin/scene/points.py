@@ -13,6 +13,8 @@ from twin.scene.gaussians import as_float32
 NEAR_M = 0.05
 NORMAL_REACH_PX = 2
 """Normals come from the pixels this far to each side."""
+SEAMED = 0.3
+"""With a smaller share of measured pixels among measured neighbours, gaps are the rule."""
 OCCLUSION_CELL_PX = 4
 """Size of the cells in which the nearest point hides those behind it."""
 
@@ -58,6 +60,29 @@ def trusted_depth_mask(
     return trusted
 
 
+def without_seams(
+    depth_m: Float32[np.ndarray, "height width"], flying_fraction: float
+) -> Float32[np.ndarray, "height width"]:
+    """Close gaps one pixel wide between measurements that agree, where gaps are the rule.
+
+    Depth warped into a larger colour image has empty rows and columns; without this no pixel of
+    it would have measured neighbours. Depth with ordinary holes is returned as it is.
+    """
+    known = depth_m > 0
+    whole = known[1:-1, 1:-1] & known[:-2, 1:-1] & known[2:, 1:-1]
+    whole &= known[1:-1, :-2] & known[1:-1, 2:]
+    if whole.sum() >= SEAMED * known.sum():
+        return depth_m
+    closed = depth_m.copy()
+    for _ in range(2):  # where an empty row crosses an empty column, the second pass closes
+        for filled, last in ((closed, closed.copy()), (closed.T, closed.T.copy())):
+            before, after = last[:-2], last[2:]
+            near = np.abs(before - after) <= flying_fraction * np.minimum(before, after)
+            gap = (last[1:-1] == 0) & (before > 0) & (after > 0) & near
+            filled[1:-1][gap] = (0.5 * (before + after))[gap]
+    return closed
+
+
 class FrameSurface:
     """The trusted surface points of one frame; what initialisation and fit both start from."""
 
@@ -65,6 +90,7 @@ class FrameSurface:
         """Find the trusted pixels and carry them to the colour camera."""
         self.frame = frame
         depth = np.where(np.isfinite(frame.depth_m), frame.depth_m, 0.0).astype(np.float32)
+        depth = without_seams(depth, limits.flying_fraction)
         self.trusted = trusted_depth_mask(depth, limits)
         camera = frame.depth_camera
         column = ((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx).astype(np.float32)

@@ -86,9 +86,7 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
     if blind and not any(max(camera.trusted) > 0 for camera in seen):
         raise NoDepthError(_no_depth(blind[0], config))
     poses = {
-        camera.name: check_poses(camera.thumbs)
-        for camera in usable
-        if not camera.choice.still
+        camera.name: check_poses(camera.thumbs) for camera in usable if not camera.choice.still
     }
     for name, report in poses.items():
         if report.better is not None and config.check_poses:

@@ -13,6 +13,7 @@ from bridge.episode.run import RunFolder
 from bridge.geometry import se3
 from bridge.terminal import Output
 from twin.scene.frames import FrameChoice, choose_frames, find_sources, root_frame
+from twin.scene.points import without_seams
 from twin.scene.pose_check import PoseConventionError
 from twin.scene.scan_check import CameraCheck, NoDepthError, ScanReport, check_scan
 from twin.scene.settings import FrameConfig
@@ -136,3 +137,18 @@ def test_a_camera_that_tf_knows_nothing_of_is_followed_by_its_images(
     truth = np.stack([textured_room.camera_pose(k, 24) for k in range(24)])
     length = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()
     assert path == pytest.approx(length, rel=0.35)
+
+
+def test_empty_rows_and_columns_of_warped_depth_are_closed_and_edges_are_not() -> None:
+    depth = np.tile(np.linspace(1.0, 1.1, 40, dtype=np.float32), (30, 1))
+    depth[:, 20:] += 1.0
+    warped = depth.copy()
+    warped[::4] = 0.0
+    warped[:, 1::3] = 0.0
+    closed = without_seams(warped, 0.03)
+    inner = np.s_[2:27, 3:17]
+    np.testing.assert_allclose(closed[inner], depth[inner], atol=2e-3)
+    assert not ((closed > 1.2) & (closed < 1.9)).any()  # nothing between the two surfaces
+    holes = depth.copy()
+    holes[10:14, 5:9] = 0.0
+    assert without_seams(holes, 0.03) is holes
