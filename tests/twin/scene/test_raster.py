@@ -171,6 +171,14 @@ def test_an_unknown_instruction_set_is_refused() -> None:
         Rasteriser(RasterConfig(isa="sparc"))
 
 
+def test_the_widest_instruction_set_is_chosen() -> None:
+    names = raster.available_isas()
+    assert names[0] == "base"
+    assert Rasteriser(RasterConfig(threads=1)).isa == names[-1]
+    for name in names:
+        assert Rasteriser(RasterConfig(threads=1, isa=name)).isa == name
+
+
 def test_the_view_gives_depth_only_where_the_image_is_solid() -> None:
     view = Rasteriser(RasterConfig(threads=1)).view(
         one_gaussian(x_px=20.5, y_px=16.5, depth_m=1.25, sigma_m=0.05), CAMERA, IDENTITY
