@@ -109,7 +109,7 @@ def targets(rasteriser: Rasteriser) -> list[Target]:
     lifted = scene_from_masks(cloud, [(s.viewpoint, supplied(s)) for s in train], rasteriser)
     names = {item.label: item.id for item in lifted.instances}
     rows = []
-    for what, some in (("training", train), ("held-out", held_out)):
+    for what, some in (("all", shots), ("held-out", held_out)):
         scores = []
         for shot in some:
             ids = render_labels(rasteriser, cloud, lifted.labels, shot.viewpoint)

@@ -5,13 +5,16 @@ Whether two masks mean the same thing is decided on the Gaussians that both fram
 """
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt16
 
 from twin.scene.semantics.lift import Observation
+
+Smooth = Callable[[np.ndarray], np.ndarray]
+"""Takes and gives shares, one row for each thing, one column for each Gaussian."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +65,10 @@ class Association:
 
 
 def associate(
-    observations: Sequence[Observation], num_splats: int, config: AssociateConfig
+    observations: Sequence[Observation],
+    num_splats: int,
+    config: AssociateConfig,
+    smooth: Smooth | None = None,
 ) -> Association:
     """Match masks across frames and decide each Gaussian by the frames that had a mask.
 
@@ -71,6 +77,12 @@ def associate(
     to the thing with the largest share of its light inside matching masks, if that is more than
     the background's share plus ``background_bias``. Frames whose mask of the thing is missing
     do not count against it: a dropped mask says nothing about the edge.
+
+    Args:
+        observations: What each frame's masks say.
+        num_splats: Gaussians of the scene.
+        config: When masks mean the same thing.
+        smooth: What neighbours have to say about the shares before Gaussians are decided.
     """
     candidates = _candidates(observations, num_splats, config)
     sets = [votes > 0 for votes in candidates]
@@ -85,7 +97,7 @@ def associate(
     firm = (hits >= config.min_support) & (hits > config.min_hit_fraction * seen)
     kept = [int(index) for index in np.flatnonzero(firm)]
     share = _shares(observations, matches, kept, num_splats)
-    labels = _decide(share, config)
+    labels = _decide(share if smooth is None else smooth(share), config)
     return _association(observations, matches, kept, labels, hits, seen, config)
 
 

@@ -70,3 +70,14 @@ def colour_name(color: Float[np.ndarray, "3"]) -> str:
         if lightness < 52 or chroma < DULL_CHROMA:
             return "brown"
     return name
+
+
+def without_shading(
+    lab: Float[np.ndarray, "num_colours 3"], lightness_weight: float
+) -> Float[np.ndarray, "num_colours 3"]:
+    """Lab as it would be at lightness 50, and a little of the lightness itself.
+
+    Light that is s times as strong multiplies a, b and L + 16 by the cube root of s.
+    """
+    strength = np.maximum(lab[:, :1] + 16.0, 25.0) / 66.0
+    return np.concatenate([lightness_weight * lab[:, :1], lab[:, 1:] / strength], axis=1)

@@ -14,6 +14,7 @@ from twin.scene.semantics.lift import Viewpoint, observe, visible_weight
 from twin.scene.semantics.part_names import PartsConfig, find_parts
 from twin.scene.semantics.result import Instance, MaskSet, SemanticScene
 from twin.scene.semantics.segment import SOURCE, SegmentConfig, segment_points
+from twin.scene.semantics.smooth import SmoothConfig, smooth_shares
 from twin.scene.semantics.support import (
     NoSupportError,
     SupportConfig,
@@ -49,7 +50,12 @@ def scene_from_masks(
         observations.append(observe(rasteriser, cloud, viewpoint, masks))
         sources.append(masks.source)
     source = ", ".join(dict.fromkeys(sources)) or "no masks"
-    found = associate(observations, len(cloud), config or AssociateConfig())
+    found = associate(
+        observations,
+        len(cloud),
+        config or AssociateConfig(),
+        smooth=lambda share: smooth_shares(share, cloud, SmoothConfig()),
+    )
     plane = support_of(cloud)
     instances = tuple(
         describe(

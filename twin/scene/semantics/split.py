@@ -15,6 +15,7 @@ from twin.scene.semantics.cluster import (
     means_of,
     numbered,
 )
+from twin.scene.semantics.colour import without_shading
 from twin.scene.semantics.form import find_cavity, height_map, measure_form
 
 
@@ -58,7 +59,7 @@ def split_by_colour(
     pieces of one colour. A piece much smaller than its neighbour is a marking (a beak, a label)
     and joins it, unless it lies in the neighbour's cavity.
     """
-    colour = _without_shading(voxels.lab, config.lightness_weight)
+    colour = without_shading(voxels.lab, config.lightness_weight)
     classes = _colour_classes(colour, config)
     if classes.max(initial=0) == 0:
         return classes
@@ -69,15 +70,6 @@ def split_by_colour(
         if small is None:
             return numbered(pieces)
         pieces = np.where(pieces == small[0], small[1], pieces)
-
-
-def _without_shading(lab: np.ndarray, lightness_weight: float) -> np.ndarray:
-    """Lab as it would be at lightness 50, and a little of the lightness itself.
-
-    Light that is s times as strong multiplies a, b and L + 16 by the cube root of s.
-    """
-    strength = np.maximum(lab[:, :1] + 16.0, 25.0) / 66.0
-    return np.concatenate([lightness_weight * lab[:, :1], lab[:, 1:] / strength], axis=1)
 
 
 def _colour_classes(colour: np.ndarray, config: SplitConfig) -> np.ndarray:
@@ -249,8 +241,7 @@ def joined_by_outline(
     xyh = np.concatenate([voxels.p_m[:, :2], height_m[:, None]], axis=1)
     left = sorted(pieces, key=len)
     colours = [
-        np.median(_without_shading(voxels.lab[ids], config.lightness_weight), axis=0)
-        for ids in left
+        np.median(without_shading(voxels.lab[ids], config.lightness_weight), axis=0) for ids in left
     ]
     joined: list[np.ndarray] = []
     for index, ids in enumerate(left):
