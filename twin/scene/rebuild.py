@@ -42,7 +42,7 @@ from twin.scene.store import (
 from twin.scene.view_numbers import summarise_views
 from twin.scene.views import ViewsJob, views_path, write_views
 
-METHOD_VERSION = 10
+METHOD_VERSION = 11
 """Counts changes of method that make older scenes out of date."""
 
 
@@ -233,6 +233,8 @@ def _already_done(run: RunFolder, key: str) -> dict[str, Any] | None:
         about = record["semantics"]
         named = [about, about.get("features") or {}, about.get("vectors") or {}]
         needed += [run.scene_dir / item["file"] for item in named if "file" in item]
+    static = (record.get("sdf") or {}).get("file")
+    needed += [run.scene_dir / static] if static else []
     whole = all(path.is_file() for path in needed)
     return record if whole and background_hash(run) == record["scene_hash"] else None
 
