@@ -74,7 +74,7 @@ def test_the_solution_is_that_of_a_dense_least_squares(
 ) -> None:
     cloud, observations = room
     start = with_harmonics(cloud, num_harmonics)
-    solved = solve_appearance(start, observations, rasteriser(), steps=300).cloud
+    solved = solve_appearance(start, observations, rasteriser(), steps=150).cloud
     count, terms = len(cloud), 1 + num_harmonics
     ridge = np.repeat([RIDGE_COLOR] + [RIDGE_HARMONICS] * num_harmonics, count)
     origin = np.concatenate([start.colors[:, None], start.harmonics], axis=1)
