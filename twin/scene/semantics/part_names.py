@@ -11,6 +11,8 @@ from twin.scene.semantics.form import Cavity, HeightMap, find_cavity, height_map
 from twin.scene.semantics.lexicon import kind_of
 from twin.scene.semantics.limbs import animal_parts
 
+MIN_HANDLE = 0.012
+"""Share of the points; less is noise at a rim or a foot."""
 MIN_SHARE = 0.005
 """A part has at least this share of the points."""
 
@@ -90,6 +92,8 @@ def _container(
     margin = max(config.handle_fraction * cavity.rim_m, heights.cell_m)
     handle = (height > cavity.rim_m + margin) & (top_m > cavity.rim_m + 2 * margin)
     handle |= _sticking_out(xyh_m, heights, cavity)
+    if handle.sum() < MIN_HANDLE * len(xyh_m):
+        handle = np.zeros_like(handle)  # a ragged rim
     thick = max(config.floor_fraction * depth, 0.004)
     floor = ~handle & over & (height < cavity.floor_m + thick)
     rim = ~handle & ~floor & (height > cavity.rim_m - span)
@@ -109,7 +113,7 @@ def _sticking_out(
     radius = 0.35 * float(thickness.max())
     core = thickness > radius
     opened = ndimage.distance_transform_edt(~core) <= radius + 1.0
-    around = ndimage.distance_transform_edt(~(opened | cavity.mask)) > 1.5
+    around = ndimage.distance_transform_edt(~(opened | cavity.mask)) > 2.5
     return np.asarray((around & heights.footprint)[heights.cells(xyh_m)])
 
 

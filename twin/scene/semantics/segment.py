@@ -17,7 +17,7 @@ from twin.scene.semantics.cluster import (
     make_voxels,
     neighbour_pairs,
 )
-from twin.scene.semantics.colour import colour_name, lab_from_srgb
+from twin.scene.semantics.colour import colour_name, lab_from_srgb, without_shading
 from twin.scene.semantics.form import Form, measure_form
 from twin.scene.semantics.split import (
     SplitConfig,
@@ -57,7 +57,7 @@ class SegmentConfig:
     """Larger groups are furniture or the robot."""
     robot_distance_m: float = 0.015
     """Points this near to the robot's surface are robot."""
-    foot_colour_gap: float = 16.0
+    foot_colour_gap: float = 12.0
     """Lab distance up to which low points belong to the thing above them."""
 
 
@@ -227,7 +227,7 @@ def _add_feet(
     plane = low & (np.abs(height_m) < 0.5 * config.min_height_m)
     if not plane.any():
         return
-    lab = lab_from_srgb(points.colors)
+    lab = without_shading(lab_from_srgb(points.colors), config.split.lightness_weight)
     to_plane = np.linalg.norm(lab - np.median(lab[plane], axis=0), axis=1)
     reach = config.min_height_m + 1.5 * voxel_m
     for _ in range(MAX_FOOT_ROUNDS):
