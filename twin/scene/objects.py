@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.episode import provenance
 from bridge.geometry import se3
+from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import ObjectModel, Task
 from bridge.whole_file import write_whole
 from twin.scene.fill import fill_footprint
@@ -192,7 +193,10 @@ def _owners(
 def shape_mesh(
     model: ObjectModel,
 ) -> tuple[Float[np.ndarray, "num_vertices 3"], Int[np.ndarray, "num_faces 3"]]:
-    """Triangles of the known shape in the object frame, one closed box per panel [m]."""
+    """Triangles of the known shape in the object frame [m]: its mesh, or a box per panel."""
+    if model.mesh is not None:
+        known = object_mesh(model)
+        return known.vertices_m, known.triangles
     vertices, faces = [], []
     corner = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     # Counter-clockwise seen from outside.
@@ -258,9 +262,7 @@ def _write_geometry(
     """Write the reconstructed shape, or the known one with the reason why."""
     remove_shape(place)
     if not isinstance(shape, str):
-        names, geometry = write_shape(
-            place, shape, model.id, soft=getattr(model, "soft", None) is not None
-        )
+        names, geometry = write_shape(place, shape, model.id, soft=model.soft is not None)
         source = f"reconstructed from {shape.num_views} views"
         return names, {"shape_source": source, "geometry": geometry}
     write_whole(place / MESH, mesh_ply(*shape_mesh(model)))

@@ -9,6 +9,7 @@ import open3d as o3d
 import pytest
 
 from bridge.geometry import se3
+from bridge.task.task_file import load_task
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.localise import LocalisedObject
 from twin.scene.localise_shape import pose_of, surface_distances
@@ -17,6 +18,7 @@ from twin.scene.semantics.result import Instance
 from twin.scene.shape.from_labels import shape_of_instance
 from twin.scene.shape.from_training import masked_view, shapes_of, write_static
 from twin.scene.shape.masked_view import ShapeError
+from twin.scene.shape.mesh import is_watertight, volume_m3
 from twin.scene.shape.reconstruct import ObjectShape
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import FREE, SURFACE, UNSEEN, StaticConfig, StaticSdf, static_sdf
@@ -265,3 +267,11 @@ def test_the_scene_folder_gets_the_static_scene(views: list[TrainingView], tmp_p
     assert again.conservative.distance(POSES["cube"][:3, 3]) > 0
     nameless = write_static(tmp_path, views, None, {}, COARSE)
     assert nameless["table_z_m"] is None
+
+
+def test_a_toy_that_could_not_be_reconstructed_keeps_its_known_mesh() -> None:
+    sloth = load_task("sloth_into_basket").objects["sloth"]
+    vertices, faces = cast_views.shape_mesh(sloth)
+    assert is_watertight(faces)
+    assert volume_m3(vertices, faces) > 0
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), sloth.size_m, rtol=0.02)
