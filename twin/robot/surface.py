@@ -104,25 +104,27 @@ class PosedSurface:
         self.links: tuple[str, ...] = tuple(item.link for item in link_surfaces(robot))
         make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
         self._scene = make()
-        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        boxes = []
         for item in link_surfaces(robot):
             T = poses[item.link]
             vertices = item.vertices_m @ T[:3, :3].T + T[:3, 3]
-            low, high = (
-                np.minimum(low, vertices.min(axis=0)),
-                np.maximum(high, vertices.max(axis=0)),
-            )
+            boxes.append((vertices.min(axis=0), vertices.max(axis=0)))
             self._scene.add_triangles(
                 _tensor(vertices.astype(np.float32)), _tensor(item.triangles.astype(np.uint32))
             )
-        self.low_m, self.high_m = low, high
+        self._boxes = boxes
 
     def near_box(
         self, p_base: Float[np.ndarray, "num_points 3"], margin_m: float
     ) -> Int64[np.ndarray, " num_near"]:
-        """Which points lie in the bounding box grown by a margin; the others are far for sure."""
-        inside = (p_base > self.low_m - margin_m) & (p_base < self.high_m + margin_m)
-        return np.flatnonzero(inside.all(axis=1))
+        """Which points lie in the bounding box of a shape grown by a margin; others are far."""
+        lows, highs = (np.array(ends) for ends in zip(*self._boxes, strict=True))
+        around = (p_base > lows.min(axis=0) - margin_m) & (p_base < highs.max(axis=0) + margin_m)
+        candidates = np.flatnonzero(around.all(axis=1))
+        p, near = p_base[candidates], np.zeros(len(candidates), dtype=bool)
+        for low, high in zip(lows, highs, strict=True):
+            near |= ((p > low - margin_m) & (p < high + margin_m)).all(axis=1)
+        return candidates[near]
 
     def nearest(self, p_base: Float[np.ndarray, "num_points 3"]) -> Nearest:
         """Find the nearest surface points."""

@@ -135,7 +135,7 @@ def test_the_frame_of_the_scene_does_not_matter(biased: list[RobotView]) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 7])
+@pytest.mark.parametrize("seed", [7])
 def test_the_robot_is_found_anywhere_with_a_biased_depth(
     biased: list[RobotView], seed: int
 ) -> None:
@@ -200,3 +200,10 @@ def test_the_equations_are_the_derivative_of_the_residual(exact: list[RobotView]
     change = se3.invert(place.T_base_source) @ again.T_base_source
     assert np.linalg.norm(change[:3, 3]) < 1e-4
     assert abs(again.depth_scale - place.depth_scale) < 1e-4
+
+
+def test_a_depth_that_no_camera_is_so_wrong_about_is_refused(exact: list[RobotView]) -> None:
+    """With ten percent too much depth something else is wrong; no place may hide it."""
+    wrong = [replace(view, depth_m=1.1 * view.depth_m) for view in exact]
+    with pytest.raises(RobotNotAlignedError, match="cannot be aligned"):
+        align_robot(wrong, cell_views.robot(), start=np.eye(4))

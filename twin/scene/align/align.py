@@ -14,7 +14,7 @@ from twin.robot.surface import PosedSurface, sample_surface
 from twin.scene.align.judge import Looked, Sureness, look, resample
 from twin.scene.align.plane import find_planes
 from twin.scene.align.refine import COARSE, FINE, Equations, Place, refine
-from twin.scene.align.search import APART_M, APART_RAD, search
+from twin.scene.align.search import APART_M, APART_RAD, search, search_near
 from twin.scene.align.view import RobotView
 
 COARSE_POINTS = 1000
@@ -26,10 +26,12 @@ NUM_SURFACE = 400
 class AlignConfig:
     """When an alignment is accepted, and what it estimates."""
 
-    min_fitness: float = 0.6
+    min_fitness: float = 0.8
     """Share of the robot's pixels that must show it within 15 mm."""
     max_residual_m: float = 0.006
     """Root mean square distance of matched points to the surface."""
+    max_scale_error: float = 0.05
+    """No depth camera is that wrong; a scale farther from 1 hides a wrong place."""
     min_margin: float = 1.3
     """The second-best place must cost this many times as much as the best."""
     min_points: int = 300
@@ -118,7 +120,7 @@ def align_robot(
             found="there is no depth image", hint="Record the camera while the robot stands still."
         )
     surfaces = [PosedSurface(robot, view.posture) for view in views]
-    starts = [Place(T_base_source=start)] if start is not None else _starts(views, robot)
+    starts = _starts(views, robot) if start is None else _near(views, robot, start)
     coarse = [_refined(views, surfaces, place, config, fine=False) for place in starts]
     best, others = _ranked(coarse)
     finals = [_refined(views, surfaces, item.place, config, fine=True) for item in (best, *others)]
@@ -151,6 +153,14 @@ def _starts(views: Sequence[RobotView], robot: RobotModel) -> list[Place]:
         )
     found = search(views, robot, planes)
     return [Place(T_base_source=item.T_base_source) for item in found[:MAX_COARSE]]
+
+
+def _near(
+    views: Sequence[RobotView], robot: RobotModel, start: Float[np.ndarray, "4 4"]
+) -> list[Place]:
+    """The start, and the best of what lies around it: nearest points alone get stuck beside it."""
+    polished = search_near(views, robot, start)
+    return [Place(T_base_source=T) for T in (start, polished.T_base_source)]
 
 
 def _refined(
@@ -211,6 +221,13 @@ def _accept(best: _Candidate, margin: float | None, num_views: int, config: Alig
             found=f"the robot's surface is missed by {residual * 1e3:.1f} mm (at most "
             f"{config.max_residual_m * 1e3:.0f} mm)",
             hint="Check depth calibration, joint zero positions and the description's meshes.",
+        )
+    scale = best.place.depth_scale
+    if abs(scale - 1.0) > config.max_scale_error:
+        raise RobotNotAlignedError(
+            found=f"the best place found needs the depth scaled by {scale:.3f}, more than the "
+            f"{config.max_scale_error:.0%} a depth camera can be wrong",
+            hint=f"Check that depth is in millimetres. {more}",
         )
     if margin is not None and margin < config.min_margin:
         raise RobotNotAlignedError(

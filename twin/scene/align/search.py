@@ -64,18 +64,40 @@ def _on_plane(
     places = _grid(plane)
     yaws = np.arange(NUM_YAWS) * 2 * np.pi / NUM_YAWS
     scores = _scores(views, samples, plane, yaws, places, CAP_M)
-    near_yaws = np.linspace(-0.5, 0.5, NUM_NEAR) * 2 * (yaws[1] - yaws[0])
+    return [
+        _polished(views, samples, plane, yaw, place)
+        for yaw, place in _distinct(scores, yaws, places)
+    ]
+
+
+def search_near(
+    views: Sequence[RobotView], robot: RobotModel, T_base_source: Float[np.ndarray, "4 4"]
+) -> Hypothesis:
+    """Try yaws within 6 degrees and places within 7 cm of a pose whose tilt is about right."""
+    samples = [sample_surface(robot, v.posture, NUM_SAMPLES, seed=i) for i, v in enumerate(views)]
+    nowhere = np.zeros(2)
+    plane = LevelPlane(T_level_source=T_base_source, low_m=nowhere, high_m=nowhere, share=0.0)
+    return _polished(views, samples, plane, 0.0, np.zeros(3))
+
+
+def _polished(
+    views: Sequence[RobotView],
+    samples: Sequence[np.ndarray],
+    plane: LevelPlane,
+    yaw: float,
+    place: Float[np.ndarray, "3"],
+) -> Hypothesis:
+    """The best of finer steps around a yaw and a place."""
+    near_yaws = yaw + np.linspace(-1.0, 1.0, NUM_NEAR) * 2 * np.pi / NUM_YAWS
     step = np.linspace(-STEP_M, STEP_M, NUM_NEAR)
-    near_places = np.stack([*np.meshgrid(step, step), np.zeros((NUM_NEAR,) * 2)], axis=-1)
-    found = []
-    for yaw, place in _distinct(scores, yaws, places):
-        around = place + near_places.reshape(-1, 3)
-        finer = _scores(views, samples, plane, yaw + near_yaws, around, FINE_CAP_M)
-        i, k = np.unravel_index(int(np.argmax(finer)), finer.shape)
-        T_level_base = _place(float(yaw + near_yaws[i]), around[k])
-        T_base_source = se3.invert(T_level_base) @ plane.T_level_source
-        found.append(Hypothesis(T_base_source=T_base_source, score=float(finer[i, k])))
-    return found
+    near = np.stack([*np.meshgrid(step, step), np.zeros((NUM_NEAR,) * 2)], axis=-1)
+    around = place + near.reshape(-1, 3)
+    finer = _scores(views, samples, plane, near_yaws, around, FINE_CAP_M)
+    i, k = np.unravel_index(int(np.argmax(finer)), finer.shape)
+    T_level_base = _place(float(near_yaws[i]), around[k])
+    return Hypothesis(
+        T_base_source=se3.invert(T_level_base) @ plane.T_level_source, score=float(finer[i, k])
+    )
 
 
 def _scores(
