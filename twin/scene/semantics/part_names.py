@@ -11,6 +11,8 @@ from twin.scene.semantics.form import Cavity, HeightMap, find_cavity, height_map
 from twin.scene.semantics.lexicon import kind_of
 from twin.scene.semantics.limbs import animal_parts
 
+MAX_HANDLE = 0.45
+"""Share of the cells around a cavity; more is no handle but the rim itself."""
 MIN_HANDLE = 0.012
 """Share of the points; less is noise at a rim or a foot."""
 MIN_SHARE = 0.005
@@ -90,7 +92,11 @@ def _container(
     height, depth = xyh_m[:, 2], cavity.rim_m - cavity.floor_m
     span = config.rim_fraction * cavity.rim_m
     margin = max(config.handle_fraction * cavity.rim_m, heights.cell_m)
-    handle = (height > cavity.rim_m + margin) & (top_m > cavity.rim_m + 2 * margin)
+    wall = heights.top_m[heights.footprint & ~cavity.mask]
+    if (wall > cavity.rim_m + margin).mean() > MAX_HANDLE:
+        handle = np.zeros(len(xyh_m), dtype=bool)  # the rim is that high, but for a low place
+    else:
+        handle = (height > cavity.rim_m + margin) & (top_m > cavity.rim_m + 2 * margin)
     handle |= _sticking_out(xyh_m, heights, cavity)
     if handle.sum() < MIN_HANDLE * len(xyh_m):
         handle = np.zeros_like(handle)  # a ragged rim
