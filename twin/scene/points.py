@@ -66,7 +66,8 @@ def without_seams(
     """Close gaps one pixel wide between measurements that agree, where gaps are the rule.
 
     Depth warped into a larger colour image has empty rows and columns; without this no pixel of
-    it would have measured neighbours. Depth with ordinary holes is returned as it is.
+    it would have neighbours to take a normal from. Closed gaps serve as neighbours only, they
+    never become points. Depth with ordinary holes is returned as it is.
     """
     known = depth_m > 0
     whole = known[1:-1, 1:-1] & known[:-2, 1:-1] & known[2:, 1:-1]
@@ -90,8 +91,10 @@ class FrameSurface:
         """Find the trusted pixels and carry them to the colour camera."""
         self.frame = frame
         depth = np.where(np.isfinite(frame.depth_m), frame.depth_m, 0.0).astype(np.float32)
+        measured = depth > 0
         depth = without_seams(depth, limits.flying_fraction)
-        self.trusted = trusted_depth_mask(depth, limits)
+        self._backed = trusted_depth_mask(depth, limits)
+        self.trusted = self._backed & measured
         camera = frame.depth_camera
         column = ((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx).astype(np.float32)
         row = ((np.arange(camera.height) + 0.5 - camera.cy) / camera.fy).astype(np.float32)
@@ -142,7 +145,7 @@ class FrameSurface:
         row, column = row * stride + NORMAL_REACH_PX, column * stride + NORMAL_REACH_PX
         ok = np.ones(len(row), dtype=bool)
         for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-            ok &= self.trusted[row + down * NORMAL_REACH_PX, column + right * NORMAL_REACH_PX]
+            ok &= self._backed[row + down * NORMAL_REACH_PX, column + right * NORMAL_REACH_PX]
         return row[ok], column[ok]
 
     def _normals(self, row: np.ndarray, column: np.ndarray) -> Float32[np.ndarray, "3 num_points"]:

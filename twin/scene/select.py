@@ -91,7 +91,7 @@ def smear_px(
         turn = se3.rotation_angle_rad(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
         shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1) / TYPICAL_DEPTH_M
     found = focal_px * (turn + shift) * EXPOSURE_S / (2e-9 * MOTION_WINDOW_NS)
-    return np.nan_to_num(found, nan=UNKNOWN_PX, posinf=UNKNOWN_PX)
+    return np.asarray(np.nan_to_num(found, nan=UNKNOWN_PX, posinf=UNKNOWN_PX))
 
 
 def robot_smear_px(
