@@ -139,6 +139,7 @@ def test_gaussians_are_added_within_their_budget_and_only_if_wanted(
     assert len(fit(start, views, config, lambda *_: None).cloud) <= len(start)
 
 
+@pytest.mark.slow
 def test_refining_poses_brings_shaken_cameras_back() -> None:
     surfaces = [FrameSurface(textured_room.frame(i, 8), LIMITS) for i in range(8)]
     start = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=1000))
