@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from bridge.episode import provenance
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import ObjectModel, Task
 from twin.errors import TwinError
 from twin.scene.localise_shape import surface_distances
@@ -186,10 +187,11 @@ def _away(
     model: ObjectModel,
     T_base_object: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, " num_points"]:
-    """Distance to the known surface; inside the box around a mesh nothing is known, so 0."""
+    """Distance to the known surface; inside the box around a soft toy nothing is known, so 0."""
+    if model.mesh is not None and model.soft is None:
+        return np.abs(object_mesh(model).solid(se3.apply(se3.invert(T_base_object), points)))
     distance, _ = surface_distances(points, model, T_base_object)
-    rough = model.shape not in ("box", "open_box")
-    return np.asarray(np.maximum(distance, 0.0) if rough else np.abs(distance))
+    return np.asarray(np.abs(distance) if model.soft is None else np.maximum(distance, 0.0))
 
 
 def write_static(
