@@ -163,6 +163,12 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
                 "A trials CSV, for evaluate.",
                 "trials.csv runs/x",
             ),
+            (
+                "splats",
+                "twin.cli:import_splats",
+                "A splat file edited elsewhere, back into the scene.",
+                "edited.ply runs/x",
+            ),
         ),
     ),
     "export": (

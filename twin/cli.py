@@ -92,9 +92,9 @@ def render(
     config: RenderConfig = RENDER,
     output: Output = OUTPUT,
 ) -> int:
-    """Draw the rebuilt scene to a PNG, from a recorded or a given camera pose.
+    """Draw the rebuilt scene to a PNG: any camera, any posture of the robot, any object pose.
 
-    Example: robot-gst render runs/monday --camera wrist --at-s 3
+    Example: robot-gst render runs/monday --camera wrist --at-s 3 --object cube=0.5,-0.1,0.02
 
     Args:
         run: Run folder.
@@ -102,10 +102,37 @@ def render(
         output: How to talk.
     """
     from bridge.episode.run import RunFolder
+    from twin.scene.compose import describe_drawn
     from twin.scene.render import render as render_scene
 
     drawn = render_scene(RunFolder.open(run), config)
-    output.result(drawn, "\n".join(drawn["files"]))
+    output.result(drawn, describe_drawn(drawn))
+    return 0
+
+
+def import_splats(
+    file: Path,
+    run: Path,
+    /,
+    *,
+    object: str = "",
+    output: Output = OUTPUT,
+) -> int:
+    """Take a splat file edited elsewhere (SuperSplat) back into the rebuilt scene.
+
+    Example: robot-gst import splats edited.ply runs/monday
+
+    Args:
+        file: PLY file with Gaussians, in the frame it had when it left the scene folder.
+        run: Run folder with a rebuilt scene.
+        object: Object whose Gaussians these are; empty: the background, which makes a new scene.
+        output: How to talk.
+    """
+    from bridge.episode.run import RunFolder
+    from twin.scene.edited import describe_edit, take_back
+
+    about = take_back(RunFolder.open(run), file, object)
+    output.result(about, describe_edit(about))
     return 0
 
 

@@ -129,8 +129,20 @@ def read_objects(run: RunFolder, record: Mapping[str, Any]) -> dict[str, ObjectS
 def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
     try:
         pose = json.loads(path.read_text())["T_base_object"]
-        q, p = np.array(pose["q_wxyz"], dtype=np.float64), np.array(pose["p_m"], dtype=np.float64)
     except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UnreadableSceneError(path=path, found=f"no pose ({error!r})") from error
+    return read_pose(pose, path)
+
+
+def read_pose(pose: Any, path: Path) -> Float[np.ndarray, "4 4"]:
+    """Turn ``p_m`` and ``q_wxyz`` of a scene's JSON file into a transform.
+
+    Raises:
+        UnreadableSceneError: When they are no pose; names the file.
+    """
+    try:
+        q, p = np.array(pose["q_wxyz"], dtype=np.float64), np.array(pose["p_m"], dtype=np.float64)
+    except (ValueError, KeyError, TypeError) as error:
         raise UnreadableSceneError(path=path, found=f"no pose ({error!r})") from error
     if q.shape != (4,) or p.shape != (3,) or not np.isfinite([*q, *p]).all() or not q.any():
         raise UnreadableSceneError(path=path, found=f"a pose that is none: {pose}")

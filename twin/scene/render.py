@@ -11,8 +11,9 @@ from bridge.episode.run import RunFolder
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from bridge.task.robot import BASE_FRAME
 from twin.scene.backend import open_rasteriser
-from twin.scene.parts import put_together, read_objects
+from twin.scene.compose import carried_camera, compose
 from twin.scene.raster import RasterConfig
 from twin.scene.settings import RenderConfig
 from twin.scene.store import Scene, read_scene
@@ -26,16 +27,18 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     """Write one PNG of the scene and return what was drawn.
 
     Raises:
-        UsageError: When the episode or camera is unknown; lists those that exist.
+        UsageError: When the episode, the camera or an object is unknown (lists those that exist),
+            or joints are given for a robot that the scene does not have.
         MissingDependencyError: When the backend cuda was asked for and cannot run here.
     """
     rasteriser = open_rasteriser(RasterConfig(backend=config.backend))
     scene = read_scene(run)
     episode = _episode(run, scene, config.episode)
     camera_id = _camera_id(episode, config.camera)
+    stamp_ns = episode.start_ns + round(config.at_s * 1e9)
+    composed = compose(run, scene, episode, stamp_ns, config)
     camera, T_base_camera = _view_of(episode, camera_id, config)
-    cloud = put_together(scene.background, read_objects(run, scene.record))
-    view = rasteriser.view(cloud, camera, T_base_camera)
+    view = rasteriser.view(composed.cloud, camera, T_base_camera)
     path = config.out or run.results_dir / "render.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encode_png(view.image_u8()))
@@ -49,6 +52,7 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
         "scene_hash": scene.scene_hash,
         "episode": episode.info.id,
         "camera": camera_id,
+        "robot": composed.robot,
         "coverage_fraction": float(view.alpha.mean()),
     }
 
@@ -84,5 +88,10 @@ def _view_of(
             message = "--eye is straight above or below --target; move it a little sideways."
             raise UsageError(message)
         return info.camera, se3.look_at(eye, target, UP)
+    tree = streams.transform_tree(episode)
+    if config.joints is not None and tree.root_of(info.frame_id) == BASE_FRAME:
+        T_base_camera = carried_camera(episode, info.frame_id, np.array(config.joints))
+        if T_base_camera is not None:
+            return info.camera, T_base_camera
     stamp_ns = episode.start_ns + round(config.at_s * 1e9)
-    return info.camera, streams.transform_tree(episode).T_root_frame(info.frame_id, stamp_ns)
+    return info.camera, tree.T_root_frame(info.frame_id, stamp_ns)

@@ -232,6 +232,14 @@ class RenderConfig:
     """Stand here instead, in metres in the scene's frame; needs --target."""
     target: tuple[float, float, float] | None = None
     """Look at this point, in metres in the scene's frame."""
+    joints: tuple[float, float, float, float, float, float] | None = None
+    """Put the arm into this posture, in rad from shoulder to wrist; a camera in its hand comes
+    along. Default: as recorded at --at-s."""
+    width_m: float | None = None
+    """Opening of the gripper in metres; default: as recorded, closed with --joints."""
+    object: tuple[str, ...] = ()
+    """Put an object elsewhere: ID=x,y,z or ID=x,y,z,qw,qx,qy,qz in the scene's frame; once for
+    each object."""
     depth: bool = False
     """Write a second image with the depth, in millimetres."""
     backend: Literal["auto", "cpu", "cuda"] = "cpu"

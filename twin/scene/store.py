@@ -26,10 +26,11 @@ HASH_DIGITS = 12
 class UnreadableSceneError(TwinError):
     """``scene.json`` is damaged or from a newer version."""
 
-    def __init__(self, *, path: Path, found: str) -> None:
+    def __init__(self, *, path: Path, found: str, hint: str = "") -> None:
         """Remember the file."""
         self.path = path
-        super().__init__(f"{path}: {found}. Make it again: robot-gst rebuild RUN --force.")
+        hint = hint or "Make it again: robot-gst rebuild RUN --force."
+        super().__init__(f"{path}: {found}. {hint}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +102,11 @@ def read_scene(run: RunFolder) -> Scene:
     scene = Scene(record=record, background=read_ply(run.scene_dir / BACKGROUND))
     if background_hash(run) != scene.scene_hash:
         found = f"describes scene {scene.scene_hash}, {BACKGROUND} is {background_hash(run)}"
-        raise UnreadableSceneError(path=run.scene_dir / SCENE_FILE, found=found)
+        hint = (
+            f"If you edited it: robot-gst import splats {BACKGROUND} RUN. "
+            "Otherwise make it again: robot-gst rebuild RUN --force."
+        )
+        raise UnreadableSceneError(path=run.scene_dir / SCENE_FILE, found=found, hint=hint)
     return scene
 
 
