@@ -28,6 +28,8 @@ class SupportConfig:
     """A plane with fewer points carries nothing."""
     num_candidates: int = 3
     """Planes among which the one that carries most is chosen (table and floor)."""
+    separation_m: float = 0.04
+    """Level planes nearer than this are one surface that is not quite flat."""
     cell_m: float = 0.02
     """Size of the cells that say where the plane extends."""
     seed: int = 0
@@ -86,12 +88,12 @@ def find_support(
         found = _largest_plane(left, config)
         if found is None:
             break
-        plane, inside = found
+        plane = found
         height = plane.height_m(p_m)
         carried = (height > 2 * config.tolerance_m) & (height < 0.3)
         carried[carried] = plane.under(p_m[carried])
         planes.append((plane.num_points + int(carried.sum()), plane))
-        left = left[~inside]
+        left = left[np.abs(plane.height_m(left)) > config.separation_m]
     if not planes:
         message = (
             f"no level plane among {len(p_m)} points, {int(upright.sum())} of them upright. The "
@@ -101,9 +103,7 @@ def find_support(
     return max(planes, key=lambda item: item[0])[1]
 
 
-def _largest_plane(
-    p_m: np.ndarray, config: SupportConfig
-) -> tuple[SupportPlane, np.ndarray] | None:
+def _largest_plane(p_m: np.ndarray, config: SupportConfig) -> SupportPlane | None:
     if len(p_m) < config.min_points:
         return None
     rng = np.random.default_rng(config.seed)
@@ -129,7 +129,7 @@ def _largest_plane(
     if inside.sum() < config.min_points:
         return None
     footprint, corner = _footprint(p_m[inside], config.cell_m)
-    plane = SupportPlane(
+    return SupportPlane(
         normal=normal,
         offset_m=offset,
         num_points=int(inside.sum()),
@@ -137,7 +137,6 @@ def _largest_plane(
         corner_m=corner,
         cell_m=config.cell_m,
     )
-    return plane, inside
 
 
 def _refined(p_m: np.ndarray, config: SupportConfig) -> tuple[np.ndarray, float]:

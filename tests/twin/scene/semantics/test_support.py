@@ -58,3 +58,12 @@ def test_the_answer_moves_with_the_scene() -> None:
     first = find_support(p, normals, SupportConfig())
     second = find_support(p + shift, normals, SupportConfig())
     np.testing.assert_allclose(second.height_m(p + shift), first.height_m(p), atol=1e-6)
+
+
+def test_a_rough_table_does_not_stand_on_its_own_underside() -> None:
+    rng = np.random.default_rng(5)
+    below = sheet(rng, 0.0, 0.4, 9000)
+    below[:, 2] -= np.abs(rng.normal(0.0, 0.012, 9000))  # what a fit pushes into the wood
+    p = np.concatenate([sheet(rng, 0.0, 0.4, 9000), below])
+    plane = find_support(p, np.tile(UP, (len(p), 1)), SupportConfig())
+    assert abs(plane.offset_m) < 0.003
