@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from bridge.episode import provenance, schema, streams
 from bridge.episode.metadata import Derived
@@ -51,6 +52,7 @@ def localise_episode(
     after_ns: int | None = None,
     before_ns: int | None = None,
     held_out_ns: HeldOut | None = None,
+    last_seen_m: Mapping[str, Float[np.ndarray, "3"]] | None = None,
 ) -> dict[str, LocalisedObject]:
     """Localise from the last still frames before the first execution started.
 
@@ -64,6 +66,7 @@ def localise_episode(
         after_ns: Only frames later than this source time; then ``before_ns`` counts alone.
         before_ns: Only frames earlier than this source time.
         held_out_ns: Frames that must not be looked at.
+        last_seen_m: Where objects were seen before; tells equal ones apart.
     """
     config = LocaliseConfig() if config is None else config
     if after_ns is None and before_ns is None:
@@ -74,7 +77,7 @@ def localise_episode(
         frames = still_frames(
             episode, config.max_frames, after_ns, before_ns, held_out_ns=held_out_ns
         )
-    return localise_objects(frames, task, config)
+    return localise_objects(frames, task, config, last_seen_m)
 
 
 def first_execution_ns(episode: Episode) -> int | None:
@@ -205,15 +208,23 @@ def write_localised(
     )
     if path.exists() and not force and _made_from(path, derived):
         return path
-    phases = [
-        (
-            phase,
-            localise_episode(
-                episode, task, config, after_ns=phase.after_ns, before_ns=phase.before_ns
-            ),
+    phases: list[tuple[Phase, dict[str, LocalisedObject]]] = []
+    last_seen_m: dict[str, np.ndarray] = {}
+    for phase in quiet_phases(episode):
+        found = localise_episode(
+            episode,
+            task,
+            config,
+            after_ns=phase.after_ns,
+            before_ns=phase.before_ns,
+            last_seen_m=last_seen_m,
         )
-        for phase in quiet_phases(episode)
-    ]
+        phases.append((phase, found))
+        last_seen_m |= {
+            key: item.T_base_object[:3, 3]
+            for key, item in found.items()
+            if item.T_base_object is not None
+        }
     path.unlink(missing_ok=True)
     with EpisodeWriter(path) as writer:
         writer.describe(episode.info, derived=derived)

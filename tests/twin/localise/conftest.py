@@ -9,6 +9,7 @@ import pytest
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import Task, load_task
 
 WIDTH, HEIGHT = 320, 240
@@ -41,6 +42,10 @@ class Stage:
         self.add_box(np.array([0.45, 0, -0.02]), np.array([1.2, 1.4, 0.04]), TABLE_COLOR)
         for object_id, T in poses.items():
             model = task.objects[object_id]
+            if model.mesh is not None:
+                mesh = object_mesh(model)
+                self.add_mesh(mesh.vertices_m, mesh.triangles, model.color_srgb, T)
+                continue
             for centre, extents in model.panels():
                 self.add_box(centre, extents, model.color_srgb, T)
 
@@ -55,6 +60,19 @@ class Stage:
         mesh.translate(-np.asarray(extents) / 2 + centre)
         mesh.transform(np.eye(4) if T is None else T)
         self.scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
+        self.albedo.append(linear_from_srgb(color))
+
+    def add_mesh(
+        self,
+        vertices_m: np.ndarray,
+        triangles: np.ndarray,
+        color: tuple[int, int, int],
+        T: np.ndarray,
+    ) -> None:
+        self.scene.add_triangles(
+            o3d.core.Tensor(se3.apply(T, vertices_m).astype(np.float32)),
+            o3d.core.Tensor(np.ascontiguousarray(triangles, dtype=np.uint32)),
+        )
         self.albedo.append(linear_from_srgb(color))
 
     def _cast(self, camera: Camera, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
