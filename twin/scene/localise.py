@@ -15,22 +15,20 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.streams import RgbdFrame
-from bridge.geometry import se3
-from bridge.task.record import check_record
 from bridge.task.task_file import ObjectModel, Task
 from twin.scene.localise_colour import ColourConfig
-from twin.scene.localise_fit import FitConfig, ShapeFit, fit_shape
-from twin.scene.localise_mesh import MeshFit, MeshFitConfig, fit_mesh, known_surface
+from twin.scene.localise_fit import FitConfig, fit_shape
+from twin.scene.localise_mesh import MeshFitConfig, fit_mesh, known_surface
 from twin.scene.localise_points import Cluster, PointConfig, View, fuse_stills, object_points
+from twin.scene.localise_result import (
+    LocalisedObject,
+    found_by_mesh,
+    found_by_shape,
+    missing,
+)
 from twin.scene.localise_shape import rest_height_m, yaw_period_rad
 from twin.scene.localise_soft import SoftConfig, SoftFit, fit_toys
 from twin.scene.localise_table import TableConfig, TableFit, correct_for_table
-
-SCHEMA_VERSION = 1
-METHOD = "colour_shape_fit"
-MESH_METHOD = "colour_mesh_icp"
-UPRIGHT = 0.98
-"""Cosine of the tilt up to which an object stands."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,47 +55,6 @@ class LocaliseConfig:
     """Share of an object's points that its shape must explain."""
     rest_tolerance_m: float = 0.006
     """Nearer than this to standing on the table counts as standing on it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LocalisedObject:
-    """One object's pose, or the reason why there is none."""
-
-    object_id: str
-    found: bool
-    T_base_object: Float[np.ndarray, "4 4"] | None
-    covariance: Float[np.ndarray, "6 6"] | None
-    """Of (x, y, z, rotation about x, y, z), base frame [m^2, m rad, rad^2]."""
-    confidence: float
-    """0 to 1: the share of points and outline that the fitted shape explains."""
-    method: str
-    reason: str | None
-    stamp_ns: int
-    symmetry: str = "none"
-    detail: Mapping[str, Any] = field(default_factory=dict)
-    """Numbers behind the pose: points, residuals, what the table said of the cameras."""
-
-    def to_record(self) -> dict[str, Any]:
-        """Return the gst localisation v1 record, checked against its schema."""
-        pose = None
-        if self.T_base_object is not None:
-            q, p = se3.split(self.T_base_object)
-            pose = {"p_m": p.tolist(), "q_wxyz": q.tolist()}
-        record = {
-            "schema_version": SCHEMA_VERSION,
-            "stamp_ns": self.stamp_ns,
-            "object": self.object_id,
-            "found": self.found,
-            "T_base_object": pose,
-            "covariance": None if self.covariance is None else self.covariance.ravel().tolist(),
-            "symmetry": self.symmetry,
-            "confidence": self.confidence,
-            "method": self.method,
-            "reason": self.reason,
-            **self.detail,
-        }
-        check_record(record, name="localisation")
-        return record
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,16 +165,13 @@ def _toy(
     if equals > 1:
         detail |= {"equal_objects": equals, "assignment_margin_m": toy.margin_m}
     if toy.fit is None or toy.shape is None:
-        return _missing(model, stamp_ns, str(toy.reason), detail)
-    found = _found_mesh(model, toy.fit, stamp_ns, config, detail)
-    shape = toy.shape
-    if found.T_base_object is not None:
-        shape = replace(shape, centroid_m=found.T_base_object[:3, 3].copy())
+        return missing(model, stamp_ns, str(toy.reason), detail)
+    found = found_by_mesh(model, toy.fit, stamp_ns, config.rest_tolerance_m, detail)
     reasons = [text for text in (found.reason, toy.reason) if text]
     return replace(
         found,
         reason="; ".join(reasons) or None,
-        detail={**found.detail, "soft_shape": shape.to_record()},
+        detail={**found.detail, "soft_shape": toy.shape.to_record()},
     )
 
 
@@ -240,7 +194,7 @@ def _localise_one(
 ) -> LocalisedObject:
     stamp_ns = max((view.stamp_ns for view in views), default=0)
     if not views:
-        return _missing(model, stamp_ns, "no frames with colour, depth and a pose were given", {})
+        return missing(model, stamp_ns, "no frames with colour, depth and a pose were given", {})
     groups = object_points(views, model, config.points, config.colour)
     seen = len(groups[0]) if groups else 0
     detail = _detail(views, seen, tables)
@@ -249,7 +203,7 @@ def _localise_one(
             f"{seen} points have the colour of {model.id} above the table, "
             f"{config.points.min_points} are needed (cameras {', '.join(detail['cameras'])})"
         )
-        return _missing(model, stamp_ns, reason, detail)
+        return missing(model, stamp_ns, reason, detail)
     if model.mesh is not None:
         return _localise_mesh(groups[0], views, model, stamp_ns, config, detail)
     fit = fit_shape(groups[0], views, model, config.colour, config.fit)
@@ -265,8 +219,8 @@ def _localise_one(
             f"only {fit.explained:.0%} of {seen} points fit the shape of {model.id}, "
             f"{config.min_explained:.0%} are needed"
         )
-        return _missing(model, stamp_ns, reason, detail)
-    return _found(model, fit, stamp_ns, config, detail)
+        return missing(model, stamp_ns, reason, detail)
+    return found_by_shape(model, fit, stamp_ns, config.rest_tolerance_m, detail)
 
 
 def _localise_mesh(
@@ -292,48 +246,8 @@ def _localise_mesh(
             f"only {fit.explained:.0%} of {len(group)} points fit the mesh of {model.id}, "
             f"{config.min_explained:.0%} are needed"
         )
-        return _missing(model, stamp_ns, reason, detail)
-    return _found_mesh(model, fit, stamp_ns, config, detail)
-
-
-def _found_mesh(
-    model: ObjectModel,
-    fit: MeshFit,
-    stamp_ns: int,
-    config: LocaliseConfig,
-    detail: dict[str, Any],
-) -> LocalisedObject:
-    T = fit.T_base_object.copy()
-    lift_m = float(T[2, 3]) - rest_height_m(model)
-    detail |= {
-        "residual_m": fit.residual_m,
-        "seen_through_fraction": fit.seen_through,
-        "lift_m": lift_m,
-    }
-    reason = None
-    stands = bool(T[2, 2] > UPRIGHT) and abs(lift_m) <= config.rest_tolerance_m
-    if stands:
-        T[2, 3] = rest_height_m(model)
-    else:
-        tilt = np.degrees(np.arccos(np.clip(T[2, 2], -1, 1)))
-        reason = (
-            f"{model.id} is {lift_m * 1e3:+.0f} mm from standing on the table, "
-            f"tilted by {tilt:.0f} degrees"
-        )
-    if model.soft is None and stands:
-        T = reduce_by_symmetry(T, model)
-    return LocalisedObject(
-        object_id=model.id,
-        found=True,
-        T_base_object=T,
-        covariance=fit.covariance,
-        confidence=fit.explained * (1 - fit.seen_through),
-        method=MESH_METHOD,
-        reason=reason,
-        stamp_ns=stamp_ns,
-        symmetry=model.symmetry,
-        detail=detail,
-    )
+        return missing(model, stamp_ns, reason, detail)
+    return found_by_mesh(model, fit, stamp_ns, config.rest_tolerance_m, detail)
 
 
 def _by_view(views: Sequence[View], values: Sequence[float]) -> dict[str, list[float]]:
@@ -341,62 +255,3 @@ def _by_view(views: Sequence[View], values: Sequence[float]) -> dict[str, list[f
     for view, value in zip(views, values, strict=True):
         table.setdefault(view.camera_id, []).append(value)
     return table
-
-
-def _missing(
-    model: ObjectModel, stamp_ns: int, reason: str, detail: Mapping[str, Any]
-) -> LocalisedObject:
-    return LocalisedObject(
-        object_id=model.id,
-        found=False,
-        T_base_object=None,
-        covariance=None,
-        confidence=0.0,
-        method=METHOD if model.mesh is None else MESH_METHOD,
-        reason=reason,
-        stamp_ns=stamp_ns,
-        symmetry=model.symmetry,
-        detail=detail,
-    )
-
-
-def _found(
-    model: ObjectModel,
-    fit: ShapeFit,
-    stamp_ns: int,
-    config: LocaliseConfig,
-    detail: dict[str, Any],
-) -> LocalisedObject:
-    T = reduce_by_symmetry(fit.T_base_object, model)
-    lift_m = float(T[2, 3]) - rest_height_m(model)
-    detail["lift_m"] = lift_m
-    reason = None
-    if abs(lift_m) <= config.rest_tolerance_m:
-        T[2, 3] = rest_height_m(model)
-    else:
-        reason = f"{model.id} is {lift_m * 1e3:+.0f} mm from standing on the table"
-    return LocalisedObject(
-        object_id=model.id,
-        found=True,
-        T_base_object=T,
-        covariance=fit.covariance,
-        confidence=fit.explained,
-        method=METHOD,
-        reason=reason,
-        stamp_ns=stamp_ns,
-        symmetry=model.symmetry,
-        detail=detail,
-    )
-
-
-def reduce_by_symmetry(
-    T_base_object: Float[np.ndarray, "4 4"], model: ObjectModel
-) -> Float[np.ndarray, "4 4"]:
-    """Choose the yaw nearest zero among those that look the same."""
-    period = yaw_period_rad(model)
-    yaw = np.arctan2(T_base_object[1, 0], T_base_object[0, 0])
-    reduced = np.mod(yaw + period / 2, period) - period / 2
-    T = T_base_object.copy()
-    c, s = np.cos(reduced), np.sin(reduced)
-    T[:2, :2] = [[c, -s], [s, c]]
-    return T

@@ -20,7 +20,8 @@ from bridge.errors import EpisodeError
 from bridge.task.robot import BASE_FRAME
 from bridge.task.task_file import Task
 from twin.scene.frames import rgbd_camera_ids
-from twin.scene.localise import LocaliseConfig, LocalisedObject, localise_objects
+from twin.scene.localise import LocaliseConfig, localise_objects
+from twin.scene.localise_result import LocalisedObject
 from twin.scene.still import same_pose
 
 NO_SCENE = "noscene"

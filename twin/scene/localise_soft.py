@@ -31,6 +31,8 @@ from twin.scene.localise_shape import surface_distances
 
 DENSE_SAMPLES = 20_000
 CELL_M = 0.004
+STANDS = 0.9
+"""Cosine of the tilt up to which the underside of a toy is taken to be level."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -293,20 +295,20 @@ def soft_shape(
     # An end that every camera looks at from behind was not seen; it is taken as at rest.
     eyes = se3.apply(se3.invert(T), np.array([view.T_base_depth[:3, 3] for view in views]))
     towards = eyes / np.linalg.norm(eyes, axis=1, keepdims=True)
-    grown = np.zeros(3)
     faced = np.any([facing(T, view, surface) for view in views], axis=0)
-    for sign in (1.0, -1.0):
+    half, ends = np.array(model.size_m) / 2, np.zeros((2, 3))
+    for row, sign in enumerate((1.0, -1.0)):
         seen = (sign * towards).max(axis=0) > -0.2
-        ends = np.percentile(sign * local, 98, axis=0)
+        reached = np.percentile(sign * local, 98, axis=0)
         rest = np.percentile(sign * surface.p_m[faced], 98, axis=0)
-        grown += np.where(seen, ends - rest, 0.0)
-    size = np.array(model.size_m)
-    extents = np.maximum(size + grown, 0.2 * size)
+        ends[row] = sign * np.maximum(half + np.where(seen, reached - rest, 0.0), 0.1 * half)
+    if T[2, 2] > STANDS and T[2, 3] + ends[1, 2] < 0:
+        ends[1, 2] = -T[2, 3]  # it cannot reach below the table
     sigma = np.hypot(0.005, fit.residual_m) * np.ones(3)
     return SoftShape(
-        centroid_m=T[:3, 3].copy(),
+        centroid_m=se3.apply(T, ends.mean(axis=0)[None])[0],
         R_base_axes=T[:3, :3].copy(),
-        extents_m=extents,
+        extents_m=ends[0] - ends[1],
         extents_sigma_m=sigma,
     )
 

@@ -21,9 +21,9 @@ from bridge.task.task_file import ObjectModel, Task
 from bridge.whole_file import write_whole
 from twin.scene.fill import fill_footprint
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, turned_harmonics
-from twin.scene.localise import LocalisedObject
 from twin.scene.localise_colour import ColourConfig, likeness, linear_from_srgb
 from twin.scene.localise_fit import FitConfig, refine_on_points
+from twin.scene.localise_result import LocalisedObject
 from twin.scene.localise_shape import surface_distances
 from twin.scene.ply import write_ply
 from twin.scene.shape.files import MESH, remove_shape, write_shape

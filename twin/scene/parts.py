@@ -16,8 +16,8 @@ from bridge.geometry import se3
 from bridge.task.task_file import Task, load_task
 from twin.scene.frames import FrameChoice, Sources
 from twin.scene.gaussians import GaussianCloud, concatenate
-from twin.scene.localise import LocalisedObject
 from twin.scene.localise_episode import localise_episode
+from twin.scene.localise_result import LocalisedObject
 from twin.scene.objects import (
     ObjectSplats,
     SceneParts,

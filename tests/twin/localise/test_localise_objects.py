@@ -11,7 +11,8 @@ from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.task.record import check_record
 from bridge.task.task_file import Task
-from twin.scene.localise import localise, localise_objects, reduce_by_symmetry
+from twin.scene.localise import localise, localise_objects
+from twin.scene.localise_result import reduce_by_symmetry
 from twin.scene.localise_shape import pose_of
 
 SIDE = ("side", (1.15, -0.15, 0.65), (0.45, 0.0, 0.0))

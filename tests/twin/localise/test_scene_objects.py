@@ -12,7 +12,7 @@ from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.scene.fill import fill_footprint
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32, concatenate
-from twin.scene.localise import LocalisedObject
+from twin.scene.localise_result import LocalisedObject
 from twin.scene.localise_shape import pose_of
 from twin.scene.objects import (
     SplitConfig,

@@ -20,7 +20,7 @@ from twin.replay.run import replay_run
 from twin.scene import parts as parts_module
 from twin.scene.frames import choose_frames, find_sources
 from twin.scene.initialise import fuse
-from twin.scene.localise import LocalisedObject
+from twin.scene.localise_result import LocalisedObject
 from twin.scene.parts import read_objects, take_apart
 from twin.scene.points import DepthLimits, FrameSurface
 from twin.scene.rebuild import rebuild

@@ -9,7 +9,7 @@ from bridge.episode.run import RunFolder
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.localise import LocalisedObject
+from twin.scene.localise_result import LocalisedObject
 from twin.scene.objects import split_objects, write_objects
 from twin.scene.parts import put_together, read_objects
 

@@ -11,7 +11,7 @@ import pytest
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.localise import LocalisedObject
+from twin.scene.localise_result import LocalisedObject
 from twin.scene.localise_shape import pose_of, surface_distances
 from twin.scene.objects import ObjectSplats, SceneParts, write_objects
 from twin.scene.semantics.result import Instance

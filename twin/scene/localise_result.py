@@ -1,0 +1,164 @@
+"""What localisation says of one object: its pose with how sure it is, or why there is none."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry import se3
+from bridge.task.record import check_record
+from bridge.task.task_file import ObjectModel
+from twin.scene.localise_fit import ShapeFit
+from twin.scene.localise_mesh import MeshFit
+from twin.scene.localise_shape import rest_height_m, yaw_period_rad
+
+SCHEMA_VERSION = 1
+METHOD = "colour_shape_fit"
+MESH_METHOD = "colour_mesh_icp"
+UPRIGHT = 0.98
+"""Cosine of the tilt up to which an object stands."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalisedObject:
+    """One object's pose, or the reason why there is none."""
+
+    object_id: str
+    found: bool
+    T_base_object: Float[np.ndarray, "4 4"] | None
+    covariance: Float[np.ndarray, "6 6"] | None
+    """Of (x, y, z, rotation about x, y, z), base frame [m^2, m rad, rad^2]."""
+    confidence: float
+    """0 to 1: the share of points and outline that the fitted shape explains."""
+    method: str
+    reason: str | None
+    stamp_ns: int
+    symmetry: str = "none"
+    detail: Mapping[str, Any] = field(default_factory=dict)
+    """Numbers behind the pose: points, residuals, what the table said of the cameras."""
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the gst localisation v1 record, checked against its schema."""
+        pose = None
+        if self.T_base_object is not None:
+            q, p = se3.split(self.T_base_object)
+            pose = {"p_m": p.tolist(), "q_wxyz": q.tolist()}
+        record = {
+            "schema_version": SCHEMA_VERSION,
+            "stamp_ns": self.stamp_ns,
+            "object": self.object_id,
+            "found": self.found,
+            "T_base_object": pose,
+            "covariance": None if self.covariance is None else self.covariance.ravel().tolist(),
+            "symmetry": self.symmetry,
+            "confidence": self.confidence,
+            "method": self.method,
+            "reason": self.reason,
+            **self.detail,
+        }
+        check_record(record, name="localisation")
+        return record
+
+
+def missing(
+    model: ObjectModel, stamp_ns: int, reason: str, detail: Mapping[str, Any]
+) -> LocalisedObject:
+    """Say why an object was not found."""
+    return LocalisedObject(
+        object_id=model.id,
+        found=False,
+        T_base_object=None,
+        covariance=None,
+        confidence=0.0,
+        method=METHOD if model.mesh is None else MESH_METHOD,
+        reason=reason,
+        stamp_ns=stamp_ns,
+        symmetry=model.symmetry,
+        detail=detail,
+    )
+
+
+def found_by_mesh(
+    model: ObjectModel,
+    fit: MeshFit,
+    stamp_ns: int,
+    rest_tolerance_m: float,
+    detail: dict[str, Any],
+) -> LocalisedObject:
+    """Turn a fitted mesh into a result; what nearly stands on the table stands on it."""
+    T = fit.T_base_object.copy()
+    lift_m = float(T[2, 3]) - rest_height_m(model)
+    detail |= {
+        "residual_m": fit.residual_m,
+        "seen_through_fraction": fit.seen_through,
+        "lift_m": lift_m,
+    }
+    reason = None
+    stands = bool(T[2, 2] > UPRIGHT) and abs(lift_m) <= rest_tolerance_m
+    if stands:
+        T[2, 3] = rest_height_m(model)
+    else:
+        tilt = np.degrees(np.arccos(np.clip(T[2, 2], -1, 1)))
+        reason = (
+            f"{model.id} is {lift_m * 1e3:+.0f} mm from standing on the table, "
+            f"tilted by {tilt:.0f} degrees"
+        )
+    if model.soft is None and stands:
+        T = reduce_by_symmetry(T, model)
+    return LocalisedObject(
+        object_id=model.id,
+        found=True,
+        T_base_object=T,
+        covariance=fit.covariance,
+        confidence=fit.explained * (1 - fit.seen_through),
+        method=MESH_METHOD,
+        reason=reason,
+        stamp_ns=stamp_ns,
+        symmetry=model.symmetry,
+        detail=detail,
+    )
+
+
+def found_by_shape(
+    model: ObjectModel,
+    fit: ShapeFit,
+    stamp_ns: int,
+    rest_tolerance_m: float,
+    detail: dict[str, Any],
+) -> LocalisedObject:
+    """Turn a fitted shape into a result; what nearly stands on the table stands on it."""
+    T = reduce_by_symmetry(fit.T_base_object, model)
+    lift_m = float(T[2, 3]) - rest_height_m(model)
+    detail["lift_m"] = lift_m
+    reason = None
+    if abs(lift_m) <= rest_tolerance_m:
+        T[2, 3] = rest_height_m(model)
+    else:
+        reason = f"{model.id} is {lift_m * 1e3:+.0f} mm from standing on the table"
+    return LocalisedObject(
+        object_id=model.id,
+        found=True,
+        T_base_object=T,
+        covariance=fit.covariance,
+        confidence=fit.explained,
+        method=METHOD,
+        reason=reason,
+        stamp_ns=stamp_ns,
+        symmetry=model.symmetry,
+        detail=detail,
+    )
+
+
+def reduce_by_symmetry(
+    T_base_object: Float[np.ndarray, "4 4"], model: ObjectModel
+) -> Float[np.ndarray, "4 4"]:
+    """Choose the yaw nearest zero among those that look the same."""
+    period = yaw_period_rad(model)
+    yaw = np.arctan2(T_base_object[1, 0], T_base_object[0, 0])
+    reduced = np.mod(yaw + period / 2, period) - period / 2
+    T = T_base_object.copy()
+    c, s = np.cos(reduced), np.sin(reduced)
+    T[:2, :2] = [[c, -s], [s, c]]
+    return T
