@@ -61,6 +61,8 @@ def take_back(run: RunFolder, file: Path, object_id: str = "") -> dict[str, Any]
         "num_splats": len(cloud),
         "from_scene": record["scene_hash"],
     }
+    if not object_id and digest[:HASH_DIGITS] == record["scene_hash"]:
+        return about | {"scene_hash": record["scene_hash"]}  # the scene's own file, not edited
     if object_id:
         place = run.scene_dir / "objects" / check_episode_id(object_id)
         write_ply(place / SPLATS, cloud)
@@ -69,7 +71,7 @@ def take_back(run: RunFolder, file: Path, object_id: str = "") -> dict[str, Any]
         item["files"][SPLATS] = provenance.hash_file(place / SPLATS)
     else:
         write_ply(run.scene_dir / BACKGROUND, cloud)
-        record["scene_hash"] = background_hash(run)[:HASH_DIGITS]
+        record["scene_hash"] = background_hash(run)
         record["background"] = {"file": BACKGROUND, "num_splats": len(cloud)}
     record["edited"] = [*record.get("edited", []), about]
     write_record(run, record)

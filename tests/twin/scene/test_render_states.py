@@ -197,6 +197,12 @@ def test_a_background_edited_in_place_is_taken_after_being_refused(room: RunFold
     assert len(read_scene(room).background) == 50
 
 
+def test_taking_the_background_back_unchanged_changes_nothing(room: RunFolder) -> None:
+    before = (room.scene_dir / "scene.json").read_bytes()
+    take_back(room, room.scene_dir / "background.ply")
+    assert (room.scene_dir / "scene.json").read_bytes() == before
+
+
 def test_an_edited_object_keeps_the_scene(room: RunFolder, tmp_path: Path) -> None:
     before = read_scene(room).scene_hash
     write_ply(tmp_path / "blob.ply", blob().take(np.arange(10)))
