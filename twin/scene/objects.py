@@ -144,7 +144,12 @@ def _refined(
     T_base_object: Float[np.ndarray, "4 4"],
     config: SplitConfig,
 ) -> Float[np.ndarray, "4 4"]:
-    """The scene's own errors shift what it shows by millimetres: follow the Gaussians."""
+    """The scene's own errors shift what it shows by millimetres: follow the Gaussians.
+
+    Only boxes: what stands in for a mesh is too coarse to lay it out by, and knows no tilt.
+    """
+    if model.mesh is not None:
+        return T_base_object
     ids = _near_ids(cloud, model, T_base_object, config.search_m)
     ids = ids[_alike(cloud.take(ids), model, config)]
     if len(ids) < MIN_SPLATS_TO_REFINE:

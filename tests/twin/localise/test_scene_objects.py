@@ -237,3 +237,25 @@ def test_the_object_folder_can_be_read_by_others_and_is_vouched_for_by_hashes(
     saved = json.loads((tmp_path / "objects" / "cube" / "object.json").read_text())
     assert saved["size_m"] == list(TASK.objects["cube"].size_m)
     assert saved["localisation"]["found"] is True
+
+
+def test_a_toy_that_lies_on_its_side_is_left_as_it_was_found() -> None:
+    task = load_task("sloth_into_basket")
+    T = pose_of(np.array([0.48, -0.17, 0.05, 0.3]))
+    T[:3, :3] = T[:3, :3] @ np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+    rng = np.random.default_rng(0)
+    points = se3.apply(T, rng.uniform(-1, 1, (500, 3)) * [0.08, 0.05, 0.03])
+    cloud = cloud_of(points, task.objects["sloth"].color_srgb)
+    found = LocalisedObject(
+        object_id="sloth",
+        found=True,
+        T_base_object=T,
+        covariance=None,
+        confidence=1.0,
+        method="test",
+        reason=None,
+        stamp_ns=1,
+    )
+    parts = split_objects(cloud, {"sloth": found}, task)
+    np.testing.assert_array_equal(parts.objects["sloth"].T_base_object, T)
+    assert len(parts.objects["sloth"].cloud) == 500
