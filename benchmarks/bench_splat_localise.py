@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from measure import Target, report_targets
 
-TRIALS, TOY_TRIALS = 50, 5
+TRIALS, TOY_TRIALS = 50, 20
 NOTE = "development seeds, 3 frames of wrist and side camera, 320 x 240; wall time"
 
 

@@ -195,7 +195,9 @@ def _localise_one(
     stamp_ns = max((view.stamp_ns for view in views), default=0)
     if not views:
         return missing(model, stamp_ns, "no frames with colour, depth and a pose were given", {})
-    groups = object_points(views, model, config.points, config.colour)
+    low_m = config.points.min_height_m if model.mesh is None else config.soft.min_height_m
+    points = replace(config.points, min_height_m=low_m)
+    groups = object_points(views, model, points, config.colour)
     seen = len(groups[0]) if groups else 0
     detail = _detail(views, seen, tables)
     if seen < config.points.min_points:

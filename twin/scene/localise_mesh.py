@@ -351,3 +351,22 @@ def _turn(R: Float[np.ndarray, "3 3"], period_rad: float) -> float:
     turns = np.arange(0.0, 2 * np.pi - 1e-9, period_rad)
     spun = [R @ Rotation.from_euler("z", turn).as_matrix() for turn in turns]
     return min(float(se3.rotation_angle_rad(rotation)) for rotation in spun)
+
+
+def agreeing(
+    T: Float[np.ndarray, "4 4"], surface: Surface, views: Sequence[View], margin_m: float
+) -> float:
+    """Share of the mesh's facing surface that the camera which sees most of it measured there.
+
+    Args:
+        T: ``T_base_object``.
+        surface: The mesh.
+        views: With their depth.
+        margin_m: How far off a measurement may be.
+    """
+    share = 0.0
+    for view in views:
+        # Behind the nearer bound, but not behind the farther one.
+        behind = seen_through(T, surface, [view], -margin_m)
+        share = max(share, behind - seen_through(T, surface, [view], margin_m))
+    return share

@@ -22,6 +22,7 @@ from twin.scene.localise_mesh import (
     MeshFit,
     MeshFitConfig,
     Surface,
+    agreeing,
     facing,
     fit_mesh,
     known_surface,
@@ -59,6 +60,8 @@ class SoftConfig:
     """So they are with more of its surface seen through."""
     max_seen_through: float = 0.3
     """With more of its surface seen through it is something else."""
+    min_agreeing: float = 0.35
+    """Some camera must measure this share of the surface that faces it where the toy is."""
     moved_m: float = 0.05
     """Equal toys farther from where they are expected were moved, no matter how far: those that
     stayed keep their names."""
@@ -136,7 +139,9 @@ def fit_toys(
     good = [
         index
         for index, item in enumerate(fits)
-        if item.explained >= min_explained and item.seen_through <= soft.max_seen_through
+        if item.explained >= min_explained
+        and item.seen_through <= soft.max_seen_through
+        and agreeing(item.T_base_object, surface, views, mesh.see_through_m) >= soft.min_agreeing
     ]
     cost = np.array(
         [

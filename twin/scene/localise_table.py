@@ -89,11 +89,12 @@ def _table_points(
 ) -> Float[np.ndarray, "num_points 3"]:
     wanted = np.abs(view.p_base[:, 2]) < config.band_m
     step = max(1, int(wanted.sum()) // config.max_points)
-    ids = np.flatnonzero(wanted)[::step]
+    ids = everything = np.flatnonzero(wanted)[::step]
     for model in task.objects.values():
         like = likeness(view.color_linear[ids], model.color_srgb, colour)
         ids = ids[like < points.min_likeness / 2]
-    return view.p_base[ids]
+    # A table of the objects' own colour: most points of the band are table all the same.
+    return view.p_base[ids if len(ids) >= config.min_points else everything]
 
 
 def fit_table(
