@@ -16,7 +16,7 @@ from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.record import check_record
 from bridge.task.task_file import Task, load_task
 from twin.scene.localise import LocaliseConfig, localise, localise_objects
-from twin.scene.localise_mesh import known_surface, seen_through, surface_of
+from twin.scene.localise_mesh import agreeing, known_surface, seen_through, surface_of
 from twin.scene.localise_points import fuse_stills
 from twin.scene.localise_shape import pose_of
 
@@ -246,3 +246,16 @@ def test_a_mesh_where_nothing_is_is_seen_through(stage: Callable[..., Any]) -> N
     elsewhere = AT.copy()
     elsewhere[1, 3] += 0.1
     assert seen_through(elsewhere, surface, views, 0.012) > 0.6
+
+
+def test_a_mesh_of_which_no_camera_measures_anything_is_not_believed(
+    stage: Callable[..., Any],
+) -> None:
+    task = only(DUCKS, "duck_1")
+    frames, config = shoot(table_with(stage, (DUCK, AT))), LocaliseConfig()
+    views = fuse_stills(frames, 3, 8, task, config.points)
+    surface, below = known_surface(DUCK, 1000), AT.copy()
+    below[2, 3] -= 0.2  # hidden by the table, so nothing sees through it either
+    assert agreeing(AT, surface, views, 0.012) > 0.8
+    assert seen_through(below, surface, views, 0.012) < 0.05
+    assert agreeing(below, surface, views, 0.012) < 0.05
