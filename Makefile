@@ -35,7 +35,7 @@ demo: $(READY)
 	@$(BIN)/robot-gst demo $(RUN) $(DEMO)
 
 test: $(READY)
-	@$(BIN)/python -m pytest -q -n 2 --dist loadfile -m "not gpu and not hardware and not network" $(TEST)
+	@$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not gpu and not hardware and not network" $(TEST)
 
 fast: $(READY)
 	@$(BIN)/python -m pytest -q -n 2 --dist loadfile $(TEST)
