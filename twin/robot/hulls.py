@@ -38,19 +38,28 @@ def convex_hull(points_m: Float[np.ndarray, "num_points 3"]) -> coal.ConvexBase:
     return coal.ConvexBase.convexHull(stored, False, "Qt")
 
 
+def collision_geometry(robot: RobotModel) -> pin.GeometryModel:
+    """Read the collision shapes of a description.
+
+    Raises:
+        RobotDescriptionError: When a mesh cannot be read.
+    """
+    try:
+        return pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
+    except (ValueError, RuntimeError) as error:
+        raise RobotDescriptionError(
+            found=f"has collision shapes that cannot be read ({str(error)[:200]})",
+            hint="Check its mesh files.",
+        ) from error
+
+
 def link_hulls(robot: RobotModel) -> list[LinkHull]:
     """Return one hull for each collision element of the description.
 
     Raises:
         RobotDescriptionError: When a mesh cannot be read, or a shape is of an unknown kind.
     """
-    try:
-        geometry = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
-    except (ValueError, RuntimeError) as error:
-        raise RobotDescriptionError(
-            found=f"has collision shapes that cannot be read ({str(error)[:200]})",
-            hint="Check its mesh files.",
-        ) from error
+    geometry = collision_geometry(robot)
     hulls = []
     for item in geometry.geometryObjects:
         frame = robot.model.frames[item.parentFrame]

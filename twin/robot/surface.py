@@ -17,6 +17,7 @@ import pinocchio as pin
 from jaxtyping import Float, Float32, Int, Int64
 
 from twin.robot.description import RobotDescriptionError
+from twin.robot.hulls import collision_geometry
 from twin.robot.model import RobotModel
 from twin.robot.posture import Posture
 
@@ -67,13 +68,7 @@ def link_surfaces(robot: RobotModel) -> tuple[LinkSurface, ...]:
         RobotDescriptionError: When a shape cannot be read or is of an unknown kind, or none is
             there.
     """
-    try:
-        geometry = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
-    except (ValueError, RuntimeError) as error:
-        raise RobotDescriptionError(
-            found=f"has collision shapes that cannot be read ({str(error)[:200]})",
-            hint="Check its mesh files.",
-        ) from error
+    geometry = collision_geometry(robot)
     surfaces = []
     for item in geometry.geometryObjects:
         frame = robot.model.frames[item.parentFrame]
