@@ -1,5 +1,6 @@
 # make demo    the whole loop on a stand-in cell, ends with the dashboard's address
-# make test    all tests but the very slow ones   make check   lint, types, import contracts
+# make test    all tests that need no device   make check   lint, types, import contracts
+# make soak    kills and endurance at full size (minutes), which make test runs smaller
 # make bench   benchmarks against named references; BENCH=record picks those of the recorder
 # Everything lives in .venv; the first target run makes it (about 5 GB, a few minutes).
 
@@ -8,15 +9,15 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
 	command -v $$p >/dev/null 2>&1 && $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' && echo $$p && break; done)
 BIN := .venv/bin
 READY := .venv/.ready
-NATIVE := $(wildcard twin/scene/native/* bridge/media/native/* bridge/episode/native/*)
+NATIVE := $(wildcard twin/scene/native/* bridge/media/native/* bridge/episode/native/* twin/physics/native/*)
 RUN ?= runs/demo
 BENCH ?=
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: help setup demo test fast check format bench clean
+.PHONY: help setup demo test soak fast check format bench clean
 
 help:
-	@sed -n '1,5s/^# //p' Makefile
+	@sed -n '1,6s/^# //p' Makefile
 
 setup: $(READY)
 
@@ -36,6 +37,10 @@ demo: $(READY)
 
 test: $(READY)
 	@$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not gpu and not hardware and not network" $(TEST)
+
+soak: $(READY)
+	@GST_KILLS=100 GST_EPISODES=1000 $(BIN)/python -m pytest -q -rA -m slow \
+		tests/bridge/episode/test_writer_killed.py tests/bridge/record/faults/test_endurance.py
 
 fast: $(READY)
 	@$(BIN)/python -m pytest -q -n 2 --dist loadfile $(TEST)

@@ -16,6 +16,8 @@ from bridge.episode.run import RunFolder
 
 CHILD = Path(__file__).with_name("writer_child.py")
 MAX_TAIL_NS = 500_000_000
+KILLS = int(os.environ.get("GST_KILLS", "30"))
+"""`make soak` kills a hundred times, which takes four minutes."""
 
 
 def start(*arguments: object) -> subprocess.Popen[str]:
@@ -69,16 +71,17 @@ def test_a_killed_writer_leaves_all_but_the_last_half_second(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_a_hundred_kills_cost_at_most_half_a_second_each(tmp_path: Path) -> None:
+def test_kills_at_random_instants_cost_at_most_half_a_second_each(tmp_path: Path) -> None:
+    """Two in five kills hit writing, one in five finalising, two in five a recovery."""
     rng = random.Random(3)
-    for index in range(40):
+    for index in range(KILLS * 2 // 5):
         kind = ("joints", "mixed")[index % 2]
         check_one_kill(tmp_path / f"w{index}", kind, rng.uniform(0.01, 2.5))
-    for index in range(20):
+    for index in range(KILLS // 5):
         check_one_kill(tmp_path / f"c{index}", "mixed", "closing")
     whole = write_ours(tmp_path / "whole.mcap", some_messages(30_000), chunk_bytes=1 << 18)
     data = whole.read_bytes()
-    for index in range(40):
+    for index in range(KILLS * 2 // 5):
         kill_a_recovery(tmp_path / f"r{index}", data[: len(data) * 9 // 10], rng.uniform(0, 0.3))
 
 

@@ -1,4 +1,7 @@
-"""A recorder that runs for long: a thousand episodes, and a cell in full flow."""
+"""A recorder that runs for long: many episodes, and a cell in full flow.
+
+`make soak` runs a thousand episodes; the number here fits into every test run.
+"""
 
 import os
 import threading
@@ -12,14 +15,14 @@ from fault_messages import MIX
 
 pytestmark = pytest.mark.slow
 
-EPISODES = 1000
+EPISODES = int(os.environ.get("GST_EPISODES", "250"))
 SOAK_S = float(os.environ.get("GST_SOAK_S", "60"))
 WARM_UP_S = 15.0
 MAX_MB_PER_MIN = 3.0
 MAX_GROWTH_MB = 20.0
 
 
-def test_a_thousand_episodes_leave_no_files_threads_or_memory(cell: FaultCell) -> None:
+def test_many_episodes_leave_no_files_threads_or_memory(cell: FaultCell) -> None:
     """Law: what an episode took, its end gives back."""
     recorder = cell.record()
     publisher = cell.publisher()
@@ -50,7 +53,7 @@ def test_a_thousand_episodes_leave_no_files_threads_or_memory(cell: FaultCell) -
     assert after[1] <= before[1] + 2
     assert after_mb - before_mb < MAX_GROWTH_MB
     assert len(list((cell.run / "episodes").iterdir())) == EPISODES + 50
-    for name in ("e0000", "e0999"):
+    for name in ("e0000", f"e{EPISODES - 1:04d}"):
         assert len(read(cell.path(name))) == 4
         assert check_code(cell.path(name)) == 0
 
