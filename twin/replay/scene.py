@@ -48,6 +48,9 @@ class ReplayScene:
 
     reasons: Mapping[str, str] = field(default_factory=dict)
     """Why an object has no pose."""
+    covariances: Mapping[str, Float[np.ndarray, "6 6"]] = field(default_factory=dict)
+    """How sure each start pose is: (x, y, z, rotation about x, y, z), base frame; what samples are
+    drawn from."""
 
     def missing(self) -> list[str]:
         """Objects of the task that have no pose."""

@@ -20,6 +20,8 @@ class StartState:
 
     Ts_base_object: dict[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
+    covariances: dict[str, Float[np.ndarray, "6 6"]] = field(default_factory=dict)
+    """How sure each pose is: (x, y, z, rotation about x, y, z), base frame."""
 
 
 class StartStates:
@@ -67,6 +69,7 @@ def localised_starts(
 
 def _state_of(phase: Phase, task: Task, records: list[dict[str, object]]) -> StartState:
     poses: dict[str, Float[np.ndarray, "4 4"]] = {}
+    covariances: dict[str, Float[np.ndarray, "6 6"]] = {}
     reasons = dict.fromkeys(task.objects, "no localisation record")
     for record in records:
         if (record.get("phase"), record.get("plan_id")) != (phase.name, phase.plan_id):
@@ -77,6 +80,8 @@ def _state_of(phase: Phase, task: Task, records: list[dict[str, object]]) -> Sta
         if record["found"] and isinstance(pose, dict):
             poses[name] = se3.transform_from(np.array(pose["q_wxyz"]), np.array(pose["p_m"]))
             reasons.pop(name, None)
+            if record.get("covariance") is not None:
+                covariances[name] = np.array(record["covariance"], dtype=np.float64).reshape(6, 6)
         else:
             reasons[name] = str(record.get("reason") or "not found")
-    return StartState(Ts_base_object=poses, reasons=reasons)
+    return StartState(Ts_base_object=poses, reasons=reasons, covariances=covariances)
