@@ -116,6 +116,7 @@ _DECODERS: dict[str, Callable[[bytes], object]] = {
     schema.STRING: string_from_cdr,
     schema.PLAN: Plan.from_json,
     schema.VERDICT: Verdict.from_json,
+    schema.SAMPLE: lambda data: parse_record(data, name="sample"),
     schema.LOCALISATION: lambda data: parse_record(data, name="localisation"),
     schema.EVENT: lambda data: parse_record(data, name="event", package="bridge.episode"),
 }

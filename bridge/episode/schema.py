@@ -20,6 +20,7 @@ POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 PLAN = "gst/Plan"
 VERDICT = "gst/Verdict"
+SAMPLE = "gst/Sample"
 LOCALISATION = "gst/Localisation"
 EVENT = "gst/Event"
 DROPS = "recorder/Drops"
@@ -33,6 +34,7 @@ TRUTH_PREFIX = "/standin/truth/"
 _JSON_SCHEMAS = {
     PLAN: ("bridge.task", "schemas/plan.schema.json"),
     VERDICT: ("bridge.task", "schemas/verdict.schema.json"),
+    SAMPLE: ("bridge.task", "schemas/sample.schema.json"),
     LOCALISATION: ("bridge.task", "schemas/localisation.schema.json"),
     EVENT: ("bridge.episode", "schemas/event.schema.json"),
     DROPS: ("bridge.episode", "schemas/drops.schema.json"),
@@ -119,6 +121,7 @@ _TOPIC_RULES: tuple[tuple[str, str], ...] = (
     (r"/plan/path$", POSES_IN_FRAME),
     (r"/event$", EVENT),
     (r"/verdict$", VERDICT),
+    (r"/verdict/sample$", SAMPLE),
     (r"/object/[^/]+/pose$", POSE_STAMPED),
     (r"/object/[^/]+/nodes$", POINT_CLOUD),
     (r"/localisation$", LOCALISATION),
