@@ -21,6 +21,8 @@ JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 PLAN = "gst/Plan"
 VERDICT = "gst/Verdict"
 SAMPLE = "gst/Sample"
+CONTACT = "gst/Contact"
+DIVERGENCE = "gst/Divergence"
 LOCALISATION = "gst/Localisation"
 EVENT = "gst/Event"
 DROPS = "recorder/Drops"
@@ -35,6 +37,8 @@ _JSON_SCHEMAS = {
     PLAN: ("bridge.task", "schemas/plan.schema.json"),
     VERDICT: ("bridge.task", "schemas/verdict.schema.json"),
     SAMPLE: ("bridge.task", "schemas/sample.schema.json"),
+    CONTACT: ("bridge.task", "schemas/contact.schema.json"),
+    DIVERGENCE: ("bridge.task", "schemas/divergence.schema.json"),
     LOCALISATION: ("bridge.task", "schemas/localisation.schema.json"),
     EVENT: ("bridge.episode", "schemas/event.schema.json"),
     DROPS: ("bridge.episode", "schemas/drops.schema.json"),
@@ -122,6 +126,8 @@ _TOPIC_RULES: tuple[tuple[str, str], ...] = (
     (r"/event$", EVENT),
     (r"/verdict$", VERDICT),
     (r"/verdict/sample$", SAMPLE),
+    (r"/replay/contact$", CONTACT),
+    (r"/replay/divergence$", DIVERGENCE),
     (r"/object/[^/]+/pose$", POSE_STAMPED),
     (r"/object/[^/]+/nodes$", POINT_CLOUD),
     (r"/localisation$", LOCALISATION),

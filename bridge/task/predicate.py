@@ -1,10 +1,10 @@
 """Hard success predicates: data in the task file, one evaluation for recorded and replayed states.
 
 Errata resolution 9 and 10: the predicate reads the settled final state x_{T+1}; its semantics
-(terminal, held for t seconds) are part of the predicate itself.
+(terminal, held for t seconds, over the whole execution) are part of the predicate itself.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,7 +13,11 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
+from bridge.task.contact import Contact
 from bridge.task.task_file import ObjectModel, Task
+
+ALLOWED_CONTACTS = "allowed_contacts"
+"""No contact outside the allowed pairs over the whole execution."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +30,12 @@ class Rollout:
     """Per object: whether a finger touches it. An object may be missing: unknown."""
     extents_m: Mapping[str, Float[np.ndarray, "num_steps 3"]] = field(default_factory=dict)
     """Per soft object: its extents along its own axes [m]. May be missing: unknown."""
+    broken: Mapping[str, str] = field(default_factory=dict)
+    """Soft objects that are no bodies any more (burst, turned inside out), and what was found."""
+    contacts: Sequence[Contact] | None = None
+    """Who was closer than the margin to whom over the whole execution; None: unknown."""
+    contacts_inferred: bool = False
+    """The contacts were worked out from joints and poses rather than measured or simulated."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +52,21 @@ class Finding:
 def evaluate_success(task: Task, rollout: Rollout) -> list[Finding]:
     """Evaluate every success predicate of a task on a rollout's final state."""
     return [_evaluate(spec, task, rollout) for spec in task.success]
+
+
+def evaluate_contacts(task: Task, rollout: Rollout, *, tolerance_m: float = 0.0) -> Finding:
+    """Say whether nothing touched what it may not, from the start of the execution to its end.
+
+    Asked of every rollout; the tolerance of a task that lists the predicate itself counts.
+
+    Args:
+        task: Its own ``allowed_contacts`` predicate is used where it has one.
+        rollout: With ``contacts``.
+        tolerance_m: Depth up to which two bodies do not count as touching.
+    """
+    listed = (spec for spec in task.success if spec["kind"] == ALLOWED_CONTACTS)
+    spec = next(listed, {"kind": ALLOWED_CONTACTS, "tolerance_m": tolerance_m})
+    return _evaluate(spec, task, rollout)
 
 
 def all_hold(findings: list[Finding]) -> bool | None:
@@ -70,8 +95,8 @@ def _evaluate(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
     if rule is None:
         message = f"success predicate {spec['kind']!r} is unknown. Known: {', '.join(_RULES)}."
         raise UsageError(message)
-    object_id = spec["object"]
-    if object_id not in rollout.Ts_base_object:
+    object_id = str(spec.get("object", ""))
+    if spec["kind"] != ALLOWED_CONTACTS and object_id not in rollout.Ts_base_object:
         return Finding(
             kind=spec["kind"],
             value=None,
@@ -135,15 +160,44 @@ def _shape(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
     model = task.objects[object_id]
     if model.soft is None:
         return Finding(kind="shape", value=True, detail=f"{object_id} is rigid")
+    if object_id in rollout.broken:
+        return Finding(kind="shape", value=False, detail=f"{object_id} {rollout.broken[object_id]}")
     extents = rollout.extents_m.get(object_id)
     if extents is None:
         return Finding(kind="shape", value=None, detail=f"the shape of {object_id} is not known")
     change = float(np.max(np.abs(extents[-1] / np.array(model.size_m) - 1.0)))
+    if not np.isfinite(change):
+        detail = f"the extents of {object_id} are no numbers"
+        return Finding(kind="shape", value=False, detail=detail)
     return Finding(
         kind="shape",
         value=bool(change <= spec["tolerance_fraction"]),
         detail=f"an extent of {object_id} differs by {change:.0%} from rest",
     )
+
+
+def _allowed_contacts(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
+    kind = ALLOWED_CONTACTS
+    if rollout.contacts is None:
+        return Finding(kind=kind, value=None, detail="contacts are not known")
+    said = "inferred: " if rollout.contacts_inferred else ""
+    only, deepest = spec.get("object"), -float(spec.get("tolerance_m", 0.0))
+    wrong = [
+        contact
+        for contact in rollout.contacts
+        if not contact.allowed
+        and contact.min_distance_m <= deepest
+        and (only is None or only in contact.bodies)
+    ]
+    if not wrong:
+        detail = f"{said}nothing touched what it may not touch"
+        return Finding(kind=kind, value=True, detail=detail)
+    first = min(wrong, key=lambda contact: contact.start_ns)
+    detail = (
+        f"{said}{first.bodies[0]} touched {first.bodies[1]} at {first.start_ns * 1e-9:.2f} s, "
+        f"{-first.min_distance_m * 1e3:.1f} mm deep"
+    )
+    return Finding(kind=kind, value=False, detail=detail)
 
 
 def objects_done(findings: list[Finding], manipulated: tuple[str, ...]) -> dict[str, bool | None]:
@@ -159,4 +213,5 @@ _RULES: dict[str, Callable[[Mapping[str, Any], Task, Rollout], Finding]] = {
     "settled": _settled,
     "no_finger_contact": _no_finger_contact,
     "shape": _shape,
+    ALLOWED_CONTACTS: _allowed_contacts,
 }

@@ -36,6 +36,11 @@ class Verdict:
     calibration_id: str | None = None
     p_success: dict[str, float] | None = None
     reason: str | None = None
+    warnings: tuple[str, ...] = ()
+    """What does not change the verdict but a reader should know: the goal held before anything
+    moved, a shape that was stood in for."""
+    findings: tuple[dict[str, Any], ...] = ()
+    """What each predicate said: side (replayed or recorded), kind, object, value, detail."""
 
     @property
     def accepted(self) -> bool | None:
@@ -67,6 +72,8 @@ class Verdict:
         known = {name: record[name] for name in Verdict.__dataclass_fields__ if name in record}
         for name in ("ik", "clearance", "terminal"):
             known[name] = _factor(record[name])
+        known["warnings"] = tuple(record.get("warnings") or ())
+        known["findings"] = tuple(record.get("findings") or ())
         known.setdefault("trajectory", "planned")
         known.setdefault("mode", "dynamic")
         return Verdict(**known)
