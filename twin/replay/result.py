@@ -1,24 +1,13 @@
 """What a replay says: states over time and the verdict."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 
+from bridge.task.contact import Contact as Contact  # part of what a result says
 from bridge.task.predicate import Rollout
 from bridge.task.verdict import Verdict
-
-
-@dataclass(frozen=True, kw_only=True)
-class Contact:
-    """One stretch of time in which two bodies were closer than the margin."""
-
-    start_ns: int
-    end_ns: int
-    bodies: tuple[str, str]
-    allowed: bool
-    """Whether the active stage allowed them to touch."""
-    min_distance_m: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +25,12 @@ class ReplayResult:
     clearance_m: Float[np.ndarray, " num_steps"]
     """Smallest signed distance over the pairs that may not touch [m]."""
     contacts: list[Contact]
+    nodes_m: dict[str, Float32[np.ndarray, "num_steps _ 3"]] = field(default_factory=dict)
+    """Soft objects: where their nodes are, base frame [m]."""
+    extents_m: dict[str, Float[np.ndarray, "num_steps 3"]] = field(default_factory=dict)
+    """Soft objects: outer extents along their own axes [m]."""
+    broken: dict[str, str] = field(default_factory=dict)
+    """Soft objects that burst or turned inside out, and what was found."""
 
     def rollout(self) -> Rollout:
         """The states the success predicate reads."""
@@ -43,4 +38,7 @@ class ReplayResult:
             stamps_ns=self.stamps_ns,
             Ts_base_object=self.Ts_base_object,
             finger_contact=self.finger_contact,
+            extents_m=self.extents_m,
+            broken=self.broken,
+            contacts=self.contacts,
         )
