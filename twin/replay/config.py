@@ -7,6 +7,7 @@ from cyclopts import Parameter
 
 from bridge.errors import UsageError
 from twin.physics.config import PhysicsConfig
+from twin.replay.variation import VariationConfig
 from twin.robot.config import IkConfig
 
 Mode = Literal["kinematic", "dynamic"]
@@ -40,7 +41,14 @@ class ReplayConfig:
     squeeze_m: float = 0.01
     """How far below the recorded width an executed grasp is commanded, so that it presses [m]."""
     seed: int = 0
-    """Seed of the replay; nominal replays draw nothing, so it only labels them."""
+    """Seed of the samples; nominal replays draw nothing, so it only labels them."""
+    grip_delay_s: float = 0.0
+    """The gripper acts this much later than the arm [s]; planned trajectories only, a recorded one
+    has its own times."""
+    samples: Annotated[int, Parameter(parse=False)] = 0
+    """Varied replays behind each nominal one. No flag here: the commands have --samples."""
+    variation: VariationConfig = field(default_factory=VariationConfig)
+    """What the samples vary, and how far."""
     ik: IkConfig = field(default_factory=IkConfig)
     """When a pose counts as reached."""
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
@@ -65,6 +73,12 @@ class ReplayRunConfig:
     """Ids of the trial episodes to replay; all of them when none is given."""
     workers: int = 1
     """Processes that replay side by side."""
+    ray: str = ""
+    """Replay on a Ray cluster instead: its HOST:PORT, or local to start one on this machine;
+    docs/scale.md says how it is kept closed."""
+    samples: int = 0
+    """Varied replays of each dynamic trajectory; they give the success probability of its verdict.
+    A kinematic replay moves no objects and has none."""
     force: bool = False
     """Redo replays that are there already."""
     relocalise: bool = False

@@ -4,7 +4,7 @@ The IK indicator is 1 when joints exist within their limits that reach every pos
 tolerance, when no joint jumps along the interpolated path, and when no links meet.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -61,6 +61,18 @@ class JointPath:
         """Commanded widths."""
         index = np.searchsorted(self.width_times_ns, times_ns, side="right") - 1
         return self.width_m[np.clip(index, 0, len(self.width_m) - 1)]
+
+    def with_late_gripper(self, delay_s: float) -> "JointPath":
+        """The same motion with every gripper command this much later."""
+        delay_ns = round(delay_s * 1e9)
+        if delay_ns == 0:
+            return self
+        first = self.first_close_ns
+        return replace(
+            self,
+            width_times_ns=self.width_times_ns + delay_ns,
+            first_close_ns=None if first is None else first + delay_ns,
+        )
 
     def end_ns(self) -> int:
         """Time of the last knot."""

@@ -32,6 +32,7 @@ def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> ReplayR
     """
     robot = load_robot(scene.urdf)
     path, failures, unreachable_ns = path_of_plan(plan, robot, config)
+    path = path.with_late_gripper(config.grip_delay_s)
     return _replay(path, failures, unreachable_ns, plan, scene, config, trajectory="planned")
 
 
