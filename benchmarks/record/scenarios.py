@@ -43,21 +43,39 @@ class Plan:
 
 
 def ratio(plan: Plan) -> None:
-    """480p, lossless: our processor time and the reference's, turn by turn."""
+    """480p, lossless: our processor time and the reference's, turn by turn.
+
+    Transports as in the recorder study, section 2: ours through shared memory, the reference over
+    TCP; ours over TCP stands beside it.
+    """
     ours: list[Recording] = []
+    over_tcp: list[Recording] = []
     compact: list[Recording] = []
     reference: list[Recording] = []
     for index in range(plan.repeats):
         folder = plan.folder / f"ratio{index}"
         reference.append(record_reference(plan.spec, plan.seconds, folder / "reference"))
-        ours.append(record_ours(plan.spec, plan.seconds, folder / "ours"))
-        compact.append(
-            record_ours(plan.spec, min(plan.seconds, 20.0), folder / "compact", depth="compact")
+        ours.append(
+            record_ours(plan.spec, plan.seconds, folder / "ours", shared_memory_mb=SHARED_MB)
         )
-    core, slow = median_core(ours), median_core(reference)
+        short_s = min(plan.seconds, 20.0)
+        over_tcp.append(record_ours(plan.spec, short_s, folder / "tcp"))
+        compact.append(
+            record_ours(
+                plan.spec,
+                short_s,
+                folder / "compact",
+                shared_memory_mb=SHARED_MB,
+                depth="compact",
+            )
+        )
+    core, slow, tcp = median_core(ours), median_core(reference), median_core(over_tcp)
     kept = statistics.median(run.kept_of_wanted for run in reference)
-    beside = f"mcap Writer zstd + PNG: {slow:.3f} core, {kept:.1%} of the frames"
-    lost = sum(run.total("lost") for run in ours)
+    beside = (
+        f"mcap Writer zstd + PNG: {slow:.3f} core, {kept:.1%} of the frames; "
+        f"ours over tcp: {tcp:.3f}, {tcp / slow:.2f} of it"
+    )
+    lost = sum(run.total("lost") for run in [*ours, *over_tcp])
     report_targets(
         "record_480p",
         [
@@ -78,10 +96,11 @@ def ratio(plan: Plan) -> None:
                 f"{ours[0].file_mb / ours[0].seconds:.1f} MB/s",
             ),
             Target(what="480p messages lost, all repeats", measured=lost, limit=0),
-            _inexact("480p topics altered or misdeclared", [*ours, *compact]),
+            _inexact("480p topics altered or misdeclared", [*ours, *over_tcp, *compact]),
         ],
-        note=plan.note(f"2 x 640x480 RGB-D, {plan.repeats} x {plan.seconds:g} s, tcp"),
+        note=plan.note(f"2 x 640x480 RGB-D, {plan.repeats} x {plan.seconds:g} s, shared memory"),
         ours=_records(ours),
+        over_tcp=_records(over_tcp),
         compact=_records(compact),
         reference=_records(reference),
     )
@@ -89,7 +108,7 @@ def ratio(plan: Plan) -> None:
 
 def long(plan: Plan) -> None:
     """480p for a long time: nothing lost."""
-    run = record_ours(plan.spec, plan.long_s, plan.folder / "long")
+    run = record_ours(plan.spec, plan.long_s, plan.folder / "long", shared_memory_mb=SHARED_MB)
     sent, wanted = run.total("sent"), run.total("wanted")
     report_targets(
         "record_long",
@@ -105,7 +124,7 @@ def long(plan: Plan) -> None:
             ),
             _inexact("480p long: topics altered or misdeclared", [run]),
         ],
-        note=plan.note(f"2 x 640x480 RGB-D, lossless, {plan.long_s:g} s, tcp"),
+        note=plan.note(f"2 x 640x480 RGB-D, lossless, {plan.long_s:g} s, shared memory"),
         ours=_records([run]),
     )
 
