@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from bridge.task.task_file import Task
 from twin.errors import TwinError
+from twin.scene.shape.static import StaticSdf
 
 
 class SoftBodiesError(TwinError):
@@ -51,6 +52,15 @@ class ReplayScene:
     covariances: Mapping[str, Float[np.ndarray, "6 6"]] = field(default_factory=dict)
     """How sure each start pose is: (x, y, z, rotation about x, y, z), base frame; what samples are
     drawn from."""
+    calibration_id: str | None = None
+    """The calibration whose physics is used; None when there is none."""
+    static_sdf: StaticSdf | None = None
+    """Distances to what stands still; None: only the table and the containers are known."""
+    lattices: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
+    """Soft objects by the arrays of the scene's ``soft.npz``; the task's mesh stands in for
+    others."""
+    shape_sources: Mapping[str, str] = field(default_factory=dict)
+    """Per object: where its shape comes from."""
 
     def missing(self) -> list[str]:
         """Objects of the task that have no pose."""
