@@ -83,6 +83,9 @@ def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterato
             yield _pose_message(stamp, f"{prefix}/object/{name}/pose", Ts[index])
     end = start + int(result.stamps_ns[-1])
     yield _Message(end, f"{prefix}/verdict", schema.VERDICT, result.verdict.to_json())
+    for sample in result.samples:
+        data = json.dumps(sample.to_record(), separators=(",", ":")).encode()
+        yield _Message(end, f"{prefix}/verdict/sample", schema.SAMPLE, data)
 
 
 def _joint_message(

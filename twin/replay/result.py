@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from bridge.task.contact import Contact as Contact  # part of what a result says
 from bridge.task.predicate import Rollout
 from bridge.task.verdict import Verdict
+from twin.replay.samples import Sample
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +26,8 @@ class ReplayResult:
     clearance_m: Float[np.ndarray, " num_steps"]
     """Smallest signed distance over the pairs that may not touch [m]."""
     contacts: list[Contact]
+    samples: tuple[Sample, ...] = ()
+    """Varied replays behind the verdict's probability."""
     nodes_m: dict[str, Float32[np.ndarray, "num_steps _ 3"]] = field(default_factory=dict)
     """Soft objects: where their nodes are, base frame [m]."""
     extents_m: dict[str, Float[np.ndarray, "num_steps 3"]] = field(default_factory=dict)
