@@ -291,6 +291,20 @@ class World:
             )
         )
 
+    @property
+    def client(self) -> int:
+        """PyBullet's number of this world."""
+        return self._client
+
+    @property
+    def robot_id(self) -> int:
+        """PyBullet's number of the robot."""
+        return self._robot
+
+    def link_id(self, link: str) -> int:
+        """PyBullet's number of a link of the robot."""
+        return self._links[link]
+
     def close(self) -> None:
         """Give the client back; a second call does nothing."""
         if self._client >= 0:
