@@ -1,4 +1,4 @@
-"""Tie an object to the tool instead of holding it by friction: ``--grasp attach``, never the default.
+"""Tie an object to the tool instead of holding it by friction: ``--grasp attach``, not the default.
 
 For robots or grippers whose friction nobody knows. What is tied cannot slip, so a verdict made this
 way says nothing about the grasp; the engine's name carries the word wherever it is shown.

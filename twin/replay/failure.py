@@ -4,6 +4,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bridge.task.verdict import Factor
+from twin.errors import TwinError
+
+
+class NotEvaluatedError(TwinError):
+    """A trajectory cannot be judged at all; the message says why."""
+
+    def __init__(self, why: str) -> None:
+        """Put the words that tables and verdicts look for in front."""
+        self.why = why.removeprefix("not evaluated: ")
+        super().__init__(f"not evaluated: {self.why}")
 
 
 @dataclass(frozen=True, kw_only=True)
