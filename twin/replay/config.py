@@ -11,6 +11,7 @@ from twin.replay.variation import VariationConfig
 from twin.robot.config import IkConfig
 
 Mode = Literal["kinematic", "dynamic"]
+Grasp = Literal["friction", "attach"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,6 +21,12 @@ class ReplayConfig:
     mode: Annotated[Mode, Parameter(parse=False)] = "dynamic"
     """kinematic follows the joints exactly; dynamic lets physics answer. No flag: the commands
     choose it for each trajectory."""
+    grasp: Annotated[Grasp, Parameter(name="--grasp")] = "friction"
+    """What holds objects: friction between the fingers, or attach, which ties rigid objects to the
+    tool at the first touch. The engine's name says attach wherever such a verdict is shown."""
+    start_overlap_m: float = 0.006
+    """Rigid objects that were localised into each other by up to this are moved apart; deeper ones
+    are not evaluated [m]."""
     eps_col_m: float = 0.002
     """Smallest distance between bodies that may not touch, the paper's epsilon_col [m]."""
     max_contact_depth_m: float = 0.005
@@ -79,6 +86,8 @@ class ReplayRunConfig:
     samples: int = 0
     """Varied replays of each dynamic trajectory; they give the success probability of its verdict.
     A kinematic replay moves no objects and has none."""
+    render: bool = False
+    """Also draw what the recorded cameras would have seen, with the rebuilt scene's Gaussians."""
     force: bool = False
     """Redo replays that are there already."""
     relocalise: bool = False
