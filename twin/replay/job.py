@@ -19,6 +19,7 @@ from twin.replay.execution import check_covers, cut_track, stages_as_executed
 from twin.replay.files import ReplayOrigin, write_replay
 from twin.replay.result import ReplayResult
 from twin.replay.rollout import KINEMATIC_ENGINE, replay_joints, replay_plan
+from twin.replay.samples import replay_samples, with_probability
 from twin.replay.scene import ReplayScene
 from twin.replay.starts import StartState
 
@@ -44,6 +45,19 @@ class ReplayJob:
     scene_hash: str | None
     config: ReplayConfig
     folder: Path
+    duration_s: float = 0.0
+    """Of the plan; what takes longer is begun first."""
+
+    def cost(self) -> float:
+        """How long it takes, compared with others."""
+        if self.config.mode == "kinematic":
+            return 0.1 * self.duration_s
+        bodies = 1 + len(load_task(self.task).soft_objects)
+        return (1 + self.config.samples) * bodies * self.duration_s
+
+    def needed_paths(self) -> tuple[Path, ...]:
+        """What a process on another machine must see."""
+        return (self.episode_path, self.folder)
 
     def path(self) -> Path:
         """Where the derived episode goes."""
@@ -77,7 +91,14 @@ class ReplayJob:
             "task": asdict(load_task(self.task)),
             "Ts_base_object": {name: T.tolist() for name, T in self.start.Ts_base_object.items()},
             "config": asdict(self.config),
+            **self._sampled_from(),
         }
+
+    def _sampled_from(self) -> dict[str, Any]:
+        if not self.config.samples:
+            return {}
+        spreads = self.start.covariances
+        return {"covariances": {name: spreads[name].tolist() for name in sorted(spreads)}}
 
 
 def run_job(job: ReplayJob) -> dict[str, Any]:
@@ -85,7 +106,7 @@ def run_job(job: ReplayJob) -> dict[str, Any]:
     try:
         verdict = _replay(job)
     except GstError as error:
-        return {**_row(job), "error": str(error)}
+        return row_of_failure(job, str(error))
     return {**_row(job), **_judgement(verdict)}
 
 
@@ -100,6 +121,11 @@ def row_of_existing(job: ReplayJob) -> dict[str, Any] | None:
     if not verdicts:
         return None
     return {**_row(job), **_judgement(verdicts[-1][1]), "skipped": True}
+
+
+def row_of_failure(job: ReplayJob, message: str) -> dict[str, Any]:
+    """Return the row of a replay that never came back."""
+    return {**_row(job), "error": message}
 
 
 def _row(job: ReplayJob) -> dict[str, Any]:
@@ -140,13 +166,14 @@ def _replay(job: ReplayJob) -> Verdict:
         task=load_task(job.task),
         Ts_base_object=job.start.Ts_base_object,
         reasons=job.start.reasons,
+        covariances=job.start.covariances,
         urdf=urdf,
         scene_hash=job.scene_hash,
     )
     executed = job.trajectory == "executed" and job.end_ns is not None
     events = streams.events(episode) if executed else []
     lived = replace(plan, stages=stages_as_executed(plan, events, job.start_ns))
-    result = _run(job, episode, lived, scene)
+    result = _with_samples(job, _run(job, episode, lived, scene), episode, lived, scene)
     derived = Derived(
         kind="replay",
         source_episode=episode.info.id,
@@ -182,6 +209,22 @@ def _run(job: ReplayJob, episode: Episode, plan: Plan, scene: ReplayScene) -> Re
     check_covers(arm, job.end_ns, plan)
     widths = cut_track(streams.joint_track(episode, "/gripper/state"), job.start_ns, job.end_ns)
     return replay_joints(arm, widths, scene, job.config, plan=plan)
+
+
+def _with_samples(
+    job: ReplayJob, result: ReplayResult, episode: Episode, plan: Plan, scene: ReplayScene
+) -> ReplayResult:
+    """Ask varied replays too; plans of one episode are tried against the same variations."""
+    if not job.config.samples or scene.missing():
+        return result
+    samples = replay_samples(
+        lambda there, config: _run(replace(job, config=config), episode, plan, there).verdict,
+        scene,
+        job.config,
+        plan_id=plan.id,
+        identity=job.episode_sha256,
+    )
+    return replace(result, verdict=with_probability(result.verdict, samples), samples=samples)
 
 
 def _planned_grips(plan: Plan) -> tuple[tuple[int, str], ...]:

@@ -1,22 +1,24 @@
 """Replay every trajectory of a run: each plan as planned, each execution as recorded."""
 
-import multiprocessing
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
-from bridge.errors import GstError, UsageError
+from bridge.errors import UsageError
 from bridge.task.task_file import load_task
-from bridge.terminal import Output
+from bridge.terminal import Advance, Output
 from twin.replay.config import ReplayRunConfig
-from twin.replay.job import ReplayJob, row_of_existing, run_job
+from twin.replay.job import ReplayJob, row_of_existing, row_of_failure, run_job
+from twin.replay.pool import Alone, Crew, Runner
+from twin.replay.prepare import Preparation, prepare, replayed_task
 from twin.replay.scene import refuse_soft
 from twin.replay.starts import localised_starts
+from twin.replay.worker import Failed, do
 from twin.scene.store import scene_hash_of
 
 
@@ -31,24 +33,15 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
         UsageError: When an episode named in the configuration is not in the run.
     """
     scene_hash = _scene_hash(run, output)
-    jobs: list[ReplayJob] = []
-    skipped: dict[str, str] = {}
-    paths = _chosen(run, config)
-    with output.progress("localise", len(paths)) as advance:
-        for index, episode_id in enumerate(paths):
-            try:
-                jobs += _jobs_of(run, episode_id, scene_hash, config, output)
-            except GstError as error:
-                skipped[episode_id] = str(error)
-                output.say(f"{episode_id}: {error}")
-            advance(index + 1, episode_id)
-    rows = []
-    with output.progress("replay", len(jobs)) as advance:
-        for row in _rows(jobs, config):
-            rows.append(row)
-            advance(len(rows), f"{row['episode']} {row['trajectory']} {row['mode']}")
-            if row["error"]:
-                output.say(f"{row['episode']} {row['plan']}: {row['error']}")
+    with runner_for(config) as runner:
+        jobs, skipped = _all_jobs(run, scene_hash, config, runner, output)
+        rows = []
+        with output.progress("replay", len(jobs)) as advance:
+            for row in _rows(jobs, config, runner, output):
+                rows.append(row)
+                advance(len(rows), f"{row['episode']} {row['trajectory']} {row['mode']}")
+                if row["error"]:
+                    output.say(f"{row['episode']} {row['plan']}: {row['error']}")
     rows.sort(key=lambda row: (row["episode"], row["plan"], row["trajectory"], row["mode"]))
     return {
         "run": str(run.path),
@@ -57,6 +50,83 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
         "skipped_episodes": skipped,
         "rows": rows,
     }
+
+
+@contextmanager
+def runner_for(config: ReplayRunConfig) -> Iterator[Runner]:
+    """Open what does the work: this process, several, or a Ray cluster.
+
+    Raises:
+        UsageError: When Ray has no token to show.
+        TwinError: When the cluster cannot be reached.
+    """
+    runner: Runner = Alone()
+    if config.ray:
+        from twin.replay.ray_cluster import RayRunner  # noqa: PLC0415  # an extra
+
+        runner = RayRunner(config.ray, config.workers)
+    elif config.workers > 1:
+        runner = Crew(config.workers)
+    with runner:
+        yield runner
+
+
+def _all_jobs(
+    run: RunFolder,
+    scene_hash: str | None,
+    config: ReplayRunConfig,
+    runner: Runner,
+    output: Output,
+) -> tuple[list[ReplayJob], dict[str, str]]:
+    """List what is to be replayed, and the episodes that cannot be, with the reason."""
+    names = _chosen(run, config)
+    jobs: list[ReplayJob] = []
+    ahead = not isinstance(runner, Alone)
+    relocalise = config.relocalise and not ahead
+    with output.progress("localise", len(names)) as advance:
+        skipped = _prepare(run, names, scene_hash, config, runner, advance) if ahead else {}
+        for index, episode_id in enumerate(name for name in names if name not in skipped):
+            answer = do(
+                lambda name: _jobs_of(run, name, scene_hash, config, output, relocalise=relocalise),
+                episode_id,
+            )
+            if isinstance(answer, Failed):
+                skipped[episode_id] = answer.message
+                output.detail(answer.trace)
+            else:
+                jobs += answer
+            if not ahead:
+                advance(index + 1, episode_id)
+    for episode_id, reason in sorted(skipped.items()):
+        output.say(f"{episode_id}: {reason}")
+    return jobs, skipped
+
+
+def _prepare(
+    run: RunFolder,
+    names: list[str],
+    scene_hash: str | None,
+    config: ReplayRunConfig,
+    runner: Runner,
+    advance: Advance,
+) -> dict[str, str]:
+    """Localise many episodes side by side; returns those that failed, with the reason."""
+    items = [
+        Preparation(
+            run_path=run.path.resolve(),
+            episode_id=name,
+            scene_hash=scene_hash,
+            force=config.relocalise,
+        )
+        for name in names
+    ]
+    failed = {}
+    answers = runner.run(prepare, items, lambda item: item.episode_path().stat().st_size)
+    for done, (item, answer) in enumerate(answers, start=1):
+        if isinstance(answer, Failed):
+            failed[item.episode_id] = answer.message
+        advance(done, item.episode_id)
+    return failed
 
 
 def _scene_hash(run: RunFolder, output: Output) -> str | None:
@@ -87,17 +157,19 @@ def _jobs_of(
     scene_hash: str | None,
     config: ReplayRunConfig,
     output: Output,
+    *,
+    relocalise: bool,
 ) -> list[ReplayJob]:
-    path = run.episodes_dir / f"{episode_id}.mcap"
+    path = run.episodes_dir.resolve() / f"{episode_id}.mcap"  # for processes elsewhere
     episode = Episode.open(path)
     plans = streams.plans(episode)
-    if episode.info.kind != "trial" or not plans:
+    task_name = replayed_task(episode, plans)
+    if task_name is None:
         output.detail(f"{episode_id}: {episode.info.kind} with {len(plans)} plan(s), not replayed")
         return []
-    task_name = episode.info.task or plans[0][1].task
     task = load_task(task_name)
     refuse_soft(task)
-    starts = localised_starts(run, episode, task, scene_hash=scene_hash, force=config.relocalise)
+    starts = localised_starts(run, episode, task, scene_hash=scene_hash, force=relocalise)
     digest = episode.sha256()
     jobs = []
     for index, (stamp_ns, plan) in enumerate(plans):
@@ -114,8 +186,9 @@ def _jobs_of(
             task=task_name,
             start=starts.at(start_ns),
             scene_hash=scene_hash,
-            config=replace(config.replay, mode="dynamic"),
-            folder=run.derived_dir,
+            config=replace(config.replay, mode="dynamic", samples=config.samples),
+            folder=run.derived_dir.resolve(),
+            duration_s=plan.tau[-1].t_ns * 1e-9 if plan.tau else 0.0,
         )
         jobs.append(common)
         if interval is not None:
@@ -125,7 +198,9 @@ def _jobs_of(
     return jobs
 
 
-def _rows(jobs: list[ReplayJob], config: ReplayRunConfig) -> Iterator[dict[str, Any]]:
+def _rows(
+    jobs: list[ReplayJob], config: ReplayRunConfig, runner: Runner, output: Output
+) -> Iterator[dict[str, Any]]:
     todo = []
     for job in jobs:
         row = None if config.force else row_of_existing(job)
@@ -133,18 +208,12 @@ def _rows(jobs: list[ReplayJob], config: ReplayRunConfig) -> Iterator[dict[str, 
             todo.append(job)
         else:
             yield row
-    if config.workers <= 1 or len(todo) <= 1:
-        yield from map(run_job, todo)
-        return
-    # spawn: PyBullet and pinocchio hold memory that must not be forked.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(max_workers=config.workers, mp_context=context) as pool:
-        try:
-            for future in as_completed([pool.submit(run_job, job) for job in todo]):
-                yield future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    for job, answer in runner.run(run_job, todo, ReplayJob.cost):
+        if isinstance(answer, Failed):
+            output.detail(answer.trace)
+            yield row_of_failure(job, answer.message)
+        else:
+            yield answer
 
 
 def count_verdicts(rows: list[dict[str, Any]]) -> dict[str, dict[str, int]]:

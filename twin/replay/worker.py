@@ -1,0 +1,174 @@
+"""One process that does one piece of work after another, and may hang or die without harm.
+
+Whoever asked sees an answer, a death or a time that is up, and can start the process again.
+"""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+from bridge.errors import GstError
+from twin.errors import TwinError
+
+ONE_THREAD: Mapping[str, str] = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OMP_WAIT_POLICY": "passive",
+}
+"""Side by side, libraries that start a thread for each core only get in each other's way."""
+JOIN_S = 5.0
+_starting = threading.Lock()
+
+
+class WorkerDiedError(TwinError):
+    """The process that did the work is gone."""
+
+    def __init__(self, *, exit_code: int | None) -> None:
+        """Remember how it ended."""
+        self.exit_code = exit_code
+        super().__init__(f"the process that did it ended {_ending(exit_code)}")
+
+
+class TimeIsUpError(TwinError):
+    """The work was not done in time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failed:
+    """An exception, as far as it crosses between processes."""
+
+    message: str
+    known: bool
+    """A ``GstError``, whose message a user can act on; anything else is a bug."""
+    trace: str = ""
+
+
+Answer = Any
+Function = Callable[[Any], Answer]
+
+
+class Worker:
+    """A process that imports once and then works. Close it, or it ends with its owner."""
+
+    def __init__(self) -> None:
+        """Start it; what it imports, it imports with the first piece of work."""
+        # spawn: PyBullet and pinocchio hold memory that must not be forked.
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_work, args=(theirs,), daemon=True)
+        with _one_thread():
+            self._process.start()
+        theirs.close()
+        self.busy = False
+
+    @property
+    def pipe(self) -> Connection:
+        """Becomes readable with an answer, and when the process ends."""
+        return self._pipe
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process."""
+        return self._process.pid
+
+    def begin(self, function: Function, item: Any) -> None:
+        """Give it a piece of work; the function is one of a module that can be imported.
+
+        Raises:
+            WorkerDiedError: When it is gone already.
+        """
+        try:
+            self._pipe.send((function, item))
+        except OSError as error:
+            raise WorkerDiedError(exit_code=self._exit_code()) from error
+        self.busy = True
+
+    def finish(self, timeout_s: float | None = None) -> Answer | Failed:
+        """Wait for the answer.
+
+        Raises:
+            WorkerDiedError: When the process ended before it answered.
+            TimeIsUpError: When it has not answered yet; it goes on working.
+        """
+        try:
+            if not self._pipe.poll(timeout_s):
+                message = f"no answer within {timeout_s:g} s"
+                raise TimeIsUpError(message)
+            answer = self._pipe.recv()
+        except (EOFError, OSError) as error:
+            raise WorkerDiedError(exit_code=self._exit_code()) from error
+        self.busy = False
+        return answer
+
+    def _exit_code(self) -> int | None:
+        self._process.join(JOIN_S)
+        return self._process.exitcode
+
+    def close(self) -> None:
+        """End it; one in the middle of something is killed, and leaves no finished file."""
+        self._pipe.close()
+        if self.busy:
+            self._process.kill()
+        self._process.join(JOIN_S)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join(JOIN_S)
+
+
+def _work(pipe: Connection) -> None:
+    """Until the owner closes the pipe, or is gone."""
+    # The owner decides when to stop; Ctrl-C reaches every process of the terminal.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            function, item = pipe.recv()
+            pipe.send(do(function, item))
+
+
+def do(function: Function, item: Any) -> Answer | Failed:
+    """Do one piece of work; whatever goes wrong with it is its answer."""
+    try:
+        return function(item)
+    except GstError as error:
+        return Failed(message=str(error), known=True)
+    except Exception as error:  # noqa: BLE001  # one bad piece does not stop a thousand
+        message = f"internal error: {type(error).__name__}: {error}"
+        return Failed(message=message, known=False, trace=traceback.format_exc())
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let a process that is started now have one thread per library."""
+    with _starting:
+        before = {name: os.environ.get(name) for name in ONE_THREAD}
+        os.environ.update(ONE_THREAD)
+        try:
+            yield
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    os.environ.pop(name, None)
+                else:
+                    os.environ[name] = value
+
+
+def _ending(exit_code: int | None) -> str:
+    if exit_code is None:
+        return "without a word"
+    if exit_code >= 0:
+        return f"with exit code {exit_code}"
+    try:
+        name = signal.Signals(-exit_code).name
+    except ValueError:
+        name = f"signal {-exit_code}"
+    memory = ", perhaps by a machine short of memory" if name == "SIGKILL" else ""
+    return f"by {name}{memory}"
