@@ -25,6 +25,8 @@ ARM_JOINTS = (
 )
 FINGER_JOINTS = ("gripper_left_finger_joint", "gripper_right_finger_joint")
 FINGER_LINKS = ("gripper_left_finger", "gripper_right_finger")
+GRIPPER = "gripper"
+"""What task files call the fingers and what carries them."""
 GRIPPER_LINKS = ("gripper_base", *FINGER_LINKS)
 MAX_WIDTH_M = 0.085
 """Finger distance when open; each finger joint is at half of it."""

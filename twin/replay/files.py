@@ -1,23 +1,27 @@
 """A replay as a derived episode, in the schema a recording has."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from bridge.episode import schema
 from bridge.episode.metadata import Derived, EpisodeInfo
-from bridge.episode.records import JointSample, PoseSample, string_to_cdr
+from bridge.episode.point_cloud import PointCloudSample
+from bridge.episode.records import CompressedColor, JointSample, PoseSample, string_to_cdr
 from bridge.episode.writer import EpisodeWriter
 from bridge.task.plan import Plan, Stage
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME
+from bridge.task.robot import ARM_JOINTS, BASE_FRAME, GRIPPER
 from twin.replay.result import ReplayResult
 
 GRIPPER_WIDTH = "gripper_width"
 MIN_CLEARANCE = "min_clearance_m"
+NODES_PERIOD_NS = 33_000_000
+"""Nodes of soft bodies are written at most this often: 30 Hz, as the stand-in's truth has them."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,10 @@ class ReplayOrigin:
     """When, from time 0, the gripper was told to close or open."""
     end_ns: int
     """When, from time 0, the trajectory ended and settling began."""
+    divergence: Mapping[str, Any] | None = None
+    """The gst divergence v1 record, where there was something to compare with."""
+    images: tuple[tuple[str, CompressedColor], ...] = ()
+    """Rendered images by camera id."""
 
 
 def write_replay(path: Path, result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Path:
@@ -81,11 +89,75 @@ def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterato
         yield _pose_message(stamp, f"{prefix}/tcp/pose", result.Ts_base_tcp[index])
         for name, Ts in result.Ts_base_object.items():
             yield _pose_message(stamp, f"{prefix}/object/{name}/pose", Ts[index])
+    yield from _nodes(result, prefix, start)
+    yield from _contacts(result, prefix, start)
+    for camera_id, image in origin.images:
+        topic = f"{prefix}/cam/{camera_id}/rendered/image"
+        yield _Message(image.stamp_ns, topic, schema.COMPRESSED_IMAGE, image.to_cdr())
     end = start + int(result.stamps_ns[-1])
     yield _Message(end, f"{prefix}/verdict", schema.VERDICT, result.verdict.to_json())
     for sample in result.samples:
         data = json.dumps(sample.to_record(), separators=(",", ":")).encode()
         yield _Message(end, f"{prefix}/verdict/sample", schema.SAMPLE, data)
+    if origin.divergence is not None:
+        data = json.dumps(origin.divergence, separators=(",", ":")).encode()
+        yield _Message(end, f"{prefix}/replay/divergence", schema.DIVERGENCE, data)
+
+
+def _nodes(result: ReplayResult, prefix: str, start_ns: int) -> Iterator[_Message]:
+    for name, nodes in result.nodes_m.items():
+        due_ns = 0
+        for t_ns, points in zip(result.stamps_ns.tolist(), nodes, strict=True):
+            if t_ns < due_ns:
+                continue
+            due_ns = t_ns + NODES_PERIOD_NS
+            sample = PointCloudSample(
+                stamp_ns=start_ns + t_ns, frame_id=BASE_FRAME, points_m=points
+            )
+            topic = f"{prefix}/object/{name}/nodes"
+            yield _Message(sample.stamp_ns, topic, schema.POINT_CLOUD, sample.to_cdr())
+
+
+def _contacts(result: ReplayResult, prefix: str, start_ns: int) -> Iterator[_Message]:
+    """Measured distances below the margin, and what physics says of the fingers."""
+    topic = f"{prefix}/replay/contact"
+    for contact in result.contacts:
+        record = _contact_record(
+            start_ns, contact.start_ns, contact.end_ns, contact.bodies, source="distance"
+        ) | {"allowed": contact.allowed, "min_distance_m": contact.min_distance_m}
+        yield _json_message(topic, schema.CONTACT, record)
+    for name, touches in result.finger_contact.items():
+        for first_ns, last_ns in stretches_ns(result.stamps_ns, touches):
+            record = _contact_record(start_ns, first_ns, last_ns, (GRIPPER, name), source="physics")
+            yield _json_message(topic, schema.CONTACT, record)
+
+
+def _contact_record(
+    origin_ns: int, first_ns: int, last_ns: int, bodies: tuple[str, str], *, source: str
+) -> dict[str, Any]:
+    return {
+        "schema_version": 1,
+        "stamp_ns": origin_ns + first_ns,
+        "end_ns": origin_ns + last_ns,
+        "bodies": list(bodies),
+        "allowed": None,
+        "min_distance_m": None,
+        "source": source,
+    }
+
+
+def _json_message(topic: str, type_name: str, record: Mapping[str, Any]) -> _Message:
+    data = json.dumps(record, separators=(",", ":")).encode()
+    return _Message(int(record["stamp_ns"]), topic, type_name, data)
+
+
+def stretches_ns(
+    stamps_ns: Int[np.ndarray, " num_steps"], flags: Bool[np.ndarray, " num_steps"]
+) -> list[tuple[int, int]]:
+    """First and last stamp of each run of True."""
+    edges = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
+    first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+    return [(int(stamps_ns[a]), int(stamps_ns[b])) for a, b in zip(first, last, strict=True)]
 
 
 def _joint_message(
