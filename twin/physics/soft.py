@@ -1,0 +1,237 @@
+"""Soft bodies as lattices of tetrahedra: what they are made of, and whether they hold."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, Int32
+
+from bridge.task.meshes.catalogue import ToyMesh, toy_mesh
+from bridge.task.meshes.lattice import Lattice, make_lattice, volumes_m3
+from bridge.task.task_file import ObjectModel
+from twin.errors import TwinError
+from twin.physics.soft_shape import surface_triangles
+
+POISSON_RANGE = (0.0, 0.45)
+"""Beyond, a lattice of linear tetrahedra locks."""
+MAX_STRETCH = 2.0
+"""Edges longer than this many times their rest length belong to a body that burst."""
+_EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+
+
+class SoftBodyError(TwinError):
+    """A soft body cannot be simulated."""
+
+    def __init__(self, *, found: str) -> None:
+        """Remember what was found."""
+        self.found = found
+        super().__init__(
+            f"a soft body has {found}. Check the object's size, mass and soft table in the task "
+            "file, or rebuild its lattice."
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoftModel:
+    """A soft body at rest, in the frame of its object."""
+
+    nodes_m: Float32[np.ndarray, "num_nodes 3"]
+    tets: Int32[np.ndarray, "num_tets 4"]
+    """Four nodes each, positively oriented."""
+    mass_fraction: Float32[np.ndarray, " num_nodes"]
+    """Share of the mass at each node; the sum is 1."""
+    spacing_m: float
+    """Distance of neighbouring nodes."""
+    mass_kg: float
+    young_pa: float
+    poisson: float
+    damping_s: float
+    """Rayleigh damping: the stiffness times this resists the speed of deformation [s]."""
+    size_m: tuple[float, float, float]
+    """Outer extents at rest."""
+    friction: float | None = None
+    """Sliding friction, multiplied by the partner's; None: ``PhysicsConfig.object_friction``."""
+    triangles: Int32[np.ndarray, "num_triangles 3"] | None = None
+    """Surface, outward; None: the faces that belong to one tetrahedron."""
+    skin_m: Float32[np.ndarray, "num_points 3"] | None = None
+    """Points of the true surface, which may lie outside of the lattice; None: the nodes."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be simulated.
+
+        Raises:
+            SoftBodyError: No tetrahedra, inverted ones, or impossible material.
+        """
+        low, high = POISSON_RANGE
+        numbers = (self.mass_kg, self.young_pa, self.spacing_m)
+        if len(self.tets) == 0:
+            raise SoftBodyError(found="no tetrahedra")
+        if not np.isfinite(self.nodes_m).all():
+            raise SoftBodyError(found="nodes that are no numbers")
+        if int(self.tets.min()) < 0 or int(self.tets.max()) >= len(self.nodes_m):
+            raise SoftBodyError(found="a tetrahedron with a node that is not there")
+        if not (volumes_m3(self.nodes_m.astype(np.float64), self.tets) > 0).all():
+            raise SoftBodyError(found="tetrahedra without volume or turned inside out at rest")
+        if not all(np.isfinite(value) and value > 0 for value in numbers):
+            raise SoftBodyError(found=f"mass, stiffness and spacing of {numbers}")
+        if not low <= self.poisson <= high:
+            raise SoftBodyError(
+                found=f"Poisson's ratio {self.poisson}; {low} to {high} can be simulated"
+            )
+        if not (np.isfinite(self.damping_s) and self.damping_s >= 0):
+            raise SoftBodyError(found=f"a damping time of {self.damping_s} s")
+        if self.friction is not None and not 0 <= self.friction <= 10:
+            raise SoftBodyError(found=f"a friction of {self.friction}")
+        if not (self.mass_fraction > 0).all():
+            raise SoftBodyError(found="nodes without mass")
+
+    @staticmethod
+    def from_task(model: ObjectModel) -> "SoftModel":
+        """Fill the mesh that a task names with its own lattice (``bridge.task.meshes``).
+
+        Raises:
+            SoftBodyError: The object is rigid.
+        """
+        if model.soft is None:
+            raise SoftBodyError(found=f"no soft table: {model.id} is rigid")
+        mesh, lattice = _mesh_and_lattice(model.mesh or "", model.size_m, model.soft.cell_m)
+        nodes = lattice.points_m.astype(np.float32)
+        tets = lattice.tetrahedra.astype(np.int32)
+        return _soft_model(
+            model, nodes, tets, _lumped(nodes, tets), model.soft.cell_m,
+            skin=mesh.vertices_m.astype(np.float32),
+        )  # fmt: skip
+
+    @staticmethod
+    def from_lattice(arrays: Mapping[str, np.ndarray], model: ObjectModel) -> "SoftModel":
+        """Take the lattice of a rebuilt scene.
+
+        Args:
+            arrays: What ``objects/<id>/soft.npz`` holds: ``nodes_m``, ``tets``, ``mass_fraction``
+                and ``spacing_m`` (``twin.scene.shape.lattice``).
+            model: Mass and material.
+
+        Raises:
+            SoftBodyError: Arrays are missing or unusable, or the object is rigid.
+        """
+        if model.soft is None:
+            raise SoftBodyError(found=f"no soft table: {model.id} is rigid")
+        missing = [
+            name for name in ("nodes_m", "tets", "mass_fraction", "spacing_m") if name not in arrays
+        ]
+        if missing:
+            raise SoftBodyError(found=f"a lattice without {', '.join(missing)}")
+        return _soft_model(
+            model,
+            np.asarray(arrays["nodes_m"], dtype=np.float32),
+            np.asarray(arrays["tets"], dtype=np.int32),
+            np.asarray(arrays["mass_fraction"], dtype=np.float32),
+            float(arrays["spacing_m"]),
+            skin=None,
+        )
+
+    def volume_m3(self) -> float:
+        """Volume of the tetrahedra at rest."""
+        return float(volumes_m3(self.nodes_m.astype(np.float64), self.tets).sum())
+
+    def surface(self) -> Int32[np.ndarray, "num_triangles 3"]:
+        """Triangles of the surface, counter-clockwise seen from outside."""
+        return surface_triangles(self.tets) if self.triangles is None else self.triangles
+
+    def edges(self) -> Int[np.ndarray, "num_edges 2"]:
+        """Edges of all tetrahedra, once each, the lower number first."""
+        pairs = np.concatenate([self.tets[:, list(pair)] for pair in _EDGES])
+        return np.asarray(np.unique(np.sort(pairs, axis=1), axis=0))
+
+    def slowest_mode_rad_s(self) -> float:
+        """Estimate of the lowest frequency of deformation: a bar as long as the body.
+
+        A free bar's first longitudinal mode, pi / length * sqrt(young / density).
+        """
+        density = self.mass_kg / self.volume_m3()
+        return float(np.pi / max(self.size_m) * np.sqrt(self.young_pa / density))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoftHealth:
+    """Whether a soft body is still what it was."""
+
+    num_inverted: int
+    """Tetrahedra turned inside out."""
+    max_stretch: float
+    """Longest edge relative to its length at rest; infinite for a body that burst."""
+    is_finite: bool
+
+    @property
+    def sound(self) -> bool:
+        """Nothing burst and nothing is inside out."""
+        return self.is_finite and self.num_inverted == 0 and self.max_stretch < MAX_STRETCH
+
+    def describe(self) -> str:
+        """One sentence about what is wrong; empty when nothing is."""
+        if not self.is_finite:
+            return "it burst: its nodes are no numbers any more"
+        if self.max_stretch >= MAX_STRETCH:
+            return f"it burst: an edge is {self.max_stretch:.1f} times as long as at rest"
+        if self.num_inverted:
+            return f"{self.num_inverted} of its tetrahedra are turned inside out"
+        return ""
+
+
+def health_of(model: SoftModel, nodes_m: Float[np.ndarray, "num_nodes 3"]) -> SoftHealth:
+    """Compare a body's nodes with its rest state."""
+    if not np.isfinite(nodes_m).all():
+        return SoftHealth(num_inverted=0, max_stretch=np.inf, is_finite=False)
+    edges = model.edges()
+    rest = model.nodes_m.astype(np.float64)
+    now, before = (np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1) for p in (nodes_m, rest))
+    inverted = volumes_m3(np.asarray(nodes_m, dtype=np.float64), model.tets) <= 0
+    return SoftHealth(
+        num_inverted=int(inverted.sum()),
+        max_stretch=float((now / before).max()),
+        is_finite=True,
+    )
+
+
+@lru_cache(maxsize=16)
+def _mesh_and_lattice(
+    mesh: str, size_m: tuple[float, float, float], cell_m: float
+) -> tuple[ToyMesh, Lattice]:
+    found = toy_mesh(mesh, size_m)
+    return found, make_lattice(found, cell_m)
+
+
+def _lumped(
+    nodes: Float32[np.ndarray, "num_nodes 3"], tets: Int32[np.ndarray, "num_tets 4"]
+) -> Float32[np.ndarray, " num_nodes"]:
+    """A quarter of each tetrahedron's volume at each of its nodes."""
+    shares = np.zeros(len(nodes))
+    np.add.at(shares, tets, volumes_m3(nodes.astype(np.float64), tets)[:, None] / 4)
+    return (shares / shares.sum()).astype(np.float32)
+
+
+def _soft_model(
+    model: ObjectModel,
+    nodes: Float32[np.ndarray, "num_nodes 3"],
+    tets: Int32[np.ndarray, "num_tets 4"],
+    mass_fraction: Float32[np.ndarray, " num_nodes"],
+    spacing_m: float,
+    *,
+    skin: Float32[np.ndarray, "num_points 3"] | None,
+) -> SoftModel:
+    soft = model.soft
+    if soft is None:
+        raise SoftBodyError(found=f"no soft table: {model.id} is rigid")
+    return SoftModel(
+        nodes_m=nodes,
+        tets=tets,
+        mass_fraction=mass_fraction,
+        spacing_m=spacing_m,
+        mass_kg=model.mass_kg,
+        young_pa=soft.young_pa,
+        poisson=soft.poisson,
+        damping_s=soft.damping_s,
+        size_m=model.size_m,
+        skin_m=skin,
+    )
