@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from bridge.episode import schema
 from bridge.episode.metadata import Derived, EpisodeInfo
@@ -17,6 +17,7 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.task.plan import Plan, Stage
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME, GRIPPER
 from twin.replay.result import ReplayResult
+from twin.replay.stretches import stretches_ns
 
 GRIPPER_WIDTH = "gripper_width"
 MIN_CLEARANCE = "min_clearance_m"
@@ -149,15 +150,6 @@ def _contact_record(
 def _json_message(topic: str, type_name: str, record: Mapping[str, Any]) -> _Message:
     data = json.dumps(record, separators=(",", ":")).encode()
     return _Message(int(record["stamp_ns"]), topic, type_name, data)
-
-
-def stretches_ns(
-    stamps_ns: Int[np.ndarray, " num_steps"], flags: Bool[np.ndarray, " num_steps"]
-) -> list[tuple[int, int]]:
-    """First and last stamp of each run of True."""
-    edges = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
-    first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-    return [(int(stamps_ns[a]), int(stamps_ns[b])) for a, b in zip(first, last, strict=True)]
 
 
 def _joint_message(

@@ -22,6 +22,10 @@ class StartState:
     reasons: dict[str, str] = field(default_factory=dict)
     covariances: dict[str, Float[np.ndarray, "6 6"]] = field(default_factory=dict)
     """How sure each pose is: (x, y, z, rotation about x, y, z), base frame."""
+    extents_m: dict[str, Float[np.ndarray, "3"]] = field(default_factory=dict)
+    """Soft objects: their outer extents as they were seen."""
+    seen_ns: int | None = None
+    """Source time of the latest frame that was looked at."""
 
 
 class StartStates:
@@ -45,6 +49,14 @@ class StartStates:
         if phase.before_ns is not None and stamp_ns > phase.before_ns:
             return self._nothing("the plan was made while another one was being executed")
         return state
+
+    def after(self, plan_id: str) -> StartState:
+        """The state that the last execution of a plan left behind."""
+        chosen = None
+        for phase, state in zip(self._phases, self._states, strict=True):
+            if phase.name == "end" and phase.plan_id == plan_id:
+                chosen = state
+        return self._nothing("no quiet frames after the execution") if chosen is None else chosen
 
     def _nothing(self, reason: str) -> StartState:
         return StartState(reasons=dict.fromkeys(self._task.objects, reason))
@@ -70,6 +82,8 @@ def localised_starts(
 def _state_of(phase: Phase, task: Task, records: list[dict[str, object]]) -> StartState:
     poses: dict[str, Float[np.ndarray, "4 4"]] = {}
     covariances: dict[str, Float[np.ndarray, "6 6"]] = {}
+    extents: dict[str, Float[np.ndarray, "3"]] = {}
+    seen_ns: int | None = None
     reasons = dict.fromkeys(task.objects, "no localisation record")
     for record in records:
         if (record.get("phase"), record.get("plan_id")) != (phase.name, phase.plan_id):
@@ -80,8 +94,18 @@ def _state_of(phase: Phase, task: Task, records: list[dict[str, object]]) -> Sta
         if record["found"] and isinstance(pose, dict):
             poses[name] = se3.transform_from(np.array(pose["q_wxyz"]), np.array(pose["p_m"]))
             reasons.pop(name, None)
+            seen_ns = max(seen_ns or 0, int(str(record["stamp_ns"])))
+            soft = record.get("soft_shape")
+            if isinstance(soft, dict):
+                extents[name] = np.array(soft["extents_m"], dtype=np.float64)
             if record.get("covariance") is not None:
                 covariances[name] = np.array(record["covariance"], dtype=np.float64).reshape(6, 6)
         else:
             reasons[name] = str(record.get("reason") or "not found")
-    return StartState(Ts_base_object=poses, reasons=reasons, covariances=covariances)
+    return StartState(
+        Ts_base_object=poses,
+        reasons=reasons,
+        covariances=covariances,
+        extents_m=extents,
+        seen_ns=seen_ns,
+    )
