@@ -87,16 +87,28 @@ def _bar(label: str, total: int) -> Iterator[Advance]:
 
 
 def _plain(label: str, total: int) -> Iterator[Advance]:
-    last = time.monotonic()
+    began = last = time.monotonic()
 
     def advance(done: int, note: str) -> None:
         nonlocal last
-        if time.monotonic() - last >= PLAIN_PERIOD_S:
-            last = time.monotonic()
-            sys.stderr.write(f"{label}: {done} of {total} {note}\n")
+        now = time.monotonic()
+        if now - last >= PLAIN_PERIOD_S:
+            last = now
+            left = _left((now - began) * (total - done) / done) if done else ""
+            sys.stderr.write(f"{label}: {done} of {total}{left} {note}\n")
             sys.stderr.flush()
 
     yield advance
+
+
+def _left(seconds: float) -> str:
+    """Say about how long it will still take, judging by what it took so far."""
+    if seconds < 90:
+        return f", about {seconds:.0f} s left,"
+    minutes = seconds / 60
+    if minutes < 90:
+        return f", about {minutes:.0f} min left,"
+    return f", about {minutes / 60:.1f} h left,"
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
-from twin.gate import GateConfig
+from twin.gate.config import GateConfig
 from twin.replay.config import ReplayRunConfig
 from twin.scene.settings import RebuildConfig, RenderConfig
 
@@ -55,7 +55,7 @@ def gate(
         config: Settings.
         output: How to talk.
     """
-    from twin.gate import run_gate
+    from twin.gate.service import run_gate
 
     return run_gate(run, config, output)
 

@@ -3,6 +3,7 @@
 import contextlib
 import queue
 import threading
+import time
 import traceback
 from collections.abc import Callable
 from typing import Any
@@ -12,20 +13,32 @@ from bridge.wire.library import zenoh
 
 MAX_WAITING = 32
 """Requests that wait for one service; each may hold a whole plan."""
+CLOSE_S = 5.0
+"""How long a request in work may take when the service stops."""
 
 
 class Service:
-    """Answers requests on one key, one after another, on its own thread."""
+    """Answers requests on one key on its own threads, as many side by side as there are."""
 
-    def __init__(self, key: str, handler: Callable[[bytes], bytes], max_waiting: int) -> None:
+    def __init__(
+        self,
+        key: str,
+        handler: Callable[[bytes], bytes],
+        max_waiting: int,
+        side_by_side: int = 1,
+    ) -> None:
         """Use ``WireSession.serve``."""
         self._key = key
         self._handler = handler
         self._max_waiting = max_waiting
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._inner: Any = None
-        self._thread = threading.Thread(target=self._work, name=f"serve {key}", daemon=True)
-        self._thread.start()
+        self._threads = [
+            threading.Thread(target=self._work, name=f"serve {key}", daemon=True)
+            for _ in range(side_by_side)
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def start(self, inner: Any) -> None:
         """Keep the queryable that feeds this service."""
@@ -59,5 +72,8 @@ class Service:
         if self._inner is not None:
             with contextlib.suppress(zenoh.ZError):
                 self._inner.undeclare()
-        self._requests.put(None)
-        self._thread.join(timeout=5.0)
+        for _ in self._threads:
+            self._requests.put(None)
+        ends_s = time.monotonic() + CLOSE_S
+        for thread in self._threads:
+            thread.join(timeout=max(0.0, ends_s - time.monotonic()))

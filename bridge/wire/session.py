@@ -125,16 +125,22 @@ class WireSession:
             raise WireConfigError(message) from error
 
     def serve(
-        self, key: str, handler: Callable[[bytes], bytes], *, max_waiting: int = MAX_WAITING
+        self,
+        key: str,
+        handler: Callable[[bytes], bytes],
+        *,
+        max_waiting: int = MAX_WAITING,
+        side_by_side: int = 1,
     ) -> Service:
         """Answer requests on a key; a ``GstError`` of the handler goes back as the answer.
 
         Args:
             key: Without a leading slash.
-            handler: Called with one request after another.
+            handler: Called with one request after another, or with several at once.
             max_waiting: Requests that may wait for their turn; further ones are refused.
+            side_by_side: Requests that are answered at once, each on its own thread.
         """
-        service = Service(key, handler, max_waiting)
+        service = Service(key, handler, max_waiting, side_by_side)
         callback = zenoh.handlers.Callback(service.take, indirect=False)
         try:
             service.start(self._inner.declare_queryable(key, callback))

@@ -35,11 +35,11 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
     scene_hash = _scene_hash(run, output)
     with runner_for(config) as runner:
         jobs, skipped = _all_jobs(run, scene_hash, config, runner, output)
-        rows = []
-        with output.progress("replay", len(jobs)) as advance:
-            for row in _rows(jobs, config, runner, output):
+        rows, todo = _there_already(jobs, config)
+        with output.progress("replay", len(todo)) as advance:
+            for done, row in enumerate(_replayed(todo, runner, output), start=1):
                 rows.append(row)
-                advance(len(rows), f"{row['episode']} {row['trajectory']} {row['mode']}")
+                advance(done, f"{row['episode']} {row['trajectory']} {row['mode']}")
                 if row["error"]:
                     output.say(f"{row['episode']} {row['plan']}: {row['error']}")
     rows.sort(key=lambda row: (row["episode"], row["plan"], row["trajectory"], row["mode"]))
@@ -198,16 +198,21 @@ def _jobs_of(
     return jobs
 
 
-def _rows(
-    jobs: list[ReplayJob], config: ReplayRunConfig, runner: Runner, output: Output
-) -> Iterator[dict[str, Any]]:
-    todo = []
+def _there_already(
+    jobs: list[ReplayJob], config: ReplayRunConfig
+) -> tuple[list[dict[str, Any]], list[ReplayJob]]:
+    """Rows of the replays that were made before, and the jobs that are still to do."""
+    rows, todo = [], []
     for job in jobs:
         row = None if config.force else row_of_existing(job)
         if row is None:
             todo.append(job)
         else:
-            yield row
+            rows.append(row)
+    return rows, todo
+
+
+def _replayed(todo: list[ReplayJob], runner: Runner, output: Output) -> Iterator[dict[str, Any]]:
     for job, answer in runner.run(run_job, todo, ReplayJob.cost):
         if isinstance(answer, Failed):
             output.detail(answer.trace)

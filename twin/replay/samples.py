@@ -33,7 +33,7 @@ STANDS_M = 1e-4
 """Localisation puts what stands exactly onto the table; within this counts as exactly [m]."""
 STANDING = (0, 1, 5)
 """What is unsure of an object that stands: x, y and the turn about the vertical."""
-SLOWER = 1.2
+SLOWER = 1.5
 """A sample may take this much longer than the longest replay so far."""
 
 Replay = Callable[[ReplayScene, ReplayConfig], Verdict]

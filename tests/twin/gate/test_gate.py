@@ -21,16 +21,9 @@ from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output, stop_signals
 from bridge.wire.errors import WireConfigError
 from twin.errors import TwinError
-from twin.gate import (
-    Gate,
-    GateConfig,
-    GateError,
-    no_verdict,
-    robot_name,
-    run_gate,
-    serve_gate,
-    watch_cell,
-)
+from twin.gate.config import GateConfig
+from twin.gate.judge import Gate, no_verdict, robot_name
+from twin.gate.service import GateError, run_gate, serve_gate, watch_cell
 
 TASK = load_task("cube_into_box")
 URDF = '<?xml version="1.0"?><robot xmlns:x="y" name="ur5_parallel_gripper"><link/></robot>'
@@ -53,7 +46,7 @@ class FakeEyes:
     description: str | None = URDF
     running: str | None = None
     heard: int = 1
-    seen: list[Any] = field(default_factory=lambda: ["a frame"])
+    seen: list[Any] = field(default_factory=lambda: [SimpleNamespace(stamp_ns=1)])
     reasons: list[str] = field(default_factory=lambda: ["side: silent for 9.0 s"])
 
     def urdf(self) -> str | None:
@@ -81,7 +74,7 @@ def found(**missing: str) -> dict[str, Any]:
     }
 
 
-def accept(plan: Plan, poses: dict[str, Any], urdf: str) -> Verdict:
+def accept(plan: Plan, *_: Any) -> Verdict:
     yes = Factor(value=True)
     return Verdict(
         plan_id=plan.id,
@@ -97,7 +90,7 @@ def accept(plan: Plan, poses: dict[str, Any], urdf: str) -> Verdict:
 
 def gate_with(
     eyes: FakeEyes | None = None,
-    localise: Callable[..., Any] = lambda frames, task: found(),
+    localise: Callable[..., Any] = lambda *_: found(),
     replay: Callable[..., Verdict] = accept,
     now_ns: Callable[[], int] = lambda: 0,
     **settings: Any,
@@ -116,7 +109,7 @@ def gate_with(
 def test_the_verdict_is_the_replays_from_the_localised_poses() -> None:
     seen: dict[str, Any] = {}
 
-    def replay(plan: Plan, poses: dict[str, Any], urdf: str) -> Verdict:
+    def replay(plan: Plan, poses: dict[str, Any], urdf: str, ends_s: float) -> Verdict:
         seen.update(plan=plan, poses=poses, urdf=urdf)
         return replace(accept(plan, poses, urdf), terminal=Factor(value=False, cause="inside"))
 
@@ -221,7 +214,7 @@ def test_a_plan_of_a_newer_version_is_an_error() -> None:
 def test_a_replay_past_the_deadline_is_null_and_the_next_plan_waits_for_its_turn() -> None:
     go_on = threading.Event()
 
-    def slow(plan: Plan, poses: dict[str, Any], urdf: str) -> Verdict:
+    def slow(plan: Plan, poses: dict[str, Any], urdf: str, ends_s: float) -> Verdict:
         go_on.wait(5)
         return accept(plan, poses, urdf)
 
@@ -240,7 +233,7 @@ def test_a_replay_past_the_deadline_is_null_and_the_next_plan_waits_for_its_turn
 def test_more_plans_than_may_wait_are_turned_away_at_once() -> None:
     inside, go_on = threading.Semaphore(0), threading.Event()
 
-    def slow(plan: Plan, poses: dict[str, Any], urdf: str) -> Verdict:
+    def slow(plan: Plan, poses: dict[str, Any], urdf: str, ends_s: float) -> Verdict:
         inside.release()
         go_on.wait(5)
         return accept(plan, poses, urdf)
@@ -269,7 +262,7 @@ def test_no_two_replays_ever_run_side_by_side() -> None:
     """Robot models are shared and keep scratch memory; late replays go on and hold the turn."""
     counting, running, most, done = threading.Lock(), 0, 0, 0
 
-    def slow(plan: Plan, poses: dict[str, Any], urdf: str) -> Verdict:
+    def slow(plan: Plan, poses: dict[str, Any], urdf: str, ends_s: float) -> Verdict:
         nonlocal running, most, done
         with counting:
             running += 1
@@ -319,7 +312,7 @@ class FakeSession:
 
         return SimpleNamespace(put=put)
 
-    def serve(self, key: str, handler: Callable[[bytes], bytes]) -> None:
+    def serve(self, key: str, handler: Callable[[bytes], bytes], *, side_by_side: int) -> None:
         self.services[key] = handler
 
     def subscribe(self, key: str, callback: Callable[[Any], None]) -> None:

@@ -28,7 +28,9 @@ from bridge.terminal import Output
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import RemoteError
 from bridge.wire.session import WireSession, open_session
-from twin.gate import Gate, GateConfig, serve_gate, watch_cell
+from twin.gate.config import GateConfig
+from twin.gate.judge import Gate
+from twin.gate.service import serve_gate, watch_cell
 from twin.scene.live import LiveView
 
 CAMERA = Camera(width=8, height=6, fx=10.0, fy=10.0, cx=4.0, cy=3.0)
@@ -96,12 +98,12 @@ def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(
     eyes, config = LiveView("lab"), GateConfig(cell="lab", frame_wait_s=3.0, deadline_s=10.0)
     seen: dict[str, Any] = {}
 
-    def localise(frames: Any, task: Any) -> dict[str, Any]:
+    def localise(frames: Any, task: Any, ends_s: float) -> dict[str, Any]:
         seen["depth_m"] = float(frames[0].depth_m.max())
         item = SimpleNamespace(found=True, reason=None, T_base_object=np.eye(4))
         return dict.fromkeys(task.objects, item)
 
-    def replay(plan: Plan, poses: dict[str, Any], urdf: str) -> Verdict:
+    def replay(plan: Plan, poses: dict[str, Any], urdf: str, ends_s: float) -> Verdict:
         yes = Factor(value=True)
         return Verdict(
             plan_id=plan.id,

@@ -1,0 +1,70 @@
+"""Settings of the gate; imports nothing heavy."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from bridge.errors import UsageError, refuse_outside
+from bridge.wire.config import DEFAULT_ENDPOINT
+from twin.replay.config import ReplayConfig
+from twin.scene.settings import convert_duration
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class GateConfig:
+    """What the gate judges, and how long it may take."""
+
+    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    """Endpoints of the recorder."""
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None
+    """zenoh configuration (JSON5), for example with certificates."""
+    cell: str = "standin"
+    """Whose plans are judged: topics and the service are below this name."""
+    task: str = "cube_into_box"
+    """The task whose objects and success predicate count."""
+    deadline_s: Annotated[float, Parameter(name="--deadline", converter=convert_duration)] = 20.0
+    """Answer after this long at the latest: 20s, 1min or plain seconds."""
+    waiting: int = 4
+    """Plans that may wait while one is judged; more are turned away at once."""
+    samples: int = 0
+    """Varied replays behind each verdict, for its success probability: as many of them as fit
+    before the deadline."""
+    min_p_success: float = 0.0
+    """Refuse a plan that the nominal replay accepts when fewer of its samples succeed, as a
+    fraction; 0 leaves the nominal replay alone to decide."""
+    frames: int = 3
+    """Frames per camera that are averaged to find the objects."""
+    frame_wait_s: float = 2.0
+    """Wait this long for fresh frames before giving up."""
+    max_frame_age_s: float = 5.0
+    """A camera that has been silent for longer, on the cell's clock, is not trusted."""
+    max_silence_s: float = 30.0
+    """When nothing at all arrived for this long, not counting the time spent on a verdict, the
+    cell is not trusted to be as it was last seen."""
+    moved_m: float = 0.01
+    """An object seen this far from where the verdict has it, before the answer is given, has been
+    moved [m]."""
+    moved_rad: float = 0.3
+    """Or turned by this much [rad]."""
+    replay: Annotated[ReplayConfig, Parameter(name="replay")] = field(default_factory=ReplayConfig)
+    """How each plan is re-lived."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers with which no gate can work."""
+        most = float("inf")
+        refuse_outside(
+            self,
+            {
+                "deadline_s": (0, most),
+                "waiting": (0, 1000),
+                "samples": (0, 100_000),
+                "min_p_success": (0, 1),
+                "frames": (1, 100),
+            },
+        )
+        if self.min_p_success > 0 and self.samples == 0:
+            message = "--min-p-success needs samples to count: add, for example, --samples 16."
+            raise UsageError(message)

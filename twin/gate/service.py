@@ -1,0 +1,102 @@
+"""The gate on the wire: what it listens to, what it answers, and the verdict in the log."""
+
+import re
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from bridge.episode import schema
+from bridge.episode.run import RunFolder
+from bridge.task.task_file import load_task
+from bridge.terminal import Output, stop_signals
+from bridge.wire.config import WireConfig
+from twin.errors import TwinError
+from twin.gate.config import GateConfig
+from twin.gate.judge import Eyes, Gate
+from twin.gate.twin_process import TwinProcess
+
+CELL_NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
+SAID = {True: "accepted", False: "rejected", None: "no verdict"}
+
+
+class GateError(TwinError):
+    """The gate cannot be set up as asked."""
+
+
+def make_gate(config: GateConfig, eyes: Eyes, now_ns: Callable[[], int], twin: TwinProcess) -> Gate:
+    """Put the real localisation and replay behind the gate."""
+    return Gate(
+        task=load_task(config.task),
+        config=config,
+        eyes=eyes,
+        localise=twin.localise,
+        replay=twin.replay,
+        now_ns=now_ns,
+    )
+
+
+def serve_gate(session: Any, gate: Gate, eyes: Eyes, config: GateConfig, output: Output) -> None:
+    """Answer on ``<cell>/gate/verdict`` and publish every verdict on ``/<cell>/verdict``.
+
+    A published verdict carries the time of the newest thing seen, on the cell's own clock, so
+    that it lies before the execution it allows.
+    """
+    publisher = session.publisher(f"/{config.cell}/verdict", schema.VERDICT)
+    publishing = threading.Lock()
+
+    def answer(payload: bytes) -> bytes:
+        started = time.monotonic()
+        verdict = gate.judge(payload)
+        data = verdict.to_json()
+        with publishing:
+            publisher.put(data, source_ns=eyes.newest_ns() or session.now_ns())
+        seconds = time.monotonic() - started
+        p = verdict.p_success
+        share = f" {p['k']:g} of {p['n']:g} samples succeed." if p else ""
+        text = f"{verdict.plan_id}: {SAID[verdict.accepted]} in {seconds:.1f} s.{share}"
+        output.say(f"{text} {verdict.reason or ''}".rstrip())
+        return data
+
+    # One is judged, some wait, and one more is told at once that it may not: all heard at once,
+    # for the deadline runs from when a plan comes in.
+    session.serve(f"{config.cell}/gate/verdict", answer, side_by_side=config.waiting + 2)
+
+
+def watch_cell(session: Any, cell: str, take: Callable[[str, bytes, int, str], None]) -> None:
+    """Hand the cell's images, transforms, description and events to ``take``."""
+
+    def on_sample(sample: Any) -> None:
+        take(sample.topic, sample.data, sample.received_ns, sample.type_name)
+
+    for key in (f"{cell}/cam/**", f"{cell}/event", "tf", "tf_static", "robot_description"):
+        session.subscribe(key, on_sample)
+
+
+def run_gate(path: Path, config: GateConfig, output: Output) -> int:
+    """Judge plans until SIGINT or SIGTERM; both end with exit code 0."""
+    from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
+    from twin.scene.live import LiveView  # noqa: PLC0415
+
+    if not CELL_NAME.match(config.cell):
+        raise GateError(f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'.")
+    run, task = RunFolder.open(path), load_task(config.task)
+    eyes = LiveView(config.cell)
+    wire = WireConfig(connect=config.connect, config=config.zenoh_config)
+    with (
+        stop_signals() as stopped,
+        open_session(wire) as session,
+        TwinProcess(run.path, task, config, output) as twin,
+    ):
+        watch_cell(session, config.cell, eyes.take)
+        gate = make_gate(config, eyes, session.now_ns, twin)
+        serve_gate(session, gate, eyes, config, output)
+        output.say(
+            f"gate ready: {config.task} of cell {config.cell}, service {config.cell}/gate/verdict. "
+            "Stop with Ctrl-C."
+        )
+        while not stopped.wait(0.2):
+            pass
+    output.say("gate stopped")
+    return 0
