@@ -18,9 +18,10 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "ur": ("example-robot-data",),
     "foundation": ("transformers", "safetensors"),
     "gpu": ("gsplat",),
+    "cluster": ("ray",),
 }
-OPTIONAL = ("foundation", "gpu")
-"""Nothing is wrong without these: all works on a CPU and without weights of others."""
+OPTIONAL = ("foundation", "gpu", "cluster")
+"""Nothing is wrong without these: all works on one machine's CPU and without weights of others."""
 NATIVE = (
     ("splat rasteriser", "twin.scene._splat", "no place can be rebuilt"),
     ("depth codec", "bridge.media._depth", "slow fallback, for playing back only"),
