@@ -1,0 +1,123 @@
+"""Many episodes: two processes against one, a Ray cluster against two processes, and a kill.
+
+The episodes are recorded trials of the stand-in cell (development seeds) under many names; every
+replay starts from nothing, localisation included, as ``robot-gst replay`` does it. Wall time, so
+only an idle machine with two cores gives a number worth keeping. First argument: episodes.
+"""
+
+import hashlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from measure import ROOT, Target, report_targets
+
+EPISODES, RECORDED = 100, 4
+SEED = 70
+TASK = "cube_into_box"
+
+
+def replay(run: Path, *options: str) -> list[str]:
+    return [sys.executable, str(ROOT / "robot_gst.py"), "replay", str(run), "--quiet", *options]
+
+
+def timed(run: Path, *options: str) -> float:
+    """Replay a run from nothing [s]."""
+    shutil.rmtree(run / "derived")
+    (run / "derived").mkdir()
+    before = time.monotonic()
+    subprocess.run(replay(run, *options), check=True, stdout=subprocess.DEVNULL)
+    return time.monotonic() - before
+
+
+def digests(run: Path) -> dict[str, str]:
+    """What the derived files hold, byte for byte."""
+    return {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted((run / "derived").iterdir())
+    }
+
+
+def killed_and_resumed(run: Path, whole_s: float, *options: str) -> tuple[float, int]:
+    """Kill a replay half way, go on; how long both took together, and files made twice."""
+    shutil.rmtree(run / "derived")
+    (run / "derived").mkdir()
+    before = time.monotonic()
+    running = subprocess.Popen(replay(run, *options), stdout=subprocess.DEVNULL)
+    time.sleep(0.6 * whole_s)
+    running.send_signal(signal.SIGKILL)
+    running.wait()
+    spent_s = time.monotonic() - before
+    made = {path: path.stat().st_mtime_ns for path in (run / "derived").glob("*.mcap")}
+    time.sleep(5)  # what was being done ends with its owner, or is finished
+    before = time.monotonic()
+    subprocess.run(replay(run, *options), check=True, stdout=subprocess.DEVNULL)
+    again = sum(path.stat().st_mtime_ns != stamp for path, stamp in made.items())
+    return spent_s + time.monotonic() - before, again
+
+
+def ray_start_s() -> float:
+    """How long a cluster on this machine takes to start and to stop [s]."""
+    from twin.replay.ray_cluster import RayRunner
+
+    before = time.monotonic()
+    with RayRunner("local", 2):
+        pass
+    return time.monotonic() - before
+
+
+def measure(folder: Path, episodes: int) -> Sequence[Target]:
+    from cell_run import record_ungated, with_copies
+
+    from bridge.episode.run import RunFolder
+
+    recorded = RunFolder.create(folder / "recorded")
+    paths = record_ungated(recorded, TASK, SEED, RECORDED)
+    run = RunFolder.create(folder / "run")
+    with_copies(run, paths, episodes)
+
+    one_s = timed(run.path, "--workers", "1")
+    first = digests(run.path)
+    two_s = timed(run.path, "--workers", "2")
+    second = digests(run.path)
+    resumed_s, again = killed_and_resumed(run.path, two_s, "--workers", "2")
+    third = digests(run.path)
+    ray_s = timed(run.path, "--ray", "local", "--workers", "2")
+    fourth = digests(run.path)
+    start_s = ray_start_s()
+    different = sum(other != first for other in (second, third, fourth))
+    about = f"{episodes} episodes: 1 process {one_s:.1f} s, 2 processes {two_s:.1f} s"
+    return [
+        Target(what="2 processes against 1", measured=one_s / two_s, limit=1.8, unit="x",
+               at_most=False, reference=about),
+        Target(what="Ray against 2 processes, its start left out",
+               measured=100 * ((ray_s - start_s) / two_s - 1), limit=5.0, unit="%",
+               reference=f"{ray_s:.1f} s, of which start and stop {start_s:.1f} s"),
+        Target(what="kill -9 at 60 % and resumed against uninterrupted",
+               measured=resumed_s / two_s, limit=1.25, unit="x"),
+        Target(what="files made twice after the kill", measured=again, limit=0),
+        Target(what="runs with other bytes than the first of 4", measured=different, limit=0,
+               reference="1 and 2 processes, killed and resumed, Ray"),
+    ]  # fmt: skip
+
+
+def main() -> None:
+    """Record, then replay again and again."""
+    episodes = int(sys.argv[1]) if len(sys.argv) > 1 else EPISODES
+    with tempfile.TemporaryDirectory(prefix="robot-gst-scale-") as folder:
+        targets = measure(Path(folder), episodes)
+    note = (
+        f"{episodes} episodes ({RECORDED} recorded ones under many names), {TASK}, wall time, "
+        f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the end"
+    )
+    report_targets("replay_scale", targets, note=note)
+
+
+if __name__ == "__main__":
+    main()
