@@ -1,7 +1,7 @@
 """What the gate's own process does: finding objects and replaying plans."""
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from twin.replay.config import ReplayConfig
-
 
 SAMPLING = 0.9
 """Share of the time left in which samples are begun; a late one would cost the verdict too."""
@@ -62,17 +61,20 @@ def answer(question: Question) -> Verdict:
 
     Rounds of one start are tried against the same variations: their identity is the start's name.
     """
+    from twin.replay.calibrated import calibrated  # noqa: PLC0415
     from twin.replay.place import read_place  # noqa: PLC0415
     from twin.replay.rollout import replay_plan  # noqa: PLC0415
     from twin.replay.samples import replay_samples, with_probability  # noqa: PLC0415
     from twin.replay.scene import ReplayScene  # noqa: PLC0415
+    from twin.scene.calibration import read_calibration  # noqa: PLC0415
 
     started_s = time.monotonic()
-    plan, place = question.plan, read_place(RunFolder.open(question.run_path), question.task)
+    run, plan = RunFolder.open(question.run_path), question.plan
+    place = read_place(run, question.task)
     scene = place.scene(
         question.task, question.urdf, question.Ts_base_object, covariances=question.covariances
     )
-    config = replace(question.config, physics=place.physics_for(question.config.physics))
+    config = calibrated(question.config, read_calibration(run))
 
     def judge(there: ReplayScene, settings: ReplayConfig) -> Verdict:
         return replay_plan(plan, there, settings).verdict

@@ -58,7 +58,13 @@ class VariationConfig:
         )
 
     def physics_spreads(self) -> dict[str, float]:
-        """Spread of the logarithm per field of ``PhysicsConfig``, in a fixed order."""
+        """Spread of the logarithm per field of ``PhysicsConfig``, in a fixed order.
+
+        What a calibration finds of fingers and surfaces is found together with the objects: their
+        own coefficient is then not varied once more.
+        """
         spreads = dict.fromkeys(FRICTIONS, self.friction_log) | {GRIP_FORCE: self.grip_force_log}
         known = dict(self.calibrated)
+        if known.keys() & set(FRICTIONS[1:]):
+            spreads[FRICTIONS[0]] = 0.0
         return {**spreads, **{name: known[name] for name in sorted(known)}}

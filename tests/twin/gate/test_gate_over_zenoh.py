@@ -2,6 +2,7 @@
 
 import json
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -50,23 +51,28 @@ def sessions() -> Iterator[tuple[WireSession, WireSession]]:
         yield router, cell
 
 
-def publish_one_frame(cell: WireSession) -> None:
+def publish_one_frame(cell: WireSession, stamp_ns: int = S) -> None:
     frames = [
         FrameTransform(
-            stamp_ns=S, parent="base_link", child=f"side_{k}_optical", T_parent_child=np.eye(4)
+            stamp_ns=stamp_ns,
+            parent="base_link",
+            child=f"side_{k}_optical",
+            T_parent_child=np.eye(4),
         )
         for k in ("color", "depth")
     ]
     image = encode_jpeg(np.full((6, 8, 3), 99, dtype=np.uint8))
-    color = CompressedColor(stamp_ns=S, frame_id="c", format="jpeg", data=image)
-    depth = DepthImage(stamp_ns=S, frame_id="d", depth_mm=np.full((6, 8), 700, dtype=np.uint16))
+    color = CompressedColor(stamp_ns=stamp_ns, frame_id="c", format="jpeg", data=image)
+    depth = DepthImage(
+        stamp_ns=stamp_ns, frame_id="d", depth_mm=np.full((6, 8), 700, dtype=np.uint16)
+    )
     messages = [
         ("/robot_description", string_to_cdr('<robot name="arm"/>')),
         ("/tf_static", transforms_to_cdr(frames)),
         *(
             (
                 f"/lab/cam/side/{k}/info",
-                CameraInfo(stamp_ns=S, frame_id=f"side_{k}_optical", camera=CAMERA).to_cdr(),
+                CameraInfo(stamp_ns=stamp_ns, frame_id=f"side_{k}_optical", camera=CAMERA).to_cdr(),
             )
             for k in ("color", "depth")
         ),
@@ -74,7 +80,7 @@ def publish_one_frame(cell: WireSession) -> None:
         ("/lab/cam/side/depth/image", depth.to_cdr()),
     ]
     for topic, data in messages:
-        cell.publisher(topic, schema.type_of_topic(topic) or "").put(data, source_ns=S)
+        cell.publisher(topic, schema.type_of_topic(topic) or "").put(data, source_ns=stamp_ns)
 
 
 def plan_for(robot: str) -> bytes:
@@ -147,3 +153,161 @@ def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(
     assert [sample.topic for sample in published] == ["/lab/verdict"] * 2
     assert published[0].data == answer
     assert published[0].source_ns == S
+
+
+def a_gate(router: WireSession, eyes: LiveView, replay: Any, found: Any, **settings: Any) -> None:
+    """Serve a gate whose cell has shown itself."""
+    config = GateConfig(**{"cell": "lab", "frame_wait_s": 3.0, "deadline_s": 10.0, **settings})
+    gate = Gate(
+        task=load_task("cube_into_box"),
+        config=config,
+        eyes=eyes,
+        localise=found,
+        replay=replay,
+        now_ns=router.now_ns,
+    )
+    watch_cell(router, "lab", eyes.take)
+    serve_gate(router, gate, eyes, config, Output(quiet=True))
+
+
+def everything_at(x_m: float = 0.0) -> dict[str, Any]:
+    T = np.eye(4)
+    T[0, 3] = x_m
+    item = SimpleNamespace(found=True, reason=None, T_base_object=T, covariance=None)
+    return dict.fromkeys(load_task("cube_into_box").objects, item)
+
+
+def yes(plan: Plan, *_: Any) -> Verdict:
+    good = Factor(value=True)
+    return Verdict(
+        plan_id=plan.id,
+        trajectory="planned",
+        mode="dynamic",
+        ik=good,
+        clearance=good,
+        terminal=good,
+        engine="fake",
+        seed=0,
+    )
+
+
+def ask(cell: WireSession, payload: bytes | None = None) -> Verdict:
+    data = plan_for("arm") if payload is None else payload
+    return Verdict.from_json(cell.query("lab/gate/verdict", data, timeout_s=10.0))
+
+
+def test_a_replay_that_hangs_or_raises_is_null_on_the_wire_and_in_the_log(
+    sessions: tuple[WireSession, WireSession], capsys: pytest.CaptureFixture[str]
+) -> None:
+    router, cell = sessions
+    go_on, kinds = threading.Event(), iter(["raise", "hang", "hang"])
+
+    def replay(plan: Plan, *rest: Any) -> Verdict:
+        if next(kinds) == "raise":
+            raise ZeroDivisionError("oops")
+        go_on.wait(5)
+        return yes(plan)
+
+    a_gate(router, LiveView("lab"), replay, lambda *_: everything_at(), deadline_s=0.4)
+    published: list[Any] = []
+    cell.subscribe("lab/verdict", published.append)
+    publish_one_frame(cell)
+    raised = ask(cell)
+    assert (raised.accepted, raised.reason) == (None, "internal error: ZeroDivisionError: oops")
+    assert "oops" in capsys.readouterr().err
+    started = time.monotonic()
+    hung = ask(cell)
+    assert time.monotonic() - started < 3.0
+    assert hung.accepted is None
+    assert "not done at the deadline of 0.4 s" in str(hung.reason)
+    behind = ask(cell)
+    assert behind.accepted is None
+    assert "an earlier plan was still being judged" in str(behind.reason)
+    go_on.set()
+    ends = time.monotonic() + 5
+    while len(published) < 3 and time.monotonic() < ends:
+        time.sleep(0.01)
+    assert [Verdict.from_json(sample.data).accepted for sample in published] == [None] * 3
+
+
+def test_plans_that_may_not_wait_are_told_at_once_on_the_wire(
+    sessions: tuple[WireSession, WireSession],
+) -> None:
+    router, cell = sessions
+    inside, go_on = threading.Semaphore(0), threading.Event()
+
+    def replay(plan: Plan, *_: Any) -> Verdict:
+        inside.release()
+        go_on.wait(8)
+        return yes(plan)
+
+    a_gate(router, LiveView("lab"), replay, lambda *_: everything_at(), waiting=0)
+    publish_one_frame(cell)
+    answers: list[Verdict] = []
+    first = threading.Thread(target=lambda: answers.append(ask(cell)))
+    first.start()
+    assert inside.acquire(timeout=5)
+    started = time.monotonic()
+    turned_away = ask(cell)
+    assert time.monotonic() - started < 2.0
+    assert turned_away.accepted is None
+    assert "ask later" in str(turned_away.reason)
+    go_on.set()
+    first.join(10)
+    assert [verdict.accepted for verdict in answers] == [True]
+
+
+def test_an_object_moved_while_its_plan_is_judged_is_no_yes(
+    sessions: tuple[WireSession, WireSession],
+) -> None:
+    router, cell = sessions
+    eyes = LiveView("lab")
+    places = iter([0.0, 0.05, 0.05])
+
+    def replay(plan: Plan, *_: Any) -> Verdict:
+        publish_one_frame(cell, 2 * S)  # somebody moved the cube, and the camera saw it
+        ends = time.monotonic() + 5
+        while eyes.newest_ns() < 2 * S and time.monotonic() < ends:
+            time.sleep(0.01)
+        return yes(plan)
+
+    a_gate(router, eyes, replay, lambda *_: everything_at(next(places)))
+    publish_one_frame(cell)
+    verdict = ask(cell)
+    assert verdict.accepted is None
+    assert "moved while the plan was being judged: cube by 50 mm" in str(verdict.reason)
+    # Asked again it is judged from where it lies now; nothing newer is seen after that.
+    assert ask(cell).accepted is True
+
+
+def test_pictures_that_are_old_on_the_cells_clock_are_no_basis(
+    sessions: tuple[WireSession, WireSession],
+) -> None:
+    router, cell = sessions
+    eyes = LiveView("lab")
+    a_gate(router, eyes, yes, lambda *_: everything_at(), frame_wait_s=0.1)
+    publish_one_frame(cell)
+    assert ask(cell).accepted is True
+    later = [
+        FrameTransform(stamp_ns=60 * S, parent="base_link", child="wrist", T_parent_child=np.eye(4))
+    ]
+    cell.publisher("/tf", schema.TF_MESSAGE).put(transforms_to_cdr(later), source_ns=60 * S)
+    ends = time.monotonic() + 5
+    while eyes.newest_ns() < 60 * S and time.monotonic() < ends:
+        time.sleep(0.01)
+    expired = ask(cell)
+    assert expired.accepted is None
+    assert "side: silent for 59.0 s" in str(expired.reason)
+
+
+@pytest.mark.parametrize("number", [b"NaN", b"1e999", b"-Infinity"])
+def test_a_plan_with_numbers_that_are_none_is_refused(
+    sessions: tuple[WireSession, WireSession], number: bytes
+) -> None:
+    router, cell = sessions
+    a_gate(router, LiveView("lab"), yes, lambda *_: everything_at())
+    publish_one_frame(cell)
+    payload = plan_for("arm").replace(b"0.4", number)
+    assert payload != plan_for("arm")
+    with pytest.raises(RemoteError, match="plan is invalid"):
+        cell.query("lab/gate/verdict", payload, timeout_s=10.0)
