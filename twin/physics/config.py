@@ -25,3 +25,7 @@ class PhysicsConfig:
     """Torsional friction radius of objects on flat contacts [m]."""
     gravity_m_s2: float = 9.81
     """Downward acceleration."""
+    soft_substeps: int = 10
+    """Substeps of soft bodies within each physics step; 10 are 2400 a second."""
+    soft_stiffness_scale: float = 1.0
+    """Factor on Young's modulus of all soft bodies."""

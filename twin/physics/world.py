@@ -1,43 +1,32 @@
-"""A PyBullet world of one robot, static boxes and free boxes; the same bits on every run.
+"""One simulated cell: a robot, boxes that stand and boxes that move in PyBullet, soft bodies beside.
 
 Measured choices (design page on physics): ``deterministicOverlappingPairs`` always on, 240 Hz with
 200 solver iterations (slip p90 1.7 mm, 24 of 24 grasps held), a gear of ratio -1 between the
-fingers, whose axes point outward (+1 lets them shear and the grasp fails).
+fingers, whose axes point outward (+1 lets them shear and the grasp fails). The same bits on every
+run.
 """
 
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 from types import TracebackType
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from bridge.geometry import se3
-from bridge.task.robot import (
-    ARM_JOINTS,
-    BASE_FRAME,
-    FINGER_JOINTS,
-    FINGER_LINKS,
-    MAX_WIDTH_M,
-    TCP_FRAME,
-)
-from twin.errors import TwinError
+from bridge.task.robot import BASE_FRAME
+from twin.physics.arm import Arm, PhysicsError
 from twin.physics.config import PhysicsConfig
-from twin.physics.description import Hulls, write_description
+from twin.physics.description import Hulls
 from twin.physics.engine import pybullet
-
-
-class PhysicsError(TwinError):
-    """The physics engine refused or lost something."""
-
+from twin.physics.soft import SoftHealth, SoftModel
+from twin.physics.soft_world import SoftWorld
 
 Box = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 """Centre and extents in the owner's frame [m]."""
 
 
 class World:
-    """One simulated cell. A context manager: its client and its files go away at the end."""
+    """One simulated cell. A context manager: its client goes away at the end."""
 
     def __init__(self, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig) -> None:
         """Load the robot with its base at the origin.
@@ -62,82 +51,12 @@ class World:
         )
         pybullet.setGravity(0, 0, -config.gravity_m_s2, physicsClientId=self._client)
         self.free_ids: dict[str, int] = {}
-        self._robot = self._load_robot(urdf, mesh_hulls_m)
-        self._index_joints()
-        self._couple_fingers()
-
-    def _load_robot(self, urdf: str, mesh_hulls_m: Hulls) -> int:
-        with tempfile.TemporaryDirectory(prefix="robot-gst-physics-") as folder:
-            path = write_description(urdf, mesh_hulls_m, Path(folder))
-            try:
-                return int(
-                    pybullet.loadURDF(
-                        str(path),
-                        useFixedBase=True,
-                        flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
-                        physicsClientId=self._client,
-                    )
-                )
-            except pybullet.error as error:
-                self.close()
-                message = (
-                    f"PyBullet does not load the robot description ({error}). "
-                    "Check its links and collision meshes."
-                )
-                raise PhysicsError(message) from error
-
-    def _index_joints(self) -> None:
-        self._joints: dict[str, int] = {}
-        self._links: dict[str, int] = {}
-        self._efforts: dict[str, float] = {}
-        client = self._client
-        for index in range(pybullet.getNumJoints(self._robot, physicsClientId=client)):
-            item = pybullet.getJointInfo(self._robot, index, physicsClientId=client)
-            self._joints[item[1].decode()] = index
-            self._links[item[12].decode()] = index
-            self._efforts[item[1].decode()] = item[10]
-        missing = [name for name in (*ARM_JOINTS, *FINGER_JOINTS) if name not in self._joints] + [
-            name for name in (TCP_FRAME,) if name not in self._links
-        ]
-        if missing:
+        try:
+            self._arm = Arm(self._client, urdf, mesh_hulls_m, config)
+        except PhysicsError:
             self.close()
-            message = (
-                f"the robot description lacks {', '.join(missing)}; it has the joints "
-                f"{', '.join(self._joints)}. Physics needs the arm and two prismatic fingers."
-            )
-            raise PhysicsError(message)
-        self._arm = [self._joints[name] for name in ARM_JOINTS]
-        self._fingers = [self._joints[name] for name in FINGER_JOINTS]
-        self._finger_links = [self._links[name] for name in FINGER_LINKS]
-        self._arm_forces = [self._efforts[name] for name in ARM_JOINTS]
-
-    def _couple_fingers(self) -> None:
-        for link in self._finger_links:
-            pybullet.changeDynamics(
-                self._robot,
-                link,
-                lateralFriction=self.config.finger_friction,
-                spinningFriction=self.config.spinning_friction_m,
-                physicsClientId=self._client,
-            )
-        gear = pybullet.createConstraint(
-            self._robot,
-            self._finger_links[0],
-            self._robot,
-            self._finger_links[1],
-            pybullet.JOINT_GEAR,
-            [0, 1, 0],
-            [0, 0, 0],
-            [0, 0, 0],
-            physicsClientId=self._client,
-        )
-        pybullet.changeConstraint(
-            gear,
-            gearRatio=-1,
-            erp=0.2,
-            maxForce=10 * self.config.grip_force_N,
-            physicsClientId=self._client,
-        )
+            raise
+        self._soft = SoftWorld(self._client, self._arm, urdf, mesh_hulls_m, config)
 
     def add_static(self, boxes: Sequence[Box], T_base_owner: Float[np.ndarray, "4 4"]) -> list[int]:
         """Add solid boxes that never move, one body each; returns the body ids."""
@@ -147,6 +66,7 @@ class World:
             T_owner_box[:3, 3] = centre
             body = self._box(extents, 0.0, T_base_owner @ T_owner_box)
             self._set_friction(body, self.config.surface_friction)
+            self._soft.add_static(extents, T_base_owner @ T_owner_box)
             ids.append(body)
         return ids
 
@@ -156,12 +76,15 @@ class World:
         extents = np.array([size_m, size_m, thickness_m])
         body = self.add_static([(centre, extents)], np.eye(4))[0]
         # The robot stands on the table: its base touches it by construction.
-        pybullet.setCollisionFilterPair(self._robot, body, -1, -1, 0, physicsClientId=self._client)
-        if BASE_FRAME in self._links:
-            pybullet.setCollisionFilterPair(
-                self._robot, body, self._links[BASE_FRAME], -1, 0, physicsClientId=self._client
-            )
+        self._ignore(body, -1)
+        if BASE_FRAME in self._arm.links:
+            self._ignore(body, self._arm.links[BASE_FRAME])
         return body
+
+    def _ignore(self, body: int, link: int) -> None:
+        pybullet.setCollisionFilterPair(
+            self._arm.id, body, link, -1, 0, physicsClientId=self._client
+        )
 
     def add_free(
         self,
@@ -173,7 +96,20 @@ class World:
         """Add a solid box that moves."""
         body = self._box(size_m, mass_kg, T_base_object)
         self._set_friction(body, self.config.object_friction)
+        self._soft.add_free(body, size_m, mass_kg, T_base_object)
         self.free_ids[object_id] = body
+
+    def add_soft(
+        self, object_id: str, model: SoftModel, T_base_object: Float[np.ndarray, "4 4"]
+    ) -> None:
+        """Add a body that deforms, at rest and undeformed.
+
+        Args:
+            object_id: Its name in all other calls.
+            model: Shape and material.
+            T_base_object: Where its object frame is.
+        """
+        self._soft.add(object_id, model, T_base_object)
 
     def _box(
         self, size_m: Float[np.ndarray, "3"], mass_kg: float, T: Float[np.ndarray, "4 4"]
@@ -203,14 +139,8 @@ class World:
 
     def reset_robot(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
         """Put the robot into a posture at rest, without simulating."""
-        for index, value in zip(self._arm, joints_rad, strict=True):
-            pybullet.resetJointState(
-                self._robot, index, float(value), 0.0, physicsClientId=self._client
-            )
-        for index in self._fingers:
-            pybullet.resetJointState(
-                self._robot, index, float(width_m) / 2, 0.0, physicsClientId=self._client
-            )
+        self._arm.reset(joints_rad, width_m)
+        self._soft.place_links()
 
     def command(
         self,
@@ -219,77 +149,76 @@ class World:
         width_m: float,
     ) -> None:
         """Set the position targets that the motors follow from the next step on."""
-        pybullet.setJointMotorControlArray(
-            self._robot,
-            self._arm,
-            pybullet.POSITION_CONTROL,
-            targetPositions=joints_rad.tolist(),
-            targetVelocities=velocity_rad_s.tolist(),
-            forces=self._arm_forces,
-            physicsClientId=self._client,
-        )
-        half = min(max(width_m, 0.0), MAX_WIDTH_M) / 2
-        for index in self._fingers:
-            pybullet.setJointMotorControl2(
-                self._robot,
-                index,
-                pybullet.POSITION_CONTROL,
-                targetPosition=half,
-                force=self.config.grip_force_N,
-                maxVelocity=self.config.finger_speed_m_s,
-                physicsClientId=self._client,
-            )
+        self._arm.command(joints_rad, velocity_rad_s, width_m)
 
     def step(self) -> None:
-        """Advance by one fixed step."""
+        """Advance rigid and soft bodies by one fixed step."""
+        self._soft.push_rigid()
         pybullet.stepSimulation(physicsClientId=self._client)
+        self._soft.step()
 
     def joints_rad(self) -> Float[np.ndarray, " num_joints"]:
         """Where the arm is."""
-        states = pybullet.getJointStates(self._robot, self._arm, physicsClientId=self._client)
-        return np.array([state[0] for state in states])
+        return self._arm.joints_rad()
 
     def width_m(self) -> float:
         """Distance between the finger pads."""
-        states = pybullet.getJointStates(self._robot, self._fingers, physicsClientId=self._client)
-        return float(sum(state[0] for state in states))
+        return self._arm.width_m()
 
     def T_base_link(self, link: str) -> Float[np.ndarray, "4 4"]:
         """Pose of a link's frame."""
-        state = pybullet.getLinkState(
-            self._robot,
-            self._links[link],
-            computeForwardKinematics=1,
-            physicsClientId=self._client,
-        )
-        x, y, z, w = state[5]
-        return se3.transform_from(np.array([w, x, y, z]), np.array(state[4]))
+        return self._arm.T_base_link(link)
 
     def object_pose(self, object_id: str) -> tuple[float, ...]:
-        """Position [m] and quaternion wxyz of a free object, seven numbers."""
+        """Position [m] and quaternion wxyz of an object that moves, seven numbers.
+
+        The pose of a soft body is the rigid motion nearest to its nodes, weighted by mass.
+        """
+        if object_id in self._soft.names:
+            return self._soft.pose(object_id)
         p, (x, y, z, w) = pybullet.getBasePositionAndOrientation(
-            self.free_ids[object_id], physicsClientId=self._client
+            self._free(object_id), physicsClientId=self._client
         )
         return (*p, w, x, y, z)
 
     def T_base_object(self, object_id: str) -> Float[np.ndarray, "4 4"]:
-        """Pose of a free object."""
+        """Pose of an object that moves, as ``object_pose``."""
         pose = np.array(self.object_pose(object_id))
         return se3.transform_from(pose[3:], pose[:3])
 
     def finger_touches(self, object_id: str) -> bool:
-        """Whether a finger is in contact with a free object."""
+        """Whether a finger is in contact with an object that moves."""
+        if object_id in self._soft.names:
+            return self._soft.finger_touches(object_id)
         return any(
             point[8] <= 0.0
-            for link in self._finger_links
+            for link in self._arm.finger_links
             for point in pybullet.getContactPoints(
-                self._robot,
-                self.free_ids[object_id],
-                link,
-                -1,
-                physicsClientId=self._client,
+                self._arm.id, self._free(object_id), link, -1, physicsClientId=self._client
             )
         )
+
+    def soft_nodes_m(self, object_id: str) -> Float32[np.ndarray, "num_nodes 3"]:
+        """Where the nodes of a soft body are, base frame."""
+        return self._soft.nodes_m(object_id).astype(np.float32)
+
+    def soft_extents_m(self, object_id: str) -> Float[np.ndarray, "3"]:
+        """Outer extents of a soft body's surface along the axes of its pose.
+
+        Relative to those of its surface at rest, times ``SoftModel.size_m``.
+        """
+        return self._soft.extents_m(object_id)
+
+    def soft_health(self, object_id: str) -> SoftHealth:
+        """Whether a soft body burst or turned inside out."""
+        return self._soft.health(object_id)
+
+    def _free(self, object_id: str) -> int:
+        if object_id not in self.free_ids:
+            known = ", ".join([*self.free_ids, *self._soft.names]) or "none"
+            message = f"no object {object_id!r} moves in this world. There are: {known}."
+            raise PhysicsError(message)
+        return self.free_ids[object_id]
 
     @property
     def client(self) -> int:
@@ -299,11 +228,11 @@ class World:
     @property
     def robot_id(self) -> int:
         """PyBullet's number of the robot."""
-        return self._robot
+        return self._arm.id
 
     def link_id(self, link: str) -> int:
         """PyBullet's number of a link of the robot."""
-        return self._links[link]
+        return self._arm.links[link]
 
     def close(self) -> None:
         """Give the client back; a second call does nothing."""

@@ -1,0 +1,231 @@
+"""The robot in PyBullet: its motors, its fingers, where its links are."""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry import se3
+from bridge.task.robot import ARM_JOINTS, FINGER_JOINTS, FINGER_LINKS, MAX_WIDTH_M, TCP_FRAME
+from twin.errors import TwinError
+from twin.physics.config import PhysicsConfig
+from twin.physics.description import Hulls, write_description
+from twin.physics.engine import pybullet
+
+SLOWEST_M_S = 1e-4
+"""Stalled fingers still creep this fast: PyBullet takes a speed of 0 for no limit."""
+
+_Vector = Float[np.ndarray, "3"]
+
+
+class PhysicsError(TwinError):
+    """The physics engine refused or lost something."""
+
+
+class Arm:
+    """One robot with its base at the origin of a PyBullet client."""
+
+    def __init__(self, client: int, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig) -> None:
+        """Load it.
+
+        Args:
+            client: PyBullet's number of the world.
+            urdf: Description without package URIs.
+            mesh_hulls_m: Per link, hulls that replace its collision meshes [m].
+            config: Frictions and forces.
+
+        Raises:
+            PhysicsError: When PyBullet does not load the description or joints are missing.
+        """
+        self._client = client
+        self._config = config
+        self.id = self._load(urdf, mesh_hulls_m)
+        self._index_joints()
+        self._couple_fingers()
+        self._target_m = MAX_WIDTH_M / 2
+
+    def _load(self, urdf: str, mesh_hulls_m: Hulls) -> int:
+        with tempfile.TemporaryDirectory(prefix="robot-gst-physics-") as folder:
+            path = write_description(urdf, mesh_hulls_m, Path(folder))
+            try:
+                return int(
+                    pybullet.loadURDF(
+                        str(path),
+                        useFixedBase=True,
+                        flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+                        physicsClientId=self._client,
+                    )
+                )
+            except pybullet.error as error:
+                message = (
+                    f"PyBullet does not load the robot description ({error}). "
+                    "Check its links and collision meshes."
+                )
+                raise PhysicsError(message) from error
+
+    def _index_joints(self) -> None:
+        self._joints: dict[str, int] = {}
+        self.links: dict[str, int] = {}
+        self._efforts: dict[str, float] = {}
+        self._axes: dict[str, _Vector] = {}
+        parents: dict[str, int] = {}
+        client = self._client
+        for index in range(pybullet.getNumJoints(self.id, physicsClientId=client)):
+            item = pybullet.getJointInfo(self.id, index, physicsClientId=client)
+            self._joints[item[1].decode()] = index
+            self.links[item[12].decode()] = index
+            self._efforts[item[1].decode()] = item[10]
+            self._axes[item[12].decode()] = np.array(item[13])
+            parents[item[12].decode()] = item[16]
+        missing = [name for name in (*ARM_JOINTS, *FINGER_JOINTS) if name not in self._joints] + [
+            name for name in (TCP_FRAME,) if name not in self.links
+        ]
+        if missing:
+            message = (
+                f"the robot description lacks {', '.join(missing)}; it has the joints "
+                f"{', '.join(self._joints)}. Physics needs the arm and two prismatic fingers."
+            )
+            raise PhysicsError(message)
+        self._arm = [self._joints[name] for name in ARM_JOINTS]
+        self._fingers = [self._joints[name] for name in FINGER_JOINTS]
+        self.finger_links = [self.links[name] for name in FINGER_LINKS]
+        self._finger_parent = parents[FINGER_LINKS[0]]
+        self._arm_forces = [self._efforts[name] for name in ARM_JOINTS]
+
+    def _couple_fingers(self) -> None:
+        for link in self.finger_links:
+            pybullet.changeDynamics(
+                self.id,
+                link,
+                lateralFriction=self._config.finger_friction,
+                spinningFriction=self._config.spinning_friction_m,
+                physicsClientId=self._client,
+            )
+        gear = pybullet.createConstraint(
+            self.id,
+            self.finger_links[0],
+            self.id,
+            self.finger_links[1],
+            pybullet.JOINT_GEAR,
+            [0, 1, 0],
+            [0, 0, 0],
+            [0, 0, 0],
+            physicsClientId=self._client,
+        )
+        pybullet.changeConstraint(
+            gear,
+            gearRatio=-1,
+            erp=0.2,
+            maxForce=10 * self._config.grip_force_N,
+            physicsClientId=self._client,
+        )
+
+    def reset(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
+        """Put the robot into a posture at rest, without simulating."""
+        for index, value in zip(self._arm, joints_rad, strict=True):
+            pybullet.resetJointState(
+                self.id, index, float(value), 0.0, physicsClientId=self._client
+            )
+        for index in self._fingers:
+            pybullet.resetJointState(
+                self.id, index, float(width_m) / 2, 0.0, physicsClientId=self._client
+            )
+
+    def command(
+        self,
+        joints_rad: Float[np.ndarray, " num_joints"],
+        velocity_rad_s: Float[np.ndarray, " num_joints"],
+        width_m: float,
+    ) -> None:
+        """Set the position targets that the motors follow from the next step on."""
+        pybullet.setJointMotorControlArray(
+            self.id,
+            self._arm,
+            pybullet.POSITION_CONTROL,
+            targetPositions=joints_rad.tolist(),
+            targetVelocities=velocity_rad_s.tolist(),
+            forces=self._arm_forces,
+            physicsClientId=self._client,
+        )
+        self._target_m = min(max(width_m, 0.0), MAX_WIDTH_M) / 2
+        self._drive_fingers(self._target_m, self._config.finger_speed_m_s)
+
+    def _drive_fingers(self, target_m: float, speed_m_s: float) -> None:
+        for index in self._fingers:
+            pybullet.setJointMotorControl2(
+                self.id,
+                index,
+                pybullet.POSITION_CONTROL,
+                targetPosition=target_m,
+                force=self._config.grip_force_N,
+                maxVelocity=speed_m_s,
+                physicsClientId=self._client,
+            )
+
+    def yield_fingers(self, reaction_N: float) -> None:
+        """Let what is soft between the fingers slow, stall or push back their drive.
+
+        The line of a geared motor: the speed falls with the load and is zero at the grip force.
+        As an external force one step late, the reaction shakes fingers of 50 g instead (measured,
+        docs/decisions/0029-soft-bodies-by-stress.md).
+
+        Args:
+            reaction_N: Mean over both fingers of what pushes them apart.
+        """
+        top, here = self._config.finger_speed_m_s, self.width_m() / 2
+        speed = top * (1.0 - reaction_N / self._config.grip_force_N)
+        if self._target_m >= here:
+            self._drive_fingers(self._target_m, top)
+        elif speed >= 0:
+            self._drive_fingers(self._target_m, max(speed, SLOWEST_M_S))
+        else:
+            self._drive_fingers(MAX_WIDTH_M / 2, min(-speed, top))
+
+    def joints_rad(self) -> Float[np.ndarray, " num_joints"]:
+        """Where the arm is."""
+        states = pybullet.getJointStates(self.id, self._arm, physicsClientId=self._client)
+        return np.array([state[0] for state in states])
+
+    def width_m(self) -> float:
+        """Distance between the finger pads."""
+        states = pybullet.getJointStates(self.id, self._fingers, physicsClientId=self._client)
+        return float(sum(state[0] for state in states))
+
+    def link_poses(
+        self, links: Sequence[int]
+    ) -> list[tuple[tuple[float, ...], tuple[float, float, float, float]]]:
+        """Position [m] and quaternion xyzw of the frames of links, base frame."""
+        states = pybullet.getLinkStates(
+            self.id, links, computeForwardKinematics=1, physicsClientId=self._client
+        )
+        return [(state[4], state[5]) for state in states]
+
+    def T_base_link(self, link: str) -> Float[np.ndarray, "4 4"]:
+        """Pose of a link's frame."""
+        p, (x, y, z, w) = self.link_poses([self.links[link]])[0]
+        return se3.transform_from(np.array([w, x, y, z]), np.array(p))
+
+    def opening_axis(self, link: str) -> Float[np.ndarray, "3"]:
+        """Direction in which a finger opens, in its own frame."""
+        return self._axes[link]
+
+    def push(
+        self, link: str | None, force_N: Float[np.ndarray, "3"], point_m: Float[np.ndarray, "3"]
+    ) -> None:
+        """Apply a force at a point of the base frame during the next step.
+
+        Args:
+            link: What it acts on; None: what carries the fingers.
+            force_N: The force, base frame.
+            point_m: Where it acts.
+        """
+        pybullet.applyExternalForce(
+            self.id,
+            self._finger_parent if link is None else self.links[link],
+            force_N.tolist(),
+            point_m.tolist(),
+            pybullet.WORLD_FRAME,
+            physicsClientId=self._client,
+        )

@@ -1,0 +1,101 @@
+// One soft body: nodes around an origin of its own, in single precision.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "geometry.hpp"
+#include "tets.hpp"
+
+namespace soft {
+
+struct Sample {
+    std::int32_t ids[2];  // a surface node twice, or both ends of a surface edge
+};
+
+struct Contact {
+    std::int32_t sample;
+    std::int32_t collider;
+};
+
+struct Pair {
+    std::int32_t sample;       // of this body
+    std::int32_t other;        // another body
+    std::int32_t ids[3];       // nodes of one of its triangles
+    float weights[3];          // nearest point of the triangle
+};
+
+struct Box {
+    Double3 low, high;
+};
+
+struct BodySpec {
+    std::vector<Double3> nodes;           // where they are now
+    std::vector<Double3> rest;            // at rest, any frame
+    std::vector<std::int32_t> tets;
+    std::vector<double> masses;           // [kg]
+    std::vector<Sample> samples;
+    std::vector<std::int32_t> triangles;
+    double young, poisson, damping_rate, friction, spacing;
+};
+
+class Body {
+  public:
+    Body(const BodySpec& spec, double step_s);
+
+    // x, y, z and the inverse mass of each node; four that never move come last, for empty lanes.
+    std::vector<float> p;
+    std::vector<float> start;   // of the substep
+    std::vector<float> v;       // fourth number unused
+    Double3 origin;
+    std::vector<TetBlock> blocks;
+    std::vector<std::int32_t> order;
+    Material material;
+    std::vector<Sample> samples;
+    std::vector<std::int32_t> triangles;
+    double friction, damping_rate, spacing;
+    int num_nodes;
+    bool lost = false;          // its nodes are no numbers any more
+
+    std::vector<Contact> contacts;
+    std::vector<Pair> pairs;
+    std::vector<std::uint8_t> touched;  // by collider, in the last step
+    Box box;                            // around all nodes, base frame
+    double top_speed;
+
+    Float3 at(std::int32_t id) const { return {p[4 * id], p[4 * id + 1], p[4 * id + 2]}; }
+    Float3 started(std::int32_t id) const {
+        return {start[4 * id], start[4 * id + 1], start[4 * id + 2]};
+    }
+    float inverse_mass(std::int32_t id) const { return p[4 * id + 3]; }
+    void shift(std::int32_t id, const Float3& by) {
+        p[4 * id] += by.x;
+        p[4 * id + 1] += by.y;
+        p[4 * id + 2] += by.z;
+    }
+    Float3 sample_at(const Sample& s) const { return (at(s.ids[0]) + at(s.ids[1])) * 0.5f; }
+    Float3 sample_started(const Sample& s) const {
+        return (started(s.ids[0]) + started(s.ids[1])) * 0.5f;
+    }
+    // What a force on a sample accelerates it by, and how a shift of the sample moves its nodes.
+    float sample_inverse_mass(const Sample& s) const {
+        return s.ids[0] == s.ids[1] ? inverse_mass(s.ids[0])
+                                    : 0.25f * (inverse_mass(s.ids[0]) + inverse_mass(s.ids[1]));
+    }
+    void shift_sample(const Sample& s, const Float3& by, float sample_inverse_mass);
+
+    void look_around();                       // box, speed, origin
+    void predict(double gravity, float step_s, const Kernels& kernels);
+    void relax(const Kernels& kernels) {
+        kernels.relax(blocks.data(), static_cast<int>(blocks.size()), p.data(), material);
+    }
+    void finish(float step_s);
+    void damp(double period_s);               // what is not rigid motion gets slower
+
+  private:
+    std::vector<float> predicted_;
+    void build_blocks(const BodySpec& spec, double step_s);
+    void recentre(const Double3& middle);
+};
+
+}  // namespace soft

@@ -1,0 +1,285 @@
+"""Soft bodies beside PyBullet, on its clock: what drives them, and what they do to rigid bodies.
+
+Each step PyBullet moves first; then the soft bodies take their substeps while links and boxes go
+from their old poses to the new ones. What they push back with reaches PyBullet with its next step:
+on boxes as velocity, on the arm as a force, on the fingers as a slower drive.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry import se3
+from twin.physics.arm import Arm
+from twin.physics.colliders import ConvexPiece, box_piece, link_pieces
+from twin.physics.config import PhysicsConfig
+from twin.physics.description import Hulls
+from twin.physics.engine import pybullet
+from twin.physics.soft import SoftHealth, SoftModel, health_of
+from twin.physics.soft_shape import Skin, bind_points, rigid_fit
+from twin.physics.soft_solver import SoftSolver, add_body
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Placed:
+    """One piece as the solver will get it."""
+
+    piece: ConvexPiece
+    pose: tuple[float, ...]
+    friction: float
+    mass_kg: float = 0.0
+    inertia: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SoftBody:
+    index: int
+    model: SoftModel
+    skin: Skin | None
+    rest_extents_m: Float[np.ndarray, "3"]
+
+
+class SoftWorld:
+    """The soft part of a world. Costs nothing until a soft body is added."""
+
+    def __init__(
+        self, client: int, arm: Arm, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig
+    ) -> None:
+        """Remember what soft bodies will meet.
+
+        Args:
+            client: PyBullet's number of the world.
+            arm: The robot.
+            urdf: Its description.
+            mesh_hulls_m: Per link, hulls that stand for its collision meshes [m].
+            config: Rates and frictions.
+        """
+        self.names: dict[str, _SoftBody] = {}
+        self._client, self._arm, self._config = client, arm, config
+        self._description = (urdf, mesh_hulls_m)
+        self._period_s = 1.0 / config.rate_hz
+        self._waiting: list[_Placed] = []
+        self._free: dict[int, int] = {}
+        self._solver: SoftSolver | None = None
+        self._num_pieces = 0
+        self._links: list[str] = []
+        self._link_pieces: dict[str, list[int]] = {}
+        self._pushes: Float[np.ndarray, "num_pieces 12"] = np.zeros((0, 12))
+
+    def add_static(
+        self, size_m: Float[np.ndarray, "3"], T_base_box: Float[np.ndarray, "4 4"]
+    ) -> None:
+        """Add a box that never moves."""
+        self._add(
+            _Placed(
+                piece=box_piece(size_m, np.eye(4)),
+                pose=_pose(T_base_box),
+                friction=self._config.surface_friction,
+            )
+        )
+
+    def add_free(
+        self,
+        body: int,
+        size_m: Float[np.ndarray, "3"],
+        mass_kg: float,
+        T_base_box: Float[np.ndarray, "4 4"],
+    ) -> None:
+        """Add a box that PyBullet moves."""
+        x, y, z = (np.asarray(size_m) ** 2).tolist()
+        self._free[body] = self._add(
+            _Placed(
+                piece=box_piece(size_m, np.eye(4)),
+                pose=_pose(T_base_box),
+                friction=self._config.object_friction,
+                mass_kg=mass_kg,
+                inertia=tuple(mass_kg / 12 * value for value in (y + z, x + z, x + y)),
+            )
+        )
+
+    def _add(self, placed: _Placed) -> int:
+        """Returns the number that the solver gives, or will give, to the piece."""
+        self._num_pieces += 1
+        if self._solver is None:
+            self._waiting.append(placed)
+        else:
+            self._hand_over(placed)
+        return self._num_pieces - 1
+
+    def _hand_over(self, placed: _Placed) -> None:
+        solver = self._begun()
+        solver.add_collider(
+            placed.piece.planes,
+            placed.piece.corners_m,
+            np.array(placed.pose),
+            placed.friction,
+            placed.mass_kg,
+            np.array(placed.inertia),
+        )
+
+    def _begun(self) -> SoftSolver:
+        if self._solver is None:
+            self._solver = SoftSolver(
+                self._period_s, self._config.soft_substeps, self._config.gravity_m_s2
+            )
+            for placed in self._waiting:
+                self._hand_over(placed)
+            self._waiting.clear()
+            self._add_links()
+        return self._solver
+
+    def _add_links(self) -> None:
+        config = self._config
+        for link, pieces in link_pieces(*self._description).items():
+            if link not in self._arm.links:
+                continue  # PyBullet has no number for the root; it stands still on the table
+            finger = self._arm.links[link] in self._arm.finger_links
+            friction = config.finger_friction if finger else config.surface_friction
+            self._links.append(link)
+            self._link_pieces[link] = [
+                self._add(_Placed(piece=piece, pose=(0, 0, 0, 0, 0, 0, 1), friction=friction))
+                for piece in pieces
+            ]
+        self.place_links()
+
+    def place_links(self) -> None:
+        """Take the robot's links to be where they are now, without having moved there."""
+        if self._solver is None:
+            return
+        poses = self._arm.link_poses([self._arm.links[link] for link in self._links])
+        for link, (p, q) in zip(self._links, poses, strict=True):
+            for piece in self._link_pieces[link]:
+                self._solver.place(piece, np.array([*p, *q]))
+
+    def add(
+        self, object_id: str, model: SoftModel, T_base_object: Float[np.ndarray, "4 4"]
+    ) -> None:
+        """Add a soft body at rest."""
+        rest = model.nodes_m.astype(np.float64)
+        friction = self._config.object_friction if model.friction is None else model.friction
+        index, _ = add_body(
+            self._begun(),
+            model,
+            T_base_object,
+            young_pa=model.young_pa * self._config.soft_stiffness_scale,
+            friction=friction,
+        )
+        skin, points = None, rest
+        if model.skin_m is not None:
+            points = model.skin_m.astype(np.float64)
+            skin = bind_points(points, rest, model.tets)
+        self.names[object_id] = _SoftBody(
+            index=index, model=model, skin=skin, rest_extents_m=np.ptp(points, axis=0)
+        )
+
+    def push_rigid(self) -> None:
+        """Hand to the rigid world what the soft bodies did in the last step."""
+        if self._solver is None or not len(self._pushes):
+            return
+        fingers = [link for link in self._links if self._arm.links[link] in self._arm.finger_links]
+        apart, totals = 0.0, np.zeros(6)
+        poses = dict(
+            zip(
+                self._links,
+                self._arm.link_poses([self._arm.links[link] for link in self._links]),
+                strict=True,
+            )
+        )
+        for link in self._links:
+            push = self._pushes[self._link_pieces[link]][:, :6].sum(axis=0) / self._period_s
+            if not push.any():
+                continue
+            p, (x, y, z, w) = poses[link]
+            if link in fingers:
+                R = se3.rotation_from_quaternion(np.array([w, x, y, z]))
+                apart += float(push[:3] @ R @ self._arm.opening_axis(link)) / len(fingers)
+                totals[:3] += push[:3]
+                totals[3:] += push[3:] + np.cross(p, push[:3])
+            else:
+                self._arm.push(link, push[:3], _line_of_action(push, np.array(p)))
+        if totals.any():
+            self._arm.push(None, totals[:3], _line_of_action(totals, np.zeros(3)))
+        self._arm.yield_fingers(apart)
+
+    def step(self) -> None:
+        """Advance the soft bodies to where PyBullet is."""
+        if self._solver is None:
+            return
+        poses, driven = [], []
+        states = self._arm.link_poses([self._arm.links[link] for link in self._links])
+        for link, (p, q) in zip(self._links, states, strict=True):
+            for piece in self._link_pieces[link]:
+                driven.append(piece)
+                poses.append((*p, *q))
+        for body, piece in self._free.items():
+            p, q = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
+            driven.append(piece)
+            poses.append((*p, *q))
+        self._solver.step(np.array(driven, dtype=np.int32), np.array(poses))
+        self._pushes = self._solver.pushes()
+        for body, piece in self._free.items():
+            change = self._pushes[piece, 6:]
+            if change.any():
+                v, omega = pybullet.getBaseVelocity(body, physicsClientId=self._client)
+                pybullet.resetBaseVelocity(
+                    body,
+                    (np.array(v) + change[:3]).tolist(),
+                    (np.array(omega) + change[3:]).tolist(),
+                    physicsClientId=self._client,
+                )
+
+    def nodes_m(self, object_id: str) -> Float[np.ndarray, "num_nodes 3"]:
+        """Where a body's nodes are."""
+        return np.asarray(self._begun().nodes(self.names[object_id].index))
+
+    def T_base_object(self, object_id: str) -> Float[np.ndarray, "4 4"]:
+        """Rigid motion nearest to a body's nodes; of a body that burst no numbers."""
+        model = self.names[object_id].model
+        return rigid_fit(
+            model.nodes_m.astype(np.float64),
+            self.nodes_m(object_id),
+            model.mass_fraction.astype(np.float64),
+        )
+
+    def pose(self, object_id: str) -> tuple[float, ...]:
+        """Position [m] and quaternion wxyz of that motion, seven numbers."""
+        T = self.T_base_object(object_id)
+        if not np.isfinite(T).all():
+            return (float("nan"),) * 7
+        q, p = se3.split(T)
+        return (*p.tolist(), *q.tolist())
+
+    def extents_m(self, object_id: str) -> Float[np.ndarray, "3"]:
+        """Extents of a body's surface along the axes of its pose."""
+        body, nodes = self.names[object_id], self.nodes_m(object_id)
+        points = nodes if body.skin is None else body.skin.points_m(nodes)
+        local = points @ self.T_base_object(object_id)[:3, :3]
+        return np.asarray(np.ptp(local, axis=0) / body.rest_extents_m * body.model.size_m)
+
+    def health(self, object_id: str) -> SoftHealth:
+        """Whether a body is sound."""
+        return health_of(self.names[object_id].model, self.nodes_m(object_id))
+
+    def finger_touches(self, object_id: str) -> bool:
+        """Whether a finger touched a body in the last step."""
+        touched = set(self._begun().touched(self.names[object_id].index))
+        return any(
+            self._arm.links[link] in self._arm.finger_links
+            and not touched.isdisjoint(self._link_pieces[link])
+            for link in self._links
+        )
+
+
+def _pose(T: Float[np.ndarray, "4 4"]) -> tuple[float, ...]:
+    q, p = se3.split(T)
+    w, x, y, z = q.tolist()
+    return (*p.tolist(), x, y, z, w)
+
+
+def _line_of_action(
+    wrench: Float[np.ndarray, "6"], origin_m: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3"]:
+    """A point where the force alone has the moment about the origin, but for twist about itself."""
+    force, moment = wrench[:3], wrench[3:]
+    return np.asarray(origin_m + np.cross(force, moment) / float(force @ force))
