@@ -21,7 +21,6 @@ from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
 from twin.gate.moved import who_moved
-from twin.replay.scene import refuse_soft
 
 ENGINE_NONE = "none"
 POLL_S = 0.05
@@ -162,7 +161,6 @@ class Gate:
 
     def _check(self, plan: Plan) -> str:
         """Refuse plans this gate cannot judge; return the robot description."""
-        refuse_soft(self._task)
         if plan.task and plan.task != self._task.name:
             raise UndecidedError(
                 f"plan {plan.id} is for task {plan.task!r}; this gate judges {self._task.name!r}. "

@@ -7,6 +7,7 @@ from cyclopts import Parameter
 
 from bridge.errors import UsageError
 from twin.physics.config import PhysicsConfig
+from twin.replay.parting_config import PartingConfig
 from twin.replay.variation import VariationConfig
 from twin.robot.config import IkConfig
 
@@ -56,6 +57,8 @@ class ReplayConfig:
     """Varied replays behind each nominal one. No flag here: the commands have --samples."""
     variation: VariationConfig = field(default_factory=VariationConfig)
     """What the samples vary, and how far."""
+    parting: PartingConfig = field(default_factory=PartingConfig)
+    """From which size on planned, executed and recorded are apart."""
     ik: IkConfig = field(default_factory=IkConfig)
     """When a pose counts as reached."""
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)

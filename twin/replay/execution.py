@@ -40,6 +40,8 @@ def path_of_execution(
             found="was executed without recorded joints or gripper",
             hint="Record /joint_states and /gripper/state over the whole execution.",
         )
+    _check_finite(track, "joints", plan)
+    _check_finite(widths, "gripper widths", plan)
     _check_gaps(track, plan)
     missing = [name for name in ARM_JOINTS if name not in track.names]
     if missing:
@@ -86,6 +88,17 @@ def check_covers(track: JointTrack, end_ns: int, plan: Plan) -> None:
     missing_ns = end_ns - int(track.stamps_ns[-1])
     if missing_ns > _LARGEST_GAP_NS:
         raise _not_recorded(plan, missing_ns, "at its end")
+
+
+def _check_finite(track: JointTrack, what: str, plan: Plan) -> None:
+    wrong = ~np.isfinite(track.position).all(axis=1)
+    if wrong.any():
+        at_s = int(track.stamps_ns[int(np.argmax(wrong))] - track.stamps_ns[0]) * 1e-9
+        raise UnusablePlanError(
+            plan_id=plan.id,
+            found=f"was executed with {what} that are no numbers at {at_s:.2f} s",
+            hint=f"{int(wrong.sum())} of {len(wrong)} samples are concerned; look at their source.",
+        )
 
 
 def _check_gaps(track: JointTrack, plan: Plan) -> None:

@@ -6,14 +6,17 @@ from dataclasses import dataclass
 from bridge.task.verdict import Factor
 from twin.errors import TwinError
 
+NOT_EVALUATED = "not evaluated: "
+"""What tables and verdicts look for."""
+
 
 class NotEvaluatedError(TwinError):
     """A trajectory cannot be judged at all; the message says why."""
 
     def __init__(self, why: str) -> None:
         """Put the words that tables and verdicts look for in front."""
-        self.why = why.removeprefix("not evaluated: ")
-        super().__init__(f"not evaluated: {self.why}")
+        self.why = why.removeprefix(NOT_EVALUATED)
+        super().__init__(f"{NOT_EVALUATED}{self.why}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from bridge.episode import provenance
 from bridge.episode.run import RunFolder
 from bridge.task.task_file import ObjectModel, Task
 from twin.physics.config import PhysicsConfig
 from twin.replay.scene import ReplayScene
-from twin.scene.calibration import read_calibration
+from twin.scene.calibration import Calibration, read_calibration
 from twin.scene.shape.lattice import Lattice
 from twin.scene.shape.npz import UnreadableArraysError
 from twin.scene.shape.static import StaticSdf
@@ -41,8 +42,6 @@ class Place:
     shape_sources: Mapping[str, str] = field(default_factory=dict)
     """Per object: where its shape comes from."""
     calibration_id: str | None = None
-    physics: Mapping[str, float] = field(default_factory=dict)
-    """Fields of ``PhysicsConfig`` that a calibration identified."""
     remarks: tuple[str, ...] = ()
     """What was there and could not be used."""
 
@@ -77,17 +76,6 @@ class Place:
             shape_sources=self.shape_sources,
         )
 
-    def physics_for(self, wanted: PhysicsConfig) -> PhysicsConfig:
-        """Calibrated physics, but for the fields that the user set to something of their own."""
-        nominal = PhysicsConfig()
-        known = {item.name for item in fields(PhysicsConfig)}
-        free = {
-            name: type(getattr(nominal, name))(value)
-            for name, value in self.physics.items()
-            if name in known and getattr(wanted, name) == getattr(nominal, name)
-        }
-        return replace(wanted, **free)
-
 
 def read_place(run: RunFolder, task: Task) -> Place:
     """Read what the scene folder of a run knows about a task's objects.
@@ -98,11 +86,9 @@ def read_place(run: RunFolder, task: Task) -> Place:
     """
     sources = dict.fromkeys(task.objects, TASK_SHAPE)
     calibration = read_calibration(run)
-    calibrated = {} if calibration is None else physics_of(calibration.record)
     place = Place(
         shape_sources=sources,
         calibration_id=None if calibration is None else calibration.calibration_id,
-        physics=calibrated,
     )
     record = read_record(run)
     if record is None:
@@ -121,6 +107,30 @@ def read_place(run: RunFolder, task: Task) -> Place:
         lattices=lattices,
         remarks=tuple(remarks),
     )
+
+
+def physics_for(wanted: PhysicsConfig, calibration: Calibration | None) -> PhysicsConfig:
+    """Calibrated physics, but for the fields that the user set to something of their own."""
+    if calibration is None:
+        return wanted
+    nominal = PhysicsConfig()
+    free = {
+        name: type(getattr(nominal, name))(value)
+        for name, value in physics_of(calibration.record).items()
+        if getattr(wanted, name) == getattr(nominal, name)
+    }
+    return replace(wanted, **free)
+
+
+def shape_hashes(run: RunFolder) -> dict[str, str]:
+    """SHA-256 of the scene's files that a replay reads, by their names in the scene folder."""
+    folder = run.scene_dir
+    paths = [folder / "sdf.npz", *sorted(folder.glob("objects/*/soft.npz"))]
+    return {
+        path.relative_to(folder).as_posix(): provenance.hash_file(path)
+        for path in paths
+        if path.is_file()
+    }
 
 
 def physics_of(calibration: Mapping[str, Any]) -> dict[str, float]:

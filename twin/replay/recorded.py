@@ -4,7 +4,7 @@ Joints and gripper are measured. Objects are localised before and after, and in 
 what the fingers hold moves with the tool. Contacts follow from that, so they are called inferred.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -101,6 +101,13 @@ def trace_of_recording(recording: Recording, robot: RobotModel, rate_hz: int) ->
 def rollout_of_recording(
     recording: Recording, robot: RobotModel, hulls: RobotHulls, config: ReplayConfig
 ) -> Rollout:
+    """The recorded states with the contacts that follow from joints and carried objects."""
+    monitor = _watched(recording, robot, hulls, config)
+    states = states_of_recording(recording, robot)
+    return replace(states, contacts=monitor.contacts(), contacts_inferred=True)
+
+
+def states_of_recording(recording: Recording, robot: RobotModel) -> Rollout:
     """The recorded states that success predicates read: localised before and after.
 
     One look afterwards does not say whether anything still moves: ``settled`` stays undecided.
@@ -120,7 +127,6 @@ def rollout_of_recording(
         if float(np.linalg.norm(Ts[-1, :3, 3] - tool)) > AWAY_M
     }
     rest = {name: np.array(scene.task.objects[name].size_m) for name in end.extents_m}
-    monitor = _watched(recording, robot, hulls, config)
     return Rollout(
         stamps_ns=seen,
         Ts_base_object=places,
@@ -128,8 +134,6 @@ def rollout_of_recording(
         extents_m={
             name: np.stack([rest[name], extents]) for name, extents in end.extents_m.items()
         },
-        contacts=monitor.contacts(),
-        contacts_inferred=True,
     )
 
 

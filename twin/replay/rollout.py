@@ -7,14 +7,18 @@ from jaxtyping import Float, Int
 
 from bridge.episode.streams import JointTrack
 from bridge.task.plan import Plan
-from bridge.task.predicate import all_hold, already_true_at_start, evaluate_success
+from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
 from twin.physics.engine import ENGINE_VERSION
 from twin.replay.clearance import ClearanceMonitor
+from twin.replay.clearance.postures import posture_clearance
 from twin.replay.config import ReplayConfig
 from twin.replay.dynamics import States, simulate
 from twin.replay.execution import path_of_execution
 from twin.replay.failure import Failure, factor_from
+from twin.replay.furnish import soft_models
+from twin.replay.judge import findings_of, reason_of, terminal_factor, warnings_of
+from twin.replay.overlap import free_start
 from twin.replay.path import JointPath, check_path, path_of_plan
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
@@ -22,6 +26,7 @@ from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 
 KINEMATIC_ENGINE = "pinocchio"
+SOFT_ENGINE = "xpbd"
 
 
 def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> ReplayResult:
@@ -31,7 +36,8 @@ def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> ReplayR
         UnusablePlanError: When the plan has no usable waypoints.
     """
     robot = load_robot(scene.urdf)
-    path, failures, unreachable_ns = path_of_plan(plan, robot, config)
+    free = posture_clearance(scene, hulls_of(robot), config)
+    path, failures, unreachable_ns = path_of_plan(plan, robot, config, clearance=free)
     path = path.with_late_gripper(config.grip_delay_s)
     return _replay(path, failures, unreachable_ns, plan, scene, config, trajectory="planned")
 
@@ -74,6 +80,8 @@ def _replay(
     hulls = hulls_of(robot)
     failures = failures + check_path(path, robot, hulls, config)
     dynamic = config.mode == "dynamic"
+    if dynamic:
+        scene = free_start(scene, soft_models(scene), config.start_overlap_m)
     states = simulate(path, scene, hulls, config) if dynamic else follow(path, scene, config)
     monitor = ClearanceMonitor(scene, plan, hulls, config)
     _pre_grasp(monitor, path, config)
@@ -85,6 +93,7 @@ def _replay(
             states.joints_rad[index],
             float(states.width_m[index]),
             {name: Ts[index] for name, Ts in known.items()},
+            {name: nodes[index] for name, nodes in states.nodes_m.items()},
         )
         for index, t_ns in enumerate(states.stamps_ns)
     ]
@@ -98,17 +107,23 @@ def _replay(
         finger_contact=states.finger_contact,
         clearance_m=np.array(clearance),
         contacts=monitor.contacts(),
+        nodes_m=states.nodes_m,
+        extents_m=states.extents_m,
+        broken=states.broken,
     )
-    terminal = _terminal(result, scene, config, unreachable_ns)
     verdict = replace(
         result.verdict,
         ik=factor_from(failures),
         clearance=factor_from(
-            monitor.failures, undecided=_clearance_undecided(scene, config, unreachable_ns)
+            monitor.failures, undecided=_clearance_undecided(scene, unreachable_ns, states)
         ),
-        terminal=terminal,
+        terminal=terminal_factor(
+            result, scene, config, unreachable_ns=unreachable_ns, burst=states.burst
+        ),
+        warnings=warnings_of(scene, result),
+        findings=tuple(findings_of(scene.task, result.rollout(), "replayed")) if dynamic else (),
     )
-    return replace(result, verdict=replace(verdict, reason=_reason(verdict, scene, result)))
+    return replace(result, verdict=replace(verdict, reason=reason_of(verdict)))
 
 
 def follow(path: JointPath, scene: ReplayScene, config: ReplayConfig) -> States:
@@ -146,58 +161,28 @@ def _undecided(plan: Plan, trajectory: str, config: ReplayConfig, scene: ReplayS
         ik=open_factor,
         clearance=open_factor,
         terminal=open_factor,
-        engine=ENGINE_VERSION if config.mode == "dynamic" else KINEMATIC_ENGINE,
+        engine=engine_of(scene.task, config),
         seed=config.seed,
         scene_hash=scene.scene_hash,
+        calibration_id=scene.calibration_id,
     )
 
 
+def engine_of(task: Task, config: ReplayConfig) -> str:
+    """Name what moved things: a grasp that is no friction grasp is part of the name."""
+    if config.mode == "kinematic":
+        return KINEMATIC_ENGINE
+    soft = f"+{SOFT_ENGINE}" if task.soft_objects else ""
+    return f"{ENGINE_VERSION}{soft}{'+attach' if config.grasp == 'attach' else ''}"
+
+
 def _clearance_undecided(
-    scene: ReplayScene, config: ReplayConfig, unreachable_ns: int | None
+    scene: ReplayScene, unreachable_ns: int | None, states: States
 ) -> str | None:
+    if states.burst is not None:
+        return f"known only until {states.burst.object_id} burst"
     if unreachable_ns is not None:
         return f"known only up to the unreachable pose at {unreachable_ns * 1e-9:.2f} s"
     if scene.missing():
         return f"not localised: {scene.describe_missing()}"
-    return None
-
-
-def _terminal(
-    result: ReplayResult, scene: ReplayScene, config: ReplayConfig, unreachable_ns: int | None
-) -> Factor:
-    if config.mode == "kinematic":
-        return Factor(value=None, detail="a kinematic replay does not move objects")
-    if unreachable_ns is not None:
-        detail = f"the trajectory cannot be executed beyond {unreachable_ns * 1e-9:.2f} s"
-        return Factor(value=None, detail=detail)
-    findings = evaluate_success(scene.task, result.rollout())
-    detail = "; ".join(finding.detail for finding in findings)
-    value = all_hold(findings)
-    if value is not False:
-        return Factor(value=value, detail=detail)
-    index = next(i for i, finding in enumerate(findings) if finding.value is False)
-    spec = scene.task.success[index]
-    return Factor(
-        value=False,
-        first_t_ns=int(result.stamps_ns[-1]),
-        cause=findings[index].kind,
-        bodies=tuple(spec[key] for key in ("object", "container") if key in spec),
-        detail=detail,
-    )
-
-
-def _reason(verdict: Verdict, scene: ReplayScene, result: ReplayResult) -> str | None:
-    name = verdict.first_failing
-    if name is not None:
-        factor: Factor = getattr(verdict, name)
-        return f"{name}: {factor.cause}: {factor.detail}"
-    if verdict.accepted is None:
-        undecided = [
-            f"{name}: {getattr(verdict, name).detail}"
-            for name in ("ik", "clearance", "terminal")
-            if getattr(verdict, name).value is None
-        ]
-        return "undecided: " + "; ".join(undecided)
-    if already_true_at_start(scene.task, result.rollout()):
-        return "the goal held before anything moved"
     return None

@@ -1,6 +1,5 @@
 """Replay every trajectory of a run: each plan as planned, each execution as recorded."""
 
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,13 +11,19 @@ from bridge.episode.run import RunFolder
 from bridge.errors import UsageError
 from bridge.task.task_file import load_task
 from bridge.terminal import Advance, Output
+from twin.replay.calibrated import calibrated
 from twin.replay.config import ReplayRunConfig
-from twin.replay.job import ReplayJob, row_of_existing, row_of_failure, run_job
+from twin.replay.job import ReplayJob, row_of_existing, row_of_failure
+from twin.replay.place import shape_hashes
 from twin.replay.pool import Alone, Crew, Runner
 from twin.replay.prepare import Preparation, prepare, replayed_task
-from twin.replay.scene import refuse_soft
+from twin.replay.relive import run_job
 from twin.replay.starts import localised_starts
+from twin.replay.table import count_verdicts as count_verdicts
+from twin.replay.table import describe_run as describe_run
+from twin.replay.table import executions_of, recorded_labels
 from twin.replay.worker import Failed, do
+from twin.scene.calibration import read_calibration
 from twin.scene.store import scene_hash_of
 
 
@@ -47,6 +52,9 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
         "run": str(run.path),
         "scene_hash": scene_hash,
         "counts": count_verdicts(rows),
+        "executions": executions_of(
+            rows, recorded_labels(run, sorted({row["episode"] for row in rows}))
+        ),
         "skipped_episodes": skipped,
         "rows": rows,
     }
@@ -168,9 +176,10 @@ def _jobs_of(
         output.detail(f"{episode_id}: {episode.info.kind} with {len(plans)} plan(s), not replayed")
         return []
     task = load_task(task_name)
-    refuse_soft(task)
     starts = localised_starts(run, episode, task, scene_hash=scene_hash, force=relocalise)
     digest = episode.sha256()
+    calibration = read_calibration(run)
+    replay = calibrated(config.replay, calibration)
     jobs = []
     for index, (stamp_ns, plan) in enumerate(plans):
         interval = streams.executed_interval_ns(episode, plan.id)
@@ -186,15 +195,19 @@ def _jobs_of(
             task=task_name,
             start=starts.at(start_ns),
             scene_hash=scene_hash,
-            config=replace(config.replay, mode="dynamic", samples=config.samples),
+            config=replace(replay, mode="dynamic", samples=config.samples),
             folder=run.derived_dir.resolve(),
             duration_s=plan.tau[-1].t_ns * 1e-9 if plan.tau else 0.0,
+            run_path=run.path.resolve(),
+            shapes=shape_hashes(run),
+            calibration_id=None if calibration is None else calibration.calibration_id,
+            render=config.render,
         )
         jobs.append(common)
         if interval is not None:
-            jobs.append(replace(common, trajectory="executed"))
-            kinematic = replace(config.replay, mode="kinematic")
-            jobs.append(replace(common, trajectory="executed", config=kinematic))
+            executed = replace(common, trajectory="executed", end=starts.after(plan.id))
+            jobs.append(executed)
+            jobs.append(replace(executed, config=replace(replay, mode="kinematic")))
     return jobs
 
 
@@ -213,47 +226,14 @@ def _there_already(
 
 
 def _replayed(todo: list[ReplayJob], runner: Runner, output: Output) -> Iterator[dict[str, Any]]:
-    for job, answer in runner.run(run_job, todo, ReplayJob.cost):
-        if isinstance(answer, Failed):
-            output.detail(answer.trace)
-            yield row_of_failure(job, answer.message)
-        else:
-            yield answer
-
-
-def count_verdicts(rows: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
-    """Accepted, rejected, undecided and failed per trajectory and mode, and how many in all."""
-    counts: dict[str, Counter[str]] = {}
-    for row in rows:
-        key = f"{row['trajectory']} {row['mode']}"
-        if key == "planned dynamic" and not row["executed"]:
-            key = "planned dynamic, never executed"
-        word = {True: "accepted", False: "rejected", None: "undecided"}[row["accepted"]]
-        counts.setdefault(key, Counter())["failed" if row["error"] else word] += 1
-        counts[key]["n"] += 1
-    words = ("n", "accepted", "rejected", "undecided", "failed")
-    return {key: {word: counter[word] for word in words} for key, counter in counts.items()}
-
-
-def describe_run(summary: dict[str, Any]) -> str:
-    """The final table as text."""
-    if not summary["rows"]:
-        return "No trial with a plan to replay."
-    width = max(len(key) for key in summary["counts"])
-    lines = [
-        f"{'':{width}}  {'n':>5} {'accepted':>9} {'rejected':>9} {'undecided':>9} {'failed':>7}"
-    ]
-    lines += [
-        f"{key:{width}}  {c['n']:>5} {c['accepted']:>9} {c['rejected']:>9} {c['undecided']:>9} "
-        f"{c['failed']:>7}"
-        for key, c in sorted(summary["counts"].items())
-    ]
-    rejected = [row for row in summary["rows"] if row["accepted"] is False]
-    lines += [
-        f"  {row['episode']} {row['plan']} {row['trajectory']} {row['mode']}: {row['reason']}"
-        for row in rejected
-    ]
-    kept = sum(row["skipped"] for row in summary["rows"])
-    if kept:
-        lines.append(f"{kept} of {len(summary['rows'])} were there already; --force redoes them.")
-    return "\n".join(lines)
+    # An executed replay is compared with the planned one, which must be there before.
+    for late in (False, True):
+        batch = [job for job in todo if job.needs_planned is late]
+        if not batch:
+            continue
+        for job, answer in runner.run(run_job, batch, ReplayJob.cost):
+            if isinstance(answer, Failed):
+                output.detail(answer.trace)
+                yield row_of_failure(job, answer.message)
+            else:
+                yield answer

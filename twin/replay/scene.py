@@ -7,30 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.task.task_file import Task
-from twin.errors import TwinError
 from twin.scene.shape.static import StaticSdf
-
-
-class SoftBodiesError(TwinError):
-    """A task has objects that deform, and replays have only rigid ones so far."""
-
-    def __init__(self, task: Task) -> None:
-        """Remember which objects they are."""
-        self.objects = task.soft_objects
-        super().__init__(
-            f"not evaluated: soft bodies are not in the twin yet, and task {task.name} has "
-            f"{len(self.objects)} ({', '.join(self.objects)}). Replay a task with rigid objects."
-        )
-
-
-def refuse_soft(task: Task) -> None:
-    """Say that a task cannot be replayed yet rather than replay it as something else.
-
-    Raises:
-        SoftBodiesError: The task has soft objects.
-    """
-    if task.soft_objects:
-        raise SoftBodiesError(task)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -82,7 +82,7 @@ def localised_starts(
 def _state_of(phase: Phase, task: Task, records: list[dict[str, object]]) -> StartState:
     poses: dict[str, Float[np.ndarray, "4 4"]] = {}
     covariances: dict[str, Float[np.ndarray, "6 6"]] = {}
-    extents: dict[str, Float[np.ndarray, "3"]] = {}
+    extents = {}
     seen_ns: int | None = None
     reasons = dict.fromkeys(task.objects, "no localisation record")
     for record in records:

@@ -1,0 +1,71 @@
+"""The tables at the end of a replay: counts, planned and executed against recorded, partings."""
+
+from typing import Any
+
+from twin.replay.table import (
+    EXECUTED,
+    PLANNED,
+    count_verdicts,
+    cross_table,
+    describe_run,
+    executions_of,
+)
+
+
+def row(episode: str, trajectory: str, accepted: bool | None, **more: Any) -> dict[str, Any]:
+    return {
+        "episode": episode, "plan": "p", "trajectory": trajectory, "mode": "dynamic",
+        "executed": True, "accepted": accepted, "error": None, "reason": "r", "skipped": False,
+        **more,
+    }  # fmt: skip
+
+
+APART = {
+    "first": {"first_t_ns": 2_340_000_000, "detail": "only as planned in the twin", "attribution":
+              "perception"},
+    "lag_s": 0.06,
+}  # fmt: skip
+ROWS = [
+    row("a", "planned", True),
+    row("a", "executed", True, divergence={"first": None, "lag_s": 0.05}),
+    row("a", "executed", None, mode="kinematic", predicates=True),
+    row("b", "planned", True),
+    row("b", "executed", False, divergence=APART),
+    row("c", "planned", False, executed=False),
+]
+LABELS = {"a": "success", "b": "failure", "c": "unknown"}
+
+
+def summary() -> dict[str, Any]:
+    return {
+        "rows": ROWS,
+        "counts": count_verdicts(ROWS),
+        "executions": executions_of(ROWS, LABELS),
+    }
+
+
+def test_an_executed_plan_has_one_line_with_every_side() -> None:
+    first, second = executions_of(ROWS, LABELS)
+    assert (first["recorded"], first["recorded_predicates"]) == ("success", True)
+    assert (first["planned"], first["executed"], first["apart"]) == (True, True, None)
+    assert (second["planned"], second["executed"]) == (True, False)
+    assert second["apart"]["attribution"] == "perception"
+
+
+def test_a_plan_that_was_never_executed_is_in_no_cross_table() -> None:
+    table = cross_table(executions_of(ROWS, LABELS))
+    assert table[PLANNED]["accepted"] == {"success": 1, "failure": 1, "unknown": 0}
+    assert table[EXECUTED]["rejected"] == {"success": 0, "failure": 1, "unknown": 0}
+    assert sum(sum(cells.values()) for cells in table[PLANNED].values()) == 2
+
+
+def test_the_text_holds_the_tables_and_where_things_part() -> None:
+    text = describe_run(summary())
+    assert "planned dynamic, never executed" in text
+    assert "b p: 2.34 s: only as planned in the twin (perception), lag 60 ms" in text
+    assert "a p: nowhere, lag 50 ms" in text
+
+
+def test_an_attached_grasp_is_counted_apart_and_named() -> None:
+    attached = row("a", "planned", True, engine="pybullet-1+attach")
+    assert list(count_verdicts([*ROWS, attached]))[-1] == "planned dynamic, attached grasp"

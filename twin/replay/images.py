@@ -1,0 +1,175 @@
+"""What the recorded cameras would have seen of a replay: the rebuilt scene's Gaussians, moved.
+
+The background stands still, links follow the replayed joints, rigid objects their replayed poses
+and soft ones their nodes. A plan that was executed is seen from where the cameras were while it
+was; one that never was, from the fixed cameras and from where the hand would have carried others.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode import schema, streams
+from bridge.episode.reader import Episode
+from bridge.episode.records import CompressedColor
+from bridge.episode.run import RunFolder
+from bridge.episode.transforms import TransformTree
+from bridge.geometry import se3
+from bridge.media.color import encode_jpeg
+from bridge.task.robot import BASE_FRAME
+from twin.replay.furnish import soft_models
+from twin.replay.result import ReplayResult
+from twin.replay.scene import ReplayScene
+from twin.scene.backend import open_rasteriser
+from twin.scene.compose import carried_camera
+from twin.scene.gaussians import GaussianCloud, concatenate
+from twin.scene.objects import ObjectSplats, moved_cloud
+from twin.scene.parts import read_objects, read_pose
+from twin.scene.robot_splats import posed, read_links
+from twin.scene.skin import Binding, bind, pose_cloud
+from twin.scene.store import SCENE_FILE, read_scene
+
+RATE_HZ = 5.0
+"""Of the images of a plan that was never executed."""
+MAX_IMAGES = 300
+"""Per camera; more are thinned out evenly."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stage:
+    """Everything that can be drawn, ready to be moved."""
+
+    still: GaussianCloud
+    objects: Mapping[str, ObjectSplats]
+    """Those that can move, in their own frames."""
+    bindings: Mapping[str, Binding]
+    """Of soft ones: which nodes carry which Gaussians."""
+    links: Mapping[str, GaussianCloud]
+    T_root_base: Float[np.ndarray, "4 4"]
+
+    def at(self, result: ReplayResult, scene: ReplayScene, index: int) -> GaussianCloud:
+        """The scene at one of the replay's states."""
+        parts = [self.still]
+        for name, item in self.objects.items():
+            nodes = result.nodes_m.get(name)
+            if nodes is not None and name in self.bindings:
+                parts.append(pose_cloud(item.cloud, self.bindings[name], nodes[index]))
+                continue
+            Ts = result.Ts_base_object.get(name)
+            T = scene.Ts_base_object.get(name, item.T_base_object) if Ts is None else Ts[index]
+            parts.append(moved_cloud(item.cloud, T))
+        if self.links:
+            robot = posed(
+                self.links,
+                result.joints_rad[index],
+                scene.urdf,
+                width_m=float(result.width_m[index]),
+            )
+            parts.append(moved_cloud(robot, self.T_root_base))
+        return concatenate(parts)
+
+
+def render_replay(
+    run: RunFolder,
+    episode: Episode,
+    result: ReplayResult,
+    scene: ReplayScene,
+    *,
+    start_ns: int,
+    executed: bool,
+) -> Iterator[tuple[str, CompressedColor]]:
+    """Yield camera ids with JPEG images, stamped with source times.
+
+    Args:
+        run: Whose rebuilt scene is drawn.
+        episode: The recording, for the cameras.
+        result: The replay.
+        scene: Where it happened.
+        start_ns: Source time that is the replay's time 0.
+        executed: Whether the plan was executed then, so that the cameras were where it is told.
+
+    Raises:
+        PathNotFoundError: When the run was not rebuilt.
+    """
+    stage = _set_up(run, scene, result)
+    rasteriser = open_rasteriser()
+    tree = streams.transform_tree(episode)
+    for camera_id in streams.camera_ids(episode):
+        info = streams.camera_info(episode, camera_id)
+        T_tcp_camera = None if executed else _mounting(episode, tree, info.frame_id, result)
+        for stamp_ns in _stamps(episode, camera_id, result, start_ns, executed=executed):
+            index = int(np.abs(result.stamps_ns - (stamp_ns - start_ns)).argmin())
+            if T_tcp_camera is None:
+                T = tree.T_root_frame(info.frame_id, stamp_ns)
+            else:
+                T = result.Ts_base_tcp[index] @ T_tcp_camera
+            view = rasteriser.view(stage.at(result, scene, index), info.camera, T)
+            yield (
+                camera_id,
+                CompressedColor(
+                    stamp_ns=stamp_ns,
+                    frame_id=info.frame_id,
+                    format="jpeg",
+                    data=encode_jpeg(view.image_u8()),
+                ),
+            )
+
+
+def _set_up(run: RunFolder, scene: ReplayScene, result: ReplayResult) -> _Stage:
+    rebuilt = read_scene(run)
+    objects = read_objects(run, rebuilt.record)
+    still = [
+        moved_cloud(item.cloud, scene.Ts_base_object.get(name, item.T_base_object))
+        for name, item in objects.items()
+        if name not in scene.movable()
+    ]
+    movable = {name: item for name, item in objects.items() if name in scene.movable()}
+    soft = {name: body for name, body in soft_models(scene).items() if name in movable}
+    root = rebuilt.record.get("robot", {}).get("T_base_root")
+    T_base_root = np.eye(4) if root is None else read_pose(root, run.scene_dir / SCENE_FILE)
+    return _Stage(
+        still=concatenate([rebuilt.background, *still]),
+        objects=movable,
+        bindings={
+            name: bind(movable[name].cloud.means_m, body.nodes_m)
+            for name, body in soft.items()
+            if name in result.nodes_m and len(movable[name].cloud)
+        },
+        links=read_links(run, rebuilt.record),
+        T_root_base=se3.invert(T_base_root),
+    )
+
+
+def _stamps(
+    episode: Episode, camera_id: str, result: ReplayResult, start_ns: int, *, executed: bool
+) -> list[int]:
+    """When images were recorded during the replayed time, or a grid where none could be."""
+    end_ns = start_ns + int(result.stamps_ns[-1])
+    if executed:
+        topics = [
+            topic
+            for name in (schema.COMPRESSED_IMAGE, schema.IMAGE)
+            for topic in episode.topics_of_type(name)
+            if topic.endswith(f"/cam/{camera_id}/color/image") and not schema.is_truth(topic)
+        ]
+        stamps = [
+            message.publish_time_ns
+            for message in episode.messages(topics)
+            if start_ns <= message.publish_time_ns <= end_ns
+        ]
+    else:
+        stamps = np.arange(start_ns, end_ns, round(1e9 / RATE_HZ)).tolist()
+    step = -(-len(stamps) // MAX_IMAGES) or 1
+    return stamps[::step]
+
+
+def _mounting(
+    episode: Episode, tree: TransformTree, frame_id: str, result: ReplayResult
+) -> Float[np.ndarray, "4 4"] | None:
+    """Where a camera sits in the hand; None for one that stands still."""
+    if tree.root_of(frame_id) != BASE_FRAME:
+        return None
+    T_base_camera = carried_camera(episode, frame_id, result.joints_rad[0])
+    return None if T_base_camera is None else se3.invert(result.Ts_base_tcp[0]) @ T_base_camera

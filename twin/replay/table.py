@@ -1,0 +1,156 @@
+"""The tables of ``robot-gst replay``: verdicts, planned and executed against recorded, partings."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from bridge.episode import streams
+from bridge.episode.catalogue.labels import outcome_of
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
+from bridge.errors import GstError
+
+WORDS = {True: "accepted", False: "rejected", None: "undecided"}
+LABELS = ("success", "failure", "unknown")
+PLANNED, EXECUTED = "planned in twin", "executed in twin"
+SIDES = {("planned", "dynamic"): PLANNED, ("executed", "dynamic"): EXECUTED}
+
+Rows = Sequence[Mapping[str, Any]]
+
+
+def count_verdicts(rows: Rows) -> dict[str, dict[str, int]]:
+    """Accepted, rejected, undecided and failed per trajectory and mode, and how many in all."""
+    counts: dict[str, Counter[str]] = {}
+    for row in rows:
+        key = f"{row['trajectory']} {row['mode']}"
+        if key == "planned dynamic" and not row["executed"]:
+            key = "planned dynamic, never executed"
+        if "+attach" in (row.get("engine") or ""):
+            key += ", attached grasp"
+        counts.setdefault(key, Counter())["failed" if row["error"] else WORDS[row["accepted"]]] += 1
+        counts[key]["n"] += 1
+    words = ("n", "accepted", "rejected", "undecided", "failed")
+    return {key: {word: counter[word] for word in words} for key, counter in counts.items()}
+
+
+def recorded_labels(run: RunFolder, episode_ids: Sequence[str]) -> dict[str, str]:
+    """What the operator said of each episode: success, failure or unknown."""
+    labels = {}
+    for episode_id in episode_ids:
+        try:
+            labels[episode_id] = _label(run, episode_id)
+        except (GstError, TypeError):
+            labels[episode_id] = "unknown"
+    return labels
+
+
+def _label(run: RunFolder, episode_id: str) -> str:
+    episode = Episode.open(run.episodes_dir / f"{episode_id}.mcap")
+    outcome = outcome_of(run, episode)
+    if outcome is not None:
+        return outcome.result
+    said = [event.get("outcome") for event in streams.events(episode) if event["type"] == "label"]
+    last = said[-1] if said else None
+    return str(last.get("result", "unknown")) if isinstance(last, dict) else "unknown"
+
+
+def executions_of(rows: Rows, labels: Mapping[str, str]) -> list[dict[str, Any]]:
+    """One entry per executed plan: what each side says, and where they part first."""
+    found: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in rows:
+        if not row["executed"]:
+            continue
+        key = (row["episode"], row["plan"])
+        entry = found.setdefault(
+            key,
+            {
+                "episode": row["episode"],
+                "plan": row["plan"],
+                "recorded": labels.get(row["episode"], "unknown"),
+                "recorded_predicates": None,
+                "planned": None,
+                "executed": None,
+                "lag_s": None,
+                "apart": None,
+            },
+        )
+        if row["mode"] == "kinematic":
+            entry["recorded_predicates"] = row.get("predicates")
+        else:
+            entry[row["trajectory"]] = row["accepted"]
+        if row.get("divergence"):
+            entry["apart"], entry["lag_s"] = row["divergence"]["first"], row["divergence"]["lag_s"]
+    return list(found.values())
+
+
+def cross_table(executions: Rows) -> dict[str, dict[str, dict[str, int]]]:
+    """Planned and executed in the twin, by what they said, against the recorded label."""
+    table: dict[str, dict[str, dict[str, int]]] = {}
+    for name, key in ((PLANNED, "planned"), (EXECUTED, "executed")):
+        table[name] = {
+            word: {
+                label: sum(
+                    entry[key] is value and entry["recorded"] == label for entry in executions
+                )
+                for label in LABELS
+            }
+            for value, word in WORDS.items()
+        }
+    return table
+
+
+def describe_run(summary: Mapping[str, Any]) -> str:
+    """The final tables as text."""
+    if not summary["rows"]:
+        return "No trial with a plan to replay."
+    lines = _count_lines(summary["counts"])
+    executions = summary.get("executions", [])
+    if executions:
+        lines += ["", *_cross_lines(cross_table(executions)), "", *_parting_lines(executions)]
+    rejected = [row for row in summary["rows"] if row["accepted"] is False]
+    if rejected:
+        lines += ["", "rejected:"]
+    lines += [
+        f"  {row['episode']} {row['plan']} {row['trajectory']} {row['mode']}: {row['reason']}"
+        for row in rejected
+    ]
+    kept = sum(row["skipped"] for row in summary["rows"])
+    if kept:
+        lines.append(f"{kept} of {len(summary['rows'])} were there already; --force redoes them.")
+    return "\n".join(lines)
+
+
+def _count_lines(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
+    width = max(len(key) for key in counts)
+    lines = [
+        f"{'':{width}}  {'n':>5} {'accepted':>9} {'rejected':>9} {'undecided':>9} {'failed':>7}"
+    ]
+    return lines + [
+        f"{key:{width}}  {c['n']:>5} {c['accepted']:>9} {c['rejected']:>9} {c['undecided']:>9} "
+        f"{c['failed']:>7}"
+        for key, c in sorted(counts.items())
+    ]
+
+
+def _cross_lines(table: Mapping[str, Mapping[str, Mapping[str, int]]]) -> list[str]:
+    lines = [f"{'':28}  {'recorded:':>9} {'success':>8} {'failure':>8} {'unlabelled':>10}"]
+    for name, rows in table.items():
+        for word, cells in rows.items():
+            lines.append(
+                f"{name:<17} {word:<10}  {'':>9} {cells['success']:>8} {cells['failure']:>8} "
+                f"{cells['unknown']:>10}"
+            )
+    return lines
+
+
+def _parting_lines(executions: Rows) -> list[str]:
+    lines = ["where planned, executed and recorded part first:"]
+    for entry in executions:
+        apart = entry["apart"]
+        if apart is None:
+            said = "nowhere" if entry["executed"] is not None else "not compared"
+        else:
+            said = f"{apart['first_t_ns'] * 1e-9:.2f} s: {apart['detail']} ({apart['attribution']})"
+        lag = "" if entry["lag_s"] is None else f", lag {entry['lag_s'] * 1e3:.0f} ms"
+        lines.append(f"  {entry['episode']} {entry['plan']}: {said}{lag}")
+    return lines
