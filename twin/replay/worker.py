@@ -32,10 +32,10 @@ _starting = threading.Lock()
 class WorkerDiedError(TwinError):
     """The process that did the work is gone."""
 
-    def __init__(self, *, exit_code: int | None) -> None:
-        """Remember how it ended."""
-        self.exit_code = exit_code
-        super().__init__(f"the process that did it ended {_ending(exit_code)}")
+    def __init__(self, *, status: int | None) -> None:
+        """Remember its exit code, or minus the number of the signal that ended it."""
+        self.status = status
+        super().__init__(f"the process that did it ended {_ending(status)}")
 
 
 class TimeIsUpError(TwinError):
@@ -89,7 +89,7 @@ class Worker:
         try:
             self._pipe.send((function, item))
         except OSError as error:
-            raise WorkerDiedError(exit_code=self._exit_code()) from error
+            raise WorkerDiedError(status=self._status()) from error
         self.busy = True
 
     def finish(self, timeout_s: float | None = None) -> Answer | Failed:
@@ -105,11 +105,11 @@ class Worker:
                 raise TimeIsUpError(message)
             answer = self._pipe.recv()
         except (EOFError, OSError) as error:
-            raise WorkerDiedError(exit_code=self._exit_code()) from error
+            raise WorkerDiedError(status=self._status()) from error
         self.busy = False
         return answer
 
-    def _exit_code(self) -> int | None:
+    def _status(self) -> int | None:
         self._process.join(JOIN_S)
         return self._process.exitcode
 
@@ -161,14 +161,14 @@ def _one_thread() -> Iterator[None]:
                     os.environ[name] = value
 
 
-def _ending(exit_code: int | None) -> str:
-    if exit_code is None:
+def _ending(status: int | None) -> str:
+    if status is None:
         return "without a word"
-    if exit_code >= 0:
-        return f"with exit code {exit_code}"
+    if status >= 0:
+        return f"with exit code {status}"
     try:
-        name = signal.Signals(-exit_code).name
+        name = signal.Signals(-status).name
     except ValueError:
-        name = f"signal {-exit_code}"
+        name = f"signal {-status}"
     memory = ", perhaps by a machine short of memory" if name == "SIGKILL" else ""
     return f"by {name}{memory}"

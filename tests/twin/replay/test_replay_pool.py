@@ -154,5 +154,5 @@ def test_a_worker_that_ends_says_how() -> None:
     worker = Worker()
     worker.begin(os._exit, 3)
     with pytest.raises(WorkerDiedError, match="with exit code 3"):
-        worker.finish(20)
+        worker.finish(20.0)
     worker.close()

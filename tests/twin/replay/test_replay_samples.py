@@ -18,7 +18,7 @@ from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.replay.calibrated import calibrated
 from twin.replay.config import ReplayConfig
-from twin.replay.rollout import replay_plan
+from twin.replay.path import path_of_plan
 from twin.replay.samples import (
     Sample,
     draw_variation,
@@ -29,6 +29,7 @@ from twin.replay.samples import (
 )
 from twin.replay.scene import ReplayScene
 from twin.replay.variation import VariationConfig
+from twin.robot.model import load_robot
 from twin.scene.calibration import Calibration
 
 UNSURE = np.diag([4e-6, 9e-6, 1e-6, 1e-4, 1e-4, 4e-4])
@@ -66,14 +67,14 @@ def test_what_stands_goes_on_standing_and_moves_as_far_as_localisation_is_unsure
 ) -> None:
     scene = scene_with(script)
     T = scene.Ts_base_object["cube"]
-    moved = np.array([draw.Ts_base_object["cube"] for draw in draws(scene, 4000)])
+    moved = np.array([draw.Ts_base_object["cube"] for draw in draws(scene, 800)])
     np.testing.assert_array_equal(moved[:, 2, 3], T[2, 3])
     np.testing.assert_allclose(moved[:, 2, 2], 1.0, atol=1e-12)
     shifts = moved[:, :2, 3] - T[:2, 3]
-    # Compared with the sampling error of 4000 draws (5 standard errors).
-    np.testing.assert_allclose(np.cov(shifts.T), CORRELATED[:2, :2], atol=5 * 9e-6 / np.sqrt(2000))
+    # Compared with the sampling error of 800 draws (5 standard errors).
+    np.testing.assert_allclose(np.cov(shifts.T), CORRELATED[:2, :2], atol=5 * 9e-6 / np.sqrt(400))
     turns = np.arctan2(*(T[:3, :3].T @ moved[:, :3, :3])[:, (1, 0), 0].T)
-    assert np.std(turns) == pytest.approx(0.02, rel=0.06)
+    assert np.std(turns) == pytest.approx(0.02, rel=0.12)
 
 
 def test_an_object_in_the_air_moves_in_all_six_directions(script: SimpleNamespace) -> None:
@@ -81,7 +82,7 @@ def test_an_object_in_the_air_moves_in_all_six_directions(script: SimpleNamespac
     lifted = scene.Ts_base_object["cube"].copy()
     lifted[2, 3] += 0.1
     scene = replace(scene, Ts_base_object={**scene.Ts_base_object, "cube": lifted})
-    moved = np.array([draw.Ts_base_object["cube"] for draw in draws(scene, 2000)])
+    moved = np.array([draw.Ts_base_object["cube"] for draw in draws(scene, 500)])
     steps = np.concatenate(
         [
             moved[:, :3, 3] - lifted[:3, 3],
@@ -89,7 +90,7 @@ def test_an_object_in_the_air_moves_in_all_six_directions(script: SimpleNamespac
         ],
         axis=1,
     )
-    np.testing.assert_allclose(np.std(steps, axis=0), np.sqrt(np.diag(CORRELATED)), rtol=0.08)
+    np.testing.assert_allclose(np.std(steps, axis=0), np.sqrt(np.diag(CORRELATED)), rtol=0.16)
 
 
 def test_given_standing_is_the_conditional_distribution() -> None:
@@ -133,26 +134,26 @@ def test_a_toy_looks_different_from_every_side() -> None:
 
 def test_without_a_covariance_the_prior_says_how_unsure_a_pose_is(script: SimpleNamespace) -> None:
     scene = scene_with(script, None)
-    moved = np.array([d.Ts_base_object["cube"] for d in draws(scene, 1000, unknown_pose_m=0.01)])
-    assert np.std(moved[:, 0, 3]) == pytest.approx(0.01, rel=0.1)
+    moved = np.array([d.Ts_base_object["cube"] for d in draws(scene, 300, unknown_pose_m=0.01)])
+    assert np.std(moved[:, 0, 3]) == pytest.approx(0.01, rel=0.2)
 
 
 def test_physics_is_log_normal_around_what_the_nominal_replay_uses(
     script: SimpleNamespace,
 ) -> None:
     scene = scene_with(script)
-    found = draws(scene, 3000, friction_log=0.3)
+    found = draws(scene, 600, friction_log=0.3)
     frictions = np.log([draw.physics.object_friction / 0.8 for draw in found])
     assert stats.kstest(frictions / 0.3, "norm").pvalue > 1e-3
     masses = np.log([draw.objects["cube"].mass_kg for draw in found])
-    assert np.exp(np.median(masses)) == pytest.approx(scene.task.objects["cube"].mass_kg, rel=0.03)
+    assert np.exp(np.median(masses)) == pytest.approx(scene.task.objects["cube"].mass_kg, rel=0.05)
     assert all(draw.objects["box"] == scene.task.objects["box"] for draw in found)
     delays = [draw.grip_delay_s for draw in found]
     assert stats.kstest(delays, "uniform", args=(0.0, 0.1)).pvalue > 1e-3
 
 
 def test_a_calibration_replaces_the_priors_of_what_it_identified(script: SimpleNamespace) -> None:
-    found = draws(scene_with(script), 500, calibrated=(("object_friction", 0.01),))
+    found = draws(scene_with(script), 200, calibrated=(("object_friction", 0.01),))
     assert np.std(np.log([d.physics.object_friction for d in found])) == pytest.approx(
         0.01, rel=0.2
     )
@@ -281,15 +282,19 @@ def test_a_spread_that_is_none_is_refused() -> None:
         VariationConfig(friction_log=-0.1)
 
 
-@pytest.mark.slow
-def test_a_late_gripper_and_a_heavier_cube_are_replayed_as_drawn(script: SimpleNamespace) -> None:
-    scene = scene_with(script)
-    plan = script.plan(scene)
-    config = ReplayConfig(settle_after_s=0.4)
-    late = replay_plan(plan, scene, replace(config, grip_delay_s=0.2))
-    prompt = replay_plan(plan, scene, config)
-    closing = [int(result.stamps_ns[np.argmax(result.width_m < 0.08)]) for result in (prompt, late)]
-    assert (closing[1] - closing[0]) * 1e-9 == pytest.approx(0.2, abs=0.02)
+def test_a_late_gripper_lags_behind_the_arm(
+    script: SimpleNamespace,
+) -> None:
+    scene = script.scene()
+    config = ReplayConfig()
+    path, _, _ = path_of_plan(script.plan(scene), load_robot(scene.urdf), config)
+    late = path.with_late_gripper(0.2)
+    times = np.arange(0, path.end_ns(), 10_000_000)
+    np.testing.assert_array_equal(late.joints_at(times), path.joints_at(times))
+    np.testing.assert_array_equal(late.width_at(times + 200_000_000), path.width_at(times))
+    assert path.first_close_ns is not None
+    assert late.first_close_ns == path.first_close_ns + 200_000_000
+    assert path.with_late_gripper(0.0) is path
 
 
 def test_what_was_identified_of_pairs_is_not_varied_once_more(script: SimpleNamespace) -> None:
