@@ -126,8 +126,8 @@ def against_torch(repeats: int) -> Target:
     )
 
 
-def iterations(count: int, threads: int, repeats: int) -> tuple[float, dict[str, float]]:
-    """Wall time of a whole fit step and of its stages, medians [s]."""
+def iterations(count: int, threads: int, repeats: int) -> tuple[float, float, dict[str, float]]:
+    """Wall time of a whole fit step, what of it is serial, and its stages, medians [s]."""
     rng = np.random.default_rng(1)
     size = (VGA.height, VGA.width)
     target = Seen(
@@ -143,24 +143,28 @@ def iterations(count: int, threads: int, repeats: int) -> tuple[float, dict[str,
         name: statistics.median(report.seconds[name] for report in reports)
         for name in reports[0].seconds
     }
-    return statistics.median(sum(report.seconds.values()) for report in reports), stages
+    total = statistics.median(sum(report.seconds.values()) for report in reports)
+    return total, statistics.median(report.serial_s for report in reports), stages
 
 
 def with_threads(count: int, repeats: int) -> tuple[Target, dict[str, dict[str, float]]]:
-    one, stages_one = iterations(count, 1, repeats)
-    two, stages_two = iterations(count, 2, repeats)
+    one, serial, stages_one = iterations(count, 1, repeats)
+    two, _, stages_two = iterations(count, 2, repeats)
+    share = serial / one
     print(f"fit step, {count} Gaussians, 640 x 480, wall time [ms]")
     print("  threads  " + "".join(f"{name:>9}" for name in stages_one) + "      all")
     for threads, total, stages in ((1, one, stages_one), (2, two, stages_two)):
         row = "".join(f"{seconds * 1e3:9.2f}" for seconds in stages.values())
         print(f"  {threads:7d}  {row}{total * 1e3:9.2f}")
+    bound = f"serial {100 * share:.1f} %: at most {2 / (1 + share):.2f} x by Amdahl's law"
+    print(f"  {bound}")
     target = Target(
         what=f"fit step, {count // 1000}k Gaussians, two threads faster than one",
         measured=one / two,
         limit=THREADS_FACTOR,
         unit="x",
         at_most=False,
-        reference=f"{one * 1e3:.1f} ms, {two * 1e3:.1f} ms wall",
+        reference=f"{one * 1e3:.1f} ms, {two * 1e3:.1f} ms wall; {bound}",
     )
     return target, {"1": stages_one, "2": stages_two}
 

@@ -34,6 +34,8 @@ class StepReport:
     """Gradient of the loss on the camera's pose, as in ``CloudGradient``."""
     seconds: Mapping[str, float]
     """Wall time of each stage: draw, compare, pull, learn."""
+    serial_s: float
+    """How much of it one thread spent alone: by Amdahl's law it bounds what more threads gain."""
 
 
 class FitSession:
@@ -101,7 +103,7 @@ class FitSession:
         """
         self.steps += 1
         red, green, blue = (float(value) for value in gain)
-        loss, squared, num_static, d_gain, d_pose, seconds = self._native.step(
+        loss, squared, num_static, d_gain, d_pose, seconds, serial_s = self._native.step(
             self._tables(dict(arrays(self._cloud))),
             self._tables(self._first),
             self._tables(self._second),
@@ -122,6 +124,7 @@ class FitSession:
             gain=np.array(d_gain),
             T_camera_base=d_pose,
             seconds=dict(zip(STAGES, seconds, strict=True)),
+            serial_s=serial_s,
         )
 
     def planes(self) -> Float32[np.ndarray, "5 height width"]:

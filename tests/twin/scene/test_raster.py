@@ -106,6 +106,17 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
             np.testing.assert_array_equal(first, second)
 
 
+def test_equal_depths_and_uneven_shares_show_no_threads() -> None:
+    """Ties go by index, and threads that have little to sort are no exception."""
+    cloud = many_gaussians(9000)
+    cloud.means_m[:, 2] = np.round(cloud.means_m[:, 2] * 4) / 4
+    cloud.means_m[2500:8000, 2] *= -1.0
+    drawn = [draw(cloud, RasterConfig(threads=threads)) for threads in (1, 2, 3, 4, 7)]
+    assert drawn[0][4].max() > 0.5
+    for other in drawn[1:]:
+        np.testing.assert_array_equal(drawn[0], other)
+
+
 def test_a_gaussian_behind_the_camera_is_not_drawn() -> None:
     cloud = one_gaussian(x_px=20.0, y_px=16.5)
     behind = GaussianCloud(**(dict(arrays(cloud)) | {"means_m": -cloud.means_m}))

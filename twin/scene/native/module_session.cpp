@@ -110,7 +110,8 @@ class PyFitSession {
         return nb::make_tuple(
             result.loss, result.squared, result.static_pixels,
             std::make_tuple(result.gain[0], result.gain[1], result.gain[2]), pose,
-            std::make_tuple(result.draw_s, result.compare_s, result.pull_s, result.learn_s));
+            std::make_tuple(result.draw_s, result.compare_s, result.pull_s, result.learn_s),
+            result.serial_s);
     }
 
     NewArray<float> copy(int table, std::initializer_list<std::size_t> shape) const {

@@ -4,6 +4,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "depth_order.hpp"
 #include "kernels.hpp"
 
 namespace splat {
@@ -35,6 +36,8 @@ class Rasteriser {
     int count() const { return count_; }
     const Camera& camera() const { return camera_; }
     std::int64_t num_pairs() const { return static_cast<std::int64_t>(tile_ids_.size()); }
+    // Time spent so far in loops that threads share, in ``draw`` and ``pull``.
+    double parallel_s() const { return parallel_s_; }
 
   private:
     struct TileRange {
@@ -42,12 +45,15 @@ class Rasteriser {
     };
     TileRange tiles_of(const Projected&) const;
     void project(const Splats&);
-    void sort_by_depth();
+    void project_block(const Splats&, int begin, int end);
+    void sort_and_count();
+    void begin_tiles();
     void fill_tiles();
     TileJob job(int tile) const;
     TileJob drawn_job(int tile) const;
     float* begin_pair_rows(int tile, int row_floats);
     void add_pair_rows(int index, int row_floats, float* sums) const;
+    void gather_gradients(const Splats&, const SplatGradients&, int block);
     int num_tiles() const { return tiles_x_ * tiles_y_; }
 
     const Kernels& kernels_;
@@ -59,16 +65,17 @@ class Rasteriser {
     std::vector<Projected> projected_;
     std::vector<TileRange> ranges_;
     std::vector<std::uint32_t> order_;                    // visible Gaussians, front to back
-    std::vector<std::uint64_t> entries_, other_entries_;  // depth above, index below
+    DepthOrder depth_order_;
     std::vector<std::int64_t> tile_begin_;
     std::vector<std::uint32_t> tile_ids_;
-    std::vector<std::int64_t> next_;        // where each block of order_ writes in each tile
+    std::vector<std::int64_t> next_;        // where each slice of order_ writes in each tile
     std::vector<int> drawn_;                // per tile: Gaussians drawn before it was opaque
     std::vector<std::int64_t> slot_begin_;  // per Gaussian: its pairs in slots_
     std::vector<std::int64_t> slots_;       // where those pairs stand in tile_ids_
     std::vector<float> pair_rows_;
     std::vector<float> tile_planes_;  // working memory of each thread
     std::vector<float> pose_sums_;    // of each block of Gaussians
+    double parallel_s_ = 0;
 };
 
 }  // namespace splat

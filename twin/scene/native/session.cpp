@@ -5,12 +5,20 @@
 #include <chrono>
 #include <cmath>
 
+#include "threads.hpp"
+
 namespace splat {
 
 namespace {
 
 constexpr int kColumns[Tables::kCount] = {3, 4, 3, 1, 3, 3 * kHarmonics};
-constexpr std::int64_t kLearnBlock = 1 << 14;
+constexpr std::int64_t kLearnBlock = 1 << 13;
+
+struct LearnBlock {
+    int table;
+    std::int64_t at;
+    int size;
+};
 
 double seconds_since(std::chrono::steady_clock::time_point* start) {
     const auto now = std::chrono::steady_clock::now();
@@ -47,7 +55,9 @@ StepResult FitSession::step(int count, const Camera& camera, const Settings& set
     float* const* table = learning.values.table;
     const Splats splats{table[0], table[1], table[2], table[3], table[4], table[5]};
     StepResult result{};
-    auto clock = std::chrono::steady_clock::now();
+    const auto begin = std::chrono::steady_clock::now();
+    auto clock = begin;
+    parallel_s_ = -rasteriser_.parallel_s();
     start(count, learning, pixels);
     rasteriser_.draw(splats, count, camera, settings, planes_.data());
     result.draw_s = seconds_since(&clock);
@@ -58,6 +68,8 @@ StepResult FitSession::step(int count, const Camera& camera, const Settings& set
     result.pull_s = seconds_since(&clock);
     learn(count, learning);
     result.learn_s = seconds_since(&clock);
+    parallel_s_ += rasteriser_.parallel_s();
+    result.serial_s = std::chrono::duration<double>(clock - begin).count() - parallel_s_;
     return result;
 }
 
@@ -69,12 +81,15 @@ ColorRow FitSession::color_row(const FitTarget& target, int channel, int y) cons
             target.gain[channel], camera.width};
 }
 
-double FitSession::compare(const FitTarget& target, const LossWeights& weights,
-                           StepResult* result) {
+// Fills the images to compare and the sums of their differences, row by row.
+void FitSession::compare_rows(const FitTarget& target) {
     const Camera& camera = rasteriser_.camera();
-    row_counts_.assign(2 * camera.height, 0);
+    const int height = camera.height;
+    row_counts_.assign(2 * height, 0);
+    row_sums_.assign(6 * height, 0.0);
+    const InParallel timed(&parallel_s_);
 #pragma omp parallel for schedule(static) num_threads(threads_)
-    for (int y = 0; y < camera.height; ++y) {
+    for (int y = 0; y < height; ++y) {
         std::int64_t is_static = 0, measured = 0;
         const std::int64_t row = static_cast<std::int64_t>(y) * camera.width;
         for (int x = 0; x < camera.width; ++x) {
@@ -83,28 +98,52 @@ double FitSession::compare(const FitTarget& target, const LossWeights& weights,
         }
         row_counts_[2 * y] = is_static;
         row_counts_[2 * y + 1] = measured;
+        for (int channel = 0; channel < 3; ++channel) {
+            const std::int64_t task = static_cast<std::int64_t>(channel) * height + y;
+            kernels_.compare_row(color_row(target, channel, y),
+                                 compared_.data() + task * camera.width,
+                                 wanted_.data() + task * camera.width, &row_sums_[2 * task],
+                                 &row_sums_[2 * task + 1]);
+        }
     }
-    std::int64_t measured = 0;
-    for (int y = 0; y < camera.height; ++y) {
-        result->static_pixels += row_counts_[2 * y];
-        measured += row_counts_[2 * y + 1];
-    }
-    const double photometric = compare_colors(target, weights, result);
-    return photometric + compare_depth(target, weights, measured);
 }
 
-double FitSession::compare_colors(const FitTarget& target, const LossWeights& weights,
-                                  StepResult* result) {
+// Turns the gradient of the similarity into that of the loss, and adds that of depth.
+void FitSession::gradient_rows(const FitTarget& target, const ColorWeights& weights,
+                               float depth_weight) {
+    const Camera& camera = rasteriser_.camera();
+    const int height = camera.height;
+    const std::int64_t pixels = static_cast<std::int64_t>(camera.width) * height;
+    row_sums_.assign(4 * height, 0.0);
+    const InParallel timed(&parallel_s_);
+#pragma omp parallel for schedule(static) num_threads(threads_)
+    for (int y = 0; y < height; ++y) {
+        const std::int64_t row = static_cast<std::int64_t>(y) * camera.width;
+        for (int channel = 0; channel < 3; ++channel) {
+            const std::int64_t at = channel * pixels + row;
+            row_sums_[channel * height + y] = kernels_.color_gradient_row(
+                color_row(target, channel, y), compared_.data() + at, wanted_.data() + at, weights,
+                plane_gradients_.data() + at);
+        }
+        float* on_depth = plane_gradients_.data() + 3 * pixels + row;
+        const float* drawn = planes_.data() + 3 * pixels + row;
+        const DepthRow depth{drawn,        drawn + pixels, target.depth_m + row,
+                             target.is_static + row, depth_weight, camera.width};
+        row_sums_[3 * height + y] =
+            kernels_.depth_gradient_row(depth, on_depth, on_depth + pixels);
+    }
+}
+
+double FitSession::compare(const FitTarget& target, const LossWeights& weights,
+                           StepResult* result) {
     const Camera& camera = rasteriser_.camera();
     const int height = camera.height, tasks = 3 * height;
     const double entries = 3.0 * camera.width * height;
-    row_sums_.assign(2 * tasks, 0.0);
-#pragma omp parallel for schedule(static) num_threads(threads_)
-    for (int task = 0; task < tasks; ++task) {
-        const std::int64_t at = static_cast<std::int64_t>(task) * camera.width;
-        kernels_.compare_row(color_row(target, task / height, task % height),
-                             compared_.data() + at, wanted_.data() + at, &row_sums_[2 * task],
-                             &row_sums_[2 * task + 1]);
+    compare_rows(target);
+    std::int64_t measured = 0;
+    for (int y = 0; y < height; ++y) {
+        result->static_pixels += row_counts_[2 * y];
+        measured += row_counts_[2 * y + 1];
     }
     double l1 = 0;
     for (int task = 0; task < tasks; ++task) {
@@ -114,9 +153,11 @@ double FitSession::compare_colors(const FitTarget& target, const LossWeights& we
     double loss = result->squared / entries;
     ColorWeights row_weights{0.0f, static_cast<float>(1.0 / entries), 0.0f};
     if (weights.structural) {
+        const double before_s = similarity_.parallel_s();
         const double similarity =
             similarity_.mean(compared_.data(), wanted_.data(), plane_gradients_.data(),
                              camera.width, height);
+        parallel_s_ += similarity_.parallel_s() - before_s;
         loss = weights.l1_share * l1 / entries + (1.0 - weights.l1_share) * (1.0 - similarity);
         row_weights = {static_cast<float>(weights.l1_share / entries), 0.0f,
                        1.0f - weights.l1_share};
@@ -124,58 +165,36 @@ double FitSession::compare_colors(const FitTarget& target, const LossWeights& we
         std::fill_n(plane_gradients_.begin(), 3 * static_cast<std::int64_t>(camera.width) * height,
                     0.0f);
     }
-#pragma omp parallel for schedule(static) num_threads(threads_)
-    for (int task = 0; task < tasks; ++task) {
-        const std::int64_t at = static_cast<std::int64_t>(task) * camera.width;
-        row_sums_[task] = kernels_.color_gradient_row(
-            color_row(target, task / height, task % height), compared_.data() + at,
-            wanted_.data() + at, row_weights, plane_gradients_.data() + at);
-    }
+    const double depth_share = measured == 0 ? 0.0 : weights.depth / static_cast<double>(measured);
+    gradient_rows(target, row_weights, static_cast<float>(depth_share));
     for (int task = 0; task < tasks; ++task) result->gain[task / height] += row_sums_[task];
-    return loss;
+    double depth = 0;
+    for (int y = 0; y < height; ++y) depth += row_sums_[tasks + y];
+    return loss + depth_share * depth;
 }
 
-double FitSession::compare_depth(const FitTarget& target, const LossWeights& weights,
-                                 std::int64_t measured) {
-    const Camera& camera = rasteriser_.camera();
-    const std::int64_t pixels = static_cast<std::int64_t>(camera.width) * camera.height;
-    float* on_depth = plane_gradients_.data() + 3 * pixels;
-    if (weights.depth == 0 || measured == 0) {
-        std::fill_n(on_depth, 2 * pixels, 0.0f);
-        return 0;
-    }
-    const float weight = weights.depth / static_cast<float>(measured);
-#pragma omp parallel for schedule(static) num_threads(threads_)
-    for (int y = 0; y < camera.height; ++y) {
-        const std::int64_t at = static_cast<std::int64_t>(y) * camera.width;
-        const float* drawn = planes_.data() + 3 * pixels + at;
-        const DepthRow row{drawn, drawn + pixels, target.depth_m + at, target.is_static + at,
-                           weight, camera.width};
-        row_sums_[y] = kernels_.depth_gradient_row(row, on_depth + at, on_depth + pixels + at);
-    }
-    double total = 0;
-    for (int y = 0; y < camera.height; ++y) total += row_sums_[y];
-    return weights.depth * total / static_cast<double>(measured);
-}
-
+// Blocks of all tables are one list of tasks: waking threads for each table costs more than Adam.
 void FitSession::learn(int count, const Learning& learning) {
+    std::vector<LearnBlock> blocks;
     for (int table = 0; table < Tables::kCount; ++table) {
         if (learning.rates[table] == 0 || learning.values.table[table] == nullptr) continue;
-        const AdamRates rates{
-            learning.rates[table],
-            learning.beta1,
-            learning.beta2,
-            learning.epsilon,
-            static_cast<float>(1 - std::pow(double(learning.beta1), learning.step)),
-            static_cast<float>(1 - std::pow(double(learning.beta2), learning.step))};
         const std::int64_t size = std::int64_t{kColumns[table]} * count;
-        float* values = learning.values.table[table];
-        float *first = learning.first.table[table], *second = learning.second.table[table];
-        const float* gradients = gradient(table);
-#pragma omp parallel for schedule(static) num_threads(threads_)
         for (std::int64_t at = 0; at < size; at += kLearnBlock)
-            kernels_.adam(values + at, gradients + at, first + at, second + at, rates,
-                          static_cast<int>(std::min(kLearnBlock, size - at)));
+            blocks.push_back({table, at, static_cast<int>(std::min(kLearnBlock, size - at))});
+    }
+    const auto correction = [&](float beta) {
+        return static_cast<float>(1 - std::pow(double{beta}, learning.step));
+    };
+    const float correction1 = correction(learning.beta1), correction2 = correction(learning.beta2);
+    const InParallel timed(&parallel_s_);
+#pragma omp parallel for schedule(static) num_threads(threads_)
+    for (std::size_t i = 0; i < blocks.size(); ++i) {
+        const auto [table, at, size] = blocks[i];
+        const AdamRates rates{learning.rates[table], learning.beta1, learning.beta2,
+                              learning.epsilon,      correction1,    correction2};
+        kernels_.adam(learning.values.table[table] + at, gradient(table) + at,
+                      learning.first.table[table] + at, learning.second.table[table] + at, rates,
+                      size);
     }
 }
 

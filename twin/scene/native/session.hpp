@@ -29,6 +29,7 @@ struct StepResult {
     double gain[3];              // dL/dgain
     double pose[kPoseEntries];   // dL/d[R | t]
     double draw_s, compare_s, pull_s, learn_s;
+    double serial_s;             // of these, outside of the loops that threads share
 };
 
 // The six tables of a cloud, or of what belongs to each of their entries.
@@ -62,8 +63,8 @@ class FitSession {
     void start(int count, const Learning&, std::int64_t pixels);
     SplatGradients gradient_tables(bool with_harmonics);
     double compare(const FitTarget&, const LossWeights&, StepResult*);
-    double compare_colors(const FitTarget&, const LossWeights&, StepResult*);
-    double compare_depth(const FitTarget&, const LossWeights&, std::int64_t measured);
+    void compare_rows(const FitTarget&);
+    void gradient_rows(const FitTarget&, const ColorWeights&, float depth_weight);
     void learn(int count, const Learning&);
     ColorRow color_row(const FitTarget&, int channel, int y) const;
 
@@ -75,6 +76,7 @@ class FitSession {
     std::vector<float> compared_, wanted_;  // 3 x height x width
     std::vector<double> row_sums_;
     std::vector<std::int64_t> row_counts_;
+    double parallel_s_ = 0;  // of the step that runs
     std::vector<float> gradients_;
     std::int64_t gradient_begin_[Tables::kCount + 1] = {0};
 };

@@ -2,6 +2,8 @@
 
 #include <cstdint>
 
+#include "threads.hpp"
+
 namespace splat {
 
 double Similarity::mean(const float* rendered, const float* target, float* gradient, int width,
@@ -11,12 +13,15 @@ double Similarity::mean(const float* rendered, const float* target, float* gradi
     const int strips = (width + kStripColumns - 1) / kStripColumns, tasks = kChannels * strips;
     const float scale = 1.0f / (kChannels * size);
     sums_.resize(tasks);
+    {
+        const InParallel timed(&parallel_s_);
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads_)
-    for (int task = 0; task < tasks; ++task) {
-        const std::int64_t plane = size * (task / strips);
-        sums_[task] = kernels_.similarity_strip(rendered + plane, target + plane,
-                                                gradient + plane, scale, width, height,
-                                                task % strips * kStripColumns);
+        for (int task = 0; task < tasks; ++task) {
+            const std::int64_t plane = size * (task / strips);
+            sums_[task] = kernels_.similarity_strip(rendered + plane, target + plane,
+                                                    gradient + plane, scale, width, height,
+                                                    task % strips * kStripColumns);
+        }
     }
     double total = 0;
     for (const double value : sums_) total += value;

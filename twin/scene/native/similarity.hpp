@@ -15,11 +15,13 @@ class Similarity {
     // pixels and channels, and fills the gradient of that mean with respect to ``rendered``.
     double mean(const float* rendered, const float* target, float* gradient, int width,
                 int height);
+    double parallel_s() const { return parallel_s_; }  // spent so far in ``mean``
 
   private:
     const Kernels& kernels_;
     int threads_;
     std::vector<double> sums_;  // of each strip
+    double parallel_s_ = 0;
 };
 
 }  // namespace splat

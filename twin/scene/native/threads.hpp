@@ -5,6 +5,8 @@
 #include <omp.h>
 #endif
 
+#include <chrono>
+
 namespace splat {
 
 static inline int thread_count(int wanted) {
@@ -23,5 +25,22 @@ static inline int thread_index() {
     return 0;
 #endif
 }
+
+// Stands before a loop that threads share and adds the time of its scope to a sum. What a step
+// takes beyond that sum is serial, and bounds what more threads can gain.
+class InParallel {
+  public:
+    explicit InParallel(double* seconds) : seconds_(seconds) {}
+    ~InParallel() {
+        *seconds_ += std::chrono::duration<double>(Clock::now() - start_).count();
+    }
+    InParallel(const InParallel&) = delete;
+    InParallel& operator=(const InParallel&) = delete;
+
+  private:
+    using Clock = std::chrono::steady_clock;
+    double* seconds_;
+    Clock::time_point start_ = Clock::now();
+};
 
 }  // namespace splat
