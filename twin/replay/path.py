@@ -4,10 +4,11 @@ The IK indicator is 1 when joints exist within their limits that reach every pos
 tolerance, when no joint jumps along the interpolated path, and when no links meet.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import groupby
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
@@ -16,15 +17,14 @@ from bridge.task.robot import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M
 from twin.errors import TwinError
 from twin.replay.config import ReplayConfig
 from twin.replay.failure import Failure
+from twin.replay.joint_checks import jumps, limit_failure, outside_limits
 from twin.robot.collision import RobotHulls
+from twin.robot.follow import Clearance, follow_poses
 from twin.robot.inverse import pose_error, solve_ik
 from twin.robot.model import RobotModel
 
 MAX_DURATION_S = 600.0
 """Longest trajectory that is replayed [s]."""
-_LIMIT_SLACK_RAD = 1e-3
-_SPEED_SLACK = 1.02
-"""Recorded and rounded joints may exceed a limit by as little as this."""
 
 
 class UnusablePlanError(TwinError):
@@ -85,53 +85,120 @@ class JointPath:
 
 
 def path_of_plan(
-    plan: Plan, robot: RobotModel, config: ReplayConfig
+    plan: Plan, robot: RobotModel, config: ReplayConfig, *, clearance: Clearance | None = None
 ) -> tuple[JointPath, list[Failure], int | None]:
     """Solve a plan's waypoints.
 
     Joints given by the plan are the warm start and count only where their own forward kinematics
     reaches the waypoint. Waypoints without joints are joined by straight tool motion.
 
+    Args:
+        plan: What is commanded.
+        robot: What is to follow it.
+        config: Spacing and tolerances.
+        clearance: Says which postures touch something, where the plan leaves the choice.
+
     Returns:
         The path up to the last pose that could be reached, what failed, and the time of the first
         unreachable pose (None when all were reached).
 
     Raises:
-        UnusablePlanError: No waypoints, times that do not increase, another frame or joint order.
+        UnusablePlanError: No waypoints, times that do not increase, another frame, joint order or
+            robot.
     """
-    _check_usable(plan)
-    times: list[int] = []
-    joints: list[Float[np.ndarray, " num_joints"]] = []
-    failures: list[Failure] = []
-    unreachable_ns = None
-    for t_ns, T, given in _targets(plan, config):
-        failure = None if given is None else _check_given(robot, t_ns, given, T, config)
-        if given is not None and failure is None:
-            solved = given
+    _check_usable(plan, robot)
+    knots = _Knots()
+    for is_open, group in groupby(_targets(plan, config), key=lambda target: target.given is None):
+        run = list(group)
+        if is_open:
+            _follow(knots, run, robot, config, clearance)
         else:
-            warm = given if given is not None else (joints[-1] if joints else None)
-            solution = solve_ik(robot, T, config.ik, warm_start_rad=warm)
-            solved = solution.joints_rad
-            if not solution.reached:
-                failure = _unreachable(t_ns, T, solution.position_error_m)
-                unreachable_ns = t_ns
-        failures += [] if failure is None else [failure]
-        if unreachable_ns is None or not joints:
-            times.append(t_ns)
-            joints.append(solved)
-        if unreachable_ns is not None:
+            _take_given(knots, run, robot, config)
+        if knots.unreachable_ns is not None:
             break
     path = JointPath(
-        times_ns=np.array(times, dtype=np.int64),
-        joints_rad=np.stack(joints),
+        times_ns=np.array(knots.times_ns, dtype=np.int64),
+        joints_rad=np.stack(knots.joints),
         width_times_ns=plan.times_ns(),
         width_m=np.array([_width(waypoint) for waypoint in plan.tau]),
         first_close_ns=next((w.t_ns for w in plan.tau if w.g == 1), None),
     )
-    return path, failures, unreachable_ns
+    return path, knots.failures, knots.unreachable_ns
 
 
-def _check_usable(plan: Plan) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Target:
+    """A pose to pass, with joints where the plan gives some."""
+
+    t_ns: int
+    T: Float[np.ndarray, "4 4"]
+    given: Float[np.ndarray, " num_joints"] | None = None
+
+
+@dataclass
+class _Knots:
+    """What has been solved so far."""
+
+    times_ns: list[int] = field(default_factory=list)
+    joints: list[Float[np.ndarray, " num_joints"]] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)
+    unreachable_ns: int | None = None
+
+    def add(self, t_ns: int, joints: Float[np.ndarray, " num_joints"]) -> None:
+        self.times_ns.append(t_ns)
+        self.joints.append(joints)
+
+    def stop(
+        self, robot: RobotModel, target: _Target, nearest: Float[np.ndarray, " num_joints"]
+    ) -> None:
+        """Note a pose that cannot be reached; a path needs at least one knot."""
+        self.unreachable_ns = target.t_ns
+        error_m, _ = pose_error(robot, nearest, target.T)
+        self.failures.append(_unreachable(target.t_ns, target.T, error_m))
+        if not self.joints:
+            self.add(target.t_ns, nearest)
+
+
+def _follow(
+    knots: _Knots,
+    run: list[_Target],
+    robot: RobotModel,
+    config: ReplayConfig,
+    clearance: Clearance | None,
+) -> None:
+    """Solve poses whose joints the plan leaves open."""
+    followed = follow_poses(
+        robot,
+        np.stack([target.T for target in run]),
+        start_rad=knots.joints[-1] if knots.joints else None,
+        config=config.ik,
+        clearance=clearance,
+    )
+    for target, joints, reached in zip(run, followed.joints_rad, followed.reached, strict=True):
+        if not reached:
+            knots.stop(robot, target, joints)
+            return
+        knots.add(target.t_ns, joints)
+
+
+def _take_given(knots: _Knots, run: list[_Target], robot: RobotModel, config: ReplayConfig) -> None:
+    """Take the plan's joints where they reach its own poses, and the nearest that do elsewhere."""
+    for target in run:
+        given = target.given
+        if given is None:
+            continue
+        failure = _check_given(robot, target.t_ns, given, target.T, config)
+        if failure is not None:
+            solution = solve_ik(robot, target.T, config.ik, warm_start_rad=given)
+            given = solution.joints_rad
+            if not solution.reached:
+                knots.stop(robot, target, given)
+                return
+            knots.failures.append(failure)
+        knots.add(target.t_ns, given)
+
+
+def _check_usable(plan: Plan, robot: RobotModel) -> None:
     times = plan.times_ns()
     if len(times) == 0:
         raise UnusablePlanError(plan_id=plan.id, found="has no waypoints", hint="Send tau.")
@@ -167,6 +234,12 @@ def _check_usable(plan: Plan) -> None:
             found=f"is in the frame {plan.frame!r}",
             hint=f"Transform it to {BASE_FRAME!r}.",
         )
+    if plan.robot != robot.name:
+        raise UnusablePlanError(
+            plan_id=plan.id,
+            found=f"is for the robot {plan.robot!r}",
+            hint=f"The robot that was described is {robot.name!r}.",
+        )
     if plan.joint_names and set(plan.joint_names) != set(ARM_JOINTS):
         raise UnusablePlanError(
             plan_id=plan.id,
@@ -175,10 +248,7 @@ def _check_usable(plan: Plan) -> None:
         )
 
 
-Target = tuple[int, Float[np.ndarray, "4 4"], Float[np.ndarray, " num_joints"] | None]
-
-
-def _targets(plan: Plan, config: ReplayConfig) -> list[Target]:
+def _targets(plan: Plan, config: ReplayConfig) -> list[_Target]:
     """Waypoints, and where joints are not given the poses on the straight line between them."""
     times = plan.times_ns()
     quats = plan.quaternions_wxyz()
@@ -187,7 +257,7 @@ def _targets(plan: Plan, config: ReplayConfig) -> list[Target]:
     order = (
         [list(plan.joint_names).index(name) for name in ARM_JOINTS] if plan.joint_names else None
     )
-    targets: list[Target] = []
+    targets: list[_Target] = []
     step_ns = round(config.path_step_s * 1e9)
     for index, waypoint in enumerate(plan.tau):
         given = _given_joints(plan.id, waypoint, order)
@@ -196,9 +266,10 @@ def _targets(plan: Plan, config: ReplayConfig) -> list[Target]:
             between = np.linspace(times[index - 1], times[index], count + 1)[1:-1]
             stamps = between.round().astype(np.int64)
             Ts = poses.at(stamps).transforms()
-            targets += [(int(t), T, None) for t, T in zip(stamps, Ts, strict=True)]
+            targets += [_Target(t_ns=int(t), T=T) for t, T in zip(stamps, Ts, strict=True)]
         q = np.array(waypoint.q_wxyz, dtype=np.float64)
-        targets.append((waypoint.t_ns, se3.transform_from(q, np.array(waypoint.p_m)), given))
+        T_waypoint = se3.transform_from(q, np.array(waypoint.p_m))
+        targets.append(_Target(t_ns=waypoint.t_ns, T=T_waypoint, given=given))
     return targets
 
 
@@ -241,9 +312,9 @@ def _check_given(
     config: ReplayConfig,
 ) -> Failure | None:
     """Say why a plan's own joints are no solution for its pose; None when they are."""
-    outside = _outside_limits(robot, given[None])[0]
+    outside = outside_limits(robot, given[None])[0]
     if np.any(outside):
-        return _limit_failure(robot, t_ns, given, int(np.argmax(outside)))
+        return limit_failure(robot, t_ns, given, int(np.argmax(outside)))
     offset, angle = pose_error(robot, given, T)
     if offset <= config.ik.position_tolerance_m and angle <= config.ik.rotation_tolerance_rad:
         return None
@@ -260,15 +331,15 @@ def check_path(
 ) -> list[Failure]:
     """Find joint limits, jumps, excess speed and self-collision along an interpolated path."""
     failures = []
-    outside = _outside_limits(robot, path.joints_rad)
+    outside = outside_limits(robot, path.joints_rad)
     if np.any(outside):
         knot, joint = (int(i) for i in np.argwhere(outside)[0])
         failures.append(
-            _limit_failure(robot, int(path.times_ns[knot]), path.joints_rad[knot], joint)
+            limit_failure(robot, int(path.times_ns[knot]), path.joints_rad[knot], joint)
         )
     times = path.dense_times_ns(config.path_step_s)
     joints = path.joints_at(times)
-    failures += _jumps(times, joints, robot, config)
+    failures += jumps(times, joints, robot, config)
     widths = path.width_at(times)
     for t_ns, row, width in zip(times, joints, widths, strict=True):
         hulls.place(row, float(width))
@@ -284,54 +355,4 @@ def check_path(
                 )
             )
             break
-    return failures
-
-
-def _outside_limits(
-    robot: RobotModel, joints_rad: Float[np.ndarray, "num_steps num_joints"]
-) -> Bool[np.ndarray, "num_steps num_joints"]:
-    return (joints_rad < robot.lower_rad - _LIMIT_SLACK_RAD) | (
-        joints_rad > robot.upper_rad + _LIMIT_SLACK_RAD
-    )
-
-
-def _limit_failure(
-    robot: RobotModel, t_ns: int, joints_rad: Float[np.ndarray, " num_joints"], joint: int
-) -> Failure:
-    return Failure(
-        t_ns=t_ns,
-        cause="joint_limit",
-        bodies=(ARM_JOINTS[joint],),
-        detail=f"{ARM_JOINTS[joint]} is at {joints_rad[joint]:.3f} rad, its limits are "
-        f"{robot.lower_rad[joint]:.3f} to {robot.upper_rad[joint]:.3f} rad",
-    )
-
-
-def _jumps(
-    times_ns: Int[np.ndarray, " num_times"],
-    joints_rad: Float[np.ndarray, "num_times num_joints"],
-    robot: RobotModel,
-    config: ReplayConfig,
-) -> list[Failure]:
-    if len(times_ns) < 2:
-        return []
-    steps = np.abs(np.diff(joints_rad, axis=0))
-    speeds = steps / (np.diff(times_ns)[:, None] * 1e-9)
-    failures = []
-    for cause, values, limit, unit in (
-        ("joint_jump", steps, np.full(len(ARM_JOINTS), config.max_joint_step_rad), "rad"),
-        ("joint_speed", speeds, robot.velocity_limit_rad_s * _SPEED_SLACK, "rad/s"),
-    ):
-        over = values > limit
-        if np.any(over):
-            index, joint = (int(i) for i in np.argwhere(over)[0])
-            failures.append(
-                Failure(
-                    t_ns=int(times_ns[index]),
-                    cause=cause,
-                    bodies=(ARM_JOINTS[joint],),
-                    detail=f"{ARM_JOINTS[joint]} changes by {values[index, joint]:.2f} {unit}, "
-                    f"the limit is {limit[joint]:.2f} {unit}",
-                )
-            )
     return failures

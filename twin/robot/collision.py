@@ -16,6 +16,9 @@ _SAMPLES = 60
 _ALWAYS = 0.95
 """Pairs that overlap in this share of random postures overlap by construction of their hulls."""
 
+_SIGNED = coal.DistanceRequest()
+_SIGNED.enable_signed_distance = True
+
 
 @dataclass(frozen=True, kw_only=True)
 class SelfDistance:
@@ -32,10 +35,8 @@ def signed_distance(
     T_second: coal.Transform3s,
 ) -> float:
     """Distance between two convex shapes [m], negative by the depth when they overlap."""
-    request = coal.DistanceRequest()
-    request.enable_signed_distance = True
     result = coal.DistanceResult()
-    return float(coal.distance(first, T_first, second, T_second, request, result))
+    return float(coal.distance(first, T_first, second, T_second, _SIGNED, result))
 
 
 class RobotHulls:
@@ -47,6 +48,16 @@ class RobotHulls:
         self.hulls: list[LinkHull] = link_hulls(robot)
         self._frame_ids = [robot.model.getFrameId(hull.link) for hull in self.hulls]
         self.placements: list[coal.Transform3s] = [coal.Transform3s() for _ in self.hulls]
+        self.rotations: Float[np.ndarray, "num_hulls 3 3"] = np.zeros((len(self.hulls), 3, 3))
+        self.translations: Float[np.ndarray, "num_hulls 3"] = np.zeros((len(self.hulls), 3))
+        points = [hull.points_m for hull in self.hulls]
+        self._centres = np.array([(p.min(axis=0) + p.max(axis=0)) / 2 for p in points])
+        self._radii = np.array(
+            [
+                np.linalg.norm(p - c, axis=1).max()
+                for p, c in zip(points, self._centres, strict=True)
+            ]
+        )
         self.pairs = self._pairs()
 
     def place(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
@@ -57,12 +68,24 @@ class RobotHulls:
         )
         for index, frame_id in enumerate(self._frame_ids):
             T = robot.data.oMf[frame_id]
-            self.placements[index] = coal.Transform3s(T.rotation, T.translation)
+            R, t = T.rotation, T.translation
+            self.rotations[index], self.translations[index] = R, t
+            self.placements[index] = coal.Transform3s(R, t)
 
     def self_distance(self) -> SelfDistance:
         """Closest pair at the placed posture; infinite when there is no pair to check."""
         best, links = np.inf, ("", "")
-        for first, second in self.pairs:
+        if not self.pairs:
+            return SelfDistance(distance_m=best, links=links)
+        placed = np.einsum("nij,nj->ni", self.rotations, self._centres) + self.translations
+        one, other = np.array(self.pairs).T
+        gaps = np.linalg.norm(placed[one] - placed[other], axis=1)
+        gaps -= self._radii[one] + self._radii[other]
+        # Nearest spheres first: most pairs are then skipped, and the minimum stays exact.
+        for index in np.argsort(gaps, kind="stable").tolist():
+            if gaps[index] > best:
+                break
+            first, second = self.pairs[index]
             distance = self._pair_distance(first, second)
             if distance < best:
                 best, links = distance, (self.hulls[first].link, self.hulls[second].link)

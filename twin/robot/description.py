@@ -1,9 +1,13 @@
 """A URDF text as others can load it: every mesh an absolute path that exists."""
 
+import math
 import xml.etree.ElementTree as ET
+from dataclasses import dataclass
 
 from bridge.task.robot import resolve_mesh
 from twin.errors import TwinError
+
+_MIMIC_DEFAULTS = (("multiplier", "1"), ("offset", "0"))
 
 
 class RobotDescriptionError(TwinError):
@@ -13,6 +17,55 @@ class RobotDescriptionError(TwinError):
         """Remember what was found."""
         self.found = found
         super().__init__(f"the robot description {found}. {hint}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mimic:
+    """A joint that goes where another one goes: multiplier * leader + offset."""
+
+    joint: str
+    leader: str
+    multiplier: float
+    offset: float
+
+
+def mimicked(urdf: str) -> list[Mimic]:
+    """Read the joints that follow another joint, which pinocchio takes for free ones.
+
+    Raises:
+        RobotDescriptionError: When one follows a joint that is not there, or follows another one
+            itself, or by a number that is none.
+    """
+    root = parse_description(urdf)
+    joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
+    followers = {
+        name: element
+        for name, joint in joints.items()
+        if (element := joint.find("mimic")) is not None
+    }
+    return [
+        _mimic(name, element, set(joints) - set(followers)) for name, element in followers.items()
+    ]
+
+
+def _mimic(name: str, element: ET.Element, leaders: set[str]) -> Mimic:
+    leader = element.get("joint", "")
+    if leader not in leaders:
+        raise RobotDescriptionError(
+            found=f"lets the joint {name!r} mimic {leader!r}, which is not there or mimics another",
+            hint="Let it mimic a joint that moves by itself.",
+        )
+    try:
+        numbers = [float(element.get(key, default)) for key, default in _MIMIC_DEFAULTS]
+    except ValueError:
+        numbers = [math.nan]
+    if not all(map(math.isfinite, numbers)):
+        raise RobotDescriptionError(
+            found=f"lets the joint {name!r} mimic {leader!r} by something that is no number",
+            hint="Give multiplier and offset as numbers.",
+        )
+    multiplier, offset = numbers
+    return Mimic(joint=name, leader=leader, multiplier=multiplier, offset=offset)
 
 
 def with_absolute_meshes(urdf: str, *, keep_visuals: bool = False) -> str:

@@ -1,22 +1,27 @@
 """Inverse kinematics: joints that put the tool centre point where a plan wants it.
 
 Levenberg-Marquardt on the SE(3) error with a warm start, because the next waypoint of a
-trajectory is near; random restarts, from a fixed seed, only where there is no warm start.
+trajectory is near; random restarts, from a fixed seed, only where there is no warm start. Works
+for any arm; ``twin.robot.ur_inverse`` knows all answers at once for arms of one kind.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
+from scipy.linalg.lapack import dposv
 
 from twin.robot.config import IkConfig
 from twin.robot.model import RobotModel
 
-_HOME_RAD = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
+HOME_RAD = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
+"""Where a search begins that knows no better; treat as constant."""
 _CONVERGED = 1e-8
 """Norm of the error twist at which iterating stops: far below the tolerance, so that a round
 trip is exact and the tolerance decides feasibility only."""
+_MAX_DAMPING = 1e3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,17 +57,19 @@ def solve_ik(
     Returns:
         The best solution found; ``reached`` says whether it is one.
     """
-    start = _HOME_RAD if warm_start_rad is None else warm_start_rad
+    start = HOME_RAD if warm_start_rad is None else warm_start_rad
     best = _descend(robot, T_base_tcp, start, config)
+    if best.reached:
+        return best
     rng = np.random.default_rng(config.seed)
     span = np.minimum(np.pi, (robot.upper_rad - robot.lower_rad) / 2)
     for _ in range(config.restarts):
-        if best.reached:
-            break
         start = np.clip(rng.uniform(-span, span), robot.lower_rad, robot.upper_rad)
         other = _descend(robot, T_base_tcp, start, config)
         if other.reached or other.position_error_m < best.position_error_m:
             best = other
+        if best.reached:
+            break
     return best
 
 
@@ -72,33 +79,38 @@ def _descend(
     start_rad: Float[np.ndarray, " num_joints"],
     config: IkConfig,
 ) -> IkSolution:
+    """One descent. Calls into pinocchio take a microsecond each, so each is made once a step."""
+    model, data, tcp_id = robot.model, robot.data, robot.tcp_id
+    lower, upper, arm = robot.lower_rad, robot.upper_rad, robot.arm_ids
     target = pin.SE3(T_base_tcp)
-    model, data = robot.model, robot.data
-    joints = np.clip(start_rad, robot.lower_rad, robot.upper_rad)
+    joints = np.minimum(np.maximum(start_rad, lower), upper)
     q = robot.configuration(joints)
-    damping, last = 1e-6, np.inf
-    accepted = joints
-    jacobian = np.zeros((6, len(joints)))
-    error = np.zeros(6)
+    damping, last = 1e-6, math.inf
+    accepted, misses = joints, target.translation
+    jacobian, error = np.zeros((6, len(joints))), np.zeros(6)
     for _ in range(config.max_iterations):
-        q[robot.arm_ids] = joints
-        pin.framesForwardKinematics(model, data, q)
-        trial = pin.log6(data.oMf[robot.tcp_id].actInv(target)).vector
-        norm = float(np.linalg.norm(trial))
+        q[arm] = joints
+        pin.computeJointJacobians(model, data, q)
+        difference = pin.updateFramePlacement(model, data, tcp_id).actInv(target)
+        trial = pin.log6(difference).vector
+        norm = math.sqrt(trial @ trial)
         if norm < last:
-            accepted, last, error = joints, norm, trial
+            accepted, last, error, misses = joints, norm, trial, difference.translation
             if norm < _CONVERGED:
                 break
             damping = max(damping * 0.2, 1e-9)
-            full = pin.computeFrameJacobian(model, data, q, robot.tcp_id)
-            jacobian = full[:, robot.arm_ids]
+            full = pin.getFrameJacobian(model, data, tcp_id, pin.LOCAL)
+            jacobian = full[:, robot.arm_velocity_ids]
         else:
             damping *= 10.0
-            if damping > 1e3:
+            if not damping < _MAX_DAMPING:
                 break
-        step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping * np.eye(6), error)
-        joints = np.clip(accepted + step, robot.lower_rad, robot.upper_rad)
-    position, rotation = pose_error(robot, accepted, T_base_tcp)
+        square = jacobian @ jacobian.T
+        square.flat[::7] += damping
+        weights = dposv(square, error)[1]
+        joints = np.minimum(np.maximum(accepted + jacobian.T @ weights, lower), upper)
+    # The angular part of the twist is the rotation vector of what is left.
+    position, rotation = math.hypot(*misses), math.hypot(*error[3:])
     return IkSolution(
         joints_rad=accepted,
         position_error_m=position,

@@ -11,7 +11,7 @@ import pinocchio as pin
 from jaxtyping import Float
 
 from bridge.task.robot import ARM_JOINTS, FINGER_JOINTS, TCP_FRAME
-from twin.robot.description import RobotDescriptionError, with_absolute_meshes
+from twin.robot.description import RobotDescriptionError, mimicked, with_absolute_meshes
 
 
 class RobotModel:
@@ -24,19 +24,31 @@ class RobotModel:
             RobotDescriptionError: When joints or the frame ``tcp`` are missing.
         """
         self.urdf = with_absolute_meshes(urdf)
+        mimics = mimicked(urdf)
         try:
             self.model = pin.buildModelFromXML(self.urdf)
         except (ValueError, RuntimeError) as error:
             raise RobotDescriptionError(
                 found=f"is refused by pinocchio ({str(error)[:200]})", hint="Check it."
             ) from error
+        self.name = str(self.model.name)
         self._check_names()
+        self._check_joints()
         self.data = self.model.createData()
+        self._neutral: Float[np.ndarray, " num_values"] = pin.neutral(self.model)
         self.arm_ids = np.array([self._q_id(name) for name in ARM_JOINTS])
+        self.arm_velocity_ids = np.array(
+            [int(self.model.joints[self.model.getJointId(name)].idx_v) for name in ARM_JOINTS]
+        )
         self.finger_ids = np.array(
             [self._q_id(name) for name in FINGER_JOINTS if self.model.existJointName(name)],
             dtype=np.int64,
         )
+        followers = [m for m in mimics if self.model.existJointName(m.joint)]
+        self._follower_ids = np.array([self._q_id(m.joint) for m in followers], dtype=np.int64)
+        self._leader_ids = np.array([self._q_id(m.leader) for m in followers], dtype=np.int64)
+        self._ratios = np.array([m.multiplier for m in followers])
+        self._shifts = np.array([m.offset for m in followers])
         self.tcp_id = int(self.model.getFrameId(TCP_FRAME))
         self.lower_rad: Float[np.ndarray, " num_joints"] = self._arm(self.model.lowerPositionLimit)
         self.upper_rad: Float[np.ndarray, " num_joints"] = self._arm(self.model.upperPositionLimit)
@@ -57,6 +69,14 @@ class RobotModel:
                 hint="Add a link of that name where plans put the tool centre point.",
             )
 
+    def _check_joints(self) -> None:
+        for name in ARM_JOINTS:
+            if self.model.joints[self.model.getJointId(name)].nq != 1:
+                raise RobotDescriptionError(
+                    found=f"has the joint {name!r}, which turns without end",
+                    hint="Make it revolute and give it limits.",
+                )
+
     def _q_id(self, name: str) -> int:
         return int(self.model.joints[self.model.getJointId(name)].idx_q)
 
@@ -68,9 +88,11 @@ class RobotModel:
         self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float = 0.0
     ) -> Float[np.ndarray, " num_values"]:
         """Put arm joints and half the gripper width per finger into pinocchio's order."""
-        q: Float[np.ndarray, " num_values"] = pin.neutral(self.model)
+        q = self._neutral.copy()
         q[self.arm_ids] = joints_rad
         q[self.finger_ids] = width_m / 2
+        if len(self._follower_ids):
+            q[self._follower_ids] = self._ratios * q[self._leader_ids] + self._shifts
         return q
 
     def T_base_tcp(self, joints_rad: Float[np.ndarray, " num_joints"]) -> Float[np.ndarray, "4 4"]:

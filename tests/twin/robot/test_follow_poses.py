@@ -1,0 +1,189 @@
+"""Joints along a path: smooth, within limits, clear of things, and honest where there are none."""
+
+import re
+
+import numpy as np
+import pytest
+
+from bridge.geometry import se3
+from bridge.task.robot import ur5_with_gripper_urdf
+from twin.robot.config import IkConfig
+from twin.robot.follow import NO_BRANCH, follow_poses
+from twin.robot.inverse import pose_error
+from twin.robot.model import RobotModel, load_robot
+from twin.robot.ur_inverse import UrInverse
+
+HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotModel:
+    return load_robot(ur5_with_gripper_urdf())
+
+
+def arc(start: np.ndarray, end: np.ndarray, count: int = 60) -> np.ndarray:
+    """Postures on a straight line in joints."""
+    return start + np.linspace(0, 1, count)[:, None] * (end - start)
+
+
+def largest_step(joints: np.ndarray) -> float:
+    return float(np.abs(np.diff(joints, axis=0)).max())
+
+
+def test_a_path_is_followed_on_the_branch_it_starts_on(robot: RobotModel) -> None:
+    wanted = arc(HOME, HOME + np.array([1.2, 0.4, -0.5, 0.6, 0.7, -0.8]))
+    followed = follow_poses(
+        robot, robot.Ts_base_tcp(wanted), start_rad=wanted[0], config=IkConfig()
+    )
+    assert followed.reached.all()
+    np.testing.assert_allclose(followed.joints_rad, wanted, atol=1e-7)
+    assert len(set(followed.branch.tolist())) == 1
+
+
+@pytest.mark.parametrize("branch", range(8))
+def test_whatever_the_start_nothing_jumps(robot: RobotModel, branch: int) -> None:
+    Ts = robot.Ts_base_tcp(arc(HOME, HOME + np.array([0.8, 0.3, -0.3, 0.2, 0.3, -0.5])))
+    inverse = UrInverse.for_robot(robot)
+    assert inverse is not None
+    start = inverse.all_branches(Ts[:1])[0][0, branch]
+    followed = follow_poses(robot, Ts, start_rad=start, config=IkConfig())
+    assert followed.reached.all()
+    assert np.abs(followed.joints_rad[0] - start).max() < 1e-9
+    assert largest_step(followed.joints_rad) < 0.2
+    for T, joints in zip(Ts, followed.joints_rad, strict=True):
+        assert max(pose_error(robot, joints, T)) < 1e-9
+
+
+def test_a_turn_beyond_pi_goes_on_turning(robot: RobotModel) -> None:
+    """Half a turn past pi and on: the same poses also have an answer a whole turn lower."""
+    wanted = arc(HOME, HOME + np.array([0, 0, 0, 0, 0, 5.5]), 120)
+    followed = follow_poses(robot, robot.Ts_base_tcp(wanted), start_rad=HOME, config=IkConfig())
+    np.testing.assert_allclose(followed.joints_rad[:, 5], wanted[:, 5], atol=1e-7)
+
+
+def test_a_turn_starts_a_whole_turn_lower_where_it_would_end_at_the_limit(
+    robot: RobotModel,
+) -> None:
+    """Nobody says where to start; from +3 by 4.5 rad would pass the limit of 2 pi."""
+    start = HOME.copy()
+    start[5] = 3.0
+    wanted = arc(start, start + np.array([0, 0, 0, 0, 0, 4.5]), 120)
+    followed = follow_poses(robot, robot.Ts_base_tcp(wanted), start_rad=None, config=IkConfig())
+    assert followed.reached.all()
+    assert largest_step(followed.joints_rad) < 0.1
+    assert np.all(followed.joints_rad <= robot.upper_rad + 1e-6)
+    assert np.all(followed.joints_rad >= robot.lower_rad - 1e-6)
+
+
+def test_a_turn_that_fits_no_limits_winds_back_once_and_stays_inside(robot: RobotModel) -> None:
+    """A joint limited to plus minus pi cannot make one and a half turns: the jump stays visible."""
+    narrow = RobotModel(
+        re.sub(
+            r'(<joint name="wrist_3_joint".*?lower=")[^"]*(" upper=")[^"]*(")',
+            r"\g<1>-3.14159265359\g<2>3.14159265359\g<3>",
+            ur5_with_gripper_urdf(),
+            flags=re.DOTALL,
+        )
+    )
+    wanted = arc(HOME, HOME + np.array([0, 0, 0, 0, 0, 4.0]), 120)
+    followed = follow_poses(narrow, robot.Ts_base_tcp(wanted), start_rad=HOME, config=IkConfig())
+    assert followed.reached.all()
+    assert np.all(np.abs(followed.joints_rad[:, 5]) <= np.pi + 1e-6)
+    assert np.sum(np.abs(np.diff(followed.joints_rad[:, 5])) > 3.0) <= 1
+
+
+def test_passing_through_a_straight_wrist_keeps_the_joints_smooth(robot: RobotModel) -> None:
+    """The fifth joint goes through 0: another branch before than after, and none in between."""
+    start, end = HOME.copy(), HOME.copy()
+    start[4], end[4] = -0.4, 0.4
+    wanted = arc(start, end, 41)
+    assert abs(wanted[20, 4]) < 1e-12
+    followed = follow_poses(robot, robot.Ts_base_tcp(wanted), start_rad=start, config=IkConfig())
+    assert followed.reached.all()
+    assert largest_step(followed.joints_rad) < 0.05
+    assert followed.branch[20] == NO_BRANCH
+
+
+def test_a_branch_that_touches_is_left_for_one_that_does_not(robot: RobotModel) -> None:
+    Ts = robot.Ts_base_tcp(arc(HOME, HOME + np.array([0.5, 0.1, -0.1, 0.1, 0.1, 0.1]), 20))
+    free = follow_poses(robot, Ts, start_rad=None, config=IkConfig())
+    up = np.sign(free.joints_rad[0, 2])
+    asked = []
+
+    def clearance(joints: np.ndarray) -> np.ndarray:
+        asked.append(len(joints))
+        return np.where(np.sign(joints[:, 2]) == up, -0.01, 0.01)
+
+    other = follow_poses(robot, Ts, start_rad=None, config=IkConfig(), clearance=clearance)
+    assert np.all(np.sign(other.joints_rad[:, 2]) == -up)
+    assert sum(asked) < 8 * len(Ts), "only what was wanted is asked about"
+
+
+def test_where_every_branch_touches_nothing_jumps_all_the_same(robot: RobotModel) -> None:
+    Ts = robot.Ts_base_tcp(arc(HOME, HOME + np.array([0.5, 0.1, -0.1, 0.1, 0.1, 0.1]), 20))
+    touching = follow_poses(
+        robot, Ts, start_rad=None, config=IkConfig(), clearance=lambda q: np.full(len(q), -1.0)
+    )
+    assert touching.reached.all()
+    assert largest_step(touching.joints_rad) < 0.2
+
+
+def test_a_path_that_leaves_the_reach_is_followed_up_to_there(robot: RobotModel) -> None:
+    T = robot.T_base_tcp(HOME)
+    Ts = np.repeat(T[None], 30, axis=0)
+    Ts[:, :3, 3] += np.linspace(0, 1.5, 30)[:, None] * np.array([1.0, 0.0, 0.0])
+    followed = follow_poses(robot, Ts, start_rad=None, config=IkConfig(restarts=2))
+    first = int(np.argmin(followed.reached))
+    assert 0 < first < 30
+    assert followed.reached[:first].all()
+    assert not followed.reached[first:].any()
+    assert np.isfinite(followed.joints_rad).all()
+    assert pose_error(robot, followed.joints_rad[first], Ts[first])[0] > 1e-4
+
+
+def test_an_arm_that_is_no_ur_is_followed_by_iterating(robot: RobotModel) -> None:
+    """Calibrated kinematics: every axis a little off, as a controller reports them."""
+    off = RobotModel(
+        ur5_with_gripper_urdf()
+        .replace('xyz="0.0 -0.1197 0.425"', 'xyz="0.0003 -0.1195 0.4252"')
+        .replace(
+            'rpy="0.0 1.57079632679 0.0" xyz="0.0 0.13585',
+            'rpy="0.002 1.5712 0.001" xyz="0 0.13585',
+        )
+    )
+    assert UrInverse.for_robot(off) is None
+    wanted = arc(HOME, HOME + np.array([0.6, 0.2, -0.2, 0.2, 0.2, -0.3]))
+    followed = follow_poses(off, off.Ts_base_tcp(wanted), start_rad=HOME, config=IkConfig())
+    assert followed.reached.all()
+    assert set(followed.branch.tolist()) == {NO_BRANCH}
+    np.testing.assert_allclose(followed.joints_rad, wanted, atol=1e-6)
+
+
+def test_a_roughly_written_ur_is_solved_in_closed_form_and_polished(robot: RobotModel) -> None:
+    rough = RobotModel(
+        ur5_with_gripper_urdf().replace(
+            'rpy="0.0 0.0 0.0" xyz="0.0 -0.1197 0.425"', 'rpy="3e-6 0 0" xyz="0.0 -0.1197 0.425"'
+        )
+    )
+    inverse = UrInverse.for_robot(rough)
+    assert inverse is not None
+    assert inverse.geometry.deviation > 1e-9
+    wanted = arc(HOME, HOME + np.array([0.6, 0.2, -0.2, 0.2, 0.2, -0.3]), 10)
+    Ts = rough.Ts_base_tcp(wanted)
+    followed = follow_poses(rough, Ts, start_rad=HOME, config=IkConfig())
+    for T, joints in zip(Ts, followed.joints_rad, strict=True):
+        assert max(pose_error(rough, joints, T)) < 1e-8
+
+
+def test_the_same_path_gives_the_same_bits(robot: RobotModel) -> None:
+    q = se3.transform_from(np.array([0.0, 1.0, 0.0, 0.0]), np.array([0.45, -0.1, 0.3]))
+    Ts = np.repeat(q[None], 25, axis=0)
+    Ts[:, 0, 3] += np.linspace(0, 0.1, 25)
+    first = follow_poses(robot, Ts, start_rad=None, config=IkConfig())
+    second = follow_poses(robot, Ts, start_rad=None, config=IkConfig())
+    assert first.joints_rad.tobytes() == second.joints_rad.tobytes()
+
+
+def test_no_poses_give_no_joints(robot: RobotModel) -> None:
+    followed = follow_poses(robot, np.zeros((0, 4, 4)), start_rad=None, config=IkConfig())
+    assert followed.joints_rad.shape == (0, 6)

@@ -1,0 +1,211 @@
+"""The closed form: all branches reach, singular poses have none, other arms are refused."""
+
+import re
+import sysconfig
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.task.robot import ur5_with_gripper_urdf
+from twin.robot.model import RobotModel, load_robot
+from twin.robot.ur_inverse import UrInverse
+
+HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
+ROBOTS = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix/share/example-robot-data/robots"
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotModel:
+    return load_robot(ur5_with_gripper_urdf())
+
+
+@pytest.fixture(scope="module")
+def inverse(robot: RobotModel) -> UrInverse:
+    found = UrInverse.for_robot(robot)
+    assert found is not None
+    return found
+
+
+def other_ur(size: str) -> RobotModel:
+    """A UR of another size, with a tool frame that is turned and shifted."""
+    text = (ROBOTS / "ur_description" / "urdf" / f"ur{size}_robot.urdf").read_text()
+    tool = (
+        '<link name="tcp"/><joint name="tcp_joint" type="fixed"><parent link="tool0"/>'
+        '<child link="tcp"/><origin xyz="0.03 -0.02 0.11" rpy="0.3 -0.4 0.9"/></joint></robot>'
+    )
+    return RobotModel(text.replace("</robot>", tool))
+
+
+def errors(robot: RobotModel, joints: np.ndarray, T: np.ndarray) -> tuple[float, float]:
+    reached = robot.T_base_tcp(joints)
+    offset = float(np.linalg.norm(reached[:3, 3] - T[:3, 3]))
+    return offset, float(np.abs(reached[:3, :3] - T[:3, :3]).max())
+
+
+def test_every_reachable_pose_is_solved_and_every_answer_reaches_it(
+    robot: RobotModel, inverse: UrInverse
+) -> None:
+    rng = np.random.default_rng(11)
+    postures = rng.uniform(-np.pi, np.pi, (1000, 6))
+    Ts = robot.Ts_base_tcp(postures)
+    joints, valid = inverse.all_branches(Ts)
+    assert valid.any(axis=1).all()
+    assert np.isfinite(joints).all()
+    for index in range(0, 1000, 10):
+        for branch in np.flatnonzero(valid[index]):
+            offset, turned = errors(robot, joints[index, branch], Ts[index])
+            assert offset < 1e-9
+            assert turned < 1e-9
+
+
+def test_the_posture_that_made_a_pose_is_among_its_answers(
+    robot: RobotModel, inverse: UrInverse
+) -> None:
+    rng = np.random.default_rng(12)
+    postures = rng.uniform(-3.1, 3.1, (300, 6))
+    joints, valid = inverse.all_branches(robot.Ts_base_tcp(postures))
+    apart = joints - postures[:, None]
+    apart = np.abs(apart - 2 * np.pi * np.rint(apart / (2 * np.pi))).max(axis=2)
+    nearest = np.where(valid, apart, np.inf).min(axis=1)
+    assert nearest.max() < 1e-6
+
+
+def test_the_branches_of_a_pose_are_eight_different_postures(
+    robot: RobotModel, inverse: UrInverse
+) -> None:
+    joints, valid = inverse.all_branches(robot.T_base_tcp(HOME)[None])
+    assert valid.all()
+    for first in range(8):
+        for second in range(first):
+            assert np.abs(joints[0, first] - joints[0, second]).max() > 0.05
+
+
+@pytest.mark.parametrize("size", ["3", "10"])
+def test_other_sizes_and_other_tools_are_solved_too(size: str) -> None:
+    robot = other_ur(size)
+    inverse = UrInverse.for_robot(robot)
+    assert inverse is not None
+    Ts = robot.Ts_base_tcp(np.random.default_rng(13).uniform(-3.0, 3.0, (40, 6)))
+    joints, valid = inverse.all_branches(Ts)
+    assert valid.any(axis=1).all()
+    for index, branch in np.argwhere(valid):
+        offset, turned = errors(robot, joints[index, branch], Ts[index])
+        assert max(offset, turned) < 1e-8
+
+
+def test_lengths_are_those_of_the_data_sheet(inverse: UrInverse) -> None:
+    g = inverse.geometry
+    assert (g.a2_m, g.a3_m) == pytest.approx((0.425, 0.39225))
+    assert (g.d4_m, g.d5_m) == pytest.approx((0.10915, 0.09465))
+    assert g.T_base_0[2, 3] == pytest.approx(0.089159)
+
+
+@pytest.mark.parametrize(
+    ("joint", "origin"),
+    [("wrist_2_joint", "0.01 0.093 0.0"), ("elbow_joint", "0.05 -0.1197 0.425")],
+)
+def test_an_arm_whose_axes_do_not_meet_is_refused(joint: str, origin: str) -> None:
+    urdf = ur5_with_gripper_urdf()
+    bent = re.sub(
+        rf'(<joint name="{joint}".*?xyz=")[^"]*(")', rf"\g<1>{origin}\g<2>", urdf, flags=re.DOTALL
+    )
+    found = UrInverse.for_robot(RobotModel(bent))
+    if joint == "elbow_joint":  # the elbow may be anywhere: that is only another length
+        assert found is not None
+        assert found.geometry.a2_m == pytest.approx(np.hypot(0.05, 0.425))
+    else:
+        assert found is None
+
+
+def test_an_arm_with_a_tilted_axis_is_refused() -> None:
+    urdf = ur5_with_gripper_urdf()
+    tilted = re.sub(
+        r'(<joint name="elbow_joint".*?rpy=")[^"]*(")',
+        r"\g<1>0.02 0.0 0.0\g<2>",
+        urdf,
+        flags=re.DOTALL,
+    )
+    assert tilted != urdf
+    assert UrInverse.for_robot(RobotModel(tilted)) is None
+
+
+def test_a_pose_out_of_reach_has_no_answer(robot: RobotModel, inverse: UrInverse) -> None:
+    T = robot.T_base_tcp(HOME)
+    T[:3, 3] = (2.0, 0.0, 0.3)
+    joints, valid = inverse.all_branches(T[None])
+    assert not valid.any()
+    assert np.all(joints == 0.0)
+
+
+def test_a_pose_that_is_not_a_number_has_no_answer(robot: RobotModel, inverse: UrInverse) -> None:
+    Ts = np.stack([robot.T_base_tcp(HOME)] * 2)
+    Ts[0, 1, 3] = np.nan
+    joints, valid = inverse.all_branches(Ts)
+    assert not valid[0].any()
+    assert valid[1].all()
+    assert np.isfinite(joints).all()
+
+
+def test_a_straight_wrist_is_not_valid_and_nearly_straight_is(
+    robot: RobotModel, inverse: UrInverse
+) -> None:
+    """The fifth joint decides whether the sixth is determined; the shoulders' other side is."""
+    for bend, determined in ((0.0, False), (1e-5, True)):
+        posture = HOME.copy()
+        posture[4] = bend
+        T = robot.T_base_tcp(posture)
+        joints, valid = inverse.all_branches(T[None])
+        own_side = [b for b in range(8) if abs(np.sin(joints[0, b, 4])) < 1e-3 or not valid[0, b]]
+        assert any(valid[0, b] for b in own_side) is determined
+        for branch in np.flatnonzero(valid[0]):
+            assert max(errors(robot, joints[0, branch], T)) < 1e-9
+
+
+def test_a_stretched_arm_is_reached_from_both_elbows_at_once(
+    robot: RobotModel, inverse: UrInverse
+) -> None:
+    posture = HOME.copy()
+    posture[2] = 0.0
+    T = robot.T_base_tcp(posture)
+    joints, valid = inverse.all_branches(T[None])
+    assert valid.any()
+    for branch in np.flatnonzero(valid[0]):
+        assert max(errors(robot, joints[0, branch], T)) < 1e-9
+
+
+def test_a_wrist_inside_the_shoulder_cylinder_has_no_answer(
+    robot: RobotModel, inverse: UrInverse
+) -> None:
+    g = inverse.geometry
+    T_0_tcp = np.linalg.inv(g.T_base_0) @ robot.T_base_tcp(HOME)
+    T_0_6 = T_0_tcp @ np.linalg.inv(g.T_6_tcp)
+    for radius, reachable in ((0.9 * g.d4_m, False), (0.0, False), (1.1 * g.d4_m, True)):
+        T_0_6[:3, 3] = (radius, 0.0, 0.5)
+        _, valid = inverse.all_branches((g.T_base_0 @ T_0_6 @ g.T_6_tcp)[None])
+        assert valid.any() == reachable
+
+
+def test_joints_are_within_limits_and_whole_turns_are_used_to_stay_there(robot: RobotModel) -> None:
+    urdf = ur5_with_gripper_urdf()
+    shifted = re.sub(
+        r'(<joint name="shoulder_pan_joint".*?lower=")[^"]*(" upper=")[^"]*(")',
+        r"\g<1>0.0\g<2>6.28318530718\g<3>",
+        urdf,
+        flags=re.DOTALL,
+    )
+    narrow = RobotModel(shifted)
+    assert narrow.lower_rad[0] == 0.0
+    inverse = UrInverse.for_robot(narrow)
+    assert inverse is not None
+    Ts = robot.Ts_base_tcp(np.random.default_rng(14).uniform(-3.0, 3.0, (100, 6)))
+    joints, valid = inverse.all_branches(Ts)
+    assert valid.any(axis=1).all()
+    assert np.all(joints[valid] >= narrow.lower_rad - 1e-6)
+    assert np.all(joints[valid] <= narrow.upper_rad + 1e-6)
+
+
+def test_no_poses_give_no_joints(inverse: UrInverse) -> None:
+    joints, valid = inverse.all_branches(np.zeros((0, 4, 4)))
+    assert joints.shape == (0, 8, 6)
+    assert valid.shape == (0, 8)

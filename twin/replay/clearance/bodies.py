@@ -1,0 +1,67 @@
+"""Convex pieces with bounding spheres, and the names bodies have in contacts and failures."""
+
+from dataclasses import dataclass
+from itertools import product
+
+import coal
+import numpy as np
+from jaxtyping import Float
+
+from bridge.task.robot import GRIPPER_LINKS
+from twin.robot.hulls import convex_hull
+
+TABLE = "table"
+GRIPPER = "gripper"
+SCENE = "scene"
+"""What stands still and has no name of its own."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """One convex piece with a bounding sphere, to skip pairs that are far apart."""
+
+    body: str
+    shape: coal.CollisionGeometry
+    centre: Float[np.ndarray, "3"]
+    radius_m: float
+
+
+@dataclass(frozen=True)
+class Placed:
+    """One piece where it is."""
+
+    body: str
+    shape: coal.CollisionGeometry | None
+    """None: the unnamed scene, which is a grid."""
+    placement: coal.Transform3s
+    piece: int = 0
+
+
+def solid_of(
+    body: str, shape: coal.CollisionGeometry, points_m: Float[np.ndarray, "num_points 3"]
+) -> Solid:
+    """Put a sphere around a piece."""
+    centre = (points_m.min(axis=0) + points_m.max(axis=0)) / 2
+    radius = float(np.linalg.norm(points_m - centre, axis=1).max())
+    return Solid(body, shape, centre, radius)
+
+
+def box_corners(size_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "8 3"]:
+    """Corners of a box around the origin."""
+    return np.asarray(np.array(list(product((-0.5, 0.5), repeat=3))) * size_m)
+
+
+def box_solid(body: str, size_m: Float[np.ndarray, "3"]) -> Solid:
+    """A box around the origin."""
+    corners = box_corners(size_m)
+    return solid_of(body, convex_hull(corners), corners)
+
+
+def group_of(body: str) -> str:
+    """The name stages allow contacts by."""
+    return GRIPPER if body in GRIPPER_LINKS else body
+
+
+def placement_of(T: Float[np.ndarray, "4 4"]) -> coal.Transform3s:
+    """The same pose, as coal wants it."""
+    return coal.Transform3s(T[:3, :3], T[:3, 3])

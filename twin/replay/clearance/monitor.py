@@ -1,0 +1,288 @@
+"""Measure one state after another; name who came too close to what, and when first.
+
+Robot, gripper and moved objects against the static scene (table, container panels, and what the
+scene's grid shows beside them), and the arm against objects. Pairs the active stage allows may
+touch, but not lie in each other; all others keep ``eps_col_m``. Objects that have not moved since
+the start belong to nobody's motion and are left out. Links and the carried boxes are convex hulls,
+soft bodies their nodes, and distances are on the safe side.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry import se3
+from bridge.task.meshes.catalogue import object_mesh
+from bridge.task.plan import Plan, Stage
+from twin.replay.clearance.bodies import Solid, box_solid, group_of, placement_of, solid_of
+from twin.replay.clearance.nodes import planes_of
+from twin.replay.clearance.surroundings import Pair, Surroundings
+from twin.replay.clearance.sweep import MAX_LEAP_M, Reach, State, half_way, object_travel_m
+from twin.replay.config import ReplayConfig
+from twin.replay.failure import Failure
+from twin.replay.result import Contact
+from twin.replay.scene import ReplayScene
+from twin.robot.collision import RobotHulls, signed_distance
+
+Poses = Mapping[str, Float[np.ndarray, "4 4"]]
+Nodes = Mapping[str, Float[np.ndarray, "num_nodes 3"]]
+
+_LOOK_AHEAD_M = 0.01
+"""Pairs nearer than this are measured although they keep their distance now, so that what may
+happen before the next state is bounded: steps of up to twice as far need no state in between."""
+_FINE_TRAVEL_M = 0.001
+"""Motion between two states that is not looked into further: half of it is what may be missed."""
+_MAX_HALVINGS = 10
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Distances at one state."""
+
+    state: State
+    distances: dict[Pair, float]
+    cut_m: float
+    """Every pair without a distance is at least this far apart."""
+    allowed: set[frozenset[str]]
+
+
+class ClearanceMonitor:
+    """Measures one state after another and remembers what went wrong first."""
+
+    def __init__(
+        self, scene: ReplayScene, plan: Plan, hulls: RobotHulls, config: ReplayConfig
+    ) -> None:
+        """Prepare the static scene and the bounding spheres."""
+        self.config = config
+        self.hulls = hulls
+        self.stages = plan.stages
+        self.failures: list[Failure] = []
+        self._scene = scene
+        self._around = Surroundings(scene, hulls, config.eps_col_m)
+        self._links = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
+        self._objects = {
+            name: box_solid(name, np.array(scene.task.objects[name].size_m))
+            for name in scene.movable()
+        }
+        self._reach = Reach(hulls)
+        self._contacts: dict[tuple[str, str, bool], list[Contact]] = {}
+        self._last: _Look | None = None
+        self._last_ns = 0
+        self._first_centre: dict[str, Float[np.ndarray, " 3"]] = {}
+
+    def measure(
+        self,
+        t_ns: int,
+        joints_rad: Float[np.ndarray, " num_joints"],
+        width_m: float,
+        Ts_base_object: Poses,
+        nodes_m: Nodes | None = None,
+    ) -> float:
+        """Return delta(x_t), the smallest distance over the pairs that may not touch [m].
+
+        What may have happened since the call before is bounded by how far everything moved; where
+        the bound is not enough, states in between are measured too, straight in joints and poses.
+        A body that comes too close between two calls is therefore missed by half a millimetre at
+        most, and the smallest distance in between is returned.
+
+        Args:
+            t_ns: Time from the start of the trajectory; calls come in order.
+            joints_rad: Where the arm is.
+            width_m: Where the fingers are.
+            Ts_base_object: Where the movable objects are; those not known are left out.
+            nodes_m: Where the nodes of the soft objects are, base frame; a soft object with a pose
+                only counts as the box around it.
+        """
+        nodes = (
+            {}
+            if nodes_m is None
+            else {name: np.asarray(rows, dtype=np.float64) for name, rows in nodes_m.items()}
+        )
+        state = State(
+            t_ns=t_ns,
+            joints_rad=joints_rad,
+            width_m=width_m,
+            Ts_base_object={n: T for n, T in Ts_base_object.items() if n not in nodes},
+            nodes_m=nodes,
+        )
+        look = self._look(state)
+        looks = [] if self._last is None else self._between(self._last, look, _MAX_HALVINGS)
+        self._last = look
+        return min(self._judge_all(item) for item in (*looks, look))
+
+    def _look(self, state: State) -> _Look:
+        """Measure every pair that is near, or the nearest one."""
+        self.hulls.place(state.joints_rad, state.width_m)
+        moved = [name for name, T in state.Ts_base_object.items() if self._has_moved(name, T)]
+        soft = {n: p for n, p in state.nodes_m.items() if self._nodes_have_moved(n, p)}
+        allowed = _allowed(active_stage(self.stages, state.t_ns))
+        distances, cut = self._around.measure(
+            self._links + [self._objects[name] for name in moved],
+            [state.Ts_base_object[name] for name in moved],
+            {name: (self._objects[name], T) for name, T in state.Ts_base_object.items()},
+            near_m=self.config.eps_col_m + _LOOK_AHEAD_M,
+            counts=lambda body, other: not _may_touch(body, other, allowed),
+        )
+        distances |= self._around.measure_nodes(self._links, state.nodes_m, soft)
+        return _Look(state, distances, cut, allowed)
+
+    def _between(self, a: _Look, b: _Look, halvings: int) -> list[_Look]:
+        """States between two that must be measured because the bound allows a touch."""
+        if halvings == 0 or not self._may_have_touched(a, b):
+            return []
+        middle = self._look(half_way(a.state, b.state))
+        before = self._between(a, middle, halvings - 1)
+        return [*before, middle, *self._between(middle, b, halvings - 1)]
+
+    def _may_have_touched(self, a: _Look, b: _Look) -> bool:
+        links_m = self._reach.travel_m(a.state, b.state)
+        objects_m = {
+            name: object_travel_m(a.state, b.state, name, solid.radius_m)
+            for name, solid in self._objects.items()
+        }
+        farthest = float(links_m.max()) + max(
+            (travel for travel in objects_m.values() if travel <= MAX_LEAP_M), default=0.0
+        )
+        eps = self.config.eps_col_m
+        if farthest > _FINE_TRAVEL_M and a.cut_m + b.cut_m - farthest < 2 * eps:
+            return True
+        for pair in a.distances.keys() | b.distances.keys():
+            body, piece, other, _ = pair
+            travel = objects_m.get(body, 0.0) if piece < 0 else float(links_m[piece])
+            travel += objects_m.get(other, 0.0)
+            if max(objects_m.get(body, 0.0), objects_m.get(other, 0.0)) > MAX_LEAP_M:
+                continue
+            limit = eps
+            if _may_touch(body, other, a.allowed) or _may_touch(body, other, b.allowed):
+                # Objects push each other and the fingers; only what stands still can be run into.
+                if piece < 0 or other in objects_m:
+                    continue
+                limit = -self.config.max_contact_depth_m
+            first, last = (look.distances.get(pair, look.cut_m) for look in (a, b))
+            known = first < limit or last < limit  # judged at that state already
+            if not known and travel > _FINE_TRAVEL_M and first + last - travel < 2 * limit:
+                return True
+        return False
+
+    def _judge_all(self, look: _Look) -> float:
+        """Note every pair of a state that is too close; return its delta."""
+        t_ns = look.state.t_ns
+        ordered = sorted(look.distances.items(), key=lambda item: item[1])
+        judged = [
+            self._judge(t_ns, pair[0], pair[2], distance, look.allowed)
+            for pair, distance in ordered
+        ]
+        self._last_ns = t_ns
+        return min(judged, default=float("inf"))
+
+    def check_pre_grasp(
+        self, t_ns: int, joints_rad: Float[np.ndarray, " num_joints"], width_m: float
+    ) -> None:
+        """Look for links inside objects that still lie where they were localised.
+
+        Physics would push the object aside and hide that a finger comes down on it.
+        """
+        self.hulls.place(joints_rad, width_m)
+        for name, T in self._scene.movable().items():
+            model = self._scene.task.objects[name]
+            solid = self._objects[name]
+            points = None if model.mesh is None else se3.apply(T, object_mesh(model).vertices_m)
+            for index, link in enumerate(self._links):
+                R, t = self.hulls.rotations[index], self.hulls.translations[index]
+                if _sphere_gap(R @ link.centre + t, link, se3.apply(T, solid.centre), solid) > 0:
+                    continue
+                distance = (
+                    planes_of(self.hulls)[index].distance_m(points, R, t)
+                    if points is not None
+                    else signed_distance(
+                        link.shape, self.hulls.placements[index], solid.shape, placement_of(T)
+                    )
+                )
+                if distance < -self.config.pre_grasp_depth_m:
+                    self._fail(t_ns, "pre_grasp_penetration", link.body, name, distance)
+
+    def contacts(self) -> list[Contact]:
+        """Stretches of time in which two bodies were closer than the margin."""
+        collected = [contact for stretch in self._contacts.values() for contact in stretch]
+        return sorted(collected, key=lambda contact: (contact.start_ns, contact.bodies))
+
+    def _has_moved(self, name: str, T: Float[np.ndarray, "4 4"]) -> bool:
+        start = self._scene.Ts_base_object[name]
+        return bool(np.linalg.norm(T[:3, 3] - start[:3, 3]) > self.config.moved_m)
+
+    def _nodes_have_moved(self, name: str, nodes: Float[np.ndarray, "num_nodes 3"]) -> bool:
+        """Against where the body had come to rest, because it sags when it is put down."""
+        centre = nodes.mean(axis=0)
+        start = self._first_centre.setdefault(name, centre)
+        return bool(np.linalg.norm(centre - start) > self.config.moved_m)
+
+    def _judge(
+        self, t_ns: int, body: str, other: str, distance: float, allowed: set[frozenset[str]]
+    ) -> float:
+        """Note a pair that is too close; returns its distance if the pair may not touch."""
+        may_touch = _may_touch(body, other, allowed)
+        if distance < self.config.eps_col_m:
+            self._note(t_ns, (body, other), distance, may_touch)
+        if may_touch:
+            # An object that drops may lie deep for one step: the solver's doing, not the plan's.
+            if distance < -self.config.max_contact_depth_m and body not in self._objects:
+                self._fail(t_ns, "deep_contact", body, other, distance)
+            return np.inf
+        if distance < self.config.eps_col_m:
+            self._fail(t_ns, "collision" if distance < 0 else "too_close", body, other, distance)
+        return distance
+
+    def _fail(self, t_ns: int, cause: str, body: str, other: str, distance: float) -> None:
+        if any(failure.cause == cause for failure in self.failures):
+            return
+        where = f"{abs(distance) * 1e3:.1f} mm {'inside' if distance < 0 else 'from'} {other}"
+        self.failures.append(
+            Failure(
+                t_ns=t_ns,
+                cause=cause,
+                bodies=(body, other),
+                detail=f"{body} is {where}",
+            )
+        )
+
+    def _note(self, t_ns: int, bodies: tuple[str, str], distance: float, may_touch: bool) -> None:
+        stretches = self._contacts.setdefault((*bodies, may_touch), [])
+        if stretches and stretches[-1].end_ns >= self._last_ns:
+            last = stretches.pop()
+            start, least = last.start_ns, min(last.min_distance_m, distance)
+        else:
+            start, least = t_ns, distance
+        stretches.append(
+            Contact(
+                start_ns=start,
+                end_ns=t_ns,
+                bodies=bodies,
+                allowed=may_touch,
+                min_distance_m=least,
+            )
+        )
+
+
+def active_stage(stages: tuple[Stage, ...], t_ns: int) -> Stage | None:
+    """The last stage that has begun; before the first one begins, the first."""
+    begun = [stage for stage in stages if stage.t_start_ns <= t_ns]
+    if begun:
+        return begun[-1]
+    return stages[0] if stages else None
+
+
+def _allowed(stage: Stage | None) -> set[frozenset[str]]:
+    return set() if stage is None else {frozenset(pair) for pair in stage.allowed_contacts}
+
+
+def _may_touch(body: str, other: str, allowed: set[frozenset[str]]) -> bool:
+    return frozenset((group_of(body), other)) in allowed or frozenset((body, other)) in allowed
+
+
+def _sphere_gap(
+    centre: Float[np.ndarray, "3"], link: Solid, other: Float[np.ndarray, "3"], solid: Solid
+) -> float:
+    """Lower bound of the distance of two pieces, from their bounding spheres."""
+    return float(np.linalg.norm(centre - other)) - link.radius_m - solid.radius_m

@@ -1,0 +1,256 @@
+"""What stands still around the robot, and how far placed pieces are from it and from objects."""
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+
+import coal
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry import se3
+from twin.replay.clearance.bodies import (
+    SCENE,
+    TABLE,
+    Placed,
+    Solid,
+    box_corners,
+    placement_of,
+)
+from twin.replay.clearance.grid import GridLookup
+from twin.replay.clearance.nodes import distance_to_box_m, planes_of
+from twin.replay.clearance.shells import Shell, shell_of, shell_of_robot
+from twin.replay.clearance.unnamed import Foot, Panel, unnamed_scene
+from twin.replay.scene import ReplayScene
+from twin.robot.collision import RobotHulls, signed_distance
+
+Pair = tuple[str, int, str, int]
+"""A body and which of the robot's hulls it is (-1: an object), the other body and its piece."""
+
+_STILL_M = 1e-9
+_SAMPLES = 4
+
+
+class Surroundings:
+    """Table, container panels and the unnamed rest of the scene."""
+
+    def __init__(self, scene: ReplayScene, hulls: RobotHulls, eps_m: float) -> None:
+        """Place the panels and take what has a name out of the scene's grid.
+
+        Args:
+            scene: Table height, containers and the static scene.
+            hulls: The robot.
+            eps_m: Pairs closer than this are always measured.
+        """
+        self._hulls = hulls
+        self._eps_m = eps_m
+        self._table_height_m = scene.table_height_m
+        half_space = coal.Halfspace(np.array([0.0, 0.0, 1.0]), scene.table_height_m)
+        self._table = Placed(TABLE, half_space, coal.Transform3s())
+        self._panels = [
+            (name, piece, panel)
+            for name, T in scene.containers().items()
+            for piece, panel in enumerate(_panels(scene, name, T))
+        ]
+        self._placed = [
+            Placed(name, coal.Box(*extents), placement_of(T), piece)
+            for name, piece, (T, extents) in self._panels
+        ]
+        if self._panels:
+            Ts_panel_base = np.stack([se3.invert(T) for _, _, (T, _) in self._panels])
+            self._R_panel_base, self._p_panel_base = (
+                Ts_panel_base[:, :3, :3],
+                Ts_panel_base[:, :3, 3],
+            )
+            self._half_m = np.stack([extents / 2 for _, _, (_, extents) in self._panels])
+        self._standing, foot = standing_links(hulls)
+        self.lookup: GridLookup | None = None
+        if scene.static_sdf is not None:
+            panels = [panel for _, _, panel in self._panels]
+            grid = unnamed_scene(scene.static_sdf, scene.table_height_m, foot, panels)
+            self.lookup = None if grid is None else GridLookup(grid)
+        self._unnamed = Placed(SCENE, None, coal.Transform3s())
+        self._shells: dict[str, Shell] = {}
+        if self.lookup is not None:
+            self._shells = {
+                name: _box_shell(scene.task.objects[name].size_m)
+                for name in scene.movable()
+                if scene.task.objects[name].soft is None
+            }
+
+    def measure(
+        self,
+        solids: list[Solid],
+        Ts_base_moved: list[Float[np.ndarray, "4 4"]],
+        objects: Mapping[str, tuple[Solid, Float[np.ndarray, "4 4"]]],
+        *,
+        near_m: float,
+        counts: Callable[[str, str], bool],
+    ) -> tuple[dict[Pair, float], float]:
+        """Measure the nearest pairs.
+
+        Args:
+            solids: The robot's hulls, placed by ``RobotHulls.place``, then moved objects.
+            Ts_base_moved: Poses of the moved objects.
+            objects: What the robot is measured against.
+            near_m: Pairs closer than this are all measured.
+            counts: Whether a pair's distance counts for the smallest one.
+
+        Returns:
+            Distances [m], and one that all other pairs keep.
+        """
+        num_links = len(self._hulls.hulls)
+        placements = self._hulls.placements + [placement_of(T) for T in Ts_base_moved]
+        R = np.concatenate([self._hulls.rotations, *(T[None, :3, :3] for T in Ts_base_moved)])
+        t = np.concatenate([self._hulls.translations, *(T[None, :3, 3] for T in Ts_base_moved)])
+        coarse = self._coarse_distances_m(R[:num_links], t[:num_links])
+        found: dict[Pair, float] = {}
+        best = np.inf
+        # Nearest bounds first: most pairs are then skipped, and the minimum stays exact.
+        for bound, index, other in self._candidates(solids, R, t, objects, coarse):
+            if bound > max(best, near_m):
+                return found, max(best, near_m)
+            solid = solids[index]
+            if other.shape is None:
+                distance = self._to_scene_m(solid.body, index, R[index], t[index], coarse)
+            else:
+                distance = signed_distance(
+                    solid.shape, placements[index], other.shape, other.placement
+                )
+            piece = index if index < num_links else -1
+            found[solid.body, piece, other.body, other.piece] = distance
+            if counts(solid.body, other.body):
+                best = min(best, distance)
+        return found, np.inf
+
+    def measure_nodes(
+        self,
+        links: list[Solid],
+        nodes_m: Mapping[str, Float[np.ndarray, "num_nodes 3"]],
+        moved_m: Mapping[str, Float[np.ndarray, "num_nodes 3"]],
+    ) -> dict[Pair, float]:
+        """Measure soft bodies: the near links against all, what stands still against moved ones."""
+        found: dict[Pair, float] = {}
+        for name, nodes in nodes_m.items():
+            centre = (nodes.min(axis=0) + nodes.max(axis=0)) / 2
+            radius = float(np.linalg.norm(nodes - centre, axis=1).max())
+            for index, link in enumerate(links):
+                R, t = self._hulls.rotations[index], self._hulls.translations[index]
+                gap = float(np.linalg.norm(R @ link.centre + t - centre)) - radius - link.radius_m
+                if gap < self._eps_m:
+                    planes = planes_of(self._hulls)[index]
+                    found[link.body, index, name, 0] = planes.distance_m(nodes, R, t)
+                else:
+                    found[link.body, index, name, 0] = gap
+        for name, nodes in moved_m.items():
+            found[name, -1, TABLE, 0] = float(nodes[:, 2].min()) - self._table_height_m
+            for container, piece, panel in self._panels:
+                found[name, -1, container, piece] = distance_to_box_m(nodes, panel)
+            if self.lookup is not None:
+                found[name, -1, SCENE, 0] = float(self.lookup.distance(nodes).min())
+        return found
+
+    def _coarse_distances_m(
+        self, R: Float[np.ndarray, "num_links 3 3"], t: Float[np.ndarray, "num_links 3"]
+    ) -> Float[np.ndarray, " num_coarse"] | None:
+        if self.lookup is None:
+            return None
+        return shell_of_robot(self._hulls).coarse_distances_m(self.lookup, R, t)
+
+    def _to_scene_m(
+        self,
+        body: str,
+        index: int,
+        R: Float[np.ndarray, "3 3"],
+        t: Float[np.ndarray, "3"],
+        coarse: Float[np.ndarray, " num_coarse"] | None,
+    ) -> float:
+        if self.lookup is None or coarse is None:
+            return np.inf
+        if body in self._shells:
+            shell = self._shells[body]
+            placed = shell.coarse_m @ R.T + t
+            return shell.distance_m(
+                self.lookup, R, t, self.lookup.distance(placed).astype(np.float64)
+            )
+        robot = shell_of_robot(self._hulls)
+        part = slice(robot.starts[index], robot.starts[index + 1])
+        return robot.shells[index].distance_m(self.lookup, R, t, coarse[part])
+
+    def _candidates(
+        self,
+        solids: list[Solid],
+        R: Float[np.ndarray, "num_solids 3 3"],
+        t: Float[np.ndarray, "num_solids 3"],
+        objects: Mapping[str, tuple[Solid, Float[np.ndarray, "4 4"]]],
+        coarse: Float[np.ndarray, " num_coarse"] | None,
+    ) -> list[tuple[float, int, Placed]]:
+        """Pairs with a lower bound of their distance, nearest first."""
+        num_links = len(self._hulls.hulls)
+        centres = np.einsum("nij,nj->ni", R, np.stack([solid.centre for solid in solids])) + t
+        radii = np.array([solid.radius_m for solid in solids])
+        pairs: list[tuple[float, int, Placed]] = []
+        mobile = [i for i, solid in enumerate(solids) if solid.body not in self._standing]
+        heights = (centres[:, 2] - radii - self._table_height_m).tolist()
+        pairs += [(heights[index], index, self._table) for index in mobile]
+        if self._panels:
+            local = np.einsum("pij,sj->psi", self._R_panel_base, centres)
+            outside = np.abs(local + self._p_panel_base[:, None]) - self._half_m[:, None]
+            gaps = np.linalg.norm(np.maximum(outside, 0.0), axis=-1) - radii
+            pairs += [
+                (gap, index, panel)
+                for row, panel in zip(gaps.tolist(), self._placed, strict=True)
+                for index, gap in enumerate(row)
+            ]
+        for name, (solid, T) in objects.items():
+            placed = Placed(name, solid.shape, placement_of(T))
+            offsets = centres[:num_links] - se3.apply(T, solid.centre)
+            gaps = np.linalg.norm(offsets, axis=1) - radii[:num_links] - solid.radius_m
+            pairs += [(gap, index, placed) for index, gap in enumerate(gaps.tolist())]
+        if self.lookup is not None and coarse is not None:
+            bounds = shell_of_robot(self._hulls).bounds_m(coarse).tolist()
+            around = self.lookup.distance(centres[num_links:]) - radii[num_links:]
+            bounds += around.tolist()
+            pairs += [(bounds[index], index, self._unnamed) for index in mobile]
+        return sorted(pairs, key=lambda pair: pair[0])
+
+
+@lru_cache(maxsize=32)
+def _box_shell(size_m: tuple[float, float, float]) -> Shell:
+    return shell_of(box_corners(np.array(size_m)))
+
+
+def _panels(scene: ReplayScene, name: str, T_base_object: Float[np.ndarray, "4 4"]) -> list[Panel]:
+    panels = []
+    for centre, extents in scene.task.objects[name].panels():
+        T_object_panel = np.eye(4)
+        T_object_panel[:3, 3] = centre
+        panels.append((T_base_object @ T_object_panel, extents))
+    return panels
+
+
+@lru_cache(maxsize=4)
+def standing_links(hulls: RobotHulls) -> tuple[frozenset[str], Foot | None]:
+    """Links whose height no motion changes: the base, and a shoulder that turns about vertical.
+
+    The robot stands on the table with them, so their distance to it says nothing of a plan. With
+    them the cylinder about the base's z axis that holds them.
+    """
+    rng = np.random.default_rng(0)
+    corners = []
+    for _ in range(_SAMPLES):
+        hulls.place(rng.uniform(-1.0, 1.0, len(hulls.robot.arm_ids)), 0.0)
+        corners.append(
+            [
+                hull.points_m @ R.T + t
+                for hull, R, t in zip(hulls.hulls, hulls.rotations, hulls.translations, strict=True)
+            ]
+        )
+    lowest = np.array([[points[:, 2].min() for points in posture] for posture in corners])
+    still = np.flatnonzero(np.ptp(lowest, axis=0) < _STILL_M)
+    if not len(still):
+        return frozenset(), None
+    held = np.concatenate([posture[index] for posture in corners for index in still])
+    foot = Foot(
+        radius_m=float(np.hypot(held[:, 0], held[:, 1]).max()), top_m=float(held[:, 2].max())
+    )
+    return frozenset(hulls.hulls[index].link for index in still), foot
