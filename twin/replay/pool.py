@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from twin.replay.worker import Answer, Failed, Function, Worker, WorkerDiedError, do
 
@@ -17,6 +17,7 @@ ATTEMPTS = 2
 Item = TypeVar("Item")
 
 
+@runtime_checkable
 class Runner(Protocol):
     """Does a function for many items; a context manager that ends what it started."""
 
