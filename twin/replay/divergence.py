@@ -9,9 +9,9 @@ What parts first decides the attribution of a pair; what parts later may follow 
 the same name:
 
 - tool pose: tracking;
-- gripper width while neither side touches anything: tracking; while something is held: perception
-  against the recording (the fingers hold another part of it than was localised), contact inside the
-  twin (both began with the same poses);
+- gripper width, at rest, while neither side touches anything: tracking; while something is held:
+  perception against the recording (the fingers hold another part of it than was localised), contact
+  inside the twin (both began with the same poses);
 - fingers touch earlier or later, or only on one side: perception against the recording, contact
   inside the twin;
 - fingers lose it earlier or later: contact;
@@ -36,6 +36,10 @@ SCHEMA_VERSION = 1
 STEP_NS = 16_666_667
 HELD_STEPS = 3
 """A difference counts when it lasts for so many steps: one sample may be noise."""
+REST_M_S = 0.02
+"""A gripper slower than this rests."""
+REST_STEPS = 12
+"""So many steps before and after it moves are left out: two grippers start 0.2 s apart."""
 LAGS_S = np.arange(-0.2, 0.601, 0.01)
 SIDES = ("planned", "executed", "recorded")
 ORDER = ("tool_position", "tool_rotation", "gripper_width", "contact", "object_position")
@@ -155,6 +159,10 @@ def _shifted(trace: Trace, lag: float) -> Trace:
         trace,
         tool=tool,
         width_times_ns=trace.width_times_ns - shift,
+        objects={
+            name: replace(track, stamps_ns=track.stamps_ns - shift)
+            for name, track in trace.objects.items()
+        },
         touches={
             name: None if touch is None else (touch[0] - shift, touch[1] - shift)
             for name, touch in trace.touches.items()
@@ -171,10 +179,7 @@ def _partings(first: Trace, second: Trace, config: PartingConfig) -> Iterator[Pa
     turned = se3.rotation_angle_rad(
         np.swapaxes(one.transforms()[:, :3, :3], 1, 2) @ two.transforms()[:, :3, :3]
     )
-    widths = np.abs(
-        np.interp(times, first.width_times_ns, first.width_m)
-        - np.interp(times, second.width_times_ns, second.width_m)
-    )
+    widths = _resting_difference(first, second, times)
     recorded = "recorded" in pair
     held = _held(first, times) | _held(second, times)
     for quantity, values, limit in (
@@ -191,6 +196,22 @@ def _partings(first: Trace, second: Trace, config: PartingConfig) -> Iterator[Pa
         yield _parting(pair, quantity, int(times[index]), values[index:].max(), limit, cause)
     yield from _touches(first, second, config)
     yield from _objects(first, second, config)
+
+
+def _resting_difference(
+    first: Trace, second: Trace, times_ns: Int[np.ndarray, " num_times"]
+) -> Float[np.ndarray, " num_times"]:
+    """Difference of the widths while neither gripper moves; 0 while one does.
+
+    How fast a gripper closes is seen in when it touches; what it holds, in where it stops.
+    """
+    one, two = (np.interp(times_ns, t.width_times_ns, t.width_m) for t in (first, second))
+    moving = np.zeros(len(times_ns), dtype=bool)
+    for width in (one, two):
+        fast = np.abs(np.diff(width, prepend=width[:1])) > REST_M_S * STEP_NS * 1e-9
+        around = np.convolve(fast.astype(np.int64), np.ones(2 * REST_STEPS + 1), mode="same")
+        moving |= around[: len(times_ns)] > 0
+    return np.where(moving, 0.0, np.abs(one - two))
 
 
 def _held(trace: Trace, times_ns: Int[np.ndarray, " num_times"]) -> Bool[np.ndarray, " num_times"]:
