@@ -8,11 +8,11 @@ namespace soft {
 namespace {
 
 constexpr double kRecentre = 0.03;   // farther from its origin [m] a body gets another one
+// Most that the local step's matrix may add to 1 before kept stress overshoots (measured: 3 is too
+// much); the stiffest tetrahedra forget part of theirs, most bodies' need smaller substeps.
+constexpr double kCoupling = 2.0;
+constexpr double kUsual = 0.9;       // share of the tetrahedra that must keep all of their stress
 constexpr double kOriginGrid = 1.0 / 1024;  // origins are multiples of it [m]
-
-struct Matrix {
-    double m[3][3];
-};
 
 Matrix inverse(const Matrix& a) {
     const auto& m = a.m;
@@ -33,15 +33,29 @@ Matrix inverse(const Matrix& a) {
     return r;
 }
 
+double largest_eigenvalue(const Matrix& a) {
+    // Power iteration from a vector that no symmetry of a lattice makes orthogonal.
+    double x[3] = {0.577, 0.637, 0.511}, size = 1.0;
+    for (int turn = 0; turn < 60; ++turn) {
+        double y[3];
+        for (int i = 0; i < 3; ++i)
+            y[i] = a.m[i][0] * x[0] + a.m[i][1] * x[1] + a.m[i][2] * x[2];
+        size = std::sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2]);
+        for (int i = 0; i < 3; ++i) x[i] = y[i] / size;
+    }
+    return size;
+}
+
 }  // namespace
 
-Body::Body(const BodySpec& spec, double step_s)
+Body::Body(const BodySpec& spec)
     : samples(spec.samples),
       triangles(spec.triangles),
       friction(spec.friction),
       damping_rate(spec.damping_rate),
       spacing(spec.spacing),
-      num_nodes(static_cast<int>(spec.nodes.size())) {
+      num_nodes(static_cast<int>(spec.nodes.size())),
+      spec_(spec) {
     // Lame's constants, and Smith et al. 2018 (section 3.4): lambda is theirs plus mu, so that the
     // energy is linear elasticity for small strains.
     const double mu = spec.young / (2 * (1 + spec.poisson));
@@ -67,13 +81,50 @@ Body::Body(const BodySpec& spec, double step_s)
     }
     start = p;
     predicted_ = p;
-    build_blocks(spec, step_s);
     look_around();
 }
 
-void Body::build_blocks(const BodySpec& spec, double step_s) {
-    const int num_tets = static_cast<int>(spec.tets.size() / 4);
-    order = block_order(spec.tets.data(), num_tets, num_nodes);
+Body::Tet Body::tet_of(std::int32_t t, double step_s) const {
+    const std::int32_t* ids = spec_.tets.data() + 4 * t;
+    Matrix edges;
+    for (int k = 0; k < 3; ++k) {
+        const Double3 edge = spec_.rest[ids[k + 1]] - spec_.rest[ids[0]];
+        edges.m[0][k] = edge.x;
+        edges.m[1][k] = edge.y;
+        edges.m[2][k] = edge.z;
+    }
+    const Double3 e1{edges.m[0][0], edges.m[1][0], edges.m[2][0]},
+        e2{edges.m[0][1], edges.m[1][1], edges.m[2][1]},
+        e3{edges.m[0][2], edges.m[1][2], edges.m[2][2]};
+    Tet tet;
+    tet.b = inverse(edges);
+    tet.step_volume = step_s * step_s * dot(cross(e1, e2), e3) / 6;
+    tet.system = Matrix{};
+    for (int i = 0; i < 3; ++i) tet.system.m[i][i] = 1.0;
+    for (int k = 0; k < 4; ++k) {
+        double row[3];
+        for (int j = 0; j < 3; ++j)
+            row[j] = k ? tet.b.m[k - 1][j] : -(tet.b.m[0][j] + tet.b.m[1][j] + tet.b.m[2][j]);
+        const double scale = material.metric * tet.step_volume / spec_.masses[ids[k]];
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j) tet.system.m[i][j] += scale * row[i] * row[j];
+    }
+    tet.coupling = largest_eigenvalue(tet.system) - 1.0;
+    return tet;
+}
+
+double Body::longest_substep(double step_s) const {
+    std::vector<double> couplings;
+    for (std::size_t t = 0; t < spec_.tets.size() / 4; ++t)
+        couplings.push_back(tet_of(static_cast<std::int32_t>(t), step_s).coupling);
+    std::sort(couplings.begin(), couplings.end());
+    const double usual = couplings[static_cast<std::size_t>(kUsual * (couplings.size() - 1))];
+    return step_s * std::sqrt(kCoupling / usual);
+}
+
+void Body::build_blocks(double step_s) {
+    const int num_tets = static_cast<int>(spec_.tets.size() / 4);
+    order = block_order(spec_.tets.data(), num_tets, num_nodes);
     blocks.assign(order.size() / kLanes, TetBlock{});
     for (std::size_t n = 0; n < order.size(); ++n) {
         TetBlock& block = blocks[n / kLanes];
@@ -84,37 +135,14 @@ void Body::build_blocks(const BodySpec& spec, double step_s) {
             for (int k = 0; k < 3; ++k) block.b[4 * k][lane] = 1.0f;
             continue;
         }
-        const std::int32_t* ids = spec.tets.data() + 4 * t;
-        Matrix edges;
-        for (int k = 0; k < 3; ++k) {
-            const Double3 edge = spec.rest[ids[k + 1]] - spec.rest[ids[0]];
-            edges.m[0][k] = edge.x;
-            edges.m[1][k] = edge.y;
-            edges.m[2][k] = edge.z;
-        }
-        const Double3 e1{edges.m[0][0], edges.m[1][0], edges.m[2][0]},
-            e2{edges.m[0][1], edges.m[1][1], edges.m[2][1]},
-            e3{edges.m[0][2], edges.m[1][2], edges.m[2][2]};
-        const double volume = dot(cross(e1, e2), e3) / 6;
-        const Matrix b = inverse(edges);
-        const double step_volume = step_s * step_s * volume;
-        Matrix system{};
-        for (int i = 0; i < 3; ++i) system.m[i][i] = 1.0;
-        for (int k = 0; k < 4; ++k) {
-            double row[3];
-            for (int j = 0; j < 3; ++j)
-                row[j] = k ? b.m[k - 1][j] : -(b.m[0][j] + b.m[1][j] + b.m[2][j]);
-            const double w = 1.0 / spec.masses[ids[k]];
-            for (int i = 0; i < 3; ++i)
-                for (int j = 0; j < 3; ++j)
-                    system.m[i][j] += material.metric * step_volume * w * row[i] * row[j];
-        }
-        const Matrix z = inverse(system);
+        const Tet tet = tet_of(t, step_s);
+        const Matrix z = inverse(tet.system);
         const double six[6] = {z.m[0][0], z.m[0][1], z.m[0][2], z.m[1][1], z.m[1][2], z.m[2][2]};
-        for (int k = 0; k < 4; ++k) block.ids[k][lane] = ids[k];
-        for (int k = 0; k < 9; ++k) block.b[k][lane] = static_cast<float>(b.m[k / 3][k % 3]);
+        for (int k = 0; k < 4; ++k) block.ids[k][lane] = spec_.tets[4 * t + k];
+        for (int k = 0; k < 9; ++k) block.b[k][lane] = static_cast<float>(tet.b.m[k / 3][k % 3]);
         for (int k = 0; k < 6; ++k) block.z[k][lane] = static_cast<float>(six[k]);
-        block.step_volume[lane] = static_cast<float>(step_volume);
+        block.kept[lane] = static_cast<float>(std::min(1.0, kCoupling / tet.coupling));
+        block.step_volume[lane] = static_cast<float>(tet.step_volume);
     }
 }
 

@@ -41,7 +41,10 @@ struct BodySpec {
 
 class Body {
   public:
-    Body(const BodySpec& spec, double step_s);
+    explicit Body(const BodySpec& spec);
+
+    double longest_substep(double step_s) const;  // that keeps its stiffness; a guess is given
+    void build_blocks(double step_s);
 
     // x, y, z and the inverse mass of each node; four that never move come last, for empty lanes.
     std::vector<float> p;
@@ -93,8 +96,15 @@ class Body {
     void damp(double period_s);               // what is not rigid motion gets slower
 
   private:
+    struct Tet {
+        Matrix b, system;
+        double step_volume, coupling;
+    };
+
+    BodySpec spec_;
     std::vector<float> predicted_;
-    void build_blocks(const BodySpec& spec, double step_s);
+
+    Tet tet_of(std::int32_t t, double step_s) const;
     void recentre(const Double3& middle);
 };
 

@@ -34,6 +34,10 @@ inline Float3 narrow(const Double3& a) {
 }
 inline Double3 widen(const Float3& a) { return {a.x, a.y, a.z}; }
 
+struct Matrix {
+    double m[3][3];
+};
+
 struct Rotation {
     double m[9];  // row by row
 

@@ -14,7 +14,7 @@ namespace SOFT_ISA {
 namespace {
 
 constexpr float kCrushed = 0.25f;       // below this share of its volume a tetrahedron stiffens
-constexpr float kBarrier = 8.0f;        // by so many times lambda
+constexpr float kBarrier = 0.0f;        // by so many times lambda
 constexpr float kVolumeShare = 0.5f;    // of the volume term's stiffness in the local step
 
 struct Tets {
@@ -90,7 +90,8 @@ void relax(TetBlock* blocks, int num_blocks, float* nodes, Material material) {
                              e[0] * xz + e[1] * yz + e[2] * zz};
         const Lanes q[9] = {s[0].x, s[1].x, s[2].x, s[0].y, s[1].y,
                             s[2].y, s[0].z, s[1].z, s[2].z};
-        for (int k = 0; k < 9; ++k) store(block.stress[k], load(block.stress[k]) + q[k]);
+        const Lanes kept = load(block.kept);
+        for (int k = 0; k < 9; ++k) store(block.stress[k], (load(block.stress[k]) + q[k]) * (kept * shrink));
         move(block, tets, q, nodes);
     }
 }

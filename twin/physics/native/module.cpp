@@ -172,6 +172,7 @@ class SoftSolver {
         return found;
     }
 
+    int num_substeps() { return solver_->num_substeps(); }
     bool is_lost(int index) { return body(index).lost; }
     std::vector<std::int32_t> order(int index) { return body(index).order; }
 
@@ -207,6 +208,7 @@ NB_MODULE(_soft, m) {
         .def("set_velocities", &SoftSolver::set_velocities, "body"_a, "velocities"_a)
         .def("pushes", &SoftSolver::pushes)
         .def("touched", &SoftSolver::touched, "body"_a)
+        .def("num_substeps", &SoftSolver::num_substeps)
         .def("is_lost", &SoftSolver::is_lost, "body"_a)
         .def("order", &SoftSolver::order, "body"_a);
 }

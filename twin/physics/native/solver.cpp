@@ -1,15 +1,32 @@
 #include "solver.hpp"
 
 #include <algorithm>
+#include <cmath>
 
 namespace soft {
 
+namespace {
+
+constexpr int kMostRefined = 4;  // times the substeps asked for, for the stiffest and lightest
+
+}  // namespace
+
 Solver::Solver(double period_s, int num_substeps, double gravity, const Kernels* kernels)
-    : period_s_(period_s), gravity_(gravity), num_substeps_(num_substeps), kernels_(kernels) {}
+    : period_s_(period_s),
+      gravity_(gravity),
+      fewest_substeps_(num_substeps),
+      num_substeps_(num_substeps),
+      kernels_(kernels) {}
 
 int Solver::add_body(const BodySpec& spec) {
-    bodies.emplace_back(spec, substep_s());
-    bodies.back().touched.assign(colliders.size(), 0);
+    bodies.emplace_back(spec);
+    Body& added = bodies.back();
+    added.touched.assign(colliders.size(), 0);
+    const double longest = added.longest_substep(substep_s());
+    const int needed = static_cast<int>(std::ceil(period_s_ / longest - 1e-9));
+    const int most = kMostRefined * fewest_substeps_;
+    num_substeps_ = std::min(std::max(num_substeps_, needed), most);
+    for (Body& body : bodies) body.build_blocks(substep_s());
     return static_cast<int>(bodies.size()) - 1;
 }
 
@@ -44,16 +61,16 @@ void Solver::step(const std::vector<int>& driven, const std::vector<Pose>& poses
     for (int substep = 1; substep <= num_substeps_; ++substep) {
         const double share = static_cast<double>(substep) / num_substeps_;
         for (Collider& collider : colliders) collider.interpolate(share, step_s);
-        for (Body& body : bodies) {
-            if (body.lost) continue;
-            body.predict(gravity_, step_s, *kernels_);
-            body.relax(*kernels_);
-        }
+        for (Body& body : bodies)
+            if (!body.lost) body.predict(gravity_, step_s, *kernels_);
+        // Before the stress is looked at: where forces balance contact then leaves nothing to do,
+        // and the material sees the body as it is and not as it would be inside of its support.
         for (std::size_t i = 0; i < bodies.size(); ++i)
             solve_pairs(bodies, static_cast<int>(i), step_s);
         for (Body& body : bodies) {
             if (body.lost) continue;
             solve_contacts(body, colliders, step_s);
+            body.relax(*kernels_);
             body.finish(step_s);
         }
     }

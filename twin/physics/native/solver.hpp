@@ -20,11 +20,12 @@ class Solver {
     std::vector<Body> bodies;
     std::vector<Collider> colliders;
 
+    int num_substeps() const { return num_substeps_; }
     double substep_s() const { return period_s_ / num_substeps_; }
 
   private:
     double period_s_, gravity_;
-    int num_substeps_;
+    int fewest_substeps_, num_substeps_;
     const Kernels* kernels_;
 
     void find();

@@ -18,6 +18,7 @@ struct alignas(32) TetBlock {
     float b[9][kLanes];        // inverse of the edge matrix at rest, row by row [1/m]
     float z[6][kLanes];        // xx, xy, xz, yy, yz, zz of the local step's 3 x 3 matrix
     float stress[9][kLanes];   // first Piola-Kirchhoff stress kept from visit to visit [Pa]
+    float kept[kLanes];        // share of the stress that the next substep begins with
     float step_volume[kLanes]; // rest volume times the square of the substep [m^3 s^2]
 };
 

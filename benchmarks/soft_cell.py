@@ -1,0 +1,218 @@
+"""Pick-and-place of soft toys in the twin's world and in MuJoCo, from the same scripted plan."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bridge.sources.standin.cell import HOME_SEED_RAD
+from bridge.sources.standin.cell_file import load_cell
+from bridge.sources.standin.hidden import nominal_hidden
+from bridge.sources.standin.kinematics import arm_kinematics, tool_down
+from bridge.sources.standin.planner import GraspError, plan_pick_and_place
+from bridge.sources.standin.world import World as MujocoWorld
+from bridge.task.robot import ur5_with_gripper_urdf
+from bridge.task.task_file import ObjectModel, Task, load_task
+from twin.physics.config import PhysicsConfig
+from twin.physics.soft import SoftModel
+from twin.physics.world import World
+from twin.replay.config import ReplayConfig
+from twin.replay.path import JointPath, path_of_plan
+from twin.robot.collision import hulls_of
+from twin.robot.model import load_robot
+
+SETTLE_S = 1.0
+LIFTED_M = 0.08
+GRIP_N = (6.0, 12.0)
+"""What the toys' cell file draws the gripper from: a stronger one crushes the softest toys."""
+JOINT_SPEED_RAD_S = 1.6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """Everything that both engines need."""
+
+    task: Task
+    Ts_base_object: dict[str, np.ndarray]
+    path: JointPath
+    physics: PhysicsConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Toy:
+    """How one toy ended."""
+
+    held: bool
+    placed: bool
+    num_inverted: int
+    extents_off: float
+    """Largest change of an extent, as a fraction."""
+    shape_error_m: float
+    """Largest distance of a node from where the rigid body would have it."""
+    T_base_object: np.ndarray
+
+    @property
+    def good(self) -> bool:
+        """What the issue asks of a trial."""
+        return (
+            self.held
+            and self.placed
+            and self.num_inverted == 0
+            and self.extents_off <= 0.10
+            and self.shape_error_m <= 0.005
+        )
+
+
+def one_duck() -> Task:
+    """The ducks' task with its first duck alone."""
+    task = load_task("five_ducks_into_basket")
+    key, kept = "duck_1", {"duck_1", "basket"}
+    return replace(
+        task,
+        manipulated=(key,),
+        objects={name: task.objects[name] for name in task.objects if name in kept},
+        start={name: task.start[name] for name in task.start if name in kept},
+        stages=tuple(stage for stage in task.stages if stage["id"].endswith("_1")),
+        success=tuple(item for item in task.success if item["object"] == key),
+    )
+
+
+def draw_trial(task: Task, seed: int, *, varied: bool) -> Trial:
+    """Draw a start, and with ``varied`` material, friction and a grasp that misses a little."""
+    rng = np.random.default_rng([808, seed])
+    starts = task.draw_start(rng)
+    objects = dict(task.objects)
+    errors = []
+    for key in task.manipulated:
+        shift, turn = rng.uniform(-0.004, 0.004, 2), rng.uniform(-0.08, 0.08)
+        young, mass = np.exp(rng.uniform(np.log(1e4), np.log(1e5))), rng.uniform(0.02, 0.1)
+        if varied:
+            objects[key] = with_material(objects[key], float(young), float(mass))
+        else:
+            shift, turn = shift * 0, 0.0
+        errors.append(
+            GraspError(along_m=float(shift[0]), across_m=float(shift[1]), yaw_rad=float(turn),
+                       height_m=0.0, release_m=(0.0, 0.0))
+        )  # fmt: skip
+    friction, grip = float(rng.uniform(0.3, 1.0)), float(rng.uniform(*GRIP_N))
+    physics = PhysicsConfig(grip_force_N=grip if varied else sum(GRIP_N) / 2)
+    if varied:
+        physics = replace(physics, object_friction=friction)
+    task = replace(task, objects=objects)
+    return Trial(
+        task=task, Ts_base_object=starts, path=planned_path(task, starts, errors), physics=physics
+    )
+
+
+def with_material(model: ObjectModel, young_pa: float, mass_kg: float) -> ObjectModel:
+    """The same toy of other stuff."""
+    if model.soft is None:
+        return model
+    return replace(model, mass_kg=mass_kg, soft=replace(model.soft, young_pa=young_pa))
+
+
+def planned_path(
+    task: Task, starts: Mapping[str, np.ndarray], errors: list[GraspError]
+) -> JointPath:
+    """What the scripted planner would do, as joints."""
+    kinematics = arm_kinematics()
+    home_m = np.array(load_cell(task.cell).home_m)
+    home = kinematics.joints_for(tool_down(home_m, 0.0), np.array(HOME_SEED_RAD))
+    plan = plan_pick_and_place(
+        task, starts, errors, kinematics=kinematics, joints_start_rad=home,
+        max_joint_speed_rad_s=JOINT_SPEED_RAD_S, plan_id="bench", condition="ungated",
+        start_id="0",
+    )  # fmt: skip
+    path, failures, unreachable = path_of_plan(
+        plan, load_robot(ur5_with_gripper_urdf()), ReplayConfig()
+    )
+    if failures or unreachable is not None:
+        message = f"the scripted plan cannot be followed: {failures}"
+        raise RuntimeError(message)
+    return path
+
+
+def furnished(trial: Trial) -> World:
+    """The twin's world with the trial's objects."""
+    hulls = hulls_of(load_robot(ur5_with_gripper_urdf()))
+    meshes: dict[str, list[np.ndarray]] = {}
+    for hull in hulls.hulls:
+        if hull.from_mesh:
+            meshes.setdefault(hull.link, []).append(hull.points_m)
+    world = World(hulls.robot.urdf, meshes, trial.physics)
+    world.add_table(0.0)
+    for key in trial.task.containers:
+        world.add_static(trial.task.objects[key].panels(), trial.Ts_base_object[key])
+    for key in trial.task.soft_objects:
+        world.add_soft(key, SoftModel.from_task(trial.task.objects[key]), trial.Ts_base_object[key])
+    return world
+
+
+def replayed(trial: Trial) -> tuple[dict[str, Toy], float, float]:
+    """Run a trial in the twin: how the toys ended, simulated seconds, CPU seconds."""
+    with furnished(trial) as world:
+        path, dt = trial.path, 1.0 / trial.physics.rate_hz
+        steps = int((path.end_ns() * 1e-9 + SETTLE_S) / dt)
+        times = (np.arange(steps + 1) * dt * 1e9).astype(np.int64)
+        targets, widths = path.joints_at(times), path.width_at(times)
+        velocities = np.diff(targets, axis=0) / dt
+        world.reset_robot(targets[0], float(widths[0]))
+        highest = dict.fromkeys(trial.task.soft_objects, 0.0)
+        before = time.process_time()
+        spent = 0.0
+        for step in range(steps):
+            world.command(targets[step + 1], velocities[step], float(widths[step]))
+            world.step()
+            if step % 24 == 0:
+                paused = time.process_time()
+                for key in highest:
+                    z = float(np.mean(world.soft_nodes_m(key)[:, 2]))
+                    highest[key] = max(highest[key], z)
+                spent += time.process_time() - paused
+        cpu_s = time.process_time() - before - spent
+        toys = {key: _judge(world, trial, key, highest[key]) for key in highest}
+    return toys, steps * dt, cpu_s
+
+
+def _judge(world: World, trial: Trial, key: str, highest_m: float) -> Toy:
+    model = SoftModel.from_task(trial.task.objects[key])
+    nodes, T = world.soft_nodes_m(key).astype(np.float64), world.T_base_object(key)
+    off = (nodes - T[:3, 3]) @ T[:3, :3] - model.nodes_m
+    container = trial.task.objects[trial.task.containers[0]]
+    T_box = trial.Ts_base_object[trial.task.containers[0]]
+    return Toy(
+        held=highest_m > trial.Ts_base_object[key][2, 3] + LIFTED_M,
+        placed=inside(T, T_box, container) and not world.finger_touches(key),
+        num_inverted=world.soft_health(key).num_inverted,
+        extents_off=float(np.abs(world.soft_extents_m(key) / model.size_m - 1).max()),
+        shape_error_m=float(np.linalg.norm(off, axis=1).max()),
+        T_base_object=T,
+    )
+
+
+def inside(T: np.ndarray, T_box: np.ndarray, container: ObjectModel) -> bool:
+    """Whether the middle of a toy is in the cavity."""
+    local = T_box[:3, :3].T @ (T[:3, 3] - T_box[:3, 3])
+    centre = np.array([0.0, 0.0, container.wall_m + container.inner_m[2] / 2])
+    return bool(np.all(np.abs(local - centre) <= np.array(container.inner_m) / 2))
+
+
+def in_mujoco(trial: Trial) -> dict[str, np.ndarray]:
+    """Where the toys end in MuJoCo with trilinear flexes, everything hidden set to the trial's."""
+    hidden = replace(
+        nominal_hidden(load_cell(trial.task.cell)), latency_s=0.0, mass_scale=1.0,
+        stiffness_scale=1.0, grip_N=trial.physics.grip_force_N,
+        finger_friction=trial.physics.finger_friction * trial.physics.object_friction,
+        object_friction=trial.physics.surface_friction * trial.physics.object_friction,
+    )  # fmt: skip
+    world = MujocoWorld(trial.task, hidden)
+    path = trial.path
+    steps = int((path.end_ns() * 1e-9 + SETTLE_S) / world.step_s)
+    times = (np.arange(steps) * world.step_s * 1e9).astype(np.int64)
+    targets, widths = path.joints_at(times), path.width_at(times)
+    world.reset(targets[0], trial.Ts_base_object)
+    for joints, width in zip(targets, widths, strict=True):
+        world.command(joints, float(width))
+        world.step()
+    return {key: T for key, T in world.Ts_base_object().items() if key in trial.task.soft_objects}
