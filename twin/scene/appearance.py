@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float32
 
+from twin.scene.allowance import UNLIMITED, Allowance
 from twin.scene.gaussians import (
     NUM_FIRST,
     GaussianCloud,
@@ -26,6 +27,8 @@ RIDGE_HARMONICS = 0.5
 """Stronger: a Gaussian seen from few directions says little about the others."""
 SATURATED = 250 / 255
 """A channel brighter than this no longer follows the exposure."""
+LEAST_STEPS = 2
+"""With fewer steps a solution is not worth its time: Adam uses it better."""
 GAIN_PRIOR = 1e-3
 """Pull of a gain towards 1, as a mean squared brightness: decides only black images."""
 
@@ -45,9 +48,11 @@ class Appearance:
     """The outcome of one closed-form solution."""
 
     cloud: GaussianCloud
-    mse_before: float
-    """Mean squared colour error of the start, over the pixels that count."""
+    mse_before: float | None
+    """Mean squared colour error of the start, over the pixels that count; None when there was no
+    time to look at all of them."""
     steps: int
+    """Conjugate gradient steps done; 0: the cloud is as it was."""
 
 
 def solve_appearance(
@@ -56,6 +61,7 @@ def solve_appearance(
     rasteriser: Rasteriser,
     *,
     steps: int,
+    allowance: Allowance = UNLIMITED,
 ) -> Appearance:
     """Minimise sum |g A (c + sum_k Y_k h_k) - I|^2 + ridge |x - x_start|^2 over colours x = (c, h).
 
@@ -68,26 +74,40 @@ def solve_appearance(
         observations: Images with their gains.
         rasteriser: Draws and lifts.
         steps: Conjugate gradient steps, at most; more than six follow the noise.
+        allowance: Fewer steps are made, or none, when so many do not fit; what is begun and does
+            not end in time is dropped.
     """
-    model = _ImageModel(cloud, observations, rasteriser)
+    model = _ImageModel(cloud, observations, rasteriser, allowance)
     start = np.concatenate([cloud.colors[:, None], cloud.harmonics], axis=1)
-    right, diagonal, mse = model.right_side(start)
-    change, done = conjugate_gradients(model.normal, right, diagonal, steps=steps)
+    affordable = model.affordable_passes(start) - 1  # one pass sets the equations up
+    equations = None if affordable < min(steps, LEAST_STEPS) else model.right_side(start)
+    if equations is None:
+        return Appearance(cloud=cloud, mse_before=None, steps=0)
+    right, diagonal, mse = equations
+    change, done = conjugate_gradients(
+        model.normal, right, diagonal, steps=int(min(steps, affordable))
+    )
     solved = start + change
     painted = replace(cloud, colors=as_float32(solved[:, 0]), harmonics=as_float32(solved[:, 1:]))
     return Appearance(cloud=painted, mse_before=mse, steps=done)
 
 
 def solve_gains(
-    cloud: GaussianCloud, observations: Sequence[Observation], rasteriser: Rasteriser
+    cloud: GaussianCloud,
+    observations: Sequence[Observation],
+    rasteriser: Rasteriser,
+    allowance: Allowance = UNLIMITED,
 ) -> Float[np.ndarray, "num_views 3"]:
     """Brightness of each image relative to the drawn one, per channel; their mean is 1.
 
     Least squares over static pixels that are not saturated. The mean is the gauge: all images
-    twice as bright and all colours half as bright would look the same.
+    twice as bright and all colours half as bright would look the same. Images that there is no
+    time for keep the gains they have.
     """
-    gains = np.ones((len(observations), 3))
+    gains = np.array([item.gain for item in observations], dtype=np.float64)
     for index, item in enumerate(observations):
+        if allowance.is_over():
+            break
         drawn = rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)[:3]
         gains[index] = gain_between(drawn, item.target)
     return np.asarray(gains / gains.mean(axis=0))
@@ -106,7 +126,7 @@ def gain_between(
 
 
 def conjugate_gradients(
-    apply: Callable[[np.ndarray], np.ndarray],
+    apply: Callable[[np.ndarray], np.ndarray | None],
     right: Float32[np.ndarray, "num_splats num_terms channels"],
     diagonal: Float32[np.ndarray, "num_splats num_terms channels"],
     *,
@@ -114,7 +134,8 @@ def conjugate_gradients(
 ) -> tuple[Float32[np.ndarray, "num_splats num_terms channels"], int]:
     """Solve ``apply(x) = right`` from zero, each channel a system of its own.
 
-    Hestenes and Stiefel 1952 with a diagonal preconditioner. Returns x and the steps taken.
+    Hestenes and Stiefel 1952 with a diagonal preconditioner. Ends early when ``apply`` gives None.
+    Returns x and the steps taken.
     """
     x = np.zeros_like(right)
     residual = right.copy()
@@ -126,6 +147,8 @@ def conjugate_gradients(
         if np.all(size <= enough):
             return x, step
         applied = apply(direction)
+        if applied is None:
+            return x, step
         length = size / np.maximum(_dots(direction, applied), 1e-30)
         x += length.astype(np.float32) * direction
         residual -= length.astype(np.float32) * applied
@@ -144,20 +167,41 @@ class _ImageModel:
     """The normal equations of all images, one image in memory at a time."""
 
     def __init__(
-        self, cloud: GaussianCloud, observations: Sequence[Observation], rasteriser: Rasteriser
+        self,
+        cloud: GaussianCloud,
+        observations: Sequence[Observation],
+        rasteriser: Rasteriser,
+        allowance: Allowance,
     ) -> None:
         self._cloud = cloud
+        self._allowance = allowance
         self._observations = observations
         self._rasteriser = rasteriser
         ridge = [RIDGE_COLOR] + [RIDGE_HARMONICS] * (NUM_FIRST if cloud.num_harmonics else 0)
         self._ridge = np.array(ridge, dtype=np.float32)[None, :, None]
 
-    def right_side(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Pull of all images on the start, the preconditioner, and the mean squared error."""
+    def affordable_passes(self, start: np.ndarray) -> float:
+        """How often all images fit into the allowance, judged by the first."""
+        if self._allowance.until_s == np.inf:
+            return np.inf
+        if self._allowance.is_over():
+            return 0.0
+        began_s = self._allowance.clock()
+        self._lifted(start, self._observations[0])
+        took_s = max(self._allowance.clock() - began_s, 1e-9) * len(self._observations)
+        return float(np.floor(self._allowance.left_s() / took_s))
+
+    def right_side(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+        """Pull of all images on the start, the preconditioner, and the mean squared error.
+
+        None when the time is over before all images were drawn.
+        """
         right, diagonal = np.zeros_like(start), np.zeros_like(start)
         diagonal += self._ridge
         error, count = 0.0, 0
         for item in self._observations:
+            if self._allowance.is_over():
+                return None
             gain = item.gain.astype(np.float32)[:, None, None]
             mask = item.target.static_mask
             basis = self._basis(item)
@@ -172,16 +216,21 @@ class _ImageModel:
             diagonal += np.square(basis)[:, :, None] * squared[:, None, :]
         return right, diagonal, error / max(count, 1)
 
-    def normal(self, x: np.ndarray) -> np.ndarray:
-        """Carry a change of colours into all images and back: (A^T A + ridge) x."""
+    def normal(self, x: np.ndarray) -> np.ndarray | None:
+        """Carry a change of colours into all images and back: (A^T A + ridge) x; None: no time."""
         total = self._ridge * x
         for item in self._observations:
-            basis = self._basis(item)
-            squared = np.square(item.gain).astype(np.float32)[:, None, None]
-            drawn = self._draw(x, item)[:3]
-            lifted = self._rasteriser.lift(squared * drawn * item.target.static_mask)
-            total += basis[:, :, None] * lifted[:, None, :]
+            if self._allowance.is_over():
+                return None
+            total += self._lifted(x, item)
         return np.asarray(total)
+
+    def _lifted(self, x: np.ndarray, item: Observation) -> np.ndarray:
+        """A change of colours carried into one image and back."""
+        squared = np.square(item.gain).astype(np.float32)[:, None, None]
+        drawn = self._draw(x, item)[:3]
+        lifted = self._rasteriser.lift(squared * drawn * item.target.static_mask)
+        return np.asarray(self._basis(item)[:, :, None] * lifted[:, None, :])
 
     def _basis(self, item: Observation) -> Float32[np.ndarray, "num_splats num_terms"]:
         """Value of each unknown's harmonic along the ray to each Gaussian; 1 for the colour."""

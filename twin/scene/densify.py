@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from bridge.geometry import se3
+from twin.scene.allowance import UNLIMITED, Allowance
 from twin.scene.appearance import Observation
 from twin.scene.gaussians import (
     GaussianCloud,
@@ -49,6 +50,8 @@ class Scores:
     """Largest standard deviation in any image, in image widths."""
     size_px: Float32[np.ndarray, " num_splats"]
     """The same in pixels."""
+    complete: bool = True
+    """Whether all views that were chosen could be asked in time; else not seen says nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,13 +66,23 @@ class Densified:
 
 
 def score(
-    cloud: GaussianCloud, observations: Sequence[Observation], rasteriser: Rasteriser
+    cloud: GaussianCloud,
+    observations: Sequence[Observation],
+    rasteriser: Rasteriser,
+    allowance: Allowance = UNLIMITED,
 ) -> Scores:
-    """Draw the views, evenly chosen where there are many, and lift their errors."""
+    """Draw the views, evenly chosen where there are many, and lift their errors.
+
+    Views that there is no time for are left out.
+    """
     step = -(-len(observations) // MAX_SCORED_VIEWS)
     error, pixels, size_px, fraction = (np.zeros(len(cloud), np.float32) for _ in range(4))
     largest_m = np.exp(cloud.scales_log.max(axis=1))
+    complete = True
     for item in observations[::step]:
+        if allowance.is_over():
+            complete = False
+            break
         camera, mask = item.target.camera, item.target.static_mask
         planes = rasteriser.draw_planes(cloud, camera, item.T_base_camera)
         gain = item.gain.astype(np.float32)[:, None, None]
@@ -82,7 +95,9 @@ def score(
         px = np.where(seen, largest_m * camera.fx / np.maximum(depth_m, 0.05), 0.0)
         np.maximum(size_px, px.astype(np.float32), out=size_px)
         np.maximum(fraction, (px / camera.width).astype(np.float32), out=fraction)
-    return Scores(error=error, pixels=pixels, size_px=size_px, size_fraction=fraction)
+    return Scores(
+        error=error, pixels=pixels, size_px=size_px, size_fraction=fraction, complete=complete
+    )
 
 
 def densify(cloud: GaussianCloud, scores: Scores, *, max_splats: int, most: int) -> Densified:
@@ -114,7 +129,8 @@ def densify(cloud: GaussianCloud, scores: Scores, *, max_splats: int, most: int)
 
 def _kept_mask(cloud: GaussianCloud, scores: Scores) -> Bool[np.ndarray, " num_splats"]:
     kept: np.ndarray = cloud.opacities() > TRANSPARENT
-    kept &= scores.pixels > UNSEEN_PIXELS
+    if scores.complete:
+        kept &= scores.pixels > UNSEEN_PIXELS
     kept &= scores.size_fraction < HUGE_FRACTION
     if not kept.any():  # nothing is seen at all: images that are masked everywhere
         kept[:] = True

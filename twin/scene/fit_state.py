@@ -13,12 +13,14 @@ from bridge.whole_file import write_whole
 from twin.scene.camera_correction import CameraCorrections
 from twin.scene.fit_session import FitSession
 from twin.scene.gaussians import GaussianCloud, arrays
+from twin.scene.surface_prior import SurfacePrior
 
 FIT_STATE = "fit.npz"
 """In the scene folder while a fit runs, or after one that was interrupted."""
-STATE_VERSION = 1
-SCALARS = ("coarse_steps", "events_done", "num_split", "num_pruned")
+STATE_VERSION = 2
+SCALARS = ("coarse_steps", "events_done", "num_split", "num_pruned", "colour_steps")
 CAMERA_ARRAYS = ("values", "first", "second", "counts")
+SURFACE_ARRAYS = ("normals", "heights_m", "sizes_m")
 
 
 @dataclass(kw_only=True)
@@ -31,6 +33,8 @@ class FitState:
     """Median size of the first Gaussians; positions move in units of it."""
     gains: Float[np.ndarray, "num_views 3"]
     cameras: CameraCorrections
+    surface: SurfacePrior
+    """Where the Gaussians began."""
     seconds: float = 0.0
     """Time spent so far."""
     coarse_steps: int = 0
@@ -38,6 +42,7 @@ class FitState:
     """How much of the schedule of colour solutions and splits is behind."""
     num_split: int = 0
     num_pruned: int = 0
+    colour_steps: int = 0
     errors: list[float] = field(default_factory=list)
     """Mean squared errors of the last images."""
 
@@ -60,6 +65,7 @@ def first_state(session: FitSession, num_views: int) -> FitState:
         size_m=float(np.median(np.exp(session.cloud.scales_log.max(axis=1)))),
         gains=np.ones((num_views, 3)),
         cameras=CameraCorrections.none(num_views),
+        surface=SurfacePrior.of(session.cloud),
     )
 
 
@@ -76,6 +82,7 @@ def save_state(checkpoint: Checkpoint, state: FitState) -> None:
     }
     content |= {name: np.array(getattr(state, name)) for name in SCALARS}
     content |= {f"cameras.{name}": getattr(state.cameras, name) for name in CAMERA_ARRAYS}
+    content |= {f"surface.{name}": getattr(state.surface, name) for name in SURFACE_ARRAYS}
     moments = state.session.moments
     for name, rows in arrays(state.session.cloud):
         content[f"cloud.{name}"] = rows
@@ -119,6 +126,7 @@ def _state_from(
         size_m=float(content["size_m"]),
         gains=content["gains"],
         cameras=CameraCorrections(**part("cameras.")),
+        surface=SurfacePrior(**part("surface.")),
         seconds=float(content["seconds"]),
         errors=content["errors"].tolist(),
         **{name: int(content[name]) for name in SCALARS},

@@ -1,13 +1,14 @@
 """Read the training frames once: points, views, what moved, and whether the scan makes sense."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.terminal import Output
+from twin.scene.carried import CarriedMask, find_carried
 from twin.scene.frames import FrameChoice, NoFramesError, load
 from twin.scene.moving import MovingVoxels, Witness, choose_witnesses, find_moving
 from twin.scene.points import DepthLimits, FrameSurface, PointSet
@@ -35,6 +36,8 @@ class Learnt:
     owners: list[int]
     """Index of each view's choice."""
     moving: MovingVoxels
+    carried: dict[int, CarriedMask]
+    """By index of the choice: what moves with a camera whose robot is not known by joints."""
     witnesses: list[Witness]
     report: ScanReport
     robot: FoundRobot
@@ -47,6 +50,16 @@ def limits_of(config: RebuildConfig) -> DepthLimits:
     )
 
 
+@dataclass(kw_only=True)
+class _Read:
+    """What reading the training frames gave, frame by frame."""
+
+    points: list[PointSet] = field(default_factory=list)
+    views: list[TrainingView] = field(default_factory=list)
+    owners: list[int] = field(default_factory=list)
+    cameras: list[CameraCheck] = field(default_factory=list)
+
+
 def learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output) -> Learnt:
     """Read every training frame, check the scan, and set aside what moved.
 
@@ -55,34 +68,17 @@ def learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output)
         NoDepthError: When no depth image holds anything usable.
         PoseConventionError: When the poses fit only if read in another convention.
     """
-    total = sum(len(choice.train_ns) for choice in choices)
-    points: list[PointSet] = []
-    views: list[TrainingView] = []
-    owners: list[int] = []
-    cameras: list[CameraCheck] = []
     robot = find_robot(choices, output)
-    with output.progress("read frames", total) as advance:
-        for index, choice in enumerate(choices):
-            thumbs: list[Thumb] = []
-            trusted = []
-            for frame in load(choice, choice.train_ns):
-                surface = FrameSurface(frame, limits_of(config))
-                seen = surface.points(_stride(total, frame.depth_m.size))
-                view = training_view(surface)
-                seen, view = robot.frames.take_out(choice.episode, frame, seen, view)
-                points.append(seen)
-                views.append(view)
-                owners.append(index)
-                thumbs.append(thumb_of(frame, THUMB_PX))
-                trusted.append(float(surface.trusted.mean()))
-                advance(len(views), f"camera {frame.camera_id}")
-            cameras.append(CameraCheck(choice=choice, thumbs=thumbs, trusted=trusted))
-    if not views:
+    read = _read(choices, config, robot, output)
+    if not read.views:
         message = "no frame of this run has colour, depth and a pose together. Record it again."
         raise NoFramesError(message)
-    still_stride = _stride(MAX_POSTURES, views[0].full.depth_m.size)
+    still_stride = _stride(MAX_POSTURES, read.views[0].full.depth_m.size)
     look_closer(robot, choices, limits_of(config), still_stride)
-    report = check_scan(cameras, config.frames)
+    report = check_scan(read.cameras, config.frames)
+    carried = _set_carried_aside(choices, read, robot)
+    shares = {read.cameras[index].name: item.share for index, item in carried.items()}
+    points, views, owners = read.points, read.views, read.owners
     moved = list(choices)
     if config.frames.align_poses:
         refined = refine_poses(points, views, output)
@@ -93,7 +89,7 @@ def learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output)
     static = [moving.drop_from(item) for item in points]
     total_points = max(sum(len(p.p_m) for p in points), 1)
     gone = sum(len(p.p_m) - len(s.p_m) for p, s in zip(points, static, strict=True)) / total_points
-    report = replace(report, moving_fraction=round(gone, 4))
+    report = replace(report, moving_fraction=round(gone, 4), carried=shares)
     for remark in report.remarks():
         output.say(remark)
     return Learnt(
@@ -102,10 +98,55 @@ def learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output)
         views=[moving.mask_in(view) for view in views],
         owners=owners,
         moving=moving,
+        carried=carried,
         witnesses=witnesses,
         report=report,
         robot=robot,
     )
+
+
+def _read(
+    choices: Sequence[FrameChoice], config: RebuildConfig, robot: FoundRobot, output: Output
+) -> _Read:
+    """Read every training frame once, the robot set aside where its joints are known."""
+    total = sum(len(choice.train_ns) for choice in choices)
+    read = _Read()
+    with output.progress("read frames", total) as advance:
+        for index, choice in enumerate(choices):
+            thumbs: list[Thumb] = []
+            trusted = []
+            for frame in load(choice, choice.train_ns):
+                surface = FrameSurface(frame, limits_of(config))
+                seen = surface.points(_stride(total, frame.depth_m.size))
+                view = training_view(surface)
+                seen, view = robot.frames.take_out(choice.episode, frame, seen, view)
+                read.points.append(seen)
+                read.views.append(view)
+                read.owners.append(index)
+                thumbs.append(thumb_of(frame, THUMB_PX))
+                trusted.append(float(surface.trusted.mean()))
+                advance(len(read.views), f"camera {frame.camera_id}")
+            read.cameras.append(CameraCheck(choice=choice, thumbs=thumbs, trusted=trusted))
+    return read
+
+
+def _set_carried_aside(
+    choices: Sequence[FrameChoice], read: _Read, robot: FoundRobot
+) -> dict[int, CarriedMask]:
+    """Take out of points and views what moves with a camera, where no joints tell the robot."""
+    found: dict[int, CarriedMask] = {}
+    for index, choice in enumerate(choices):
+        if choice.still or robot.frames.knows(choice.episode):
+            continue
+        mine = [place for place, owner in enumerate(read.owners) if owner == index]
+        carried = find_carried([read.views[place] for place in mine])
+        if carried is None:
+            continue
+        found[index] = carried
+        for place in mine:
+            read.points[place] = carried.drop_from(read.points[place], read.views[place])
+            read.views[place] = carried.mask_in(read.views[place])
+    return found
 
 
 def with_fitted_poses(learnt: Learnt, Ts_base_color: Float[np.ndarray, "num_views 4 4"]) -> Learnt:

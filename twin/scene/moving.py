@@ -6,14 +6,14 @@ robot is needed. A thing that never moves, such as the robot's base, is static a
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 
 from bridge.geometry import se3
 from twin.scene.points import PointSet
-from twin.scene.training_view import Target, TrainingView
+from twin.scene.training_view import TrainingView
 
 VOXEL_M = 0.02
 """Points are judged in groups of this size."""
@@ -42,35 +42,18 @@ class MovingVoxels:
 
     def drop_from(self, points: PointSet) -> PointSet:
         """Return the static points only."""
-        kept = ~self.contains(points.p_m)
-        return PointSet(
-            p_m=points.p_m[kept],
-            normals=points.normals[kept],
-            colors=points.colors[kept],
-            footprint_m=points.footprint_m[kept],
-        )
+        return points.take(~self.contains(points.p_m))
 
     def mask_in(self, view: TrainingView) -> TrainingView:
         """Mark the pixels that show something moving, so that the fit passes them over."""
         if not len(self.keys):
             return view
-        half, full = view.half, view.full
+        half = view.half
         known = half.depth_m > 0
         p_camera = half.camera.unproject(half.depth_m)[known]
         hit = np.zeros_like(known)
         hit[known] = self.contains(se3.apply(view.T_base_color, p_camera).astype(np.float32))
-        static = ~_grown(hit)
-        height, width = full.depth_m.shape
-        doubled = np.repeat(np.repeat(static, 2, axis=0), 2, axis=1)[:height, :width]
-        return replace(view, half=_masked(half, static), full=_masked(full, doubled))
-
-
-def _masked(target: Target, static_mask: np.ndarray) -> Target:
-    return replace(
-        target,
-        static_mask=static_mask,
-        depth_m=np.where(static_mask, target.depth_m, np.float32(0.0)),
-    )
+        return view.without(_grown(hit))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +87,7 @@ def choose_witnesses(views: Sequence[TrainingView]) -> list[Witness]:
     """Take training frames spread evenly; their depth images are the witnesses."""
     step = max(1, -(-len(views) // MAX_WITNESSES))
     return [
-        Witness(view=view, nearest_m=_nearest_around(view.half.depth_m)) for view in views[::step]
+        Witness(view=view, nearest_m=nearest_around(view.half.depth_m)) for view in views[::step]
     ]
 
 
@@ -127,7 +110,7 @@ def find_moving(points: Sequence[PointSet], witnesses: Sequence[Witness]) -> Mov
     return MovingVoxels(keys=keys[(through >= MIN_THROUGH) & (through > confirmed)])
 
 
-def _nearest_around(depth_m: np.ndarray) -> np.ndarray:
+def nearest_around(depth_m: np.ndarray) -> np.ndarray:
     """Smallest measurement within a few pixels: beside an outline nothing counts as passed."""
     nearest = np.where(depth_m > 0, depth_m, np.float32(np.inf))
     for axis in (0, 1):

@@ -30,6 +30,15 @@ class PointSet:
     footprint_m: Float32[np.ndarray, " num_points"]
     """Size of a colour pixel at the point, z/f."""
 
+    def take(self, chosen: Bool[np.ndarray, " num_points"]) -> "PointSet":
+        """Return some of the points."""
+        return PointSet(
+            p_m=self.p_m[chosen],
+            normals=self.normals[chosen],
+            colors=self.colors[chosen],
+            footprint_m=self.footprint_m[chosen],
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class DepthLimits:

@@ -6,7 +6,7 @@ sees a held-out frame, and ``scene.json`` is written last: it vouches for all th
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -42,20 +42,29 @@ from twin.scene.store import (
 from twin.scene.view_numbers import summarise_views
 from twin.scene.views import ViewsJob, views_path, write_views
 
-METHOD_VERSION = 12
+METHOD_VERSION = 13
 """Counts changes of method that make older scenes out of date."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Clock:
-    """When the rebuild began."""
+    """What the rebuild took so far, stage by stage."""
 
-    wall: float
-    cpu: float
+    def __init__(self) -> None:
+        self._wall = self._lap = time.monotonic()
+        self._cpu = time.process_time()
+        self._stages: dict[str, float] = {}
+
+    def end(self, stage: str) -> None:
+        """A stage is over; the next one begins."""
+        now = time.monotonic()
+        self._stages[stage] = now - self._lap
+        self._lap = now
 
     def cost(self) -> Cost:
         return Cost(
-            seconds=time.monotonic() - self.wall, cpu_seconds=time.process_time() - self.cpu
+            seconds=time.monotonic() - self._wall,
+            cpu_seconds=time.process_time() - self._cpu,
+            stages_s=dict(self._stages),
         )
 
 
@@ -83,14 +92,16 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     if done is not None:
         output.say("the scene is up to date (same episodes, same settings); --force redoes it")
         return done
-    clock = _Clock(wall=time.monotonic(), cpu=time.process_time())
+    clock = _Clock()
     choices = choose_frames(sources, config.frames, output, calibration)
     learnt = learn(choices, config, output)
+    clock.end("read")
     run.scene_dir.mkdir(parents=True, exist_ok=True)
     kept = Checkpoint(path=run.scene_dir / FIT_STATE, key=key)
     if config.force:
         kept.path.unlink(missing_ok=True)
     fitted = _fit(learnt, config, kept, output)
+    clock.end("initialise_and_fit")
     learnt = with_fitted_poses(learnt, fitted.Ts_base_color)
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     apart = take_apart(sources, fitted.cloud, learnt.choices)
@@ -98,7 +109,9 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         output.say(apart.remark)
     write_ply(run.scene_dir / BACKGROUND, apart.background)
     links = learnt.robot.frames.links(config.initialise)
+    clock.end("take_apart")
     views = _hold_out(run, learnt, fitted, apart, links, config, clock, output)
+    clock.end("held_out_views")
     extras = apart.write(run, learnt.views) | write_robot(run, learnt.robot, links)
     extras |= write_scene_semantics(
         run.scene_dir,
@@ -110,6 +123,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         choices=learnt.choices,
         task=_task(sources),
     )
+    clock.end("objects_and_semantics")
     record = make_record(
         key=key,
         scene_hash=background_hash(run),
@@ -128,6 +142,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
 
 
 def _fit(learnt: Learnt, config: RebuildConfig, kept: Checkpoint, output: Output) -> FitResult:
+    began_s = time.monotonic()
     first = fuse(learnt.points, config.initialise)
     output.say(f"{len(first)} Gaussians from {len(learnt.views)} training frames")
     with output.progress("fit", 100) as advance:
@@ -138,6 +153,7 @@ def _fit(learnt: Learnt, config: RebuildConfig, kept: Checkpoint, output: Output
             advance,
             max_splats=config.initialise.max_splats,
             checkpoint=kept,
+            spent_s=time.monotonic() - began_s,
         )
 
 
@@ -162,6 +178,10 @@ def _hold_out(
         protocol=protocol_of(choices, fitted, config, clock.cost()),
         marked=_marked_objects(apart),
         robot=DrivenRobot(frames=learnt.robot.frames, links=links),
+        carried={
+            (choices[index].episode.path, choices[index].camera_id): mask
+            for index, mask in learnt.carried.items()
+        },
         align=config.frames.align_holdout,
     )
     total = sum(len(choice.holdout_ns) for choice in choices)

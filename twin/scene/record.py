@@ -3,7 +3,7 @@
 import resource
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from bridge.episode import provenance, streams
@@ -23,6 +23,8 @@ class Cost:
     """Wall time."""
     cpu_seconds: float
     """Of all threads."""
+    stages_s: Mapping[str, float] = field(default_factory=dict)
+    """Wall time of each stage."""
 
     def to_record(self) -> dict[str, Any]:
         """What ``scene.json`` says."""
@@ -30,6 +32,7 @@ class Cost:
             "seconds": round(self.seconds, 2),
             "cpu_seconds": round(self.cpu_seconds, 2),
             "peak_memory_mb": round(peak_memory_mb()),
+            "stages_s": {name: round(seconds, 2) for name, seconds in self.stages_s.items()},
         }
 
 
@@ -75,6 +78,7 @@ def make_record(
             "coarse_iterations": fitted.coarse_iterations,
             "seconds": round(fitted.seconds, 2),
             "cpu_seconds": round(fitted.cpu_seconds, 2),
+            "colour_steps": fitted.colour_steps,
             "train_psnr_db": None
             if fitted.train_psnr_db is None
             else round(fitted.train_psnr_db, 3),

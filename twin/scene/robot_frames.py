@@ -25,7 +25,7 @@ from twin.scene.objects import moved_cloud
 from twin.scene.points import PointSet
 from twin.scene.robot_splats import posed, surface_owners
 from twin.scene.settings import InitialiseConfig
-from twin.scene.training_view import Target, TrainingView
+from twin.scene.training_view import TrainingView
 
 IN_FRONT_M = 0.03
 """A measurement this much nearer than the robot shows something in front of it."""
@@ -73,6 +73,10 @@ class RobotFrames:
         """Why the robot is not told apart in some episodes; empty when it is in all."""
         self._points: dict[str, list[PointSet]] = {}
 
+    def knows(self, episode: Episode) -> bool:
+        """Say whether joints tell where the robot is in the frames of an episode."""
+        return str(episode.path) in self._tracked
+
     def take_out(
         self, episode: Episode, frame: RgbdFrame, points: PointSet, view: TrainingView
     ) -> tuple[PointSet, TrainingView]:
@@ -85,7 +89,7 @@ class RobotFrames:
             return points, view
         owner = self._keep(episode, frame.stamp_ns, surface, points)
         masked = _masked(view, surface, self.T_base_root @ view.T_base_color)
-        return _taken(points, owner < 0), masked
+        return points.take(owner < 0), masked
 
     def collect(self, episode: Episode, stamp_ns: int, points: PointSet) -> None:
         """Keep the robot's points of a frame that the background does not need."""
@@ -124,7 +128,7 @@ class RobotFrames:
             poses = link_poses(tracked.robot, tracked.track.at(stamp_ns))
             for link in {surface.links[index] for index in np.unique(owner[owner >= 0])}:
                 mine = np.isin(owner, [i for i, name in enumerate(surface.links) if name == link])
-                moved = _moved(_taken(points, mine), se3.invert(poses[link]) @ T)
+                moved = _moved(points.take(mine), se3.invert(poses[link]) @ T)
                 self._points.setdefault(link, []).append(moved)
         return owner
 
@@ -166,15 +170,6 @@ class RobotFrames:
         return concatenate([cloud, moved_cloud(robot, se3.invert(self.T_base_root))])
 
 
-def _taken(points: PointSet, mask: Bool[np.ndarray, " num_points"]) -> PointSet:
-    return PointSet(
-        p_m=points.p_m[mask],
-        normals=points.normals[mask],
-        colors=points.colors[mask],
-        footprint_m=points.footprint_m[mask],
-    )
-
-
 def _moved(points: PointSet, T_link_base: Float[np.ndarray, "4 4"]) -> PointSet:
     return replace(
         points,
@@ -187,13 +182,7 @@ def _masked(
     view: TrainingView, surface: PosedSurface, T_base_camera: Float[np.ndarray, "4 4"]
 ) -> TrainingView:
     """Mark the pixels that show the robot as not static, at both sizes."""
-    half, full = view.half, view.full
-    hit = robot_mask(surface, half.camera, T_base_camera, half.depth_m)
-    if not hit.any():
-        return view
-    height, width = full.depth_m.shape
-    doubled = np.repeat(np.repeat(hit, 2, axis=0), 2, axis=1)[:height, :width]
-    return replace(view, half=_without(half, hit), full=_without(full, doubled))
+    return view.without(robot_mask(surface, view.half.camera, T_base_camera, view.half.depth_m))
 
 
 def robot_mask(
@@ -207,11 +196,3 @@ def robot_mask(
     hidden = (depth_m > 0) & (depth_m < expected - IN_FRONT_M)
     around = np.ones((2 * GROW_PX + 1, 2 * GROW_PX + 1), dtype=bool)
     return np.asarray(binary_dilation(np.isfinite(expected) & ~hidden, around))
-
-
-def _without(target: Target, hit: Bool[np.ndarray, "height width"]) -> Target:
-    return replace(
-        target,
-        static_mask=target.static_mask & ~hit,
-        depth_m=np.where(hit, np.float32(0.0), target.depth_m),
-    )

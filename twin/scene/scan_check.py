@@ -1,7 +1,7 @@
 """What can be wrong with a scan, each in one sentence, before time goes into a fit."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -50,13 +50,21 @@ class ScanReport:
     """Sentences about what is wrong."""
     moving_fraction: float = 0.0
     """Share of the measured surface that other frames look through."""
+    carried: Mapping[str, float] = field(default_factory=dict)
+    """By camera without joints: share of its image that moves with it."""
 
     def remarks(self) -> list[str]:
         """All sentences, that about motion included."""
+        found = list(self.found)
+        for name, share in self.carried.items():
+            found.append(
+                f"{100 * share:.0f} % of the image of {name} moves with the camera, as a gripper "
+                "before it does, and was left out"
+            )
         if self.moving_fraction < MUCH_MOVED:
-            return list(self.found)
+            return found
         return [
-            *self.found,
+            *found,
             f"{100 * self.moving_fraction:.0f} % of the measured surface moved during the scan and "
             "was left out; scan while nothing but the camera moves, or check the poses",
         ]
@@ -66,6 +74,7 @@ class ScanReport:
         return {
             "remarks": self.remarks(),
             "moving_fraction": self.moving_fraction,
+            "carried_fraction": {name: round(share, 4) for name, share in self.carried.items()},
             "pose_agreement": {
                 name: None if report.agreement is None else round(report.agreement, 4)
                 for name, report in self.poses.items()

@@ -129,13 +129,17 @@ class FitConfig:
     """How the Gaussians are fitted to the images."""
 
     budget_s: Annotated[float, Parameter(name="--budget", converter=convert_duration)] = 60.0
-    """Wall time for the fit: 60s, 2min or plain seconds."""
+    """Wall time for initialisation and fit: 60s, 2min or plain seconds. Reading the frames before
+    and all that is made of the scene afterwards come on top; scene.json says how long each took."""
     iterations: int = 0
     """Fit exactly this many images instead of a time; the result is then reproducible."""
     loss: Literal["3dgs", "paper"] = "3dgs"
     """3dgs: 0.8 L1 + 0.2 (1 - SSIM); paper: squared error (Eq. 3). Both with depth L1."""
     depth_weight: float = 0.1
     """Weight of the L1 depth term (the paper's lambda_d), relative to depth."""
+    slab: float = 0.0
+    """How far a Gaussian may leave the surface that depth fused, along its normal and in units of
+    its own size; 0: as far as it likes."""
     coarse_fraction: float = 0.6
     """Share of the budget spent at half resolution."""
     appearance_steps: int = 4
@@ -163,6 +167,9 @@ class FitConfig:
                 f"{MAX_APPEARANCE_STEPS}: more steps follow the noise."
             )
             raise UsageError(message)
+        if not self.slab >= 0:
+            message = f"--slab {self.slab:g} is no thickness: 0 or more."
+            raise UsageError(message)
         if self.iterations == 0 and not self.budget_s > 0:
             message = f"--budget {self.budget_s:g} s leaves no time to fit; give more than 0."
             raise UsageError(message)
@@ -188,6 +195,12 @@ class ModelConfig:
     """Image pixels per feature; default: the model's own, 16 or 32. Less costs more."""
     clip: str = ""
     """Folder of CLIP: things are found by meaning, not by the words of the lexicon."""
+    generator: str = ""
+    """Program with its arguments that completes the shape of an object from one view, for example
+    SAM 3D Objects in an environment of its own; what it must read and write is in
+    docs/foundation_models.md. Depth decides how large, where, and whether it is used."""
+    generator_timeout_s: float = 900.0
+    """The program is stopped after this time for one object."""
     model_frames: int = 12
     """Training frames the models look at, spread evenly."""
     device: str = "auto"
@@ -196,6 +209,11 @@ class ModelConfig:
     def __post_init__(self) -> None:
         """Refuse to look at nothing."""
         _refuse_below(1, feature_channels=self.feature_channels, model_frames=self.model_frames)
+        if not self.generator_timeout_s > 0:
+            message = (
+                f"--generator-timeout-s {self.generator_timeout_s:g} leaves no time; give more."
+            )
+            raise UsageError(message)
         if self.feature_stride is not None:
             _refuse_below(1, feature_stride=self.feature_stride)
 

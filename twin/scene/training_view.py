@@ -24,6 +24,14 @@ class Target:
         """Colour planes, 0..1."""
         return self.planes_u8.astype(np.float32) * np.float32(1 / 255)
 
+    def without(self, hit: Bool[np.ndarray, "height width"]) -> "Target":
+        """The same with some pixels passed over, beside those that already are."""
+        return replace(
+            self,
+            static_mask=self.static_mask & ~hit,
+            depth_m=np.where(hit, np.float32(0.0), self.depth_m),
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingView:
@@ -34,6 +42,14 @@ class TrainingView:
     T_base_color: Float[np.ndarray, "4 4"]
     half: Target
     full: Target
+
+    def without(self, half_hit: Bool[np.ndarray, "half_height half_width"]) -> "TrainingView":
+        """The same with some pixels of the half-size image passed over, at both sizes."""
+        if not half_hit.any():
+            return self
+        height, width = self.full.depth_m.shape
+        hit = np.repeat(np.repeat(half_hit, 2, axis=0), 2, axis=1)[:height, :width]
+        return replace(self, half=self.half.without(half_hit), full=self.full.without(hit))
 
 
 def training_view(surface: FrameSurface) -> TrainingView:

@@ -26,6 +26,7 @@ from bridge.episode.streams import RgbdFrame
 from bridge.episode.writer import EpisodeWriter
 from bridge.terminal import Advance
 from twin.scene.camera_correction import align_view
+from twin.scene.carried import CarriedMask
 from twin.scene.frames import FrameChoice, load
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.moving import Witness, find_moving
@@ -59,6 +60,8 @@ class ViewsJob:
     """The same scene with objects white and everything else black; None without objects."""
     robot: DrivenRobot | None = None
     """Drawn where it stood at each frame; the cloud holds only what is static."""
+    carried: Mapping[tuple[Path, str], CarriedMask] = field(default_factory=dict)
+    """By episode and camera: what moves with the camera and is not part of the scene."""
     align: bool = False
     """Also draw each view where it fits the recorded image best."""
 
@@ -131,7 +134,7 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
         cloud = job.cloud
         if job.robot is not None:
             cloud = job.robot.joined(cloud, choice.episode, frame.stamp_ns)
-        recorded = _recorded(frame, job)
+        recorded = _recorded(frame, job, job.carried.get((choice.episode.path, choice.camera_id)))
         masks = {"static": recorded.full.static_mask}
         if job.marked is not None:
             planes = rasteriser.draw_planes(job.marked, camera, T)
@@ -150,11 +153,13 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
         )
 
 
-def _recorded(frame: RgbdFrame, job: ViewsJob) -> TrainingView:
-    """A held-out frame without the pixels that training frames look through."""
+def _recorded(frame: RgbdFrame, job: ViewsJob, carried: CarriedMask | None) -> TrainingView:
+    """A held-out frame without what training frames look through or moves with the camera."""
     surface = FrameSurface(frame, job.limits)
-    moving = find_moving([surface.points()], job.witnesses)
-    return moving.mask_in(training_view(surface))
+    view, points = training_view(surface), surface.points()
+    if carried is not None:
+        view, points = carried.mask_in(view), carried.drop_from(points, view)
+    return find_moving([points], job.witnesses).mask_in(view)
 
 
 def one_camera(frame: RgbdFrame) -> bool:

@@ -62,6 +62,19 @@ def test_the_pixels_of_a_visitor_are_masked(
     assert moving.mask_in(views[0]).half.static_mask.mean() > 0.97
 
 
+def test_what_was_masked_before_stays_masked(
+    learnt: tuple[list[PointSet], list[TrainingView]],
+) -> None:
+    points, views = learnt
+    moving = find_moving(points, choose_witnesses(views))
+    robot = np.zeros(views[3].half.static_mask.shape, dtype=bool)
+    robot[:5, 20:] = True
+    masked = moving.mask_in(views[3].without(robot))
+    assert not masked.half.static_mask[robot].any()
+    assert not masked.full.static_mask[:10, 40:].any()
+    assert (~moving.mask_in(views[3]).half.static_mask & masked.half.static_mask).sum() == 0
+
+
 def test_a_visitor_leaves_no_trace_in_the_fitted_scene(
     learnt: tuple[list[PointSet], list[TrainingView]],
 ) -> None:
