@@ -16,6 +16,8 @@ struct Sample {
 struct Contact {
     std::int32_t sample;
     std::int32_t collider;
+    bool holds = false;        // it touched in the last substep
+    Float3 anchor{0, 0, 0};    // where friction holds it, in the piece's frame
 };
 
 struct Pair {
@@ -61,6 +63,7 @@ class Body {
     bool lost = false;          // its nodes are no numbers any more
 
     std::vector<Contact> contacts;
+    std::vector<Contact> past_contacts;  // of the last step, in the same order
     std::vector<Pair> pairs;
     std::vector<std::uint8_t> touched;  // by collider, in the last step
     Box box;                            // around all nodes, base frame

@@ -65,6 +65,9 @@ class Collider {
 // Lists the samples of a body that may touch the collider during the step.
 void find_contacts(Body& body, const Collider& collider, int index, double period_s);
 
+// Lets contacts that were there in the last step hold on where they held.
+void keep_anchors(Body& body);
+
 // Pushes samples out and holds them by friction (Coulomb, one coefficient).
 void solve_contacts(Body& body, std::vector<Collider>& colliders, float step_s);
 

@@ -71,6 +71,19 @@ void find_contacts(Body& body, const Collider& collider, int index, double perio
     }
 }
 
+void keep_anchors(Body& body) {
+    // Both lists are sorted by piece, then by sample.
+    std::size_t old = 0;
+    const auto before = [](const Contact& a, const Contact& b) {
+        return a.collider != b.collider ? a.collider < b.collider : a.sample < b.sample;
+    };
+    for (Contact& contact : body.contacts) {
+        while (old < body.past_contacts.size() && before(body.past_contacts[old], contact)) ++old;
+        if (old == body.past_contacts.size()) return;
+        if (!before(contact, body.past_contacts[old])) contact = body.past_contacts[old];
+    }
+}
+
 void solve_contacts(Body& body, std::vector<Collider>& colliders, float step_s) {
     std::size_t n = 0;
     while (n < body.contacts.size()) {
@@ -80,7 +93,8 @@ void solve_contacts(Body& body, std::vector<Collider>& colliders, float step_s) 
         const float mu = static_cast<float>(piece.friction * body.friction);
         Double3 push{0, 0, 0};
         for (; n < body.contacts.size() && body.contacts[n].collider == index; ++n) {
-            const Sample& sample = body.samples[body.contacts[n].sample];
+            Contact& contact = body.contacts[n];
+            const Sample& sample = body.samples[contact.sample];
             const Float3 p = body.sample_at(sample);
             const Float3 q = frame.inward(p) + frame.offset;
             float best = -std::numeric_limits<float>::max();
@@ -93,7 +107,10 @@ void solve_contacts(Body& body, std::vector<Collider>& colliders, float step_s) 
                 }
                 if (best > 0.0f) break;
             }
-            if (best > 0.0f || !face) continue;
+            if (best > 0.0f || !face) {
+                contact.holds = false;
+                continue;
+            }
             const Float3 normal = frame.outward(face->n);
             const Double3 place = widen(p) + body.origin;
             Float3 slip = p - body.sample_started(sample);
@@ -107,8 +124,13 @@ void solve_contacts(Body& body, std::vector<Collider>& colliders, float step_s) 
                     ? static_cast<float>(piece.inverse_mass_along(arm, widen(normal)))
                     : 0.0f;
             const float share = w / (w + other);
-            const Float3 back = friction_shift(slip, normal, mu * pushed);
+            // Slip counts from where the contact last held, or what the stress moves between two
+            // looks would add up to creep.
+            const Float3 since = contact.holds ? frame.outward(q - contact.anchor) : slip;
+            const Float3 back = friction_shift(since, normal, mu * pushed);
             const Float3 by = (normal * pushed + back) * share;
+            contact.holds = true;
+            contact.anchor = q + frame.inward(by);
             body.shift_sample(sample, by, w);
             body.touched[index] = 1;
             const Double3 impulse = widen(by) * (-1.0 / (static_cast<double>(w) * step_s));

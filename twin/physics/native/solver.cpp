@@ -38,6 +38,7 @@ int Solver::add_collider(const ColliderSpec& spec) {
 
 void Solver::find() {
     for (Body& body : bodies) {
+        body.past_contacts.swap(body.contacts);
         body.contacts.clear();
         body.pairs.clear();
         std::fill(body.touched.begin(), body.touched.end(), 0);
@@ -48,6 +49,7 @@ void Solver::find() {
         if (bodies[i].lost) continue;
         for (std::size_t k = 0; k < colliders.size(); ++k)
             find_contacts(bodies[i], colliders[k], static_cast<int>(k), period_s_);
+        keep_anchors(bodies[i]);
         for (int j = 0; j < num_bodies; ++j)
             if (j != i && !bodies[j].lost) find_pairs(bodies, i, j, period_s_);
     }
