@@ -138,7 +138,7 @@ class SoftWorld:
             friction = config.finger_friction if finger else config.surface_friction
             self._links.append(link)
             self._link_pieces[link] = [
-                self._add(_Placed(piece=piece, pose=(0, 0, 0, 0, 0, 0, 1), friction=friction))
+                self._add(_Placed(piece=piece, pose=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), friction=friction))
                 for piece in pieces
             ]
         self.place_links()
