@@ -44,6 +44,7 @@ class World:
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=1.0 / config.rate_hz,
             numSolverIterations=config.solver_iterations,
+            solverResidualThreshold=config.solver_residual,
             numSubSteps=0,
             deterministicOverlappingPairs=1,
             enableFileCaching=0,
