@@ -9,7 +9,7 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
 	command -v $$p >/dev/null 2>&1 && $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' && echo $$p && break; done)
 BIN := .venv/bin
 READY := .venv/.ready
-NATIVE := $(wildcard twin/scene/native/* bridge/media/native/* bridge/episode/native/* twin/physics/native/*)
+NATIVE := $(wildcard twin/scene/native/* bridge/media/native/* bridge/episode/native/* twin/physics/native/* twin/replay/native/*)
 RUN ?= runs/demo
 BENCH ?=
 export OMP_WAIT_POLICY ?= passive

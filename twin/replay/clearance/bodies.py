@@ -31,8 +31,7 @@ class Placed:
     """One piece where it is."""
 
     body: str
-    shape: coal.CollisionGeometry | None
-    """None: the unnamed scene, which is a grid."""
+    shape: coal.CollisionGeometry
     placement: coal.Transform3s
     piece: int = 0
 

@@ -16,12 +16,13 @@ class GridLookup:
     def __init__(self, grid: SdfGrid) -> None:
         """Lay the grid's values out for lookups."""
         num_x, num_y, num_z = grid.values_m.shape
-        self.voxel_m = grid.voxel_m
-        self.origin_m = grid.origin_m
+        self.voxel_m = float(grid.voxel_m)
+        self.origin_m = np.asarray(grid.origin_m, dtype=np.float64)
+        self.values_m = np.ascontiguousarray(grid.values_m, dtype=np.float32)
         self._strides = (num_y * num_z, num_z)
         self._last = np.array([[num_x - 1], [num_y - 1], [num_z - 1]], dtype=np.float32)
         self._cells = (num_x - 2, num_y - 2, num_z - 2)
-        rows = np.ascontiguousarray(grid.values_m, dtype=np.float32).ravel()
+        rows = self.values_m.ravel()
         # The same memory from each corner of the first cell on.
         self._corners = [
             rows[i * num_y * num_z + j * num_z + k :]
@@ -39,7 +40,8 @@ class GridLookup:
         """Distances [m] of places in voxels from the centre of the first one.
 
         All solid lies inside the grid or nobody knows of it, so beyond the grid the nearest grid
-        point at distance e bounds the distance by sqrt(d^2 + e^2).
+        point at distance e bounds the distance by sqrt(d^2 + e^2); solid that reaches the edge is
+        taken to end behind it as deep as it was.
         """
         held = np.minimum(np.maximum(place, np.float32(0.0)), self._last)
         x, y, z = held
@@ -62,7 +64,7 @@ class GridLookup:
         beyond = place - held
         if beyond.any():
             e = np.sqrt(np.square(beyond).sum(axis=0)) * np.float32(self.voxel_m)
-            value = np.where(e > 0, np.hypot(np.maximum(value, 0), e), value)
+            value = np.where(value > 0, np.hypot(value, e), value + e)
         return value
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan, Stage
-from twin.replay.clearance.bodies import Solid, box_solid, group_of, placement_of, solid_of
+from twin.replay.clearance.bodies import Solid, box_solid, group_of, placement_of
 from twin.replay.clearance.nodes import planes_of
 from twin.replay.clearance.surroundings import Pair, Surroundings
 from twin.replay.clearance.sweep import MAX_LEAP_M, Reach, State, half_way, object_travel_m
@@ -61,7 +61,7 @@ class ClearanceMonitor:
         self.failures: list[Failure] = []
         self._scene = scene
         self._around = Surroundings(scene, hulls, config.eps_col_m)
-        self._links = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
+        self._links = self._around.links
         self._objects = {
             name: box_solid(name, np.array(scene.task.objects[name].size_m))
             for name in scene.movable()

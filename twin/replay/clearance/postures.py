@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.task.robot import GRIPPER_LINKS, MAX_WIDTH_M
-from twin.replay.clearance.bodies import solid_of
 from twin.replay.clearance.surroundings import Surroundings
 from twin.replay.config import ReplayConfig
 from twin.replay.scene import ReplayScene
@@ -22,7 +21,6 @@ def posture_clearance(
     is where the path says, whatever the arm does, so it is left out; so are objects.
     """
     around = Surroundings(scene, hulls, config.eps_col_m)
-    solids = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
 
     def room_m(
         joints_rad: Float[np.ndarray, "num_postures num_joints"],
@@ -35,7 +33,7 @@ def posture_clearance(
         if apart <= 0:
             return apart
         distances, _ = around.measure(
-            solids,
+            around.links,
             [],
             {},
             near_m=config.eps_col_m,

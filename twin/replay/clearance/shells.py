@@ -1,87 +1,145 @@
-"""Points that cover the surface of convex pieces, coarse ones with fine ones below them.
+"""Points that cover the surface of convex pieces: few coarse ones, with finer ones below them.
 
-A grid is asked about points. Few coarse points, each with the radius of the fine ones it stands
-for, bound the distance of a whole robot in one look-up; where that bound is near, the fine points
-of the nearest coarse ones give the distance. Fine points lie so close that no point of a surface
-is farther from one than a few millimetres, which are subtracted: distances are never too large.
+A grid is asked about points. A coarse point, with the radius of the patch it stands for, bounds the
+distance of all the points below it, so of some ten thousand points a few hundred are looked at. The
+finest lie so close that no point of a surface is farther from one than a few millimetres, which
+are subtracted: distances are never too large.
 """
 
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Int32
 from scipy.spatial import ConvexHull, cKDTree
 
 from bridge.task.robot import GRIPPER_LINKS
+from twin.replay._clearance import nearest
 from twin.replay.clearance.grid import GridLookup
 from twin.robot.collision import RobotHulls
 
 FINE_M, ARM_FINE_M = 0.002, 0.004
 """For the gripper and what it carries, and for the arm."""
-SLOPE = 1.1
-"""Between voxels an interpolated distance changes by a little more than the way that is gone."""
-COARSE_RATIO = 6.0
-"""Radius of the patch of fine points below one coarse point, at most, by the fine distance."""
+PATCHES_M = (0.032, 0.015, 0.007)
+"""Radii of patches, coarsest first."""
+SLOPE = 3.0**0.5
+"""Most that an interpolated distance changes per way that is gone: 1 along each axis."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shell:
-    """The surface of one convex piece, in the frame of its body."""
+    """The surface of one convex piece as a tree of points, in the frame of its body."""
 
-    coarse_m: Float[np.ndarray, "num_coarse 3"]
-    radius_m: Float[np.ndarray, " num_coarse"]
-    """How far the surface that a coarse point stands for reaches from it."""
-    fine_m: Float[np.ndarray, "num_fine 3"]
-    """In the order of the coarse points they belong to."""
-    starts: Int[np.ndarray, " num_starts"]
-    """Where each coarse point's fine ones begin, and the end."""
+    points_m: Float[np.ndarray, "num_points 3"]
+    """Level by level, coarsest first."""
+    radius_m: Float[np.ndarray, " num_points"]
+    """How far the surface below a point reaches from it."""
+    children: Int32[np.ndarray, "num_points 2"]
+    """Where a point's own begin and end in the next level; nothing below the finest."""
+    num_roots: int
+    """Points of the coarsest level."""
     cover_m: float
-    """No point of the surface is farther from a fine one."""
+    """No point of the surface is farther from one of the finest."""
 
-    def distance_m(
+    def finest_m(self) -> Float[np.ndarray, "num_finest 3"]:
+        """The points without others below them."""
+        return np.asarray(self.points_m[self.children[:, 0] == self.children[:, 1]])
+
+
+class Shells:
+    """Pieces that are asked for together."""
+
+    def __init__(self, shells: list[Shell]) -> None:
+        """Put their trees into one."""
+        self._points = np.concatenate([shell.points_m for shell in shells])
+        self._radius = np.concatenate([shell.radius_m for shell in shells])
+        starts = np.concatenate([[0], np.cumsum([len(shell.points_m) for shell in shells])])
+        children = [shell.children + start for shell, start in zip(shells, starts, strict=False)]
+        self._children = np.concatenate(children).astype(np.int32)
+        ends = starts[:-1] + [shell.num_roots for shell in shells]
+        self._roots = np.stack([starts[:-1], ends], axis=1).astype(np.int32)
+        self._cover = np.array([shell.cover_m for shell in shells])
+
+    def distances_m(
         self,
         lookup: GridLookup,
-        R: Float[np.ndarray, "3 3"],
-        t: Float[np.ndarray, "3"],
-        coarse_distance_m: Float[np.ndarray, " num_coarse"],
-    ) -> float:
-        """Distance of the placed piece to the grid's surface [m], never too large.
-
-        Args:
-            lookup: The grid.
-            R: Rotation of the body's frame.
-            t: Its origin.
-            coarse_distance_m: What the grid says of the coarse points.
-        """
-        best = coarse_distance_m.min() + self.cover_m
-        near = np.flatnonzero(coarse_distance_m - self.radius_m < best)
-        picked = np.concatenate(
-            [np.arange(self.starts[i], self.starts[i + 1]) for i in near.tolist()]
+        R: Float[np.ndarray, "num_pieces 3 3"],
+        t: Float[np.ndarray, "num_pieces 3"],
+    ) -> Float[np.ndarray, " num_pieces"]:
+        """Signed distance of each placed piece to the grid's surface [m], never too large."""
+        answers = np.empty(len(R))
+        nearest(
+            lookup.values_m,
+            lookup.origin_m,
+            lookup.voxel_m,
+            R,
+            t,
+            self._points,
+            self._radius,
+            self._children,
+            self._roots,
+            answers,
         )
-        return float(lookup.distance(self.fine_m[picked] @ R.T + t).min()) - self.cover_m
+        return np.asarray(answers - self._cover)
 
 
 def shell_of(corners_m: Float[np.ndarray, "num_points 3"], fine_m: float = FINE_M) -> Shell:
     """Cover the convex hull of points so that nothing is farther from a fine one than asked."""
     hull = ConvexHull(corners_m)
     # A triangle with edges of at most e leaves nothing farther from its corners than e / sqrt(3).
-    fine = _divided(corners_m[hull.simplices], fine_m * np.sqrt(3.0))
-    tree = cKDTree(fine)
-    free = np.ones(len(fine), dtype=bool)
+    levels = [_divided(corners_m[hull.simplices], fine_m * np.sqrt(3.0))]
+    owners: list[Int[np.ndarray, " num_points"]] = []
+    for radius in reversed(PATCHES_M):
+        chosen = levels[0][_spread(levels[0], radius)]
+        owners.insert(0, cKDTree(chosen).query(levels[0])[1])
+        levels.insert(0, chosen)
+    order = np.arange(len(levels[0]))
+    begin, starts = 0, []
+    for level, owner in enumerate(owners):
+        # Each level goes into the order of the one above it.
+        rank = np.empty(len(order), dtype=np.int64)
+        rank[order] = np.arange(len(order))
+        levels[level] = levels[level][order]
+        below = rank[owner]
+        begin += len(order)
+        starts.append(begin + np.searchsorted(np.sort(below), np.arange(len(order) + 1)))
+        order = np.argsort(below, kind="stable")
+    levels[-1] = levels[-1][order]
+    children = [np.stack([ends[:-1], ends[1:]], axis=1) for ends in starts]
+    children.append(np.zeros((len(levels[-1]), 2), dtype=np.int64))
+    return Shell(
+        points_m=np.concatenate(levels),
+        radius_m=_radii(levels, starts, fine_m),
+        children=np.concatenate(children).astype(np.int32),
+        num_roots=len(levels[0]),
+        cover_m=fine_m,
+    )
+
+
+def _radii(
+    levels: list[Float[np.ndarray, "_ 3"]], starts: list[Int[np.ndarray, " _"]], cover_m: float
+) -> Float[np.ndarray, " num_points"]:
+    """Measure how far the finest points below each one are from it."""
+    finest = levels[-1]
+    radii = [np.full(len(finest), cover_m)]
+    ends = np.arange(len(finest) + 1)
+    for points, rows in zip(reversed(levels[:-1]), reversed(starts), strict=True):
+        ends = ends[rows - rows[0]]  # where each point's own begin among the finest
+        away = np.linalg.norm(finest - np.repeat(points, np.diff(ends), axis=0), axis=1)
+        radii.insert(0, SLOPE * np.maximum.reduceat(away, ends[:-1]) + cover_m)
+    return np.concatenate(radii)
+
+
+def _spread(points_m: Float[np.ndarray, "num_points 3"], radius_m: float) -> list[int]:
+    """Choose points so that every other one is within a radius of one of them."""
+    tree = cKDTree(points_m)
+    free = np.ones(len(points_m), dtype=bool)
     chosen = []
-    for index in range(len(fine)):
+    for index in range(len(points_m)):
         if free[index]:
             chosen.append(index)
-            free[tree.query_ball_point(fine[index], COARSE_RATIO * fine_m)] = False
-    coarse = fine[chosen]
-    distance, owner = cKDTree(coarse).query(fine)
-    order = np.argsort(owner, kind="stable")
-    starts = np.searchsorted(owner[order], np.arange(len(coarse) + 1))
-    radius = SLOPE * np.maximum.reduceat(distance[order], starts[:-1]) + fine_m
-    return Shell(
-        coarse_m=coarse, radius_m=radius, fine_m=fine[order], starts=starts, cover_m=fine_m
-    )
+            free[tree.query_ball_point(points_m[index], radius_m)] = False
+    return chosen
 
 
 def _divided(
@@ -104,39 +162,13 @@ def _divided(
     return np.unique(np.concatenate(points).round(9), axis=0)
 
 
-class RobotShell:
-    """The shells of a robot's links, looked up together."""
-
-    def __init__(self, hulls: RobotHulls) -> None:
-        """Cover every hull; ``shell_of_robot`` remembers."""
-        self.shells = [
+@lru_cache(maxsize=4)
+def shells_of_robot(hulls: RobotHulls, left_out: frozenset[str]) -> Shells:
+    """Cover the hulls of a robot but those of some links; made once."""
+    return Shells(
+        [
             shell_of(hull.points_m, FINE_M if hull.link in GRIPPER_LINKS else ARM_FINE_M)
             for hull in hulls.hulls
+            if hull.link not in left_out
         ]
-        counts = [len(shell.coarse_m) for shell in self.shells]
-        self.starts = np.concatenate([[0], np.cumsum(counts)])
-        self._link = np.repeat(np.arange(len(counts)), counts)
-        self._coarse = np.concatenate([shell.coarse_m for shell in self.shells])
-        self._radius = np.concatenate([shell.radius_m for shell in self.shells])
-
-    def coarse_distances_m(
-        self,
-        lookup: GridLookup,
-        R: Float[np.ndarray, "num_links 3 3"],
-        t: Float[np.ndarray, "num_links 3"],
-    ) -> Float[np.ndarray, " num_coarse"]:
-        """What a grid says of the coarse points of all links; link i's begin at ``starts[i]``."""
-        placed = np.einsum("nij,nj->ni", R[self._link], self._coarse) + t[self._link]
-        return lookup.distance(placed).astype(np.float64)
-
-    def bounds_m(
-        self, coarse_distance_m: Float[np.ndarray, " num_coarse"]
-    ) -> Float[np.ndarray, " num_links"]:
-        """For each link a distance that it certainly keeps [m]."""
-        return np.asarray(np.minimum.reduceat(coarse_distance_m - self._radius, self.starts[:-1]))
-
-
-@lru_cache(maxsize=4)
-def shell_of_robot(hulls: RobotHulls) -> RobotShell:
-    """Return the shells of a robot, made once."""
-    return RobotShell(hulls)
+    )

@@ -15,10 +15,11 @@ from twin.replay.clearance.bodies import (
     Solid,
     box_corners,
     placement_of,
+    solid_of,
 )
 from twin.replay.clearance.grid import GridLookup
 from twin.replay.clearance.nodes import distance_to_box_m, planes_of
-from twin.replay.clearance.shells import Shell, shell_of, shell_of_robot
+from twin.replay.clearance.shells import Shells, shell_of, shells_of_robot
 from twin.replay.clearance.unnamed import Foot, Panel, unnamed_scene
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, signed_distance
@@ -62,16 +63,22 @@ class Surroundings:
                 Ts_panel_base[:, :3, 3],
             )
             self._half_m = np.stack([extents / 2 for _, _, (_, extents) in self._panels])
-        self._standing, foot = standing_links(hulls)
+        standing, foot = standing_links(hulls)
+        self._mobile = [i for i, hull in enumerate(hulls.hulls) if hull.link not in standing]
+        solids = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
+        self._centres = np.stack([solid.centre for solid in solids])
+        self._radii = np.array([solid.radius_m for solid in solids])
+        self.links = solids
         self.lookup: GridLookup | None = None
         if scene.static_sdf is not None:
             panels = [panel for _, _, panel in self._panels]
             grid = unnamed_scene(scene.static_sdf, scene.table_height_m, foot, panels)
             self.lookup = None if grid is None else GridLookup(grid)
-        self._unnamed = Placed(SCENE, None, coal.Transform3s())
-        self._shells: dict[str, Shell] = {}
+        self._shells: Shells | None = None
+        self._object_shells: dict[str, Shells] = {}
         if self.lookup is not None:
-            self._shells = {
+            self._shells = shells_of_robot(hulls, standing)
+            self._object_shells = {
                 name: _box_shell(scene.task.objects[name].size_m)
                 for name in scene.movable()
                 if scene.task.objects[name].soft is None
@@ -100,22 +107,20 @@ class Surroundings:
         """
         num_links = len(self._hulls.hulls)
         placements = self._hulls.placements + [placement_of(T) for T in Ts_base_moved]
-        R = np.concatenate([self._hulls.rotations, *(T[None, :3, :3] for T in Ts_base_moved)])
-        t = np.concatenate([self._hulls.translations, *(T[None, :3, 3] for T in Ts_base_moved)])
-        coarse = self._coarse_distances_m(R[:num_links], t[:num_links])
-        found: dict[Pair, float] = {}
-        best = np.inf
+        R, t = self._hulls.rotations, self._hulls.translations
+        if Ts_base_moved:
+            Ts = np.stack(Ts_base_moved)
+            R, t = np.concatenate([R, Ts[:, :3, :3]]), np.concatenate([t, Ts[:, :3, 3]])
+        found = self._to_scene(solids[num_links:], R, t)
+        best = min(
+            (d for (body, _, other, _), d in found.items() if counts(body, other)), default=np.inf
+        )
         # Nearest bounds first: most pairs are then skipped, and the minimum stays exact.
-        for bound, index, other in self._candidates(solids, R, t, objects, coarse):
+        for bound, index, other in self._candidates(solids, R, t, objects):
             if bound > max(best, near_m):
                 return found, max(best, near_m)
             solid = solids[index]
-            if other.shape is None:
-                distance = self._to_scene_m(solid.body, index, R[index], t[index], coarse)
-            else:
-                distance = signed_distance(
-                    solid.shape, placements[index], other.shape, other.placement
-                )
+            distance = signed_distance(solid.shape, placements[index], other.shape, other.placement)
             piece = index if index < num_links else -1
             found[solid.body, piece, other.body, other.piece] = distance
             if counts(solid.body, other.body):
@@ -149,32 +154,28 @@ class Surroundings:
                 found[name, -1, SCENE, 0] = float(self.lookup.distance(nodes).min())
         return found
 
-    def _coarse_distances_m(
-        self, R: Float[np.ndarray, "num_links 3 3"], t: Float[np.ndarray, "num_links 3"]
-    ) -> Float[np.ndarray, " num_coarse"] | None:
-        if self.lookup is None:
-            return None
-        return shell_of_robot(self._hulls).coarse_distances_m(self.lookup, R, t)
-
-    def _to_scene_m(
+    def _to_scene(
         self,
-        body: str,
-        index: int,
-        R: Float[np.ndarray, "3 3"],
-        t: Float[np.ndarray, "3"],
-        coarse: Float[np.ndarray, " num_coarse"] | None,
-    ) -> float:
-        if self.lookup is None or coarse is None:
-            return np.inf
-        if body in self._shells:
-            shell = self._shells[body]
-            placed = shell.coarse_m @ R.T + t
-            return shell.distance_m(
-                self.lookup, R, t, self.lookup.distance(placed).astype(np.float64)
-            )
-        robot = shell_of_robot(self._hulls)
-        part = slice(robot.starts[index], robot.starts[index + 1])
-        return robot.shells[index].distance_m(self.lookup, R, t, coarse[part])
+        moved: list[Solid],
+        R: Float[np.ndarray, "num_solids 3 3"],
+        t: Float[np.ndarray, "num_solids 3"],
+    ) -> dict[Pair, float]:
+        """Distances to the unnamed scene: of every link that moves, and of moved objects."""
+        if self.lookup is None or self._shells is None:
+            return {}
+        links = self._shells.distances_m(self.lookup, R[self._mobile], t[self._mobile])
+        found: dict[Pair, float] = {
+            (self.links[index].body, index, SCENE, 0): distance
+            for index, distance in zip(self._mobile, links.tolist(), strict=True)
+        }
+        start = len(self.links)
+        for index, solid in enumerate(moved, start=start):
+            shell = self._object_shells.get(solid.body)
+            if shell is not None:
+                one = slice(index, index + 1)
+                distance = shell.distances_m(self.lookup, R[one], t[one])[0]
+                found[solid.body, -1, SCENE, 0] = float(distance)
+        return found
 
     def _candidates(
         self,
@@ -182,14 +183,16 @@ class Surroundings:
         R: Float[np.ndarray, "num_solids 3 3"],
         t: Float[np.ndarray, "num_solids 3"],
         objects: Mapping[str, tuple[Solid, Float[np.ndarray, "4 4"]]],
-        coarse: Float[np.ndarray, " num_coarse"] | None,
     ) -> list[tuple[float, int, Placed]]:
         """Pairs with a lower bound of their distance, nearest first."""
         num_links = len(self._hulls.hulls)
-        centres = np.einsum("nij,nj->ni", R, np.stack([solid.centre for solid in solids])) + t
-        radii = np.array([solid.radius_m for solid in solids])
+        own, radii = self._centres, self._radii
+        if len(solids) > num_links:
+            own = np.concatenate([own, [solid.centre for solid in solids[num_links:]]])
+            radii = np.concatenate([radii, [solid.radius_m for solid in solids[num_links:]]])
+        centres = np.matmul(R, own[:, :, None])[:, :, 0] + t
         pairs: list[tuple[float, int, Placed]] = []
-        mobile = [i for i, solid in enumerate(solids) if solid.body not in self._standing]
+        mobile = [*self._mobile, *range(num_links, len(solids))]
         heights = (centres[:, 2] - radii - self._table_height_m).tolist()
         pairs += [(heights[index], index, self._table) for index in mobile]
         if self._panels:
@@ -206,17 +209,12 @@ class Surroundings:
             offsets = centres[:num_links] - se3.apply(T, solid.centre)
             gaps = np.linalg.norm(offsets, axis=1) - radii[:num_links] - solid.radius_m
             pairs += [(gap, index, placed) for index, gap in enumerate(gaps.tolist())]
-        if self.lookup is not None and coarse is not None:
-            bounds = shell_of_robot(self._hulls).bounds_m(coarse).tolist()
-            around = self.lookup.distance(centres[num_links:]) - radii[num_links:]
-            bounds += around.tolist()
-            pairs += [(bounds[index], index, self._unnamed) for index in mobile]
         return sorted(pairs, key=lambda pair: pair[0])
 
 
 @lru_cache(maxsize=32)
-def _box_shell(size_m: tuple[float, float, float]) -> Shell:
-    return shell_of(box_corners(np.array(size_m)))
+def _box_shell(size_m: tuple[float, float, float]) -> Shells:
+    return Shells([shell_of(box_corners(np.array(size_m)))])
 
 
 def _panels(scene: ReplayScene, name: str, T_base_object: Float[np.ndarray, "4 4"]) -> list[Panel]:
