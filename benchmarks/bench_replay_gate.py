@@ -183,7 +183,7 @@ def tables(label: str, pairs: Sequence[tuple[bool | None, bool]]) -> tuple[list[
     reference = f"base rate {told(found['base_rate'])}, PPV {told(found['ppv'])}"
     nan = float("nan")
     rows = [
-        Target(what=f"{label}: PPV above the base rate, lower end", limit=0.0, at_most=False,
+        Target(what=f"{label}: PPV above the base rate, lower end", limit=1e-6, at_most=False,
                measured=nan if low is None else low, reference=reference),
     ]  # fmt: skip
     return rows, found

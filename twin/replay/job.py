@@ -194,6 +194,7 @@ def judged(
         "engine": verdict.engine,
         "warnings": list(verdict.warnings),
         "predicates": predicates_hold(verdict),
+        "p_success": verdict.p_success,
         "divergence": None if divergence is None else dict(divergence),
     }
 

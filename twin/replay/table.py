@@ -107,6 +107,7 @@ def describe_run(summary: Mapping[str, Any]) -> str:
     executions = summary.get("executions", [])
     if executions:
         lines += ["", *_cross_lines(cross_table(executions)), "", *_parting_lines(executions)]
+    lines += _sample_lines(summary["rows"])
     rejected = [row for row in summary["rows"] if row["accepted"] is False]
     if rejected:
         lines += ["", "rejected:"]
@@ -118,6 +119,19 @@ def describe_run(summary: Mapping[str, Any]) -> str:
     if kept:
         lines.append(f"{kept} of {len(summary['rows'])} were there already; --force redoes them.")
     return "\n".join(lines)
+
+
+def _sample_lines(rows: Rows) -> list[str]:
+    """How sure each verdict is, where varied replays were asked for."""
+    lines = []
+    for row in rows:
+        p = row.get("p_success")
+        if p is not None:
+            lines.append(
+                f"  {row['episode']} {row['plan']} {row['trajectory']}: "
+                f"{p['k']:g} of {p['n']:g}, {p['value']:.0%} [{p['low']:.0%}, {p['high']:.0%}]"
+            )
+    return ["", "varied replays that succeed:", *lines] if lines else []
 
 
 def _count_lines(counts: Mapping[str, Mapping[str, int]]) -> list[str]:

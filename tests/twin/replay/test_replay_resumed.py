@@ -10,18 +10,20 @@ from typing import Any
 
 import pytest
 
-from bridge.episode import schema
+from bridge.episode import schema, streams
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.records import string_to_cdr
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import MissingDependencyError, UsageError
+from bridge.task.record import parse_record
 from twin.replay import ray_cluster
 from twin.replay.config import ReplayConfig
 from twin.replay.job import ReplayJob, row_of_existing
 from twin.replay.ray_cluster import RayClusterError, RayRunner, code_version, is_loopback
 from twin.replay.relive import run_job
 from twin.replay.starts import StartState
+from twin.replay.table import count_verdicts, describe_run
 from twin.replay.worker import Failed
 
 T0 = 1_700_000_000_000_000_000
@@ -86,7 +88,8 @@ def test_settings_of_samples_name_another_file(jobs: list[ReplayJob]) -> None:
 
 @pytest.mark.slow
 def test_what_a_killed_replay_left_is_made_again_and_whole(jobs: list[ReplayJob]) -> None:
-    job = jobs[0]
+    """With its varied replays as records beside the verdict, in the same file."""
+    job = replace(jobs[0], config=replace(QUICK, samples=1))
     part = job.path().with_name(job.path().name + ".part")
     writer = EpisodeWriter(job.path())
     writer.describe(EpisodeInfo(id="trial_0001", kind="trial"))
@@ -99,7 +102,20 @@ def test_what_a_killed_replay_left_is_made_again_and_whole(jobs: list[ReplayJob]
     again = row_of_existing(job)
     assert again is not None
     assert again["skipped"]
-    assert again["accepted"] == row["accepted"]
+    assert again == {**row, "skipped": True}
+    episode = Episode.open(job.path())
+    (sample,) = [
+        parse_record(message.data, name="sample")
+        for message in episode.messages(episode.topics_of_type(schema.SAMPLE))
+    ]
+    assert (sample["plan_id"], sample["index"]) == ("a", 0)
+    ((_, verdict),) = streams.verdicts(episode)
+    assert verdict.p_success == row["p_success"]
+    assert verdict.p_success is not None
+    assert (verdict.p_success["k"], verdict.p_success["n"]) == (int(sample["accepted"]), 1)
+    assert "varied replays that succeed:" in describe_run(
+        {"rows": [row], "counts": count_verdicts([row])}
+    )
 
 
 def test_an_address_of_this_machine_is_one() -> None:
