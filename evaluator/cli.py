@@ -1,64 +1,105 @@
 """Commands of the room ``evaluator``; imports stay late so that --help is quick."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from bridge.terminal import Output
 
 if TYPE_CHECKING:
-    from evaluator.result import Results
+    from evaluator.compare import Comparison
+    from evaluator.compare.published import Finding
+    from evaluator.thresholds import Missed
 
 THRESHOLD_NOT_MET = 3
 
 
 def evaluate(
-    source: Path,
+    source: Path | None = None,
     /,
     *,
     out: Path | None = None,
-    fail_under: float | None = None,
+    fail_under: str | float | None = None,
+    check_published: Path | None = None,
+    interval: Literal["wilson", "clopper-pearson", "jeffreys"] = "wilson",
+    goal: float | None = None,
     output: Output = Output(),  # noqa: B008  # frozen, and cyclopts reads the default
 ) -> int:
     """Say how far the twin can be trusted: agreement, tables, figures, report.html.
 
-    Example: robot-gst evaluate runs/monday --fail-under 0.8
+    Example: robot-gst evaluate runs/monday --fail-under r=0.8
 
     Args:
-        source: A run folder, a trials CSV (one row per trial) or a rates CSV (task, condition,
-            side, unit, n, rate).
-        out: Folder for the results; RUN/results, or NAME_results beside a CSV NAME.csv, without it.
-        fail_under: Exit with 3 when sim and outcome agree in a smaller fraction of trials (0..1).
+        source: A run folder, a trials CSV (one row per trial), a rates CSV (task, condition, side,
+            unit, n, rate), PolaRiS eval_results.csv, LeRobot eval_info.json, or a folder of SIMPLER
+            videos. May be left out with --check-published.
+        out: Folder for the results; RUN/results, or NAME_results beside a table, without it.
+        fail_under: Exit with 3 when a number stays below: 0.8 for the trials in which sim and
+            outcome agree, or r=0.8, ppv=0.9, any id of results.json; several with commas.
+        check_published: A published table (a rates CSV with printed figures): recompute it from
+            its rows, and exit with 3 when a figure does not follow from them.
+        interval: Interval of success rates.
+        goal: A success rate from 0 to 1: say for each cell whether its trials settle that it lies
+            above or below, at any time, or how many more that may take.
         output: How to talk.
     """
-    from bridge.episode.run import RunFolder
     from bridge.errors import UsageError
-    from evaluator.compare import compare_csv, compare_run
+    from evaluator.compare.published import check_published as recompute
     from evaluator.report.write import summary_text, write_report
+    from evaluator.thresholds import missed, parse_thresholds
 
-    if fail_under is not None and not 0 <= fail_under <= 1:
-        message = f"--fail-under {fail_under} is not a fraction from 0 to 1, for example 0.8."
+    if goal is not None and not 0 < goal < 1:
+        message = f"--goal {goal} is no success rate between 0 and 1, for example 0.8."
         raise UsageError(message)
-    if source.suffix.lower() == ".csv" and not source.is_dir():
-        comparison = compare_csv(source)
-        folder = out or source.with_name(f"{source.stem}_results")
+    thresholds = [] if fail_under is None else parse_thresholds(fail_under)
+    published = None if check_published is None else recompute(check_published)
+    if source is not None:
+        comparison, folder = _compare(source, interval, goal)
+        if published is not None:
+            comparison = _beside(comparison, published.comparison)
+    elif published is not None and check_published is not None:
+        comparison = published.comparison
+        folder = check_published.with_name(f"{check_published.stem}_results")
     else:
-        run = RunFolder.open(source)
-        comparison = compare_run(run)
-        folder = out or run.results_dir
-    written = write_report(comparison, folder)
+        message = "evaluate needs a run folder or a table, or --check-published TABLE."
+        raise UsageError(message)
+    written = write_report(comparison, out or folder)
     results = comparison.results()
     output.result(results.to_record(), summary_text(results, written))
-    if fail_under is None:
-        return 0
-    return _judge(results, fail_under, output)
+    failed = [_missed_text(item) for item in missed(thresholds, results)]
+    failed += [_finding_text(item) for item in (published.failed if published else ())]
+    for text in failed:
+        output.say(text)
+    return THRESHOLD_NOT_MET if failed else 0
 
 
-def _judge(results: "Results", fail_under: float, output: Output) -> int:
-    from evaluator.report.wording import measurement_text
+def _compare(source: Path, interval: str, goal: float | None) -> "tuple[Comparison, Path]":
+    from bridge.episode.run import RunFolder
+    from evaluator.compare import compare_csv, compare_run
 
-    found = [m for m in results.measurements if m.id == "agreement.sim_planned.rate"]
-    if found and found[0].value is not None and found[0].value >= fail_under:
-        return 0
-    shown = measurement_text(found[0]) if found else "undefined: no trials to compare"
-    output.say(f"Agreement of sim and outcome is {shown}; the threshold is {fail_under:g}.")
-    return THRESHOLD_NOT_MET
+    beside = source.with_name(f"{source.stem}_results") if source.name else Path("results")
+    if not source.is_dir() and source.suffix.lower() in (".csv", ".json"):
+        return compare_csv(source, method=interval, goal=goal), beside
+    if source.is_dir() and not (source / "episodes").is_dir() and any(source.rglob("*_obj_*.mp4")):
+        return compare_csv(source, method=interval, goal=goal), beside
+    run = RunFolder.open(source)
+    return compare_run(run, method=interval, goal=goal), run.results_dir
+
+
+def _beside(comparison: "Comparison", published: "Comparison") -> "Comparison":
+    """Add the check of a published table to a report about something else."""
+    from dataclasses import replace
+
+    added = [table for table in published.tables if table.id == "published"]
+    return replace(comparison, tables=(*comparison.tables, *added))
+
+
+def _missed_text(item: "Missed") -> str:
+    threshold = item.threshold
+    name = "Agreement of sim and outcome" if threshold.name == "agreement" else threshold.name
+    shown = item.reason if item.value is None else f"{item.value:.4g}"
+    return f"{name} is {shown}; the threshold is {threshold.limit:g}."
+
+
+def _finding_text(item: "Finding") -> str:
+    where = "" if item.row is None else f"row {item.row}: "
+    return f"{where}{item.what}: {item.verdict}. {item.remark}".strip()

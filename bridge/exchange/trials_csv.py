@@ -119,7 +119,7 @@ def read_rows(path: Path, required: Sequence[str], known: Sequence[str]) -> list
     if not lines:
         raise TableError(path=path, row=None, found="empty", hint=f"Columns: {', '.join(known)}")
     header = [name.strip() for name in lines[0][1]]
-    _check_header(path, lines[0][0], header, required, known)
+    check_header(path, lines[0][0], header, required, known)
     rows = []
     for number, cells in lines[1:]:
         if len(cells) != len(header):
@@ -158,9 +158,14 @@ def _lines(path: Path, *, what: str, hint: str) -> list[tuple[int, list[str]]]:
     return [line for line in lines if not line[1][0].startswith("#")]
 
 
-def _check_header(
+def check_header(
     path: Path, row: int, header: list[str], required: Sequence[str], known: Sequence[str]
 ) -> None:
+    """Refuse a header that lacks a column, or has an unknown or doubled one.
+
+    Raises:
+        TableError: Naming the columns.
+    """
     columns = f"Columns: {', '.join(known)}; needed: {', '.join(required)}"
     absent = [name for name in required if name not in header]
     strange = [name for name in header if name not in known]
@@ -182,24 +187,38 @@ def read_trials(path: Path) -> list[TrialRecord]:
     units: dict[str, tuple[str, int]] = {}
     trials = []
     for row in rows:
-        trial = _trial(row)
+        trial = read_trial(row)
         if trial.trial_id in seen:
             raise row.refuse(
                 f"trial_id {trial.trial_id!r} stands in row {seen[trial.trial_id]} already",
                 "Give each trial its own id, or remove the copy",
             )
         seen[trial.trial_id] = row.row
-        unit, first = units.setdefault(trial.task, (trial.unit, row.row))
-        if unit != trial.unit:
-            raise row.refuse(
-                f"unit {trial.unit!r} in task {trial.task!r}, but row {first} says {unit!r}",
-                "One task is counted in one unit; mixing them changes what a rate means",
-            )
+        check_unit(row, trial, units)
         trials.append(trial)
     return trials
 
 
-def _trial(row: SourceRow) -> TrialRecord:
+def check_unit(row: SourceRow, trial: TrialRecord, units: dict[str, tuple[str, int]]) -> None:
+    """Refuse a second unit in one task; ``units`` remembers each task's unit and first row.
+
+    Raises:
+        TableError: Naming both rows.
+    """
+    unit, first = units.setdefault(trial.task, (trial.unit, row.row))
+    if unit != trial.unit:
+        raise row.refuse(
+            f"unit {trial.unit!r} in task {trial.task!r}, but row {first} says {unit!r}",
+            "One task is counted in one unit; mixing them changes what a rate means",
+        )
+
+
+def read_trial(row: SourceRow) -> TrialRecord:
+    """Read and check one row.
+
+    Raises:
+        TableError: For what no trial can be.
+    """
     for name in ("trial_id", "task"):
         if not row.text(name):
             raise row.refuse(f"{name} is empty", f"Every trial needs a {name}")

@@ -39,7 +39,7 @@ def read_rates(path: Path) -> list[RateRecord]:
     """
     records: list[RateRecord] = []
     for row in read_rows(path, ("task", "side"), COLUMNS):
-        record = _rate(row)
+        record = read_rate(row)
         for other in records:
             if other.task == record.task and other.unit != record.unit:
                 raise row.refuse(
@@ -61,7 +61,12 @@ def _key(record: RateRecord) -> tuple[str, str, str]:
     return record.task, record.condition, "sim" if record.side == "sim" else "recorded"
 
 
-def _rate(row: SourceRow) -> RateRecord:
+def read_rate(row: SourceRow) -> RateRecord:
+    """Read one row of a rates CSV; other columns than ours are not looked at.
+
+    Raises:
+        TableError: For a rate that is no count of n.
+    """
     if not row.text("task"):
         raise row.refuse("task is empty", "Every rate needs its task")
     side, unit = row.text("side"), row.text("unit") or "trial"
@@ -70,7 +75,7 @@ def _rate(row: SourceRow) -> RateRecord:
     if unit not in UNITS:
         raise row.refuse(f"unit is {unit!r}", f"Units: {', '.join(UNITS)}")
     k, n = row.whole("k"), row.whole("n")
-    printed = _printed(row)
+    printed = printed_rate(row)
     if n == 0 or (k is not None and n is not None and k > n):
         raise row.refuse(f"{k} of {n} is not a possible count", "Check k and n")
     if k is not None and n is None:
@@ -95,8 +100,12 @@ def _rate(row: SourceRow) -> RateRecord:
     )
 
 
-def _printed(row: SourceRow) -> tuple[Fraction, Fraction] | None:
-    """Return the rate as printed and half a unit of its last digit, both as fractions of 1."""
+def printed_rate(row: SourceRow) -> tuple[Fraction, Fraction] | None:
+    """Return the rate as printed and half a unit of its last digit, both as fractions of 1.
+
+    Raises:
+        TableError: For what is no rate.
+    """
     texts = {name: row.text(name) for name in ("rate", "rate_percent")}
     given = {name: text for name, text in texts.items() if text}
     if len(given) == 2:

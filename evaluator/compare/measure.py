@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval, Measurement
-from evaluator.statistics.proportion import wilson
+from evaluator.statistics.coverage.stored import vouch
+from evaluator.statistics.proportion import RATE_INTERVALS
 
 Statistic = Callable[[], float | tuple[float, Interval | None]]
 
@@ -26,10 +27,13 @@ def measured(
     counted: str | None = None,
     reason_without_interval: str | None = None,
     episodes: Iterable[str] = (),
+    interval_n: int | None = None,
+    coverage_key: str = "",
 ) -> Measurement:
     """Compute one statistic; ``compute`` gives a value, or a value with its interval.
 
     What is not finite is undefined and says so: one broken pose must not end an evaluation.
+    An interval that covers too little at ``interval_n`` (``n`` without it) is left out, with why.
     """
     value: float | None = None
     interval: Interval | None = None
@@ -42,6 +46,10 @@ def measured(
     if value is not None and not math.isfinite(value):
         value, interval = None, None
         reason = "the recorded or replayed data hold values that are not finite"
+    if interval is not None:
+        size = n if interval_n is None else interval_n
+        interval, refusal = vouch(interval, size, key=coverage_key)
+        reason_without_interval = refusal or reason_without_interval
     return Measurement(
         id=measurement_id,
         value=value,
@@ -65,17 +73,25 @@ def proportion(
     counted: str,
     reason_if_undefined: str,
     episodes: Iterable[str] = (),
+    method: str = "wilson",
 ) -> Measurement:
-    """Measure k/n with its Wilson interval; undefined for n = 0."""
+    """Measure k/n with its interval, Wilson's unless another was asked for; undefined for n = 0."""
+    interval, refusal = vouched_rate(k, n, method) if n else (None, "")
     return Measurement(
         id=measurement_id,
         value=k / n if n else None,
         unit="1",
         definition=definition,
-        interval=wilson(k, n) if n else None,
+        interval=interval,
         k=k,
         n=n,
         counted=counted,
         reason_if_undefined=None if n else reason_if_undefined,
+        reason_without_interval=refusal or None,
         episodes=tuple(episodes),
     )
+
+
+def vouched_rate(k: int, n: int, method: str) -> tuple[Interval | None, str]:
+    """Return the interval of k/n by a named method, or None and why it is not printed."""
+    return vouch(RATE_INTERVALS[method](k, n), n)

@@ -1,111 +1,22 @@
-"""Trial by trial: does the twin agree with what happened, and do paired starts improve?"""
+"""Do paired starts improve with replanning? The same start without and with it."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from evaluator.compare.measure import measured, proportion
+from evaluator.compare.measure import measured
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
-from evaluator.result import Exclusion, Measurement
-from evaluator.statistics.agreement import Confusion, mcnemar, phi
+from evaluator.result import Exclusion, Interval, Measurement
+from evaluator.statistics.paired import mcnemar, tango_difference
+from evaluator.statistics.power import power_paired
 
 START_LIMIT_M = 0.03
 """Paired trials whose objects started further apart than this are not the same start."""
-
-
-def agreement(rows: Sequence[TrialRow]) -> list[Measurement]:
-    """Measure k/n agreement, phi and predictive values, of the replay and of the verdict."""
-    measurements = []
-    for name, said, words in (
-        ("sim_planned", lambda row: row.sim_planned, "planned-in-twin (dynamic, of the sent plan)"),
-        ("verdict", lambda row: row.verdict, "the verdict before motion"),
-        ("sim_executed", lambda row: row.sim_executed, "executed-in-twin (diagnosis only)"),
-    ):
-        measurements.extend(_agreement_of(rows, name, said, words))
-    if any(unheeded_verdict(row) is not None for row in rows):
-        words = "the verdict before motion, recorded and not obeyed (without replanning)"
-        measurements.extend(_agreement_of(rows, "verdict_unheeded", unheeded_verdict, words))
-    return measurements
-
-
-def unheeded_verdict(row: TrialRow) -> bool | None:
-    """The gate's verdict where it decided nothing: a refused plan was executed all the same.
-
-    Only these trials can show a false refusal, and only they are not selected by the gate.
-    """
-    return row.verdict if row.condition == WITHOUT else None
-
-
-def heeded_verdict(row: TrialRow) -> bool | None:
-    """The gate's verdict where it selected the plan: refused plans were never executed."""
-    return row.verdict if row.condition == WITH else None
-
-
-def _agreement_of(
-    rows: Sequence[TrialRow], name: str, said: Callable[[TrialRow], bool | None], words: str
-) -> list[Measurement]:
-    seen = [
-        (row.episode, answer, row.recorded)
-        for row in rows
-        if (answer := said(row)) is not None and row.recorded is not None
-    ]
-    episodes = [episode for episode, _, _ in seen]
-    counts = Confusion.count((answer, happened) for _, answer, happened in seen)
-    nothing = f"no trial has both {words} and a known outcome"
-    return [
-        proportion(
-            f"agreement.{name}.rate",
-            counts.agreed,
-            counts.n,
-            definition=f"trials where {words} and the labelled outcome say the same / trials",
-            counted="trial",
-            reason_if_undefined=nothing,
-            episodes=episodes,
-        ),
-        measured(
-            f"agreement.{name}.phi",
-            lambda: phi(counts),
-            unit="1",
-            definition=f"phi coefficient of {words} and the labelled outcome over trials",
-            n=counts.n,
-            counted="trial",
-            episodes=episodes,
-        ),
-        proportion(
-            f"agreement.{name}.ppv",
-            counts.true_positive,
-            counts.said_success,
-            definition=f"positive predictive value: trials that succeeded / trials where {words} "
-            "said success",
-            counted="trial",
-            reason_if_undefined=nothing if not counts.n else "it never said success",
-            episodes=[episode for episode, answer, _ in seen if answer],
-        ),
-        proportion(
-            f"agreement.{name}.npv",
-            counts.true_negative,
-            counts.said_failure,
-            definition=f"negative predictive value: trials that failed / trials where {words} "
-            "said failure",
-            counted="trial",
-            reason_if_undefined=nothing if not counts.n else "it never said failure",
-            episodes=[episode for episode, answer, _ in seen if not answer],
-        ),
-    ]
-
-
-def confusion_of(rows: Sequence[TrialRow], said: Callable[[TrialRow], bool | None]) -> Confusion:
-    """Count what was said against what was labelled, over trials where both are known."""
-    return Confusion.count(
-        (answer, row.recorded)
-        for row in rows
-        if (answer := said(row)) is not None and row.recorded is not None
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +31,9 @@ class StartPair:
 
 def pair_starts(rows: Sequence[TrialRow]) -> tuple[list[StartPair], list[Exclusion]]:
     """Pair trials on task, policy and start_id; what cannot be paired is listed."""
+    if any(not row.episode for row in rows):
+        reason = "a streamed table: starts are not paired; give the paired trials as a table apart"
+        return [], [Exclusion(episode="all", scope="pairing of conditions", reason=reason)]
     conditions = {row.condition for row in rows}
     if not {WITHOUT, WITH} <= conditions:
         return [], []
@@ -210,6 +124,8 @@ def paired_gain(pairs: Sequence[StartPair]) -> list[Measurement]:
         improved = sum(after and not before for before, after in answers)
         worsened = sum(before and not after for before, after in answers)
         words = f"{improved} improved, {worsened} worsened of {len(known)} paired starts ({side})"
+        measurements.append(_paired_points(side, known, improved, worsened, words))
+        measurements.append(_paired_power(side, known, improved, worsened, words))
         for kind in ("exact", "mid"):
             measurements.append(
                 measured(
@@ -226,6 +142,45 @@ def paired_gain(pairs: Sequence[StartPair]) -> list[Measurement]:
                 )
             )
     return measurements
+
+
+def _paired_points(
+    side: str, known: Sequence[StartPair], improved: int, worsened: int, words: str
+) -> Measurement:
+    def points() -> tuple[float, Interval | None]:
+        fraction = tango_difference(improved, worsened, len(known))
+        interval = replace(fraction, low=100 * fraction.low, high=100 * fraction.high)
+        return 100 * (improved - worsened) / len(known), interval
+
+    return measured(
+        f"paired.gain_pp.{side}",
+        points,
+        unit="pp",
+        definition=f"gain with replanning in percentage points over paired starts: {words}",
+        n=len(known),
+        counted="pair",
+        episodes=[r.episode for pair in known for r in (pair.before, pair.after)],
+    )
+
+
+def _paired_power(
+    side: str, known: Sequence[StartPair], improved: int, worsened: int, words: str
+) -> Measurement:
+    def power() -> float:
+        if not known:
+            raise UndefinedStatisticError(statistic="paired power", reason="there are no pairs")
+        return power_paired(improved / len(known), worsened / len(known), len(known))
+
+    return measured(
+        f"power.paired.{side}",
+        power,
+        unit="1",
+        definition=f"chance that McNemar's exact test on {len(known)} pairs is significant at 0.05 "
+        f"if these shares are true: {words}",
+        n=len(known),
+        counted="pair",
+        reason_without_interval="a plan, not an estimate",
+    )
 
 
 def _out(row: TrialRow, reason: str) -> Exclusion:

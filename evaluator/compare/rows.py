@@ -58,6 +58,12 @@ class TrialRow:
     planned_replay: str | None = None
     """File name of the derived episode ``sim_planned`` comes from."""
     executed_replay: str | None = None
+    failing_cause: str | None = None
+    """The cause alone, to be counted: ``collision``, ``unreachable`` ..."""
+    stages: tuple[tuple[str, bool | None], ...] = ()
+    """How each stage ended as labelled, in order; empty where nobody said."""
+    count: int = 1
+    """Trials this row stands for; above 1 only in a streamed table, where ``episode`` is empty."""
     path: Path | None = None
     tcp_errors: tuple[TcpErrorSeries, ...] = ()
     start_positions_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
@@ -89,6 +95,9 @@ class RateCell:
     """Over the trials where both sides are known, with its interval; the scatter draws these two,
     so that a point never compares different trials. None for a rates CSV."""
     sim_common: Measurement | None = None
+
+    trial_table: tuple[int, int, int, int] | None = None
+    """Trials in which both succeed, only sim, only recorded, neither; None where not paired."""
 
     @property
     def pair(self) -> tuple[Measurement, Measurement]:

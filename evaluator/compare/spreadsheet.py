@@ -1,51 +1,121 @@
-"""Trials CSV and rates CSV into a ``Comparison``, and a run's trials out again."""
+"""A trials CSV, or another benchmark's results, into a ``Comparison``; a run's trials out again."""
 
 from collections.abc import Sequence
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
 from bridge.errors import UsageError
+from bridge.exchange.benchmark_results import (
+    POLARIS_COLUMNS,
+    read_lerobot_eval,
+    read_polaris,
+    read_simpler,
+)
 from bridge.exchange.trials_csv import TrialRecord, header_of, read_trials
-from bridge.exchange.trials_rates import RateRecord, read_rates
+from bridge.exchange.trials_stream import count_trials
 from evaluator.compare.imported import row_from_record
-from evaluator.compare.measure import slug
-from evaluator.compare.rows import Comparison, RateCell, TrialRow
+from evaluator.compare.published import check_published
+from evaluator.compare.rates import compare_rates
+from evaluator.compare.remarks import remarks_table
+from evaluator.compare.rows import Comparison, TrialRow
 from evaluator.compare.run import compare_rows
-from evaluator.compare.success import WITH, cell_agreement, replanning_gains
-from evaluator.compare.tables import gains_table, success_table
-from evaluator.result import Exclusion, Measurement
-from evaluator.statistics.proportion import wilson
+from evaluator.compare.success import trials_in
+from evaluator.result import Exclusion
+
+STREAM_ABOVE_BYTES = 32 * 2**20
+"""A larger trials CSV is read row by row and only counted: about 300,000 trials."""
 
 
-def compare_csv(path: Path) -> Comparison:
-    """Compare a trials CSV or a rates CSV; the header tells which it is.
+def compare_csv(path: Path, *, method: str = "wilson", goal: float | None = None) -> Comparison:
+    """Compare a table, or another benchmark's result file or folder; its content tells which.
+
+    Read are a trials CSV, a rates CSV, a published table (rates with printed figures),
+    ``eval_results.csv`` of PolaRiS, ``eval_info.json`` of LeRobot, and a folder of SIMPLER videos.
 
     Raises:
         TableError: Naming the row that cannot be believed.
-        UsageError: When the columns are neither's.
+        UsageError: When it is none of these.
     """
+    if path.is_dir():
+        return _from_benchmark(path, read_simpler(path), "SIMPLER", method)
+    if path.suffix.lower() == ".json":
+        return _from_benchmark(path, read_lerobot_eval(path), "LeRobot", method)
     header = header_of(path)
     if "trial_id" in header:
-        return compare_trials(path)
+        return compare_trials(path, method=method, goal=goal)
+    if "statistic" in header:
+        return check_published(path).comparison
     if "side" in header:
-        return compare_rates(path)
+        return compare_rates(path, method=method)
+    if set(POLARIS_COLUMNS) <= set(header):
+        return _from_benchmark(path, read_polaris(path), "PolaRiS", method)
     message = (
-        f"{path} is neither a trials CSV (no column trial_id) nor a rates CSV (no column side); "
-        f"its columns are: {', '.join(header) or 'none'}."
+        f"{path} is neither a trials CSV (no column trial_id) nor a rates CSV (no column side) nor "
+        f"PolaRiS results ({', '.join(POLARIS_COLUMNS)}); its columns are: "
+        f"{', '.join(header) or 'none'}."
     )
     raise UsageError(message)
 
 
-def compare_trials(path: Path) -> Comparison:
-    """Compare a trials CSV as if it were a run."""
+def compare_trials(
+    path: Path,
+    *,
+    method: str = "wilson",
+    goal: float | None = None,
+    stream_above: int = STREAM_ABOVE_BYTES,
+) -> Comparison:
+    """Compare a trials CSV as if it were a run.
+
+    A large one is streamed: its rows are counted by their answers, in constant memory; what needs
+    single trials (pairs of starts, success probabilities, the list of trials) is left out by name.
+    """
+    if path.stat().st_size > stream_above:
+        return _compare_streamed(path, method)
     records = read_trials(path)
     rows = [row_from_record(record) for record in records]
+    stand_in = any(record.stand_in for record in records)
     base = compare_rows(
-        rows, run=path.stem, source="trials", stand_in=any(record.stand_in for record in records)
+        rows, run=path.stem, source="trials", stand_in=stand_in, method=method, goal=goal
     )
+    return _with_source(base, path, _unknown(rows))
+
+
+def _compare_streamed(path: Path, method: str) -> Comparison:
+    counted = count_trials(path)
+    rows = [replace(row_from_record(record), episode="", count=count) for record, count in counted]
+    stand_in = any(record.stand_in for record, _ in counted)
+    base = compare_rows(rows, run=path.stem, source="trials", stand_in=stand_in, method=method)
     left_out = [
+        Exclusion(episode=f"{trials_in(lacking)} trials", scope="agreement", reason=reason)
+        for reason, lacking in (
+            ("the outcome is unknown", [row for row in rows if row.recorded is None]),
+            ("sim_planned is unknown", [row for row in rows if row.sim_planned is None]),
+        )
+        if lacking
+    ]
+    return replace(_with_source(base, path, left_out), rows=())
+
+
+def _from_benchmark(
+    path: Path, records: Sequence[TrialRecord], name: str, method: str
+) -> Comparison:
+    """Enter outcomes of closed-loop rollouts on the sim side, and say what they are."""
+    rows = [row_from_record(record) for record in records]
+    base = compare_rows(rows, run=path.stem, source="trials", stand_in=None, method=method)
+    remark = (
+        f"{name} results are rollouts of a policy in that simulator, entered on the sim side: no "
+        "plan was sent and nothing was replayed. Add real trials of the same starts to compare"
+    )
+    old = [(str(a), str(b)) for t in base.tables if t.id == "remarks" for a, b in t.rows]
+    kept = (table for table in base.tables if table.id != "remarks")
+    tables = (*kept, *remarks_table([(name, remark), *old]))
+    base = replace(base, tables=tables)
+    return _with_source(base, path, ())
+
+
+def _unknown(rows: Sequence[TrialRow]) -> list[Exclusion]:
+    return [
         Exclusion(episode=row.episode, scope="agreement", reason=reason)
         for row in rows
         for reason, lacks in (
@@ -54,7 +124,6 @@ def compare_trials(path: Path) -> Comparison:
         )
         if lacks
     ]
-    return _with_source(base, path, left_out)
 
 
 def record_from_row(row: TrialRow) -> TrialRecord:
@@ -81,89 +150,13 @@ def record_from_row(row: TrialRow) -> TrialRecord:
     )
 
 
-def compare_rates(path: Path) -> Comparison:
-    """Compare printed rates: r over cells, gains, intervals where n is known."""
-    records = read_rates(path)
-    stand_in = any(record.side == "stand-in" for record in records)
-    cells, left_out = _rate_cells(records)
-    word = "stand-in" if stand_in else "real"
-    gains = replanning_gains(cells)
-    table = gains_table(gains, word)
-    tables = (success_table(cells, word, "Rates as given."), *(() if table is None else (table,)))
-    base = Comparison(
-        run=path.stem,
-        source="rates",
-        stand_in=stand_in,
-        cells=cells,
-        measurements=(
-            *(side for cell in cells for side in (cell.recorded, cell.sim)),
-            *cell_agreement(cells),
-            *gains,
-        ),
-        tables=tables,
-        missing=("trial-level agreement: a table of rates does not say which trial succeeded",),
-    )
-    return _with_source(base, path, left_out)
-
-
-def _rate_cells(records: Sequence[RateRecord]) -> tuple[tuple[RateCell, ...], list[Exclusion]]:
-    keys = list(dict.fromkeys((r.task, r.condition, r.unit) for r in records))
-    tasks = list(dict.fromkeys(record.task for record in records))
-    keys.sort(key=lambda key: (tasks.index(key[0]), key[1] == WITH))
-    cells, left_out = [], []
-    for task, condition, unit in keys:
-        sides: dict[str, RateRecord] = {
-            "sim" if r.side == "sim" else "recorded": r
-            for r in records
-            if (r.task, r.condition) == (task, condition)
-        }
-        for side in ("sim", "recorded"):
-            if side not in sides:
-                reason = f"{task} {condition}: no {side} rate"
-                left_out.append(Exclusion(episode=task, scope="agreement of cells", reason=reason))
-        cells.append(
-            RateCell(
-                task=task,
-                condition=condition,
-                policy="",
-                unit=unit,
-                recorded=_rate(sides.get("recorded"), "recorded", task, condition, unit),
-                sim=_rate(sides.get("sim"), "sim_planned", task, condition, unit),
-                recorded_rate=_fraction(sides.get("recorded")),
-                sim_rate=_fraction(sides.get("sim")),
-            )
-        )
-    return tuple(cells), left_out
-
-
-def _fraction(record: RateRecord | None) -> Fraction | None:
-    return None if record is None else record.rate
-
-
-def _rate(
-    record: RateRecord | None, side: str, task: str, condition: str, unit: str
-) -> Measurement:
-    known = record is not None and record.k is not None and record.n is not None
-    return Measurement(
-        id=f"rate.{side}.{slug(task)}.{slug(condition)}.-",
-        value=None if record is None else float(record.rate),
-        unit="1",
-        definition=f"successes / {unit}s, as given"
-        + (f" in row {record.row} ({record.side})" if record is not None else ""),
-        interval=wilson(record.k, record.n)
-        if record is not None and record.k is not None and record.n is not None
-        else None,
-        k=record.k if record is not None else None,
-        n=record.n if record is not None else None,
-        counted=unit,
-        reason_if_undefined="not in the table" if record is None else None,
-        reason_without_interval=None if known else "no n",
-    )
-
-
 def _with_source(base: Comparison, path: Path, left_out: Sequence[Exclusion]) -> Comparison:
     return replace(
         base,
         exclusions=(*left_out, *base.exclusions),
-        provenance={"software": software(), "file": path.name, "sha256": hash_file(path)},
+        provenance={
+            "software": software(),
+            "file": path.name,
+            "sha256": hash_file(path) if path.is_file() else None,
+        },
     )

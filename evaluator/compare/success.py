@@ -1,15 +1,13 @@
-"""Success rates per cell, how the twin's move with the recorded ones, and the replanning gain."""
+"""Success rates per task, condition and policy, in the twin and recorded, and their averages."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
-from functools import partial
 
 from evaluator.compare.measure import measured, proportion, slug
 from evaluator.compare.rows import RateCell, TrialRow
 from evaluator.errors import UndefinedStatisticError
-from evaluator.result import Interval, Measurement
-from evaluator.statistics import correlation
-from evaluator.statistics.proportion import newcombe_difference, relative_gain
+from evaluator.result import Measurement
+from evaluator.statistics.agreement import mean_rate
 
 WITHOUT = "without_replanning"
 WITH = "with_replanning"
@@ -27,7 +25,11 @@ VERDICT_DEFINITION = (
     "without replanning it was recorded and not obeyed, with replanning it selected these plans"
 )
 
-SIDES: tuple[tuple[str, Callable[[TrialRow], bool | None], str], ...] = (
+Key = tuple[str, str, str]
+"""Task, condition, policy."""
+Answer = Callable[[TrialRow], bool | None]
+
+SIDES: tuple[tuple[str, Answer, str], ...] = (
     ("recorded", lambda row: row.recorded, "successes / trials as labelled by the operator"),
     ("sim_planned", lambda row: row.sim_planned, SIM_DEFINITION),
     ("sim_executed", lambda row: row.sim_executed, EXECUTED_DEFINITION),
@@ -35,9 +37,9 @@ SIDES: tuple[tuple[str, Callable[[TrialRow], bool | None], str], ...] = (
 )
 
 
-def group_rows(rows: Sequence[TrialRow]) -> dict[tuple[str, str, str], list[TrialRow]]:
+def group_rows(rows: Sequence[TrialRow]) -> dict[Key, list[TrialRow]]:
     """Gather rows by task, condition and policy; without replanning comes first."""
-    groups: dict[tuple[str, str, str], list[TrialRow]] = {}
+    groups: dict[Key, list[TrialRow]] = {}
     for row in rows:
         groups.setdefault((row.task, row.condition, row.policy), []).append(row)
     return dict(
@@ -45,42 +47,78 @@ def group_rows(rows: Sequence[TrialRow]) -> dict[tuple[str, str, str], list[Tria
     )
 
 
-def side_rates(rows: Sequence[TrialRow]) -> list[Measurement]:
+def trials_in(rows: Iterable[TrialRow]) -> int:
+    """Count trials; a row of a streamed table stands for several."""
+    return sum(row.count for row in rows)
+
+
+def names_of(rows: Iterable[TrialRow]) -> list[str]:
+    """List the episodes of rows that stand for one trial each."""
+    return [row.episode for row in rows if row.episode]
+
+
+def answered(
+    measurement_id: str,
+    rows: Sequence[TrialRow],
+    answer: Answer,
+    *,
+    definition: str,
+    reason_if_undefined: str,
+    method: str = "wilson",
+) -> Measurement:
+    """Measure the share of yes among the trials whose answer is known."""
+    known = [row for row in rows if answer(row) is not None]
+    return proportion(
+        measurement_id,
+        trials_in(row for row in known if answer(row)),
+        trials_in(known),
+        definition=definition,
+        counted="trial",
+        reason_if_undefined=reason_if_undefined,
+        episodes=names_of(known),
+        method=method,
+    )
+
+
+def side_rates(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Measurement]:
     """Measure every side of every cell, counted in trials; object counts beside them."""
     measurements = []
     for key, members in group_rows(rows).items():
         for side, answer, definition in SIDES:
-            known = [row for row in members if answer(row) is not None]
             measurements.append(
-                proportion(
-                    _rate_id(side, key),
-                    sum(answer(row) is True for row in known),
-                    len(known),
+                answered(
+                    rate_id(side, key),
+                    members,
+                    answer,
                     definition=definition,
-                    counted="trial",
-                    reason_if_undefined=f"none of {len(members)} trials has it",
-                    episodes=[row.episode for row in known],
+                    reason_if_undefined=f"none of {trials_in(members)} trials has it",
+                    method=method,
                 )
             )
-        measurements.extend(_object_rate(key, members))
+        measurements.extend(_counted_rate(key, members, method))
     return measurements
 
 
-def _object_rate(key: tuple[str, str, str], members: Sequence[TrialRow]) -> list[Measurement]:
+def _counted_rate(key: Key, members: Sequence[TrialRow], method: str) -> list[Measurement]:
+    """Measure objects or sub-tasks where trials are counted in them; never two units together."""
     counted = [row for row in members if row.unit != "trial" and row.k is not None and row.n]
     if not counted:
         return []
+    by_unit = {row.unit: row for row in reversed(counted)}
     unit = counted[0].unit
+    mixed = len(by_unit) > 1
+    firsts = " and ".join(f"{row.episode} in {name}s" for name, row in sorted(by_unit.items()))
     return [
         proportion(
-            _rate_id(f"recorded_{unit}", key),
-            sum(row.k or 0 for row in counted),
-            sum(row.n or 0 for row in counted),
+            rate_id(f"recorded_{unit}", key),
+            0 if mixed else sum((row.k or 0) * row.count for row in counted),
+            0 if mixed else sum((row.n or 0) * row.count for row in counted),
             definition=f"successes / {unit}s as labelled; {unit}s of one trial are not "
             "independent, so the interval is narrower than the trials justify",
             counted=unit,
-            reason_if_undefined="no counts",
-            episodes=[row.episode for row in counted],
+            reason_if_undefined=f"trials are counted in different units: {firsts}",
+            episodes=names_of(counted),
+            method=method,
         )
     ]
 
@@ -101,230 +139,124 @@ def never_sent(rows: Sequence[TrialRow]) -> list[Measurement]:
             n=made,
             counted="plan",
             reason_without_interval="a count",
-            episodes=[row.episode for row in planned],
+            episodes=names_of(planned),
         )
     ]
 
 
-def rate_cells(rows: Sequence[TrialRow], rates: Sequence[Measurement]) -> tuple[RateCell, ...]:
+def rate_cells(
+    rows: Sequence[TrialRow], rates: Sequence[Measurement], *, method: str = "wilson"
+) -> tuple[RateCell, ...]:
     """Lay the recorded and the headline sim rate of each cell side by side."""
     by_id = {measurement.id: measurement for measurement in rates}
     cells = []
     for key, members in group_rows(rows).items():
         both = [r for r in members if r.recorded is not None and r.sim_planned is not None]
-        num = len(both)
-        recorded_common, sim_common = _common_rates(key, both)
+        recorded_common, sim_common = (
+            answered(
+                rate_id(side, key).replace("rate.", "rate_common.", 1),
+                both,
+                answer,
+                definition=f"{definition}; over the trials where both sides are known",
+                reason_if_undefined="no trial has both sides",
+                method=method,
+            )
+            for side, answer, definition in SIDES[:2]
+        )
         cells.append(
             RateCell(
                 task=key[0],
                 condition=key[1],
                 policy=key[2],
                 unit="trial",
-                recorded=by_id[_rate_id("recorded", key)],
-                sim=by_id[_rate_id("sim_planned", key)],
-                recorded_rate=Fraction(sum(r.recorded is True for r in both), num) if num else None,
-                sim_rate=Fraction(sum(r.sim_planned is True for r in both), num) if num else None,
-                episodes=tuple(row.episode for row in both),
+                recorded=by_id[rate_id("recorded", key)],
+                sim=by_id[rate_id("sim_planned", key)],
+                recorded_rate=fraction_of(recorded_common),
+                sim_rate=fraction_of(sim_common),
+                episodes=tuple(names_of(both)),
                 recorded_common=recorded_common,
                 sim_common=sim_common,
+                trial_table=_trial_table(both) if both else None,
             )
         )
     return tuple(cells)
 
 
-def _common_rates(
-    key: tuple[str, str, str], both: Sequence[TrialRow]
-) -> tuple[Measurement, Measurement]:
-    rates = [
-        proportion(
-            _rate_id(side, key).replace("rate.", "rate_common.", 1),
-            sum(answer(row) is True for row in both),
-            len(both),
-            definition=f"{definition}; over the trials where both sides are known",
-            counted="trial",
-            reason_if_undefined="no trial has both sides",
-            episodes=[row.episode for row in both],
-        )
-        for side, answer, definition in SIDES[:2]
-    ]
-    return rates[0], rates[1]
+def fraction_of(measurement: Measurement) -> Fraction | None:
+    """Return k/n exactly, None where it is not known."""
+    if measurement.k is None or not measurement.n:
+        return None
+    return Fraction(measurement.k, measurement.n)
 
 
-def cell_agreement(cells: Sequence[RateCell]) -> list[Measurement]:
-    """Measure over cells: r, rank correlation, bias, MAE, MMRV in both conventions."""
-    usable = [c for c in cells if c.recorded_rate is not None and c.sim_rate is not None]
-    recorded = [c.recorded_rate for c in usable if c.recorded_rate is not None]
-    sim = [c.sim_rate for c in usable if c.sim_rate is not None]
-    units = sorted({cell.unit for cell in usable})
-    what = f"over cells (task x condition x policy), n = {len(usable)}"
-    what += f", rates counted in different units ({', '.join(units)})" if len(units) > 1 else ""
-    shared = len({(c.task, c.policy) for c in usable}) < len(usable)
-    make = partial(
-        measured,
-        n=len(usable),
-        counted="cell",
-        episodes=[name for cell in usable for name in cell.episodes],
-    )
-    return [
-        make(
-            "agreement.pearson_r",
-            partial(_pearson, recorded, sim, shared),
-            unit="1",
-            definition=f"Pearson r of the twin's and the recorded success rates {what}",
-            reason_without_interval=_no_interval(len(usable), shared),
-        ),
-        make(
-            "agreement.spearman_rho",
-            partial(correlation.spearman, recorded, sim),
-            unit="1",
-            definition=f"Spearman rank correlation of the same rates {what}; average ranks",
-        ),
-        make(
-            "agreement.bias_pp",
-            lambda: 100 * correlation.bias(recorded=recorded, sim=sim),
-            unit="pp",
-            definition=f"mean of sim rate - recorded rate {what}; above 0 the twin is optimistic",
-        ),
-        make(
-            "agreement.mae_pp",
-            lambda: 100 * correlation.mean_absolute_error(recorded=recorded, sim=sim),
-            unit="pp",
-            definition=f"mean |sim rate - recorded rate| {what}",
-        ),
-        make(
-            "agreement.mmrv_recorded_gap",
-            partial(correlation.mmrv, recorded=recorded, sim=sim, gap="recorded"),
-            unit="1",
-            definition=f"mean maximum rank violation {what}; convention: gap of recorded rates "
-            "(SIMPLER equation 1)",
-        ),
-        make(
-            "agreement.mmrv_sim_gap",
-            partial(correlation.mmrv, recorded=recorded, sim=sim, gap="sim"),
-            unit="1",
-            definition=f"mean maximum rank violation {what}; convention: gap of sim rates "
-            "(arguments swapped, as some published code does)",
-        ),
-    ]
+def _trial_table(both: Sequence[TrialRow]) -> tuple[int, int, int, int]:
+    """Count trials in which both succeed, only sim, only recorded, neither."""
+    table = [0, 0, 0, 0]
+    for row in both:
+        place = (0 if row.recorded else 1) if row.sim_planned else (2 if row.recorded else 3)
+        table[place] += row.count
+    return table[0], table[1], table[2], table[3]
 
 
-def _pearson(
-    recorded: Sequence[Fraction], sim: Sequence[Fraction], shared: bool
-) -> tuple[float, Interval | None]:
-    r = correlation.pearson(recorded, sim)
-    if shared or len(recorded) < correlation.MIN_CELLS_INTERVAL or abs(r) >= 1:
-        return r, None
-    return r, correlation.fisher_interval(r, len(recorded))
-
-
-def _no_interval(num_cells: int, shared: bool) -> str:
-    if num_cells < correlation.MIN_CELLS_INTERVAL:
-        return f"{num_cells} cells; Fisher's interval needs {correlation.MIN_CELLS_INTERVAL}"
-    if shared:
-        return "cells share tasks across conditions; Fisher's interval assumes independent cells"
-    return "r is exactly 1 or -1"
-
-
-def replanning_gains(cells: Sequence[RateCell]) -> list[Measurement]:
-    """Measure the gain with replanning per task and side: percentage points and relative."""
-    found = {(c.task, c.policy, c.condition): c for c in cells}
+def averages(cells: Sequence[RateCell], *, method: str = "wilson") -> list[Measurement]:
+    """Average over cells of a condition: macro (cells alike) and pooled (trials alike)."""
     measurements = []
-    both: list[tuple[RateCell, RateCell]] = []
-    for (task, policy, condition), before in found.items():
-        after = found.get((task, policy, WITH))
-        if condition != WITHOUT or after is None:
+    for condition in dict.fromkeys(cell.condition for cell in cells):
+        members = [cell for cell in cells if cell.condition == condition]
+        if len(members) < 2:
             continue
-        both.append((before, after))
-        for side in ("recorded", "sim"):
-            name = f"{slug(task)}.{slug(policy)}"
-            first, second = getattr(before, side), getattr(after, side)
-            measurements.extend(_gain(side, name, first, second))
-    measurements.extend(_average_gains(both))
+        for side in ("recorded", "sim_planned"):
+            rates = [cell.recorded if side == "recorded" else cell.sim for cell in members]
+            measurements += _averages(side, condition, members, rates, method)
     return measurements
 
 
-def _gain(side: str, name: str, before: Measurement, after: Measurement) -> list[Measurement]:
-    def points() -> tuple[float, Interval | None]:
-        first, second = _value(before), _value(after)
-        if before.k is None or not before.n or after.k is None or not after.n:
-            return 100 * (second - first), None
-        fraction = newcombe_difference(before.k, before.n, after.k, after.n)
-        interval = Interval(
-            low=100 * fraction.low,
-            high=100 * fraction.high,
-            level=fraction.level,
-            method=f"{fraction.method}, unpaired",
-        )
-        return 100 * (second - first), interval
-
-    words = f"{_shown(before)} without and {_shown(after)} with replanning"
+def _averages(
+    side: str,
+    condition: str,
+    members: Sequence[RateCell],
+    rates: Sequence[Measurement],
+    method: str,
+) -> list[Measurement]:
+    units = sorted({cell.unit for cell in members})
+    countable = len(units) == 1 and all(rate.k is not None and rate.n for rate in rates)
+    why = f"cells are counted in different units ({', '.join(units)})"
+    why = why if len(units) > 1 else "the number of trials of a cell is not known"
+    name = f"{side}.{slug(condition)}"
+    episodes = [episode for rate in rates for episode in rate.episodes]
     return [
         measured(
-            f"gain.pp.{side}.{name}",
-            points,
-            unit="pp",
-            definition=f"gain with replanning in percentage points ({side}): {words}",
-            reason_without_interval="no n",
-            episodes=(*before.episodes, *after.episodes),
-        ),
-        measured(
-            f"gain.relative.{side}.{name}",
-            lambda: relative_gain(_value(before), _value(after)),
+            f"average.macro.{name}",
+            lambda: _macro(rates),
             unit="1",
-            definition=f"relative gain with replanning ({side}), (with - without) / without: "
-            f"{words}; not percentage points",
-            episodes=(*before.episodes, *after.episodes),
+            definition=f"mean of the unrounded {side} rates of {len(members)} cells {condition}: "
+            "every cell counts the same",
+            n=len(members),
+            counted="cell",
+            reason_without_interval="the cells are these, not a sample of others",
+            episodes=episodes,
+        ),
+        proportion(
+            f"average.pooled.{name}",
+            sum(rate.k or 0 for rate in rates) if countable else 0,
+            sum(rate.n or 0 for rate in rates) if countable else 0,
+            definition=f"successes / {units[0]}s over {len(members)} cells {condition} ({side}): "
+            "every trial counts the same",
+            counted=units[0],
+            reason_if_undefined=why,
+            episodes=episodes,
+            method=method,
         ),
     ]
 
 
-def _average_gains(both: Sequence[tuple[RateCell, RateCell]]) -> list[Measurement]:
-    measurements = []
-    for side in ("recorded", "sim") if len(both) > 1 else ():
-        first = partial(_mean, [getattr(before, side) for before, _ in both])
-        second = partial(_mean, [getattr(after, side) for _, after in both])
-        what = f"of the unrounded mean rates of {len(both)} tasks ({side})"
-        measurements += [
-            measured(
-                f"gain.pp.{side}.average",
-                lambda first=first, second=second: 100 * (second() - first()),  # type: ignore[misc]
-                unit="pp",
-                definition=f"gain with replanning in percentage points {what}",
-                n=len(both),
-                counted="task",
-                reason_without_interval="tasks may be counted in different units",
-            ),
-            measured(
-                f"gain.relative.{side}.average",
-                lambda first=first, second=second: relative_gain(first(), second()),  # type: ignore[misc]
-                unit="1",
-                definition=f"relative gain with replanning {what}; not percentage points",
-                n=len(both),
-                counted="task",
-            ),
-        ]
-    return measurements
+def _macro(rates: Sequence[Measurement]) -> float:
+    undefined = [rate for rate in rates if rate.value is None]
+    if undefined:
+        raise UndefinedStatisticError(statistic="average", reason=f"{undefined[0].id} is undefined")
+    return mean_rate([rate.value for rate in rates if rate.value is not None])
 
 
-def _mean(measurements: Sequence[Measurement]) -> float:
-    return sum(_value(m) for m in measurements) / len(measurements)
-
-
-def _value(measurement: Measurement) -> float:
-    if measurement.value is None:
-        raise UndefinedStatisticError(
-            statistic="gain", reason=f"a rate is undefined: {measurement.reason_if_undefined}"
-        )
-    return measurement.value
-
-
-def _shown(measurement: Measurement) -> str:
-    if measurement.value is None:
-        return "undefined"
-    if measurement.n is None:
-        return f"{measurement.value:.3g}"
-    return f"{measurement.k}/{measurement.n}"
-
-
-def _rate_id(side: str, key: tuple[str, str, str]) -> str:
+def rate_id(side: str, key: Key) -> str:
+    """Return the id of a cell's rate on one side."""
     return f"rate.{side}.{slug(key[0])}.{slug(key[1])}.{slug(key[2])}"

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 
-from evaluator.compare.pairing import confusion_of, heeded_verdict, unheeded_verdict
 from evaluator.compare.rows import RateCell, TrialRow
+from evaluator.compare.success import WITH, WITHOUT
+from evaluator.compare.verdicts import confusion_of, heeded_verdict, unheeded_verdict
 from evaluator.result import Measurement, Table
 
 
@@ -60,12 +61,12 @@ def _gap(cell: RateCell) -> float | None:
     return round(float(100 * (cell.sim_rate - cell.recorded_rate)), 1)
 
 
-def gains_table(gains: Sequence[Measurement], word: str) -> Table | None:
-    """The replanning gain: percentage points and relative gain are two columns."""
+def gains_table(gains: Sequence[Measurement], word: str) -> tuple[Table, ...]:
+    """The replanning gain: percentage points and relative gain are two columns; none without."""
     points = [m for m in gains if m.id.startswith("gain.pp.")]
     relative = {m.id: m for m in gains if m.id.startswith("gain.relative.")}
     if not points:
-        return None
+        return ()
     rows = []
     for gain in points:
         side, name = gain.id.split(".", 3)[2:]
@@ -79,14 +80,61 @@ def gains_table(gains: Sequence[Measurement], word: str) -> Table | None:
                 _relative(relative[gain.id.replace("gain.pp.", "gain.relative.")]),
             )
         )
-    return Table(
+    table = Table(
         id="gains",
         title="Gain with replanning",
         columns=("task", "side", "percentage points", "relative gain"),
         rows=tuple(rows),
         note="Two different numbers. Brackets: 95 % Newcombe intervals of unpaired groups; one "
-        "that reaches below 0 does not show a gain.",
+        "that reaches below 0 does not show a gain. An interval that would cover too little with "
+        "so few trials is left out; measurements say which to use.",
     )
+    return (table,)
+
+
+def layout_table(
+    cells: Sequence[RateCell], measurements: Sequence[Measurement], word: str
+) -> tuple[Table, ...]:
+    """Lay rates out as papers print them: a row per task, sim and recorded without and with."""
+    conditions = [name for name in (WITHOUT, WITH) if any(c.condition == name for c in cells)]
+    if len(conditions) < 2:
+        return ()
+    found = {(c.task, c.policy, c.condition): c for c in cells}
+    rows = []
+    for task, policy in dict.fromkeys((c.task, c.policy) for c in cells):
+        line: list[str | None] = [task, policy]
+        for condition in conditions:
+            cell = found.get((task, policy, condition))
+            line += [_percent(cell.sim), _percent(cell.recorded)] if cell else [None, None]
+        rows.append(tuple(line))
+    by_id = {measurement.id: measurement for measurement in measurements}
+    for kind in ("macro", "pooled"):
+        ids = [
+            f"average.{kind}.{side}.{condition}"
+            for condition in conditions
+            for side in ("sim_planned", "recorded")
+        ]
+        if all(name in by_id for name in ids):
+            rows.append((f"average, {kind}", "", *(_percent(by_id[name]) for name in ids)))
+    columns = [
+        f"{side}, {condition.replace('_', ' ')}"
+        for condition in conditions
+        for side in ("sim", word)
+    ]
+    return (
+        Table(
+            id="layout",
+            title="Success without and with replanning",
+            columns=("task", "policy", *columns),
+            rows=tuple(rows),
+            note="Percent. Macro: every task counts the same. Pooled: every trial counts the same; "
+            "undefined where tasks are counted in different units.",
+        ),
+    )
+
+
+def _percent(measurement: Measurement) -> str:
+    return "undefined" if measurement.value is None else f"{100 * measurement.value:.1f} %"
 
 
 def _points(gain: Measurement) -> str:

@@ -122,6 +122,8 @@ def _row(
         p_success=_p_success(planned.verdict, verdict),
         first_failing=None if failing is None else failing.first_failing,
         failing_detail=_failing_detail(failing),
+        failing_cause=_failing_cause(failing),
+        stages=_stages(outcome),
         planned_replay=None if planned.file is None else planned.file.path.name,
         executed_replay=None if executed.file is None else executed.file.path.name,
         path=episode.path,
@@ -163,7 +165,9 @@ def _note_event(log: _Log, event: dict[str, object]) -> None:
         outcome = event.get("outcome")
         if isinstance(outcome, dict) and "result" in outcome:
             names = {"result", "unit", "k", "n", "by", "detail"}
-            log.label = Outcome(**{key: outcome[key] for key in names & outcome.keys()})
+            known = {key: outcome[key] for key in names & outcome.keys()}
+            stages = outcome.get("stages") or ()
+            log.label = Outcome(**known, stages=tuple(s for s in stages if isinstance(s, dict)))
 
 
 def _p_success(*said: Verdict | None) -> float | None:
@@ -182,6 +186,21 @@ def _failing_detail(verdict: Verdict | None) -> str | None:
     if factor.first_t_ns is not None:
         parts.append(f"at {factor.first_t_ns / NS_PER_S:.2f} s")
     return ", ".join(part for part in parts if part) or None
+
+
+def _failing_cause(verdict: Verdict | None) -> str | None:
+    if verdict is None or verdict.first_failing is None:
+        return None
+    cause: str | None = getattr(verdict, verdict.first_failing).cause
+    return cause
+
+
+def _stages(outcome: Outcome | None) -> tuple[tuple[str, bool | None], ...]:
+    answers = {"success": True, "failure": False}
+    return tuple(
+        (str(stage.get("id", "")), answers.get(str(stage.get("result"))))
+        for stage in (outcome.stages if outcome is not None else ())
+    )
 
 
 def _start_positions(

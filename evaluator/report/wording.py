@@ -11,6 +11,8 @@ HEADLINES: tuple[tuple[str, str], ...] = (
     ("agreement.sim_planned.npv", "Failure when sim says failure (NPV)"),
     ("agreement.verdict.ppv", "Success when the gate accepted (PPV)"),
     ("agreement.pearson_r", "Pearson r over cells"),
+    ("agreement.pearson_r.without_replanning", "Pearson r without replanning"),
+    ("agreement.pearson_r.with_replanning", "Pearson r with replanning"),
     ("agreement.bias_pp", "Bias of sim"),
     ("agreement.mmrv_recorded_gap", "MMRV (gap of recorded rates)"),
     ("gain.pp.recorded.average", "Replanning gain, mean of tasks"),
@@ -56,7 +58,7 @@ def measurement_text(measurement: Measurement) -> str:
 
 
 def interval_text(measurement: Measurement) -> str:
-    """Write the interval with its level and method, or nothing."""
+    """Write the interval with its level, method and least coverage at this n, or nothing."""
     interval = measurement.interval
     if interval is None:
         return ""
@@ -64,7 +66,9 @@ def interval_text(measurement: Measurement) -> str:
         ends = f"[{100 * interval.low:.1f}, {100 * interval.high:.1f}] %"
     else:
         ends = f"[{interval.low:.3g}, {interval.high:.3g}]"
-    return f" {ends} ({100 * interval.level:.0f} % {interval.method})"
+    known = interval.worst_coverage
+    worst = "" if known is None else f", worst case {100 * known:.1f} %"
+    return f" {ends} ({100 * interval.level:.0f} % {interval.method}{worst})"
 
 
 def headlines(results: Results) -> list[tuple[str, str, Measurement]]:

@@ -14,6 +14,9 @@ from evaluator.report.tables import as_csv, as_latex, as_markdown, as_text
 from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
 
+SHOWN = ("published", "success", "layout", "gains", "stopping", "remarks")
+"""Tables a terminal shows; the others are in the report."""
+
 PARQUET_PACKAGES = ("pandas", "pyarrow")
 
 
@@ -91,7 +94,7 @@ def summary_text(results: Results, written: Written) -> str:
     banner = stand_in_sentence(results)
     if banner:
         parts.append(banner)
-    shown = [t for t in results.tables if t.id in ("success", "gains") or t.id.startswith("bands_")]
+    shown = [t for t in results.tables if t.id in SHOWN or t.id.startswith("bands_")]
     parts += [as_text(table) for table in shown]
     lines = [f"{label}: {text}" for label, text, _ in headlines(results)]
     if lines or not results.measurements:

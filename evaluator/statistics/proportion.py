@@ -1,6 +1,7 @@
-"""Intervals for success rates and their differences. Never Wald: it collapses at 0/n and n/n."""
+"""Intervals for success rates. Never Wald: it collapses at 0/n and n/n."""
 
 import math
+from collections.abc import Callable
 
 from scipy.special import betaincinv, ndtri
 
@@ -27,8 +28,8 @@ def wilson(k: int, n: int, *, level: float = LEVEL) -> Interval:
         UndefinedStatisticError: Without trials.
         ImpossibleCountError: When k is not in 0..n.
     """
-    _check(k, n)
-    z = _z(level)
+    check_count(k, n)
+    z = normal_quantile(0.5 + level / 2)
     rate = k / n
     centre = (rate + z * z / (2 * n)) / (1 + z * z / n)
     half = z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n)) / (1 + z * z / n)
@@ -38,30 +39,42 @@ def wilson(k: int, n: int, *, level: float = LEVEL) -> Interval:
 
 
 def clopper_pearson(k: int, n: int, *, level: float = LEVEL) -> Interval:
-    """Return the interval that covers at least ``level`` for every true rate (1934)."""
-    _check(k, n)
+    """Return the interval that covers at least ``level`` for every true rate (1934).
+
+    Raises:
+        UndefinedStatisticError: Without trials.
+        ImpossibleCountError: When k is not in 0..n.
+    """
+    check_count(k, n)
     tail = (1 - level) / 2
     low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
     high = 1.0 if k == n else float(betaincinv(k + 1, n - k, 1 - tail))
     return Interval(low=low, high=high, level=level, method="clopper-pearson")
 
 
-def newcombe_difference(
-    k_first: int, n_first: int, k_second: int, n_second: int, *, level: float = LEVEL
-) -> Interval:
-    """Return the interval of second - first for independent groups (Newcombe 1998, method 10).
+def jeffreys(k: int, n: int, *, level: float = LEVEL) -> Interval:
+    """Return the equal-tailed interval of the posterior Beta(k + 1/2, n - k + 1/2).
 
-    The result is a fraction: 0.2 is a gain of 20 percentage points.
+    With the ends 0 at k = 0 and 1 at k = n (Brown, Cai and DasGupta 2001, section 4.1): without
+    that change it never covers rates near 0 and 1.
+
+    Raises:
+        UndefinedStatisticError: Without trials.
+        ImpossibleCountError: When k is not in 0..n.
     """
-    first = wilson(k_first, n_first, level=level)
-    second = wilson(k_second, n_second, level=level)
-    p_first, p_second = k_first / n_first, k_second / n_second
-    difference = p_second - p_first
-    below = math.hypot(p_second - second.low, first.high - p_first)
-    above = math.hypot(second.high - p_second, p_first - first.low)
-    return Interval(
-        low=difference - below, high=difference + above, level=level, method="newcombe-10"
-    )
+    check_count(k, n)
+    tail = (1 - level) / 2
+    low = 0.0 if k == 0 else float(betaincinv(k + 0.5, n - k + 0.5, tail))
+    high = 1.0 if k == n else float(betaincinv(k + 0.5, n - k + 0.5, 1 - tail))
+    return Interval(low=low, high=high, level=level, method="jeffreys")
+
+
+RATE_INTERVALS: dict[str, Callable[..., Interval]] = {
+    "wilson": wilson,
+    "clopper-pearson": clopper_pearson,
+    "jeffreys": jeffreys,
+}
+"""What ``evaluate --interval`` chooses from."""
 
 
 def relative_gain(before: float, after: float) -> float:
@@ -77,12 +90,19 @@ def relative_gain(before: float, after: float) -> float:
     return (after - before) / before
 
 
-def _check(k: int, n: int) -> None:
+def check_count(k: int, n: int) -> None:
+    """Refuse what cannot be counted.
+
+    Raises:
+        UndefinedStatisticError: Without trials.
+        ImpossibleCountError: When k is not in 0..n.
+    """
     if n == 0:
         raise UndefinedStatisticError(statistic="rate", reason="there are no trials")
     if not 0 <= k <= n:
         raise ImpossibleCountError(k=k, n=n)
 
 
-def _z(level: float) -> float:
-    return float(ndtri(0.5 + level / 2))
+def normal_quantile(probability: float) -> float:
+    """Return the standard normal's quantile, 1.96 at 0.975."""
+    return float(ndtri(probability))

@@ -8,15 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics import correlation
-from evaluator.statistics.agreement import Confusion, mcnemar, phi
+from evaluator.statistics import agreement, correlation
+from evaluator.statistics.gate import Confusion, phi
+from evaluator.statistics.paired import mcnemar
 from evaluator.statistics.proportion import (
     ImpossibleCountError,
     clopper_pearson,
-    newcombe_difference,
     relative_gain,
     wilson,
 )
+from evaluator.statistics.unpaired import newcombe_difference
 
 counts = st.integers(1, 200).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 rates = st.lists(st.fractions(0, 1, max_denominator=20), min_size=3, max_size=8)
@@ -132,25 +133,25 @@ def test_r_of_three_cells_has_no_interval() -> None:
 @settings(max_examples=40, deadline=None)
 @given(rates)
 def test_a_perfect_twin_violates_no_rank(recorded: list[Fraction]) -> None:
-    assert correlation.mmrv(recorded=recorded, sim=recorded) == 0
-    assert correlation.bias(recorded=recorded, sim=recorded) == 0
+    assert agreement.mmrv(recorded=recorded, sim=recorded) == 0
+    assert agreement.bias(recorded=recorded, sim=recorded) == 0
 
 
 def test_mmrv_by_hand_in_both_conventions() -> None:
     # Cells 1 and 2 are swapped: gaps 0.2 on the recorded side, 0.5 on the twin's; cell 3 is right.
     recorded, sim = [0.2, 0.4, 0.9], [0.6, 0.1, 0.95]
-    assert correlation.mmrv(recorded=recorded, sim=sim) == pytest.approx(0.4 / 3)
-    assert correlation.mmrv(recorded=recorded, sim=sim, gap="sim") == pytest.approx(1.0 / 3)
+    assert agreement.mmrv(recorded=recorded, sim=sim) == pytest.approx(0.4 / 3)
+    assert agreement.mmrv(recorded=recorded, sim=sim, gap="sim") == pytest.approx(1.0 / 3)
 
 
 def test_a_tie_on_one_side_only_counts_from_one_side() -> None:
     # Equation 1 compares S_i > S_j with R_i > R_j: only the better recorded cell sees the tie.
-    assert correlation.mmrv(recorded=[0.2, 0.6], sim=[0.5, 0.5]) == pytest.approx(0.4 / 2)
+    assert agreement.mmrv(recorded=[0.2, 0.6], sim=[0.5, 0.5]) == pytest.approx(0.4 / 2)
 
 
 def test_mmrv_arguments_cannot_be_swapped_by_position() -> None:
     with pytest.raises(TypeError):
-        correlation.mmrv([0.1, 0.2], [0.1, 0.2])  # type: ignore[misc]
+        agreement.mmrv([0.1, 0.2], [0.1, 0.2])  # type: ignore[misc]
 
 
 @pytest.mark.slow

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from evaluator.statistics import correlation
-from evaluator.statistics.agreement import mcnemar
+from evaluator.statistics import agreement, correlation
+from evaluator.statistics.paired import mcnemar
 from evaluator.statistics.proportion import clopper_pearson, wilson
 
 pytestmark = pytest.mark.parity
@@ -87,7 +87,7 @@ def mmrv_plain(recorded: list[float], sim: list[float]) -> float:
 def test_mmrv_agrees_with_equation_1(seed: int) -> None:
     rng = np.random.default_rng(seed)
     recorded, sim = (rng.integers(0, 8, 6) / 8).tolist(), (rng.integers(0, 8, 6) / 8).tolist()
-    mine = correlation.mmrv(recorded=recorded, sim=sim)
+    mine = agreement.mmrv(recorded=recorded, sim=sim)
     assert mine == pytest.approx(mmrv_plain(recorded, sim))
-    swapped = correlation.mmrv(recorded=recorded, sim=sim, gap="sim")
+    swapped = agreement.mmrv(recorded=recorded, sim=sim, gap="sim")
     assert swapped == pytest.approx(mmrv_plain(sim, recorded))

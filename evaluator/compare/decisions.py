@@ -1,0 +1,133 @@
+"""Over cells: what the twin would have chosen, and what hangs on one task alone."""
+
+from collections.abc import Sequence
+from fractions import Fraction
+
+from evaluator.compare.cells import sides, usable_cells
+from evaluator.compare.measure import measured, proportion
+from evaluator.compare.rows import RateCell
+from evaluator.errors import UndefinedStatisticError
+from evaluator.result import Measurement, Table
+from evaluator.statistics import agreement, correlation
+from evaluator.statistics.decision import Decision, choose, over_tasks, without_each
+
+
+def decisions(cells: Sequence[RateCell]) -> tuple[list[Measurement], tuple[Table, ...]]:
+    """Judge the choice the twin would have made among conditions and policies, task by task."""
+    usable = usable_cells(cells)
+    found: dict[str, Decision] = {}
+    for task in dict.fromkeys(cell.task for cell in usable):
+        members = [cell for cell in usable if cell.task == task]
+        try:
+            found[task] = choose(
+                recorded={_candidate(c): c.recorded_rate or Fraction(0) for c in members},
+                sim={_candidate(c): c.sim_rate or Fraction(0) for c in members},
+            )
+        except UndefinedStatisticError:
+            continue
+    why = "no task has two conditions or policies to choose from"
+    measurements = [
+        proportion(
+            f"decision.{name}",
+            sum(getattr(decision, name) for decision in found.values()),
+            len(found),
+            definition=f"tasks in which {words} (best: highest rate, ties together) / tasks with a "
+            "choice of condition or policy",
+            counted="task",
+            reason_if_undefined=why,
+        )
+        for name, words in (
+            ("surely_right", "every choice that is best in the twin is among the recorded best"),
+            ("possibly_right", "one choice that is best in the twin is among the recorded best"),
+        )
+    ]
+    measurements.append(
+        measured(
+            "decision.regret_pp",
+            lambda: _mean_regret(found, why),
+            unit="pp",
+            definition="recorded success lost by choosing what is best in the twin, the worst of "
+            "a tie, mean over tasks with a choice",
+            n=len(found),
+            counted="task",
+            reason_without_interval="the tasks are these, not a sample of others",
+        )
+    )
+    return measurements, _decision_tables({**found, **_over_all(usable)}, usable)
+
+
+def _mean_regret(found: dict[str, Decision], why: str) -> float:
+    if not found:
+        raise UndefinedStatisticError(statistic="regret", reason=why)
+    return float(100 * sum(d.regret for d in found.values()) / len(found))
+
+
+def _over_all(usable: Sequence[RateCell]) -> dict[str, Decision]:
+    """The one choice for all tasks, by mean rates of what every task has; nothing for one task."""
+    by_task: dict[str, tuple[dict[str, Fraction], dict[str, Fraction]]] = {}
+    for cell in usable:
+        recorded, sim = by_task.setdefault(cell.task, ({}, {}))
+        recorded[_candidate(cell)] = cell.recorded_rate or Fraction(0)
+        sim[_candidate(cell)] = cell.sim_rate or Fraction(0)
+    if len(by_task) < 2:
+        return {}
+    try:
+        decision = choose(
+            recorded=over_tasks({task: rates for task, (rates, _) in by_task.items()}),
+            sim=over_tasks({task: rates for task, (_, rates) in by_task.items()}),
+        )
+    except UndefinedStatisticError:
+        return {}
+    return {"all tasks, mean rate": decision}
+
+
+def _candidate(cell: RateCell) -> str:
+    return ", ".join(p.replace("_", " ") for p in (cell.condition, cell.policy) if p)
+
+
+def _decision_tables(found: dict[str, Decision], usable: Sequence[RateCell]) -> tuple[Table, ...]:
+    tables = []
+    if found:
+        tables.append(
+            Table(
+                id="decisions",
+                title="What the twin would have chosen",
+                columns=("task", "best in the twin", "best recorded", "right", "regret (pp)"),
+                rows=tuple(
+                    (
+                        task,
+                        " or ".join(sorted(d.sim_best)),
+                        " or ".join(sorted(d.recorded_best)),
+                        "yes" if d.surely_right else ("perhaps" if d.possibly_right else "no"),
+                        round(float(100 * d.regret), 1),
+                    )
+                    for task, d in found.items()
+                ),
+                note="Ties are listed together. Regret: recorded success lost by the worst of the "
+                "twin's best. Rates over trials where both sides are known.",
+            )
+        )
+    return (*tables, *_leave_one_out(usable))
+
+
+def _leave_one_out(usable: Sequence[RateCell]) -> tuple[Table, ...]:
+    try:
+        left = without_each(list(dict.fromkeys(cell.task for cell in usable)))
+    except UndefinedStatisticError:
+        return ()
+    rows = []
+    for task, others in left.items():
+        kept = [cell for cell in usable if cell.task in others]
+        recorded, sim = sides(kept)
+        bias = 100 * agreement.bias(recorded=recorded, sim=sim)
+        try:
+            r: float | str = round(correlation.pearson(recorded, sim), 3)
+        except UndefinedStatisticError as error:
+            r = f"undefined: {error.reason}"
+        rows.append((task, len(kept), r, round(bias, 1)))
+    note = "An agreement that one task carries alone is none."
+    title = "Without one task"
+    columns = ("task left out", "cells", "Pearson r", "bias (pp)")
+    return (
+        Table(id="leave_one_task_out", title=title, columns=columns, rows=tuple(rows), note=note),
+    )

@@ -1,0 +1,202 @@
+"""Fewer robot trials: the recorded rate with the twin's help, and when to stop."""
+
+import math
+from collections.abc import Sequence
+
+from evaluator.compare.measure import Statistic, measured
+from evaluator.compare.pairing import StartPair
+from evaluator.compare.rows import TrialRow
+from evaluator.compare.success import Key, group_rows, names_of, rate_id, trials_in
+from evaluator.compare.verdicts import confusion_of
+from evaluator.errors import UndefinedStatisticError
+from evaluator.result import Cell, Interval, Measurement, Table
+from evaluator.statistics.proxy import (
+    applicability,
+    post_stratified,
+    ppi_plus_plus,
+    trials_saved,
+)
+from evaluator.statistics.sequential import ConfidenceSequence, capital_log, stop_or_continue
+
+ALPHA = 0.05
+GOAL = 0.5
+"""Under no effect an improved and a worsened pair are equally likely."""
+
+
+def assisted_rates(rows: Sequence[TrialRow]) -> list[Measurement]:
+    """Estimate each cell's recorded rate from its robot trials and the starts only the twin has.
+
+    Cells without a start of the twin's own are left out: there the twin adds nothing.
+    """
+    measurements = []
+    for key, members in group_rows(rows).items():
+        known = [row for row in members if row.sim_planned is not None]
+        paired = [row for row in known if row.recorded is not None]
+        alone = [row for row in known if row.recorded is None]
+        if alone and paired:
+            measurements += _assisted_rate(key, paired, alone)
+    return measurements
+
+
+def _assisted_rate(
+    key: Key, paired: Sequence[TrialRow], alone: Sequence[TrialRow]
+) -> list[Measurement]:
+    counts = confusion_of(paired, lambda row: row.sim_planned)
+    alone_n = trials_in(alone)
+    alone_k = trials_in(row for row in alone if row.sim_planned)
+    many = f"{counts.n} trials with an outcome and {alone_n} starts that only the twin has"
+
+    def p_random() -> float:
+        return applicability(counts.said_success, counts.n, alone_k, alone_n)
+
+    def checked() -> None:
+        try:
+            p = p_random()
+        except UndefinedStatisticError:
+            return  # too many tables to count out: the check is undefined and says so itself
+        if p < ALPHA:
+            raise UndefinedStatisticError(
+                statistic="rate from the twin",
+                reason=f"the tried starts are no random part of the twin's (p = {p:.3g})",
+            )
+
+    def stratified() -> tuple[float, Interval | None]:
+        checked()
+        estimate = post_stratified(counts, alone_k, alone_n)
+        return estimate.value, estimate.interval
+
+    def saved() -> float:
+        checked()
+        return float(trials_saved(post_stratified(counts, alone_k, alone_n), counts.n))
+
+    def ppi() -> tuple[float, Interval | None]:
+        checked()
+        real = [True] * counts.true_positive + [False] * counts.false_positive
+        real += [True] * counts.false_negative + [False] * counts.true_negative
+        said = [1.0] * counts.said_success + [0.0] * counts.said_failure
+        further = [1.0] * alone_k + [0.0] * (alone_n - alone_k)
+        estimate = ppi_plus_plus(real, said, further)
+        return estimate.value, estimate.interval
+
+    def make(name: str, compute: Statistic, unit: str, words: str) -> Measurement:
+        return measured(
+            rate_id(name, key).replace("rate.", "proxy.", 1),
+            compute,
+            unit=unit,
+            definition=f"{words}; {many}",
+            n=counts.n,
+            counted="trial",
+            reason_without_interval="a count or a p-value",
+            episodes=names_of(paired),
+        )
+
+    return [
+        make(
+            "recorded_rate",
+            stratified,
+            "1",
+            "recorded success rate with the twin's help: strata of the twin's answer, each with a "
+            "Beta(1/2, 1/2) prior",
+        ),
+        make("recorded_rate_ppi", ppi, "1", "the same by PPI++ (normal approximation)"),
+        make("trials_saved", saved, "count", "further trials Wilson's interval would need"),
+        make(
+            "random_starts_p",
+            p_random,
+            "1",
+            "p of Boschloo's test that the twin succeeds as often on the tried starts as on the "
+            "others: small forbids the estimates",
+        ),
+    ]
+
+
+def sequences(rows: Sequence[TrialRow], pairs: Sequence[StartPair]) -> list[Measurement]:
+    """Say what holds however often somebody looked: each cell's rate, and the paired gain."""
+    measurements = []
+    for key, members in group_rows(rows).items():
+        known = [row for row in members if row.recorded is not None]
+        if known and all(row.count == 1 for row in known):
+            measurements.append(_sequence(key, known))
+    if pairs:
+        measurements.append(_evidence(pairs))
+    return measurements
+
+
+def _sequence(key: Key, known: Sequence[TrialRow]) -> Measurement:
+    def compute() -> tuple[float, Interval | None]:
+        sequence = ConfidenceSequence()
+        interval: Interval | None = None
+        for row in known:
+            interval = sequence.add(bool(row.recorded))
+        return sequence.k / sequence.n, interval
+
+    return measured(
+        rate_id("recorded", key).replace("rate.", "sequence.", 1),
+        compute,
+        unit="1",
+        definition="successes / trials as labelled, with a betting confidence sequence in the "
+        "order of the trials: it may be looked at after every one, to stop or to continue",
+        n=len(known),
+        counted="trial",
+        episodes=names_of(known),
+    )
+
+
+def stopping_table(rows: Sequence[TrialRow], goal: float | None) -> tuple[Table, ...]:
+    """Say for each cell whether its recorded rate is settled against a goal; none without one."""
+    if goal is None:
+        return ()
+    lines: list[tuple[Cell, ...]] = []
+    for (task, condition, policy), members in group_rows(rows).items():
+        known = [row for row in members if row.recorded is not None]
+        if not known or any(row.count > 1 for row in known):
+            continue
+        sequence = ConfidenceSequence()
+        try:
+            for row in known:
+                sequence.add(bool(row.recorded))
+        except UndefinedStatisticError as error:
+            lines.append((task, condition, policy, len(known), None, error.reason, None))
+            continue
+        advice = stop_or_continue(sequence, goal)
+        ends = f"[{100 * sequence.low:.1f}, {100 * sequence.high:.1f}] %"
+        words = f"stop: {advice.answer} {100 * goal:g} %" if advice.stop else "continue"
+        lines.append((task, condition, policy, sequence.n, ends, words, advice.more_trials))
+    return (
+        Table(
+            id="stopping",
+            title=f"Is the success rate above or below {100 * goal:g} %?",
+            columns=(
+                "task",
+                "condition",
+                "policy",
+                "trials",
+                "interval at any time",
+                "advice",
+                "more trials at this rate",
+            ),
+            rows=tuple(lines),
+            note="Betting confidence sequences at 95 %: the answer holds however often one looked.",
+        ),
+    )
+
+
+def _evidence(pairs: Sequence[StartPair]) -> Measurement:
+    answers = [
+        (pair.before.recorded, pair.after.recorded)
+        for pair in pairs
+        if pair.before.recorded is not None and pair.after.recorded is not None
+    ]
+    improved = sum(bool(after) and not before for before, after in answers)
+    worsened = sum(bool(before) and not after for before, after in answers)
+    return measured(
+        "sequence.replanning_evidence.recorded",
+        lambda: math.exp(capital_log(improved, improved + worsened, GOAL)),
+        unit="1",
+        definition=f"what a bettor against 'replanning changes nothing' made of 1, over {improved} "
+        f"improved and {worsened} worsened pairs; {1 / ALPHA:.0f} or more: stop, it is shown at "
+        f"{ALPHA:g}, however often one looked",
+        n=len(answers),
+        counted="pair",
+        reason_without_interval="evidence, not an estimate",
+    )

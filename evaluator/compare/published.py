@@ -1,0 +1,271 @@
+"""Recompute a published success table from its own rows, and say where its figures differ.
+
+The table is a rates CSV with two more columns: a row with a ``statistic`` holds a printed figure
+(``printed``) instead of a rate. docs/examples/paper_table_published.csv is one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from decimal import Decimal, InvalidOperation
+from fractions import Fraction
+from pathlib import Path
+
+from bridge.exchange.trials_csv import SourceRow, TableError, read_rows
+from bridge.exchange.trials_rates import COLUMNS, RateRecord, printed_rate, read_rate
+from evaluator.compare.cells import sides, usable_cells
+from evaluator.compare.rates import compare_records
+from evaluator.compare.remarks import remarks_table
+from evaluator.compare.rows import Comparison, RateCell
+from evaluator.compare.success import WITH, WITHOUT
+from evaluator.errors import UndefinedStatisticError
+from evaluator.result import Table
+from evaluator.statistics.agreement import bias, mean_rate, mmrv
+from evaluator.statistics.correlation import pearson, spearman
+from evaluator.statistics.proportion import relative_gain
+
+EXTRA = ("statistic", "printed")
+STATISTICS = (
+    "average_percent",
+    "gain_pp",
+    "gain_relative_percent",
+    "pearson_r",
+    "spearman_rho",
+    "bias_pp",
+    "mmrv",
+)
+AS_PRINTED, ROUNDED, DIFFERS = "as printed", "only from rounded figures", "differs"
+IMPOSSIBLE, UNDEFINED, NOT_PRINTED = "impossible", "undefined", "not in the table"
+FAILED = (ROUNDED, DIFFERS, IMPOSSIBLE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One printed figure against what its rows give."""
+
+    row: int | None
+    """As a spreadsheet numbers it; None for what the table does not print."""
+    what: str
+    printed: str
+    recomputed: str
+    verdict: str
+    remark: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Claim:
+    row: SourceRow
+    statistic: str
+    task: str
+    """Empty for a figure over all tasks."""
+    side: str
+    condition: str
+    value: Decimal
+    half: Fraction
+    """Half a unit of the last printed digit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishedCheck:
+    """The recomputed table, and every figure that was looked at."""
+
+    comparison: Comparison
+    findings: tuple[Finding, ...]
+
+    @property
+    def failed(self) -> tuple[Finding, ...]:
+        """Figures that do not follow from the rows."""
+        return tuple(finding for finding in self.findings if finding.verdict in FAILED)
+
+
+def check_published(path: Path) -> PublishedCheck:
+    """Recompute every printed figure of a table.
+
+    Raises:
+        TableError: Naming the row that cannot be read at all.
+    """
+    records: list[RateRecord] = []
+    claims: list[_Claim] = []
+    findings: list[Finding] = []
+    for row in read_rows(path, ("task", "side", *EXTRA), (*COLUMNS, *EXTRA)):
+        if row.text("statistic"):
+            claims.append(_claim(row))
+            continue
+        try:
+            records.append(read_rate(row))
+        except TableError as error:
+            records.append(_as_printed(row, error))
+            findings.append(_impossible(row, error))
+    comparison = compare_records(records, path)
+    cells = usable_cells(comparison.cells)
+    findings += [_judge(claim, cells, claims) for claim in claims]
+    findings += _not_printed(cells, claims)
+    about = [(f.what, f.remark) for f in findings if f.remark]
+    shown = [t for t in comparison.tables if t.id != "remarks"]
+    old = [t.rows for t in comparison.tables if t.id == "remarks"]
+    about += [(str(a), str(b)) for rows in old for a, b in rows]
+    tables = (_table(findings), *shown, *remarks_table(about))
+    return PublishedCheck(comparison=replace(comparison, tables=tables), findings=tuple(findings))
+
+
+def _claim(row: SourceRow) -> _Claim:
+    statistic = row.text("statistic")
+    if statistic not in STATISTICS:
+        raise row.refuse(f"statistic is {statistic!r}", f"Statistics: {', '.join(STATISTICS)}")
+    try:
+        value = Decimal(row.text("printed").removesuffix("%"))
+    except InvalidOperation as error:
+        raise row.refuse(f"printed is {row.text('printed')!r}", "Give a number") from error
+    exponent = value.as_tuple().exponent
+    digits = -exponent if isinstance(exponent, int) and exponent < 0 else 0
+    side = "sim" if row.text("side") == "sim" else "recorded"
+    return _Claim(
+        row=row,
+        statistic=statistic,
+        task=row.text("task"),
+        side=side,
+        condition=row.text("condition"),
+        value=value,
+        half=Fraction(1, 2 * 10**digits),
+    )
+
+
+def _as_printed(row: SourceRow, error: TableError) -> RateRecord:
+    """Keep a rate that no count gives, without its n, so that the rest can be recomputed."""
+    printed = printed_rate(row)
+    if printed is None:
+        raise error
+    return RateRecord(
+        task=row.text("task"),
+        condition=row.text("condition"),
+        side=row.text("side"),
+        unit=row.text("unit") or "trial",
+        k=None,
+        n=None,
+        rate=printed[0],
+        row=row.row,
+    )
+
+
+def _impossible(row: SourceRow, error: TableError) -> Finding:
+    where = " ".join(p for p in (row.text("task"), row.text("condition"), row.text("side")) if p)
+    text = str(error).partition(": ")[2]
+    return Finding(
+        row=row.row,
+        what=where,
+        printed=row.text("rate_percent") or row.text("rate"),
+        recomputed=f"no count of {row.text('n')}",
+        verdict=IMPOSSIBLE,
+        remark=text,
+    )
+
+
+def _judge(claim: _Claim, cells: Sequence[RateCell], claims: Sequence[_Claim]) -> Finding:
+    parts = (claim.statistic, claim.task, claim.side, claim.condition)
+    what = " ".join(part for part in parts if part)
+    cells = [cell for cell in cells if claim.task in ("", cell.task)]
+    printed = str(claim.value)
+    try:
+        value = _value(claim.statistic, claim.side, claim.condition, cells)
+    except UndefinedStatisticError as error:
+        return Finding(
+            row=claim.row.row,
+            what=what,
+            printed=printed,
+            recomputed=f"undefined: {error.reason}",
+            verdict=UNDEFINED,
+        )
+    shown = f"{value:.4g}" if abs(value) < 1 else f"{value:.2f}"
+    if _fits(value, claim):
+        verdict, remark = AS_PRINTED, ""
+    else:
+        verdict, remark = DIFFERS, f"printed {printed}, the rows give {shown}"
+        from_rounded = _from_rounded(claim, claims)
+        if from_rounded is not None and _fits(from_rounded, claim):
+            verdict = ROUNDED
+            remark = f"{printed} comes from the rounded averages; unrounded it is {shown}"
+    return Finding(
+        row=claim.row.row,
+        what=what,
+        printed=printed,
+        recomputed=shown,
+        verdict=verdict,
+        remark=remark,
+    )
+
+
+def _fits(value: float, claim: _Claim) -> bool:
+    return abs(Fraction(value) - Fraction(claim.value)) <= claim.half + Fraction(1, 10**9)
+
+
+def _value(statistic: str, side: str, condition: str, cells: Sequence[RateCell]) -> float:
+    """Recompute one statistic from the cells, over one condition or all."""
+    chosen = [cell for cell in cells if condition in ("", cell.condition)]
+    recorded, sim = sides(chosen)
+    if statistic == "average_percent":
+        return 100 * mean_rate(sim if side == "sim" else recorded)
+    if statistic in ("gain_pp", "gain_relative_percent"):
+        before = _value("average_percent", side, WITHOUT, cells)
+        after = _value("average_percent", side, WITH, cells)
+        return after - before if statistic == "gain_pp" else 100 * relative_gain(before, after)
+    if statistic == "pearson_r":
+        return pearson(recorded, sim)
+    if statistic == "spearman_rho":
+        return spearman(recorded, sim)
+    if statistic == "bias_pp":
+        return 100 * bias(recorded=recorded, sim=sim)
+    return mmrv(recorded=recorded, sim=sim)
+
+
+def _from_rounded(claim: _Claim, claims: Sequence[_Claim]) -> float | None:
+    """Recompute a gain from the averages as they are printed."""
+    if claim.task or claim.statistic not in ("gain_pp", "gain_relative_percent"):
+        return None
+    averages = {
+        other.condition: float(other.value)
+        for other in claims
+        if other.statistic == "average_percent" and (other.side, other.task) == (claim.side, "")
+    }
+    if not {WITHOUT, WITH} <= averages.keys() or not averages[WITHOUT]:
+        return None
+    before, after = averages[WITHOUT], averages[WITH]
+    if claim.statistic == "gain_pp":
+        return after - before
+    return 100 * relative_gain(before, after)
+
+
+def _not_printed(cells: Sequence[RateCell], claims: Sequence[_Claim]) -> list[Finding]:
+    """The correlation that a success table of both sides invites, where it is not printed."""
+    printed = {claim.condition for claim in claims if claim.statistic == "pearson_r"}
+    conditions = [*dict.fromkeys(cell.condition for cell in cells), ""]
+    findings = []
+    for condition in conditions:
+        if condition in printed:
+            continue
+        try:
+            shown = f"{_value('pearson_r', '', condition, cells):.3f}"
+        except UndefinedStatisticError as error:
+            shown = f"undefined: {error.reason}"
+        num = sum(condition in ("", cell.condition) for cell in cells)
+        findings.append(
+            Finding(
+                row=None,
+                what=f"pearson_r {condition or 'all cells'} (n = {num})",
+                printed="",
+                recomputed=shown,
+                verdict=NOT_PRINTED,
+            )
+        )
+    return findings
+
+
+def _table(findings: Sequence[Finding]) -> Table:
+    return Table(
+        id="published",
+        title="Printed figures, recomputed from the table's own rows",
+        columns=("row", "figure", "printed", "recomputed", "verdict", "remark"),
+        rows=tuple(
+            (f.row, f.what, f.printed or None, f.recomputed, f.verdict, f.remark or None)
+            for f in findings
+        ),
+        note="A figure fits when it rounds to what is printed. Row numbers as in the CSV.",
+    )

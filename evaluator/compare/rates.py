@@ -1,0 +1,119 @@
+"""A table of printed rates into a ``Comparison``: no trials, so no pairing and no verdicts."""
+
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+from bridge.episode.provenance import hash_file, software
+from bridge.exchange.trials_rates import RateRecord, read_rates
+from evaluator.compare.cells import cell_agreement
+from evaluator.compare.decisions import decisions
+from evaluator.compare.gains import gain_tests, replanning_gains
+from evaluator.compare.measure import slug, vouched_rate
+from evaluator.compare.remarks import remarks, remarks_table
+from evaluator.compare.rows import Comparison, RateCell
+from evaluator.compare.success import WITH, averages
+from evaluator.compare.tables import gains_table, layout_table, success_table
+from evaluator.result import Exclusion, Measurement
+
+
+def compare_rates(path: Path, *, method: str = "wilson") -> Comparison:
+    """Compare printed rates: r over cells, gains, intervals where n is known.
+
+    Raises:
+        TableError: Naming the row that cannot be believed.
+    """
+    return compare_records(read_rates(path), path, method=method)
+
+
+def compare_records(
+    records: Sequence[RateRecord], path: Path, *, method: str = "wilson"
+) -> Comparison:
+    """Compare rates that were read already; ``path`` is where they come from."""
+    stand_in = any(record.side == "stand-in" for record in records)
+    cells, left_out = _rate_cells(records, method)
+    word = "stand-in" if stand_in else "real"
+    gains = replanning_gains(cells, method=method)
+    chosen, decision_tables = decisions(cells)
+    measurements = (
+        *(side for cell in cells for side in (cell.recorded, cell.sim)),
+        *averages(cells, method=method),
+        *cell_agreement(cells),
+        *gains,
+        *gain_tests(cells),
+        *chosen,
+    )
+    return Comparison(
+        run=path.stem,
+        source="rates",
+        stand_in=stand_in,
+        cells=cells,
+        measurements=measurements,
+        tables=(
+            success_table(cells, word, "Rates as given."),
+            *layout_table(cells, measurements, word),
+            *gains_table(gains, word),
+            *decision_tables,
+            *remarks_table(remarks(cells, measurements)),
+        ),
+        exclusions=tuple(left_out),
+        missing=("trial-level agreement: a table of rates does not say which trial succeeded",),
+        provenance={"software": software(), "file": path.name, "sha256": hash_file(path)},
+    )
+
+
+def _rate_cells(
+    records: Sequence[RateRecord], method: str
+) -> tuple[tuple[RateCell, ...], list[Exclusion]]:
+    keys = list(dict.fromkeys((r.task, r.condition, r.unit) for r in records))
+    tasks = list(dict.fromkeys(record.task for record in records))
+    keys.sort(key=lambda key: (tasks.index(key[0]), key[1] == WITH))
+    cells, left_out = [], []
+    for task, condition, unit in keys:
+        sides: dict[str, RateRecord] = {
+            "sim" if r.side == "sim" else "recorded": r
+            for r in records
+            if (r.task, r.condition) == (task, condition)
+        }
+        for side in ("sim", "recorded"):
+            if side not in sides:
+                reason = f"{task} {condition}: no {side} rate"
+                left_out.append(Exclusion(episode=task, scope="agreement of cells", reason=reason))
+        cells.append(
+            RateCell(
+                task=task,
+                condition=condition,
+                policy="",
+                unit=unit,
+                recorded=_rate(sides.get("recorded"), "recorded", task, condition, unit, method),
+                sim=_rate(sides.get("sim"), "sim_planned", task, condition, unit, method),
+                recorded_rate=_fraction(sides.get("recorded")),
+                sim_rate=_fraction(sides.get("sim")),
+            )
+        )
+    return tuple(cells), left_out
+
+
+def _fraction(record: RateRecord | None) -> Fraction | None:
+    return None if record is None else record.rate
+
+
+def _rate(
+    record: RateRecord | None, side: str, task: str, condition: str, unit: str, method: str
+) -> Measurement:
+    interval, why = None, "no n"
+    if record is not None and record.k is not None and record.n is not None:
+        interval, why = vouched_rate(record.k, record.n, method)
+    return Measurement(
+        id=f"rate.{side}.{slug(task)}.{slug(condition)}.-",
+        value=None if record is None else float(record.rate),
+        unit="1",
+        definition=f"successes / {unit}s, as given"
+        + (f" in row {record.row} ({record.side})" if record is not None else ""),
+        interval=interval,
+        k=record.k if record is not None else None,
+        n=record.n if record is not None else None,
+        counted=unit,
+        reason_if_undefined="not in the table" if record is None else None,
+        reason_without_interval=None if interval is not None else why,
+    )

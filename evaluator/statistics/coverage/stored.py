@@ -1,0 +1,102 @@
+"""Ask the stored coverage map before an interval is printed; refuse one that promises too much."""
+
+import json
+from bisect import bisect_left
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib import resources
+
+from evaluator.result import Interval
+from evaluator.statistics.coverage.exact import Coverage
+
+FLOOR = 0.90
+"""An interval that claims 95 % and covers less than this somewhere is not printed."""
+JUDGED_BY_MEAN = ("wilson", "clopper-pearson")
+"""Printed everywhere: Clopper-Pearson holds by construction; Wilson's dips are narrow and its mean
+over rates is right, which is what it is for."""
+INSTEAD = {
+    "jeffreys": "wilson or clopper-pearson",
+    "newcombe-10": "clopper-pearson-difference",
+    "tango": "McNemar's exact test, which needs no interval",
+    "fisher-z": "the coefficient with its n, or more cells",
+    "bootstrap-points": "fisher-z for r, student-t for means, or more cells",
+    "bootstrap-clusters": "more policies: no interval holds with so few",
+    "student-t": "the value with its n, or more cells",
+    "post-stratified-beta": "wilson on the robot trials alone",
+    "ppi++": "post-stratified-beta",
+    "remeasurement": "the coefficient with its n",
+}
+MAP = "coverage_map.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodCoverage:
+    """The stored coverage of one method over n."""
+
+    how: str
+    """exact, or simulated with how many draws."""
+    over: str
+    """Which truths were looked at."""
+    axis: str
+    """What n counts."""
+    points: tuple[Coverage, ...]
+    """By rising n."""
+
+
+@cache
+def load_map() -> dict[str, MethodCoverage]:
+    """Read the map that ships with the package, by name of method."""
+    record = json.loads(resources.files("evaluator.statistics.coverage").joinpath(MAP).read_text())
+    return {
+        name: MethodCoverage(
+            how=item["how"],
+            over=item["over"],
+            axis=item["axis"],
+            points=tuple(Coverage(**point) for point in item["points"]),
+        )
+        for name, item in record["methods"].items()
+    }
+
+
+def coverage_of(method: str, n: int) -> Coverage | None:
+    """Return the stored coverage of a method at n, the worse of the two stored neighbours.
+
+    Above the largest stored n that one counts; below the smallest nothing is known.
+    """
+    found = load_map().get(method)
+    if found is None or n < found.points[0].n:
+        return None
+    sizes = [point.n for point in found.points]
+    place = bisect_left(sizes, n)
+    if place == len(sizes):
+        return found.points[-1]
+    if sizes[place] == n:
+        return found.points[place]
+    return min(found.points[place - 1 : place + 1], key=lambda point: point.worst)
+
+
+def vouch(interval: Interval, n: int | None, *, key: str = "") -> tuple[Interval | None, str]:
+    """Return the interval with its worst coverage, or None and why it is not printed.
+
+    Only 95 % intervals were looked at; those of other levels pass unmarked.
+
+    Args:
+        interval: What a method gave.
+        n: What the method's coverage depends on: trials, pairs, cells, policies.
+        key: Name in the map, where one method serves several statistics; its own without.
+    """
+    method = interval.method.split(",")[0]
+    key = key or method
+    if n is None or interval.level != 0.95 or key not in load_map():
+        return interval, ""
+    known = coverage_of(key, n)
+    axis = load_map()[key].axis
+    if known is None:
+        reason = f"the coverage of {method} at {n} {axis} is not known"
+        return None, f"{reason}; use {INSTEAD.get(method, 'more data')}"
+    if method not in JUDGED_BY_MEAN and known.worst < FLOOR:
+        return None, (
+            f"{method} at {n} {axis} covers as little as {100 * known.worst:.1f} % where 95 % are "
+            f"claimed ({known.worst_at}); use {INSTEAD.get(method, 'more data')}"
+        )
+    return replace(interval, worst_coverage=round(known.worst, 4)), ""

@@ -1,0 +1,168 @@
+"""What a yes/no answer before motion is worth. Counted per trial, not as rates.
+
+Equal rates can hide that the twin was wrong about every single trial.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from fractions import Fraction
+
+from evaluator.errors import UndefinedStatisticError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Confusion:
+    """Said against happened, counted over trials."""
+
+    true_positive: int
+    """Said success, and it was one."""
+    false_positive: int
+    """Said success, but it failed: the costly one."""
+    false_negative: int
+    """Said failure, but it would have succeeded."""
+    true_negative: int
+
+    @staticmethod
+    def count(pairs: Iterable[tuple[bool, bool]]) -> "Confusion":
+        """Count pairs (said, happened)."""
+        return Confusion.weigh((said, happened, 1) for said, happened in pairs)
+
+    @staticmethod
+    def weigh(pairs: Iterable[tuple[bool, bool, int]]) -> "Confusion":
+        """Count triples (said, happened, how many trials it stands for)."""
+        sums = {(True, True): 0, (True, False): 0, (False, True): 0, (False, False): 0}
+        for said, happened, count in pairs:
+            sums[bool(said), bool(happened)] += count
+        return Confusion(
+            true_positive=sums[True, True],
+            false_positive=sums[True, False],
+            false_negative=sums[False, True],
+            true_negative=sums[False, False],
+        )
+
+    @property
+    def n(self) -> int:
+        """All pairs."""
+        return self.true_positive + self.false_positive + self.false_negative + self.true_negative
+
+    @property
+    def agreed(self) -> int:
+        """Pairs where both said the same."""
+        return self.true_positive + self.true_negative
+
+    @property
+    def said_success(self) -> int:
+        """Denominator of the positive predictive value."""
+        return self.true_positive + self.false_positive
+
+    @property
+    def said_failure(self) -> int:
+        """Denominator of the negative predictive value."""
+        return self.true_negative + self.false_negative
+
+    @property
+    def succeeded(self) -> int:
+        """Pairs that happened to succeed."""
+        return self.true_positive + self.false_negative
+
+
+def phi(confusion: Confusion) -> float:
+    """Return the correlation of two yes/no columns (Matthews' coefficient).
+
+    Range: -1 to 1, 1 is full agreement, 0 is none beyond the margins.
+    Undefined when: one column is constant, for then there is nothing to correlate.
+
+    Raises:
+        UndefinedStatisticError: Naming the constant column.
+    """
+    tp, fp = confusion.true_positive, confusion.false_positive
+    fn, tn = confusion.false_negative, confusion.true_negative
+    if confusion.n == 0:
+        raise UndefinedStatisticError(statistic="phi", reason="there are no pairs")
+    constant = [
+        name
+        for name, positives in (("twin", tp + fp), ("recorded", tp + fn))
+        if positives in (0, confusion.n)
+    ]
+    if constant:
+        sides = " and ".join(constant)
+        raise UndefinedStatisticError(
+            statistic="phi", reason=f"the {sides} side is the same in all {confusion.n} pairs"
+        )
+    margins = math.sqrt((tp + fp) * (tp + fn) * (tn + fp) * (tn + fn))
+    return (tp * tn - fp * fn) / margins
+
+
+def kappa(confusion: Confusion) -> float:
+    """Return Cohen's kappa (1960): agreement beyond what the margins give by chance.
+
+    Range: -1 to 1. Undefined when: both columns are constant and alike.
+
+    Raises:
+        UndefinedStatisticError: With the reason.
+    """
+    n = confusion.n
+    if n == 0:
+        raise UndefinedStatisticError(statistic="kappa", reason="there are no pairs")
+    said, happened = confusion.said_success, confusion.succeeded
+    by_chance = Fraction(said * happened + (n - said) * (n - happened), n * n)
+    if by_chance == 1:
+        raise UndefinedStatisticError(
+            statistic="kappa", reason=f"both sides are the same in all {n} pairs"
+        )
+    return float((Fraction(confusion.agreed, n) - by_chance) / (1 - by_chance))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """Mean cost per trial, in units of one bad execution, where refusing a good plan has a price.
+
+    The retry, or the person who is called, costs ``refusal_price`` of a bad execution.
+    """
+
+    refusal_price: float
+    with_gate: float
+    """Bad plans let through, and good plans refused."""
+    without_gate: float
+    """Every plan is executed."""
+
+
+def cost_curve(confusion: Confusion, refusal_prices: Iterable[float]) -> list[Cost]:
+    """Compare obeying the gate with executing everything, over prices of a false refusal.
+
+    Only trials in which the answer was not obeyed can show false refusals; give only those.
+
+    Raises:
+        UndefinedStatisticError: Without trials.
+    """
+    if confusion.n == 0:
+        raise UndefinedStatisticError(statistic="cost curve", reason="there are no trials")
+    bad = confusion.false_positive + confusion.true_negative
+    return [
+        Cost(
+            refusal_price=price,
+            with_gate=(confusion.false_positive + price * confusion.false_negative) / confusion.n,
+            without_gate=bad / confusion.n,
+        )
+        for price in refusal_prices
+    ]
+
+
+def break_even(confusion: Confusion) -> float:
+    """Return the price of a false refusal up to which obeying the gate pays.
+
+    In units of one bad execution: bad executions avoided / good plans refused.
+
+    Raises:
+        UndefinedStatisticError: Without trials, or when no good plan was refused: it always pays.
+    """
+    if confusion.n == 0:
+        raise UndefinedStatisticError(statistic="break-even price", reason="there are no trials")
+    if confusion.false_negative == 0:
+        reason = (
+            f"no good plan was refused ({confusion.true_negative} bad ones were): at no price "
+            "does the gate cost more than it avoids"
+        )
+        raise UndefinedStatisticError(statistic="break-even price", reason=reason)
+    return confusion.true_negative / confusion.false_negative

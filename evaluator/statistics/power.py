@@ -1,0 +1,137 @@
+"""How many trials a question needs, before or after somebody ran too few."""
+
+import math
+
+import numpy as np
+from scipy.special import ndtr
+from scipy.stats import binom
+
+from evaluator.errors import UndefinedStatisticError
+from evaluator.statistics.paired import sign_test
+from evaluator.statistics.proportion import normal_quantile
+
+ALPHA = 0.05
+"""Two-sided."""
+POWER = 0.8
+MAX_TRIALS = 1_000_000
+MAX_PAIRS = 400
+"""The exact paired power counts every outcome out; beyond this a normal formula is as good."""
+
+
+def power_unpaired(
+    p_first: float, p_second: float, n_per_arm: int, *, alpha: float = ALPHA, sides: int = 2
+) -> float:
+    """Return the chance that n trials per arm show the difference of two rates.
+
+    Normal approximation with the pooled variance under no difference and the separate variances
+    under the difference (Fleiss, Levin and Paik 2003, section 4.3, no continuity correction).
+
+    Raises:
+        UndefinedStatisticError: Without trials, or for equal rates.
+    """
+    _check_rates(p_first, p_second)
+    if n_per_arm < 1:
+        raise UndefinedStatisticError(statistic="power", reason="there are no trials")
+    z = normal_quantile(1 - alpha / sides)
+    pooled, separate = _spreads(p_first, p_second)
+    distance = abs(p_second - p_first) * math.sqrt(n_per_arm)
+    if separate == 0:
+        return 1.0 if distance > z * pooled else 0.0
+    power = float(ndtr((distance - z * pooled) / separate))
+    return power + (float(ndtr((-distance - z * pooled) / separate)) if sides == 2 else 0.0)
+
+
+def trials_needed(
+    p_first: float,
+    p_second: float,
+    *,
+    power: float = POWER,
+    alpha: float = ALPHA,
+    sides: int = 2,
+) -> int:
+    """Return the trials per arm with which a difference of two rates is found.
+
+    The smallest n with the wanted power by the formula of ``power_unpaired`` (one tail counted,
+    as its closed form has it): 82 per arm for 60 % against 80 %.
+
+    Raises:
+        UndefinedStatisticError: For equal rates: no number of trials is enough.
+    """
+    _check_rates(p_first, p_second)
+    pooled, separate = _spreads(p_first, p_second)
+    z = normal_quantile(1 - alpha / sides)
+    root = (z * pooled + normal_quantile(power) * separate) / abs(p_second - p_first)
+    return max(1, math.ceil(root * root))
+
+
+def detectable_rate(
+    p_first: float, n_per_arm: int, *, power: float = POWER, alpha: float = ALPHA
+) -> float:
+    """Return the smallest better rate that n trials per arm would show with this power.
+
+    Raises:
+        UndefinedStatisticError: When even a rate of 1 would not show.
+    """
+    if n_per_arm < 1:
+        raise UndefinedStatisticError(statistic="detectable rate", reason="there are no trials")
+    if p_first >= 1 or trials_needed(p_first, 1.0, power=power, alpha=alpha) > n_per_arm:
+        raise UndefinedStatisticError(
+            statistic="detectable rate",
+            reason=f"with {n_per_arm} trials per arm not even a rate of 100 % would be told from "
+            f"{100 * p_first:.0f} %",
+        )
+    low, high = p_first, 1.0
+    for _ in range(50):
+        middle = (low + high) / 2
+        # Nothing is ever enough to tell equal rates apart.
+        close = middle - p_first < 1e-9
+        enough = not close and trials_needed(p_first, middle, power=power, alpha=alpha)
+        low, high = (low, middle) if enough and enough <= n_per_arm else (middle, high)
+    return high
+
+
+def power_paired(
+    p_improved: float, p_worsened: float, num_pairs: int, *, alpha: float = ALPHA
+) -> float:
+    """Return the chance that McNemar's exact test on n pairs is significant.
+
+    By counting out: sum over the number of pairs that differ, and over how many of them improved.
+
+    Raises:
+        UndefinedStatisticError: Beyond 400 pairs, or without pairs that can differ.
+    """
+    differ = p_improved + p_worsened
+    if not 0 < differ <= 1 or min(p_improved, p_worsened) < 0:
+        raise UndefinedStatisticError(
+            statistic="paired power",
+            reason=f"the chances to improve ({p_improved:g}) and to worsen ({p_worsened:g}) are "
+            "no probabilities of pairs that differ",
+        )
+    if not 1 <= num_pairs <= MAX_PAIRS:
+        raise UndefinedStatisticError(
+            statistic="paired power", reason=f"{num_pairs} pairs; it is counted out for 1 to 400"
+        )
+    total = 0.0
+    for discordant in range(1, num_pairs + 1):
+        chance = float(binom.pmf(discordant, num_pairs, differ))
+        improved = np.arange(discordant + 1)
+        shown = [sign_test(i, discordant - i)[0] <= alpha for i in improved.tolist()]
+        total += chance * float(binom.pmf(improved, discordant, p_improved / differ)[shown].sum())
+    return min(1.0, total)
+
+
+def _spreads(p_first: float, p_second: float) -> tuple[float, float]:
+    """Standard deviation of the difference for one trial per arm: pooled, and separate."""
+    mean = (p_first + p_second) / 2
+    separate = p_first * (1 - p_first) + p_second * (1 - p_second)
+    return math.sqrt(2 * mean * (1 - mean)), math.sqrt(separate)
+
+
+def _check_rates(p_first: float, p_second: float) -> None:
+    if not (0 <= p_first <= 1 and 0 <= p_second <= 1):
+        message = f"rates lie in 0..1, not {p_first} and {p_second}"
+        raise ValueError(message)
+    if p_first == p_second:
+        raise UndefinedStatisticError(
+            statistic="power", reason="the rates are equal; no number of trials shows a difference"
+        )

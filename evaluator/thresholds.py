@@ -1,0 +1,83 @@
+"""``--fail-under``: what must be reached for an evaluation to count as passed."""
+
+from dataclasses import dataclass
+
+from bridge.errors import UsageError
+from evaluator.result import Results
+
+SHORT = {
+    "agreement": "agreement.sim_planned.rate",
+    "phi": "agreement.sim_planned.phi",
+    "ppv": "agreement.sim_planned.ppv",
+    "npv": "agreement.sim_planned.npv",
+    "r": "agreement.pearson_r",
+    "rho": "agreement.spearman_rho",
+    "tau": "agreement.kendall_tau_b",
+    "order": "agreement.order_accuracy",
+    "psnr": "views.all.psnr_db",
+    "ssim": "views.all.ssim",
+}
+"""Names that are quicker to write than ids. All are better when higher."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Threshold:
+    """One number that must be reached."""
+
+    name: str
+    """As the user wrote it."""
+    id: str
+    limit: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Missed:
+    """A threshold that was not reached, and what was found instead."""
+
+    threshold: Threshold
+    value: float | None
+    reason: str
+    """Why there is no value, empty where there is one."""
+
+
+def parse_thresholds(text: str | float) -> list[Threshold]:
+    """Read ``0.8``, ``r=0.8`` or ``r=0.8,ppv=0.9``; a bare number is the agreement of trials.
+
+    Raises:
+        UsageError: For what is no number, or a fraction outside 0..1.
+    """
+    return [_parse(part.strip()) for part in str(text).split(",")]
+
+
+def _parse(part: str) -> Threshold:
+    name, equals, number = part.rpartition("=")
+    name = name.strip() if equals else "agreement"
+    try:
+        limit = float(number)
+    except ValueError as error:
+        message = f"--fail-under {part!r} is no number; write 0.8, r=0.8 or ID=0.8."
+        raise UsageError(message) from error
+    if name == "agreement" and not 0 <= limit <= 1:
+        message = f"--fail-under {limit} is not a fraction from 0 to 1, for example 0.8."
+        raise UsageError(message)
+    if "." not in name and name not in SHORT:
+        message = f"--fail-under knows no {name!r}; there are: {', '.join(SHORT)}, and every id."
+        raise UsageError(message)
+    return Threshold(name=name, id=SHORT.get(name, name), limit=limit)
+
+
+def missed(thresholds: list[Threshold], results: Results) -> list[Missed]:
+    """Return what was not reached; an undefined number reaches nothing."""
+    by_id = {measurement.id: measurement for measurement in results.measurements}
+    found = []
+    for threshold in thresholds:
+        measurement = by_id.get(threshold.id)
+        if measurement is None:
+            reason = f"undefined: there is no {threshold.id} in these results"
+            found.append(Missed(threshold=threshold, value=None, reason=reason))
+        elif measurement.value is None:
+            reason = f"undefined: {measurement.reason_if_undefined}"
+            found.append(Missed(threshold=threshold, value=None, reason=reason))
+        elif measurement.value < threshold.limit:
+            found.append(Missed(threshold=threshold, value=measurement.value, reason=""))
+    return found

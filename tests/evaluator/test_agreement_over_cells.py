@@ -1,0 +1,185 @@
+"""Rank agreement, error, calibration, resampling and decisions over cells."""
+
+import itertools
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evaluator.errors import UndefinedStatisticError
+from evaluator.statistics import agreement, correlation
+from evaluator.statistics.bootstrap import (
+    bootstrap_interval,
+    remeasurement_band,
+    remeasurement_band_of_counts,
+    resamples,
+    student_interval,
+)
+from evaluator.statistics.decision import choose, over_tasks, without_each
+
+rates = st.lists(st.fractions(0, 1, max_denominator=10), min_size=3, max_size=7)
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(3)
+
+
+@settings(max_examples=40, deadline=None)
+@given(rates, st.data())
+def test_errors_keep_their_order(recorded: list[Fraction], data: st.DataObject) -> None:
+    sim = data.draw(st.permutations(recorded))
+    absolute = agreement.mean_absolute_error(recorded=recorded, sim=sim)
+    square = agreement.root_mean_square_error(recorded=recorded, sim=sim)
+    largest = agreement.largest_gap(recorded=recorded, sim=sim)
+    assert abs(agreement.bias(recorded=recorded, sim=sim)) <= absolute + 1e-12
+    assert absolute <= square + 1e-12
+    assert square <= largest + 1e-12
+
+
+def test_the_calibration_line_recovers_a_line_exactly() -> None:
+    sim = [Fraction(1, 10), Fraction(5, 10), Fraction(9, 10)]
+    line = agreement.calibration_line(recorded=[v / 2 + Fraction(1, 5) for v in sim], sim=sim)
+    assert (line.slope, line.intercept) == (0.5, 0.2)
+    with pytest.raises(UndefinedStatisticError, match="twin side is constant"):
+        agreement.calibration_line(recorded=sim, sim=[1, 1, 1])
+
+
+def test_order_accuracy_counts_ties_of_the_twin_as_half() -> None:
+    found = agreement.order_accuracy(recorded=[0.1, 0.2, 0.2, 0.4], sim=[0.5, 0.5, 0.9, 0.7])
+    # Pairs that differ when recorded: 5; tied in sim: 1, right: 3 (1-3, 1-4, 2-4), wrong: 3-4.
+    assert (found.right, found.pairs) == (Fraction(7, 2), 5)
+    assert found.value == pytest.approx(0.7)
+    with pytest.raises(UndefinedStatisticError, match="recorded side is constant"):
+        agreement.order_accuracy(recorded=[1, 1], sim=[0, 1])
+
+
+def test_a_reversed_twin_orders_nothing_right() -> None:
+    recorded = [0.1, 0.4, 0.8]
+    assert agreement.order_accuracy(recorded=recorded, sim=recorded[::-1]).value == 0
+    assert correlation.kendall(recorded, recorded[::-1]) == -1
+    assert correlation.kendall(recorded, recorded) == 1
+
+
+def test_exact_counts_see_ties_that_floats_would_miss() -> None:
+    # 3 x 0.1 is not 0.3 as a float; as counts 3/10 of ten and of thirty are the same rate.
+    recorded = [Fraction(3, 10), Fraction(9, 30), Fraction(5, 10)]
+    sim = [Fraction(1, 10), Fraction(2, 10), Fraction(9, 10)]
+    assert agreement.order_accuracy(recorded=recorded, sim=sim).pairs == 2
+    assert agreement.mmrv(recorded=recorded, sim=sim) == 0
+
+
+@pytest.mark.parametrize("num_units", [1, 2, 4, 5])
+def test_few_units_are_resampled_exactly(num_units: int) -> None:
+    drawn = resamples(num_units, rng())
+    assert drawn.is_exact
+    assert drawn.weights.sum() == pytest.approx(1)
+    assert (drawn.counts.sum(axis=1) == num_units).all()
+    assert len(drawn.counts) == math.comb(2 * num_units - 1, num_units)
+    ordered = itertools.product(range(num_units), repeat=num_units)
+    shares: dict[tuple[int, ...], float] = {}
+    for draw in ordered:
+        key = tuple(draw.count(unit) for unit in range(num_units))
+        shares[key] = shares.get(key, 0) + num_units**-num_units
+    for counts, weight in zip(drawn.counts.tolist(), drawn.weights, strict=True):
+        assert weight == pytest.approx(shares[tuple(counts)])
+
+
+def test_many_units_are_drawn() -> None:
+    drawn = resamples(30, rng())
+    assert not drawn.is_exact
+    assert len(drawn.weights) == 9999
+
+
+@pytest.mark.parametrize("statistic", ["pearson", "bias", "mae"])
+def test_an_exact_bootstrap_is_the_bootstrap_of_all_ordered_draws(statistic: str) -> None:
+    recorded, sim = [0.1, 0.5, 0.6, 0.9, 0.3], [0.2, 0.4, 0.9, 0.8, 0.35]
+    plain = {
+        "pearson": correlation.pearson,
+        "bias": lambda x, y: agreement.bias(recorded=x, sim=y),
+        "mae": lambda x, y: agreement.mean_absolute_error(recorded=x, sim=y),
+    }[statistic]
+    values = []
+    for draw in itertools.product(range(5), repeat=5):
+        try:
+            values.append(plain([recorded[i] for i in draw], [sim[i] for i in draw]))
+        except UndefinedStatisticError:
+            continue
+    interval = bootstrap_interval(statistic, recorded=recorded, sim=sim, rng=rng())
+    low, high = np.quantile(values, [0.025, 0.975], method="inverted_cdf")
+    assert interval.low == pytest.approx(low, abs=1e-9)
+    assert interval.high == pytest.approx(high, abs=1e-9)
+    assert interval.method == "bootstrap-points"
+
+
+def test_clusters_are_resampled_together() -> None:
+    recorded = [0.1, 0.2, 0.5, 0.6, 0.8, 0.9, 0.3, 0.4]
+    sim = [0.2, 0.1, 0.6, 0.5, 0.9, 0.8, 0.4, 0.3]
+    clusters = list("aabbccdd")
+    interval = bootstrap_interval("bias", recorded=recorded, sim=sim, rng=rng(), clusters=clusters)
+    # Within every cluster the gaps cancel, so no resample of clusters has a bias.
+    assert interval.low == pytest.approx(0, abs=1e-12)
+    assert interval.high == pytest.approx(0, abs=1e-12)
+    assert interval.method == "bootstrap-clusters"
+
+
+def test_too_few_units_and_too_many_constant_resamples_are_refused() -> None:
+    with pytest.raises(UndefinedStatisticError, match="3 units; it needs at least 4"):
+        bootstrap_interval("bias", recorded=[0, 1, 1], sim=[0, 1, 0], rng=rng())
+    with pytest.raises(UndefinedStatisticError, match="undefined in 32 % of the resamples"):
+        bootstrap_interval("pearson", recorded=[0, 1, 1, 1], sim=[0.1, 0.5, 0.2, 0.3], rng=rng())
+    with pytest.raises(ValueError, match="'mmrv' has no bootstrap"):
+        bootstrap_interval("mmrv", recorded=[0, 1], sim=[0, 1], rng=rng())
+
+
+def test_student_gives_no_interval_of_no_width() -> None:
+    with pytest.raises(UndefinedStatisticError, match="all 3 values are the same"):
+        student_interval([Fraction(1, 3)] * 3)
+    with pytest.raises(UndefinedStatisticError, match="2 values"):
+        student_interval([1, 2])
+
+
+def test_the_remeasurement_band_shrinks_with_trials_and_is_reproducible() -> None:
+    few = [(5, 1, 1, 3), (8, 1, 0, 1), (2, 2, 1, 5)]
+    many = [tuple(50 * v for v in table) for table in few]
+    narrow = remeasurement_band([(a, b, c, d) for a, b, c, d in many], rng=rng())
+    wide = remeasurement_band(few, rng=rng())
+    assert narrow.high - narrow.low < wide.high - wide.low
+    assert remeasurement_band(few, rng=rng()) == wide
+    unpaired = remeasurement_band_of_counts(
+        [(6, 10), (8, 10), (3, 10)], [(6, 10), (9, 10), (4, 10)], rng=rng()
+    )
+    assert -1 <= unpaired.low < unpaired.high <= 1
+    with pytest.raises(UndefinedStatisticError, match="no trial with both sides"):
+        remeasurement_band([(0, 0, 0, 0), *few], rng=rng())
+
+
+def test_a_high_r_may_choose_wrongly() -> None:
+    recorded = {"a": Fraction(9, 10), "b": Fraction(8, 10), "c": Fraction(1, 10)}
+    sim = {"a": Fraction(8, 10), "b": Fraction(9, 10), "c": Fraction(1, 10)}
+    assert correlation.pearson(list(recorded.values()), list(sim.values())) > 0.9
+    decision = choose(recorded=recorded, sim=sim)
+    assert not decision.possibly_right
+    assert decision.regret == Fraction(1, 10)
+
+
+def test_ties_are_sets_and_the_worst_of_them_counts() -> None:
+    decision = choose(recorded={"a": 0.5, "b": 0.75}, sim={"a": 1, "b": 1})
+    assert decision.sim_best == {"a", "b"}
+    assert decision.possibly_right
+    assert not decision.surely_right
+    assert (float(decision.regret), decision.regret_if_lucky) == (0.25, 0)
+    with pytest.raises(UndefinedStatisticError, match="1 candidate; a choice needs two"):
+        choose(recorded={"a": 1}, sim={"a": 1})
+    with pytest.raises(ValueError, match="different candidates"):
+        choose(recorded={"a": 1}, sim={"b": 1})
+
+
+def test_means_over_tasks_use_candidates_that_every_task_has() -> None:
+    rates = {"cube": {"a": 1, "b": 0.5}, "duck": {"a": 0, "b": 0.5, "c": 1}}
+    assert over_tasks(rates) == {"a": Fraction(1, 2), "b": Fraction(1, 2)}
+    assert without_each(["x", "y"]) == {"x": ["y"], "y": ["x"]}
+    with pytest.raises(UndefinedStatisticError, match="1 task; nothing would be left"):
+        without_each(["x"])

@@ -1,0 +1,156 @@
+"""Intervals hold what they promise, the shipped map says so, and what does not is refused."""
+
+import numpy as np
+import pytest
+
+from evaluator.compare.measure import measured, proportion
+from evaluator.result import Interval
+from evaluator.statistics.coverage import exact, simulate, stored
+from evaluator.statistics.paired import tango_difference
+from evaluator.statistics.proportion import clopper_pearson, jeffreys, wilson
+from evaluator.statistics.sequential import betting_interval
+from evaluator.statistics.unpaired import guaranteed_difference, newcombe_difference
+
+REQUIRED = range(5, 101)
+
+
+def test_clopper_pearson_covers_95_percent_everywhere() -> None:
+    for n in REQUIRED:
+        found = exact.of_rate(clopper_pearson, n)
+        assert found.worst >= 0.95, found
+
+
+def test_wilsons_mean_coverage_is_right_at_every_n_and_its_minimum_is_stored() -> None:
+    for n in REQUIRED:
+        found = exact.of_rate(wilson, n)
+        assert found.mean >= 0.945, found
+        known = stored.coverage_of("wilson", n)
+        assert known is not None
+        assert known.worst == pytest.approx(found.worst, abs=1e-6)
+
+
+@pytest.mark.parametrize("n", [5, 23, 60])
+def test_the_shipped_map_is_what_counting_out_gives(n: int) -> None:
+    for name, method in (("jeffreys", jeffreys), ("betting", betting_interval)):
+        known = stored.coverage_of(name, n)
+        assert known is not None
+        assert known.worst == pytest.approx(exact.of_rate(method, n).worst, abs=1e-6)
+
+
+@pytest.mark.parametrize("n", [3, 8])
+def test_the_shipped_map_of_differences_is_what_counting_out_gives(n: int) -> None:
+    for name, found in (
+        ("newcombe-10", exact.of_difference(newcombe_difference, n)),
+        ("clopper-pearson-difference", exact.of_difference(guaranteed_difference, n)),
+        ("tango", exact.of_paired_difference(tango_difference, n)),
+    ):
+        known = stored.coverage_of(name, n)
+        assert known is not None
+        assert known.worst == pytest.approx(found.worst, abs=1e-6)
+
+
+def test_what_is_guaranteed_is_kept() -> None:
+    for name in ("clopper-pearson", "clopper-pearson-difference", "betting"):
+        assert min(point.worst for point in stored.load_map()[name].points) >= 0.95
+
+
+def test_coverage_counts_a_coin_by_hand() -> None:
+    def half(k: int, n: int) -> Interval:
+        """Hold everything up to 1/2, unless every toss succeeded."""
+        high = 0.5 if k < n else 0.0
+        return Interval(low=0.0, high=high, level=0.95, method="test")
+
+    found = exact.of_rate(half, 2)
+    # At p = 0.5 the two tosses succeed together in 1/4 of the cases; above 1/2 nothing is held.
+    assert found.worst == 0
+    assert found.mean == pytest.approx(
+        float(np.mean([1 - p * p if p <= 0.5 else 0 for p in exact.RATES]))
+    )
+
+
+@pytest.mark.slow
+def test_simulated_coverage_of_fisher_is_the_stored_one() -> None:
+    from evaluator.statistics import correlation
+
+    def make(cells: simulate.Cells, _: int, __: np.random.Generator) -> Interval:
+        return correlation.fisher_interval(correlation.pearson(*cells), len(cells[0]))
+
+    rng = np.random.default_rng(1)
+    found = simulate.of_cells(make, "pearson", 10, simulate.POPULATIONS[:3], draws=500, rng=rng)
+    known = stored.coverage_of("fisher-z", 10)
+    assert known is not None
+    assert abs(found.mean - known.mean) < 0.04  # 1500 draws: 0.006 each side, and fewer truths
+
+
+def test_correlated_cells_are_drawn_as_they_are_described() -> None:
+    population = simulate.Population(
+        correlation=0.9, trials=1000, cluster_share=0.5, cells_per_cluster=2
+    )
+    x, y = population.draw(20_000, np.random.default_rng(2))
+    assert np.corrcoef(x, y)[0, 1] == pytest.approx(0.89, abs=0.01)  # uniform marginals
+    first, second = x.reshape(-1, 2).T
+    assert np.corrcoef(first, second)[0, 1] == pytest.approx(0.48, abs=0.02)
+
+
+def an_interval(method: str, level: float = 0.95) -> Interval:
+    return Interval(low=0.1, high=0.2, level=level, method=method)
+
+
+def test_an_interval_that_covers_too_little_is_refused_and_another_is_named() -> None:
+    worst = {
+        name: min(found.points, key=lambda point: point.worst)
+        for name, found in stored.load_map().items()
+    }
+    refused = [n for n, point in worst.items() if point.worst < stored.FLOOR]
+    refused = [name for name in refused if name not in stored.JUDGED_BY_MEAN]
+    assert refused, "no method is ever refused: the map cannot be right"
+    for name in refused:
+        method = name.split(":")[0]
+        kept, why = stored.vouch(an_interval(method), worst[name].n, key=name)
+        assert kept is None
+        assert "where 95 % are claimed" in why
+        assert f"use {stored.INSTEAD[method]}" in why
+
+
+def test_an_interval_that_holds_carries_its_worst_case() -> None:
+    kept, why = stored.vouch(wilson(3, 10), 10)
+    assert why == ""
+    assert kept is not None
+    assert kept.worst_coverage is not None
+    assert 0.8 < kept.worst_coverage < 0.95
+    unpaired = an_interval("clopper-pearson-difference, unpaired")
+    kept, _ = stored.vouch(unpaired, 7)
+    assert kept is not None
+    assert kept.worst_coverage is not None
+
+
+def test_what_nobody_looked_at_passes_unmarked_and_too_few_are_refused() -> None:
+    assert stored.vouch(an_interval("wilson", 0.9), 10) == (an_interval("wilson", 0.9), "")
+    assert stored.vouch(an_interval("block bootstrap"), 3)[0] == an_interval("block bootstrap")
+    kept, why = stored.vouch(an_interval("ppi++"), 12)
+    assert kept is None
+    assert "coverage of ppi++ at 12 robot trials is not known" in why
+
+
+def test_between_stored_sizes_the_worse_neighbour_counts_and_above_them_the_last() -> None:
+    points = stored.load_map()["newcombe-10"].points
+    sizes = [point.n for point in points]
+    between = stored.coverage_of("newcombe-10", 60)
+    assert between is not None
+    neighbours = [point.worst for point in points if point.n in (50, 75)]
+    assert between.worst == min(neighbours)
+    assert stored.coverage_of("newcombe-10", 10**6) == points[sizes.index(max(sizes))]
+
+
+def test_a_measurement_without_its_interval_says_why() -> None:
+    jeffreys_refused = [p.n for p in stored.load_map()["jeffreys"].points if p.worst < 0.9]
+    n = jeffreys_refused[0]
+    rate = proportion(
+        "x", 1, n, definition="d", counted="trial", reason_if_undefined="r", method="jeffreys"
+    )
+    assert rate.interval is None
+    assert "jeffreys at" in str(rate.reason_without_interval)
+    value = measured("x", lambda: (0.5, jeffreys(1, n)), unit="1", definition="d", n=n)
+    assert value.value == 0.5
+    assert value.interval is None
+    assert "use wilson" in str(value.reason_without_interval)

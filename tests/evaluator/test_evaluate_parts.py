@@ -1,0 +1,272 @@
+"""The parts of an evaluation on trials: what they say with data, and without."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bridge.errors import UsageError
+from bridge.task.record import check_record
+from evaluator.cli import evaluate
+from evaluator.compare import Comparison, compare_csv, compare_run
+from evaluator.compare.spreadsheet import compare_trials
+from evaluator.result import load_results
+
+HEADER = "trial_id,task,condition,policy,start_id,recorded,sim_planned,verdict,p_success\n"
+
+
+def trials(write_table: Callable[[str], Path], lines: list[str]) -> Comparison:
+    return compare_csv(write_table(HEADER + "\n".join(lines) + "\n"))
+
+
+def line(
+    number: int,
+    recorded: bool | None,
+    sim: bool | None,
+    *,
+    condition: str = "without_replanning",
+    verdict: str = "",
+    p: str = "",
+    policy: str = "x",
+) -> str:
+    words = {True: "success", False: "failure", None: ""}
+    start = f"s{number % 1000}"
+    return (
+        f"t{number},cube,{condition},{policy},{start},{words[recorded]},{words[sim]},{verdict},{p}"
+    )
+
+
+def test_a_run_without_data_for_a_part_says_no_data(six_trials: Any) -> None:
+    missing = " | ".join(compare_run(six_trials.run).missing)
+    for part in ("reliability of the success probability", "stage funnel", "recorded rate with"):
+        assert f"{part}" in missing
+    assert missing.count("no data") == 3
+
+
+def test_everything_new_fits_the_schema_and_is_read_back(six_trials: Any) -> None:
+    assert evaluate(six_trials.run.path) == 0
+    results = load_results(six_trials.run.path)
+    check_record(results.to_record(), name="results", package="evaluator")
+    ids = [measurement.id for measurement in results.measurements]
+    assert len(ids) == len(set(ids))
+    rate = results.get("rate.recorded.cube_into_box.without_replanning.scripted")
+    assert rate.interval is not None
+    assert rate.interval.worst_coverage is not None
+
+
+def test_paired_starts_have_a_tango_interval_or_the_reason(six_trials: Any) -> None:
+    gain = compare_run(six_trials.run).results().get("paired.gain_pp.recorded")
+    assert gain.value == pytest.approx(100 / 3)
+    assert gain.n == 3
+    assert gain.interval is not None or "tango at 3 pairs" in str(gain.reason_without_interval)
+
+
+def test_unpaired_tests_and_power_stand_beside_every_gain(six_trials: Any) -> None:
+    results = compare_run(six_trials.run).results()
+    p = results.get("unpaired.boschloo_p.recorded.cube_into_box.scripted")
+    assert p.value is not None
+    assert p.value > 0.5
+    needed = results.get("power.trials_needed.recorded.cube_into_box.scripted")
+    assert needed.value == pytest.approx(36, abs=1)  # 1/3 against 2/3
+    power = results.get("power.this_large.recorded.cube_into_box.scripted")
+    assert power.value is not None
+    assert power.value < 0.3
+    detectable = results.get("power.detectable_rate.recorded.cube_into_box.scripted")
+    assert detectable.value is None
+    assert "not even a rate of 100 %" in str(detectable.reason_if_undefined)
+
+
+def test_the_gates_worth_is_priced_where_it_was_not_obeyed(
+    write_table: Callable[[str], Path],
+) -> None:
+    lines = [line(i, True, True, verdict="accepted") for i in range(6)]
+    lines += [line(10 + i, False, False, verdict="refused") for i in range(4)]
+    lines += [line(20 + i, True, False, verdict="refused") for i in range(2)]
+    comparison = trials(write_table, lines)
+    results = comparison.results()
+    assert results.get("gate.break_even_price").value == 2.0
+    costs = next(table for table in comparison.tables if table.id == "gate_costs")
+    assert costs.rows[0][1:] == (0.0, round(4 / 12, 4))
+    assert results.get("agreement.verdict_unheeded.kappa").value == pytest.approx(0.6667, abs=1e-4)
+
+
+def test_a_stated_probability_is_judged(write_table: Callable[[str], Path]) -> None:
+    lines = [line(i, i % 2 == 0, None, p="0.9" if i % 2 == 0 else "0.2") for i in range(8)]
+    comparison = trials(write_table, lines)
+    results = comparison.results()
+    assert results.get("reliability.brier").value == pytest.approx((0.01 + 0.04) / 2)
+    assert results.get("reliability.brier_of_base_rate").value == 0.25
+    table = next(table for table in comparison.tables if table.id == "reliability")
+    assert [row[2] for row in table.rows] == [4, 4]
+    assert not any("reliability" in text for text in comparison.missing)
+
+
+def test_starts_that_only_the_twin_has_help_the_real_rate(
+    write_table: Callable[[str], Path],
+) -> None:
+    lines = [line(i, i < 6, i < 6) for i in range(10)]
+    lines += [line(100 + i, None, i < 60) for i in range(100)]
+    results = trials(write_table, lines).results()
+    rate = results.get("proxy.recorded_rate.cube.without_replanning.x")
+    assert rate.value == pytest.approx(0.58, abs=0.03)
+    ppi = results.get("proxy.recorded_rate_ppi.cube.without_replanning.x")
+    assert ppi.value is None
+    assert "needs 100" in str(ppi.reason_if_undefined)
+    saved = results.get("proxy.trials_saved.cube.without_replanning.x")
+    assert saved.value is not None
+    assert saved.value > 0
+    assert results.get("proxy.random_starts_p.cube.without_replanning.x").value > 0.5
+
+
+def test_starts_that_were_picked_get_no_estimate(write_table: Callable[[str], Path]) -> None:
+    lines = [line(i, True, True) for i in range(12)]
+    lines += [line(100 + i, None, i < 5) for i in range(100)]
+    results = trials(write_table, lines).results()
+    rate = results.get("proxy.recorded_rate.cube.without_replanning.x")
+    assert rate.value is None
+    assert "no random part of the twin's" in str(rate.reason_if_undefined)
+
+
+def test_subtasks_make_a_funnel(write_table: Callable[[str], Path]) -> None:
+    text = "trial_id,task,unit,k,n\na,tidy,subtask,3,3\nb,tidy,subtask,1,3\nc,tidy,subtask,0,3\n"
+    comparison = compare_csv(write_table(text))
+    funnel = next(table for table in comparison.tables if table.id == "funnel")
+    assert [row[2:5] for row in funnel.rows] == [
+        ("subtask_1", 3, 2),
+        ("subtask_2", 2, 1),
+        ("subtask_3", 1, 1),
+    ]
+    curve = next(table for table in comparison.tables if table.id == "success_curve")
+    assert [row[4:6] for row in curve.rows] == [(2, 3), (1, 3), (1, 3)]
+    stage = comparison.results().get("stage.tidy.-.subtask_2")
+    assert (stage.k, stage.n) == (1, 2)
+    assert stage.interval is not None
+
+
+def test_labelled_stages_of_an_episode_make_a_funnel(maker: Any) -> None:
+    from bridge.episode.catalogue import label_episode
+    from bridge.episode.metadata import Outcome
+
+    for name, second in (("t1", "success"), ("t2", "failure"), ("t3", "unknown")):
+        maker.trial(name, start_id=name)
+        stages = ({"id": "grasp", "result": "success"}, {"id": "release", "result": second})
+        result = second if second != "unknown" else "success"
+        label_episode(
+            maker.run, name, Outcome(result=result, k=int(result == "success"), stages=stages)
+        )
+    comparison = compare_run(maker.run)
+    results = comparison.results()
+    assert (results.get("stage.cube_into_box.without_replanning.release").k) == 1
+    assert (results.get("stage.cube_into_box.without_replanning.release").n) == 2
+    failures = next(table for table in comparison.tables if table.id == "failures")
+    assert ("stand-in", "release", "", 1) in failures.rows
+
+
+def test_policies_are_what_agreement_is_resampled_by(write_table: Callable[[str], Path]) -> None:
+    lines = []
+    for index in range(12):
+        for trial in range(10):
+            good = trial < 1 + index * 2 // 3
+            seen = trial < 1 + index * 2 // 3 + (index % 3 == 0)
+            number = 1000 * index + trial
+            lines.append(
+                line(number, good, seen, policy=f"p{index % 6}", condition=f"c{index // 6}")
+            )
+    results = trials(write_table, lines).results()
+    r = results.get("agreement.pearson_r")
+    assert r.value is not None
+    assert r.interval is not None or "covers as little as" in str(r.reason_without_interval)
+    assert "policies resampled" in r.definition
+    band = results.get("agreement.pearson_r_remeasured")
+    assert band.interval is not None or "remeasurement" in str(band.reason_without_interval)
+    assert results.get("decision.regret_pp").n == 1
+    assert results.get("agreement.kendall_tau_b").value is not None
+    assert results.get("agreement.calibration_slope").value == pytest.approx(1, abs=0.15)
+
+
+def test_a_choice_among_conditions_is_judged(six_trials: Any) -> None:
+    comparison = compare_run(six_trials.run)
+    regret = comparison.results().get("decision.regret_pp")
+    # Twin: 2/3 against 2/3, recorded 1/3 against 2/3: the worst of the tie loses a third.
+    assert regret.value == pytest.approx(100 / 3)
+    right = comparison.results().get("decision.surely_right")
+    assert (right.k, right.n) == (0, 1)
+    assert comparison.results().get("decision.possibly_right").k == 1
+
+
+def test_a_sequence_may_be_looked_at_after_every_trial(six_trials: Any) -> None:
+    results = compare_run(six_trials.run).results()
+    rate = results.get("sequence.recorded.cube_into_box.with_replanning.scripted")
+    assert rate.interval is not None
+    assert rate.interval.method == "betting"
+    evidence = results.get("sequence.replanning_evidence.recorded")
+    assert evidence.value == pytest.approx(1.0)  # one pair: the mixture bets half on each side
+
+
+@pytest.mark.parametrize("method", ["clopper-pearson", "jeffreys"])
+def test_another_interval_is_used_throughout(six_trials: Any, method: str) -> None:
+    results = compare_run(six_trials.run, method=method).results()
+    rate = results.get("rate.recorded.cube_into_box.without_replanning.scripted")
+    gain = results.get("gain.pp.recorded.cube_into_box.scripted")
+    if method == "clopper-pearson":
+        assert rate.interval is not None
+        assert rate.interval.method == method
+        assert gain.interval is not None
+        assert gain.interval.method == "clopper-pearson-difference, unpaired"
+    else:
+        assert rate.interval is None or rate.interval.method == method
+
+
+def test_units_mixed_in_one_cell_are_undefined_and_named(maker: Any) -> None:
+    from bridge.episode.catalogue import label_episode
+    from bridge.episode.metadata import Outcome
+
+    for name, unit in (("t1", "object"), ("t2", "subtask")):
+        maker.trial(name, start_id=name)
+        label_episode(maker.run, name, Outcome(result="success", unit=unit, k=2, n=2))
+    results = compare_run(maker.run).results()
+    rate = results.get("rate.recorded_object.cube_into_box.without_replanning.scripted")
+    assert rate.value is None
+    assert "t1 in objects and t2 in subtasks" in str(rate.reason_if_undefined)
+
+
+def test_a_streamed_table_gives_the_same_numbers(write_table: Callable[[str], Path]) -> None:
+    lines = [line(i, i % 3 > 0, i % 4 > 0, verdict="accepted") for i in range(60)]
+    lines += [line(1000 + i, i % 5 > 0, i % 4 > 0, condition="with_replanning") for i in range(60)]
+    path = write_table(HEADER + "\n".join(lines) + "\n")
+    whole, streamed = compare_trials(path), compare_trials(path, stream_above=0)
+    theirs = {m.id: m for m in whole.measurements}
+    same = 0
+    for mine in streamed.measurements:
+        other = theirs[mine.id]
+        if mine.id.startswith(("paired.", "power.paired.")):
+            continue
+        assert (mine.value, mine.k, mine.n, mine.interval) == (
+            other.value,
+            other.k,
+            other.n,
+            other.interval,
+        ), mine.id
+        same += 1
+    assert same > 40
+    assert streamed.rows == ()
+    assert any("streamed" in item.reason for item in streamed.exclusions)
+    assert not any(table.id == "trials" for table in streamed.tables)
+
+
+def test_a_goal_is_answered_or_the_trials_it_may_take_are_named(
+    write_table: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = [line(i, True, True) for i in range(20)]
+    lines += [line(100 + i, i % 2 == 0, True, condition="with_replanning") for i in range(6)]
+    path = write_table(HEADER + "\n".join(lines) + "\n")
+    assert evaluate(path, out=tmp_path / "out", goal=0.6) == 0
+    table = next(t for t in compare_csv(path, goal=0.6).tables if t.id == "stopping")
+    settled, still_open = table.rows
+    assert settled[5] == "stop: above 60 %"
+    assert still_open[5] == "continue"
+    assert still_open[6] > 20
+    assert "stop: above 60 %" in capsys.readouterr().out
+    with pytest.raises(UsageError, match="--goal 60"):
+        evaluate(path, goal=60.0)

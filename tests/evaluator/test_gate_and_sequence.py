@@ -1,0 +1,215 @@
+"""The gate's worth, reliability, stage funnel, sequential looking, and the real rate from few."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evaluator.errors import UndefinedStatisticError
+from evaluator.statistics.funnel import failure_taxonomy, funnel, success_curve
+from evaluator.statistics.gate import Confusion, break_even, cost_curve, kappa
+from evaluator.statistics.proportion import wilson
+from evaluator.statistics.proxy import (
+    applicability,
+    post_stratified,
+    ppi_plus_plus,
+    trials_saved,
+)
+from evaluator.statistics.reliability import (
+    brier,
+    brier_of_base_rate,
+    expected_calibration_error,
+    reliability_bins,
+)
+from evaluator.statistics.sequential import (
+    ConfidenceSequence,
+    betting_interval,
+    capital_log,
+    stop_or_continue,
+)
+
+
+def table(tp: int, fp: int, fn: int, tn: int) -> Confusion:
+    return Confusion(true_positive=tp, false_positive=fp, false_negative=fn, true_negative=tn)
+
+
+def test_weights_count_as_that_many_trials() -> None:
+    assert Confusion.weigh([(True, False, 3), (False, False, 2)]) == table(0, 3, 0, 2)
+
+
+def test_a_gate_pays_until_its_refusals_cost_what_it_avoids() -> None:
+    counts = table(5, 1, 2, 4)
+    price = break_even(counts)
+    assert price == 2
+    at, below, above = cost_curve(counts, [price, price / 2, price * 2])
+    assert at.with_gate == pytest.approx(at.without_gate)
+    assert below.with_gate < below.without_gate
+    assert above.with_gate > above.without_gate
+    with pytest.raises(UndefinedStatisticError, match="no good plan was refused"):
+        break_even(table(5, 1, 0, 4))
+    with pytest.raises(UndefinedStatisticError, match="there are no trials"):
+        cost_curve(table(0, 0, 0, 0), [1.0])
+
+
+def test_kappa_by_hand_and_undefined() -> None:
+    # Cohen's example form: 20 yes-yes, 5, 10, 15: agreement 0.7, chance 0.5, kappa 0.4.
+    assert kappa(table(20, 5, 10, 15)) == pytest.approx(0.4)
+    with pytest.raises(UndefinedStatisticError, match="both sides are the same"):
+        kappa(table(4, 0, 0, 0))
+    assert kappa(table(2, 2, 0, 0)) == 0
+
+
+def test_reliability_of_a_forecaster_who_is_right_and_of_one_who_is_not() -> None:
+    assert brier([1.0, 0.0], [True, False]) == 0
+    assert brier([0.5, 0.5], [True, False]) == 0.25 == brier_of_base_rate([True, False])
+    assert expected_calibration_error([1.0, 0.0], [False, True]) == 1
+    said, happened = [0.05, 0.95, 1.0, 0.1], [False, True, True, True]
+    bins = reliability_bins(said, happened)
+    assert [(b.low, b.n, b.succeeded) for b in bins] == [(0.0, 1, 0), (0.1, 1, 1), (0.9, 2, 2)]
+    # 1/4 x 0.05 + 1/4 x 0.9 + 2/4 x 0.025
+    assert expected_calibration_error(said, happened) == pytest.approx(0.25)
+    with pytest.raises(UndefinedStatisticError, match="there are no trials"):
+        brier([], [])
+    with pytest.raises(ValueError, match=r"lies in 0\.\.1"):
+        brier([1.2], [True])
+    with pytest.raises(ValueError, match="1 probabilities but 2"):
+        brier([1.0], [True, False])
+
+
+def test_a_stage_after_a_failed_one_is_not_reached() -> None:
+    trials = [[True, True, True], [True, False, True], [False, True, True], [True, None, True]]
+    stages = funnel(trials, ["pick", "carry", "release"])
+    assert [(s.reached, s.passed, s.unknown) for s in stages] == [(4, 3, 0), (3, 1, 1), (1, 1, 0)]
+    with pytest.raises(ValueError, match="a trial has 1 stages, the task 3"):
+        funnel([[True]], ["pick", "carry", "release"])
+    with pytest.raises(UndefinedStatisticError, match="no trials with labelled stages"):
+        funnel([], ["pick"])
+
+
+def test_a_success_curve_never_falls() -> None:
+    curve = success_curve([3, None, 1, 3], 4)
+    assert [(p.step, p.done, p.n) for p in curve] == [(1, 1, 4), (2, 1, 4), (3, 3, 4), (4, 3, 4)]
+    with pytest.raises(ValueError, match="outside 1"):
+        success_curve([5], 4)
+    with pytest.raises(UndefinedStatisticError, match="no units"):
+        success_curve([], 4)
+
+
+def test_failures_are_counted_most_frequent_first() -> None:
+    found = failure_taxonomy([("ik", "", 1), ("clearance", "collision", 2), ("ik", "", 1)])
+    assert [(kind.clause, kind.count) for kind in found] == [("clearance", 2), ("ik", 2)]
+
+
+def test_all_successes_leave_a_betting_interval_open_upwards() -> None:
+    interval = betting_interval(10, 10)
+    # KT capital: B(10.5, 0.5) / B(0.5, 0.5) = C(20, 10) / 4^10; low = (that / 20)^(1/10).
+    assert interval.low == pytest.approx((math.comb(20, 10) / 4**10 / 20) ** 0.1, abs=1e-12)
+    assert interval.high == 1
+    assert betting_interval(0, 10).high == pytest.approx(1 - interval.low, abs=1e-12)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 200).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_a_betting_interval_is_wider_than_one_that_looks_once(count: tuple[int, int]) -> None:
+    k, n = count
+    anytime, once = betting_interval(k, n), wilson(k, n)
+    assert anytime.low <= k / n <= anytime.high
+    assert anytime.high - anytime.low > 0.9 * (once.high - once.low)
+
+
+def test_the_bettors_capital_is_a_martingale_under_the_truth() -> None:
+    for n in (1, 5, 12):
+        for rate in (0.2, 0.5):
+            chances = [math.comb(n, k) * rate**k * (1 - rate) ** (n - k) for k in range(n + 1)]
+            mean = sum(c * math.exp(capital_log(k, n, rate)) for k, c in enumerate(chances))
+            assert mean == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [0.1, 0.5, 0.8])
+def test_a_confidence_sequence_hardly_ever_loses_the_truth_at_any_time(rate: float) -> None:
+    rng = np.random.default_rng(11)
+    lost, paths, length = 0, 400, 150
+    ends = {}
+    for _ in range(paths):
+        k = 0
+        for n, success in enumerate(rng.random(length) < rate, start=1):
+            k += int(success)
+            if (k, n) not in ends:
+                ends[k, n] = betting_interval(k, n)
+            if not ends[k, n].low <= rate <= ends[k, n].high:
+                lost += 1
+                break
+    assert lost / paths <= 0.05  # and in fact about 0.03
+
+
+def test_a_sequence_never_widens_and_stops_when_the_question_is_answered() -> None:
+    sequence = ConfidenceSequence()
+    with pytest.raises(UndefinedStatisticError, match="there are no trials"):
+        stop_or_continue(sequence, 0.5)
+    widths = []
+    for success in [True, True, False, *[True] * 20]:
+        interval = sequence.add(success)
+        widths.append(interval.high - interval.low)
+    assert widths == sorted(widths, reverse=True)
+    assert stop_or_continue(sequence, 0.5).answer == "above"
+    still_open = stop_or_continue(sequence, 0.9)
+    assert not still_open.stop
+    assert still_open.more_trials is None or still_open.more_trials > 0
+    assert stop_or_continue(sequence, 0.999).answer in ("below", "open")
+
+
+def test_a_rate_that_changes_is_noticed() -> None:
+    def run(sequence: ConfidenceSequence) -> None:
+        for success in [True] * 60 + [False] * 200:
+            sequence.add(success)
+
+    with pytest.raises(UndefinedStatisticError, match="the rate has changed"):
+        run(ConfidenceSequence())
+
+
+def test_a_faithful_twin_narrows_the_real_rate_and_a_useless_one_does_not() -> None:
+    good = post_stratified(table(6, 0, 0, 4), 60, 100)
+    useless = post_stratified(table(3, 2, 3, 2), 50, 100)
+    alone = wilson(6, 10)
+    width = good.interval.high - good.interval.low
+    assert width < alone.high - alone.low
+    assert trials_saved(good, 10) > 0
+    assert useless.interval.high - useless.interval.low > width
+    assert good.interval.low < good.value < good.interval.high
+    with pytest.raises(UndefinedStatisticError, match="no robot trial"):
+        post_stratified(table(0, 0, 0, 0), 1, 2)
+
+
+def test_the_stratified_interval_agrees_with_drawing_from_the_posterior() -> None:
+    found = post_stratified(table(6, 2, 1, 5), 70, 120)
+    rng = np.random.default_rng(5)
+    pi = rng.beta(78.5, 56.5, 400_000)
+    rates = pi * rng.beta(6.5, 2.5, 400_000) + (1 - pi) * rng.beta(1.5, 5.5, 400_000)
+    assert found.value == pytest.approx(rates.mean(), abs=1e-3)
+    low, high = np.quantile(rates, [0.025, 0.975])
+    assert found.interval.low == pytest.approx(low, abs=4e-3)
+    assert found.interval.high == pytest.approx(high, abs=4e-3)
+
+
+def test_ppi_is_refused_where_its_interval_would_lie() -> None:
+    real, said = [True] * 60 + [False] * 40, [1.0] * 70 + [0.0] * 30
+    with pytest.raises(UndefinedStatisticError, match=r"10 robot trials; .* needs 100"):
+        ppi_plus_plus(real[:10], said[:10], said)
+    with pytest.raises(UndefinedStatisticError, match="no further starts"):
+        ppi_plus_plus(real, said, [])
+    with pytest.raises(UndefinedStatisticError, match="ended the same"):
+        ppi_plus_plus([True] * 100, said, said)
+    with pytest.raises(UndefinedStatisticError, match="said the same"):
+        ppi_plus_plus(real, [1.0] * 100, said)
+    found = ppi_plus_plus(real, said, said * 10)
+    assert found.interval.low < found.value < found.interval.high
+
+
+def test_starts_that_were_picked_forbid_the_estimate() -> None:
+    assert applicability(5, 10, 50, 100) > 0.5
+    assert applicability(10, 10, 10, 100) < 0.001
+    with pytest.raises(UndefinedStatisticError, match="no further starts"):
+        applicability(1, 2, 0, 0)

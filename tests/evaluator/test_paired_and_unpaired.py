@@ -1,0 +1,157 @@
+"""Laws and known answers of paired and unpaired comparisons, and of power."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evaluator.errors import UndefinedStatisticError
+from evaluator.statistics.paired import sign_test, tango_difference
+from evaluator.statistics.power import (
+    detectable_rate,
+    power_paired,
+    power_unpaired,
+    trials_needed,
+)
+from evaluator.statistics.proportion import ImpossibleCountError, jeffreys, wilson
+from evaluator.statistics.unpaired import boschloo, guaranteed_difference, newcombe_difference
+
+pairs = st.integers(1, 40).flatmap(
+    lambda n: st.tuples(st.integers(0, n), st.just(n)).flatmap(
+        lambda t: st.tuples(st.just(t[0]), st.integers(0, t[1] - t[0]), st.just(t[1]))
+    )
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(pairs)
+def test_tango_holds_the_difference_mirrors_and_is_never_of_no_width(
+    counts: tuple[int, int, int],
+) -> None:
+    improved, worsened, n = counts
+    interval = tango_difference(improved, worsened, n)
+    difference = (improved - worsened) / n
+    assert -1 <= interval.low <= difference + 1e-12
+    assert difference - 1e-12 <= interval.high <= 1
+    assert interval.high > interval.low
+    mirrored = tango_difference(worsened, improved, n)
+    assert mirrored.low == pytest.approx(-interval.high, abs=1e-12)
+    wider = tango_difference(improved, worsened, n, level=0.99)
+    assert wider.low <= interval.low + 1e-12
+    assert wider.high >= interval.high - 1e-12
+
+
+def test_tango_without_any_change_is_the_score_interval_of_nothing() -> None:
+    # With no discordant pair the end is z^2 / (n + z^2): Wilson's of 0/n.
+    interval = tango_difference(0, 0, 20)
+    assert interval.high == pytest.approx(wilson(0, 20).high, abs=1e-12)
+    assert interval.low == pytest.approx(-interval.high, abs=1e-12)
+
+
+def test_pairs_that_cannot_be_are_refused() -> None:
+    with pytest.raises(UndefinedStatisticError, match="there are no pairs"):
+        tango_difference(0, 0, 0)
+    with pytest.raises(ImpossibleCountError, match="6 successes of 5"):
+        tango_difference(4, 2, 5)
+
+
+def test_the_sign_test_counts_with_whole_numbers() -> None:
+    assert sign_test(4, 0) == (0.125, 0.0625)
+    assert sign_test(0, 4) == (0.125, 0.0625)
+    assert sign_test(3, 3)[0] == 1.0
+    # 2000 pairs: 2^-2000 is no float, the ratio of whole numbers is right all the same.
+    assert 0 < sign_test(1060, 940)[0] < 0.01
+
+
+def test_jeffreys_reaches_the_ends_where_it_must() -> None:
+    assert jeffreys(0, 10).low == 0
+    assert jeffreys(10, 10).high == 1
+    assert jeffreys(3, 10).low < 0.3 < jeffreys(3, 10).high
+
+
+def brute_boschloo(k1: int, n1: int, k2: int, n2: int) -> float:
+    """Definition written out: Fisher's p of each table, largest probability over a fine grid."""
+    from math import comb
+
+    def fisher(a: int, b: int) -> float:
+        total = comb(n1 + n2, a + b)
+        xs = range(max(0, a + b - n2), a + 1)
+        return sum(comb(n1, x) * comb(n2, a + b - x) for x in xs) / total
+
+    def one_sided(a: int, b: int) -> float:
+        limit = fisher(a, b) * (1 + 1e-9)
+        tables = itertools.product(range(n1 + 1), range(n2 + 1))
+        region = [(x, y) for x, y in tables if fisher(x, y) <= limit]
+        p = np.linspace(0, 1, 20_001)[1:-1]
+        return max(
+            sum(
+                comb(n1, x) * comb(n2, y) * p ** (x + y) * (1 - p) ** (n1 + n2 - x - y)
+                for x, y in region
+            )
+        )
+
+    return min(1.0, 2 * min(one_sided(k1, k2), one_sided(n1 - k1, n2 - k2)))
+
+
+@pytest.mark.parametrize("table", [(4, 6, 5, 6), (1, 5, 4, 4), (0, 5, 5, 5), (2, 4, 2, 4)])
+def test_boschloo_is_its_definition(table: tuple[int, int, int, int]) -> None:
+    assert boschloo(*table) == pytest.approx(brute_boschloo(*table), abs=1e-6)
+
+
+def test_boschloo_of_the_papers_gains() -> None:
+    # Design page, finding 3: sloth 4/10 -> 8/10 has 0.089; pooled 17/30 -> 24/30 about 0.056.
+    assert boschloo(4, 10, 8, 10) == pytest.approx(0.089, abs=5e-4)
+    assert boschloo(8, 10, 9, 10) > 0.5
+    assert boschloo(4, 10, 8, 10) == pytest.approx(boschloo(8, 10, 4, 10), abs=1e-9)
+
+
+def test_boschloo_of_what_cannot_be_counted_out_says_so() -> None:
+    with pytest.raises(UndefinedStatisticError, match="more than 4000000 tables"):
+        boschloo(1, 3000, 2, 3000)
+    with pytest.raises(UndefinedStatisticError, match="no trials"):
+        boschloo(0, 0, 1, 2)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 30), st.data())
+def test_the_guaranteed_difference_holds_newcombes_centre(n: int, data: st.DataObject) -> None:
+    first, second = data.draw(st.integers(0, n)), data.draw(st.integers(0, n))
+    wide = guaranteed_difference(first, n, second, n)
+    assert wide.low <= (second - first) / n <= wide.high
+    assert wide.high - wide.low >= newcombe_difference(first, n, second, n).high - (
+        newcombe_difference(first, n, second, n).low
+    )
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "needed"),
+    [(0.4, 0.8, 23), (0.55, 0.8, 54), (0.6, 0.8, 82), (0.8, 0.9, 199), (0.5, 0.6, 388)],
+)
+def test_trials_needed_are_those_of_the_design_page(
+    first: float, second: float, needed: int
+) -> None:
+    assert trials_needed(first, second) == needed
+    assert trials_needed(second, first) == needed
+    assert power_unpaired(first, second, needed) >= 0.8
+    assert power_unpaired(first, second, needed - 1) < 0.8
+
+
+def test_ten_trials_show_little() -> None:
+    assert power_unpaired(0.6, 0.8, 10, sides=1) == pytest.approx(0.24, abs=0.01)
+    assert detectable_rate(0.4, 23) == pytest.approx(0.795, abs=0.005)
+    with pytest.raises(UndefinedStatisticError, match="not even a rate of 100 %"):
+        detectable_rate(0.9, 10)
+    with pytest.raises(UndefinedStatisticError, match="the rates are equal"):
+        trials_needed(0.5, 0.5)
+
+
+def test_paired_power_by_hand_and_in_the_limit() -> None:
+    # Six pairs that all differ, always for the better: 2 / 2^6 = 0.03 is significant.
+    assert power_paired(1.0, 0.0, 6) == pytest.approx(1.0)
+    assert power_paired(1.0, 0.0, 5) == 0.0
+    # Under no effect the exact test is conservative.
+    assert power_paired(0.2, 0.2, 60) < 0.05
+    with pytest.raises(UndefinedStatisticError, match="no probabilities"):
+        power_paired(0.0, 0.0, 10)

@@ -1,0 +1,181 @@
+"""The paper's table, recomputed; thresholds that end a command with 3."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bridge.errors import UsageError
+from bridge.exchange.trials_csv import TableError
+from evaluator.cli import evaluate
+from evaluator.compare import compare_csv
+from evaluator.compare.published import check_published
+from evaluator.result import Results, Table, load_results
+from evaluator.thresholds import SHORT, missed, parse_thresholds
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
+RATES = EXAMPLES / "paper_table_rates.csv"
+PUBLISHED = EXAMPLES / "paper_table_published.csv"
+
+
+def table_of(results: Results, name: str) -> Table:
+    return next(table for table in results.tables if table.id == name)
+
+
+def test_the_papers_rates_give_its_averages_and_both_gains() -> None:
+    results = compare_csv(RATES).results()
+    for side, condition, percent in (
+        ("sim_planned", "without_replanning", 66.667),
+        ("recorded", "without_replanning", 55.333),
+        ("sim_planned", "with_replanning", 93.333),
+        ("recorded", "with_replanning", 80.0),
+    ):
+        macro = results.get(f"average.macro.{side}.{condition}")
+        assert macro.value == pytest.approx(percent / 100, abs=5e-6)
+        pooled = results.get(f"average.pooled.{side}.{condition}")
+        assert pooled.value is None
+        assert "different units (object, trial)" in str(pooled.reason_if_undefined)
+    assert results.get("gain.pp.recorded.average").value == pytest.approx(24.667, abs=5e-4)
+    assert results.get("gain.relative.recorded.average").value == pytest.approx(0.44578, abs=1e-5)
+
+
+def test_the_papers_r_without_with_and_over_all_cells() -> None:
+    results = compare_csv(RATES).results()
+    # By hand: (80, 40, 46) with (80, 60, 60), and (90, 80, 70) with (100, 100, 80).
+    without = results.get("agreement.pearson_r.without_replanning")
+    assert without.value == pytest.approx(0.99028, abs=1e-5)
+    with_it = results.get("agreement.pearson_r.with_replanning")
+    assert with_it.value == pytest.approx(0.86603, abs=1e-5)
+    assert results.get("agreement.pearson_r").value == pytest.approx(0.92914, abs=1e-5)
+    for r in (without, with_it):
+        assert r.interval is None
+        assert "3 cells; Fisher's interval needs 4" in str(r.reason_without_interval)
+    assert results.get("agreement.bias_pp").value == pytest.approx(12.333, abs=5e-4)
+
+
+def test_the_remarks_say_that_the_paper_is_underpowered_and_optimistic() -> None:
+    rows = table_of(compare_csv(RATES).results(), "remarks").rows
+    remarks = {about: [str(text) for other, text in rows if other == about] for about, _ in rows}
+    assert (
+        "gain of +40 pp (Boschloo p = 0.09); 23 per condition would"
+        in remarks["sloth_into_basket"][0]
+    )
+    assert "counted in objects (n = 50)" in remarks["ducks_into_basket"][0]
+    assert "optimistic by +12.3 pp" in " ".join(remarks["agreement.pearson_r"])
+    assert "+24.67 percentage points and +44.58 % relative" in remarks["gain"][0]
+
+
+def test_the_published_table_is_recomputed_figure_by_figure() -> None:
+    check = check_published(PUBLISHED)
+    verdicts = {finding.what: finding for finding in check.findings}
+    for side, condition in (
+        ("sim", "without_replanning"),
+        ("recorded", "without_replanning"),
+        ("sim", "with_replanning"),
+        ("recorded", "with_replanning"),
+    ):
+        assert verdicts[f"average_percent {side} {condition}"].verdict == "as printed"
+    relative = verdicts["gain_relative_percent recorded"]
+    assert relative.verdict == "only from rounded figures"
+    assert relative.recomputed == "44.58"
+    assert "44.67 comes from the rounded averages" in relative.remark
+    ducks = verdicts["ducks_into_basket without_replanning real"]
+    assert ducks.verdict == "impossible"
+    assert "23 of 50 objects, not 10 trials" in ducks.remark
+    assert verdicts["pearson_r all cells (n = 6)"].recomputed == "0.929"
+    assert verdicts["pearson_r without_replanning (n = 3)"].recomputed == "0.990"
+    assert verdicts["pearson_r with_replanning (n = 3)"].recomputed == "0.866"
+    assert verdicts["gain_pp sloth_into_basket sim"].verdict == "as printed"
+    assert len(check.failed) == 2
+
+
+def test_checking_a_published_table_ends_with_three_and_a_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert evaluate(check_published=PUBLISHED, out=tmp_path / "out") == 3
+    shown = capsys.readouterr()
+    assert "44.67 comes from the rounded averages" in shown.err
+    assert "row 13" in shown.err
+    assert "Printed figures" in shown.out
+    assert table_of(load_results(tmp_path / "out" / "results.json"), "published").rows
+
+
+def test_a_published_table_beside_a_run_adds_its_table(
+    six_trials: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert evaluate(six_trials.run.path, check_published=PUBLISHED) == 3
+    assert "only from rounded" in capsys.readouterr().err
+    results = load_results(six_trials.run.path)
+    assert results.get("agreement.sim_planned.rate").k == 5
+    assert table_of(results, "published").rows
+
+
+def test_a_table_whose_figures_follow_passes(write_table: Callable[[str], Path]) -> None:
+    path = write_table(
+        "task,condition,side,n,rate_percent,statistic,printed\n"
+        "a,without_replanning,sim,10,50,,\n"
+        "a,without_replanning,real,10,40,,\n"
+        "a,with_replanning,sim,10,80,,\n"
+        "a,with_replanning,real,10,80,,\n"
+        ",,real,,,gain_pp,40\n,,real,,,gain_relative_percent,100\n,,,,,bias_pp,5\n"
+    )
+    assert check_published(path).failed == ()
+    wrong = path.read_text().replace("gain_pp,40", "gain_pp,41").replace("percent,100", "percent,9")
+    path.write_text(wrong)
+    assert [f.verdict for f in check_published(path).failed] == ["differs", "differs"]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (",,real,,mood,1", "row 2: statistic is 'mood'"),
+        (",,real,,gain_pp,much", "row 2: printed is 'much'"),
+    ],
+)
+def test_a_figure_that_cannot_be_read_is_refused(
+    write_table: Callable[[str], Path], line: str, message: str
+) -> None:
+    path = write_table(f"task,condition,side,rate,statistic,printed\n{line}\n")
+    with pytest.raises(TableError, match=message):
+        check_published(path)
+
+
+def test_thresholds_are_read_by_short_name_by_id_and_several_at_once() -> None:
+    found = parse_thresholds("r=0.8, views.all.psnr_db=20,0.5")
+    assert [(t.id, t.limit) for t in found] == [
+        ("agreement.pearson_r", 0.8),
+        ("views.all.psnr_db", 20.0),
+        ("agreement.sim_planned.rate", 0.5),
+    ]
+
+
+@pytest.mark.parametrize("text", ["r=high", "mood=1", "agreement=80", "1.5"])
+def test_thresholds_that_mean_nothing_are_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="--fail-under"):
+        parse_thresholds(text)
+
+
+@pytest.mark.parametrize(("text", "code"), [("r=0.8", 0), ("r=0.95", 3), ("ppv=0.1", 3)])
+def test_r_of_the_paper_against_a_threshold(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, code: int
+) -> None:
+    assert evaluate(RATES, out=tmp_path / "out", fail_under=text) == code
+    shown = capsys.readouterr().err
+    assert ("the threshold is" in shown) == (code == 3)
+    if text == "ppv=0.1":
+        assert "undefined: there is no agreement.sim_planned.ppv" in shown
+
+
+def test_every_short_name_is_an_id_of_some_results(six_trials: Any) -> None:
+    from evaluator.compare import compare_run
+
+    ids = {m.id for m in compare_run(six_trials.run).measurements}
+    for name, identifier in SHORT.items():
+        assert identifier in ids or identifier.startswith("views."), name
+    assert missed(parse_thresholds("0.9"), compare_run(six_trials.run).results())[0].value == 5 / 6
+
+
+def test_evaluate_without_anything_is_wrong_use() -> None:
+    with pytest.raises(UsageError, match="needs a run folder or a table"):
+        evaluate()

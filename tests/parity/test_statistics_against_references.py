@@ -1,0 +1,135 @@
+"""Our statistics against statsmodels, SciPy and ppi-python."""
+
+import json
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from evaluator.statistics import agreement, correlation
+from evaluator.statistics.paired import mcnemar, tango_difference
+from evaluator.statistics.power import power_unpaired
+from evaluator.statistics.proportion import clopper_pearson, jeffreys, wilson
+from evaluator.statistics.proxy import ppi_plus_plus
+from evaluator.statistics.unpaired import boschloo, newcombe_difference
+
+pytestmark = pytest.mark.parity
+
+proportion = pytest.importorskip("statsmodels.stats.proportion")
+
+COUNTS = [(1, 10), (23, 50), (4, 10), (8, 10), (81, 263), (99, 100)]
+EXACT = 1e-9
+
+
+def load_golden(name: str) -> Any:
+    """Import a script beside its recorded answer; tests are no package."""
+    path = Path(__file__).parents[1] / "golden" / f"{name}.py"
+    spec = spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+make_ppi_reference = load_golden("make_ppi_reference")
+GOLDEN = json.loads(make_ppi_reference.PATH.read_text())
+
+
+@pytest.mark.parametrize(("k", "n"), COUNTS)
+@pytest.mark.parametrize("level", [0.9, 0.95])
+def test_rate_intervals_agree_with_statsmodels(k: int, n: int, level: float) -> None:
+    # Away from 0/n and n/n, where ours follows Brown, Cai and DasGupta and statsmodels does not.
+    for ours, name in ((wilson, "wilson"), (clopper_pearson, "beta"), (jeffreys, "jeffreys")):
+        low, high = proportion.proportion_confint(k, n, alpha=1 - level, method=name)
+        mine = ours(k, n, level=level)
+        assert (mine.low, mine.high) == pytest.approx((low, high), abs=EXACT)
+
+
+@pytest.mark.parametrize("table", [(4, 10, 8, 10), (17, 30, 24, 30), (1, 12, 9, 20)])
+def test_newcombe_agrees_with_statsmodels(table: tuple[int, int, int, int]) -> None:
+    k1, n1, k2, n2 = table
+    low, high = proportion.confint_proportions_2indep(k2, n2, k1, n1, method="newcomb")
+    mine = newcombe_difference(*table)
+    assert (mine.low, mine.high) == pytest.approx((low, high), abs=EXACT)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "n"), [(0.6, 0.8, 10), (0.6, 0.8, 82), (0.4, 0.8, 23), (0.8, 0.9, 50)]
+)
+def test_power_agrees_with_statsmodels(first: float, second: float, n: int) -> None:
+    for sides, alternative in ((2, "two-sided"), (1, "larger")):
+        theirs = proportion.power_proportions_2indep(
+            second - first, first, n, alternative=alternative
+        )
+        mine = power_unpaired(first, second, n, sides=sides)
+        assert mine == pytest.approx(float(theirs.power), abs=EXACT)
+
+
+@pytest.mark.parametrize(("improved", "worsened"), [(4, 0), (7, 2), (3, 3), (1, 9), (60, 30)])
+def test_mcnemar_agrees_with_statsmodels(improved: int, worsened: int) -> None:
+    from statsmodels.stats.contingency_tables import mcnemar as reference
+
+    pairs = [(False, True)] * improved + [(True, False)] * worsened + [(True, True)] * 3
+    theirs = reference(np.array([[3, worsened], [improved, 0]]), exact=True)
+    assert mcnemar(pairs).p_exact == pytest.approx(theirs.pvalue, abs=EXACT)
+
+
+@pytest.mark.parametrize(
+    "table", [(4, 10, 8, 10), (8, 10, 9, 10), (17, 30, 24, 30), (0, 8, 5, 12), (7, 9, 2, 11)]
+)
+def test_boschloo_agrees_with_scipy(table: tuple[int, int, int, int]) -> None:
+    k1, n1, k2, n2 = table
+    theirs = stats.boschloo_exact([[k1, k2], [n1 - k1, n2 - k2]], n=64)
+    assert boschloo(*table) == pytest.approx(theirs.pvalue, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_kendall_and_the_calibration_line_agree_with_scipy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x, y = (rng.integers(0, 6, 9) / 5).tolist(), (rng.integers(0, 6, 9) / 5).tolist()
+    assert correlation.kendall(x, y) == pytest.approx(stats.kendalltau(x, y).statistic, abs=EXACT)
+    line = agreement.calibration_line(recorded=y, sim=x)
+    theirs = stats.linregress(x, y)
+    assert (line.slope, line.intercept) == pytest.approx(
+        (theirs.slope, theirs.intercept), abs=EXACT
+    )
+
+
+def restricted_score(improved: int, worsened: int, n: int, d: float) -> float:
+    """Tango's score with the restricted maximum found by a general optimiser."""
+    same = n - improved - worsened
+
+    def minus_log(q: float) -> float:
+        p, rest = q + d, 1 - 2 * q - d
+        terms = ((improved, p), (worsened, q), (same, rest))
+        return -sum(c * np.log(max(v, 1e-300)) for c, v in terms if c)
+
+    low, high = max(0.0, -d), (1 - d) / 2
+    found = optimize.minimize_scalar(
+        minus_log, bounds=(low, high), method="bounded", options={"xatol": 1e-13}
+    )
+    variance = (2 * found.x + d - d * d) / n
+    return float(((improved - worsened) / n - d) / np.sqrt(variance))
+
+
+@pytest.mark.parametrize("table", [(5, 1, 20), (12, 9, 43), (3, 8, 15), (40, 20, 160)])
+def test_tango_is_where_the_restricted_score_reaches_its_quantile(
+    table: tuple[int, int, int],
+) -> None:
+    mine = tango_difference(*table)
+    z = stats.norm.ppf(0.975)
+    for end, wanted in ((mine.low, z), (mine.high, -z)):
+        # The optimiser knows its place to about the root of the float spacing.
+        assert restricted_score(*table, end) == pytest.approx(wanted, abs=1e-6)
+
+
+@pytest.mark.parametrize("case", GOLDEN["cases"], ids=lambda case: f"seed {case['seed']}")
+def test_ppi_plus_plus_agrees_with_ppi_python(case: dict[str, float]) -> None:
+    mine = ppi_plus_plus(*make_ppi_reference.sample(int(case["seed"])))
+    assert mine.value == pytest.approx(case["value"], abs=EXACT)
+    assert mine.interval.low == pytest.approx(case["low"], abs=EXACT)
+    assert mine.interval.high == pytest.approx(case["high"], abs=EXACT)
