@@ -28,6 +28,8 @@ BLUR_PX = 1.0
 WINDOW_PX = 5
 EDGE_LEVELS = 2.5
 """Mean gradient, in 8-bit levels per pixel at half size, from which there is an edge to judge."""
+STRONG_LEVELS = 12.0
+"""Stronger gradients count as this: one bright edge that passes by outweighs no other frames."""
 PERSISTENT = 0.8
 """Length of the sum of all frames' gradients over the sum of their lengths: 1 for an edge that
 stays, about one over the root of the number of frames for one that comes and goes."""
@@ -39,6 +41,8 @@ EVIDENCE_PX, EVIDENCE_STRIDE, EVIDENCE_VIEWS = 5, 2, 12
 """Depth is judged over neighbourhoods of this size, at every second pixel, in so many views."""
 MIN_SHARE, MAX_SHARE = 0.002, 0.5
 """Of the image: smaller is chance, larger is a camera that hardly moved."""
+EDGE_SHARE = 0.2
+"""Of a piece must be edges that stay: an even surface alone could be anything."""
 GROW_PX = 3
 """Masks grow by this much at half size: what is so near is out of focus and shadows its edge."""
 
@@ -77,11 +81,11 @@ def find_carried(views: Sequence[TrainingView]) -> CarriedMask | None:
     chosen = _apart(views)
     if len(chosen) < MIN_VIEWS:
         return None
-    images = np.stack([_grey(view.half) for view in chosen])
+    images = np.stack([_blurred(view.half) for view in chosen])
     stays = _edges_that_stay(images)
     if stays.mean() < MIN_SHARE / 10:
         return None
-    near = ndimage.distance_transform_edt(~stays) <= REACH * images.shape[1]
+    near = ndimage.distance_transform_edt(~stays) <= REACH * len(stays)
     found = (stays | (_calm(images, stays) & near)) & ~_stands_in_scene(chosen)
     mask = _solid(found, stays)
     if not MIN_SHARE <= mask.mean() <= MAX_SHARE:
@@ -103,29 +107,33 @@ def _apart(views: Sequence[TrainingView]) -> list[TrainingView]:
     return [kept[int(place)] for place in places]
 
 
-def _grey(target: Target) -> Float32[np.ndarray, "height width"]:
-    grey = target.planes_u8.astype(np.float32).mean(axis=0)
-    return np.asarray(ndimage.gaussian_filter(grey, BLUR_PX), dtype=np.float32)
+def _blurred(target: Target) -> Float32[np.ndarray, "3 height width"]:
+    planes = target.planes_u8.astype(np.float32)
+    return np.asarray(ndimage.gaussian_filter(planes, (0.0, BLUR_PX, BLUR_PX)), dtype=np.float32)
 
 
 def _edges_that_stay(
-    images: Float32[np.ndarray, "num_views height width"],
+    images: Float32[np.ndarray, "num_views 3 height width"],
 ) -> Bool[np.ndarray, "height width"]:
     """Places with edges that point the same way in all frames, whatever the exposure."""
-    down, right = np.gradient(images, axis=(1, 2))
-    length = np.hypot(down, right).mean(axis=0)
-    together = np.hypot(down.mean(axis=0), right.mean(axis=0))
+    down, right = np.gradient(images, axis=(2, 3))
+    strength = np.hypot(down, right)
+    shorter = np.minimum(1.0, STRONG_LEVELS / np.maximum(strength, 1e-6))
+    down, right, strength = down * shorter, right * shorter, strength * shorter
+    length = strength.mean(axis=(0, 1))
+    together = np.hypot(down.mean(axis=0), right.mean(axis=0)).mean(axis=0)
     length, together = (ndimage.uniform_filter(item, WINDOW_PX) for item in (length, together))
     return np.asarray((length > EDGE_LEVELS) & (together > PERSISTENT * length))
 
 
 def _calm(
-    images: Float32[np.ndarray, "num_views height width"], stays: Bool[np.ndarray, "height width"]
+    images: Float32[np.ndarray, "num_views 3 height width"], stays: Bool[np.ndarray, "height width"]
 ) -> Bool[np.ndarray, "height width"]:
     """Places whose brightness follows the exposure of the frame and nothing else."""
-    middle = np.median(images, axis=0)
-    exposure = [float(np.median(item[stays] / np.maximum(middle[stays], 1.0))) for item in images]
-    levelled = images / np.maximum(np.array(exposure, dtype=np.float32), 0.1)[:, None, None]
+    grey = images.mean(axis=1)
+    middle = np.median(grey, axis=0)
+    exposure = [float(np.median(item[stays] / np.maximum(middle[stays], 1.0))) for item in grey]
+    levelled = grey / np.maximum(np.array(exposure, dtype=np.float32), 0.1)[:, None, None]
     middle = np.median(levelled, axis=0)
     spread = 1.48 * np.median(np.abs(levelled - middle), axis=0)
     return np.asarray(spread < CALM_LEVELS + CALM_SHARE * middle)
@@ -163,7 +171,7 @@ def _solid(
         return np.zeros_like(found)
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)
     edges = np.bincount(pieces[stays], minlength=count + 1)
-    large = (sizes >= MIN_SHARE * found.size) & (edges >= 0.1 * sizes)
+    large = (sizes >= MIN_SHARE * found.size) & (edges >= EDGE_SHARE * sizes)
     large[0] = False
     whole = ndimage.binary_fill_holes(large[pieces])
     return np.asarray(ndimage.binary_dilation(whole, iterations=GROW_PX), dtype=bool)

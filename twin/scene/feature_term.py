@@ -17,7 +17,7 @@ from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster import Rasteriser
 
 RIDGE = 0.05
-"""Pull of a feature towards zero, in squared weights of a pixel."""
+"""Pull of a feature towards its start, in squared weights of a pixel."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,21 +37,25 @@ def solve_features(
     rasteriser: Rasteriser,
     *,
     steps: int,
+    start: Float32[np.ndarray, "num_splats num_features"] | None = None,
 ) -> Float32[np.ndarray, "num_splats num_features"]:
-    """Features of the Gaussians that explain all maps best; zero where nothing is seen.
+    """Features of the Gaussians that explain all maps best; the start where nothing is seen.
 
     Args:
         cloud: Geometry and opacity, fixed.
         observations: Maps of the same features.
         rasteriser: Draws and lifts.
         steps: Conjugate gradient steps, at most.
+        start: Where to begin, and what features are pulled to; zero if not given.
     """
     num_features = observations[0].values.shape[0]
+    begin = np.zeros((len(cloud), num_features), dtype=np.float32) if start is None else start
     right = np.zeros((len(cloud), 1, num_features), dtype=np.float32)
     diagonal = np.full((len(cloud), 1, 1), RIDGE, dtype=np.float32)
     for item in observations:
         alpha = rasteriser.draw_planes(cloud, item.camera, item.T_base_camera)[4:]
-        right[:, 0] += rasteriser.lift(item.values * item.valid_mask)
+        missing = item.values - rasteriser.draw_features(np.ascontiguousarray(begin))
+        right[:, 0] += rasteriser.lift(np.where(item.valid_mask, missing, np.float32(0.0)))
         diagonal[:, 0] += rasteriser.lift(alpha * item.valid_mask)
 
     def normal(x: np.ndarray) -> np.ndarray:
@@ -62,7 +66,8 @@ def solve_features(
         return np.asarray(total)
 
     whole = np.broadcast_to(diagonal, right.shape)
-    return conjugate_gradients(normal, right, np.ascontiguousarray(whole), steps=steps)[0][:, 0]
+    change, _ = conjugate_gradients(normal, right, np.ascontiguousarray(whole), steps=steps)
+    return np.asarray(begin + change[:, 0])
 
 
 def feature_loss(

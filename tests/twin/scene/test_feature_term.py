@@ -44,3 +44,14 @@ def test_features_explain_their_maps_and_come_back() -> None:
     assert feature_loss(cloud, true, observations, rasteriser) < 1e-9
     # Gaussians that cover several pixels are determined well; slivers at the border are not.
     assert np.median(np.abs(many - true)) < 0.05
+
+
+def test_a_start_that_is_right_stays_and_one_that_is_near_comes_nearer() -> None:
+    cloud, true, observations = room_with_features()
+    rasteriser = Rasteriser(RasterConfig(threads=1))
+    stayed = solve_features(cloud, observations, rasteriser, steps=2, start=true)
+    np.testing.assert_allclose(stayed, true, atol=1e-4)
+    near = true + np.random.default_rng(1).normal(scale=0.1, size=true.shape).astype(np.float32)
+    solved = solve_features(cloud, observations, rasteriser, steps=2, start=near)
+    before = feature_loss(cloud, near, observations, rasteriser)
+    assert feature_loss(cloud, solved, observations, rasteriser) < 0.3 * before

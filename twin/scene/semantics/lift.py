@@ -104,7 +104,7 @@ def lift_features(
     total, weight = None, np.zeros(len(cloud), dtype=np.float32)
     for viewpoint, feature_map in frames:
         channels, height, width = feature_map.values.shape
-        small = _camera_of_cells(viewpoint.camera, feature_map)
+        small = camera_of_cells(viewpoint.camera, feature_map)
         if total is None:
             total = np.zeros((len(cloud), channels), dtype=np.float32)
         elif channels != total.shape[1]:
@@ -124,7 +124,7 @@ def lift_features(
     return as_float32(features), np.where(seen, weight, 0.0).astype(np.float32)
 
 
-def _camera_of_cells(camera: Camera, feature_map: FeatureMap) -> Camera:
+def camera_of_cells(camera: Camera, feature_map: FeatureMap) -> Camera:
     """The camera whose pixels are the feature cells; the last cells may reach over the edge."""
     _, height, width = feature_map.values.shape
     stride = feature_map.stride
