@@ -77,7 +77,7 @@ class Reference:
 def native(isa: str, nodes: np.ndarray, tets: np.ndarray, masses: np.ndarray) -> SoftSolver:
     solver = SoftSolver(SUBSTEP_S, 1, 9.81, isa)
     none = np.zeros((0, 2), dtype=np.int32), np.zeros((0, 3), dtype=np.int32)
-    solver.add_body(nodes, nodes, tets, masses, *none, YOUNG, POISSON, 0.0, 0.5, 0.014)
+    solver.add_body(nodes, nodes, tets, masses, *none, YOUNG, POISSON, 0.0, 0.0, 0.5, 0.014)
     return solver
 
 

@@ -9,8 +9,10 @@ from twin.physics.soft import SoftModel
 
 LEAST_MASS = 0.4
 """Nodes get at least this share of the mean node's mass: a light corner would be the stiffest."""
+
 CRITICAL = 2.0
-"""Deformation is damped at most critically: twice the lowest frequency."""
+"""The slowest deformation is damped at most critically: at twice its frequency. The viscosity of
+single tetrahedra reaches only short waves, one visit in each substep being too few for long ones."""
 
 
 def add_body(
@@ -44,6 +46,7 @@ def add_body(
         np.ascontiguousarray(surface),
         young_pa,
         model.poisson,
+        model.damping_s,
         min(model.damping_s * omega**2, CRITICAL * omega),
         friction,
         model.spacing_m,

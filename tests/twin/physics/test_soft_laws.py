@@ -85,7 +85,7 @@ def test_momentum_is_kept_without_contact(box_of_cells: Boxes, damping_s: float)
 
 def test_rigid_motion_costs_nothing(box_of_cells: Boxes) -> None:
     solver = empty(gravity=0.0)
-    model = box_of_cells((4, 2, 2))
+    model = box_of_cells((2, 2, 2))  # a cube turns about any axis for ever
     index, _ = put(solver, model, 0.0, 0.0, 0.0)
     omega, v0 = np.array([1.0, -2.0, 2.0]), np.array([0.1, 0.2, 0.0])
     solver.set_velocities(index, v0 + np.cross(omega, solver.nodes(index)))
@@ -95,7 +95,7 @@ def test_rigid_motion_costs_nothing(box_of_cells: Boxes) -> None:
     )
     np.testing.assert_allclose(T[:3, 3], v0, atol=2e-3)
     turned = se3.vector_from_rotation(T[:3, :3])
-    np.testing.assert_allclose(turned, omega * (1 - 2 * np.pi / 3), atol=0.05)  # 3 rad about it
+    np.testing.assert_allclose(turned, omega, atol=0.02)
     off = solver.nodes(index) - se3.apply(T, model.nodes_m.astype(np.float64))
     assert np.abs(off).max() < 1e-4
 

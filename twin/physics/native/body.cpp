@@ -1,6 +1,8 @@
 #include "body.hpp"
 
 #include <algorithm>
+#include <array>
+#include <cstring>
 #include <limits>
 
 namespace soft {
@@ -12,6 +14,9 @@ constexpr double kRecentre = 0.03;   // farther from its origin [m] a body gets 
 // much); the stiffest tetrahedra forget part of theirs, most bodies' need smaller substeps.
 constexpr double kCoupling = 2.0;
 constexpr double kUsual = 0.9;       // share of the tetrahedra that must keep all of their stress
+// A body that touches something loses its turning at this rate [1/s]: what is pressed flat gives
+// less back than it took. Without it light toys rock for seconds.
+constexpr float kRolling = 8.0f;
 constexpr double kOriginGrid = 1.0 / 1024;  // origins are multiples of it [m]
 
 Matrix inverse(const Matrix& a) {
@@ -52,6 +57,7 @@ Body::Body(const BodySpec& spec)
     : samples(spec.samples),
       triangles(spec.triangles),
       friction(spec.friction),
+      damping_s(spec.damping_s),
       damping_rate(spec.damping_rate),
       spacing(spec.spacing),
       num_nodes(static_cast<int>(spec.nodes.size())),
@@ -78,6 +84,8 @@ Body::Body(const BodySpec& spec)
         p[4 * i + 1] = local.y;
         p[4 * i + 2] = local.z;
         p[4 * i + 3] = static_cast<float>(1.0 / spec.masses[i]);
+        masses_.push_back(static_cast<float>(spec.masses[i]));
+        mass_ += spec.masses[i];
     }
     start = p;
     predicted_ = p;
@@ -142,6 +150,9 @@ void Body::build_blocks(double step_s) {
         for (int k = 0; k < 9; ++k) block.b[k][lane] = static_cast<float>(tet.b.m[k / 3][k % 3]);
         for (int k = 0; k < 6; ++k) block.z[k][lane] = static_cast<float>(six[k]);
         block.kept[lane] = static_cast<float>(std::min(1.0, kCoupling / tet.coupling));
+        const double substeps = damping_s / step_s;
+        block.viscosity[lane] = static_cast<float>(
+            2 * material.mu * substeps / (1 + substeps * tet.coupling));
         block.step_volume[lane] = static_cast<float>(tet.step_volume);
     }
 }
@@ -188,6 +199,7 @@ void Body::recentre(const Double3& middle) {
 }
 
 void Body::predict(double gravity, float step_s, const Kernels& kernels) {
+    touches = false;
     const float fall = static_cast<float>(gravity) * step_s;
     std::copy(p.begin(), p.end(), start.begin());
     for (int i = 0; i < num_nodes; ++i) {
@@ -204,41 +216,55 @@ void Body::finish(float step_s) {
     for (int i = 0; i < 4 * num_nodes; ++i) v[i] += (p[i] - predicted_[i]) * rate;
 }
 
-void Body::damp(double period_s) {
+namespace {
+
+Four turned(Four a) { return __builtin_shufflevector(a, a, 1, 2, 0, 3); }
+
+Four cross(Four a, Four b) { return turned(a * turned(b) - turned(a) * b); }
+
+}  // namespace
+
+void Body::damp(float step_s) {
     // Mueller et al. 2007 (position based dynamics), section 3.5: linear and angular momentum stay.
-    if (damping_rate <= 0.0) return;
-    double mass = 0.0;
-    Double3 middle{0, 0, 0}, mean{0, 0, 0};
+    if (damping_rate <= 0.0 && !touches) return;
+    Four flow{}, spin{}, place{}, square{}, mixed{};
     for (int i = 0; i < num_nodes; ++i) {
-        const double m = 1.0 / inverse_mass(i);
-        mass += m;
-        middle = middle + widen(at(i)) * m;
-        mean = mean + Double3{v[4 * i], v[4 * i + 1], v[4 * i + 2]} * m;
+        const Four x = load_four(p.data() + 4 * i), m = Four{} + masses_[i];
+        const Four mx = m * x, mv = m * load_four(v.data() + 4 * i);
+        flow += mv;
+        spin += cross(x, mv);
+        place += mx;
+        square += mx * x;
+        mixed += mx * turned(x);  // xy, yz, zx
     }
-    middle = middle * (1.0 / mass);
-    mean = mean * (1.0 / mass);
-    Matrix inertia{};
-    Double3 spin{0, 0, 0};
+    const Double3 middle = Double3{place[0], place[1], place[2]} * (1.0 / mass_);
+    const Double3 mean = Double3{flow[0], flow[1], flow[2]} * (1.0 / mass_);
+    const Double3 turn = Double3{spin[0], spin[1], spin[2]} - soft::cross(middle, mean) * mass_;
+    const double xx = square[0] - mass_ * middle.x * middle.x;
+    const double yy = square[1] - mass_ * middle.y * middle.y;
+    const double zz = square[2] - mass_ * middle.z * middle.z;
+    const double xy = mixed[0] - mass_ * middle.x * middle.y;
+    const double yz = mixed[1] - mass_ * middle.y * middle.z;
+    const double zx = mixed[2] - mass_ * middle.z * middle.x;
+    const Matrix back =
+        inverse({{{yy + zz, -xy, -zx}, {-xy, xx + zz, -yz}, {-zx, -yz, xx + yy}}});
+    const auto& r = back.m;
+    const Double3 omega{r[0][0] * turn.x + r[0][1] * turn.y + r[0][2] * turn.z,
+                        r[1][0] * turn.x + r[1][1] * turn.y + r[1][2] * turn.z,
+                        r[2][0] * turn.x + r[2][1] * turn.y + r[2][2] * turn.z};
+    const double slowed = touches ? 1.0 / (1.0 + kRolling * step_s) : 1.0;
+    const auto motion = [&](const Double3& turning) {
+        const Float3 base = narrow(mean - soft::cross(turning, middle)), axis = narrow(turning);
+        return std::array<Four, 2>{Four{base.x, base.y, base.z, 0.0f},
+                                   Four{axis.x, axis.y, axis.z, 0.0f}};
+    };
+    const auto now = motion(omega), after = motion(omega * slowed);
+    const Four kept = Four{} + 1.0f / (1.0f + static_cast<float>(damping_rate) * step_s);
     for (int i = 0; i < num_nodes; ++i) {
-        const double m = 1.0 / inverse_mass(i);
-        const Double3 r = widen(at(i)) - middle;
-        const double rr = dot(r, r), c[3] = {r.x, r.y, r.z};
-        spin = spin + cross(r, Double3{v[4 * i], v[4 * i + 1], v[4 * i + 2]}) * m;
-        for (int a = 0; a < 3; ++a)
-            for (int b = 0; b < 3; ++b) inertia.m[a][b] += m * ((a == b ? rr : 0.0) - c[a] * c[b]);
-    }
-    const Matrix back = inverse(inertia);
-    const double s[3] = {spin.x, spin.y, spin.z};
-    double turn[3] = {0, 0, 0};
-    for (int a = 0; a < 3; ++a)
-        for (int b = 0; b < 3; ++b) turn[a] += back.m[a][b] * s[b];
-    const Double3 omega{turn[0], turn[1], turn[2]};
-    const double kept = 1.0 / (1.0 + damping_rate * period_s);
-    for (int i = 0; i < num_nodes; ++i) {
-        const Double3 rigid = mean + cross(omega, widen(at(i)) - middle);
-        v[4 * i] = static_cast<float>(rigid.x + kept * (v[4 * i] - rigid.x));
-        v[4 * i + 1] = static_cast<float>(rigid.y + kept * (v[4 * i + 1] - rigid.y));
-        v[4 * i + 2] = static_cast<float>(rigid.z + kept * (v[4 * i + 2] - rigid.z));
+        const Four x = load_four(p.data() + 4 * i);
+        const Four rest = load_four(v.data() + 4 * i) - (now[0] + cross(now[1], x));
+        const Four slower = after[0] + cross(after[1], x) + kept * rest;
+        std::memcpy(v.data() + 4 * i, &slower, sizeof(slower));
     }
 }
 

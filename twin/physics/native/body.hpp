@@ -38,7 +38,7 @@ struct BodySpec {
     std::vector<double> masses;           // [kg]
     std::vector<Sample> samples;
     std::vector<std::int32_t> triangles;
-    double young, poisson, damping_rate, friction, spacing;
+    double young, poisson, damping_s, damping_rate, friction, spacing;
 };
 
 class Body {
@@ -58,10 +58,11 @@ class Body {
     Material material;
     std::vector<Sample> samples;
     std::vector<std::int32_t> triangles;
-    double friction, damping_rate, spacing;
+    double friction, damping_s, damping_rate, spacing;
     int num_nodes;
     bool lost = false;          // its nodes are no numbers any more
 
+    bool touches = false;       // anything, in this substep
     std::vector<Contact> contacts;
     std::vector<Contact> past_contacts;  // of the last step, in the same order
     std::vector<Pair> pairs;
@@ -93,10 +94,11 @@ class Body {
     void look_around();                       // box, speed, origin
     void predict(double gravity, float step_s, const Kernels& kernels);
     void relax(const Kernels& kernels) {
-        kernels.relax(blocks.data(), static_cast<int>(blocks.size()), p.data(), material);
+        kernels.relax(blocks.data(), static_cast<int>(blocks.size()), p.data(), start.data(),
+                      material);
     }
     void finish(float step_s);
-    void damp(double period_s);               // what is not rigid motion gets slower
+    void damp(float step_s);                  // what is not rigid motion gets slower
 
   private:
     struct Tet {
@@ -105,7 +107,8 @@ class Body {
     };
 
     BodySpec spec_;
-    std::vector<float> predicted_;
+    std::vector<float> predicted_, masses_;
+    double mass_ = 0.0;
 
     Tet tet_of(std::int32_t t, double step_s) const;
     void recentre(const Double3& middle);

@@ -133,6 +133,7 @@ void solve_contacts(Body& body, std::vector<Collider>& colliders, float step_s) 
             contact.anchor = q + frame.inward(by);
             body.shift_sample(sample, by, w);
             body.touched[index] = 1;
+            body.touches = true;
             const Double3 impulse = widen(by) * (-1.0 / (static_cast<double>(w) * step_s));
             piece.take(impulse, arm);
             if (piece.dynamic()) push = push + impulse;
@@ -255,6 +256,7 @@ void solve_pairs(std::vector<Body>& bodies, int index, float step_s) {
         const float pushed = eased(depth, -dot(slip, normal), step_s);
         const float mu = static_cast<float>(body.friction * other.friction);
         const Float3 by = normal * pushed + friction_shift(slip, normal, mu * pushed);
+        body.touches = other.touches = true;
         const float w = body.sample_inverse_mass(sample), sum = w + w_other;
         body.shift_sample(sample, by * (w / sum), w);
         for (int k = 0; k < 3; ++k)

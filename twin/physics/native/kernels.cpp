@@ -54,7 +54,41 @@ void apply_stress(TetBlock* blocks, int num_blocks, float* nodes) {
     }
 }
 
-void relax(TetBlock* blocks, int num_blocks, float* nodes, Material material) {
+// Stress against the change of shape in this substep: symmetric part of dF F^-1, so that a turn costs
+// nothing. It acts once and is not kept.
+inline void add_viscosity(const TetBlock& block, const Tets& tets, const float* start,
+                          const Lanes3 f[3], const Lanes3 c[3], Lanes volume, Lanes q[9]) {
+    const Lanes least = Lanes{} + kCrushed;
+    const Lanes scale = load(block.viscosity) / (volume > least ? volume : least);
+    Lanes3 moved[4];
+    for (int k = 0; k < 4; ++k) {
+        Lanes3 from;
+        Lanes unused;
+        gather(start, block.ids[k], from, unused);
+        moved[k] = tets.p[k] - from;
+    }
+    const Lanes3 d1 = moved[1] - moved[0], d2 = moved[2] - moved[0], d3 = moved[3] - moved[0];
+    Lanes3 d[3];
+    for (int j = 0; j < 3; ++j)
+        d[j] = d1 * load(block.b[j]) + d2 * load(block.b[3 + j]) + d3 * load(block.b[6 + j]);
+    // Rows of dF cof^T, where cof F / det F is the inverse's transpose.
+    const Lanes xx = d[0].x * c[0].x + d[1].x * c[1].x + d[2].x * c[2].x;
+    const Lanes yy = d[0].y * c[0].y + d[1].y * c[1].y + d[2].y * c[2].y;
+    const Lanes zz = d[0].z * c[0].z + d[1].z * c[1].z + d[2].z * c[2].z;
+    const Lanes xy = 0.5f * (d[0].x * c[0].y + d[1].x * c[1].y + d[2].x * c[2].y +
+                             d[0].y * c[0].x + d[1].y * c[1].x + d[2].y * c[2].x);
+    const Lanes yz = 0.5f * (d[0].y * c[0].z + d[1].y * c[1].z + d[2].y * c[2].z +
+                             d[0].z * c[0].y + d[1].z * c[1].y + d[2].z * c[2].y);
+    const Lanes zx = 0.5f * (d[0].z * c[0].x + d[1].z * c[1].x + d[2].z * c[2].x +
+                             d[0].x * c[0].z + d[1].x * c[1].z + d[2].x * c[2].z);
+    for (int j = 0; j < 3; ++j) {
+        q[j] += scale * (xx * f[j].x + xy * f[j].y + zx * f[j].z);
+        q[3 + j] += scale * (xy * f[j].x + yy * f[j].y + yz * f[j].z);
+        q[6 + j] += scale * (zx * f[j].x + yz * f[j].y + zz * f[j].z);
+    }
+}
+
+void relax(TetBlock* blocks, int num_blocks, float* nodes, const float* start, Material material) {
     const Lanes zero{};
     const Lanes mu = zero + material.mu, lambda = zero + material.lambda;
     const Lanes rest = zero + (1.0f + material.mu / material.lambda);
@@ -88,10 +122,10 @@ void relax(TetBlock* blocks, int num_blocks, float* nodes, Material material) {
                     yy = load(block.z[3]), yz = load(block.z[4]), zz = load(block.z[5]);
         const Lanes3 s[3] = {e[0] * xx + e[1] * xy + e[2] * xz, e[0] * xy + e[1] * yy + e[2] * yz,
                              e[0] * xz + e[1] * yz + e[2] * zz};
-        const Lanes q[9] = {s[0].x, s[1].x, s[2].x, s[0].y, s[1].y,
-                            s[2].y, s[0].z, s[1].z, s[2].z};
+        Lanes q[9] = {s[0].x, s[1].x, s[2].x, s[0].y, s[1].y, s[2].y, s[0].z, s[1].z, s[2].z};
         const Lanes kept = load(block.kept);
         for (int k = 0; k < 9; ++k) store(block.stress[k], (load(block.stress[k]) + q[k]) * (kept * shrink));
+        add_viscosity(block, tets, start, f, c, volume, q);
         move(block, tets, q, nodes);
     }
 }

@@ -59,7 +59,7 @@ class SoftSolver {
 
     int add_body(const Rows& nodes, const Rows& rest, const Ids& tets, const Column& masses,
                  const Ids& samples, const Ids& triangles, double young, double poisson,
-                 double damping_rate, double friction, double spacing) {
+                 double damping_s, double damping_rate, double friction, double spacing) {
         soft::BodySpec spec;
         spec.nodes = points(nodes);
         spec.rest = points(rest);
@@ -75,6 +75,7 @@ class SoftSolver {
         for (const double mass : spec.masses) need(mass > 0, "a node has no mass");
         spec.young = young;
         spec.poisson = poisson;
+        spec.damping_s = damping_s;
         spec.damping_rate = damping_rate;
         spec.friction = friction;
         spec.spacing = spacing;
@@ -197,7 +198,8 @@ NB_MODULE(_soft, m) {
         .def(nb::init<double, int, double, const char*>(), "period_s"_a, "num_substeps"_a,
              "gravity"_a, "isa"_a = "auto")
         .def("add_body", &SoftSolver::add_body, "nodes"_a, "rest"_a, "tets"_a, "masses"_a,
-             "samples"_a, "triangles"_a, "young"_a, "poisson"_a, "damping_rate"_a, "friction"_a,
+             "samples"_a, "triangles"_a, "young"_a, "poisson"_a, "damping_s"_a,
+             "damping_rate"_a, "friction"_a,
              "spacing"_a)
         .def("add_collider", &SoftSolver::add_collider, "planes"_a, "corners"_a, "pose"_a,
              "friction"_a, "mass"_a, "inertia"_a)

@@ -74,10 +74,9 @@ void Solver::step(const std::vector<int>& driven, const std::vector<Pose>& poses
             solve_contacts(body, colliders, step_s);
             body.relax(*kernels_);
             body.finish(step_s);
+            body.damp(step_s);
         }
     }
-    for (Body& body : bodies)
-        if (!body.lost) body.damp(period_s_);
 }
 
 }  // namespace soft

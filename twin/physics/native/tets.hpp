@@ -18,6 +18,7 @@ struct alignas(32) TetBlock {
     float b[9][kLanes];        // inverse of the edge matrix at rest, row by row [1/m]
     float z[6][kLanes];        // xx, xy, xz, yy, yz, zz of the local step's 3 x 3 matrix
     float stress[9][kLanes];   // first Piola-Kirchhoff stress kept from visit to visit [Pa]
+    float viscosity[kLanes];   // stress that takes away a change of shape within a substep [Pa]
     float kept[kLanes];        // share of the stress that the next substep begins with
     float step_volume[kLanes]; // rest volume times the square of the substep [m^3 s^2]
 };
@@ -26,7 +27,8 @@ struct Kernels {
     // Moves the nodes by what the kept stress does in one substep.
     void (*apply_stress)(TetBlock* blocks, int num_blocks, float* nodes);
     // One visit of every block: stress and nodes come nearer to the material's law.
-    void (*relax)(TetBlock* blocks, int num_blocks, float* nodes, Material material);
+    void (*relax)(TetBlock* blocks, int num_blocks, float* nodes, const float* start,
+                  Material material);
 };
 
 namespace base {
