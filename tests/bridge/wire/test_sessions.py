@@ -101,6 +101,32 @@ def test_more_requests_than_may_wait_are_refused_at_once(
     assert answers == [b"plan", b"plan"]
 
 
+def test_several_requests_are_answered_side_by_side_where_asked_for(
+    router: WireSession, client: WireSession
+) -> None:
+    """Three handlers meet each other, which they could not one after another."""
+    together = threading.Barrier(3, timeout=5.0)
+
+    def handler(payload: bytes) -> bytes:
+        together.wait()
+        return payload
+
+    service = router.serve("cell/meet", handler, side_by_side=3)
+    answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    askers = [
+        threading.Thread(
+            target=lambda name=name: answers.put(client.query("cell/meet", name, timeout_s=5.0))
+        )
+        for name in (b"a", b"b", b"c")
+    ]
+    for asker in askers:
+        asker.start()
+    for asker in askers:
+        asker.join(10.0)
+    assert sorted(answers.get(timeout=1.0) for _ in askers) == [b"a", b"b", b"c"]
+    service.close()
+
+
 def test_a_request_nobody_answers_is_reported(client: WireSession) -> None:
     with pytest.raises(NoReplyError, match="nobody answered on rec/other"):
         client.query("rec/other", b"", timeout_s=0.5)

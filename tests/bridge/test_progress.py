@@ -1,0 +1,33 @@
+"""What long work tells about itself without a terminal: how much is done, how long it will take."""
+
+import pytest
+
+from bridge import terminal
+from bridge.terminal import Output
+
+
+@pytest.mark.parametrize(
+    ("seconds", "done", "total", "told"),
+    [
+        (20.0, 2, 6, "replay: 2 of 6, about 40 s left, trial_1\n"),
+        (60.0, 10, 100, "replay: 10 of 100, about 9 min left, trial_1\n"),
+        (60.0, 1, 241, "replay: 1 of 241, about 4.0 h left, trial_1\n"),
+        (30.0, 0, 5, "replay: 0 of 5 trial_1\n"),
+    ],
+)
+def test_a_line_says_how_much_is_left_judging_by_what_it_took(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    seconds: float,
+    done: int,
+    total: int,
+    told: str,
+) -> None:
+    clock = [100.0]
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: clock[0])
+    with Output().progress("replay", total) as advance:
+        clock[0] += seconds
+        advance(done, "trial_1")
+        clock[0] += 1.0
+        advance(done + 1, "too soon for another line")
+    assert capsys.readouterr().err == told
