@@ -65,7 +65,7 @@ class SoftWorld:
         self._num_pieces = 0
         self._links: list[str] = []
         self._link_pieces: dict[str, list[int]] = {}
-        self._pushes: Float[np.ndarray, "num_pieces 12"] = np.zeros((0, 12))
+        self._pushes: Float[np.ndarray, "num_pieces 15"] = np.zeros((0, 15))
 
     def add_static(
         self, size_m: Float[np.ndarray, "3"], T_base_box: Float[np.ndarray, "4 4"]
@@ -221,11 +221,15 @@ class SoftWorld:
         for body, piece in self._free.items():
             change = self._pushes[piece, 6:]
             if change.any():
+                p, q = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
+                pybullet.resetBasePositionAndOrientation(
+                    body, (np.array(p) + change[6:]).tolist(), q, physicsClientId=self._client
+                )
                 v, omega = pybullet.getBaseVelocity(body, physicsClientId=self._client)
                 pybullet.resetBaseVelocity(
                     body,
                     (np.array(v) + change[:3]).tolist(),
-                    (np.array(omega) + change[3:]).tolist(),
+                    (np.array(omega) + change[3:6]).tolist(),
                     physicsClientId=self._client,
                 )
 

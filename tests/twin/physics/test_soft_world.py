@@ -29,7 +29,7 @@ def at(x: float, y: float, z: float) -> np.ndarray:
 
 def closed_on(world: World, model: SoftModel, steps: int = 120) -> np.ndarray:
     """Close the fingers on a body between them; where the tool is."""
-    world.reset_robot(HOME, 0.08)
+    world.reset_robot(HOME, 0.043)
     T_tcp = world.T_base_link("tcp")
     world.add_soft("toy", model, T_tcp)
     for _ in range(steps):

@@ -47,6 +47,7 @@ class Collider {
         at_ = at_ + by;
         drift_ = drift_ + by;
     }
+    Double3 drift() const { return drift_; }  // what its position changed by in this step
     bool dynamic() const { return inverse_mass_ > 0.0; }
     double inverse_mass() const { return inverse_mass_; }
 

@@ -54,12 +54,14 @@ void apply_stress(TetBlock* blocks, int num_blocks, float* nodes) {
     }
 }
 
-// Stress against the change of shape in this substep: symmetric part of dF F^-1, so that a turn costs
-// nothing. It acts once and is not kept.
+// Stress against the change of shape in this substep: the symmetric part D of dF cof(F)^T, times
+// cof(F). A turn costs nothing, and the power is D : D whatever F is, inside out included. It acts
+// once and is not kept.
 inline void add_viscosity(const TetBlock& block, const Tets& tets, const float* start,
-                          const Lanes3 f[3], const Lanes3 c[3], Lanes volume, Lanes q[9]) {
-    const Lanes least = Lanes{} + kCrushed;
-    const Lanes scale = load(block.viscosity) / (volume > least ? volume : least);
+                          const Lanes3 c[3], Lanes turned, Lanes q[9]) {
+    const Lanes usual = Lanes{} + 3.0f;
+    const Lanes larger = (turned > usual ? turned : usual) / usual;
+    const Lanes scale = load(block.viscosity) / (larger * larger);
     Lanes3 moved[4];
     for (int k = 0; k < 4; ++k) {
         Lanes3 from;
@@ -71,7 +73,6 @@ inline void add_viscosity(const TetBlock& block, const Tets& tets, const float* 
     Lanes3 d[3];
     for (int j = 0; j < 3; ++j)
         d[j] = d1 * load(block.b[j]) + d2 * load(block.b[3 + j]) + d3 * load(block.b[6 + j]);
-    // Rows of dF cof^T, where cof F / det F is the inverse's transpose.
     const Lanes xx = d[0].x * c[0].x + d[1].x * c[1].x + d[2].x * c[2].x;
     const Lanes yy = d[0].y * c[0].y + d[1].y * c[1].y + d[2].y * c[2].y;
     const Lanes zz = d[0].z * c[0].z + d[1].z * c[1].z + d[2].z * c[2].z;
@@ -82,9 +83,9 @@ inline void add_viscosity(const TetBlock& block, const Tets& tets, const float* 
     const Lanes zx = 0.5f * (d[0].z * c[0].x + d[1].z * c[1].x + d[2].z * c[2].x +
                              d[0].x * c[0].z + d[1].x * c[1].z + d[2].x * c[2].z);
     for (int j = 0; j < 3; ++j) {
-        q[j] += scale * (xx * f[j].x + xy * f[j].y + zx * f[j].z);
-        q[3 + j] += scale * (xy * f[j].x + yy * f[j].y + yz * f[j].z);
-        q[6 + j] += scale * (zx * f[j].x + yz * f[j].y + zz * f[j].z);
+        q[j] += scale * (xx * c[j].x + xy * c[j].y + zx * c[j].z);
+        q[3 + j] += scale * (xy * c[j].x + yy * c[j].y + yz * c[j].z);
+        q[6 + j] += scale * (zx * c[j].x + yz * c[j].y + zz * c[j].z);
     }
 }
 
@@ -125,7 +126,7 @@ void relax(TetBlock* blocks, int num_blocks, float* nodes, const float* start, M
         Lanes q[9] = {s[0].x, s[1].x, s[2].x, s[0].y, s[1].y, s[2].y, s[0].z, s[1].z, s[2].z};
         const Lanes kept = load(block.kept);
         for (int k = 0; k < 9; ++k) store(block.stress[k], (load(block.stress[k]) + q[k]) * (kept * shrink));
-        add_viscosity(block, tets, start, f, c, volume, q);
+        add_viscosity(block, tets, start, c, turned, q);
         move(block, tets, q, nodes);
     }
 }

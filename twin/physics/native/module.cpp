@@ -3,6 +3,8 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
+#include <limits>
 #include <memory>
 #include <stdexcept>
 
@@ -129,6 +131,8 @@ class SoftSolver {
             data[3 * i + 1] = one.origin.y + one.p[4 * i + 1];
             data[3 * i + 2] = one.origin.z + one.p[4 * i + 2];
         }
+        if (one.lost)
+            std::fill_n(data, 3 * one.num_nodes, std::numeric_limits<double>::quiet_NaN());
         return rows;
     }
 
@@ -152,12 +156,12 @@ class SoftSolver {
         }
     }
 
-    // Momentum and its moment about the frame's origin; then changes of speed and of turning.
+    // Momentum and its moment about the frame's origin; changes of speed, of turning, of place.
     nb::ndarray<nb::numpy, double> pushes() {
         double* data = nullptr;
-        auto rows = table(solver_->colliders.size(), 12, data);
+        auto rows = table(solver_->colliders.size(), 15, data);
         for (const soft::Collider& one : solver_->colliders)
-            for (const soft::Double3& v : {one.push, one.turn, one.dv, one.domega}) {
+            for (const soft::Double3& v : {one.push, one.turn, one.dv, one.domega, one.drift()}) {
                 *data++ = v.x;
                 *data++ = v.y;
                 *data++ = v.z;
