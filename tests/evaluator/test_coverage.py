@@ -76,10 +76,10 @@ def test_simulated_coverage_of_fisher_is_the_stored_one() -> None:
         return correlation.fisher_interval(correlation.pearson(*cells), len(cells[0]))
 
     rng = np.random.default_rng(1)
-    found = simulate.of_cells(make, "pearson", 10, simulate.POPULATIONS[:3], draws=500, rng=rng)
+    found = simulate.of_cells(make, "pearson", 10, simulate.POPULATIONS[:2], draws=100, rng=rng)
     known = stored.coverage_of("fisher-z", 10)
     assert known is not None
-    assert abs(found.mean - known.mean) < 0.04  # 1500 draws: 0.006 each side, and fewer truths
+    assert abs(found.mean - known.mean) < 0.06  # 200 draws: 0.016, and fewer truths
 
 
 def test_correlated_cells_are_drawn_as_they_are_described() -> None:

@@ -114,9 +114,9 @@ print(sum(count for _, count in counted), last - first)
 
 
 @pytest.mark.slow
-def test_a_million_trials_need_no_more_memory_than_a_few_thousand(tmp_path: Path) -> None:
-    small = write(tmp_path / "small.csv", 100_000)
-    large = write(tmp_path / "large.csv", 1_000_000)
+def test_half_a_million_trials_need_no_more_memory_than_a_few_thousand(tmp_path: Path) -> None:
+    small = write(tmp_path / "small.csv", 50_000)
+    large = write(tmp_path / "large.csv", 500_000)
     done = subprocess.run(
         [sys.executable, "-c", CHILD, str(small), str(large)],
         capture_output=True,
@@ -125,5 +125,5 @@ def test_a_million_trials_need_no_more_memory_than_a_few_thousand(tmp_path: Path
         check=True,
     )
     count, grown_kib = map(int, done.stdout.split())
-    assert count == 1_000_000
-    assert grown_kib < 8 * 1024  # the ids alone would take 60 MB
+    assert count == 500_000
+    assert grown_kib < 8 * 1024  # the ids alone would take 30 MB
