@@ -34,6 +34,9 @@ class ReplayConfig:
     """Bodies that may touch may not lie deeper in each other than this [m]."""
     pre_grasp_depth_m: float = 0.002
     """Deepest overlap with an object before the first grasp that localisation may explain [m]."""
+    pre_grasp_soft_depth_m: float = 0.004
+    """The same for soft objects, which give way. A finger is 12 mm thick: what it is pushed into
+    lies at most 6 mm deep in it [m]."""
     moved_m: float = 0.005
     """An object counts as carried or pushed once it is this far from its start [m]."""
     path_step_s: float = 0.04

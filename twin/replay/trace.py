@@ -57,7 +57,7 @@ def trace_of_result(result: ReplayResult, side: str, end_ns: int) -> Trace:
             name: longest(stretches_ns(result.stamps_ns, touches))
             for name, touches in result.finger_contact.items()
         },
-        end_ns=end_ns,
+        end_ns=min(end_ns, int(result.stamps_ns[-1])),
     )
 
 
@@ -83,18 +83,19 @@ def trace_of_file(path: Path, side: str, start_ns: int, end_ns: int) -> Trace:
         if record["source"] == "physics" and first == GRIPPER:
             span = (int(record["stamp_ns"]) - start_ns, int(record["end_ns"]) - start_ns)
             spans.setdefault(second, []).append(span)
+    tool_track = _since(streams.pose_track(episode, tool), start_ns)
     objects = {
         name: _since(streams.pose_track(episode, topic), start_ns)
         for name, topic in streams.object_pose_topics(episode).items()
     }
     return Trace(
         side=side,
-        tool=_since(streams.pose_track(episode, tool), start_ns),
+        tool=tool_track,
         width_times_ns=width.stamps_ns - start_ns,
         width_m=width.position[:, 0],
         objects=objects,
         touches={name: longest(spans.get(name, [])) for name in objects},
-        end_ns=end_ns,
+        end_ns=min(end_ns, int(tool_track.stamps_ns[-1])),  # a burst body ends it early
     )
 
 

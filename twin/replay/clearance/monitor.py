@@ -16,7 +16,7 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan, Stage
-from twin.replay.clearance.bodies import Solid, box_solid, group_of, placement_of
+from twin.replay.clearance.bodies import GRIPPER, Solid, box_solid, group_of, placement_of
 from twin.replay.clearance.nodes import planes_of
 from twin.replay.clearance.surroundings import Pair, Surroundings
 from twin.replay.clearance.sweep import MAX_LEAP_M, Reach, State, half_way, object_travel_m
@@ -117,7 +117,7 @@ class ClearanceMonitor:
         self.hulls.place(state.joints_rad, state.width_m)
         moved = [name for name, T in state.Ts_base_object.items() if self._has_moved(name, T)]
         soft = {n: p for n, p in state.nodes_m.items() if self._nodes_have_moved(n, p)}
-        allowed = _allowed(active_stage(self.stages, state.t_ns))
+        allowed = allowed_pairs(self.stages, state.t_ns)
         distances, cut = self._around.measure(
             self._links + [self._objects[name] for name in moved],
             [state.Ts_base_object[name] for name in moved],
@@ -188,6 +188,9 @@ class ClearanceMonitor:
         for name, T in self._scene.movable().items():
             model = self._scene.task.objects[name]
             solid = self._objects[name]
+            limit_m = self.config.pre_grasp_depth_m
+            if model.soft is not None:  # it gives way, and is localised less exactly
+                limit_m = self.config.pre_grasp_soft_depth_m
             points = None if model.mesh is None else se3.apply(T, object_mesh(model).vertices_m)
             for index, link in enumerate(self._links):
                 R, t = self.hulls.rotations[index], self.hulls.translations[index]
@@ -200,7 +203,7 @@ class ClearanceMonitor:
                         link.shape, self.hulls.placements[index], solid.shape, placement_of(T)
                     )
                 )
-                if distance < -self.config.pre_grasp_depth_m:
+                if distance < -limit_m:
                     self._fail(t_ns, "pre_grasp_penetration", link.body, name, distance)
 
     def contacts(self) -> list[Contact]:
@@ -273,8 +276,20 @@ def active_stage(stages: tuple[Stage, ...], t_ns: int) -> Stage | None:
     return stages[0] if stages else None
 
 
-def _allowed(stage: Stage | None) -> set[frozenset[str]]:
-    return set() if stage is None else {frozenset(pair) for pair in stage.allowed_contacts}
+def allowed_pairs(stages: tuple[Stage, ...], t_ns: int) -> set[frozenset[str]]:
+    """Pairs that may touch: those of the active stage, and what earlier stages let go of.
+
+    Where a stage released an object, it may go on lying on what that stage allowed it to touch; the
+    gripper's own leave ends with the stage.
+    """
+    active = active_stage(stages, t_ns)
+    if active is None:
+        return set()
+    left = [stage for stage in stages[: stages.index(active)] if stage.release]
+    stays = {frozenset(pair) for stage in left for pair in stage.allowed_contacts}
+    return {pair for pair in stays if GRIPPER not in pair} | {
+        frozenset(pair) for pair in active.allowed_contacts
+    }
 
 
 def _may_touch(body: str, other: str, allowed: set[frozenset[str]]) -> bool:
