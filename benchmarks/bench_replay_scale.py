@@ -27,10 +27,14 @@ def replay(run: Path, *options: str) -> list[str]:
     return [sys.executable, str(ROOT / "robot_gst.py"), "replay", str(run), "--quiet", *options]
 
 
+def forget(run: Path) -> None:
+    shutil.rmtree(run / "derived", ignore_errors=True)
+    (run / "derived").mkdir()
+
+
 def timed(run: Path, *options: str) -> float:
     """Replay a run from nothing [s]."""
-    shutil.rmtree(run / "derived")
-    (run / "derived").mkdir()
+    forget(run)
     before = time.monotonic()
     subprocess.run(replay(run, *options), check=True, stdout=subprocess.DEVNULL)
     return time.monotonic() - before
@@ -46,8 +50,7 @@ def digests(run: Path) -> dict[str, str]:
 
 def killed_and_resumed(run: Path, whole_s: float, *options: str) -> tuple[float, int]:
     """Kill a replay half way, go on; how long both took together, and files made twice."""
-    shutil.rmtree(run / "derived")
-    (run / "derived").mkdir()
+    forget(run)
     before = time.monotonic()
     running = subprocess.Popen(replay(run, *options), stdout=subprocess.DEVNULL)
     time.sleep(0.6 * whole_s)

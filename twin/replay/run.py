@@ -41,6 +41,7 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
     with runner_for(config) as runner:
         jobs, skipped = _all_jobs(run, scene_hash, config, runner, output)
         rows, todo = _there_already(jobs, config)
+        run.derived_dir.mkdir(parents=True, exist_ok=True)  # Ray asks each node whether it is there
         with output.progress("replay", len(todo)) as advance:
             for done, row in enumerate(_replayed(todo, runner, output), start=1):
                 rows.append(row)
