@@ -84,7 +84,7 @@ def with_gripper(
     return shown
 
 
-@pytest.mark.parametrize("depth_m", [0.0, 0.15])
+@pytest.mark.parametrize("depth_m", [0.0, 0.25])
 def test_a_gripper_before_a_moving_camera_is_found(
     views: list[TrainingView], depth_m: float
 ) -> None:
