@@ -8,6 +8,7 @@ import ipaddress
 import os
 import secrets
 import socket
+import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -55,6 +56,7 @@ class RayRunner:
         self._address, self._workers = address, workers
         self._ray: Any = None
         self._before: dict[str, str | None] = {}
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
 
     def __enter__(self) -> "RayRunner":
         """Connect, or start a cluster on the loopback address.
@@ -65,8 +67,15 @@ class RayRunner:
             RayClusterError: When nobody answers there, or not to our token.
         """
         self._before = {name: os.environ.get(name) for name in (MODE, TOKEN, TOKEN_PATH)}
+        if self._address == LOCAL:
+            # Ray leaves its logs behind, a hundred files for each start.
+            self._folder = tempfile.TemporaryDirectory(
+                prefix="gst-ray-", ignore_cleanup_errors=True
+            )
         try:
-            self._ray = _connect(self._address, self._workers)
+            self._ray = _connect(
+                self._address, self._workers, None if self._folder is None else self._folder.name
+            )
         except BaseException:
             self._restore()
             raise
@@ -102,6 +111,9 @@ class RayRunner:
         self._restore()
 
     def _restore(self) -> None:
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
         for name, value in self._before.items():
             if value is None:
                 os.environ.pop(name, None)
@@ -109,12 +121,12 @@ class RayRunner:
                 os.environ[name] = value
 
 
-def _connect(address: str, workers: int) -> Any:
+def _connect(address: str, workers: int, folder: str | None) -> Any:
     settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address == LOCAL:
         os.environ[TOKEN] = secrets.token_hex(32)
         os.environ.pop(TOKEN_PATH, None)
-        settings |= {"num_cpus": workers, "include_dashboard": False}
+        settings |= {"num_cpus": workers, "include_dashboard": False, "_temp_dir": folder}
     else:
         _check_token()
     if address == LOCAL or is_loopback(address):
