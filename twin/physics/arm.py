@@ -17,7 +17,8 @@ from twin.physics.engine import pybullet
 SLOWEST_M_S = 1e-4
 """Stalled fingers still creep this fast: PyBullet takes a speed of 0 for no limit."""
 
-_Vector = Float[np.ndarray, "3"]
+LinkPose = tuple[tuple[float, ...], tuple[float, ...]]
+"""Position [m] and quaternion xyzw of a link's frame, as PyBullet has them."""
 
 
 class PhysicsError(TwinError):
@@ -69,7 +70,7 @@ class Arm:
         self._joints: dict[str, int] = {}
         self.links: dict[str, int] = {}
         self._efforts: dict[str, float] = {}
-        self._axes: dict[str, _Vector] = {}
+        self._axes: dict[str, tuple[float, ...]] = {}
         parents: dict[str, int] = {}
         client = self._client
         for index in range(pybullet.getNumJoints(self.id, physicsClientId=client)):
@@ -77,7 +78,7 @@ class Arm:
             self._joints[item[1].decode()] = index
             self.links[item[12].decode()] = index
             self._efforts[item[1].decode()] = item[10]
-            self._axes[item[12].decode()] = np.array(item[13])
+            self._axes[item[12].decode()] = tuple(item[13])
             parents[item[12].decode()] = item[16]
         missing = [name for name in (*ARM_JOINTS, *FINGER_JOINTS) if name not in self._joints] + [
             name for name in (TCP_FRAME,) if name not in self.links
@@ -193,9 +194,7 @@ class Arm:
         states = pybullet.getJointStates(self.id, self._fingers, physicsClientId=self._client)
         return float(sum(state[0] for state in states))
 
-    def link_poses(
-        self, links: Sequence[int]
-    ) -> list[tuple[tuple[float, ...], tuple[float, float, float, float]]]:
+    def link_poses(self, links: Sequence[int]) -> list[LinkPose]:
         """Position [m] and quaternion xyzw of the frames of links, base frame."""
         states = pybullet.getLinkStates(
             self.id, links, computeForwardKinematics=1, physicsClientId=self._client
@@ -207,12 +206,12 @@ class Arm:
         p, (x, y, z, w) = self.link_poses([self.links[link]])[0]
         return se3.transform_from(np.array([w, x, y, z]), np.array(p))
 
-    def opening_axis(self, link: str) -> Float[np.ndarray, "3"]:
+    def opening_axis(self, link: str) -> tuple[float, ...]:
         """Direction in which a finger opens, in its own frame."""
         return self._axes[link]
 
     def push(
-        self, link: str | None, force_N: Float[np.ndarray, "3"], point_m: Float[np.ndarray, "3"]
+        self, link: str | None, force_N: tuple[float, ...], point_m: tuple[float, ...]
     ) -> None:
         """Apply a force at a point of the base frame during the next step.
 
@@ -224,8 +223,8 @@ class Arm:
         pybullet.applyExternalForce(
             self.id,
             self._finger_parent if link is None else self.links[link],
-            force_N.tolist(),
-            point_m.tolist(),
+            force_N,
+            point_m,
             pybullet.WORLD_FRAME,
             physicsClientId=self._client,
         )

@@ -208,7 +208,7 @@ def _lumped(
     """A quarter of each tetrahedron's volume at each of its nodes."""
     shares = np.zeros(len(nodes))
     np.add.at(shares, tets, volumes_m3(nodes.astype(np.float64), tets)[:, None] / 4)
-    return (shares / shares.sum()).astype(np.float32)
+    return np.asarray((shares / shares.sum()).astype(np.float32))
 
 
 def _soft_model(

@@ -12,7 +12,7 @@ LEAST_MASS = 0.4
 
 CRITICAL = 2.0
 """The slowest deformation is damped at most critically: at twice its frequency. The viscosity of
-single tetrahedra reaches only short waves, one visit in each substep being too few for long ones."""
+single tetrahedra reaches only short waves: one visit in each substep is too few for long ones."""
 
 
 def add_body(

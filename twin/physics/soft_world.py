@@ -8,14 +8,15 @@ on boxes as velocity, on the arm as a force, on the fingers as a slower drive.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int32
 
 from bridge.geometry import se3
-from twin.physics.arm import Arm
+from twin.physics.arm import Arm, LinkPose
 from twin.physics.colliders import ConvexPiece, box_piece, link_pieces
 from twin.physics.config import PhysicsConfig
 from twin.physics.description import Hulls
 from twin.physics.engine import pybullet
+from twin.physics.reaction import Reaction
 from twin.physics.soft import SoftHealth, SoftModel, health_of
 from twin.physics.soft_shape import Skin, bind_points, rigid_fit
 from twin.physics.soft_solver import SoftSolver, add_body
@@ -65,6 +66,10 @@ class SoftWorld:
         self._num_pieces = 0
         self._links: list[str] = []
         self._link_pieces: dict[str, list[int]] = {}
+        self._link_ids: list[int] = []
+        self._reaction: Reaction | None = None
+        self._states: dict[str, LinkPose] = {}
+        self._pushed: list[int] = []
         self._pushes: Float[np.ndarray, "num_pieces 15"] = np.zeros((0, 15))
 
     def add_static(
@@ -138,16 +143,23 @@ class SoftWorld:
             friction = config.finger_friction if finger else config.surface_friction
             self._links.append(link)
             self._link_pieces[link] = [
-                self._add(_Placed(piece=piece, pose=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), friction=friction))
+                self._add(
+                    _Placed(
+                        piece=piece, pose=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), friction=friction
+                    )
+                )
                 for piece in pieces
             ]
+        self._link_ids = [self._arm.links[link] for link in self._links]
+        link_of = {piece: link for link in self._links for piece in self._link_pieces[link]}
+        self._reaction = Reaction(self._arm, link_of, self._period_s)
         self.place_links()
 
     def place_links(self) -> None:
         """Take the robot's links to be where they are now, without having moved there."""
         if self._solver is None:
             return
-        poses = self._arm.link_poses([self._arm.links[link] for link in self._links])
+        poses = self._arm.link_poses(self._link_ids)
         for link, (p, q) in zip(self._links, poses, strict=True):
             for piece in self._link_pieces[link]:
                 self._solver.place(piece, np.array([*p, *q]))
@@ -174,64 +186,48 @@ class SoftWorld:
         )
 
     def push_rigid(self) -> None:
-        """Hand to the rigid world what the soft bodies did in the last step."""
-        if self._solver is None or not len(self._pushes):
-            return
-        fingers = [link for link in self._links if self._arm.links[link] in self._arm.finger_links]
-        apart, totals = 0.0, np.zeros(6)
-        poses = dict(
-            zip(
-                self._links,
-                self._arm.link_poses([self._arm.links[link] for link in self._links]),
-                strict=True,
-            )
-        )
-        for link in self._links:
-            push = self._pushes[self._link_pieces[link]][:, :6].sum(axis=0) / self._period_s
-            if not push.any():
-                continue
-            p, (x, y, z, w) = poses[link]
-            if link in fingers:
-                R = se3.rotation_from_quaternion(np.array([w, x, y, z]))
-                apart += float(push[:3] @ R @ self._arm.opening_axis(link)) / len(fingers)
-                totals[:3] += push[:3]
-                totals[3:] += push[3:] + np.cross(p, push[:3])
-            else:
-                self._arm.push(link, push[:3], _line_of_action(push, np.array(p)))
-        if totals.any():
-            self._arm.push(None, totals[:3], _line_of_action(totals, np.zeros(3)))
-        self._arm.yield_fingers(apart)
+        """Hand to the robot what the soft bodies did in the last step."""
+        if self._reaction is not None and self._states:
+            self._reaction.apply(self._pushed, self._pushes, self._states)
 
     def step(self) -> None:
         """Advance the soft bodies to where PyBullet is."""
         if self._solver is None:
             return
-        poses, driven = [], []
-        states = self._arm.link_poses([self._arm.links[link] for link in self._links])
-        for link, (p, q) in zip(self._links, states, strict=True):
-            for piece in self._link_pieces[link]:
-                driven.append(piece)
-                poses.append((*p, *q))
-        for body, piece in self._free.items():
+        states = self._arm.link_poses(self._link_ids)
+        self._states = dict(zip(self._links, states, strict=True))
+        poses = [
+            (*p, *q)
+            for link, (p, q) in self._states.items()
+            for _ in range(len(self._link_pieces[link]))
+        ]
+        for body in self._free:
             p, q = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
-            driven.append(piece)
             poses.append((*p, *q))
-        self._solver.step(np.array(driven, dtype=np.int32), np.array(poses))
-        self._pushes = self._solver.pushes()
+        self._solver.step(self._driven(), np.array(poses))
+        self._pushed, self._pushes = self._solver.pushed(), self._solver.pushes()
         for body, piece in self._free.items():
             change = self._pushes[piece, 6:]
             if change.any():
-                p, q = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
-                pybullet.resetBasePositionAndOrientation(
-                    body, (np.array(p) + change[6:]).tolist(), q, physicsClientId=self._client
-                )
-                v, omega = pybullet.getBaseVelocity(body, physicsClientId=self._client)
-                pybullet.resetBaseVelocity(
-                    body,
-                    (np.array(v) + change[:3]).tolist(),
-                    (np.array(omega) + change[3:6]).tolist(),
-                    physicsClientId=self._client,
-                )
+                self._change(body, change)
+
+    def _driven(self) -> Int32[np.ndarray, " num_driven"]:
+        pieces = [piece for link in self._links for piece in self._link_pieces[link]]
+        return np.array([*pieces, *self._free.values()], dtype=np.int32)
+
+    def _change(self, body: int, change: Float[np.ndarray, "9"]) -> None:
+        """Add to the speed, the turning and the place of a box."""
+        p, q = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
+        v, omega = pybullet.getBaseVelocity(body, physicsClientId=self._client)
+        pybullet.resetBasePositionAndOrientation(
+            body, (np.array(p) + change[6:]).tolist(), q, physicsClientId=self._client
+        )
+        pybullet.resetBaseVelocity(
+            body,
+            (np.array(v) + change[:3]).tolist(),
+            (np.array(omega) + change[3:6]).tolist(),
+            physicsClientId=self._client,
+        )
 
     def nodes_m(self, object_id: str) -> Float[np.ndarray, "num_nodes 3"]:
         """Where a body's nodes are."""
@@ -279,11 +275,3 @@ def _pose(T: Float[np.ndarray, "4 4"]) -> tuple[float, ...]:
     q, p = se3.split(T)
     w, x, y, z = q.tolist()
     return (*p.tolist(), x, y, z, w)
-
-
-def _line_of_action(
-    wrench: Float[np.ndarray, "6"], origin_m: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "3"]:
-    """A point where the force alone has the moment about the origin, but for twist about itself."""
-    force, moment = wrench[:3], wrench[3:]
-    return np.asarray(origin_m + np.cross(force, moment) / float(force @ force))

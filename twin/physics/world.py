@@ -1,4 +1,4 @@
-"""One simulated cell: a robot, boxes that stand and boxes that move in PyBullet, soft bodies beside.
+"""One simulated cell: the robot and boxes in PyBullet, soft bodies beside them on one clock.
 
 Measured choices (design page on physics): ``deterministicOverlappingPairs`` always on, 240 Hz with
 200 solver iterations (slip p90 1.7 mm, 24 of 24 grasps held), a gear of ratio -1 between the
@@ -40,7 +40,7 @@ class World:
             PhysicsError: When PyBullet does not load the description or joints are missing.
         """
         self.config = config
-        self._client = pybullet.connect(pybullet.DIRECT)
+        self._client = int(pybullet.connect(pybullet.DIRECT))
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=1.0 / config.rate_hz,
             numSolverIterations=config.solver_iterations,

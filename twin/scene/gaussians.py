@@ -140,17 +140,17 @@ def view_directions(
 
 def turned_harmonics(
     harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"],
-    R_new_old: Float[np.ndarray, "3 3"],
+    R_new_old: Float[np.ndarray, "*splats 3 3"],
 ) -> Float32[np.ndarray, "num_splats num_harmonics 3"]:
     """The harmonics of Gaussians that were turned with all that shines on them.
 
-    Degree 1 is a vector for each colour, sqrt(3 / (4 pi)) v . d with v = (-h_2, -h_0, h_1), and
-    turns like one.
+    One rotation for all of them, or one for each. Degree 1 is a vector for each colour,
+    sqrt(3 / (4 pi)) v . d with v = (-h_2, -h_0, h_1), and turns like one.
     """
     if harmonics.shape[1] == 0:
         return harmonics
     v = np.stack([-harmonics[:, 2], -harmonics[:, 0], harmonics[:, 1]], axis=1)
-    x, y, z = np.moveaxis(np.einsum("ij,njc->nic", R_new_old, v), 1, 0)
+    x, y, z = np.moveaxis(R_new_old @ v, 1, 0)
     return as_float32(np.stack([-y, z, -x], axis=1))
 
 

@@ -199,17 +199,17 @@ def test_a_soft_body_carries_a_rigid_one(box_of_cells: Boxes) -> None:
     cube = solver.add_collider(
         piece.planes, piece.corners_m, pose(0, 0, 0.063), 0.8, mass, np.full(3, 1.3e-5)
     )
-    z, v = 0.063, 0.0
+    z, v, weights = 0.063, 0.0, []
     for _ in range(240):
         v -= GRAVITY * PERIOD_S
         z += v * PERIOD_S
         solver.step(np.array([cube], dtype=np.int32), pose(0, 0, z)[None])
         v += solver.pushes()[cube, 8]
         z += solver.pushes()[cube, 14]
+        weights.append(solver.pushes()[cube, 2] / PERIOD_S)
     assert abs(v) < 0.05
     assert 0.055 < z < 0.0635
-    weight = solver.pushes()[cube, 2] / PERIOD_S
-    assert weight == pytest.approx(mass * GRAVITY, rel=0.5)
+    assert np.mean(weights[-120:]) == pytest.approx(mass * GRAVITY, rel=0.1)
 
 
 _SCRIPT = """

@@ -169,6 +169,16 @@ class SoftSolver {
         return rows;
     }
 
+    std::vector<int> pushed() {
+        std::vector<int> found;
+        for (std::size_t k = 0; k < solver_->colliders.size(); ++k) {
+            const soft::Double3& push = solver_->colliders[k].push;
+            if (push.x != 0.0 || push.y != 0.0 || push.z != 0.0)
+                found.push_back(static_cast<int>(k));
+        }
+        return found;
+    }
+
     std::vector<int> touched(int index) {
         const soft::Body& one = body(index);
         std::vector<int> found;
@@ -213,6 +223,7 @@ NB_MODULE(_soft, m) {
         .def("velocities", &SoftSolver::velocities, "body"_a)
         .def("set_velocities", &SoftSolver::set_velocities, "body"_a, "velocities"_a)
         .def("pushes", &SoftSolver::pushes)
+        .def("pushed", &SoftSolver::pushed)
         .def("touched", &SoftSolver::touched, "body"_a)
         .def("num_substeps", &SoftSolver::num_substeps)
         .def("is_lost", &SoftSolver::is_lost, "body"_a)
