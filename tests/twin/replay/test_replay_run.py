@@ -19,7 +19,7 @@ from bridge.errors import UsageError
 from bridge.terminal import Output
 from twin.replay import run as replay_run_module
 from twin.replay.config import ReplayConfig, ReplayRunConfig
-from twin.replay.job import ReplayJob
+from twin.replay.job import ReplayJob, divergence_of
 from twin.replay.result import ReplayResult
 from twin.replay.run import count_verdicts, describe_run, replay_run
 from twin.replay.starts import StartState, StartStates
@@ -104,6 +104,14 @@ def test_every_plan_and_every_execution_becomes_one_episode(
     assert summary["scene_hash"] is None
     assert len(run.derived("*.replay.*")) == 4
     _check_file(run, "trial_0001.replay.planned.dynamic.round-1.pybullet.*")
+    (execution,) = summary["executions"]
+    assert (execution["planned"], execution["executed"]) == (True, True)
+    assert execution["recorded"] == "unknown", "nobody labelled it"
+    assert execution["lag_s"] is not None, "compared with the plan, replayed before"
+    (path,) = run.derived("trial_0001.replay.executed.dynamic.*")
+    record = divergence_of(Episode.open(path))
+    assert record is not None
+    assert all(item["between"] != ["planned", "executed"] for item in record["partings"])
 
     stamps = {path: path.stat().st_mtime_ns for path in run.derived()}
     again = replay_run(run, ReplayRunConfig(replay=QUICK), QUIET)
@@ -145,6 +153,7 @@ def _check_file(run: RunFolder, pattern: str) -> None:
     assert counts["/standin/joint_states"] == counts["/standin/replay/clearance"]
     assert counts["/standin/object/cube/pose"] == counts["/standin/tcp/pose"]
     assert counts["/robot_description"] == 1
+    assert counts["/standin/replay/contact"] > 2
 
     episode = Episode.open(path)
     assert episode.derived is not None
