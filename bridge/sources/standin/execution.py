@@ -19,7 +19,7 @@ def execute_plan(cell: StandinCell, plan: Plan) -> None:
     joints = np.array([waypoint.joints_rad for waypoint in plan.tau], dtype=np.float64)
     streams.event("execution_started", cell.now_ns, plan_id=plan.id)
     stage_id: str | None = None
-    g: int | None = None
+    gripper: tuple[int, float | None] | None = None
     for first, last in _pieces(plan):
         stage = plan.stage_at(int(times[first]))
         if stage is not None and stage.id != stage_id:
@@ -27,9 +27,8 @@ def execute_plan(cell: StandinCell, plan: Plan) -> None:
             stage_id = stage.id
             streams.event("stage_started", cell.now_ns, plan_id=plan.id, stage_id=stage_id)
         waypoint = plan.tau[last]
-        if waypoint.g != g:
-            g = waypoint.g
-            width = waypoint.width_m
+        if (waypoint.g, waypoint.width_m) != gripper:
+            g, width = gripper = (waypoint.g, waypoint.width_m)
             cell.grip((0.0 if g else MAX_WIDTH_M) if width is None else width)
             streams.event(
                 "gripper",
@@ -52,13 +51,15 @@ def _end_stage(cell: StandinCell, plan: Plan, stage_id: str | None) -> None:
 def _pieces(plan: Plan) -> list[tuple[int, int]]:
     """Cut the trajectory where the gripper's command or the stage changes.
 
-    A waypoint's ``g`` holds for the time before it: the piece that ends there runs under it.
+    A waypoint's ``g`` and width hold for the time before it: the piece that ends there runs under
+    them.
     """
     times = plan.times_ns()
     stages = [plan.stage_at(int(t)) for t in times]
     cuts = [0]
     for k in range(1, len(plan.tau) - 1):
-        gripper_changes = plan.tau[k + 1].g != plan.tau[k].g
+        after, here = plan.tau[k + 1], plan.tau[k]
+        gripper_changes = (after.g, after.width_m) != (here.g, here.width_m)
         stage_changes = stages[k] is not stages[k - 1]
         if gripper_changes or stage_changes:
             cuts.append(k)

@@ -1,5 +1,6 @@
 """The session: an operator who records a scan, then trials, with the planner and the gate."""
 
+import contextlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -20,6 +21,7 @@ from bridge.sources.standin.planner import (
     perceive,
     plan_pick_and_place,
 )
+from bridge.sources.standin.probes import PROBES, NoRoomForProbeError, plan_probe
 from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
 from bridge.sources.standin.settings import CONDITIONS, SessionConfig
 from bridge.sources.standin.streams import Session
@@ -29,6 +31,9 @@ from bridge.task.verdict import Verdict
 from bridge.terminal import Output
 
 RESET_STREAM = 404
+PROBE_STREAM = 505
+PROBE_TRIES = 100
+"""The object is put elsewhere until there is room for the probe."""
 SEEDS_PER_SESSION = 1000
 """Session 7 starts at start seed 7000; sessions never share a start."""
 LOOK_S = 0.9
@@ -69,6 +74,7 @@ class Operator:
         self._output = output or Output(quiet=True)
         self._open = False
         self.scanned = False
+        self.num_probes = 0
         self.results: list[tuple[EpisodeInfo, Outcome]] = []
 
     def start_seeds(self) -> list[int]:
@@ -158,6 +164,55 @@ class Operator:
         cell.cameras_running = False
         self._end(outcome)
         return info, outcome
+
+    def probes(self) -> None:
+        """Record every probe of every round, each from a start of its own."""
+        kinds = [kind for _ in range(self._config.probes) for kind in PROBES]
+        with self._output.progress("probes", len(kinds)) as advance:
+            for number, kind in enumerate(kinds, start=self._config.first_probe):
+                self._probe(number, kind)
+                self.num_probes += 1
+                advance(self.num_probes, kind)
+
+    def _probe(self, number: int, kind: str) -> None:
+        cell, config = self._cell, self._config
+        poses, plan = self._probe_start(number, kind)
+        cell.reset(poses)
+        info = self._info(
+            f"probe_{number:04d}", kind="probe", start_id=plan.start_id, tags=(f"probe:{kind}",)
+        )
+        self._begin(info)
+        cell.cameras_running = True
+        cell.wait(LOOK_S)
+        cell.streams.plan(plan, cell.now_ns)
+        execute_plan(cell, plan)
+        cell.cameras_running = False
+        self._end(None)
+        self._output.detail(f"{info.id} {kind}: recorded from seed {config.seed}")
+
+    def _probe_start(
+        self, number: int, kind: str
+    ) -> tuple[dict[str, Float[np.ndarray, "4 4"]], Plan]:
+        """Put the objects where there is room for the probe, and plan it as it is perceived."""
+        cell, config = self._cell, self._config
+        noise = cell.file.noise_for(cell.task.name)
+        for attempt in range(PROBE_TRIES):
+            rng = np.random.default_rng([PROBE_STREAM, config.seed, number, attempt])
+            poses = cell.task.draw_start(rng)
+            seed = config.seed * SEEDS_PER_SESSION + number
+            with contextlib.suppress(NoRoomForProbeError):
+                return poses, plan_probe(
+                    kind,
+                    cell.task,
+                    perceive(poses, noise, start_seed=seed),
+                    kinematics=cell.kinematics,
+                    joints_start_rad=cell.home_rad,
+                    max_joint_speed_rad_s=cell.file.max_joint_speed_rad_s,
+                    plan_id=f"probe_{number:04d}.{kind}",
+                    start_id=f"{cell.task.name}/probe/{config.seed}/{number}",
+                    turn=1 if (number - 1) // len(PROBES) % 2 else -1,
+                )
+        raise NoRoomForProbeError(kind)
 
     def _decide(self, info: EpisodeInfo, start_seed: int) -> Decision:
         """Plan, and with replanning ask the gate until it accepts or the rounds are used up."""

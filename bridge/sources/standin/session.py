@@ -25,7 +25,7 @@ def run_session(
     should_stop: Callable[[], bool] = lambda: False,
     start_ns: int | None = None,
 ) -> dict[str, Any]:
-    """Record a scan and trials as the configuration says.
+    """Record a scan, trials and probes as the configuration says.
 
     Args:
         session: Where to publish, and where recorder and gate answer.
@@ -57,6 +57,7 @@ def run_session(
         if config.scan:
             operator.scan()
         operator.trials()
+        operator.probes()
     except StoppedError:
         stopped = True
         operator.abandon(discard=False)
@@ -81,6 +82,7 @@ def _summary(operator: Operator, config: SessionConfig, *, stopped: bool) -> dic
         "task": config.task,
         "seed": config.seed,
         "scan": operator.scanned,
+        "probes": operator.num_probes,
         "outcomes": {condition: dict(counter) for condition, counter in counts.items()},
         "objects": objects,
         "stopped": stopped,
@@ -96,6 +98,8 @@ def describe(summary: dict[str, Any]) -> str:
         sums = summary["objects"].get(condition)
         told = f"; {sums['k']} of {sums['n']} objects" if sums else ""
         lines.append(f"  {condition}: {total} trials, {listed}{told}")
+    if summary["probes"]:
+        lines.append(f"  {summary['probes']} probes")
     if summary["stopped"]:
         lines.append("  stopped before the end")
     return "\n".join(lines)

@@ -30,6 +30,11 @@ class SessionConfig:
     """without_replanning, with_replanning or both."""
     first_trial: int = 1
     """Number of the first trial's episode."""
+    probes: int = 0
+    """Rounds of probe episodes after the trials, for calibrate RUN --physics: each round pushes,
+    slides, squeezes and drops the first object."""
+    first_probe: int = 1
+    """Number of the first probe's episode."""
     rounds: int = 5
     """Plans the gate may see per trial."""
     gate_cell: str = ""
@@ -57,6 +62,8 @@ class SessionConfig:
             "seed": (0, 2**31),
             "trials": (0, 8_000),
             "first_trial": (0, 9_999),
+            "probes": (0, 1_000),
+            "first_probe": (1, 9_999),
             "rounds": (1, 1_000),
             "gate_timeout_s": (0.1, most),
             "rate_hz": (0, 60),

@@ -1,6 +1,6 @@
 """From tool poses to a timed joint trajectory: straight lines at 20 Hz within the joints' speed."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,14 @@ from bridge.task.robot import MAX_WIDTH_M
 
 WAYPOINT_S = 0.05
 
+TimeLaw = Callable[[Float[np.ndarray, " num_times"]], Float[np.ndarray, " num_times"]]
+"""Share of a leg's way done at each share of its time; both run from 0 to 1."""
+
+
+def minimum_jerk(s: Float[np.ndarray, " num_times"]) -> Float[np.ndarray, " num_times"]:
+    """At rest at both ends: Flash and Hogan (1985)."""
+    return np.asarray(s**3 * (10 - 15 * s + 6 * s**2))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Leg:
@@ -24,6 +32,11 @@ class Leg:
     T_base_tcp: Float[np.ndarray, "4 4"]
     duration_s: float
     g: int
+    width_m: float | None = None
+    """Commanded opening at its end, evenly from the one before; None: shut or wide open by g."""
+    law: TimeLaw = minimum_jerk
+    step_s: float = WAYPOINT_S
+    """Between its waypoints."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +54,9 @@ class Track:
     ) -> "Track":
         """Start with an open gripper."""
         return Track(
-            tau=(_waypoint(0, T_base_tcp, joints_rad, 0),), bounds={}, T_base_tcp=T_base_tcp
+            tau=(_waypoint(0, T_base_tcp, joints_rad, 0, MAX_WIDTH_M),),
+            bounds={},
+            T_base_tcp=T_base_tcp,
         )
 
 
@@ -57,18 +72,18 @@ def follow_legs(
     T_from, t_ns = before.T_base_tcp, tau[-1].t_ns
     joints = np.array(tau[-1].joints_rad, dtype=np.float64)
     for leg in legs:
-        count = max(round(leg.duration_s / WAYPOINT_S), 1)
+        count = max(round(leg.duration_s / leg.step_s), 1)
         while True:
-            Ts, rows = _sample_leg(T_from, leg.T_base_tcp, joints, count, kinematics)
+            Ts, rows = _sample_leg(T_from, leg, joints, count, kinematics)
             steps = np.abs(np.diff(np.vstack([joints, rows]), axis=0))
-            speed = float(steps.max()) / WAYPOINT_S
+            speed = float(steps.max()) / leg.step_s
             if speed <= max_joint_speed_rad_s:
                 break
             count = int(np.ceil(count * 1.02 * speed / max_joint_speed_rad_s))
         begin_ns = t_ns
-        for T, row in zip(Ts, rows, strict=True):
-            t_ns += ns_from_s(WAYPOINT_S)
-            tau.append(_waypoint(t_ns, T, row, leg.g))
+        for T, row, width in zip(Ts, rows, _widths(tau[-1].width_m, leg, count), strict=True):
+            t_ns += ns_from_s(leg.step_s)
+            tau.append(_waypoint(t_ns, T, row, leg.g, width))
         bounds[leg.stage] = (bounds.get(leg.stage, (begin_ns, 0))[0], t_ns)
         T_from, joints = leg.T_base_tcp, rows[-1]
     return Track(tau=tuple(tau), bounds=bounds, T_base_tcp=T_from)
@@ -76,14 +91,12 @@ def follow_legs(
 
 def _sample_leg(
     T_from: Float[np.ndarray, "4 4"],
-    T_to: Float[np.ndarray, "4 4"],
+    leg: Leg,
     joints_rad: Float[np.ndarray, "6"],
     count: int,
     kinematics: Kinematics,
 ) -> tuple[Float[np.ndarray, "num_poses 4 4"], Float[np.ndarray, "num_poses 6"]]:
-    s = np.arange(1, count + 1) / count
-    # Minimum-jerk time law (Flash and Hogan 1985): at rest at both ends.
-    Ts = slerp_poses(T_from, T_to, s**3 * (10 - 15 * s + 6 * s**2))
+    Ts = slerp_poses(T_from, leg.T_base_tcp, leg.law(np.arange(1, count + 1) / count))
     rows = []
     for T in Ts:
         joints_rad = kinematics.joints_for(T, joints_rad)
@@ -91,8 +104,19 @@ def _sample_leg(
     return Ts, np.array(rows)
 
 
+def _widths(before_m: float | None, leg: Leg, count: int) -> list[float]:
+    if leg.width_m is None:
+        return [0.0 if leg.g else MAX_WIDTH_M] * count
+    first = MAX_WIDTH_M if before_m is None else before_m
+    return [first + (leg.width_m - first) * k / count for k in range(1, count + 1)]
+
+
 def _waypoint(
-    t_ns: int, T: Float[np.ndarray, "4 4"], joints_rad: Float[np.ndarray, "6"], g: int
+    t_ns: int,
+    T: Float[np.ndarray, "4 4"],
+    joints_rad: Float[np.ndarray, "6"],
+    g: int,
+    width_m: float,
 ) -> Waypoint:
     q, p = se3.split(T)
     w, x, y, z = (float(value) for value in q)
@@ -101,6 +125,6 @@ def _waypoint(
         p_m=(float(p[0]), float(p[1]), float(p[2])),
         q_wxyz=(w, x, y, z),
         g=g,
-        width_m=0.0 if g else MAX_WIDTH_M,
+        width_m=width_m,
         joints_rad=tuple(float(value) for value in joints_rad),
     )
