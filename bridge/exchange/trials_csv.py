@@ -7,7 +7,7 @@ field means unknown and stays unknown.
 
 import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -115,7 +115,9 @@ def read_rows(path: Path, required: Sequence[str], known: Sequence[str]) -> list
         PathNotFoundError: When the file is not there.
         TableError: When it is no text, a column is missing, unknown or doubled, or a row is ragged.
     """
-    lines = _lines(path, what="table", hint="Give a CSV file.")
+    if not path.is_file():
+        raise PathNotFoundError(path=path, what="table", hint="Give a CSV file.")
+    lines = list(numbered_lines(path))
     if not lines:
         raise TableError(path=path, row=None, found="empty", hint=f"Columns: {', '.join(known)}")
     header = [name.strip() for name in lines[0][1]]
@@ -139,23 +141,27 @@ def read_rows(path: Path, required: Sequence[str], known: Sequence[str]) -> list
 
 def header_of(path: Path) -> list[str]:
     """Return the column names of a CSV file, to tell which table it is."""
-    hint = "Give a run folder, or a CSV file."
-    lines = _lines(path, what="run folder or table", hint=hint)
-    return [name.strip() for name in lines[0][1]] if lines else []
-
-
-def _lines(path: Path, *, what: str, hint: str) -> list[tuple[int, list[str]]]:
-    """Read numbered lines; blank ones and comments are left out."""
     if not path.is_file():
-        raise PathNotFoundError(path=path, what=what, hint=hint)
+        hint = "Give a run folder, or a CSV file."
+        raise PathNotFoundError(path=path, what="run folder or table", hint=hint)
+    return next(([name.strip() for name in cells] for _, cells in numbered_lines(path)), [])
+
+
+def numbered_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the lines of a CSV file with their numbers; blank ones and comments are left out.
+
+    Raises:
+        TableError: When it is no text.
+    """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
-            lines = [line for line in enumerate(csv.reader(stream), start=1) if any(line[1])]
+            for number, cells in enumerate(csv.reader(stream), start=1):
+                if any(cells) and not cells[0].startswith("#"):
+                    yield number, cells
     except (UnicodeDecodeError, csv.Error) as error:
         raise TableError(
             path=path, row=None, found=f"not a CSV file ({error})", hint="Save it as UTF-8 CSV"
         ) from error
-    return [line for line in lines if not line[1][0].startswith("#")]
 
 
 def check_header(

@@ -5,7 +5,6 @@ checked once, as ``read_trials`` checks it. Ids are compared through 64-bit hash
 8 bytes for each trial in the folder for temporary files; what looks doubled is read again.
 """
 
-import csv
 import tempfile
 from array import array
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ from bridge.exchange.trials_csv import (
     TrialRecord,
     check_header,
     check_unit,
+    numbered_lines,
     read_trial,
 )
 
@@ -105,25 +105,17 @@ def _count(path: Path, ids: "_Ids") -> list[tuple[TrialRecord, int]]:
 def _rows(path: Path) -> Iterator[tuple[_Layout, int, list[str]]]:
     """Yield the rows with their numbers as a spreadsheet has them; comments are left out."""
     layout: _Layout | None = None
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            for number, cells in enumerate(csv.reader(stream), start=1):
-                if not any(cells) or cells[0].startswith("#"):
-                    continue
-                if layout is None:
-                    header = [name.strip() for name in cells]
-                    check_header(path, number, header, ("trial_id", "task"), COLUMNS)
-                    layout = _Layout(path, header)
-                    continue
-                if len(cells) != len(layout.header):
-                    found = f"{len(cells)} fields where the header has {len(layout.header)}"
-                    hint = "Quote fields that contain commas"
-                    raise TableError(path=path, row=number, found=found, hint=hint)
-                yield layout, number, cells
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise TableError(
-            path=path, row=None, found=f"not a CSV file ({error})", hint="Save it as UTF-8 CSV"
-        ) from error
+    for number, cells in numbered_lines(path):
+        if layout is None:
+            header = [name.strip() for name in cells]
+            check_header(path, number, header, ("trial_id", "task"), COLUMNS)
+            layout = _Layout(path, header)
+            continue
+        if len(cells) != len(layout.header):
+            found = f"{len(cells)} fields where the header has {len(layout.header)}"
+            hint = "Quote fields that contain commas"
+            raise TableError(path=path, row=number, found=found, hint=hint)
+        yield layout, number, cells
 
 
 class _Ids:

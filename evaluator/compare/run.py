@@ -195,6 +195,9 @@ NO_DATA = (
 """Parts of the evaluation whose input a run may not have."""
 
 
+STREAMED = "a streamed table keeps no single trials"
+
+
 def _missing(rows: Sequence[TrialRow], measurements: Sequence[Measurement]) -> list[str]:
     found = []
     conditions = {row.condition for row in rows}
@@ -209,8 +212,9 @@ def _missing(rows: Sequence[TrialRow], measurements: Sequence[Measurement]) -> l
         without = trials_in(row for row in rows if getattr(row, side) is None)
         if without:
             found.append(f"{side}: {without} of {trials_in(rows)} trials have no {words[2:]}")
+    streamed = any(not row.episode for row in rows)
     found += [
-        f"{words}: no data ({why})"
+        f"{words}: no data ({STREAMED if streamed else why})"
         for start, words, why in NO_DATA
         if not any(m.id.startswith(start) for m in measurements)
     ]

@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from bridge.errors import UsageError
 from bridge.task.record import check_record
@@ -270,3 +272,41 @@ def test_a_goal_is_answered_or_the_trials_it_may_take_are_named(
     assert "stop: above 60 %" in capsys.readouterr().out
     with pytest.raises(UsageError, match="--goal 60"):
         evaluate(path, goal=60.0)
+
+
+WORDS = st.sampled_from(["success", "failure", "", "unknown"])
+
+
+@st.composite
+def tables(draw: st.DrawFn) -> str:
+    names = ["recorded", "sim_planned", "sim_executed", "verdict"]
+    count = draw(st.integers(1, 14))
+    lines = [f"trial_id,task,condition,policy,start_id,p_success,{','.join(names)}"]
+    for number in range(count):
+        condition = draw(st.sampled_from(["without_replanning", "with_replanning", "other, one"]))
+        task, policy = draw(st.sampled_from("ab")), draw(st.sampled_from(["", "x", "y/../z"]))
+        start, p = (
+            draw(st.sampled_from(["", "s1", "s2"])),
+            draw(st.sampled_from(["", "0", "1", "0.5"])),
+        )
+        answers = ",".join(draw(WORDS) for _ in names)
+        lines.append(f't{number},{task},"{condition}",{policy},{start},{p},{answers}')
+    return "\n".join(lines) + "\n"
+
+
+@settings(max_examples=12, deadline=None)
+@given(tables())
+def test_whatever_the_trials_say_the_results_fit_the_schema(
+    tmp_path_factory: pytest.TempPathFactory, text: str
+) -> None:
+    """One task, constant sides, all success, nothing known: a number or a reason, never a crash."""
+    path = tmp_path_factory.mktemp("any") / "trials.csv"
+    path.write_text(text)
+    for comparison in (compare_trials(path, goal=0.5), compare_trials(path, stream_above=0)):
+        results = comparison.results()
+        check_record(results.to_record(), name="results", package="evaluator")
+        ids = [measurement.id for measurement in results.measurements]
+        assert len(ids) == len(set(ids))
+        for m in results.measurements:
+            if m.interval is not None:
+                assert m.interval.low < m.interval.high or m.unit == "count", m.id
