@@ -9,6 +9,7 @@ soft bodies their nodes, and distances are on the safe side.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
@@ -37,6 +38,10 @@ _FINE_TRAVEL_M = 0.001
 _MAX_HALVINGS = 10
 
 
+Allowed = frozenset[frozenset[str]]
+"""Pairs of bodies, or of a body and a group, that may touch."""
+
+
 @dataclass(frozen=True)
 class _Look:
     """Distances at one state."""
@@ -45,7 +50,7 @@ class _Look:
     distances: dict[Pair, float]
     cut_m: float
     """Every pair without a distance is at least this far apart."""
-    allowed: set[frozenset[str]]
+    allowed: Allowed
 
 
 class ClearanceMonitor:
@@ -152,6 +157,9 @@ class ClearanceMonitor:
             body, piece, other, _ = pair
             travel = objects_m.get(body, 0.0) if piece < 0 else float(links_m[piece])
             travel += objects_m.get(other, 0.0)
+            first, last = (look.distances.get(pair, look.cut_m) for look in (a, b))
+            if travel <= _FINE_TRAVEL_M or first + last - travel >= 2 * eps:
+                continue
             if max(objects_m.get(body, 0.0), objects_m.get(other, 0.0)) > MAX_LEAP_M:
                 continue
             limit = eps
@@ -160,9 +168,8 @@ class ClearanceMonitor:
                 if piece < 0 or other in objects_m:
                     continue
                 limit = -self.config.max_contact_depth_m
-            first, last = (look.distances.get(pair, look.cut_m) for look in (a, b))
             known = first < limit or last < limit  # judged at that state already
-            if not known and travel > _FINE_TRAVEL_M and first + last - travel < 2 * limit:
+            if not known and first + last - travel < 2 * limit:
                 return True
         return False
 
@@ -221,9 +228,7 @@ class ClearanceMonitor:
         start = self._first_centre.setdefault(name, centre)
         return bool(np.linalg.norm(centre - start) > self.config.moved_m)
 
-    def _judge(
-        self, t_ns: int, body: str, other: str, distance: float, allowed: set[frozenset[str]]
-    ) -> float:
+    def _judge(self, t_ns: int, body: str, other: str, distance: float, allowed: Allowed) -> float:
         """Note a pair that is too close; returns its distance if the pair may not touch."""
         may_touch = _may_touch(body, other, allowed)
         if distance < self.config.eps_col_m:
@@ -276,7 +281,7 @@ def active_stage(stages: tuple[Stage, ...], t_ns: int) -> Stage | None:
     return stages[0] if stages else None
 
 
-def allowed_pairs(stages: tuple[Stage, ...], t_ns: int) -> set[frozenset[str]]:
+def allowed_pairs(stages: tuple[Stage, ...], t_ns: int) -> Allowed:
     """Pairs that may touch: those of the active stage, and what earlier stages let go of.
 
     Where a stage released an object, it may go on lying on what that stage allowed it to touch; the
@@ -284,15 +289,16 @@ def allowed_pairs(stages: tuple[Stage, ...], t_ns: int) -> set[frozenset[str]]:
     """
     active = active_stage(stages, t_ns)
     if active is None:
-        return set()
+        return frozenset()
     left = [stage for stage in stages[: stages.index(active)] if stage.release]
     stays = {frozenset(pair) for stage in left for pair in stage.allowed_contacts}
-    return {pair for pair in stays if GRIPPER not in pair} | {
+    return frozenset(pair for pair in stays if GRIPPER not in pair) | frozenset(
         frozenset(pair) for pair in active.allowed_contacts
-    }
+    )
 
 
-def _may_touch(body: str, other: str, allowed: set[frozenset[str]]) -> bool:
+@lru_cache(maxsize=4096)
+def _may_touch(body: str, other: str, allowed: Allowed) -> bool:
     return frozenset((group_of(body), other)) in allowed or frozenset((body, other)) in allowed
 
 
