@@ -1,8 +1,8 @@
 """Lifting of bad masks, default segmentation, and parts, against the truth of ray-cast scenes.
 
 The scenes are those of ``tests/twin/scene/semantics/table_scene.py``: exact poses, 1 mm depth
-noise at half a metre, 320 x 240. The shelf is real (``rgbd_apc_shelf_wristcam``) and left out
-where the shared data are missing.
+noise at half a metre, 320 x 240; rebuilt scenes come from scans of the stand-in cell as it is. The
+shelf is real (``rgbd_apc_shelf_wristcam``) and left out where the shared data are missing.
 """
 
 import os
@@ -17,9 +17,11 @@ import numpy as np
 from measure import ROOT, Target, report_targets
 
 sys.path.insert(0, str(ROOT / "tests" / "twin" / "scene" / "semantics"))
+sys.path.insert(0, str(ROOT / "tests" / "twin" / "scene" / "shape"))
 sys.path.insert(0, str(ROOT / "benchmarks" / "semantics"))
 
 import mesh_truth
+import scanned_parts
 import shelf
 import table_scene
 from noisy_masks import spoil
@@ -41,6 +43,7 @@ def main() -> None:
     world = table_scene.make_world(table_scene.tabletop_pieces(), num_train=NUM_TRAIN)
     rasteriser = Rasteriser(RasterConfig(threads=1))
     targets = [*lifting(world, rasteriser), *default_segmenter(world), *parts()]
+    targets += scanned_parts.targets()
     targets += shelf.targets(rasteriser)
     report_targets(
         "splat_semantics",

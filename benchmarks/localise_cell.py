@@ -10,7 +10,9 @@ from bridge.geometry.camera import Camera
 from bridge.media.color import decode_color, encode_jpeg
 from bridge.sources.standin.cell import CellConfig, StandinCell
 from bridge.sources.standin.cell_file import load_cell
-from bridge.sources.standin.hidden import draw_hidden
+from bridge.sources.standin.hidden import draw_hidden, nominal_hidden
+from bridge.sources.standin.operator import STILL_S
+from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
 from bridge.sources.standin.streams import Streams
 from bridge.task.task_file import Task, load_task
 
@@ -70,6 +72,37 @@ class Start:
     Ts_base_object: dict[str, np.ndarray]
     extents_m: dict[str, np.ndarray]
     """Of soft objects, along the axes of their pose."""
+    skins_m: dict[str, np.ndarray]
+    """Vertices of the meshes of soft objects in the base frame, as they are deformed."""
+
+
+class _Laboratory:
+    """A cell with a start put down, and what it shows."""
+
+    def __init__(
+        self, task_name: str, seed: int, moved: Mapping[str, np.ndarray] | None, *, honest: bool
+    ) -> None:
+        self.task = load_task(task_name)
+        self.file = load_cell(self.task.cell)
+        self.tap = Tap({key: mount.camera for key, mount in self.file.cameras.items()})
+        hidden = nominal_hidden(self.file) if honest else draw_hidden(self.file, seed)
+        self.cell = StandinCell(
+            self.file, self.task, hidden, self.tap, config=CellConfig(), seed=seed, start_ns=0
+        )
+        self.cell.reset({**self.task.draw_start(np.random.default_rng(seed)), **(moved or {})})
+        self.cell.announce()
+        self.cell.wait(1.2 if moved else 0.4)
+
+    def start(self) -> Start:
+        world = self.cell.world
+        Ts = world.Ts_base_object()
+        return Start(
+            task=self.task,
+            frames=self.tap.frames,
+            Ts_base_object=Ts,
+            extents_m={key: world.extents_m(key, Ts[key]) for key in self.task.soft_objects},
+            skins_m=world.skins_m(),
+        )
 
 
 def look_at_start(
@@ -77,6 +110,8 @@ def look_at_start(
     seed: int,
     count: int = 3,
     moved: Mapping[str, np.ndarray] | None = None,
+    *,
+    honest: bool = False,
 ) -> Start:
     """Draw a laboratory and a start, put the objects down and take a few frames of each camera.
 
@@ -85,19 +120,32 @@ def look_at_start(
         seed: Draws what the laboratory hides, the start and the noise.
         count: Frames of each camera, 0.2 s apart, the arm at home.
         moved: Objects let go elsewhere, from where they fall.
+        honest: The laboratory hides nothing: poses, joints and depth are right but for noise.
     """
-    task = load_task(task_name)
-    file = load_cell(task.cell)
-    tap = Tap({key: mount.camera for key, mount in file.cameras.items()})
-    cell = StandinCell(
-        file, task, draw_hidden(file, seed), tap, config=CellConfig(), seed=seed, start_ns=0
-    )
-    cell.reset({**task.draw_start(np.random.default_rng(seed)), **(moved or {})})
-    cell.announce()
-    cell.wait(1.2 if moved else 0.4)
+    laboratory = _Laboratory(task_name, seed, moved, honest=honest)
     for _ in range(count):
+        laboratory.cell.capture()
+        laboratory.cell.wait(0.2)
+    return laboratory.start()
+
+
+def look_around(task_name: str, seed: int, *, honest: bool = False) -> Start:
+    """Draw a laboratory and a start, and carry the wrist camera around it as a scan does.
+
+    The side camera gives the first frame only: later the arm is in its way.
+    """
+    laboratory = _Laboratory(task_name, seed, None, honest=honest)
+    cell, file = laboratory.cell, laboratory.file
+    mount = next(item for item in file.cameras.values() if item.moving)
+    joints = cell.home_rad
+    cell.capture()
+    for target in scan_joints(mount, cell.kinematics, joints, ScanConfig()):
+        cell.follow(*joint_move(joints, target, file.max_joint_speed_rad_s))
+        cell.wait(STILL_S)
         cell.capture()
-        cell.wait(0.2)
-    Ts = cell.world.Ts_base_object()
-    extents = {key: cell.world.extents_m(key, Ts[key]) for key in task.soft_objects}
-    return Start(task=task, frames=tap.frames, Ts_base_object=Ts, extents_m=extents)
+        joints = target
+    moving = {key for key, item in file.cameras.items() if item.moving}
+    frames = laboratory.tap.frames
+    first = min(frame.stamp_ns for frame in frames)
+    frames[:] = [f for f in frames if f.camera_id in moving or f.stamp_ns == first]
+    return laboratory.start()

@@ -15,6 +15,8 @@ from bridge.task.meshes.toys import DESIGNS
 
 SCHEMA_VERSION = 1
 BASKET = "basket"
+SCANNED = "scanned"
+SHAPES = ("box", "open_box", "mesh", SCANNED)
 MESHES = (*sorted(DESIGNS), BASKET)
 """Names an object of shape ``mesh`` may give."""
 
@@ -39,9 +41,10 @@ class ObjectModel:
 
     id: str
     shape: str
-    """box, mesh (origin at the centre), open_box, mesh "basket" (origin under the floor)."""
+    """box, mesh, scanned (origin at the centre), open_box, mesh "basket" (origin under the floor).
+    Of a scanned object only size and colour are known; its shape comes from a scan."""
     size_m: tuple[float, float, float]
-    """Outer extents."""
+    """Outer extents; of a scanned object roughly."""
     color_srgb: tuple[int, int, int]
     wall_m: float = 0.0
     mass_kg: float = 0.1
@@ -63,7 +66,7 @@ class ObjectModel:
     @property
     def origin_at_centre(self) -> bool:
         """Whether the origin is the middle of the outer extents; else it is under the floor."""
-        return self.shape == "box" or (self.shape == "mesh" and self.mesh != BASKET)
+        return self.shape in ("box", SCANNED) or (self.shape == "mesh" and self.mesh != BASKET)
 
     @property
     def rest_height_m(self) -> float:
@@ -79,6 +82,7 @@ class ObjectModel:
         """Solid boxes the object is made of: (centre, extents) in the object frame [m].
 
         A mesh is stood in for: a toy by the box around it, a basket by floor and straight walls.
+        So is a scanned object: by the box around it.
         """
         size = np.array(self.size_m)
         if self.origin_at_centre:
@@ -179,8 +183,8 @@ def _task_from(table: dict[str, Any]) -> Task:
 
 def _object_from(object_id: str, table: dict[str, Any]) -> ObjectModel:
     shape, mesh = table["shape"], table.get("mesh")
-    if shape not in ("box", "open_box", "mesh"):
-        message = f"objects.{object_id}.shape {shape!r}; known: box, open_box, mesh"
+    if shape not in SHAPES:
+        message = f"objects.{object_id}.shape {shape!r}; known: {', '.join(SHAPES)}"
         raise ValueError(message)
     if (shape == "mesh") != (mesh is not None) or (mesh is not None and mesh not in MESHES):
         message = (

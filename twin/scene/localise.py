@@ -15,13 +15,14 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.streams import RgbdFrame
-from bridge.task.task_file import ObjectModel, Task
+from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.scene.localise_colour import ColourConfig
 from twin.scene.localise_fit import FitConfig, fit_shape
-from twin.scene.localise_mesh import MeshFitConfig, fit_mesh, known_surface
+from twin.scene.localise_mesh import MeshFitConfig, Surface, fit_mesh, known_surface
 from twin.scene.localise_points import Cluster, PointConfig, View, fuse_stills, object_points
 from twin.scene.localise_result import (
     LocalisedObject,
+    found_by_box,
     found_by_mesh,
     found_by_shape,
     missing,
@@ -70,6 +71,7 @@ def localise_objects(
     task: Task,
     config: LocaliseConfig | None = None,
     last_seen_m: Mapping[str, Float[np.ndarray, "3"]] | None = None,
+    surfaces: Mapping[str, Surface] | None = None,
 ) -> dict[str, LocalisedObject]:
     """Find every object of a task in frames taken while nothing moved.
 
@@ -79,12 +81,14 @@ def localise_objects(
         config: Settings; the defaults when None.
         last_seen_m: Where objects were seen before; tells equal ones apart. Default: where the
             task starts them.
+        surfaces: Of scanned objects, from the scene, in their own frames. Without one the object
+            is only boxed in: the rough pose that its shape is then reconstructed at.
 
     Returns:
         One entry per object of the task; ``found`` is False, with a reason, where it was not
         seen. Never a guess.
     """
-    return localise(frames, task, config, last_seen_m).objects
+    return localise(frames, task, config, last_seen_m, surfaces).objects
 
 
 def localise(
@@ -92,13 +96,14 @@ def localise(
     task: Task,
     config: LocaliseConfig | None = None,
     last_seen_m: Mapping[str, Float[np.ndarray, "3"]] | None = None,
+    surfaces: Mapping[str, Surface] | None = None,
 ) -> Localisation:
     """Like ``localise_objects``, and keep what the table said of the cameras."""
     config = LocaliseConfig() if config is None else config
     views = fuse_stills(frames, config.max_frames, config.max_views, task, config.points)
     views, tables = correct_for_table(views, task, config.table, config.points, config.colour)
     objects = {
-        object_id: _localise_one(views, model, config, tables)
+        object_id: _localise_one(views, model, config, tables, (surfaces or {}).get(object_id))
         for object_id, model in task.objects.items()
         if model.soft is None or not views
     }
@@ -191,11 +196,13 @@ def _localise_one(
     model: ObjectModel,
     config: LocaliseConfig,
     tables: Mapping[str, TableFit],
+    scanned: Surface | None,
 ) -> LocalisedObject:
     stamp_ns = max((view.stamp_ns for view in views), default=0)
     if not views:
         return missing(model, stamp_ns, "no frames with colour, depth and a pose were given", {})
-    low_m = config.points.min_height_m if model.mesh is None else config.soft.min_height_m
+    is_box = model.mesh is None and scanned is None
+    low_m = config.points.min_height_m if is_box else config.soft.min_height_m
     points = replace(config.points, min_height_m=low_m)
     groups = object_points(views, model, points, config.colour)
     seen = len(groups[0]) if groups else 0
@@ -207,7 +214,11 @@ def _localise_one(
         )
         return missing(model, stamp_ns, reason, detail)
     if model.mesh is not None:
-        return _localise_mesh(groups[0], views, model, stamp_ns, config, detail)
+        scanned = known_surface(model, config.mesh.num_samples)
+    if scanned is not None:
+        return _localise_mesh(groups[0], views, model, scanned, stamp_ns, config, detail)
+    if model.shape == SCANNED:
+        return _boxed_in(groups[0], model, stamp_ns, config, detail)
     fit = fit_shape(groups[0], views, model, config.colour, config.fit)
     detail |= {
         "residual_m": fit.residual_m,
@@ -225,10 +236,29 @@ def _localise_one(
     return found_by_shape(model, fit, stamp_ns, config.rest_tolerance_m, detail)
 
 
+def _boxed_in(
+    group: Cluster,
+    model: ObjectModel,
+    stamp_ns: int,
+    config: LocaliseConfig,
+    detail: dict[str, Any],
+) -> LocalisedObject:
+    """A rough place for what no scan has shown yet."""
+    boxed = found_by_box(model, group.p_base, stamp_ns, detail)
+    if boxed.confidence >= config.min_explained:
+        return boxed
+    reason = (
+        f"only {boxed.confidence:.0%} of {len(group)} points fit into the box of {model.id}, "
+        f"{config.min_explained:.0%} are needed"
+    )
+    return missing(model, stamp_ns, reason, detail)
+
+
 def _localise_mesh(
     group: Cluster,
     views: Sequence[View],
     model: ObjectModel,
+    surface: Surface,
     stamp_ns: int,
     config: LocaliseConfig,
     detail: dict[str, Any],
@@ -237,7 +267,7 @@ def _localise_mesh(
     fit = fit_mesh(
         group,
         views,
-        known_surface(model, config.mesh.num_samples),
+        surface,
         config.fit,
         config.mesh,
         tilt_sigma_rad=config.fit.upright_sigma_rad,

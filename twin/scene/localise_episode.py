@@ -21,7 +21,9 @@ from bridge.task.robot import BASE_FRAME
 from bridge.task.task_file import Task
 from twin.scene.frames import rgbd_camera_ids
 from twin.scene.localise import LocaliseConfig, localise_objects
+from twin.scene.localise_mesh import Surface
 from twin.scene.localise_result import LocalisedObject
+from twin.scene.localise_scanned import scanned_surfaces
 from twin.scene.still import same_pose
 
 NO_SCENE = "noscene"
@@ -54,6 +56,7 @@ def localise_episode(
     before_ns: int | None = None,
     held_out_ns: HeldOut | None = None,
     last_seen_m: Mapping[str, Float[np.ndarray, "3"]] | None = None,
+    surfaces: Mapping[str, Surface] | None = None,
 ) -> dict[str, LocalisedObject]:
     """Localise from the last still frames before the first execution started.
 
@@ -68,6 +71,7 @@ def localise_episode(
         before_ns: Only frames earlier than this source time.
         held_out_ns: Frames that must not be looked at.
         last_seen_m: Where objects were seen before; tells equal ones apart.
+        surfaces: Of scanned objects, from the scene.
     """
     config = LocaliseConfig() if config is None else config
     if after_ns is None and before_ns is None:
@@ -78,7 +82,7 @@ def localise_episode(
         frames = still_frames(
             episode, config.max_frames, after_ns, before_ns, held_out_ns=held_out_ns
         )
-    return localise_objects(frames, task, config, last_seen_m)
+    return localise_objects(frames, task, config, last_seen_m, surfaces)
 
 
 def first_execution_ns(episode: Episode) -> int | None:
@@ -185,7 +189,8 @@ def write_localised(
     """Write ``derived/<episode>.localised.<scene>.mcap`` and return its path.
 
     Holds one gst localisation record per object for the start and after every execution, and a
-    PoseStamped per object that was found. A file made from the same bytes with the same settings
+    PoseStamped per object that was found. Objects whose shape only a scan knows are laid out by the
+    meshes of the run's scene. A file made from the same bytes with the same settings
     is kept unless ``force``.
 
     Args:
@@ -197,6 +202,7 @@ def write_localised(
         force: Write again even when it is there.
     """
     config = LocaliseConfig() if config is None else config
+    scanned = scanned_surfaces(run, task, config.mesh.num_samples)
     scene = scene_hash[:12] if scene_hash else NO_SCENE
     path = run.derived_dir / f"{episode.path.stem}.localised.{scene}.mcap"
     derived = Derived(
@@ -205,7 +211,8 @@ def write_localised(
         source_sha256=episode.sha256(),
         scene_hash=scene_hash,
         engine="colour_shape_fit",
-        settings={"task": asdict(task), **asdict(config)},
+        settings={"task": asdict(task), **asdict(config)}
+        | ({"meshes": scanned.hashes} if scanned.hashes else {}),
     )
     if path.exists() and not force and _made_from(path, derived):
         return path
@@ -219,6 +226,7 @@ def write_localised(
             after_ns=phase.after_ns,
             before_ns=phase.before_ns,
             last_seen_m=last_seen_m,
+            surfaces=scanned.surfaces,
         )
         phases.append((phase, found))
         last_seen_m |= {

@@ -12,11 +12,20 @@ from bridge.task.record import check_record
 from bridge.task.task_file import ObjectModel
 from twin.scene.localise_fit import ShapeFit
 from twin.scene.localise_mesh import MeshFit
-from twin.scene.localise_shape import rest_height_m, yaw_period_rad
+from twin.scene.localise_shape import (
+    pose_of,
+    rectangle_yaw_rad,
+    rest_height_m,
+    surface_distances,
+    yaw_period_rad,
+)
 
 SCHEMA_VERSION = 1
 METHOD = "colour_shape_fit"
 MESH_METHOD = "colour_mesh_icp"
+BOX_METHOD = "colour_box"
+BOXED_M = 0.01
+"""A point of a thing that is only boxed in lies this near to the box."""
 UPRIGHT = 0.98
 """Cosine of the tilt up to which an object stands."""
 
@@ -145,6 +154,43 @@ def found_by_shape(
         confidence=fit.explained,
         method=METHOD,
         reason=reason,
+        stamp_ns=stamp_ns,
+        symmetry=model.symmetry,
+        detail=detail,
+    )
+
+
+def found_by_box(
+    model: ObjectModel,
+    points: Float[np.ndarray, "num_points 3"],
+    stamp_ns: int,
+    detail: dict[str, Any],
+) -> LocalisedObject:
+    """Box in a thing whose shape nobody knows yet; it stands on the table.
+
+    The box of the stated size lies over the middle of the points, along the smallest rectangle
+    around them. Its frame is a name for the place, good enough to reconstruct the thing in: which
+    side is the front is whatever came out.
+    """
+    yaw = rectangle_yaw_rad(points[:, :2])
+    c, s = np.cos(yaw), np.sin(yaw)
+    local = points[:, :2] @ np.array([[c, -s], [s, c]])
+    low, high = np.percentile(local, [1, 99], axis=0)
+    if (high - low)[0] < (high - low)[1] and model.size_m[0] > model.size_m[1]:
+        yaw += np.pi / 2
+    u, v = (low + high) / 2
+    T = pose_of(np.array([c * u - s * v, s * u + c * v, rest_height_m(model), yaw]))
+    away, _ = surface_distances(points, model, T)
+    half = np.array([*(high - low) / 2, model.size_m[2] / 2])
+    spread = np.concatenate([half / 4, np.array([0.02, 0.02, 0.3])])
+    return LocalisedObject(
+        object_id=model.id,
+        found=True,
+        T_base_object=T,
+        covariance=np.diag(np.square(spread)),
+        confidence=float((away < BOXED_M).mean()),
+        method=BOX_METHOD,
+        reason=f"the shape of {model.id} is not known yet: only boxed in",
         stamp_ns=stamp_ns,
         symmetry=model.symmetry,
         detail=detail,

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from bridge.geometry import se3
-from bridge.task.task_file import ObjectModel
+from bridge.task.task_file import SCANNED, ObjectModel
 
 
 def pose_of(state: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4 4"]:
@@ -23,7 +23,12 @@ def rest_height_m(model: ObjectModel) -> float:
 
 
 def yaw_period_rad(model: ObjectModel) -> float:
-    """Turn after which the footprint looks the same: a quarter with equal sides, else a half."""
+    """Turn after which the footprint looks the same: a quarter with equal sides, else a half.
+
+    A scanned object may have any shape, so only a whole turn.
+    """
+    if model.shape == SCANNED:
+        return 2 * np.pi
     return np.pi / 2 if np.isclose(model.size_m[0], model.size_m[1]) else np.pi
 
 

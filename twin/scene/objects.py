@@ -1,8 +1,9 @@
 """Objects as parts of their own: their Gaussians taken out of the scene, and their mesh.
 
 The scene is the background plus objects in their own frames, so an object can be put anywhere.
-Gaussians are cut where the localised shape is. The mesh is reconstructed from the views where they
-allow it; otherwise it is the known shape of the task file, and ``shape_source`` says so.
+Gaussians are cut along the reconstructed shape (``twin.scene.owners``). The mesh is reconstructed
+from the views where they allow it; otherwise it is the known shape of the task file, and
+``shape_source`` says so.
 """
 
 import json
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from bridge.episode import provenance
 from bridge.geometry import se3
@@ -21,31 +22,16 @@ from bridge.task.task_file import ObjectModel, Task
 from bridge.whole_file import write_whole
 from twin.scene.fill import fill_footprint
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, turned_harmonics
-from twin.scene.localise_colour import ColourConfig, likeness, linear_from_srgb
-from twin.scene.localise_fit import FitConfig, refine_on_points
 from twin.scene.localise_result import LocalisedObject
-from twin.scene.localise_shape import surface_distances
+from twin.scene.owners import SplitConfig, object_poses, owners
 from twin.scene.ply import write_ply
 from twin.scene.shape.files import MESH, remove_shape, write_shape
 from twin.scene.shape.mesh import mesh_ply
 from twin.scene.shape.reconstruct import ObjectShape
 
-OBJECT_VERSION = 2
-MIN_SPLATS_TO_REFINE = 50
-
-
-@dataclass(frozen=True, kw_only=True)
-class SplitConfig:
-    """Which Gaussians belong to an object."""
-
-    search_m: float = 0.012
-    """Around the localised surface, coloured Gaussians are looked for to refine the pose."""
-    margin_m: float = 0.006
-    """Gaussians whose centre is nearer than this to the refined surface may belong to it."""
-    min_likeness: float = 0.35
-    """Near the table a Gaussian must also have the object's colour, see ``likeness``."""
-    max_scale_m: float = 0.05
-    """Larger Gaussians are background that happens to pass through."""
+OBJECT_VERSION = 3
+TASK_SHAPE = "task file"
+"""Source of a shape that no view and no generator gave."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,27 +58,25 @@ def split_objects(
     localised: Mapping[str, LocalisedObject],
     task: Task,
     config: SplitConfig | None = None,
+    shapes: Mapping[str, ObjectShape | str] | None = None,
 ) -> SceneParts:
     """Take the Gaussians of each localised object out of a scene.
 
-    A Gaussian goes to the object whose surface is nearest, if it is near enough; close to the
-    table only if it has the object's colour. Every Gaussian ends up in exactly one part, the
-    filling comes on top. Objects that were not found stay in the background.
+    A Gaussian goes to the object whose surface is nearest, if it is near enough and nearer than the
+    table; close to the table only if it has the object's colour. Every Gaussian ends up in exactly
+    one part, the filling comes on top. Objects that were not found stay in the background.
 
     Args:
         cloud: The whole scene in ``base_link``.
         localised: Where the objects were while it was scanned.
         task: Their shapes and colours.
         config: Settings; the defaults when None.
+        shapes: Reconstructed at ``object_poses``; without one the task's shape decides, which for
+            a toy is the box around it.
     """
-    config = SplitConfig() if config is None else config
-    found = {key: item for key, item in localised.items() if item.T_base_object is not None}
-    poses = {
-        key: _refined(cloud, task.objects[key], item.T_base_object, config)
-        for key, item in found.items()
-        if item.T_base_object is not None
-    }
-    owner = _owners(cloud, poses, task, config)
+    poses = object_poses(cloud, localised, task, config)
+    known = {key: shape for key, shape in (shapes or {}).items() if isinstance(shape, ObjectShape)}
+    owner = owners(cloud, poses, task, known, config)
     objects = {}
     for index, (key, T) in enumerate(poses.items()):
         part = moved_cloud(cloud.take(owner == index), se3.invert(T))
@@ -129,72 +113,6 @@ def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> Ga
     )
 
 
-def _alike(
-    cloud: GaussianCloud, model: ObjectModel, config: SplitConfig
-) -> Bool[np.ndarray, " num_splats"]:
-    color_u8 = np.clip(np.rint(cloud.colors * 255), 0, 255).astype(np.uint8)
-    linear = linear_from_srgb(color_u8[None])[0]
-    like = likeness(linear, model.color_srgb, ColourConfig())
-    return np.asarray(like >= config.min_likeness)
-
-
-def _refined(
-    cloud: GaussianCloud,
-    model: ObjectModel,
-    T_base_object: Float[np.ndarray, "4 4"],
-    config: SplitConfig,
-) -> Float[np.ndarray, "4 4"]:
-    """The scene's own errors shift what it shows by millimetres: follow the Gaussians.
-
-    Only boxes: what stands in for a mesh is too coarse to lay it out by, and knows no tilt.
-    """
-    if model.mesh is not None:
-        return T_base_object
-    ids = _near_ids(cloud, model, T_base_object, config.search_m)
-    ids = ids[_alike(cloud.take(ids), model, config)]
-    if len(ids) < MIN_SPLATS_TO_REFINE:
-        return T_base_object
-    points = cloud.means_m[ids].astype(np.float64)
-    return refine_on_points(points, model, T_base_object, FitConfig())
-
-
-def _near_ids(
-    cloud: GaussianCloud, model: ObjectModel, T: Float[np.ndarray, "4 4"], margin_m: float
-) -> Int[np.ndarray, " num_near"]:
-    """Ids of Gaussians within a margin of the surface or inside the material."""
-    reach = float(np.linalg.norm(model.size_m)) + margin_m
-    around = np.linalg.norm(cloud.means_m - T[:3, 3].astype(np.float32), axis=1) < reach
-    ids = np.flatnonzero(around)
-    distance, _ = surface_distances(cloud.means_m[ids].astype(np.float64), model, T)
-    return np.asarray(ids[distance < margin_m])
-
-
-def _owners(
-    cloud: GaussianCloud,
-    poses: Mapping[str, Float[np.ndarray, "4 4"]],
-    task: Task,
-    config: SplitConfig,
-) -> Int[np.ndarray, " num_splats"]:
-    """Index of the object each Gaussian belongs to, -1 for the background."""
-    owner = np.full(len(cloud), -1, dtype=np.int64)
-    nearest = np.full(len(cloud), np.inf)
-    small = np.exp(cloud.scales_log.max(axis=1)) < config.max_scale_m if len(cloud) else owner > 0
-    for index, (key, T) in enumerate(poses.items()):
-        model = task.objects[key]
-        ids = _near_ids(cloud, model, T, config.margin_m)
-        ids = ids[small[ids]]
-        part = cloud.take(ids)
-        distance, _ = surface_distances(part.means_m.astype(np.float64), model, T)
-        above = part.means_m[:, 2] > config.margin_m
-        # Of two surfaces that touch, the one of the Gaussian's own colour wins.
-        alike = _alike(part, model, config)
-        distance = np.abs(distance) + np.where(alike, 0.0, config.margin_m)
-        wins = (above | alike) & (distance < nearest[ids])
-        owner[ids[wins]] = index
-        nearest[ids[wins]] = distance[wins]
-    return owner
-
-
 def shape_mesh(
     model: ObjectModel,
 ) -> tuple[Float[np.ndarray, "num_vertices 3"], Int[np.ndarray, "num_faces 3"]]:
@@ -222,7 +140,7 @@ def write_objects(
 ) -> dict[str, Any]:
     """Write ``objects/<id>/`` below a scene folder: Gaussians, mesh, ``object.json``.
 
-    A reconstructed object also gets ``sdf.npz``, ``collision/*.obj`` and, when it is soft,
+    A reconstructed object also gets ``sdf.npz``, ``collision/*.ply`` and, when it is soft,
     ``soft.npz``, all in the object frame.
 
     Args:
@@ -268,10 +186,10 @@ def _write_geometry(
     remove_shape(place)
     if not isinstance(shape, str):
         names, geometry = write_shape(place, shape, model.id, soft=model.soft is not None)
-        source = f"reconstructed from {shape.num_views} views"
+        source = shape.source or f"reconstructed from {shape.num_views} views"
         return names, {"shape_source": source, "geometry": geometry}
     write_whole(place / MESH, mesh_ply(*shape_mesh(model)))
-    return [MESH], {"shape_source": "task file", "shape_remark": shape}
+    return [MESH], {"shape_source": TASK_SHAPE, "shape_remark": shape}
 
 
 def _object_record(

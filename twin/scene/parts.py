@@ -1,8 +1,8 @@
 """Take a fitted scene apart into background and objects, and put it together again."""
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,8 @@ from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder, check_episode_id
 from bridge.errors import BridgeError, UsageError
 from bridge.geometry import se3
-from bridge.task.task_file import Task, load_task
+from bridge.task.task_file import ObjectModel, Task, load_task
+from twin.scene.foundation.complete import Completed, Shapes
 from twin.scene.frames import FrameChoice, Sources
 from twin.scene.gaussians import GaussianCloud, concatenate
 from twin.scene.localise_episode import localise_episode
@@ -25,10 +26,14 @@ from twin.scene.objects import (
     split_objects,
     write_objects,
 )
+from twin.scene.owners import Poses, object_poses
 from twin.scene.ply import read_ply
 from twin.scene.shape.from_training import shapes_of, write_static
+from twin.scene.shape.reconstruct import ObjectShape
 from twin.scene.store import UnreadableSceneError
 from twin.scene.training_view import TrainingView
+
+Complete = Callable[[Sequence[TrainingView], Mapping[str, ObjectModel], Poses, Shapes], Completed]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,24 +46,28 @@ class TakenApart:
     parts: SceneParts | None = None
     localised: Mapping[str, LocalisedObject] | None = None
     task: Task | None = None
+    shapes: Mapping[str, ObjectShape | str] | None = None
+    """Reconstructed from the views, in the frame of each object, or why not."""
+    generated: Mapping[str, Any] = field(default_factory=dict)
+    """What came of asking a shape generator, by object."""
 
     def write(self, run: RunFolder, views: Sequence[TrainingView] = ()) -> dict[str, Any]:
         """Write ``objects/`` and ``sdf.npz``, and return what ``scene.json`` says about them.
 
         Args:
             run: Whose scene folder is written.
-            views: What the scene was fitted to; shapes are made from them.
+            views: What the scene was fitted to; says what is static.
         """
         static = write_static(run.scene_dir, views, self.task, self.places)
         if self.parts is None or self.localised is None or self.task is None:
             return {"objects": {}, "objects_remark": self.remark, "sdf": static}
-        shapes = shapes_of(views, self.task.objects, self.places)
-        objects = write_objects(run.scene_dir, self.parts, self.localised, self.task, shapes)
+        objects = write_objects(run.scene_dir, self.parts, self.localised, self.task, self.shapes)
         return {
             "objects": objects,
             "objects_remark": self.remark,
             "filled_splats": len(self.parts.filling),
             "sdf": static,
+            **({"generated": dict(self.generated)} if self.generated else {}),
         }
 
     @property
@@ -74,7 +83,11 @@ def episode_of_task(sources: Sources) -> Episode | None:
 
 
 def take_apart(
-    sources: Sources, cloud: GaussianCloud, choices: Sequence[FrameChoice]
+    sources: Sources,
+    cloud: GaussianCloud,
+    choices: Sequence[FrameChoice],
+    views: Sequence[TrainingView] = (),
+    complete: Complete | None = None,
 ) -> TakenApart:
     """Cut the task's objects out of the scene where the first episode of a task shows them.
 
@@ -82,6 +95,8 @@ def take_apart(
         sources: The episodes the scene was made from.
         cloud: The whole fitted scene.
         choices: Which frames are held out: the objects are not looked for in them.
+        views: What the scene was fitted to; objects are reconstructed from them.
+        complete: Asks a shape generator about them; None: nobody is asked.
     """
     episode = episode_of_task(sources)
     if episode is None:
@@ -96,7 +111,12 @@ def take_apart(
         localised = localise_episode(episode, task, held_out_ns=held_out)
     except (BridgeError, UsageError) as error:
         return TakenApart(background=cloud, remark=f"objects not taken out: {error}")
-    parts = split_objects(cloud, localised, task)
+    poses = object_poses(cloud, localised, task)
+    shapes = shapes_of(views, task.objects, poses)
+    asked = Completed(shapes=shapes, record={})
+    if complete is not None:
+        asked = complete(views, task.objects, poses, shapes)
+    parts = split_objects(cloud, localised, task, shapes=asked.shapes)
     missing = {key: item.reason for key, item in localised.items() if not item.found}
     remark = "; ".join(f"{key} not found: {reason}" for key, reason in missing.items())
     return TakenApart(
@@ -105,6 +125,8 @@ def take_apart(
         parts=parts,
         localised=localised,
         task=task,
+        shapes=asked.shapes,
+        generated=asked.record,
     )
 
 

@@ -7,6 +7,7 @@ sees a held-out frame, and ``scene.json`` is written last: it vouches for all th
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from bridge.terminal import Output
 from twin.scene.calibration import Calibration, read_calibration
 from twin.scene.fit import FitResult, fit
 from twin.scene.fit_state import FIT_STATE, Checkpoint
+from twin.scene.foundation.complete import complete_shapes
 from twin.scene.foundation.stage import check_models
 from twin.scene.frames import FrameChoice, Sources, choose_frames, find_sources
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, with_harmonics
@@ -104,7 +106,8 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     clock.end("initialise_and_fit")
     learnt = with_fitted_poses(learnt, fitted.Ts_base_color)
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
-    apart = take_apart(sources, fitted.cloud, learnt.choices)
+    complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
+    apart = take_apart(sources, fitted.cloud, learnt.choices, learnt.views, complete)
     if apart.remark:
         output.say(apart.remark)
     write_ply(run.scene_dir / BACKGROUND, apart.background)

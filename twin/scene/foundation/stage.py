@@ -1,6 +1,5 @@
 """What ``rebuild`` asks the models: masks and features of training frames, vectors of things."""
 
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from bridge.task.task_file import Task
 from bridge.terminal import Advance
 from twin.scene.foundation import clip, dinov3, sam3
 from twin.scene.foundation.clip import ClipEmbedder
+from twin.scene.foundation.complete import generator_command
 from twin.scene.foundation.loading import Placement, import_transformers
 from twin.scene.foundation.open import (
     FEATURES,
@@ -35,6 +35,7 @@ from twin.scene.semantics.features import (
     lift_reduced,
     save_features,
 )
+from twin.scene.semantics.lexicon import spoken_name
 from twin.scene.semantics.lift import Viewpoint, render_labels
 from twin.scene.semantics.result import MaskSet, SemanticScene
 from twin.scene.settings import ModelConfig
@@ -75,6 +76,8 @@ def check_models(config: ModelConfig, task: Task | None) -> dict[str, str]:
         named.append(("features", folder, dinov3.KIND))
     if config.clip:
         named.append(("clip", Path(config.clip).expanduser(), clip.KIND))
+    if config.generator:
+        generator_command(config.generator)
     hashes = {}
     for option, folder, kind in named:
         check_folder(folder, kind)
@@ -93,7 +96,7 @@ def prompts_of(config: ModelConfig, task: Task | None) -> list[str]:
     """
     if config.prompt:
         return list(config.prompt)
-    names = [] if task is None else [re.sub(r"[_\d]+", " ", key).strip() for key in task.objects]
+    names = [] if task is None else [spoken_name(key) for key in task.objects]
     prompts = list(dict.fromkeys(name for name in names if name))
     if not prompts:
         message = (

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from twin.scene.gaussians import GaussianCloud, concatenate
 from twin.scene.raster import RasterConfig, Rasteriser
@@ -38,7 +38,8 @@ def add_semantics(
     Args:
         folder: The scene folder.
         background: What ``background.ply`` holds.
-        objects: What ``objects/<id>/gaussians.ply`` hold, moved to where they were scanned.
+        objects: What ``objects/<id>/gaussians.ply`` hold, moved to where they were scanned; without
+            masks each is an instance of that name.
         viewpoints: Training frames, to count in how many an instance shows.
         masks: Masks of a 2D segmenter; without any the default segmenter looks at the Gaussians.
         features: Features of the same Gaussians, background first.
@@ -56,7 +57,10 @@ def add_semantics(
             scene = scene_from_masks(cloud, masks, rasteriser)
         else:
             step = -(-len(viewpoints) // MAX_VIEWPOINTS) or 1
-            scene = scene_by_default(cloud, viewpoints[::step], rasteriser, robot_m=robot_m)
+            known = {key: _rows(rows, key) for key in objects}
+            scene = scene_by_default(
+                cloud, viewpoints[::step], rasteriser, robot_m=robot_m, known=known
+            )
     except SemanticsError as error:
         nothing = np.zeros(len(cloud), dtype=np.uint16)
         source = masks[0][1].source if masks else SOURCE
@@ -75,3 +79,8 @@ def add_semantics(
             "explained_fraction": round(features.basis.explained_fraction, 4),
         }
     return record
+
+
+def _rows(rows: Mapping[str, int], key: str) -> Bool[np.ndarray, " num_splats"]:
+    """Which Gaussians of the whole scene are one part's."""
+    return np.repeat([name == key for name in rows], list(rows.values()))

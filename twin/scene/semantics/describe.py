@@ -1,6 +1,6 @@
 """From sets of Gaussians to instances: colour, box, parts and keypoints."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt16
@@ -8,12 +8,15 @@ from jaxtyping import Bool, Float, Float32, UInt16
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster import Rasteriser
 from twin.scene.semantics.associate import AssociateConfig, associate
-from twin.scene.semantics.form import measure_form
+from twin.scene.semantics.colour import colour_name
+from twin.scene.semantics.form import CONTAINER, measure_form
 from twin.scene.semantics.from_view import points_of, solid_splats
+from twin.scene.semantics.known import label_of, numbered
+from twin.scene.semantics.lexicon import kind_of
 from twin.scene.semantics.lift import Viewpoint, observe, visible_weight
 from twin.scene.semantics.part_names import PartsConfig, find_parts
 from twin.scene.semantics.result import Instance, MaskSet, SemanticScene
-from twin.scene.semantics.segment import SOURCE, SegmentConfig, segment_points
+from twin.scene.semantics.segment import SOURCE, SegmentConfig, Thing, segment_points
 from twin.scene.semantics.smooth import SmoothConfig, smooth_shares
 from twin.scene.semantics.support import (
     NoSupportError,
@@ -24,6 +27,8 @@ from twin.scene.semantics.support import (
 
 CELL_M = 0.004
 """Gaussians of a scene lie about this far apart."""
+NAMED = "task"
+"""Source of what is an object of the task."""
 MIN_SHOWN_PX = 20.0
 """A frame shows a thing when its Gaussians give this many pixels of the image."""
 
@@ -89,35 +94,54 @@ def scene_by_default(
     rasteriser: Rasteriser,
     config: SegmentConfig | None = None,
     robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
+    known: Mapping[str, Bool[np.ndarray, " num_splats"]] | None = None,
 ) -> SemanticScene:
     """Segment the fused Gaussians with the default segmenter.
 
     Support and seen count the viewpoints that show an instance. A scene without a level plane,
-    or with nothing on it, gives no instances and a remark that says so.
+    or with nothing on it, gives only what is known already, and a remark that says so.
+
+    Args:
+        cloud: The scene.
+        viewpoints: Frames, to count in how many an instance shows.
+        rasteriser: What to draw with.
+        config: What counts as a thing; the defaults when None.
+        robot_m: Points on the robot where it stood, to leave it out.
+        known: Gaussians of the objects that a task names, by their ids. They come first, under
+            their names.
     """
     labels = np.zeros(len(cloud), dtype=np.uint16)
     ids = np.flatnonzero(solid_splats(cloud))
+    things: tuple[Thing, ...] = ()
+    plane: SupportPlane | None = None
     try:
         found = segment_points(points_of(cloud.take(ids)), config or SegmentConfig(), robot_m)
     except NoSupportError as error:
-        return SemanticScene(instances=(), labels=labels, source=SOURCE, remark=str(error))
-    labels[ids] = found.labels.astype(np.uint16)
-    shown = _num_shown(cloud, labels, len(found.things), viewpoints, rasteriser)
+        remark = str(error)
+    else:
+        labels[ids] = found.labels.astype(np.uint16)
+        things, plane, remark = found.things, found.plane, found.remark
+    final = numbered(labels, known or {})
+    total = len(final.keys) + len(final.others)
+    shown = _num_shown(cloud, final.labels, total, viewpoints, rasteriser)
+    named = [(key, "", 1.0, NAMED) for key in final.keys]
+    named += [("", things[n - 1].label, things[n - 1].score, SOURCE) for n in final.others]
     instances = tuple(
         describe(
             cloud,
             number=number,
-            mask=labels == number,
-            label=thing.label,
+            mask=final.labels == number,
+            key=key,
+            label=label,
             support=shown[number],
             seen=shown[number],
-            score=thing.score,
-            source=SOURCE,
-            plane=found.plane,
+            score=score,
+            source=source,
+            plane=plane,
         )
-        for number, thing in enumerate(found.things, start=1)
+        for number, (key, label, score, source) in enumerate(named, start=1)
     )
-    return SemanticScene(instances=instances, labels=labels, source=SOURCE, remark=found.remark)
+    return SemanticScene(instances=instances, labels=final.labels, source=SOURCE, remark=remark)
 
 
 def _num_shown(
@@ -158,10 +182,12 @@ def describe(
     score: float,
     source: str,
     plane: SupportPlane | None,
+    key: str = "",
 ) -> Instance:
     """Measure one instance: colour, box, parts, keypoints.
 
-    Without a plane, or where it lies above the thing, heights count from its lowest Gaussian.
+    Without a plane, or where it lies above the thing, heights count from its lowest Gaussian. An
+    object of a task is called by its ``key`` and its colour, whatever the label.
     """
     ids = np.flatnonzero(mask)
     p = cloud.means_m[ids].astype(np.float64)
@@ -172,7 +198,11 @@ def describe(
         ground = under if -0.02 < lowest - under < 0.05 else lowest
     xyh = p - np.array([0.0, 0.0, ground])
     form = measure_form(xyh, CELL_M)
-    parts = find_parts(xyh, label, CELL_M, PartsConfig())
+    color = np.clip(np.rint(np.median(cloud.colors[ids], axis=0) * 255), 0, 255)
+    if key:
+        label = label_of(key, colour_name(color / 255), is_open=form.cavity is not None)
+    is_nameless_container = kind_of(label) == "other" and form.word == CONTAINER
+    parts = find_parts(xyh, CONTAINER if is_nameless_container else label, CELL_M, PartsConfig())
     up = np.array([0.0, 0.0, ground])
     T = np.eye(4)
     T[:2, :2] = [
@@ -180,7 +210,6 @@ def describe(
         [np.sin(form.yaw_rad), np.cos(form.yaw_rad)],
     ]
     T[:3, 3] = form.centre_m + up
-    color = np.clip(np.rint(np.median(cloud.colors[ids], axis=0) * 255), 0, 255)
     return Instance(
         id=number,
         label=label,

@@ -1,5 +1,6 @@
 """Words for things: which mean the same, what they look like, what parts they have."""
 
+import re
 from collections.abc import Iterable
 
 from twin.scene.semantics.colour import COLOUR_NAMES
@@ -19,6 +20,8 @@ FORMS = {
 """What a form may be called."""
 ANY_THING = ("object", "thing", "item", "stuff")
 ANIMALS = ("toy", "animal", "plush", "figure", "duck", "sloth", "teddy", "bear", "doll")
+KIND_NAMES = {"container": ("container",), "animal": ("toy", "animal"), "other": ()}
+"""What every thing of a kind may be called, see ``kind_of``."""
 TYPICAL_COLOURS = {
     "duck": ("yellow", "orange"),
     "sloth": ("brown", "beige", "grey"),
@@ -72,15 +75,26 @@ def part_of(word: str) -> str | None:
     return next((part for part, names in PART_WORDS.items() if word in names), None)
 
 
+def spoken_name(key: str) -> str:
+    """An id of a task file as a person would say it: ``duck_1`` is a duck."""
+    return re.sub(r"[_\d]+", " ", key).strip()
+
+
 def form_in(label: str) -> str | None:
-    """The longest form whose name ends a label of the default segmenter, or None."""
+    """The longest form whose name ends a label of the default segmenter, or None.
+
+    What is called open, and may be a container, is one.
+    """
+    words = words_of(label)
+    if "open" in words and words[-1] in FORMS["open container"]:
+        return "open container"
     ends = [form for form in FORMS if label == form or label.endswith(" " + form)]
     return max(ends, key=len, default=None)
 
 
 def names_of(label: str) -> set[str]:
-    """Nouns that a label answers to: its own words, what its form may be called, "object"."""
-    names = set(words_of(label)) | set(ANY_THING)
+    """Nouns that a label answers to: its own words, its kind, what its form may be called."""
+    names = set(words_of(label)) | set(ANY_THING) | set(KIND_NAMES[kind_of(label)])
     form = form_in(label)
     if form is not None:
         colours = {colour_of(word) for word in words_of(label)} - {None}

@@ -5,7 +5,6 @@ in the object's own frame, so walls of a box lie along the voxels.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from bridge.episode import provenance
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.meshes.catalogue import object_mesh
-from bridge.task.task_file import ObjectModel, Task
+from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.errors import TwinError
 from twin.scene.localise_shape import surface_distances
 from twin.scene.shape.masked_view import MaskedView
@@ -34,11 +33,6 @@ STANDING_M = 0.008
 """An object whose underside is at most this far from the table stands on it."""
 UPRIGHT_COSINE = 0.999
 ALIGN_ROUNDS = 6
-TABLE_REACH_M = 0.012
-"""A point this near to z = 0 is taken for the table's."""
-MIN_TABLE_POINTS = 200
-MIN_POSES = 6
-"""A camera that saw the table from fewer poses keeps its depth: its pose may be to blame."""
 
 Poses = Mapping[str, Float[np.ndarray, "4 4"]]
 
@@ -58,7 +52,6 @@ def shapes_of(
         config: Settings; the defaults, with six rounds of view alignment, when None.
     """
     config = ShapeConfig(align_rounds=ALIGN_ROUNDS) if config is None else config
-    views = without_depth_offset(views)
     found: dict[str, ObjectShape | str] = {}
     for key, T in Ts_base_object.items():
         if T[2, 2] < UPRIGHT_COSINE:
@@ -67,56 +60,15 @@ def shapes_of(
         masked = [masked_view(view, key, models, Ts_base_object) for view in views]
         try:
             found[key] = reconstruct(
-                [view for view in masked if view.mask.any()], _support_z_m(models[key], T), config
+                [view for view in masked if view.mask.any()], support_z_m(models[key], T), config
             )
         except TwinError as error:
             found[key] = str(error)
     return found
 
 
-def without_depth_offset(views: Sequence[TrainingView]) -> list[TrainingView]:
-    """Correct the depth of cameras that see the table too near or too far from everywhere.
-
-    Errors of single poses differ in sign; what is left in the median over many poses is the
-    camera's own: depth that reads long, or a mount that is off along the optical axis. Without
-    this, carving makes things smaller or larger by it on every side. z = 0 is the table.
-    """
-    errors: dict[str, list[float]] = {}
-    for view in views:
-        error = _table_depth_error_m(view)
-        if error is not None:
-            errors.setdefault(view.camera_id, []).append(error)
-    offsets = {key: float(np.median(e)) for key, e in errors.items() if len(e) >= MIN_POSES}
-    corrected = []
-    for view in views:
-        offset = np.float32(offsets.get(view.camera_id, 0.0))
-        depth = view.full.depth_m
-        full = replace(view.full, depth_m=np.where(depth > 0, depth - offset, depth))
-        corrected.append(replace(view, full=full))
-    return corrected
-
-
-def _table_depth_error_m(view: TrainingView) -> float | None:
-    """By how much the table reads too far along the optical axis, by the median of its points."""
-    target = view.full
-    row, column = np.nonzero(target.static_mask & (target.depth_m > 0))
-    step = max(1, len(row) // 20_000)
-    row, column = row[::step], column[::step]
-    depth = target.depth_m[row, column].astype(np.float64)
-    camera, T = target.camera, view.T_base_color
-    rays = np.stack(
-        [(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy], axis=1
-    )
-    down = rays @ T[2, :2] + T[2, 2]
-    height = T[2, 3] + depth * down
-    table = (np.abs(height) < TABLE_REACH_M) & (down < -0.2)
-    if int(table.sum()) < MIN_TABLE_POINTS:
-        return None
-    return float(np.median(height[table] / down[table]))
-
-
-def _support_z_m(model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]) -> float | None:
-    """Height of the table in the object's frame, None when the object does not stand on it."""
+def support_z_m(model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]) -> float | None:
+    """Height of the table in the object's frame [m]; None when it does not stand on it."""
     underside = float(min((centre - extents / 2)[2] for centre, extents in model.panels()))
     table = -float(T_base_object[2, 3])
     return table if abs(underside - table) <= STANDING_M else None
@@ -156,6 +108,7 @@ def masked_view(
         T_base_camera=se3.invert(T) @ view.T_base_color,
         depth_m=depth,
         mask=mask,
+        sensor=view.camera_id,
     )
 
 
@@ -187,11 +140,12 @@ def _away(
     model: ObjectModel,
     T_base_object: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, " num_points"]:
-    """Distance to the known surface; inside the box around a soft toy nothing is known, so 0."""
+    """Distance to the known surface; where only the box around is known, 0 inside of it."""
     if model.mesh is not None and model.soft is None:
         return np.abs(object_mesh(model).solid(se3.apply(se3.invert(T_base_object), points)))
     distance, _ = surface_distances(points, model, T_base_object)
-    return np.asarray(np.abs(distance) if model.soft is None else np.maximum(distance, 0.0))
+    is_known = model.soft is None and model.shape != SCANNED
+    return np.asarray(np.abs(distance) if is_known else np.maximum(distance, 0.0))
 
 
 def write_static(

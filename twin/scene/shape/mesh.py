@@ -1,10 +1,32 @@
-"""Triangle meshes: are they closed, how much do they hold, and how are they written."""
+"""Triangle meshes: are they closed, how much do they hold, how are they written and read."""
+
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from bridge.errors import PathNotFoundError
+from twin.errors import TwinError
+
 Vertices = Float[np.ndarray, "num_vertices 3"]
 Faces = Int[np.ndarray, "num_faces 3"]
+
+
+MAX_BYTES = 500_000_000
+"""Larger files are refused."""
+_FACE = np.dtype([("count", "u1"), ("ids", "<i4", 3)])
+
+
+class UnreadableMeshError(TwinError):
+    """The file is no triangle mesh of the kind we write."""
+
+    def __init__(self, *, path: Path, found: str) -> None:
+        """Remember the file."""
+        self.path = path
+        super().__init__(
+            f"{path}: {found}. Expected a binary little-endian PLY with float x, y, z and "
+            "triangles. Make it again: robot-gst rebuild RUN --force."
+        )
 
 
 def is_watertight(faces: Faces) -> bool:
@@ -41,23 +63,52 @@ def face_normals(
 
 def mesh_ply(vertices_m: Vertices, faces: Faces) -> bytes:
     """Return a binary PLY file [m]."""
-    header = [
+    rows = np.zeros(len(faces), dtype=_FACE)
+    rows["count"], rows["ids"] = 3, faces
+    header = "\n".join([*_header(len(vertices_m), len(faces)), "end_header", ""])
+    return header.encode() + vertices_m.astype("<f4").tobytes() + rows.tobytes()
+
+
+def _header(num_vertices: int, num_faces: int) -> list[str]:
+    return [
         "ply",
         "format binary_little_endian 1.0",
-        f"element vertex {len(vertices_m)}",
+        f"element vertex {num_vertices}",
         *(f"property float {axis}" for axis in "xyz"),
-        f"element face {len(faces)}",
+        f"element face {num_faces}",
         "property list uchar int vertex_indices",
-        "end_header",
-        "",
     ]
-    rows = np.zeros(len(faces), dtype=[("count", "u1"), ("ids", "<i4", 3)])
-    rows["count"], rows["ids"] = 3, faces
-    return "\n".join(header).encode() + vertices_m.astype("<f4").tobytes() + rows.tobytes()
 
 
-def mesh_obj(vertices_m: Vertices, faces: Faces) -> bytes:
-    """Return a Wavefront OBJ file [m], the form PyBullet and coal both read."""
-    lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices_m.tolist()]
-    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces.tolist()]
-    return ("\n".join(lines) + "\n").encode()
+def read_mesh(path: Path) -> tuple[Vertices, Faces]:
+    """Read a mesh that ``mesh_ply`` wrote: vertices [m] and faces.
+
+    Raises:
+        PathNotFoundError: When the file is not there.
+        UnreadableMeshError: When it is another kind of file, cut short, or names vertices that
+            do not exist.
+    """
+    if not path.is_file():
+        hint = "robot-gst rebuild RUN makes it."
+        raise PathNotFoundError(path=path, what="mesh", hint=hint)
+    if path.stat().st_size > MAX_BYTES:
+        raise UnreadableMeshError(path=path, found=f"more than {MAX_BYTES} bytes")
+    head, mark, body = path.read_bytes().partition(b"end_header\n")
+    lines = head.decode("ascii", "replace").splitlines()
+    counts = [line.split()[-1] for line in lines if line.startswith("element ")]
+    if not mark or len(counts) != 2 or not all(count.isdigit() for count in counts):
+        raise UnreadableMeshError(path=path, found="no usable PLY header")
+    num_vertices, num_faces = (int(count) for count in counts)
+    if lines != _header(num_vertices, num_faces):
+        raise UnreadableMeshError(path=path, found="another header than ours")
+    if len(body) != 12 * num_vertices + _FACE.itemsize * num_faces:
+        found = f"{len(body)} bytes for {num_vertices} vertices and {num_faces} faces"
+        raise UnreadableMeshError(path=path, found=found)
+    vertices = np.frombuffer(body, dtype="<f4", count=3 * num_vertices).reshape(-1, 3)
+    rows = np.frombuffer(body, dtype=_FACE, offset=12 * num_vertices)
+    faces = rows["ids"].astype(np.int64)
+    if not np.isfinite(vertices).all() or np.any(rows["count"] != 3):
+        raise UnreadableMeshError(path=path, found="vertices that are not finite, or no triangles")
+    if num_faces and (faces.min() < 0 or faces.max() >= num_vertices):
+        raise UnreadableMeshError(path=path, found="faces of vertices that do not exist")
+    return vertices.astype(np.float64), faces

@@ -83,6 +83,8 @@ class ObjectShape:
     cavity: Cavity | None
     num_views: int
     truncation_m: float
+    source: str = ""
+    """Who made it, when it was not carved out of views."""
     view_shift_m: float = 0.0
     """Root mean square of the shifts that laid the views together; 0 without rounds."""
 
@@ -140,19 +142,25 @@ def _carved(
     views: Sequence[MaskedView], support_z_m: float | None, config: ShapeConfig
 ) -> ObjectShape:
     low, high = _extent(views, support_z_m)
-    box, truncation = _box(low, high, config)
+    box, truncation = voxel_box(low, high, config)
     evidence = gather(box, views, truncation, config.min_free_views)
     solid = solid_of(evidence, support_z_m, low - box.voxel_m, high + box.voxel_m)
     distances = distances_of_solid(solid, box.voxel_m)
     values = smoothed(distances, box.voxel_m, config.smoothing_voxels)
     grid = SdfGrid(values_m=values, origin_m=box.origin_m, voxel_m=box.voxel_m)
-    return _described(grid, evidence, solid, len(views), truncation)
+    return describe_solid(grid, evidence, solid, len(views), truncation)
 
 
-def _box(
+def voxel_box(
     low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], config: ShapeConfig
 ) -> tuple[VoxelBox, float]:
-    """Voxels around an extent, and the truncation that goes with their size [m]."""
+    """Voxels around an extent, and the truncation that goes with their size [m].
+
+    Args:
+        low: Lower corner of the extent; on the plane that something stands on, where it does.
+        high: Upper corner.
+        config: Finest voxels and truncation.
+    """
     voxel = max(config.min_voxel_m, float((high - low).max()) / config.voxels_along)
     truncation = max(config.truncation_voxels * voxel, config.min_truncation_m)
     # Faces between voxels lie on the plane: half a voxel above and below it are the centres.
@@ -161,13 +169,22 @@ def _box(
     return VoxelBox(origin_m=origin, voxel_m=voxel, counts=(num_x, num_y, num_z)), truncation
 
 
-def _described(
+def describe_solid(
     grid: SdfGrid,
     evidence: Evidence,
     solid: Bool[np.ndarray, "num_x num_y num_z"],
     num_views: int,
     truncation_m: float,
 ) -> ObjectShape:
+    """Mesh a solid and say what of it was seen.
+
+    Args:
+        grid: Its distances.
+        evidence: Where views saw a surface, and what is known to be empty.
+        solid: Its voxels.
+        num_views: So many views said so.
+        truncation_m: How far a view's word reached.
+    """
     vertices, faces = isosurface(grid.values_m, grid.origin_m, grid.voxel_m)
     completed = ~_observed(vertices, faces, evidence)
     normals, areas = face_normals(vertices, faces)

@@ -9,9 +9,10 @@ from scipy.spatial import ConvexHull
 from twin.scene.shape.cavity import find_cavity
 from twin.scene.shape.collision import CollisionConfig, collision_parts
 from twin.scene.shape.convex import hull_of_points, thinned, voxel_corners
+from twin.scene.shape.files import read_parts, write_shape
 from twin.scene.shape.isosurface import isosurface
 from twin.scene.shape.masked_view import ShapeError
-from twin.scene.shape.mesh import is_watertight, mesh_obj, volume_m3
+from twin.scene.shape.mesh import is_watertight, volume_m3
 from twin.scene.shape.reconstruct import ObjectShape
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid, smoothed
 from twin.scene.shape.voxels import VoxelBox
@@ -158,24 +159,28 @@ def test_points_in_a_plane_and_a_shape_without_volume_are_refused() -> None:
         collision_parts(empty)
 
 
-def test_pybullet_and_coal_load_the_parts(tmp_path: Path) -> None:
-    import coal
+def test_the_parts_are_read_back_and_pybullet_takes_their_vertices(tmp_path: Path) -> None:
+    """No engine needs a file of its own kind: the hull of a part's vertices is the part."""
     import pybullet
 
-    found = collision_parts(box_shape())
+    shape = box_shape()
+    names, about = write_shape(tmp_path, shape, "box", soft=False)
+    found = collision_parts(shape).parts
+    parts = read_parts(tmp_path)
+    assert len(parts) == len(found) == about["collision"]["num_parts"]
+    assert sorted(n for n in names if n.startswith("collision/"))[0] == "collision/00.ply"
     client = pybullet.connect(pybullet.DIRECT)
     try:
-        for index, part in enumerate(found.parts):
-            path = tmp_path / f"{index:02d}.obj"
-            path.write_bytes(mesh_obj(part.vertices_m, part.faces))
+        for (vertices, faces), part in zip(parts, found, strict=True):
+            np.testing.assert_allclose(vertices, part.vertices_m, atol=1e-7)
+            assert is_watertight(faces)
             shape_id = pybullet.createCollisionShape(
-                pybullet.GEOM_MESH, fileName=str(path), physicsClientId=client
+                pybullet.GEOM_MESH, vertices=vertices.tolist(), physicsClientId=client
             )
             body = pybullet.createMultiBody(0, shape_id, physicsClientId=client)
             low, high = pybullet.getAABB(body, physicsClientId=client)
-            np.testing.assert_allclose(low, part.vertices_m.min(axis=0), atol=0.003)
-            np.testing.assert_allclose(high, part.vertices_m.max(axis=0), atol=0.003)
-            loaded = coal.MeshLoader().load(str(path), np.ones(3))
-            assert loaded.num_vertices == len(part.vertices_m)
+            np.testing.assert_allclose(low, vertices.min(axis=0), atol=0.003)
+            np.testing.assert_allclose(high, vertices.max(axis=0), atol=0.003)
     finally:
         pybullet.disconnect(client)
+    assert read_parts(tmp_path / "nowhere") == []

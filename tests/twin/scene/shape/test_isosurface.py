@@ -1,13 +1,24 @@
 """The surface of a grid: closed, facing outwards, where the values say."""
 
+from pathlib import Path
+
 import numpy as np
+import open3d as o3d
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.measure import marching_cubes
 
+from bridge.errors import PathNotFoundError
 from twin.scene.shape.isosurface import isosurface
-from twin.scene.shape.mesh import face_normals, is_watertight, mesh_obj, volume_m3
+from twin.scene.shape.mesh import (
+    UnreadableMeshError,
+    face_normals,
+    is_watertight,
+    mesh_ply,
+    read_mesh,
+    volume_m3,
+)
 
 
 def sphere(radius_m: float, step_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +87,35 @@ def test_an_open_mesh_a_flipped_face_and_no_mesh_are_not_watertight() -> None:
     assert not is_watertight(degenerate)
 
 
-def test_an_obj_file_counts_from_one() -> None:
-    text = mesh_obj(np.eye(3), np.array([[0, 1, 2]])).decode()
-    assert text.splitlines()[-1] == "f 1 2 3"
-    assert text.splitlines()[0] == "v 1 0 0"
+def test_a_written_mesh_is_read_back_and_open3d_reads_it_too(tmp_path: Path) -> None:
+    vertices, faces = sphere(0.05, 0.01)
+    path = tmp_path / "mesh.ply"
+    path.write_bytes(mesh_ply(vertices, faces))
+    again, same = read_mesh(path)
+    np.testing.assert_allclose(again, vertices, atol=1e-7)
+    np.testing.assert_array_equal(same, faces)
+    other = o3d.io.read_triangle_mesh(str(path))
+    np.testing.assert_allclose(np.asarray(other.vertices), again, atol=1e-7)
+    np.testing.assert_array_equal(np.asarray(other.triangles), faces)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        (b"end_header", b"end_headed", "no usable PLY header"),
+        (b"float x", b"double x", "another header"),
+        (b"element vertex 3", b"element vertex 4", "bytes for 4 vertices"),
+        (b"\x03\x00\x00\x00\x00", b"\x04\x00\x00\x00\x00", "no triangles"),
+        (b"\x03\x00\x00\x00\x00", b"\x03\x09\x00\x00\x00", "do not exist"),
+        (b"\x00\x00\x80\x3f", b"\x00\x00\xc0\x7f", "not finite"),
+    ],
+)
+def test_a_damaged_mesh_is_refused(tmp_path: Path, old: bytes, new: bytes, says: str) -> None:
+    path = tmp_path / "mesh.ply"
+    data = mesh_ply(np.eye(3), np.array([[0, 1, 2]]))
+    assert old in data
+    path.write_bytes(data.replace(old, new, 1))
+    with pytest.raises(UnreadableMeshError, match=says):
+        read_mesh(path)
+    with pytest.raises(PathNotFoundError):
+        read_mesh(tmp_path / "none.ply")

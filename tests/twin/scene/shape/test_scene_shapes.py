@@ -14,8 +14,6 @@ from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.localise_result import LocalisedObject
 from twin.scene.localise_shape import pose_of, surface_distances
 from twin.scene.objects import ObjectSplats, SceneParts, write_objects
-from twin.scene.semantics.result import Instance
-from twin.scene.shape.from_labels import shape_of_instance
 from twin.scene.shape.from_training import masked_view, shapes_of, write_static
 from twin.scene.shape.masked_view import ShapeError
 from twin.scene.shape.mesh import is_watertight, volume_m3
@@ -135,7 +133,7 @@ def test_the_folder_holds_what_object_json_says(
     for key in POSES:
         folder = tmp_path / "objects" / key
         about = json.loads((folder / "object.json").read_text())
-        assert about["schema_version"] == 2
+        assert about["schema_version"] == 3
         assert about["shape_source"].startswith("reconstructed from 24")
         assert about["geometry"]["watertight"] is True
         assert about["geometry"]["mass_prior"]["material"] == "plastic"
@@ -163,34 +161,6 @@ def test_the_known_shape_stands_in_and_nothing_old_is_left(
     about = json.loads((folder / "object.json").read_text())
     assert about["shape_source"] == "task file"
     assert about["shape_remark"] == "seen too little"
-
-
-@pytest.mark.slow
-def test_a_segmented_instance_gets_its_shape_without_a_task(views: list[TrainingView]) -> None:
-    rng = np.random.default_rng(0)
-    cube = rng.uniform(-0.02, 0.02, (3000, 3))
-    cube[np.arange(3000), rng.integers(0, 3, 3000)] = np.sign(rng.normal(size=3000)) * 0.02
-    table = np.column_stack([rng.uniform([0.35, -0.25], [0.65, 0.05], (4000, 2)), np.zeros(4000)])
-    means = np.concatenate([se3.apply(POSES["cube"], cube), table])
-    labels = np.repeat([1, 0], [3000, 4000]).astype(np.uint16)
-    labels[:3000][means[:3000, 2] < 0.003] = 0
-    instance = Instance(
-        id=1,
-        label="cube",
-        mask=labels == 1,
-        support=1,
-        seen=1,
-        score=1.0,
-        source="test",
-        color_srgb=(1, 2, 3),
-        T_base_instance=POSES["cube"],
-        size_m=(0.04, 0.04, 0.04),
-    )
-    shape = shape_of_instance(views, as_float32(means), labels, instance, 0.0)
-    assert shape.is_watertight
-    assert shape.volume_m3 == pytest.approx(0.04**3, rel=0.12)
-    with pytest.raises(ShapeError):
-        shape_of_instance(views, as_float32(means), np.zeros_like(labels), instance, 0.0)
 
 
 @pytest.fixture(scope="module")

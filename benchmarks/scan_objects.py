@@ -1,0 +1,182 @@
+"""A scan of the stand-in cell taken apart as ``rebuild`` does it, with the truth beside it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from localise_cell import Start, look_around
+
+from bridge.episode.streams import RgbdFrame
+from bridge.geometry import se3
+from bridge.task.meshes.catalogue import object_mesh
+from twin.scene.fit import fit
+from twin.scene.gaussians import GaussianCloud
+from twin.scene.initialise import fuse
+from twin.scene.localise import LocaliseConfig, localise_objects
+from twin.scene.localise_result import LocalisedObject
+from twin.scene.objects import SceneParts, moved_cloud, shape_mesh, split_objects
+from twin.scene.owners import object_poses
+from twin.scene.points import DepthLimits, FrameSurface
+from twin.scene.settings import FitConfig, InitialiseConfig
+from twin.scene.shape.from_training import shapes_of
+from twin.scene.shape.mesh import volume_m3
+from twin.scene.shape.reconstruct import ObjectShape
+from twin.scene.training_view import TrainingView, training_view
+
+LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.03)
+GRIPPER_M = 0.28
+"""The gripper hangs into the wrist camera's frames nearer than this; ``rebuild`` knows it by the
+joints."""
+STRIDE = 2
+Mesh = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scanned:
+    """What a scan gave."""
+
+    start: Start
+    views: list[TrainingView]
+    cloud: GaussianCloud
+    localised: dict[str, LocalisedObject]
+    poses: dict[str, np.ndarray]
+    shapes: dict[str, ObjectShape | str]
+
+    def apart(self) -> SceneParts:
+        """Objects cut out along their shapes."""
+        return split_objects(self.cloud, self.localised, self.start.task, shapes=self.shapes)
+
+
+def take_scan(task_name: str, seed: int, *, iterations: int = 0, honest: bool = False) -> Scanned:
+    """Scan a start, fuse and fit it, find the objects and reconstruct them.
+
+    Args:
+        task_name: A task of ``datasets/tasks``.
+        seed: Draws laboratory, start and noise.
+        iterations: Images to fit the Gaussians to; 0 leaves them as fused.
+        honest: A laboratory that hides nothing.
+    """
+    start = look_around(task_name, seed, honest=honest)
+    wrist = [frame for frame in start.frames if frame.camera_id == "wrist"]
+    others = [frame for frame in start.frames if frame.camera_id != "wrist"]
+    surfaces = [FrameSurface(f, LIMITS) for f in [*map(without_gripper, wrist), *others]]
+    views = [training_view(surface) for surface in surfaces]
+    config = InitialiseConfig()
+    cloud = fuse([surface.points(STRIDE) for surface in surfaces], config)
+    if iterations:
+        settings = FitConfig(iterations=iterations, threads=1)
+        cloud = fit(cloud, views, settings, lambda *_: None, max_splats=config.max_splats).cloud
+    num = LocaliseConfig().max_views
+    chosen = [wrist[k] for k in np.linspace(0, len(wrist) - 1, num).round().astype(int)]
+    localised = localise_objects([*chosen, *others], start.task)
+    poses = object_poses(cloud, localised, start.task)
+    return Scanned(
+        start=start,
+        views=views,
+        cloud=cloud,
+        localised=localised,
+        poses=poses,
+        shapes=shapes_of(views, start.task.objects, poses),
+    )
+
+
+def without_gripper(frame: RgbdFrame) -> RgbdFrame:
+    """The frame without what is nearer than anything on the table."""
+    return replace(frame, depth_m=np.where(frame.depth_m > GRIPPER_M, frame.depth_m, 0.0))
+
+
+def true_mesh(start: Start, key: str) -> Mesh:
+    """The object as it really is, deformed as it lies, in its own frame."""
+    model = start.task.objects[key]
+    if key in start.skins_m:
+        T_object_base = se3.invert(start.Ts_base_object[key])
+        return se3.apply(T_object_base, start.skins_m[key]), object_mesh(model).triangles
+    return shape_mesh(model)
+
+
+def whole_scene(parts: SceneParts) -> tuple[GaussianCloud, dict[str, GaussianCloud]]:
+    """Background and objects where they were scanned, as ``add_semantics`` takes them."""
+    objects = {
+        key: moved_cloud(item.cloud, item.T_base_object) for key, item in parts.objects.items()
+    }
+    return parts.background, objects
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapeScore:
+    """How one reconstructed object compares with what it is."""
+
+    watertight: bool
+    mean_error_m: float
+    """Of the true surface to the reconstructed one, after laying one onto the other: where the
+    object is, is another question."""
+    volume_ratio: float
+    cavity_ratio: float | None
+    """Volume of the cavity over that of the known one; None where there should be none."""
+
+
+def score_shape(scan: Scanned, key: str) -> ShapeScore | None:
+    """Compare with the true mesh; None without a shape."""
+    import cast_views
+
+    shape = scan.shapes.get(key, "not found")
+    if isinstance(shape, str):
+        print(f"  {key}: {shape}")
+        return None
+    truth = true_mesh(scan.start, key)
+    laid = laid_onto((shape.vertices_m, shape.faces), truth)
+    mean, _ = cast_views.mean_error_m(laid, truth)
+    model = scan.start.task.objects[key]
+    cavity = None
+    if not model.origin_at_centre:
+        held = 0.0 if shape.cavity is None else shape.cavity.volume_m3
+        cavity = held / float(np.prod(model.inner_m))
+    return ShapeScore(
+        watertight=shape.is_watertight,
+        mean_error_m=mean,
+        volume_ratio=shape.volume_m3 / abs(volume_m3(*truth)),
+        cavity_ratio=cavity,
+    )
+
+
+def laid_onto(mesh: Mesh, reference: Mesh) -> Mesh:
+    """The mesh after point-to-plane steps onto a reference that is millimetres away (Open3D)."""
+    import open3d as o3d
+
+    def cloud(of: Mesh) -> o3d.geometry.PointCloud:
+        triangles = o3d.geometry.TriangleMesh(
+            o3d.utility.Vector3dVector(of[0]), o3d.utility.Vector3iVector(np.asarray(of[1], "i4"))
+        )
+        triangles.compute_triangle_normals()
+        o3d.utility.random.seed(0)
+        return triangles.sample_points_uniformly(6000, use_triangle_normal=True)
+
+    registration = o3d.pipelines.registration
+    found = registration.registration_icp(
+        cloud(mesh),
+        cloud(reference),
+        0.01,
+        np.eye(4),
+        registration.TransformationEstimationPointToPlane(),
+        registration.ICPConvergenceCriteria(max_iteration=40),
+    )
+    return se3.apply(found.transformation, mesh[0]), mesh[1]
+
+
+def true_owners(scan: Scanned) -> np.ndarray:
+    """Index of the object each Gaussian really belongs to, -1 for all else.
+
+    What is nearer to an object's true surface than 6 mm, and nearer than to the table.
+    """
+    import cast_views
+    import open3d as o3d
+
+    p = scan.cloud.means_m
+    owner = np.full(len(p), -1)
+    nearest = np.minimum(np.abs(p[:, 2]), np.float32(0.006))
+    for index, key in enumerate(scan.poses):
+        vertices, faces = true_mesh(scan.start, key)
+        placed = se3.apply(scan.start.Ts_base_object[key], vertices)
+        away = cast_views.ray_scene([(placed, faces)]).compute_distance(o3d.core.Tensor(p)).numpy()
+        owner[away < nearest] = index
+        nearest = np.minimum(nearest, away)
+    return owner

@@ -1,0 +1,116 @@
+"""Objects that a task names keep their names and their Gaussians."""
+
+import numpy as np
+import pytest
+from table_scene import World
+
+from twin.scene.raster import RasterConfig, Rasteriser
+from twin.scene.semantics.describe import NAMED, scene_by_default
+from twin.scene.semantics.known import MIN_SPLATS, label_of, numbered
+from twin.scene.semantics.lexicon import kind_of, names_of
+from twin.scene.semantics.query import query
+from twin.scene.semantics.result import SemanticScene
+
+
+def masks(labels: np.ndarray, **keys: tuple[int, ...]) -> dict[str, np.ndarray]:
+    return {key: np.isin(np.arange(len(labels)), ids) for key, ids in keys.items()}
+
+
+def test_a_known_object_takes_what_the_segmenter_joined_with_it_and_no_more() -> None:
+    # Thing 1 is mostly the duck's, thing 2 hardly, thing 3 not at all.
+    labels = np.repeat([0, 1, 2, 3], [40, 50, 60, 30]).astype(np.uint16)
+    duck = np.zeros(180, dtype=bool)
+    duck[10:20] = True  # the segmenter saw background here
+    duck[40:75] = True
+    duck[90:100] = True
+    found = numbered(labels, {"duck": duck, "nowhere": np.zeros(180, dtype=bool)})
+    assert (found.keys, found.others) == (("duck",), (2, 3))
+    assert np.all(found.labels[duck] == 1)
+    assert np.all(found.labels[40:90] == 1)
+    assert np.all(found.labels[100:150] == 2)
+    assert np.all(found.labels[150:] == 3)
+    assert not found.labels[:10].any()
+
+
+def test_two_known_objects_in_one_thing_share_it_by_their_own_gaussians() -> None:
+    labels = np.ones(100, dtype=np.uint16)
+    first, second = np.arange(100) < 55, np.arange(100) >= 70
+    found = numbered(labels, {"a": first, "b": second})
+    assert found.others == ()
+    assert np.bincount(found.labels).tolist() == [0, 70, 30]
+
+
+def test_without_known_objects_nothing_changes() -> None:
+    labels = np.array([0, 2, 1, 2], dtype=np.uint16)
+    found = numbered(labels, {})
+    np.testing.assert_array_equal(found.labels, labels)
+    assert found.others == (1, 2)
+
+
+def test_a_handful_of_gaussians_is_no_object() -> None:
+    few = np.arange(60) < MIN_SPLATS - 1
+    found = numbered(np.zeros(60, dtype=np.uint16), {"duck": few})
+    assert found.keys == ()
+    assert not found.labels.any()
+
+
+@pytest.mark.parametrize(
+    ("key", "is_open", "label", "kind", "called"),
+    [
+        ("duck_1", False, "yellow duck", "animal", "toy"),
+        ("box", True, "yellow open box", "container", "container"),
+        ("box", False, "yellow box", "other", "box"),
+        ("basket", True, "yellow basket", "container", "container"),
+        ("red_cube", False, "red cube", "other", "cube"),
+    ],
+)
+def test_names_say_what_parts_to_look_for(
+    key: str, is_open: bool, label: str, kind: str, called: str
+) -> None:
+    found = label_of(key, "yellow", is_open=is_open)
+    assert found == label
+    assert kind_of(found) == kind
+    assert {called, "object"} <= names_of(found)
+
+
+@pytest.fixture(scope="module")
+def scene(tabletop: World) -> SemanticScene:
+    truth = tabletop.true_instances()
+    number = {name: key for key, name in tabletop.names.items()}
+    known = {
+        "tub": truth == number["blue open container"],
+        "cube_7": truth == number["red cube"],
+    }
+    return scene_by_default(
+        tabletop.cloud,
+        [shot.viewpoint for shot in tabletop.train[:2]],
+        Rasteriser(RasterConfig(threads=1)),
+        known=known,
+    )
+
+
+def test_known_things_come_first_and_the_others_are_still_found(
+    scene: SemanticScene, tabletop: World
+) -> None:
+    labels = [item.label for item in scene.instances]
+    assert labels[:2] == ["blue tub", "red cube"]
+    assert set(labels[2:]) == set(tabletop.names.values()) - {"blue open container", "red cube"}
+    assert [item.source == NAMED for item in scene.instances[:3]] == [True, True, False]
+    assert all(item.seen == 2 for item in scene.instances[:2])
+
+
+def test_a_question_finds_the_task_s_own_words(scene: SemanticScene) -> None:
+    cube = scene.instances[1]
+    assert query(scene, "the cube").objects[cube.id] == 1.0
+    assert query(scene, "tub").best() == scene.instances[0].id
+
+
+def test_a_known_thing_without_a_table_is_named_all_the_same(tabletop: World) -> None:
+    alone = tabletop.cloud.take(tabletop.true_instances() == 1)
+    known = {"cube": np.ones(len(alone), dtype=bool)}
+    found = scene_by_default(alone, [], Rasteriser(RasterConfig(threads=1)), known=known)
+    assert [item.label for item in found.instances] == ["red cube"]
+
+
+def test_a_container_has_its_parts_under_any_name(scene: SemanticScene) -> None:
+    assert {"rim", "floor", "walls"} <= set(scene.instances[0].parts)
