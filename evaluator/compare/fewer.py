@@ -16,7 +16,7 @@ from evaluator.statistics.proxy import (
     ppi_plus_plus,
     trials_saved,
 )
-from evaluator.statistics.sequential import ConfidenceSequence, capital_log, stop_or_continue
+from evaluator.statistics.sequential import capital_log, sequence_of, stop_or_continue
 
 ALPHA = 0.05
 GOAL = 0.5
@@ -124,11 +124,8 @@ def sequences(rows: Sequence[TrialRow], pairs: Sequence[StartPair]) -> list[Meas
 
 def _sequence(key: Key, known: Sequence[TrialRow]) -> Measurement:
     def compute() -> tuple[float, Interval | None]:
-        sequence = ConfidenceSequence()
-        interval: Interval | None = None
-        for row in known:
-            interval = sequence.add(bool(row.recorded))
-        return sequence.k / sequence.n, interval
+        sequence = sequence_of([bool(row.recorded) for row in known])
+        return sequence.k / sequence.n, sequence.interval
 
     return measured(
         rate_id("recorded", key).replace("rate.", "sequence.", 1),
@@ -151,10 +148,8 @@ def stopping_table(rows: Sequence[TrialRow], goal: float | None) -> tuple[Table,
         known = [row for row in members if row.recorded is not None]
         if not known or any(row.count > 1 for row in known):
             continue
-        sequence = ConfidenceSequence()
         try:
-            for row in known:
-                sequence.add(bool(row.recorded))
+            sequence = sequence_of([bool(row.recorded) for row in known])
         except UndefinedStatisticError as error:
             lines.append((task, condition, policy, len(known), None, error.reason, None))
             continue

@@ -7,7 +7,6 @@ from scipy.special import ndtr
 from scipy.stats import binom
 
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics.paired import sign_test
 from evaluator.statistics.proportion import normal_quantile
 
 ALPHA = 0.05
@@ -115,7 +114,8 @@ def power_paired(
     for discordant in range(1, num_pairs + 1):
         chance = float(binom.pmf(discordant, num_pairs, differ))
         improved = np.arange(discordant + 1)
-        shown = [sign_test(i, discordant - i)[0] <= alpha for i in improved.tolist()]
+        smaller = np.minimum(improved, discordant - improved)
+        shown = 2 * binom.cdf(smaller, discordant, 0.5) <= alpha
         total += chance * float(binom.pmf(improved, discordant, p_improved / differ)[shown].sum())
     return min(1.0, total)
 

@@ -5,9 +5,12 @@ confidence sequence holds at every n at once.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from scipy.special import betaln
+import numpy as np
+from jaxtyping import Float64, Int64
+from scipy.special import betaln, xlog1py, xlogy
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
@@ -89,11 +92,58 @@ class ConfidenceSequence:
         now = betting_interval(self.k, self.n, level=self.level)
         self.low, self.high = max(self.low, now.low), min(self.high, now.high)
         if self.low > self.high:
-            raise UndefinedStatisticError(
-                statistic="confidence sequence",
-                reason=f"after {self.n} trials no constant rate fits: the rate has changed",
-            )
+            raise _changed(self.n)
+        return self.interval
+
+    @property
+    def interval(self) -> Interval:
+        """What is left."""
         return Interval(low=self.low, high=self.high, level=self.level, method="betting")
+
+
+def sequence_of(outcomes: Sequence[bool], *, level: float = LEVEL) -> ConfidenceSequence:
+    """Return the sequence after all these trials; ``add`` one by one, but for all at once.
+
+    Raises:
+        UndefinedStatisticError: When after some trial no constant rate was left.
+    """
+    sequence = ConfidenceSequence(level=level)
+    if not outcomes:
+        return sequence
+    k, n = np.cumsum(np.array(outcomes, dtype=bool)), np.arange(1, len(outcomes) + 1)
+    lows = np.where(k == 0, 0.0, _ends(k, n, level, np.zeros(len(n))))
+    highs = np.where(k == n, 1.0, _ends(k, n, level, np.ones(len(n))))
+    low, high = np.maximum.accumulate(lows), np.minimum.accumulate(highs)
+    crossed = np.flatnonzero(low > high)
+    if len(crossed):
+        raise _changed(int(crossed[0]) + 1)
+    sequence.k, sequence.n = int(k[-1]), len(outcomes)
+    sequence.low, sequence.high = float(low[-1]), float(high[-1])
+    return sequence
+
+
+def _ends(
+    k: Int64[np.ndarray, " trials"],
+    n: Int64[np.ndarray, " trials"],
+    level: float,
+    outside: Float64[np.ndarray, " trials"],
+) -> Float64[np.ndarray, " trials"]:
+    """Bisect all ends together."""
+    ruin = -np.log1p(-level)
+    mixture = betaln(k + PRIOR, n - k + PRIOR) - betaln(PRIOR, PRIOR)
+    inside = k / n
+    for _ in range(60):
+        middle = (inside + outside) / 2
+        poor = mixture - xlogy(k, middle) - xlog1py(n - k, -middle) < ruin
+        inside, outside = np.where(poor, middle, inside), np.where(poor, outside, middle)
+    return np.asarray(inside)
+
+
+def _changed(after: int) -> UndefinedStatisticError:
+    return UndefinedStatisticError(
+        statistic="confidence sequence",
+        reason=f"after {after} trials no constant rate fits: the rate has changed",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

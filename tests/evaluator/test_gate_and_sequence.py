@@ -27,6 +27,7 @@ from evaluator.statistics.sequential import (
     ConfidenceSequence,
     betting_interval,
     capital_log,
+    sequence_of,
     stop_or_continue,
 )
 
@@ -159,6 +160,23 @@ def test_a_sequence_never_widens_and_stops_when_the_question_is_answered() -> No
     assert not still_open.stop
     assert still_open.more_trials is None or still_open.more_trials > 0
     assert stop_or_continue(sequence, 0.999).answer in ("below", "open")
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.booleans(), min_size=1, max_size=60))
+def test_all_at_once_is_one_by_one(outcomes: list[bool]) -> None:
+    one_by_one = ConfidenceSequence()
+    try:
+        for success in outcomes:
+            one_by_one.add(success)
+    except UndefinedStatisticError as error:
+        with pytest.raises(UndefinedStatisticError, match=error.reason):
+            sequence_of(outcomes)
+        return
+    at_once = sequence_of(outcomes)
+    assert (at_once.k, at_once.n) == (one_by_one.k, one_by_one.n)
+    assert at_once.low == pytest.approx(one_by_one.low, abs=1e-12)
+    assert at_once.high == pytest.approx(one_by_one.high, abs=1e-12)
 
 
 def test_a_rate_that_changes_is_noticed() -> None:
