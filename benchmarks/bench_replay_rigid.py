@@ -142,7 +142,7 @@ def main() -> None:
             alone.append(lasted / seconds)
             whole.append(lasted / total)
             slips.append(slip_m(result) * 1e3)
-            held += np.isfinite(slips[-1])
+            held += bool(np.isfinite(slips[-1]))
             placed += result.verdict.terminal.value is True
     same = digest(REPEATS)
     physics = config.physics
@@ -153,8 +153,8 @@ def main() -> None:
                at_most=False, reference=f"slowest {min(whole):.1f}"),
         Target(what="slip, 90 % below", measured=float(np.percentile(slips, 90)), limit=2.0,
                unit="mm", reference=f"median {np.median(slips):.2f}"),
-        Target(what="held", measured=held, limit=GRASPS, at_most=False),
-        Target(what="placed", measured=placed, limit=GRASPS, at_most=False),
+        Target(what="held", measured=float(held), limit=GRASPS, at_most=False),
+        Target(what="placed", measured=float(placed), limit=GRASPS, at_most=False),
         Target(what=f"different bytes in {REPEATS} repeats", measured=len(same.split()) - 1,
                limit=0),
         Target(what="another process gives other bytes", measured=float(other_process() != same),

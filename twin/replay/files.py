@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Int
 
 from bridge.episode import schema
 from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.point_cloud import PointCloudSample
-from bridge.episode.records import CompressedColor, JointSample, PoseSample, string_to_cdr
+from bridge.episode.records import CompressedColor, string_to_cdr
+from bridge.episode.repeated import joint_messages, pose_messages
 from bridge.episode.writer import EpisodeWriter
 from bridge.task.plan import Plan, Stage
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME, GRIPPER
@@ -79,17 +80,20 @@ def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterato
     prefix, start = f"/{origin.cell}", origin.start_ns
     yield _Message(start, "/robot_description", schema.STRING, string_to_cdr(origin.urdf))
     yield _Message(start, f"{prefix}/plan", schema.PLAN, plan.to_json())
-    for index, t_ns in enumerate(result.stamps_ns):
-        stamp = start + int(t_ns)
-        for topic, names, values in (
-            ("joint_states", ARM_JOINTS, result.joints_rad[index]),
-            ("gripper/state", (GRIPPER_WIDTH,), result.width_m[index : index + 1]),
-            ("replay/clearance", (MIN_CLEARANCE,), result.clearance_m[index : index + 1]),
-        ):
-            yield _joint_message(stamp, f"{prefix}/{topic}", names, values)
-        yield _pose_message(stamp, f"{prefix}/tcp/pose", result.Ts_base_tcp[index])
-        for name, Ts in result.Ts_base_object.items():
-            yield _pose_message(stamp, f"{prefix}/object/{name}/pose", Ts[index])
+    stamps = start + result.stamps_ns
+    for topic, names, values in (
+        ("joint_states", ARM_JOINTS, result.joints_rad),
+        ("gripper/state", (GRIPPER_WIDTH,), result.width_m[:, None]),
+        ("replay/clearance", (MIN_CLEARANCE,), result.clearance_m[:, None]),
+    ):
+        rows = joint_messages(stamps, names, values)
+        yield from _stamped(stamps, f"{prefix}/{topic}", schema.JOINT_STATE, rows)
+    poses = {"tcp": result.Ts_base_tcp} | {
+        f"object/{name}": Ts for name, Ts in result.Ts_base_object.items()
+    }
+    for name, Ts in poses.items():
+        rows = pose_messages(stamps, BASE_FRAME, Ts)
+        yield from _stamped(stamps, f"{prefix}/{name}/pose", schema.POSE_STAMPED, rows)
     yield from _nodes(result, prefix, start)
     yield from _contacts(result, prefix, start)
     for camera_id, image in origin.images:
@@ -152,18 +156,11 @@ def _json_message(topic: str, type_name: str, record: Mapping[str, Any]) -> _Mes
     return _Message(int(record["stamp_ns"]), topic, type_name, data)
 
 
-def _joint_message(
-    stamp_ns: int, topic: str, names: tuple[str, ...], values: Float[np.ndarray, " num_values"]
-) -> _Message:
-    sample = JointSample(
-        stamp_ns=stamp_ns, names=names, position=values, velocity=np.zeros(0), effort=np.zeros(0)
-    )
-    return _Message(stamp_ns, topic, schema.JOINT_STATE, sample.to_cdr())
-
-
-def _pose_message(stamp_ns: int, topic: str, T_base_body: Float[np.ndarray, "4 4"]) -> _Message:
-    sample = PoseSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=T_base_body)
-    return _Message(stamp_ns, topic, schema.POSE_STAMPED, sample.to_cdr())
+def _stamped(
+    stamps_ns: Int[np.ndarray, " num_steps"], topic: str, type_name: str, rows: Iterator[bytes]
+) -> Iterator[_Message]:
+    for stamp_ns, data in zip(stamps_ns.tolist(), rows, strict=True):
+        yield _Message(stamp_ns, topic, type_name, data)
 
 
 def _events(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterator[_Message]:
