@@ -220,7 +220,7 @@ void Body::finish(float step_s) {
 
 namespace {
 
-Four turned(Four a) { return __builtin_shufflevector(a, a, 1, 2, 0, 3); }
+Four turned(Four a) { return SOFT_PICK_FOUR(a, a, 1, 2, 0, 3); }
 
 Four cross(Four a, Four b) { return turned(a * turned(b) - turned(a) * b); }
 
