@@ -64,7 +64,7 @@ COMMANDS: tuple[tuple[str, str, str, str], ...] = (
     (
         "calibrate",
         "twin.cli:calibrate",
-        "Where the cameras are, from recorded episodes.",
+        "Where the cameras are and how contact works, from episodes.",
         "runs/monday --cameras",
     ),
     (

@@ -143,9 +143,11 @@ def calibrate(
     config: CalibrateConfig = CALIBRATE,
     output: Output = OUTPUT,
 ) -> int:
-    """Find out from recorded episodes where the cameras are; writes scene/calibration.json.
+    """Find out from recorded episodes where the cameras are, or how contact works.
 
+    Writes scene/calibration.json.
     Example: robot-gst calibrate runs/monday --cameras
+    Physics: robot-gst calibrate runs/monday --physics --workers 2
 
     Args:
         run: Run folder.
@@ -154,14 +156,23 @@ def calibrate(
     """
     from bridge.episode.run import RunFolder
     from bridge.errors import UsageError
+
+    run_folder = RunFolder.open(run)
+    if config.cameras == config.physics:
+        message = "say what to calibrate: robot-gst calibrate RUN --cameras, or --physics."
+        raise UsageError(message)
+    if config.physics:
+        from twin.calibrate.physics.record import describe_physics
+        from twin.calibrate.physics.run import calibrate_physics
+
+        physics, calibration_id = calibrate_physics(run_folder, config, output)
+        output.result(
+            {**physics, "calibration_id": calibration_id},
+            describe_physics(physics, calibration_id),
+        )
+        return 0
     from twin.calibrate.cameras import calibrate_cameras, describe_cameras
 
-    if config.physics:
-        message = "--physics is not part of this version: only --cameras can be calibrated yet."
-        raise UsageError(message)
-    if not config.cameras:
-        message = "say what to calibrate: robot-gst calibrate RUN --cameras."
-        raise UsageError(message)
-    record = calibrate_cameras(RunFolder.open(run), config, output)
+    record = calibrate_cameras(run_folder, config, output)
     output.result(record, describe_cameras(record))
     return 0

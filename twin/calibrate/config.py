@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from bridge.errors import refuse_outside
+from twin.scene.settings import convert_duration
 
 Mount = Literal["auto", "hand", "fixed"]
 
@@ -19,7 +20,8 @@ class CalibrateConfig:
     cameras: bool = False
     """Where the cameras are, written to RUN/scene/calibration.json."""
     physics: bool = False
-    """Friction, masses and timing from executed plans; not part of this version."""
+    """Friction, masses, forces, delay and pose bias from executed probes and trials, written to
+    RUN/scene/calibration.json where held-out episodes confirm them."""
     pairs: Path | None = None
     """JSON or CSV file of pose pairs (T_base_effector, T_camera_target), for --camera."""
     camera: str = ""
@@ -32,8 +34,28 @@ class CalibrateConfig:
     max_postures: int = 6
     """A fixed camera is found from the robot in this many different postures."""
     seed: int = 0
-    """Of the resampling behind the intervals."""
+    """Of the resampling behind the intervals; with --physics, of the search and of which episodes
+    are held out."""
+    evaluations: int = 150
+    """With --physics: points the search tries; the intervals take about 60 more."""
+    budget_s: Annotated[float, Parameter(name="--budget", converter=convert_duration)] = 900.0
+    """With --physics: wall time after which the search ends: 900s, 10min or plain seconds."""
+    workers: int = 1
+    """With --physics: processes that simulate side by side."""
+    samples: int = 4
+    """With --physics: noisy starts of each judged trial behind its chance of success; 0: what the
+    operator said of trials is not used."""
 
     def __post_init__(self) -> None:
         """Refuse a number of postures nothing can be found from."""
-        refuse_outside(self, {"max_postures": (1, 50), "seed": (0, 2**31)})
+        refuse_outside(
+            self,
+            {
+                "max_postures": (1, 50),
+                "seed": (0, 2**31),
+                "evaluations": (1, 100_000),
+                "budget_s": (0, float("inf")),
+                "workers": (1, 1024),
+                "samples": (0, 1000),
+            },
+        )

@@ -1,7 +1,8 @@
-"""``scene/calibration.json``: where the cameras are, as ``robot-gst calibrate`` found out.
+"""``scene/calibration.json``: cameras and physics, as ``robot-gst calibrate`` found out.
 
-Written by ``twin.calibrate``, read by whoever poses frames. Only what was identified is listed
-under ``cameras``; what was not stands under ``not_identified`` with the reason.
+Written by ``twin.calibrate``, read by whoever poses frames or replays. Only cameras that were
+identified are listed under ``cameras``; what was not stands under ``not_identified`` with the
+reason. ``physics`` holds every parameter, and under ``identified`` what replays use.
 """
 
 import json
@@ -27,6 +28,8 @@ from twin.robot.posture import posture_track
 
 CALIBRATION_FILE = "calibration.json"
 CALIBRATION_VERSION = 1
+UNNAMED = ("calibration_id", "software", "physics_history")
+"""What does not change what a calibration does, and so not its name."""
 
 
 class UnreadableCalibrationError(TwinError):
@@ -116,20 +119,53 @@ def write_calibration(
         cameras: Per camera what was found, with ``link``, ``stream`` and ``T_link_camera``.
         not_identified: Per camera why nothing was found.
     """
-    before = read_calibration(run)
-    kept: dict[str, Any] = {} if before is None else dict(before.record)
+    kept = _kept(run)
     known = {**kept.get("cameras", {}), **cameras}
     lost = {**kept.get("not_identified", {}), **not_identified}
+    return _store(
+        run,
+        {
+            **kept,
+            "cameras": {key: known[key] for key in sorted(known)},
+            "not_identified": {key: lost[key] for key in sorted(lost) if key not in known},
+        },
+    )
+
+
+def write_physics(run: RunFolder, physics: Mapping[str, Any]) -> dict[str, Any]:
+    """Write what was found out about physics; earlier versions stay under ``physics_history``.
+
+    A result that was not promoted is kept there too and changes nothing that replays use.
+
+    Args:
+        run: Run folder; ``scene/`` is made where needed.
+        physics: The record, with ``promoted``, ``identified`` and ``id``.
+    """
+    kept = _kept(run)
+    history = list(kept.get("physics_history", []))
+    current = kept.get("physics")
+    version = len(history) + (current is not None) + 1
+    new = {"version": version, **physics}
+    if current is not None:
+        history.append(current if new["promoted"] else new)
+    if current is None or new["promoted"]:
+        current = new
+    return _store(run, {**kept, "physics": current, "physics_history": history})
+
+
+def _kept(run: RunFolder) -> dict[str, Any]:
+    before = read_calibration(run)
+    return {"cameras": {}, "not_identified": {}, **({} if before is None else before.record)}
+
+
+def _store(run: RunFolder, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Name the content and put it in place."""
     record = {
-        **kept,
+        **content,
         "schema_version": CALIBRATION_VERSION,
-        "cameras": {key: known[key] for key in sorted(known)},
-        "not_identified": {key: lost[key] for key in sorted(lost) if key not in known},
         "software": provenance.software(),
     }
-    named = {
-        key: value for key, value in record.items() if key not in ("calibration_id", "software")
-    }
+    named = {key: value for key, value in record.items() if key not in UNNAMED}
     record["calibration_id"] = provenance.hash_settings(named)
     run.scene_dir.mkdir(parents=True, exist_ok=True)
     path = run.scene_dir / CALIBRATION_FILE

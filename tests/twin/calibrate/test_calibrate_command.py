@@ -254,7 +254,8 @@ def test_turning_about_one_axis_is_said_in_one_sentence(
     ("arguments", "found"),
     [
         ((), "say what to calibrate"),
-        (("--physics",), "not part of this version"),
+        (("--physics", "--cameras"), "say what to calibrate"),
+        (("--physics", "--workers", "0"), "--workers 0"),
         (("--cameras", "--pairs", "x.json"), "--pairs needs --camera"),
         (("--cameras", "--camera", "front"), "camera front has neither"),
         (("--cameras", "--max-postures", "0"), "--max-postures 0"),

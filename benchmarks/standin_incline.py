@@ -1,0 +1,68 @@
+"""The incline test in MuJoCo, with the contact settings of the stand-in cell."""
+
+import mujoco
+import numpy as np
+
+from bridge.sources.standin.world_model import PAD_SOLIMP, PAD_SOLREF, STEP_S
+from twin.calibrate.physics.incline import (
+    LEAD_S,
+    REST_S,
+    SLAB_M,
+    SLIDE_S,
+    effective_friction,
+)
+
+
+def mujoco_friction(
+    slab: float, ground: float, *, slab_priority: int = 0, pad: bool = False
+) -> float:
+    """Effective friction of a pair in MuJoCo.
+
+    Args:
+        slab: Coefficient of what slides.
+        ground: Coefficient of what it lies on.
+        slab_priority: Above 0, its coefficient alone counts, as that of the cell's objects.
+        pad: The slab has the hard contacts of the cell's finger pads.
+    """
+
+    def acceleration(slope_rad: float) -> float:
+        model = _model(slab, ground, slab_priority, pad)
+        data = mujoco.MjData(model)
+        g = 9.81
+        for _ in range(round(REST_S / STEP_S)):
+            mujoco.mj_step(model, data)
+        model.opt.gravity[:] = [g * np.sin(slope_rad), 0.0, -g * np.cos(slope_rad)]
+        speeds = []
+        for seconds in (LEAD_S, SLIDE_S):
+            for _ in range(round(seconds / STEP_S)):
+                mujoco.mj_step(model, data)
+            speeds.append(float(data.qvel[0]))
+        return (speeds[1] - speeds[0]) / SLIDE_S
+
+    return effective_friction(acceleration)
+
+
+def _model(slab: float, ground: float, priority: int, pad: bool) -> mujoco.MjModel:
+    spec = mujoco.MjSpec()
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.timestep = STEP_S
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0
+    x, y, z = (extent / 2 for extent in SLAB_M)
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    spec.worldbody.add_geom(
+        type=box, size=[5, 5, 0.1], pos=[0, 0, -0.1], friction=[ground, 0.005, 0.0001]
+    )
+    body = spec.worldbody.add_body(name="slab", pos=[0, 0, z])
+    hard = {"solref": PAD_SOLREF, "solimp": PAD_SOLIMP} if pad else {}
+    body.add_geom(
+        type=box,
+        size=[x, y, z],
+        mass=0.2,
+        condim=4,
+        priority=priority,
+        friction=[slab, 0.005, 0.0001],
+        **hard,
+    )
+    body.add_freejoint()
+    return spec.compile()
