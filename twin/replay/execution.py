@@ -15,6 +15,8 @@ from twin.replay.path import JointPath, UnusablePlanError
 
 _PLATEAU_M = 0.002
 """A finger distance this close to the smallest one of a grasp belongs to the grasp."""
+_AHEAD_NS, _CREEP_M = 100_000_000, 0.003
+"""Fingers that close by less than this within a tenth of a second are stopped by something."""
 _LATENESS_NS = 2_000_000_000
 """An execution may lag behind its plan by up to this long."""
 _LARGEST_GAP_NS = 500_000_000
@@ -149,17 +151,18 @@ def closed_mask(
     """Say when the fingers were closed on something, from the plan's wish and their own motion."""
     closed = np.zeros(len(times_ns), dtype=bool)
     for start_ns, end_ns in _closed_intervals(plan):
-        window = (times_ns >= start_ns) & (times_ns <= end_ns + _LATENESS_NS)
-        wanted = (times_ns >= start_ns) & (times_ns < end_ns)
-        if not np.any(wanted):
-            continue
-        plateau = float(width_m[wanted].min()) + _PLATEAU_M
-        inside = np.flatnonzero(window & (width_m <= plateau))
-        if len(inside):
-            # One stretch: from the first sample on the plateau to where it is left for good.
-            left = np.flatnonzero((np.arange(len(width_m)) > inside[0]) & (width_m > plateau))
-            last = left[0] if len(left) else inside[-1] + 1
-            closed[inside[0] : last] = True
+        window = np.flatnonzero((times_ns >= start_ns) & (times_ns <= end_ns + _LATENESS_NS))
+        wide = np.maximum.accumulate(width_m[window])
+        begun = width_m[window] < wide - _PLATEAU_M
+        # Something soft gives way for seconds: stopped is what hardly closes any further.
+        ahead = np.interp(times_ns[window] + _AHEAD_NS, times_ns, width_m)
+        stopped = window[begun & (width_m[window] - ahead < _CREEP_M)]
+        if len(stopped):
+            # One stretch: from where the fingers stop to where they leave that for good.
+            rest = width_m[stopped[0] :]
+            left = np.flatnonzero(rest > np.minimum.accumulate(rest) + _PLATEAU_M)
+            last = stopped[0] + left[0] if len(left) else window[-1] + 1
+            closed[stopped[0] : last] = True
     return closed
 
 

@@ -111,3 +111,17 @@ def test_a_recording_that_stops_early_or_starts_late_is_refused(script: SimpleNa
     late = cut_track(track, 1_000_000_000, 3_000_000_000)
     with pytest.raises(UnusablePlanError, match=r"for 1\.0 s from 0\.0 s on"):
         path_of_execution(late, late, plan, ReplayConfig())
+
+
+def test_a_grasp_of_something_soft_begins_where_the_fingers_stop_though_they_creep_on(
+    script: SimpleNamespace,
+) -> None:
+    """57 mm at the touch, 45 mm a second later, as a plush toy was recorded."""
+    t = np.arange(0.0, 5.5, 0.008)
+    knots = [0.0, 1.2, 1.39, 2.4, 4.2, 4.5, 6.0]
+    width = np.interp(t, knots, [OPEN_M, OPEN_M, 0.057, 0.047, 0.045, OPEN_M, OPEN_M])
+    width += np.random.default_rng(0).normal(0, 2e-4, len(t))
+    closed = closed_mask((t * 1e9).astype(np.int64), width, script.plan(script.scene()))
+    found = t[closed]
+    assert found[0] == pytest.approx(1.4, abs=0.05)
+    assert found[-1] == pytest.approx(4.2, abs=0.05)
