@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from bridge.errors import UsageError
+from bridge.errors import UsageError, refuse_outside
 from twin.physics.config import PhysicsConfig
 from twin.replay.parting_config import PartingConfig
 from twin.replay.variation import VariationConfig
@@ -100,3 +100,7 @@ class ReplayRunConfig:
     """Redo the localisation of objects that is there already."""
     replay: Annotated[ReplayConfig, Parameter(name="replay")] = field(default_factory=ReplayConfig)
     """How each trajectory is re-lived."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers with which nothing can be replayed."""
+        refuse_outside(self, {"workers": (1, 4096), "samples": (0, 100_000)})

@@ -17,7 +17,7 @@ from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.replay.calibrated import calibrated
-from twin.replay.config import ReplayConfig
+from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.path import path_of_plan
 from twin.replay.samples import (
     Sample,
@@ -324,3 +324,10 @@ def test_what_the_user_set_is_varied_by_the_prior() -> None:
     config = calibrated(mine, known)
     assert config.physics.grip_force_N == 11.0
     assert config.variation.calibrated == ()
+
+
+def test_numbers_with_which_nothing_can_be_replayed_are_refused() -> None:
+    with pytest.raises(UsageError, match="--workers 0 makes no sense"):
+        ReplayRunConfig(workers=0)
+    with pytest.raises(UsageError, match="--samples -1 makes no sense"):
+        ReplayRunConfig(samples=-1)
