@@ -1,0 +1,74 @@
+"""Scans rebuilt by the whole of ``rebuild``, as the command does it: the stand-in cell, a shelf."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
+from bridge.terminal import Output
+
+ROOT = Path(__file__).resolve().parents[2]
+SEED = 20
+"""Of the stand-in laboratory; a development seed."""
+QUIET = Output(quiet=True)
+
+
+def standin_scan(folder: Path) -> RunFolder:
+    """Record one scan of the stand-in cell, with all that is wrong there."""
+    from standin_folder import record_session
+
+    return record_session(folder, seed=SEED, scan=True, trials=0)
+
+
+def shelf_folder() -> Path | None:
+    """The real wrist camera before a shelf; None without it."""
+    data = Path(os.environ.get("GST_SHARED_DATA", ROOT.parent / "shared" / "data"))
+    folder = data / "rgbd_apc_shelf_wristcam"
+    return folder if (folder / "scene.json").is_file() else None
+
+
+def shelf_scan(source: Path, folder: Path) -> RunFolder:
+    """Import the frames of the wrist camera as one scan."""
+    from bridge.cli.imports import import_rgbd
+
+    import_rgbd(source, folder, output=QUIET)
+    return RunFolder.open(folder)
+
+
+def rebuilt(run: RunFolder, budget_s: float) -> Mapping[str, Any]:
+    """Rebuild with held-out views drawn also where they fit best; the content of scene.json."""
+    from twin.scene.rebuild import rebuild
+    from twin.scene.settings import FitConfig, FrameConfig, RebuildConfig
+
+    config = RebuildConfig(frames=FrameConfig(align_holdout=True), fit=FitConfig(budget_s=budget_s))
+    return rebuild(run, config, QUIET)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldOut:
+    """Means of one way of scoring over the held-out views of moving cameras."""
+
+    psnr_db: float
+    ssim: float
+
+
+def held_out(run: RunFolder, record: Mapping[str, Any]) -> dict[str, HeldOut]:
+    """By variant (raw, gain, pose_gain, static), as the evaluator scores them."""
+    from evaluator.compare.view_images import score_views
+
+    still = {item["id"] for item in record["cameras"] if item["still"]}
+    found: dict[str, list[tuple[float, float]]] = {}
+    for path in run.derived("*.views.*"):
+        for view in score_views(Episode.open(path), None)[0]:
+            for name, score in view.scores.items() if view.camera_id not in still else ():
+                if score.psnr_db is not None and score.ssim is not None:
+                    found.setdefault(name, []).append((score.psnr_db, score.ssim))
+    return {
+        name: HeldOut(psnr_db=float(np.mean(rows, axis=0)[0]), ssim=float(np.mean(rows, axis=0)[1]))
+        for name, rows in found.items()
+    }
