@@ -16,7 +16,7 @@ from bridge.terminal import Output
 from bridge.wire.errors import NoReplyError
 from bridge.wire.qos import Qos
 
-START_NS = ns_from_s(1_750_000_000)
+START_NS = ns_from_s(1_750_000_000.0)
 UNGATED = "without_replanning"
 
 
