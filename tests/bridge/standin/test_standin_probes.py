@@ -104,20 +104,6 @@ def test_a_slide_leaves_the_fingers_behind(
     assert poses[-1][2, 3] == pytest.approx(0.02, abs=1e-3)
 
 
-@pytest.mark.slow
-def test_a_squeeze_turns_the_object_until_it_jams(
-    make_session: Callable[..., Any], make_cell: Callable[..., StandinCell], nominal: Any
-) -> None:
-    session = make_session()
-    cell = make_cell(session, hidden=nominal)
-    poses = executed(cell, planned("squeeze", cell, cube()))
-    turned = se3.rotation_angle_rad(poses[0][:3, :3].T @ poses[-1][:3, :3])
-    assert np.deg2rad(2) < turned < np.deg2rad(22)
-    told = [e["data"]["width_m"] for e in session.events() if e["type"] == "gripper"]
-    assert len(told) > 20
-    assert told[-1] == MAX_WIDTH_M
-
-
 def test_no_room_is_said_instead_of_pushed_off_the_table(
     make_session: Callable[..., Any], make_cell: Callable[..., StandinCell]
 ) -> None:
