@@ -19,6 +19,9 @@ constexpr double kViscous = 5.0;
 // A body that touches something loses its turning at this rate [1/s]: what is pressed flat gives
 // less back than it took. Without it light toys rock for seconds.
 constexpr float kRolling = 8.0f;
+// While it leaves what holds it up it loses speed at this rate [1/s]: the bounded viscosity of
+// single tetrahedra lets stiff light toys bounce, which stuffed ones do not.
+constexpr double kRebound = 600.0;
 constexpr double kOriginGrid = 1.0 / 1024;  // origins are multiples of it [m]
 
 Matrix inverse(const Matrix& a) {
@@ -202,6 +205,7 @@ void Body::recentre(const Double3& middle) {
 
 void Body::predict(double gravity, float step_s, const Kernels& kernels) {
     touches = false;
+    support = {0, 0, 0};
     const float fall = static_cast<float>(gravity) * step_s;
     std::copy(p.begin(), p.end(), start.begin());
     for (int i = 0; i < num_nodes; ++i) {
@@ -255,12 +259,19 @@ void Body::damp(float step_s) {
                         r[1][0] * turn.x + r[1][1] * turn.y + r[1][2] * turn.z,
                         r[2][0] * turn.x + r[2][1] * turn.y + r[2][2] * turn.z};
     const double slowed = touches ? 1.0 / (1.0 + kRolling * step_s) : 1.0;
-    const auto motion = [&](const Double3& turning) {
-        const Float3 base = narrow(mean - soft::cross(turning, middle)), axis = narrow(turning);
+    Double3 calmer = mean;
+    const Double3 up = widen(support);
+    const double size = norm(up), leaving = size > 0.0 ? dot(mean, up) / size : 0.0;
+    if (leaving > 0.0) {
+        const double lost = leaving * (1.0 - 1.0 / (1.0 + kRebound * step_s));
+        calmer = mean - up * (lost / size);
+    }
+    const auto motion = [&](const Double3& speed, const Double3& turning) {
+        const Float3 base = narrow(speed - soft::cross(turning, middle)), axis = narrow(turning);
         return std::array<Four, 2>{Four{base.x, base.y, base.z, 0.0f},
                                    Four{axis.x, axis.y, axis.z, 0.0f}};
     };
-    const auto now = motion(omega), after = motion(omega * slowed);
+    const auto now = motion(mean, omega), after = motion(calmer, omega * slowed);
     const Four kept = Four{} + 1.0f / (1.0f + static_cast<float>(damping_rate) * step_s);
     for (int i = 0; i < num_nodes; ++i) {
         const Four x = load_four(p.data() + 4 * i);
