@@ -20,9 +20,15 @@ QUIET = Output(quiet=True)
 
 def standin_scan(folder: Path) -> RunFolder:
     """Record one scan of the stand-in cell, with all that is wrong there."""
-    from standin_folder import record_session
+    from cell_run import START_NS, FileSession
 
-    return record_session(folder, seed=SEED, scan=True, trials=0)
+    from bridge.sources.standin.session import run_session
+    from bridge.sources.standin.settings import SessionConfig
+
+    run = RunFolder.create(folder)
+    config = SessionConfig(seed=SEED, trials=0)
+    run_session(FileSession(run.episodes_dir), config, QUIET, start_ns=START_NS)
+    return run
 
 
 def shelf_folder() -> Path | None:
