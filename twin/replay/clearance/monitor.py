@@ -235,7 +235,9 @@ class ClearanceMonitor:
             self._note(t_ns, (body, other), distance, may_touch)
         if may_touch:
             # An object that drops may lie deep for one step: the solver's doing, not the plan's.
-            if distance < -self.config.max_contact_depth_m and body not in self._objects:
+            # Neither is a finger among the nodes of a soft body that it squeezes as it may.
+            solid = body not in self._objects and other not in self._scene.task.soft_objects
+            if distance < -self.config.max_contact_depth_m and solid:
                 self._fail(t_ns, "deep_contact", body, other, distance)
             return np.inf
         if distance < self.config.eps_col_m:
