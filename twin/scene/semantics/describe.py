@@ -11,7 +11,7 @@ from twin.scene.semantics.associate import AssociateConfig, associate
 from twin.scene.semantics.colour import colour_name
 from twin.scene.semantics.form import CONTAINER, measure_form
 from twin.scene.semantics.from_view import points_of, solid_splats
-from twin.scene.semantics.known import label_of, numbered
+from twin.scene.semantics.known import NAMED, label_of, numbered
 from twin.scene.semantics.lexicon import kind_of
 from twin.scene.semantics.lift import Viewpoint, observe, visible_weight
 from twin.scene.semantics.part_names import PartsConfig, find_parts
@@ -27,8 +27,6 @@ from twin.scene.semantics.support import (
 
 CELL_M = 0.004
 """Gaussians of a scene lie about this far apart."""
-NAMED = "task"
-"""Source of what is an object of the task."""
 MIN_SHOWN_PX = 20.0
 """A frame shows a thing when its Gaussians give this many pixels of the image."""
 

@@ -8,6 +8,8 @@ from jaxtyping import Bool, UInt16
 
 from twin.scene.semantics.lexicon import FORMS, colour_of, spoken_name, words_of
 
+NAMED = "task"
+"""Source of an instance that is an object of the task."""
 MIN_SPLATS = 20
 
 

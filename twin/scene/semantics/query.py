@@ -7,6 +7,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Float32
 
+from twin.scene.semantics.known import NAMED
 from twin.scene.semantics.lexicon import (
     SIZES,
     colour_of,
@@ -113,6 +114,14 @@ def _by_lexicon(scene: SemanticScene, words: list[str]) -> tuple[dict[int, float
     known = known_words() | own | set(SIZES)
     unknown = [word for word in words if word not in known and colour_of(word) is None]
     objects = {item.id: float(_fits(item, words, scene)) for item in scene.instances}
+    nouns = {word for word in words if word not in SIZES and colour_of(word) is None}
+    named = {
+        item.id
+        for item in scene.instances
+        if item.source == NAMED and objects[item.id] and nouns <= set(words_of(item.label))
+    }
+    if nouns and named:  # a task says which thing is the sloth; others only look like one
+        objects = {key: value if key in named else 0.0 for key, value in objects.items()}
     remark = f"not in the lexicon: {', '.join(unknown)}" if unknown else ""
     return objects, remark
 

@@ -1,12 +1,14 @@
 """Objects that a task names keep their names and their Gaussians."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from table_scene import World
 
 from twin.scene.raster import RasterConfig, Rasteriser
-from twin.scene.semantics.describe import NAMED, scene_by_default
-from twin.scene.semantics.known import MIN_SPLATS, label_of, numbered
+from twin.scene.semantics.describe import scene_by_default
+from twin.scene.semantics.known import MIN_SPLATS, NAMED, label_of, numbered
 from twin.scene.semantics.lexicon import kind_of, names_of
 from twin.scene.semantics.query import query
 from twin.scene.semantics.result import SemanticScene
@@ -103,6 +105,16 @@ def test_a_question_finds_the_task_s_own_words(scene: SemanticScene) -> None:
     cube = scene.instances[1]
     assert query(scene, "the cube").objects[cube.id] == 1.0
     assert query(scene, "tub").best() == scene.instances[0].id
+
+
+def test_what_the_task_names_is_meant_and_not_what_looks_like_it(scene: SemanticScene) -> None:
+    cube = scene.instances[1]
+    double = replace(cube, id=99, source="default segmenter")
+    both = replace(scene, instances=(*scene.instances, double))
+    assert query(both, "the red cube").objects == {
+        item.id: float(item.id == cube.id) for item in both.instances
+    }
+    assert query(both, "red thing").objects[99] == 1.0
 
 
 def test_a_known_thing_without_a_table_is_named_all_the_same(tabletop: World) -> None:
