@@ -39,7 +39,7 @@ UNKNOWN_SIGMA = (0.003, 0.003, 0.05)
 """x, y [m] and turn [rad] of a pose whose localisation says nothing of its error."""
 
 
-_Series = tuple[Float[np.ndarray, " num_samples"], Float[np.ndarray, " num_samples"]]
+_Series = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]
 """Times [s] and widths [m]."""
 
 

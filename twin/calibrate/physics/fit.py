@@ -55,8 +55,8 @@ class Predictor(Protocol):
 class FitConfig:
     """How hard to look."""
 
-    evaluations: int = 150
-    """Points of the search; the intervals take about 90 more."""
+    evaluations: int = 80
+    """Points of the search; the intervals take about 60 more."""
     budget_s: float = 900.0
     """Wall time after which the search ends; the intervals are still computed."""
     seed: int = 0
@@ -92,7 +92,6 @@ class Fit:
     nominal_score: Score
     calibrated_score: Score
     num_evaluations: int
-    seconds: float
     promoted: bool
     why: str
 
@@ -153,7 +152,6 @@ def fit(
         nominal_score=nominal_score,
         calibrated_score=final_score,
         num_evaluations=count + 2,
-        seconds=time.monotonic() - started,
         promoted=promoted,
         why=why,
     )
