@@ -22,6 +22,7 @@ constexpr float kRolling = 8.0f;
 // While it leaves what holds it up it loses speed at this rate [1/s]: the bounded viscosity of
 // single tetrahedra lets stiff light toys bounce, which stuffed ones do not.
 constexpr double kRebound = 600.0;
+constexpr double kHysteresis = 0.8;  // at most this share of what held it up: nothing sticks
 constexpr double kOriginGrid = 1.0 / 1024;  // origins are multiples of it [m]
 
 Matrix inverse(const Matrix& a) {
@@ -263,7 +264,8 @@ void Body::damp(float step_s) {
     const Double3 up = widen(support);
     const double size = norm(up), leaving = size > 0.0 ? dot(mean, up) / size : 0.0;
     if (leaving > 0.0) {
-        const double lost = leaving * (1.0 - 1.0 / (1.0 + kRebound * step_s));
+        const double most = kHysteresis * size / (mass_ * step_s);
+        const double lost = std::min(leaving * (1.0 - 1.0 / (1.0 + kRebound * step_s)), most);
         calmer = mean - up * (lost / size);
     }
     const auto motion = [&](const Double3& speed, const Double3& turning) {

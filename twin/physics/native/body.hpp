@@ -63,7 +63,7 @@ class Body {
     bool lost = false;          // its nodes are no numbers any more
 
     bool touches = false;       // anything, in this substep
-    Float3 support{0, 0, 0};    // sum of what still pieces pushed it by, in this substep
+    Float3 support{0, 0, 0};    // mass times shift by still pieces, in this substep
     std::vector<Contact> contacts;
     std::vector<Contact> past_contacts;  // of the last step, in the same order
     std::vector<Pair> pairs;

@@ -134,7 +134,7 @@ void solve_contacts(Body& body, std::vector<Collider>& colliders, float step_s) 
             body.shift_sample(sample, by, w);
             body.touched[index] = 1;
             body.touches = true;
-            if (!piece.moves) body.support = body.support + normal * pushed;
+            if (!piece.moves) body.support = body.support + normal * (pushed / w);
             const Double3 impulse = widen(by) * (-1.0 / (static_cast<double>(w) * step_s));
             piece.take(impulse, arm);
             if (piece.dynamic()) push = push + impulse;
