@@ -169,8 +169,7 @@ class Arm:
         """Let what is soft between the fingers slow, stall or push back their drive.
 
         The line of a geared motor: the speed falls with the load and is zero at the grip force.
-        As an external force one step late, the reaction shakes fingers of 50 g instead (measured,
-        docs/decisions/0029-soft-bodies-by-stress.md).
+        Why not a force: docs/decisions/0029-soft-bodies-by-stress.md.
 
         Args:
             reaction_N: Mean over both fingers of what pushes them apart.
