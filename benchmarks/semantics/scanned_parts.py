@@ -16,6 +16,7 @@ from twin.scene.raster import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default
 from twin.scene.semantics.query import query
 from twin.scene.semantics.result import Instance, SemanticScene
+from twin.scene.shape.reconstruct import ObjectShape
 
 SEED = 1_000_500
 ITERATIONS = 60
@@ -86,7 +87,13 @@ def _semantics(
         ids = np.flatnonzero(mask)
         T = se3.invert(scan.start.Ts_base_object[key])
         rows[key] = (ids, se3.apply(T, cloud.means_m[ids].astype(np.float64)))
-    return scene_by_default(cloud, [], rasteriser, known=known), rows
+    surfaces = {
+        key: se3.apply(scan.poses[key], shape.vertices_m)
+        for key, shape in scan.shapes.items()
+        if isinstance(shape, ObjectShape)
+    }
+    scene = scene_by_default(cloud, [], rasteriser, known=known, surfaces_m=surfaces)
+    return scene, rows
 
 
 def true_part(model: ObjectModel, p_object: np.ndarray) -> np.ndarray:

@@ -70,6 +70,14 @@ class TakenApart:
             **({"generated": dict(self.generated)} if self.generated else {}),
         }
 
+    def surfaces_m(self) -> dict[str, Float[np.ndarray, "_ 3"]]:
+        """Vertices of the reconstructed objects where they were scanned."""
+        return {
+            key: se3.apply(T, shape.vertices_m)
+            for key, T in self.places.items()
+            if isinstance(shape := (self.shapes or {}).get(key), ObjectShape)
+        }
+
     @property
     def places(self) -> dict[str, Float[np.ndarray, "4 4"]]:
         """Poses of the objects that were taken out."""

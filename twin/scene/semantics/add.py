@@ -29,6 +29,7 @@ def add_semantics(
     masks: Sequence[tuple[Viewpoint, MaskSet]] = (),
     features: SceneFeatures | None = None,
     robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
+    surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
     threads: int = 0,
 ) -> dict[str, Any]:
     """Segment a scene and write ``semantics.npz`` (and ``features.npz``) into its folder.
@@ -44,6 +45,8 @@ def add_semantics(
         masks: Masks of a 2D segmenter; without any the default segmenter looks at the Gaussians.
         features: Features of the same Gaussians, background first.
         robot_m: Points on the robot where it stood, to leave it out.
+        surfaces_m: Points of the objects' reconstructed surfaces where they stand: their parts are
+            told apart on these.
         threads: For drawing; 0: all cores.
 
     Returns:
@@ -59,7 +62,12 @@ def add_semantics(
             step = -(-len(viewpoints) // MAX_VIEWPOINTS) or 1
             known = {key: _rows(rows, key) for key in objects}
             scene = scene_by_default(
-                cloud, viewpoints[::step], rasteriser, robot_m=robot_m, known=known
+                cloud,
+                viewpoints[::step],
+                rasteriser,
+                robot_m=robot_m,
+                known=known,
+                surfaces_m=surfaces_m,
             )
     except SemanticsError as error:
         nothing = np.zeros(len(cloud), dtype=np.uint16)

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt16
+from scipy.spatial import cKDTree
 
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster import Rasteriser
@@ -14,7 +15,7 @@ from twin.scene.semantics.from_view import points_of, solid_splats
 from twin.scene.semantics.known import NAMED, label_of, numbered
 from twin.scene.semantics.lexicon import kind_of
 from twin.scene.semantics.lift import Viewpoint, observe, visible_weight
-from twin.scene.semantics.part_names import PartsConfig, find_parts
+from twin.scene.semantics.part_names import Parts, PartsConfig, find_parts
 from twin.scene.semantics.result import Instance, MaskSet, SemanticScene
 from twin.scene.semantics.segment import SOURCE, SegmentConfig, Thing, segment_points
 from twin.scene.semantics.smooth import SmoothConfig, smooth_shares
@@ -93,6 +94,7 @@ def scene_by_default(
     config: SegmentConfig | None = None,
     robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
     known: Mapping[str, Bool[np.ndarray, " num_splats"]] | None = None,
+    surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
 ) -> SemanticScene:
     """Segment the fused Gaussians with the default segmenter.
 
@@ -107,6 +109,8 @@ def scene_by_default(
         robot_m: Points on the robot where it stood, to leave it out.
         known: Gaussians of the objects that a task names, by their ids. They come first, under
             their names.
+        surfaces_m: Points of the reconstructed surfaces of some of them, where they stand: parts
+            are told apart on these, which are thinner than any coat of Gaussians.
     """
     labels = np.zeros(len(cloud), dtype=np.uint16)
     ids = np.flatnonzero(solid_splats(cloud))
@@ -136,6 +140,7 @@ def scene_by_default(
             score=score,
             source=source,
             plane=plane,
+            surface_m=(surfaces_m or {}).get(key),
         )
         for number, (key, label, score, source) in enumerate(named, start=1)
     )
@@ -181,6 +186,7 @@ def describe(
     source: str,
     plane: SupportPlane | None,
     key: str = "",
+    surface_m: Float[np.ndarray, "_ 3"] | None = None,
 ) -> Instance:
     """Measure one instance: colour, box, parts, keypoints.
 
@@ -200,7 +206,15 @@ def describe(
     if key:
         label = label_of(key, colour_name(color / 255), is_open=form.cavity is not None)
     is_nameless_container = kind_of(label) == "other" and form.word == CONTAINER
-    parts = find_parts(xyh, CONTAINER if is_nameless_container else label, CELL_M, PartsConfig())
+    called = CONTAINER if is_nameless_container else label
+    if surface_m is None:
+        parts = find_parts(xyh, called, CELL_M, PartsConfig())
+    else:
+        surface = surface_m - np.array([0.0, 0.0, ground])
+        found = find_parts(surface, called, CELL_M, PartsConfig())
+        nearest = cKDTree(surface).query(xyh)[1]
+        masks = {name: part[nearest] for name, part in found.masks.items()}
+        parts = Parts(masks=masks, keypoints=found.keypoints)
     up = np.array([0.0, 0.0, ground])
     T = np.eye(4)
     T[:2, :2] = [

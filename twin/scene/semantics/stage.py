@@ -58,6 +58,7 @@ def write_scene_semantics(
         [Viewpoint(camera=v.half.camera, T_base_camera=v.T_base_color) for v in views],
         masks=asked.findings.masks,
         features=asked.findings.features,
+        surfaces_m=apart.surfaces_m(),
         threads=threads,
     )
     rows = {BACKGROUND_KEY: len(apart.background)}
