@@ -36,6 +36,8 @@ SCHEMA_VERSION = 1
 STEP_NS = 16_666_667
 HELD_STEPS = 3
 """A difference counts when it lasts for so many steps: one sample may be noise."""
+FALL_STEPS = 15
+"""Objects are apart when they stay so for a quarter of a second."""
 REST_M_S = 0.02
 """A gripper slower than this rests."""
 REST_STEPS = 12
@@ -222,13 +224,15 @@ def _held(trace: Trace, times_ns: Int[np.ndarray, " num_times"]) -> Bool[np.ndar
     return held
 
 
-def _first_above(values: Float[np.ndarray, " num_steps"], limit: float) -> int | None:
-    """Where values first stay above a limit."""
+def _first_above(
+    values: Float[np.ndarray, " num_steps"], limit: float, steps: int = HELD_STEPS
+) -> int | None:
+    """Where values first stay above a limit for so many steps."""
     above = (values > limit).astype(np.int64)
-    if len(above) < HELD_STEPS:
+    if len(above) < steps:
         return None
-    lasting = np.convolve(above, np.ones(HELD_STEPS, dtype=np.int64), mode="valid")
-    found = np.flatnonzero(lasting == HELD_STEPS)
+    lasting = np.convolve(above, np.ones(steps, dtype=np.int64), mode="valid")
+    found = np.flatnonzero(lasting == steps)
     return int(found[0]) if len(found) else None
 
 
@@ -271,9 +275,9 @@ def _objects(first: Trace, second: Trace, config: PartingConfig) -> Iterator[Par
         one, two = first.objects[name], second.objects[name]
         times = min(one, two, key=len).stamps_ns
         apart = np.linalg.norm(one.at(times).p_m - two.at(times).p_m, axis=1)
-        above = np.flatnonzero(apart > config.object_m)
-        if len(above):
-            index = int(above[0])
+        # A recording looks twice; of two replays, one drops a moment later than the other.
+        index = _first_above(apart, config.object_m, 1 if len(times) < FALL_STEPS else FALL_STEPS)
+        if index is not None:
             size = float(apart[index:].max())
             yield replace(
                 _parting(
