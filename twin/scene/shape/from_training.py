@@ -5,6 +5,7 @@ in the object's own frame, so walls of a box lie along the voxels.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,9 @@ from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.errors import TwinError
 from twin.scene.localise_shape import surface_distances
+from twin.scene.shape.from_mesh import shape_of_mesh
 from twin.scene.shape.masked_view import MaskedView
-from twin.scene.shape.reconstruct import ObjectShape, ShapeConfig, reconstruct
+from twin.scene.shape.reconstruct import ObjectShape, ShapeConfig, moved_views, reconstruct
 from twin.scene.shape.static import StaticConfig, static_sdf
 from twin.scene.training_view import TrainingView
 
@@ -31,7 +33,8 @@ TABLE_M = 0.003
 """Lower points may be the table's."""
 STANDING_M = 0.008
 """An object whose underside is at most this far from the table stands on it."""
-UPRIGHT_COSINE = 0.999
+UPRIGHT_COSINE, LEANING_COSINE = 0.999, 0.95
+"""Above the first an object's own frame is level; a toy may rest leaning, down to the second."""
 ALIGN_ROUNDS = 6
 
 Poses = Mapping[str, Float[np.ndarray, "4 4"]]
@@ -54,17 +57,36 @@ def shapes_of(
     config = ShapeConfig(align_rounds=ALIGN_ROUNDS) if config is None else config
     found: dict[str, ObjectShape | str] = {}
     for key, T in Ts_base_object.items():
-        if T[2, 2] < UPRIGHT_COSINE:
+        if T[2, 2] < LEANING_COSINE:
             found[key] = f"{key} does not stand upright, so its underside cannot be closed"
             continue
         masked = [masked_view(view, key, models, Ts_base_object) for view in views]
+        useful, support = [v for v in masked if v.mask.any()], support_z_m(models[key], T)
+        make = reconstruct if T[2, 2] >= UPRIGHT_COSINE else partial(_leaning, T_base_object=T)
         try:
-            found[key] = reconstruct(
-                [view for view in masked if view.mask.any()], support_z_m(models[key], T), config
-            )
+            found[key] = make(useful, support, config)
         except TwinError as error:
             found[key] = str(error)
     return found
+
+
+def _leaning(
+    views: Sequence[MaskedView],
+    support: float | None,
+    config: ShapeConfig,
+    T_base_object: Float[np.ndarray, "4 4"],
+) -> ObjectShape:
+    """Reconstruct in a level frame, where the table is a plane of the grid; then lean it."""
+    T_base_level = np.eye(4)
+    yaw = np.arctan2(T_base_object[1, 0], T_base_object[0, 0])
+    T_base_level[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    T_base_level[:3, 3] = T_base_object[:3, 3]
+    T_level_object = se3.invert(T_base_level) @ T_base_object
+    level = reconstruct(moved_views(views, T_level_object), support, config)
+    vertices = se3.apply(se3.invert(T_level_object), level.vertices_m)
+    points = np.concatenate([view.points_m() for view in views])
+    leant = shape_of_mesh(vertices, level.faces, points, config)
+    return replace(leant, num_views=level.num_views, view_shift_m=level.view_shift_m)
 
 
 def support_z_m(model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]) -> float | None:

@@ -84,6 +84,23 @@ def test_objects_are_reconstructed_in_their_own_frame(
     assert (shape.cavity is not None) == (key == "box")
 
 
+@pytest.mark.slow
+def test_an_object_whose_frame_leans_is_reconstructed_all_the_same(
+    views: list[TrainingView],
+) -> None:
+    lean = np.radians(4.0)
+    T = POSES["cube"] @ se3.transform_from(
+        np.array([np.cos(lean / 2), np.sin(lean / 2), 0.0, 0.0]), np.zeros(3)
+    )
+    shape = shapes_of(views, TASK.objects, {"cube": T})["cube"]
+    assert isinstance(shape, ObjectShape), shape
+    mesh = se3.apply(T, shape.vertices_m), shape.faces
+    mean, _ = cast_views.mean_error_m(mesh, placed("cube"))
+    assert mean < 0.0015
+    assert shape.is_watertight
+    assert shape.volume_m3 == pytest.approx(known_volume("cube"), rel=0.1)
+
+
 def test_a_pixel_belongs_to_the_nearest_object(views: list[TrainingView]) -> None:
     masks = {key: masked_view(views[0], key, TASK.objects, POSES).mask for key in POSES}
     assert masks["cube"].any()
