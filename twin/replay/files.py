@@ -23,7 +23,7 @@ from twin.replay.stretches import stretches_ns
 GRIPPER_WIDTH = "gripper_width"
 MIN_CLEARANCE = "min_clearance_m"
 NODES_PERIOD_NS = 33_000_000
-"""Nodes of soft bodies are written at most this often: 30 Hz, as the stand-in's truth has them."""
+"""Nodes of soft bodies are written at most this often: 30 Hz, about a camera's rate."""
 
 
 @dataclass(frozen=True)
