@@ -258,8 +258,12 @@ def test_a_streamed_table_gives_the_same_numbers(write_table: Callable[[str], Pa
 
 
 def test_a_goal_is_answered_or_the_trials_it_may_take_are_named(
-    write_table: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    write_table: Callable[[str], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "200")  # words of a narrow table are broken over lines
     lines = [line(i, True, True) for i in range(20)]
     lines += [line(100 + i, i % 2 == 0, True, condition="with_replanning") for i in range(6)]
     path = write_table(HEADER + "\n".join(lines) + "\n")

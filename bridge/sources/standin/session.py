@@ -98,7 +98,7 @@ def describe(summary: dict[str, Any]) -> str:
         sums = summary["objects"].get(condition)
         told = f"; {sums['k']} of {sums['n']} objects" if sums else ""
         lines.append(f"  {condition}: {total} trials, {listed}{told}")
-    if summary["probes"]:
+    if summary.get("probes"):
         lines.append(f"  {summary['probes']} probes")
     if summary["stopped"]:
         lines.append("  stopped before the end")
