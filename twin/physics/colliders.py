@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
+from bridge.geometry.box import box_corners
 from twin.physics.description import Hulls
 
 _NORMAL_DIGITS = 2
@@ -40,11 +41,11 @@ def hull_piece(points_m: Float[np.ndarray, "num_points 3"]) -> ConvexPiece:
 
 def box_piece(size_m: Float[np.ndarray, "3"], T_owner_box: Float[np.ndarray, "4 4"]) -> ConvexPiece:
     """Return a box of these extents, in its owner's frame."""
-    corners = np.array(list(product((-0.5, 0.5), repeat=3))) * size_m
     normals = np.concatenate([np.eye(3), -np.eye(3)]) @ T_owner_box[:3, :3].T
     offsets = np.tile(np.asarray(size_m) / 2, 2) + normals @ T_owner_box[:3, 3]
     return ConvexPiece(
-        planes=np.column_stack([normals, offsets]), corners_m=se3.apply(T_owner_box, corners)
+        planes=np.column_stack([normals, offsets]),
+        corners_m=se3.apply(T_owner_box, box_corners(size_m)),
     )
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
+from bridge.geometry.box import box_corners
 from bridge.task.task_file import ObjectModel
 from twin.physics.soft import SoftModel
 from twin.physics.world import World
@@ -58,8 +59,7 @@ def outline_m(model: ObjectModel, soft: SoftModel | None) -> Float[np.ndarray, "
     """Points whose convex hull holds the object, in its own frame [m]."""
     if soft is not None:
         return np.asarray(soft.nodes_m, dtype=np.float64)
-    corners = np.stack(np.meshgrid(*([(-0.5, 0.5)] * 3)), axis=-1).reshape(-1, 3)
-    return np.asarray(corners * model.size_m)
+    return box_corners(np.array(model.size_m))
 
 
 def lifted(

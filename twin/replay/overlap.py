@@ -11,9 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from twin.physics.soft import SoftModel
+from twin.replay.clearance.bodies import placed_panels, placement_of
 from twin.replay.failure import NotEvaluatedError
 from twin.replay.furnish import outline_m
 from twin.replay.scene import ReplayScene
+from twin.robot.collision import signed_distance
 from twin.robot.hulls import convex_hull
 
 GAP_M = 0.0002
@@ -96,27 +98,19 @@ def _apart(
 
 
 def _still(scene: ReplayScene) -> list[_Solid]:
-    solids = []
-    for name, T in scene.containers().items():
-        for centre, extents in scene.task.objects[name].panels():
-            T_object_panel = np.eye(4)
-            T_object_panel[:3, 3] = centre
-            solids.append(_Solid(name, coal.Box(*extents), T @ T_object_panel, still=True))
-    return solids
+    return [
+        _Solid(name, coal.Box(*extents), T_base_panel, still=True)
+        for name, T in scene.containers().items()
+        for T_base_panel, extents in placed_panels(scene.task.objects[name], T)
+    ]
 
 
 def _overlap(first: _Solid, second: _Solid) -> tuple[float, Float[np.ndarray, "3"]]:
     """Depth, negative when apart, and the direction from the first into the second."""
-    request = coal.DistanceRequest()
-    request.enable_signed_distance = True
     result = coal.DistanceResult()
-    distance = coal.distance(
-        first.shape, _placed(first.T), second.shape, _placed(second.T), request, result
+    distance = signed_distance(
+        first.shape, placement_of(first.T), second.shape, placement_of(second.T), result
     )
     normal = np.array(result.normal, dtype=np.float64)
     length = float(np.linalg.norm(normal))
-    return -float(distance), normal / length if length > 0 else np.array([0.0, 0.0, -1.0])
-
-
-def _placed(T: Float[np.ndarray, "4 4"]) -> coal.Transform3s:
-    return coal.Transform3s(T[:3, :3], T[:3, 3])
+    return -distance, normal / length if length > 0 else np.array([0.0, 0.0, -1.0])

@@ -37,9 +37,13 @@ def signed_distance(
     T_first: coal.Transform3s,
     second: coal.CollisionGeometry,
     T_second: coal.Transform3s,
+    result: coal.DistanceResult | None = None,
 ) -> float:
-    """Distance between two convex shapes [m], negative by the depth when they overlap."""
-    result = coal.DistanceResult()
+    """Distance between two convex shapes [m], negative by the depth when they overlap.
+
+    A fresh ``result`` is filled with the nearest points and the direction between them.
+    """
+    result = coal.DistanceResult() if result is None else result
     distance_m = float(coal.distance(first, T_first, second, T_second, _SIGNED, result))
     return round(distance_m, _DIGITS)
 

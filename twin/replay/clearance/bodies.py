@@ -1,13 +1,14 @@
 """Convex pieces with bounding spheres, and the names bodies have in contacts and failures."""
 
 from dataclasses import dataclass
-from itertools import product
 
 import coal
 import numpy as np
 from jaxtyping import Float
 
+from bridge.geometry.box import box_corners
 from bridge.task.robot import GRIPPER_LINKS
+from bridge.task.task_file import ObjectModel
 from twin.robot.hulls import convex_hull
 
 TABLE = "table"
@@ -45,11 +46,6 @@ def solid_of(
     return Solid(body, shape, centre, radius)
 
 
-def box_corners(size_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "8 3"]:
-    """Corners of a box around the origin."""
-    return np.asarray(np.array(list(product((-0.5, 0.5), repeat=3))) * size_m)
-
-
 def box_solid(body: str, size_m: Float[np.ndarray, "3"]) -> Solid:
     """A box around the origin."""
     corners = box_corners(size_m)
@@ -64,3 +60,15 @@ def group_of(body: str) -> str:
 def placement_of(T: Float[np.ndarray, "4 4"]) -> coal.Transform3s:
     """The same pose, as coal wants it."""
     return coal.Transform3s(T[:3, :3], T[:3, 3])
+
+
+def placed_panels(
+    model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]
+) -> list[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]]:
+    """The boxes an object is made of: pose of each box's centre, and its extents [m]."""
+    placed = []
+    for centre, extents in model.panels():
+        T_object_panel = np.eye(4)
+        T_object_panel[:3, 3] = centre
+        placed.append((T_base_object @ T_object_panel, extents))
+    return placed

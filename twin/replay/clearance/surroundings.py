@@ -8,19 +8,20 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
+from bridge.geometry.box import box_corners
 from twin.replay.clearance.bodies import (
     SCENE,
     TABLE,
     Placed,
     Solid,
-    box_corners,
+    placed_panels,
     placement_of,
     solid_of,
 )
 from twin.replay.clearance.grid import GridLookup
 from twin.replay.clearance.nodes import distance_to_box_m, planes_of
 from twin.replay.clearance.shells import Shells, shell_of, shells_of_robot
-from twin.replay.clearance.unnamed import Foot, Panel, unnamed_scene
+from twin.replay.clearance.unnamed import Foot, unnamed_scene
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, signed_distance
 
@@ -50,7 +51,7 @@ class Surroundings:
         self._panels = [
             (name, piece, panel)
             for name, T in scene.containers().items()
-            for piece, panel in enumerate(_panels(scene, name, T))
+            for piece, panel in enumerate(placed_panels(scene.task.objects[name], T))
         ]
         self._placed = [
             Placed(name, coal.Box(*extents), placement_of(T), piece)
@@ -215,15 +216,6 @@ class Surroundings:
 @lru_cache(maxsize=32)
 def _box_shell(size_m: tuple[float, float, float]) -> Shells:
     return Shells([shell_of(box_corners(np.array(size_m)))])
-
-
-def _panels(scene: ReplayScene, name: str, T_base_object: Float[np.ndarray, "4 4"]) -> list[Panel]:
-    panels = []
-    for centre, extents in scene.task.objects[name].panels():
-        T_object_panel = np.eye(4)
-        T_object_panel[:3, 3] = centre
-        panels.append((T_base_object @ T_object_panel, extents))
-    return panels
 
 
 @lru_cache(maxsize=4)
