@@ -14,12 +14,12 @@ from bridge.exchange.benchmark_results import (
 )
 from bridge.exchange.trials_csv import TrialRecord, header_of, read_trials
 from bridge.exchange.trials_stream import count_trials
+from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.imported import row_from_record
 from evaluator.compare.published import check_published
 from evaluator.compare.rates import compare_rates
 from evaluator.compare.remarks import remarks_table
 from evaluator.compare.rows import Comparison, TrialRow
-from evaluator.compare.run import compare_rows
 from evaluator.compare.success import trials_in
 from evaluator.result import Exclusion
 

@@ -1,0 +1,146 @@
+"""Measure everything that follows from trial rows alone, wherever they came from."""
+
+from collections.abc import Sequence
+
+from evaluator.compare.cells import cell_agreement
+from evaluator.compare.decisions import decisions
+from evaluator.compare.fewer import assisted_rates, sequences, stopping_table
+from evaluator.compare.gains import gain_tests, replanning_gains
+from evaluator.compare.pairing import pair_starts, paired_gain, start_distances
+from evaluator.compare.remarks import remarks, remarks_table
+from evaluator.compare.rows import Comparison, TrialRow
+from evaluator.compare.stages import failures_table, stage_results
+from evaluator.compare.success import (
+    WITH,
+    WITHOUT,
+    averages,
+    never_sent,
+    rate_cells,
+    side_rates,
+    trials_in,
+)
+from evaluator.compare.tables import (
+    confusion_table,
+    gains_table,
+    layout_table,
+    success_table,
+    trials_table,
+)
+from evaluator.compare.tracking import tcp_measurements
+from evaluator.compare.verdicts import agreement, gate_worth, reliability
+from evaluator.result import Measurement, Table
+
+
+def compare_rows(
+    rows: Sequence[TrialRow],
+    *,
+    run: str,
+    source: str,
+    stand_in: bool | None,
+    method: str = "wilson",
+    goal: float | None = None,
+) -> Comparison:
+    """Measure everything that follows from trial rows alone, wherever they came from.
+
+    Args:
+        rows: One for each trial, or, from a streamed table, one for equal trials.
+        run: Name of the run or table.
+        source: run or trials.
+        stand_in: Whether the recorded side is a simulated laboratory.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+        goal: Success rate to stop or continue for.
+    """
+    if not rows:
+        return Comparison(run=run, source=source, stand_in=stand_in)
+    word = Comparison(run=run, source=source, stand_in=stand_in).recorded_word
+    rates = side_rates(rows, method=method)
+    cells = rate_cells(rows, rates, method=method)
+    gains = replanning_gains(cells, method=method)
+    pairs, unpaired = pair_starts(rows)
+    worth, worth_tables = gate_worth(rows)
+    kept, kept_tables = reliability(rows)
+    stages, stage_tables, other_stages = stage_results(rows)
+    chosen, decision_tables = decisions(cells)
+    measurements: list[Measurement] = [
+        *rates,
+        *(rate for cell in cells for rate in cell.pair),
+        *averages(cells, method=method),
+        *agreement(rows, method=method),
+        *cell_agreement(cells),
+        *gains,
+        *gain_tests(cells),
+        *paired_gain(pairs),
+        *start_distances(pairs),
+        *never_sent(rows),
+        *worth,
+        *kept,
+        *stages,
+        *chosen,
+        *assisted_rates(rows),
+        *sequences(rows, pairs),
+        *(tcp_measurements(rows) if any(row.tcp_errors for row in rows) else ()),
+    ]
+    streamed = any(not row.episode for row in rows)
+    tables: tuple[Table, ...] = (
+        success_table(cells, word),
+        *layout_table(cells, measurements, word),
+        *gains_table(gains, word),
+        *remarks_table(remarks(cells, measurements)),
+        confusion_table(rows, word),
+        *worth_tables,
+        *kept_tables,
+        *stage_tables,
+        *failures_table(rows, word),
+        *decision_tables,
+        *stopping_table(rows, goal),
+        *(() if streamed else (trials_table(rows, word),)),
+    )
+    return Comparison(
+        run=run,
+        source=source,
+        stand_in=stand_in,
+        rows=tuple(rows),
+        cells=cells,
+        measurements=tuple(measurements),
+        tables=tables,
+        exclusions=(*unpaired, *other_stages),
+        missing=tuple(_missing(rows, measurements)),
+    )
+
+
+NO_DATA = (
+    ("reliability.", "reliability of the success probability", "no trial has p_success"),
+    ("stage.", "stage funnel", "no trial has labelled stages or counts sub-tasks"),
+    (
+        "proxy.",
+        "recorded rate with the twin's help",
+        "every start in the twin has its robot trial, or none has",
+    ),
+)
+"""Parts of the evaluation whose input a run may not have."""
+
+
+STREAMED = "a streamed table keeps no single trials"
+
+
+def _missing(rows: Sequence[TrialRow], measurements: Sequence[Measurement]) -> list[str]:
+    found = []
+    conditions = {row.condition for row in rows}
+    if not {WITH, WITHOUT} <= conditions:
+        there = ", ".join(sorted(name or "unnamed" for name in conditions))
+        found.append(f"replanning gain: it needs both conditions, there is only {there}")
+    for side, words in (
+        ("sim_planned", "a decided dynamic replay of the plan sent"),
+        ("verdict", "a verdict before motion"),
+        ("sim_executed", "a dynamic replay of the executed joints"),
+    ):
+        without = trials_in(row for row in rows if getattr(row, side) is None)
+        if without:
+            found.append(f"{side}: {without} of {trials_in(rows)} trials have no {words[2:]}")
+    streamed = any(not row.episode for row in rows)
+    found += [
+        f"{words}: no data ({STREAMED if streamed else why})"
+        for start, words, why in NO_DATA
+        if not any(m.id.startswith(start) for m in measurements)
+    ]
+    return found
