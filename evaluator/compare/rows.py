@@ -62,6 +62,10 @@ class TrialRow:
     """The cause alone, to be counted: ``collision``, ``unreachable`` ..."""
     stages: tuple[tuple[str, bool | None], ...] = ()
     """How each stage ended as labelled, in order; empty where nobody said."""
+    clauses: tuple[tuple[str, bool], ...] = ()
+    """What each clause of the planned replay's verdict said, predicates included."""
+    gate_clauses: tuple[tuple[str, bool], ...] = ()
+    """The same of the verdict before motion."""
     count: int = 1
     """Trials this row stands for; above 1 only in a streamed table, where ``episode`` is empty."""
     path: Path | None = None

@@ -17,6 +17,7 @@ from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan
 from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
+from evaluator.compare.clauses import clauses_of
 from evaluator.compare.replays import DerivedFile, Replay, find_replay, localised_of
 from evaluator.compare.rows import TcpErrorSeries, TrialRow
 from evaluator.errors import UndefinedStatisticError
@@ -124,6 +125,8 @@ def _row(
         failing_detail=_failing_detail(failing),
         failing_cause=_failing_cause(failing),
         stages=_stages(outcome),
+        clauses=clauses_of(planned.verdict),
+        gate_clauses=clauses_of(verdict),
         planned_replay=None if planned.file is None else planned.file.path.name,
         executed_replay=None if executed.file is None else executed.file.path.name,
         path=episode.path,
