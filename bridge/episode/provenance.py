@@ -43,7 +43,9 @@ def software() -> dict[str, str]:
     return {"name": "robot-gst", "version": version, "git_commit": _git_commit()}
 
 
+@cache
 def _git_commit() -> str:
+    # Asked once: a process goes on running the code it started with.
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return ""
