@@ -27,6 +27,9 @@ LOOPBACK = "127.0.0.1"
 WINDOW = 4
 """Tasks per processor that are handed over before the first are back."""
 MODE, TOKEN, TOKEN_PATH = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
+NICENESS = "RAY_worker_niceness"
+"""Ray gives way to everything else on a machine (15) unless told otherwise."""
+ENVIRONMENT = (MODE, TOKEN, TOKEN_PATH, NICENESS)
 TOKEN_FILE = Path(".ray") / "auth_token"
 """Below the home folder; where Ray itself looks last."""
 
@@ -66,7 +69,7 @@ class RayRunner:
             UsageError: Without a token.
             RayClusterError: When nobody answers there, or not to our token.
         """
-        self._before = {name: os.environ.get(name) for name in (MODE, TOKEN, TOKEN_PATH)}
+        self._before = {name: os.environ.get(name) for name in ENVIRONMENT}
         if self._address == LOCAL:
             # Ray leaves its logs behind, a hundred files for each start.
             self._folder = tempfile.TemporaryDirectory(
@@ -126,6 +129,7 @@ def _connect(address: str, workers: int, folder: str | None) -> Any:
     if address == LOCAL:
         os.environ[TOKEN] = secrets.token_hex(32)
         os.environ.pop(TOKEN_PATH, None)
+        os.environ.setdefault(NICENESS, "0")  # as processes without Ray have
         settings |= {"num_cpus": workers, "include_dashboard": False, "_temp_dir": folder}
     else:
         _check_token()
