@@ -39,8 +39,7 @@ class DemoConfig:
     seed: int = 1
     """Start positions and grasp errors of the trials; the cell's hidden parameters too."""
     task: str = "cube_into_box"
-    """Task of the trials: cube_into_box, sloth_into_basket or five_ducks_into_basket. The twin
-    does not replay soft objects yet and says so."""
+    """Task of the trials: cube_into_box, sloth_into_basket or five_ducks_into_basket."""
     serve: bool | None = None
     """Keep the dashboard running until Ctrl-C. Default: only on a terminal."""
     port: int = 0

@@ -36,7 +36,8 @@ def replay(
 
     summary = replay_run(RunFolder.open(run), config, output)
     output.result(summary, describe_run(summary))
-    return 1 if any(row["error"] for row in summary["rows"]) else 0
+    failed = summary["skipped_episodes"] or any(row["error"] for row in summary["rows"])
+    return 1 if failed else 0
 
 
 def gate(

@@ -19,7 +19,7 @@ from twin.replay.failure import NOT_EVALUATED
 from twin.replay.rollout import KINEMATIC_ENGINE, engine_of
 from twin.replay.starts import StartState
 
-REPLAY_VERSION = 6
+REPLAY_VERSION = 7
 """Raise it when the same inputs give another replay, so that old files are redone."""
 
 
@@ -161,6 +161,7 @@ def _row(job: ReplayJob) -> dict[str, Any]:
     return {
         "episode": job.episode_path.stem,
         "plan": job.plan_id,
+        "task": job.task,
         "trajectory": job.trajectory,
         "mode": job.config.mode,
         "executed": job.end_ns is not None,

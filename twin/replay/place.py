@@ -6,10 +6,9 @@ task file stands in for, and the place says so in a sentence.
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -17,9 +16,9 @@ from jaxtyping import Float
 from bridge.episode import provenance
 from bridge.episode.run import RunFolder
 from bridge.task.task_file import ObjectModel, Task
-from twin.physics.config import PhysicsConfig
+from twin.replay.calibrated import Correction, correction_of
 from twin.replay.scene import ReplayScene
-from twin.scene.calibration import Calibration, read_calibration
+from twin.scene.calibration import read_calibration
 from twin.scene.shape.lattice import Lattice
 from twin.scene.shape.npz import UnreadableArraysError
 from twin.scene.shape.static import StaticSdf
@@ -42,6 +41,8 @@ class Place:
     shape_sources: Mapping[str, str] = field(default_factory=dict)
     """Per object: where its shape comes from."""
     calibration_id: str | None = None
+    correction: Correction = field(default_factory=Correction)
+    """What a calibration says of localised poses and of masses."""
     remarks: tuple[str, ...] = ()
     """What was there and could not be used."""
 
@@ -59,16 +60,16 @@ class Place:
         Args:
             task: Whose objects they are.
             urdf: The robot's description.
-            Ts_base_object: Where the objects are that were localised.
+            Ts_base_object: Where the objects were localised; moved as the calibration says.
             reasons: Why others are not.
             covariances: How sure the poses are.
         """
         return ReplayScene(
-            task=task,
+            task=self.correction.task(task),
             urdf=urdf,
-            Ts_base_object=dict(Ts_base_object),
+            Ts_base_object=self.correction.poses(Ts_base_object),
             reasons=reasons or {},
-            covariances=covariances or {},
+            covariances=self.correction.covariances(covariances or {}),
             scene_hash=self.scene_hash,
             calibration_id=self.calibration_id,
             static_sdf=self.static_sdf,
@@ -89,6 +90,7 @@ def read_place(run: RunFolder, task: Task) -> Place:
     place = Place(
         shape_sources=sources,
         calibration_id=None if calibration is None else calibration.calibration_id,
+        correction=correction_of(calibration),
     )
     record = read_record(run)
     if record is None:
@@ -109,19 +111,6 @@ def read_place(run: RunFolder, task: Task) -> Place:
     )
 
 
-def physics_for(wanted: PhysicsConfig, calibration: Calibration | None) -> PhysicsConfig:
-    """Calibrated physics, but for the fields that the user set to something of their own."""
-    if calibration is None:
-        return wanted
-    nominal = PhysicsConfig()
-    free = {
-        name: type(getattr(nominal, name))(value)
-        for name, value in physics_of(calibration.record).items()
-        if getattr(wanted, name) == getattr(nominal, name)
-    }
-    return replace(wanted, **free)
-
-
 def shape_hashes(run: RunFolder) -> dict[str, str]:
     """SHA-256 of the scene's files that a replay reads, by their names in the scene folder."""
     folder = run.scene_dir
@@ -130,25 +119,6 @@ def shape_hashes(run: RunFolder) -> dict[str, str]:
         path.relative_to(folder).as_posix(): provenance.hash_file(path)
         for path in paths
         if path.is_file()
-    }
-
-
-def physics_of(calibration: Mapping[str, Any]) -> dict[str, float]:
-    """Fields of ``PhysicsConfig`` that a calibration record says were identified."""
-    part = calibration.get("physics")
-    identified = part.get("identified") if isinstance(part, Mapping) else None
-    if not isinstance(identified, Mapping):
-        return {}
-    known = {item.name for item in fields(PhysicsConfig)}
-    values = {
-        name: item.get("value") if isinstance(item, Mapping) else item
-        for name, item in identified.items()
-        if name in known
-    }
-    return {
-        name: float(value)
-        for name, value in values.items()
-        if isinstance(value, int | float) and np.isfinite(value)
     }
 
 

@@ -12,6 +12,7 @@ from bridge.errors import EpisodeError, GstError
 from bridge.task.plan import Plan
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Verdict
+from twin.replay.calibrated import Correction
 from twin.replay.clock import check_clock
 from twin.replay.compare import compare, recorded_findings
 from twin.replay.execution import check_covers, cut_track, path_of_execution, stages_as_executed
@@ -47,6 +48,8 @@ class _Source:
     """With the stages at the times at which they were lived through."""
     events: list[dict[str, Any]]
     scene: ReplayScene
+    correction: Correction
+    """Applied to the scene already, and still to be to what was localised afterwards."""
 
     @property
     def executed(self) -> bool:
@@ -96,7 +99,15 @@ def _open(job: ReplayJob) -> _Source:
     executed = job.trajectory == "executed" and job.end_ns is not None
     events = streams.events(episode) if executed else []
     lived = replace(plan, stages=stages_as_executed(plan, events, job.start_ns))
-    return _Source(job=job, episode=episode, plan=plan, lived=lived, events=events, scene=scene)
+    return _Source(
+        job=job,
+        episode=episode,
+        plan=plan,
+        lived=lived,
+        events=events,
+        scene=scene,
+        correction=place.correction,
+    )
 
 
 def _run(source: _Source, scene: ReplayScene, job: ReplayJob) -> ReplayResult:
@@ -126,7 +137,7 @@ def _recording(source: _Source) -> Recording:
         plan=source.lived,
         path=path_of_execution(arm, widths, source.lived, kinematic),
         scene=source.scene,
-        end=job.end,
+        end=source.correction.state(job.end),
         end_seen_ns=job.length_ns() if seen_ns is None else seen_ns - job.start_ns,
     )
 

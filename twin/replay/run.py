@@ -19,9 +19,9 @@ from twin.replay.pool import Alone, Crew, Runner
 from twin.replay.prepare import Preparation, prepare, replayed_task
 from twin.replay.relive import run_job
 from twin.replay.starts import localised_starts
+from twin.replay.table import against_recorded, executions_of, recorded_labels
 from twin.replay.table import count_verdicts as count_verdicts
 from twin.replay.table import describe_run as describe_run
-from twin.replay.table import executions_of, recorded_labels
 from twin.replay.worker import Failed, do
 from twin.scene.calibration import read_calibration
 from twin.scene.store import scene_hash_of
@@ -32,7 +32,7 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
 
     Returns:
         ``rows`` (one per trajectory), ``counts`` per trajectory and mode, ``skipped_episodes``
-        with reasons, and the scene hash.
+        with reasons, what was said ``against_recorded`` labels, and the scene hash.
 
     Raises:
         UsageError: When an episode named in the configuration is not in the run.
@@ -49,13 +49,13 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
                 if row["error"]:
                     output.say(f"{row['episode']} {row['plan']}: {row['error']}")
     rows.sort(key=lambda row: (row["episode"], row["plan"], row["trajectory"], row["mode"]))
+    executions = executions_of(rows, recorded_labels(run, sorted({row["episode"] for row in rows})))
     return {
         "run": str(run.path),
         "scene_hash": scene_hash,
         "counts": count_verdicts(rows),
-        "executions": executions_of(
-            rows, recorded_labels(run, sorted({row["episode"] for row in rows}))
-        ),
+        "executions": executions,
+        "against_recorded": against_recorded(executions),
         "skipped_episodes": skipped,
         "rows": rows,
     }

@@ -9,13 +9,17 @@ from bridge.episode.catalogue.labels import outcome_of
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.errors import GstError
+from twin.replay.failure import NOT_EVALUATED
 
 WORDS = {True: "accepted", False: "rejected", None: "undecided"}
 LABELS = ("success", "failure", "unknown")
-PLANNED, EXECUTED = "planned in twin", "executed in twin"
-SIDES = {("planned", "dynamic"): PLANNED, ("executed", "dynamic"): EXECUTED}
+PLANNED, EXECUTED, SEEN = "planned in twin", "executed in twin", "executed as seen"
+TELLINGS = ((PLANNED, "planned"), (EXECUTED, "executed"), (SEEN, "recorded_predicates"))
+"""What is held against the operator's label: two replays, and the success predicates on the objects
+as they were localised before and after the execution."""
 
 Rows = Sequence[Mapping[str, Any]]
+Counts = Mapping[str, Mapping[str, int]]
 
 
 def count_verdicts(rows: Rows) -> dict[str, dict[str, int]]:
@@ -66,6 +70,7 @@ def executions_of(rows: Rows, labels: Mapping[str, str]) -> list[dict[str, Any]]
             {
                 "episode": row["episode"],
                 "plan": row["plan"],
+                "task": row.get("task", ""),
                 "recorded": labels.get(row["episode"], "unknown"),
                 "recorded_predicates": None,
                 "planned": None,
@@ -84,10 +89,9 @@ def executions_of(rows: Rows, labels: Mapping[str, str]) -> list[dict[str, Any]]
 
 
 def cross_table(executions: Rows) -> dict[str, dict[str, dict[str, int]]]:
-    """Planned and executed in the twin, by what they said, against the recorded label."""
-    table: dict[str, dict[str, dict[str, int]]] = {}
-    for name, key in ((PLANNED, "planned"), (EXECUTED, "executed")):
-        table[name] = {
+    """Planned, executed and seen, by what they said, against the recorded label."""
+    return {
+        name: {
             word: {
                 label: sum(
                     entry[key] is value and entry["recorded"] == label for entry in executions
@@ -96,17 +100,43 @@ def cross_table(executions: Rows) -> dict[str, dict[str, dict[str, int]]]:
             }
             for value, word in WORDS.items()
         }
-    return table
+        for name, key in TELLINGS
+    }
+
+
+def agreement_of(executions: Rows) -> dict[str, dict[str, int]]:
+    """How often what was said is the operator's label, of the executions where both are decided."""
+    found = {}
+    for name, key in TELLINGS:
+        both = [
+            entry[key] is (entry["recorded"] == "success")
+            for entry in executions
+            if entry[key] is not None and entry["recorded"] in ("success", "failure")
+        ]
+        found[name] = {"k": sum(both), "n": len(both)}
+    return found
+
+
+def against_recorded(executions: Rows) -> dict[str, dict[str, Any]]:
+    """Per task what was said against the recorded label: counts, and how often they agree."""
+    by_task: dict[str, list[Mapping[str, Any]]] = {}
+    for entry in executions:
+        by_task.setdefault(entry["task"], []).append(entry)
+    return {
+        task: {"counts": cross_table(mine), "agreement": agreement_of(mine)}
+        for task, mine in sorted(by_task.items())
+    }
 
 
 def describe_run(summary: Mapping[str, Any]) -> str:
     """The final tables as text."""
+    skipped = _skipped_lines(summary.get("skipped_episodes", {}))
     if not summary["rows"]:
-        return "No trial with a plan to replay."
+        return "\n".join(["No trial with a plan to replay.", *skipped])
     lines = _count_lines(summary["counts"])
     executions = summary.get("executions", [])
     if executions:
-        lines += ["", *_cross_lines(cross_table(executions)), "", *_parting_lines(executions)]
+        lines += ["", *_cross_lines(executions), "", *_parting_lines(executions)]
     lines += _sample_lines(summary["rows"])
     rejected = [row for row in summary["rows"] if row["accepted"] is False]
     if rejected:
@@ -115,10 +145,20 @@ def describe_run(summary: Mapping[str, Any]) -> str:
         f"  {row['episode']} {row['plan']} {row['trajectory']} {row['mode']}: {row['reason']}"
         for row in rejected
     ]
+    lines += skipped
     kept = sum(row["skipped"] for row in summary["rows"])
     if kept:
         lines.append(f"{kept} of {len(summary['rows'])} were there already; --force redoes them.")
     return "\n".join(lines)
+
+
+def _skipped_lines(skipped: Mapping[str, str]) -> list[str]:
+    """Episodes of which nothing could be replayed."""
+    lines = [
+        f"  {name}: {NOT_EVALUATED}{why.removeprefix(NOT_EVALUATED)}"
+        for name, why in sorted(skipped.items())
+    ]
+    return ["", "episodes that cannot be replayed:", *lines] if lines else []
 
 
 def _sample_lines(rows: Rows) -> list[str]:
@@ -134,7 +174,7 @@ def _sample_lines(rows: Rows) -> list[str]:
     return ["", "varied replays that succeed:", *lines] if lines else []
 
 
-def _count_lines(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
+def _count_lines(counts: Counts) -> list[str]:
     width = max(len(key) for key in counts)
     lines = [
         f"{'':{width}}  {'n':>5} {'accepted':>9} {'rejected':>9} {'undecided':>9} {'failed':>7}"
@@ -146,14 +186,28 @@ def _count_lines(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
     ]
 
 
-def _cross_lines(table: Mapping[str, Mapping[str, Mapping[str, int]]]) -> list[str]:
-    lines = [f"{'':28}  {'recorded:':>9} {'success':>8} {'failure':>8} {'unlabelled':>10}"]
-    for name, rows in table.items():
+def _cross_lines(executions: Rows) -> list[str]:
+    """One table per task, because what they ask is not the same."""
+    lines: list[str] = []
+    tables = against_recorded(executions)
+    for task, table in tables.items():
+        lines += ["", f"{task}:"] if len(tables) > 1 else []
+        lines += _cross_of(table["counts"], table["agreement"])
+    return lines
+
+
+def _cross_of(counts: Mapping[str, Counts], agreement: Counts) -> list[str]:
+    lines = [
+        f"{'':28}  {'recorded:':>9} {'success':>8} {'failure':>8} {'unlabelled':>10} {'agree':>9}"
+    ]
+    for name, rows in counts.items():
+        agree = f"{agreement[name]['k']} of {agreement[name]['n']}"
         for word, cells in rows.items():
             lines.append(
                 f"{name:<17} {word:<10}  {'':>9} {cells['success']:>8} {cells['failure']:>8} "
-                f"{cells['unknown']:>10}"
+                f"{cells['unknown']:>10} {agree:>9}".rstrip()
             )
+            agree = ""
     return lines
 
 

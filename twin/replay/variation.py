@@ -10,6 +10,8 @@ from bridge.errors import refuse_outside
 FRICTIONS = ("object_friction", "finger_friction", "surface_friction")
 """Fields of ``PhysicsConfig`` that are frictions."""
 GRIP_FORCE = "grip_force_N"
+RIGID_MASSES = "masses of rigid objects"
+"""Beside fields of ``PhysicsConfig`` among what a calibration found."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,8 +39,9 @@ class VariationConfig:
     grip_delay_s: float = 0.1
     """The gripper lags behind the arm by up to this long, evenly drawn [s]."""
     calibrated: Annotated[tuple[tuple[str, float], ...], Parameter(parse=False)] = ()
-    """Fields of ``PhysicsConfig`` with the spread of their logarithm that calibration found; they
-    replace the priors above. No flag: read from the scene's calibration."""
+    """Fields of ``PhysicsConfig``, and the masses of rigid objects, with the spread of their
+    logarithm that calibration found; they replace the priors above. No flag: read from the scene's
+    calibration."""
 
     def __post_init__(self) -> None:
         """Refuse spreads that are none."""
@@ -67,4 +70,9 @@ class VariationConfig:
         known = dict(self.calibrated)
         if known.keys() & set(FRICTIONS[1:]):
             spreads[FRICTIONS[0]] = 0.0
+        known.pop(RIGID_MASSES, None)
         return {**spreads, **{name: known[name] for name in sorted(known)}}
+
+    def mass_spread(self, *, soft: bool) -> float:
+        """Spread of the logarithm of an object's mass; calibration weighs rigid ones only."""
+        return self.mass_log if soft else dict(self.calibrated).get(RIGID_MASSES, self.mass_log)

@@ -11,7 +11,8 @@ from bridge.episode.run import RunFolder
 from bridge.task.task_file import load_task
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
-from twin.replay.place import TASK_SHAPE, physics_for, read_place, shape_hashes
+from twin.replay.calibrated import physics_for
+from twin.replay.place import TASK_SHAPE, read_place, shape_hashes
 from twin.scene.calibration import Calibration
 from twin.scene.shape.lattice import Lattice
 

@@ -5,6 +5,8 @@ from typing import Any
 from twin.replay.table import (
     EXECUTED,
     PLANNED,
+    SEEN,
+    against_recorded,
     count_verdicts,
     cross_table,
     describe_run,
@@ -64,6 +66,24 @@ def test_the_text_holds_the_tables_and_where_things_part() -> None:
     assert "planned dynamic, never executed" in text
     assert "b p: 2.34 s: only as planned in the twin (perception), lag 60 ms" in text
     assert "a p: nowhere, lag 50 ms" in text
+
+
+def test_what_was_seen_is_held_against_the_label_too() -> None:
+    tables = against_recorded(executions_of(ROWS, LABELS))
+    assert list(tables) == [""], "rows of one task"
+    assert tables[""]["counts"][SEEN]["accepted"] == {"success": 1, "failure": 0, "unknown": 0}
+    assert tables[""]["agreement"] == {
+        PLANNED: {"k": 1, "n": 2},
+        EXECUTED: {"k": 2, "n": 2},
+        SEEN: {"k": 1, "n": 1},
+    }
+
+
+def test_tasks_have_a_table_each() -> None:
+    rows = [{**item, "task": item["episode"]} for item in ROWS]
+    text = describe_run({**summary(), "executions": executions_of(rows, LABELS)})
+    assert ("\na:\n" in text, "\nb:\n" in text, "\nc:\n" in text) == (True, True, False)
+    assert text.count("planned in twin   accepted") == 2
 
 
 def test_an_attached_grasp_is_counted_apart_and_named() -> None:
