@@ -7,6 +7,7 @@ from threading import Lock
 from bridge.episode.run import RunFolder
 from bridge.errors import GstError, PathNotFoundError
 from evaluator.compare import Comparison, TrialRow, compare_run
+from evaluator.compare.cache import FOLDER, SummaryCache
 from evaluator.result import Measurement, Results, load_results
 
 _ASKING = Lock()
@@ -83,7 +84,8 @@ def _judge(run: RunFolder, _state: tuple[tuple[str, int, int], ...]) -> Judgemen
         results_reason = str(error)
     comparison, comparison_reason = None, None
     try:
-        comparison = compare_run(run)
+        with SummaryCache(run.results_dir / FOLDER) as cache:
+            comparison = compare_run(run, cache=cache)
     except GstError as error:
         comparison_reason = str(error)
     return Judgement(

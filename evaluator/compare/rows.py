@@ -1,5 +1,6 @@
 """What a comparison is made of: one row per recorded trial, with what the twin said of it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -8,6 +9,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from evaluator.compare.band_measurements import BandCurve
+from evaluator.compare.motion import MotionSummary
+from evaluator.compare.states import StateSummary
+from evaluator.compare.view_quality import ViewQuality
 from evaluator.result import Exclusion, Measurement, Results, Table
 
 
@@ -69,9 +74,17 @@ class TrialRow:
     count: int = 1
     """Trials this row stands for; above 1 only in a streamed table, where ``episode`` is empty."""
     path: Path | None = None
-    tcp_errors: tuple[TcpErrorSeries, ...] = ()
     start_positions_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     """Where the objects were localised at the start, to judge pairs of starts."""
+    read_tcp_errors: Callable[[], tuple[TcpErrorSeries, ...]] | None = field(
+        default=None, repr=False, compare=False
+    )
+    """Reads the files when asked: ten thousand rows hold no series."""
+
+    @property
+    def tcp_errors(self) -> tuple[TcpErrorSeries, ...]:
+        """Recorded against replayed tool poses over time, read from the files at each access."""
+        return () if self.read_tcp_errors is None else self.read_tcp_errors()
 
     @property
     def recorded_word(self) -> str:
@@ -121,7 +134,7 @@ class Comparison:
 
     run: str
     source: str
-    """run, trials or rates."""
+    """run, trials, rates or images."""
     stand_in: bool | None
     rows: tuple[TrialRow, ...] = ()
     cells: tuple[RateCell, ...] = ()
@@ -129,6 +142,14 @@ class Comparison:
     tables: tuple[Table, ...] = ()
     exclusions: tuple[Exclusion, ...] = ()
     missing: tuple[str, ...] = ()
+    motions: tuple[MotionSummary, ...] = ()
+    """How far each motion lies from its replays, with its course."""
+    states: tuple[StateSummary, ...] = ()
+    """Where objects were predicted, replayed and localised after each stage."""
+    bands: tuple[BandCurve, ...] = ()
+    """Distance and repeatability of imported runs over normalised time."""
+    views: tuple[ViewQuality, ...] = ()
+    """Every rendered view that was scored, with pictures of the worst."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Software, settings, and the content hash of every input file."""
 

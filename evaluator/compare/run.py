@@ -1,113 +1,178 @@
 """Read a run folder into a ``Comparison``."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from pathlib import Path
+from typing import Any, TypeVar
 
 from bridge.episode.provenance import hash_file, software
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
-from bridge.errors import BridgeError, GstError
 from bridge.exchange.trials_import import trials_path
-from evaluator.compare.bands import compare_bands
+from bridge.terminal import Output
+from evaluator.compare.bands import BandReport, compare_bands
+from evaluator.compare.cache import SummaryCache
+from evaluator.compare.contents import ODD, RunContents, broken, read_contents
+from evaluator.compare.final_states import state_results
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.imported import imported_rows
+from evaluator.compare.label_results import label_results
 from evaluator.compare.pairing import START_LIMIT_M
-from evaluator.compare.replays import DerivedFile, read_derived
+from evaluator.compare.part import Part
+from evaluator.compare.renders import compare_renders
+from evaluator.compare.replays import DerivedIndex
 from evaluator.compare.rows import Comparison, TrialRow
-from evaluator.compare.trial import read_trial
-from evaluator.compare.views import compare_views
+from evaluator.compare.summaries import sum_up
+from evaluator.compare.tracking import motion_results
+from evaluator.compare.trial import Trial, lay_out
+from evaluator.compare.views import ViewReport, compare_views
+from evaluator.metrics.lpips import open_nets
+from evaluator.metrics.options import ImageOptions
 from evaluator.result import Exclusion
 
+Item = TypeVar("Item")
+AnyPart = Part | ViewReport | BandReport
 
-def compare_run(run: RunFolder, *, method: str = "wilson", goal: float | None = None) -> Comparison:
+QUIET = Output(quiet=True)
+
+
+def compare_run(
+    run: RunFolder,
+    *,
+    method: str = "wilson",
+    goal: float | None = None,
+    images: ImageOptions = ImageOptions(),  # noqa: B008  # frozen
+    cache: SummaryCache | None = None,
+    output: Output = QUIET,
+) -> Comparison:
     """Pair every recorded trial of a run with its replays and measure the agreement.
 
     A broken episode is left out and named; a missing part is listed, never guessed.
+
+    Args:
+        run: The run folder.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+        goal: Success rate to stop or continue for.
+        images: Backbones of LPIPS, and other methods to compare with the views of the run.
+        cache: What earlier evaluations read; without one every file is read.
+        output: Shows progress.
 
     Raises:
         PathNotFoundError: When the run folder is not there.
     """
     run = RunFolder.open(run.path)
-    recorded, left_out = _read_recorded(run)
-    files, broken = read_derived(run)
-    left_out += broken
-    hashes = {episode.path: episode.sha256() for episode in recorded}
-    rows = []
-    for episode in recorded:
-        if episode.info.kind != "trial":
-            continue
-        try:
-            row, lacking = read_trial(run, episode, files, sha256=hashes[episode.path])
-        except GstError as error:
-            left_out.append(_broken(episode.info.id, error))
-            continue
-        rows.append(row)
-        left_out += lacking
-    imported, doubled = imported_rows(run, {episode.info.id for episode in recorded})
-    rows += imported
-    left_out += doubled
-    views = compare_views(files, recorded, hashes)
-    bands = compare_bands(recorded, files)
+    cache = SummaryCache(None) if cache is None else cache
+    contents = read_contents(run, cache, output)
+    trials, left_out = trials_of(contents)
+    recorded_ids = {recorded.facts.info.id for recorded in contents.recorded}
+    imported, doubled = imported_rows(run, recorded_ids)
+    rows = [*(trial.row for trial in trials), *imported]
+    summaries = sum_up(trials, cache, output)
+    nets = open_nets(images.backbones)
+    views = compare_views(contents.derived, contents.sources, nets=nets)
+    methods = compare_renders(images, contents.derived, contents.sources, nets=nets)
+    bands = _bands(contents)
+    parts = (
+        motion_results(summaries.motions),
+        state_results(summaries.states),
+        label_results(summaries.witnesses, rows, method=method),
+        views,
+        methods,
+        bands,
+    )
     base = compare_rows(
         rows,
         run=run.path.resolve().name,
         source="run",
-        stand_in=_stand_in(recorded, files, imported),
+        stand_in=_stand_in(contents, imported),
         method=method,
         goal=goal,
     )
     missing = [] if rows else ["trials: the run holds no recorded trial"]
-    return replace(
+    base = replace(
         base,
-        measurements=(*base.measurements, *views.measurements, *bands.measurements),
-        tables=(*base.tables, *views.tables, *bands.tables),
-        exclusions=(*left_out, *base.exclusions, *views.exclusions, *bands.exclusions),
-        missing=(*missing, *base.missing, *views.missing, *bands.missing),
-        provenance={
-            "software": software(),
-            "start_limit_m": START_LIMIT_M,
-            "imported_trials": hash_file(trials_path(run)) if imported or doubled else None,
-            "episodes": {_name_of(path, run): sha256 for path, sha256 in hashes.items()},
-            "derived": {
-                _name_of(file.path, run): {
-                    "sha256": hash_file(file.path),
-                    "source_sha256": file.derived.source_sha256,
-                    "scene_hash": file.derived.scene_hash,
-                    "engine": file.derived.engine,
-                    "seed": file.derived.seed,
-                }
-                for file in files
-            },
-        },
+        exclusions=(*contents.left_out, *left_out, *doubled, *base.exclusions, *summaries.left_out),
+        missing=(*missing, *base.missing),
+    )
+    return replace(
+        _with_parts(base, parts),
+        motions=summaries.motions,
+        states=summaries.states,
+        bands=bands.curves,
+        views=(*views.views, *methods.views),
+        provenance=_provenance(
+            contents, hash_file(trials_path(run)) if imported or doubled else None
+        ),
     )
 
 
-def _read_recorded(run: RunFolder) -> tuple[list[Episode], list[Exclusion]]:
-    episodes, left_out = [], []
-    for path in run.episodes():
+def _with_parts(base: Comparison, parts: Sequence[AnyPart]) -> Comparison:
+    return replace(
+        base,
+        measurements=_joined(base.measurements, (part.measurements for part in parts)),
+        tables=_joined(base.tables, (part.tables for part in parts)),
+        exclusions=_joined(base.exclusions, (part.exclusions for part in parts)),
+        missing=_joined(base.missing, (part.missing for part in parts)),
+    )
+
+
+def _joined(first: Iterable[Item], others: Iterable[Iterable[Item]]) -> tuple[Item, ...]:
+    return (*first, *(item for other in others for item in other))
+
+
+def trials_of(contents: RunContents) -> tuple[list[Trial], list[Exclusion]]:
+    """Lay every recorded trial beside its replays; one that cannot be judged is left out."""
+    index = DerivedIndex(contents.derived)
+    trials, left_out = [], []
+    for recorded in contents.recorded:
+        facts = recorded.facts
+        if facts.info.kind != "trial":
+            continue
+        if facts.broken:
+            left_out.append(
+                Exclusion(episode=facts.info.id, scope="everything", reason=facts.broken)
+            )
+            continue
+        trial = lay_out(recorded.file, facts, index)
+        trials.append(trial)
+        left_out += trial.exclusions
+    return trials, left_out
+
+
+def _bands(contents: RunContents) -> BandReport:
+    imported, left_out = [], []
+    for each in contents.recorded:
+        if each.facts.info.kind != "imported":
+            continue
         try:
-            episode = Episode.open(path)
-            _ = episode.info, episode.outcome  # both are needed; another program may have erred
-            episodes.append(episode)
-        except BridgeError as error:
-            left_out.append(_broken(path.name, error))
-    return episodes, left_out
+            imported.append(Episode.open(each.file.path))
+        except ODD as error:  # it was there a moment ago
+            left_out.append(broken(each.file.path.name, error, scope="bands"))
+    report = compare_bands(imported, [f for f in contents.derived if f.info.kind == "imported"])
+    return replace(report, exclusions=(*left_out, *report.exclusions))
 
 
-def _broken(name: str, error: GstError) -> Exclusion:
-    return Exclusion(episode=name, scope="everything", reason=str(error))
-
-
-def _stand_in(
-    recorded: Sequence[Episode], files: Sequence[DerivedFile], imported: Sequence[TrialRow]
-) -> bool | None:
+def _stand_in(contents: RunContents, imported: Sequence[TrialRow]) -> bool | None:
     """True as soon as one episode is a stand-in's: mixed results are not called real."""
-    marks = [episode.info.stand_in for episode in recorded]
-    marks += [file.episode.info.stand_in for file in files]
+    marks = [each.facts.info.stand_in for each in contents.recorded]
+    marks += [file.info.stand_in for file in contents.derived]
     marks += [row.stand_in for row in imported]
     return any(marks) if marks else None
 
 
-def _name_of(path: Path, run: RunFolder) -> str:
-    return path.relative_to(run.path).as_posix()
+def _provenance(contents: RunContents, imported_sha256: str | None) -> dict[str, Any]:
+    return {
+        "software": software(),
+        "start_limit_m": START_LIMIT_M,
+        "imported_trials": imported_sha256,
+        "episodes": {each.file.name: each.file.sha256 for each in contents.recorded},
+        "derived": {
+            file.name: {
+                "sha256": file.sha256,
+                "source_sha256": file.derived.source_sha256,
+                "scene_hash": file.derived.scene_hash,
+                "engine": file.derived.engine,
+                "seed": file.derived.seed,
+            }
+            for file in contents.derived
+        },
+    }

@@ -1,0 +1,196 @@
+"""``robot-gst evaluate`` over 10,000 episodes with two replays each: cold, warm, and ten new ones.
+
+The run is written once under ``build/`` and kept. Files have just been written or read, so "cold"
+is about the evaluator's own cache, not the disk's.
+"""
+
+import json
+import os
+import random
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from evaluate_run import Size, paths_of, write_run
+from measure import ROOT, Target, report_targets
+
+from bridge.episode import schema
+from bridge.episode.run import RunFolder
+from bridge.terminal import Output
+
+FULL = 10_000
+NUM_TRIALS = int(os.environ.get("EVALUATE_EPISODES", FULL))
+if NUM_TRIALS != FULL:  # a number that proves nothing does not replace one that does
+    os.environ.setdefault("GST_BENCH_RESULTS", str(ROOT / "build" / "quick_results"))
+SHORT_S = 1.0
+"""Length of the motions of most episodes: what takes long to write is not what is measured."""
+LONG = Size(num_trials=40, seconds=20.0)
+"""Episodes as they are recorded, for the time a motion takes."""
+NUM_NEW = 10
+SAMPLE = 1000
+"""Files the reference reads."""
+QUIET = Output(quiet=True)
+
+
+class Ran(NamedTuple):
+    """One command."""
+
+    wall_s: float
+    peak_mb: float
+    """Largest resident memory of its process."""
+
+
+def bench_run() -> RunFolder:
+    """Return the run of short episodes, written where it is not there."""
+    folder = ROOT / "build" / f"bench_evaluate_{NUM_TRIALS}"
+    done = folder / "whole"
+    if not done.is_file():
+        shutil.rmtree(folder, ignore_errors=True)
+        began_s = time.perf_counter()
+        write_run(folder, Size(num_trials=NUM_TRIALS, seconds=SHORT_S))
+        done.touch()
+        print(f"wrote {3 * NUM_TRIALS} episodes in {time.perf_counter() - began_s:.0f} s")
+        time.sleep(2.1)  # younger files are not trusted to stay as they are
+    run = RunFolder(folder)
+    for path in paths_of(run):  # what an interrupted benchmark added
+        if int(path.name.split("_")[1][:6]) >= NUM_TRIALS:
+            path.unlink()
+    shutil.rmtree(run.results_dir, ignore_errors=True)
+    return run
+
+
+def wall_s(work: Callable[[], object]) -> float:
+    """Time one call [s]."""
+    began_s = time.perf_counter()
+    work()
+    return time.perf_counter() - began_s
+
+
+def evaluate(run: RunFolder) -> Ran:
+    """Run the whole command in a process of its own."""
+    command = [sys.executable, "robot_gst.py", "evaluate", str(run.path), "--quiet"]
+    began_s = time.perf_counter()
+    pid = os.posix_spawn(
+        command[0],
+        command,
+        dict(os.environ),
+        file_actions=[(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)],
+    )
+    _, status, usage = os.wait4(pid, 0)
+    if os.waitstatus_to_exitcode(status):
+        message = f"{' '.join(command)} ended with {os.waitstatus_to_exitcode(status)}"
+        raise RuntimeError(message)
+    return Ran(time.perf_counter() - began_s, usage.ru_maxrss / 1024)
+
+
+def outcomes_s(run: RunFolder) -> float:
+    """Hash and read all outcomes, nothing kept [s]."""
+    from evaluator.compare.cache import SummaryCache
+    from evaluator.compare.contents import read_contents
+
+    return wall_s(lambda: read_contents(run, SummaryCache(None), QUIET))
+
+
+def motions_s(run: RunFolder) -> float:
+    """Compare motions and final states of all trials, nothing kept [s]."""
+    from evaluator.compare.cache import SummaryCache
+    from evaluator.compare.contents import read_contents
+    from evaluator.compare.run import trials_of
+    from evaluator.compare.summaries import sum_up
+
+    cache = SummaryCache(None)
+    trials, _ = trials_of(read_contents(run, cache, QUIET))
+    return wall_s(lambda: sum_up(trials, cache, QUIET))
+
+
+def reference_s(paths: Iterable[Path]) -> float:
+    """Read the same metadata and messages with the official reader; nothing is checked [s]."""
+    from mcap.reader import make_reader
+
+    kinds = {schema.PLAN, schema.EVENT, schema.VERDICT, schema.LOCALISATION}
+
+    def read(path: Path) -> None:
+        with path.open("rb") as stream:
+            reader = make_reader(stream, validate_crcs=True)
+            summary = reader.get_summary()
+            for record in reader.iter_metadata():
+                for text in record.metadata.values():
+                    json.loads(text)
+            topics = [
+                channel.topic
+                for channel in summary.channels.values()
+                if summary.schemas[channel.schema_id].name in kinds
+            ]
+            for _, _, message in reader.iter_messages(topics=topics):
+                json.loads(message.data)
+
+    return wall_s(lambda: [read(path) for path in paths])
+
+
+def main() -> None:
+    """All of it, once: the cold run alone takes minutes."""
+    run = bench_run()
+    paths = list(paths_of(run))
+    sample = random.Random(0).sample(paths, min(SAMPLE, len(paths)))
+    outcome_ms = 1e3 * outcomes_s(run) / len(paths)
+    reference_ms = 1e3 * reference_s(sample) / len(sample)
+    with tempfile.TemporaryDirectory() as folder:
+        long_ms = 1e3 * motions_s(write_run(Path(folder) / "long", LONG)) / LONG.num_trials
+    cold = evaluate(run)
+    warm = [evaluate(run) for _ in range(3)]
+    write_run(run.path, Size(num_trials=NUM_NEW, seconds=SHORT_S), first=NUM_TRIALS)
+    time.sleep(2.1)
+    added = evaluate(run)
+    warm_s = sorted(each.wall_s for each in warm)[1]
+    size_mb = sum(path.stat().st_size for path in paths) / 1e6
+    report_targets(
+        "evaluate_speed",
+        [
+            Target(
+                what="outcomes, cold, hash included, per file",
+                measured=outcome_ms,
+                limit=2.0,
+                unit="ms",
+                reference=f"official mcap reader, no hash, no checks: {reference_ms:.2f} ms",
+            ),
+            Target(
+                what=f"trajectories, cold, per episode of {LONG.seconds:g} s at 125 Hz",
+                measured=long_ms,
+                limit=80.0,
+                unit="ms",
+            ),
+            Target(
+                what=f"{NUM_TRIALS} episodes from the cache to the report, whole command",
+                measured=warm_s,
+                limit=10.0,
+                unit="s",
+                reference=f"cold: {cold.wall_s:.1f} s",
+            ),
+            Target(
+                what=f"the same after {NUM_NEW} new episodes",
+                measured=added.wall_s,
+                limit=10.0 + NUM_NEW * 0.2,
+                unit="s",
+            ),
+            Target(
+                what="peak memory, cold",
+                measured=cold.peak_mb,
+                limit=2000.0,
+                unit="MB",
+                reference=f"warm {max(each.peak_mb for each in warm):.0f} MB",
+            ),
+        ],
+        note=f"{len(paths)} files, {size_mb:.0f} MB, motions of {SHORT_S:g} s in 8 variants; wall "
+        "time, files in the disk cache, median of 3 warm runs",
+        cold_s=cold.wall_s,
+        warm_s=[each.wall_s for each in warm],
+        added_s=added.wall_s,
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,133 @@
+"""What all episodes of a run say of themselves, each read once and then kept."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from bridge.episode.catalogue.entry import LABEL_SUFFIX
+from bridge.episode.provenance import hash_file
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
+from bridge.errors import GstError
+from bridge.terminal import Output
+from evaluator.compare.cache import SummaryCache
+from evaluator.compare.inventory import RunFile, take_inventory
+from evaluator.compare.recorded import RecordedFacts, read_recorded
+from evaluator.compare.replays import DerivedFacts, DerivedFile, read_derived
+from evaluator.result import Exclusion
+
+ODD = (GstError, OSError, TypeError, ValueError, KeyError, RecursionError)
+"""What one file of another program, or a failing disk, may raise; it costs that file only."""
+
+Facts = TypeVar("Facts", RecordedFacts, DerivedFacts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedFile:
+    """One recorded episode and what it says of itself."""
+
+    file: RunFile
+    facts: RecordedFacts
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunContents:
+    """Everything an evaluation starts from."""
+
+    recorded: tuple[RecordedFile, ...]
+    derived: tuple[DerivedFile, ...]
+    left_out: tuple[Exclusion, ...]
+    """Files that could not be read, and why."""
+
+    @property
+    def sources(self) -> dict[str, tuple[Path, str]]:
+        """File and content hash of every recorded episode by its id."""
+        return {each.facts.info.id: (each.file.path, each.file.sha256) for each in self.recorded}
+
+
+def read_contents(run: RunFolder, cache: SummaryCache, output: Output) -> RunContents:
+    """Read what is new or has changed in a run; a broken file is left out and named."""
+    inventory = take_inventory(run, cache, output)
+    labels = _labels(run)
+    recorded, left_out = _read(
+        inventory.recorded,
+        RecordedFacts,
+        lambda file: f"{file.name} {file.sha256} {labels.get(file.path.stem, '')}",
+        lambda file: read_recorded(run, Episode.open(file.path)),
+        cache,
+        output,
+    )
+    derived, broken = _read(
+        inventory.derived,
+        DerivedFacts,
+        lambda file: f"{file.name} {file.sha256}",
+        lambda file: read_derived(file.path),
+        cache,
+        output,
+    )
+    return RunContents(
+        recorded=tuple(
+            RecordedFile(file=file, facts=recorded[file.path])
+            for file in inventory.recorded
+            if file.path in recorded
+        ),
+        derived=tuple(
+            DerivedFile(
+                path=file.path, name=file.name, sha256=file.sha256, facts=derived[file.path]
+            )
+            for file in inventory.derived
+            if file.path in derived
+        ),
+        left_out=(*inventory.left_out, *left_out, *broken),
+    )
+
+
+def _labels(run: RunFolder) -> dict[str, str]:
+    """Return the content hash of each label given after the fact, by the stem of its episode."""
+    found = {}
+    for path in run.notes_dir.glob(f"*{LABEL_SUFFIX}"):
+        try:
+            found[path.name.removesuffix(LABEL_SUFFIX)] = hash_file(path)
+        except OSError:  # whoever reads the label will say so
+            continue
+    return found
+
+
+def _read(
+    files: Sequence[RunFile],
+    kind: type[Facts],
+    key: Callable[[RunFile], str],
+    read: Callable[[RunFile], Facts],
+    cache: SummaryCache,
+    output: Output,
+) -> tuple[dict[Path, Facts], list[Exclusion]]:
+    facts: dict[Path, Facts] = {}
+    unknown: list[RunFile] = []
+    left_out: list[Exclusion] = []
+    for file in files:
+        kept = cache.find(kind, key(file))
+        if kept:
+            facts[file.path] = kept[0]
+        else:
+            unknown.append(file)
+    if not unknown:
+        return facts, left_out
+    with output.progress("read episodes", len(unknown)) as advance:
+        for done, file in enumerate(unknown, start=1):
+            try:
+                made = read(file)
+            except ODD as error:
+                left_out.append(broken(file.path.name, error))
+            else:
+                facts[file.path] = made
+                if not made.broken:  # a message names the folder, which may move
+                    cache.keep(kind, key(file), (made,))
+            advance(done, file.path.name)
+    return facts, left_out
+
+
+def broken(name: str, error: Exception, *, scope: str = "everything") -> Exclusion:
+    """Leave a file out of something, with what reading it raised."""
+    said = str(error) if isinstance(error, GstError) else f"{type(error).__name__}: {error}"
+    return Exclusion(episode=name, scope=scope, reason=said)

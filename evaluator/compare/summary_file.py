@@ -1,0 +1,181 @@
+"""One Parquet file of summaries: frozen dataclasses in columns, read back as they were.
+
+Text, numbers and answers are columns of their own, tuples of them are lists, and what is nested is
+JSON text. Importing this module loads pyarrow; ``cache`` does so only when a cache is asked for.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bridge.whole_file import write_whole
+from evaluator.compare.typed_json import Reader, reader, to_text, without_none
+
+Summary = TypeVar("Summary")
+Rows = Mapping[str, tuple[Any, ...]]
+"""Summaries by the key they are kept under; there may be none or several under one."""
+
+_KEY, _PLACE = "_key", "_place"
+NOTHING = -1
+"""Place of the one row of a key under which there is no summary."""
+_KIND, _VERSION = b"gst.kind", b"gst.version"
+_SCALARS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
+_REFUSALS = (pa.ArrowException, OverflowError, ValueError, TypeError)
+"""What packing raises: a number beyond 64 bits, text that is no Unicode, another type."""
+
+
+class UnusableFileError(Exception):
+    """A file of the cache holds nothing that can be used; the message says why."""
+
+
+class _Column(NamedTuple):
+    name: str
+    type: pa.DataType
+    is_optional: bool
+    pack: Callable[[Any], Any]
+    unpack: Reader
+
+
+def write_summaries(path: Path, kind: type[Any], rows: Rows, version: str) -> int:
+    """Write all rows, whole or not at all, and return how many keys could not be packed.
+
+    Raises:
+        OSError: When the disk refuses.
+    """
+    try:
+        table, refused = _packed(kind, rows, version), 0
+    except _REFUSALS:  # one odd number must not cost the others their place
+        good = {key: found for key, found in rows.items() if _fits(kind, key, found, version)}
+        table, refused = _packed(kind, good, version), len(rows) - len(good)
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd", write_page_checksum=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, sink.getvalue().to_pybytes())
+    return refused
+
+
+def read_summaries(path: Path, kind: type[Summary], version: str) -> dict[str, tuple[Summary, ...]]:
+    """Read all rows of a file.
+
+    Raises:
+        UnusableFileError: When it is damaged, foreign, or made by other code.
+        FileNotFoundError: When it is gone.
+    """
+    try:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            said = dict(file.schema_arrow.metadata or {})
+            if said.get(_KIND) != kind.__name__.encode():
+                message = "another program wrote it"
+                raise UnusableFileError(message)
+            if said.get(_VERSION) != version.encode():
+                message = "another version of this program wrote it"
+                raise UnusableFileError(message)
+            return _unpacked(kind, file.read())
+    except FileNotFoundError:
+        raise
+    except (*_REFUSALS, OSError, KeyError, AttributeError) as error:
+        message = f"it is damaged ({type(error).__name__})"
+        raise UnusableFileError(message) from error
+
+
+def _packed(kind: type[Any], rows: Rows, version: str) -> pa.Table:
+    keys: list[str] = []
+    places: list[int] = []
+    items: list[Any] = []
+    for key, found in rows.items():
+        for place, item in enumerate(found) if found else ((NOTHING, None),):
+            keys.append(key)
+            places.append(place)
+            items.append(item)
+    arrays = [pa.array(keys, pa.string()), pa.array(places, pa.int32())]
+    for name, of_type, _, pack, _ in _columns(kind):
+        values = (None if item is None else getattr(item, name) for item in items)
+        packed = [None if value is None else pack(value) for value in values]
+        arrays.append(pa.array(packed, of_type))
+    about = {_KIND: kind.__name__.encode(), _VERSION: version.encode()}
+    return pa.Table.from_arrays(arrays, schema=_schema(kind).with_metadata(about))
+
+
+def _fits(kind: type[Any], key: str, found: tuple[Any, ...], version: str) -> bool:
+    try:
+        _packed(kind, {key: found}, version)
+    except _REFUSALS:
+        return False
+    return True
+
+
+def _unpacked(kind: type[Summary], table: pa.Table) -> dict[str, tuple[Summary, ...]]:
+    if not table.schema.equals(_schema(kind)):
+        message = "its columns are others"
+        raise UnusableFileError(message)
+    places = table.column(_PLACE).to_pylist()
+    nothing = places.count(NOTHING)
+    columns = []
+    for name, of_type, is_optional, _, unpack in _columns(kind):
+        column = table.column(name)
+        if not is_optional and column.null_count != nothing:
+            message = f"{name} is missing"
+            raise UnusableFileError(message)
+        if pa.types.is_list(of_type):
+            columns.append(_tuples(column))
+        elif unpack is _as_stored:
+            columns.append(column.to_pylist())
+        else:
+            texts = column.to_pylist()
+            columns.append([None if text is None else unpack(text) for text in texts])
+    names = [column.name for column in _columns(kind)]
+    rows: dict[str, tuple[Summary, ...]] = {}
+    for key, place, *values in zip(table.column(_KEY).to_pylist(), places, *columns, strict=True):
+        if place == NOTHING:
+            rows[key] = ()
+        else:
+            item = kind(**dict(zip(names, values, strict=True)))
+            rows[key] = (*rows[key], item) if place else (item,)
+    return rows
+
+
+def _tuples(column: pa.ChunkedArray) -> list[tuple[Any, ...] | None]:
+    """Unpack lists at once: element by element takes a second for a million numbers."""
+    array = column.combine_chunks()
+    is_number = pa.types.is_primitive(array.type.value_type) and not array.values.null_count
+    values = array.values
+    flat = values.to_numpy(zero_copy_only=False).tolist() if is_number else values.to_pylist()
+    ends = array.offsets.to_numpy().tolist()
+    return [
+        tuple(flat[first:last]) if there else None
+        for first, last, there in zip(ends, ends[1:], array.is_valid().to_pylist(), strict=False)
+    ]
+
+
+def _schema(kind: type[Any]) -> pa.Schema:
+    columns = [(column.name, column.type) for column in _columns(kind)]
+    return pa.schema([(_KEY, pa.string()), (_PLACE, pa.int32()), *columns])
+
+
+def _columns(kind: type[Any]) -> tuple[_Column, ...]:
+    hints = get_type_hints(kind)
+    return tuple(_column(item.name, hints[item.name]) for item in fields(kind))
+
+
+def _column(name: str, hint: Any) -> _Column:
+    inner, is_optional = without_none(hint)
+    if inner in _SCALARS:
+        return _Column(name, _SCALARS[inner], is_optional, _as_stored, _as_stored)
+    args = get_args(inner)
+    if get_origin(inner) is tuple and args[1:] == (Ellipsis,) and args[0] in _SCALARS:
+        return _Column(name, pa.list_(_SCALARS[args[0]]), is_optional, list, _as_stored)
+    return _Column(name, pa.string(), is_optional, to_text, partial(_from_text, reader(inner)))
+
+
+def _as_stored(value: Any) -> Any:
+    return value
+
+
+def _from_text(read: Reader, text: str) -> Any:
+    return read(json.loads(text))

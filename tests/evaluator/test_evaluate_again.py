@@ -1,0 +1,336 @@
+"""Evaluating a run again: only what changed is read, and the answer is that of a first time."""
+
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.episode.catalogue import label_episode
+from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
+from bridge.episode.provenance import hash_file
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
+from bridge.terminal import Output
+from evaluator.cli import evaluate
+from evaluator.compare import Comparison, compare_run, inventory
+from evaluator.compare.cache import FOLDER, SummaryCache
+from evaluator.compare.replays import DerivedFacts, DerivedFile, DerivedIndex
+from evaluator.result import write_results
+
+
+def again(run: RunFolder, **asked: Any) -> Comparison:
+    """Evaluate as the command does, with the run's own cache."""
+    with SummaryCache(run.results_dir / FOLDER, **asked) as cache:
+        return compare_run(run, cache=cache)
+
+
+def settle(run: RunFolder) -> None:
+    """Let all files of a run look old enough to be trusted by their stamps."""
+    for path in [*run.episodes(), *run.derived()]:
+        os.utime(path, ns=(10**18, 10**18))
+
+
+def written(comparison: Comparison, folder: Path) -> bytes:
+    """Return the bytes of results.json."""
+    return write_results(comparison.results(), folder / "results.json").read_bytes()
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the episodes that were opened."""
+    names: list[str] = []
+    really_open = Episode.open
+
+    def open_and_note(path: Path) -> Episode:
+        names.append(path.name)
+        return really_open(path)
+
+    monkeypatch.setattr(Episode, "open", staticmethod(open_and_note))
+    return names
+
+
+@pytest.fixture
+def hashed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the files whose bytes were read whole."""
+    names: list[str] = []
+    really_hash = inventory.hash_files
+
+    def hash_and_note(paths: Any) -> str:
+        paths = list(paths)
+        names.extend(path.name for path in paths)
+        return really_hash(paths)
+
+    monkeypatch.setattr(inventory, "hash_files", hash_and_note)
+    return names
+
+
+def test_kept_and_read_give_the_same_bytes(six_trials: Any, tmp_path: Path) -> None:
+    run = six_trials.run
+    label_episode(run, "a2", Outcome(result="success", k=1, n=1, by="reviewer"))
+    plain = written(compare_run(run), tmp_path / "plain")
+    assert written(again(run), tmp_path / "first") == plain
+    assert written(again(run), tmp_path / "second") == plain
+    assert written(again(run, fresh=True), tmp_path / "fresh") == plain
+
+
+@pytest.mark.slow
+def test_kept_and_read_give_the_same_bytes_with_every_part(
+    evaluation_run: RunFolder, tmp_path: Path
+) -> None:
+    plain = written(compare_run(evaluation_run), tmp_path / "plain")
+    assert written(again(evaluation_run), tmp_path / "first") == plain
+    assert written(again(evaluation_run), tmp_path / "second") == plain
+
+
+def test_nothing_is_opened_or_hashed_twice(
+    six_trials: Any, opened: list[str], hashed: list[str]
+) -> None:
+    settle(six_trials.run)
+    again(six_trials.run)
+    assert set(opened) == set(hashed)
+    assert len(hashed) == 18
+    opened.clear()
+    hashed.clear()
+    again(six_trials.run)
+    assert (opened, hashed) == ([], [])
+
+
+def test_only_new_episodes_are_read(six_trials: Any, opened: list[str], hashed: list[str]) -> None:
+    settle(six_trials.run)
+    again(six_trials.run)
+    six_trials.trial("c1", recorded="success")
+    replay = six_trials.replay("c1", accepted=True)
+    opened.clear()
+    hashed.clear()
+    comparison = again(six_trials.run)
+    assert set(opened) == {"c1.mcap", replay.name}
+    assert set(hashed) == {"c1.mcap", replay.name}
+    assert comparison.results().get("agreement.sim_planned.rate").n == 7
+
+
+def test_young_files_are_hashed_again_but_not_read_again(
+    six_trials: Any, opened: list[str], hashed: list[str]
+) -> None:
+    for path in six_trials.run.episodes():
+        os.utime(path)
+    again(six_trials.run)
+    opened.clear()
+    hashed.clear()
+    again(six_trials.run)
+    assert opened == []
+    assert {path.name for path in six_trials.run.episodes()} <= set(hashed)
+
+
+def test_a_touched_file_with_other_bytes_is_read_again(six_trials: Any) -> None:
+    run = six_trials.run
+    settle(run)
+    assert len(again(run).rows) == 6
+    path = run.episodes_dir / "a1.mcap"
+    path.unlink()
+    six_trials.trial("a1", recorded="failure")
+    comparison = again(run)
+    assert comparison.provenance["episodes"]["episodes/a1.mcap"] == hash_file(path)
+    (row,) = [row for row in comparison.rows if row.episode == "a1"]
+    assert row.recorded is False
+    reasons = [e.reason for e in comparison.exclusions if e.episode == "a1"]
+    assert any("another version of the episode" in reason for reason in reasons)
+
+
+def test_other_bytes_under_the_old_size_and_time_are_noticed(six_trials: Any) -> None:
+    run = six_trials.run
+    settle(run)
+    before = again(run).provenance
+    path = run.derived()[0]
+    data = bytearray(path.read_bytes())
+    data[-9] ^= 1  # of the footer
+    path.write_bytes(data)
+    os.utime(path, ns=(10**18, 10**18))
+    after = again(run)
+    name = f"derived/{path.name}"
+    assert name in before["derived"]
+    assert name not in after.provenance["derived"]
+    assert any(e.episode == path.name and "CRC" in e.reason for e in after.exclusions)
+
+
+def test_a_replaced_replay_is_noticed(six_trials: Any) -> None:
+    settle(six_trials.run)
+    assert again(six_trials.run).rows[0].sim_planned is True
+    six_trials.run.derived("a1.replay.planned*")[0].unlink()
+    six_trials.replay("a1", accepted=False, offset_m=0.05)
+    comparison = again(six_trials.run)
+    assert comparison.rows[0].sim_planned is False
+    largest = comparison.results().get("motion.planned.position_max_m").value
+    assert largest is not None
+    assert (
+        largest == compare_run(six_trials.run).results().get("motion.planned.position_max_m").value
+    )
+
+
+def test_a_newer_replay_of_the_same_plan_wins(six_trials: Any) -> None:
+    settle(six_trials.run)
+    again(six_trials.run)
+    newer = six_trials.replay("a1", accepted=False, tag="b")
+    assert again(six_trials.run).rows[0].planned_replay == newer.name
+
+
+def test_removed_episodes_vanish(six_trials: Any) -> None:
+    settle(six_trials.run)
+    again(six_trials.run)
+    (six_trials.run.episodes_dir / "a1.mcap").unlink()
+    for path in six_trials.run.derived("b1.replay.*"):
+        path.unlink()
+    comparison = again(six_trials.run)
+    assert [row.episode for row in comparison.rows] == ["a2", "a3", "b1", "b2", "b3"]
+    assert comparison.results().get("agreement.sim_planned.rate").n == 4
+    assert "episodes/a1.mcap" not in comparison.provenance["episodes"]
+
+
+def test_a_label_given_between_two_evaluations_counts(six_trials: Any, hashed: list[str]) -> None:
+    settle(six_trials.run)
+    assert again(six_trials.run).rows[0].recorded is True
+    label_episode(six_trials.run, "a1", Outcome(result="failure", k=0, n=1, by="reviewer"))
+    hashed.clear()
+    assert again(six_trials.run).rows[0].recorded is False
+    assert hashed == []  # gigabytes are not hashed again for a label
+
+
+def test_a_run_that_was_moved_gives_the_same_answer(six_trials: Any, tmp_path: Path) -> None:
+    run = six_trials.run
+    (run.derived_dir / "broken.replay.mcap").write_bytes(b"")
+    first = again(run)
+    moved = RunFolder(Path(shutil.move(run.path, tmp_path / "elsewhere" / run.path.name)))
+    second = again(moved)
+    assert second.measurements == first.measurements
+    assert str(run.path) not in " ".join(e.reason for e in second.exclusions)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda path: path.write_bytes(b""),
+        lambda path: path.write_bytes(b"\x89MCAP0\r\n" * 50),
+        lambda path: path.write_bytes(path.read_bytes()[:-40]),
+        lambda path: (path.unlink(), path.symlink_to("nowhere")),
+        lambda path: (path.unlink(), path.mkdir()),
+    ],
+)
+def test_a_broken_file_costs_itself_only_and_is_named_each_time(
+    six_trials: Any, spoil: Callable[[Path], object]
+) -> None:
+    spoil(six_trials.run.episodes_dir / "a1.mcap")
+    spoil(six_trials.run.derived("b1.replay.planned*")[0])
+    for _ in range(2):
+        comparison = again(six_trials.run)
+        assert len(comparison.rows) == 5
+        named = {e.episode for e in comparison.exclusions if e.scope == "everything"}
+        assert "a1.mcap" in named
+        assert any(name.startswith("b1.replay.planned") for name in named)
+
+
+def test_progress_counts_only_what_has_to_be_read(
+    six_trials: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[tuple[str, int, int]] = []
+
+    class Noting(Output):
+        def progress(self, label: str, total: int) -> Any:
+            from contextlib import contextmanager
+
+            @contextmanager
+            def steps() -> Iterator[Callable[[int, str], None]]:
+                yield lambda done, note: shown.append((label, done, total))
+
+            return steps()
+
+    settle(six_trials.run)
+    with SummaryCache(six_trials.run.results_dir / FOLDER) as cache:
+        compare_run(six_trials.run, cache=cache, output=Noting())
+    assert {(label, total) for label, _, total in shown if label != "hash files (MB)"} == {
+        ("read episodes", 6),
+        ("read episodes", 12),
+        ("compare motions", 6),
+    }
+    assert shown[-1] == ("compare motions", 6, 6)
+    shown.clear()
+    with SummaryCache(six_trials.run.results_dir / FOLDER) as cache:
+        compare_run(six_trials.run, cache=cache, output=Noting())
+    assert shown == []
+
+
+def test_the_command_keeps_and_forgets(
+    six_trials: Any, opened: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    settle(six_trials.run)
+    assert evaluate(six_trials.run.path) == 0
+    first = (six_trials.run.results_dir / "results.json").read_bytes()
+    opened.clear()
+    assert evaluate(six_trials.run.path) == 0
+    assert opened == []
+    assert (six_trials.run.results_dir / "results.json").read_bytes() == first
+    assert evaluate(six_trials.run.path, force=True) == 0
+    assert opened != []
+    assert (six_trials.run.results_dir / "results.json").read_bytes() == first
+    assert "results/cache" not in capsys.readouterr().err
+
+
+def test_the_command_works_without_pyarrow_and_says_so(
+    six_trials: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.delitem(sys.modules, "evaluator.compare.summary_file", raising=False)
+    monkeypatch.delattr("evaluator.compare.summary_file", raising=False)
+    assert evaluate(six_trials.run.path) == 0
+    assert "nothing is kept for the next evaluation" in capsys.readouterr().err
+    assert not (six_trials.run.results_dir / FOLDER).exists()
+
+
+derived_files = st.lists(
+    st.builds(
+        Derived,
+        kind=st.sampled_from(("replay", "localised")),
+        source_episode=st.sampled_from("ab"),
+        source_sha256=st.sampled_from(("", "now", "then")),
+        plan_id=st.sampled_from(("p", "q", None)),
+        trajectory=st.sampled_from(("planned", "executed")),
+        mode=st.sampled_from(("dynamic", "kinematic")),
+    ),
+    max_size=12,
+)
+
+
+@given(made=derived_files)
+def test_the_index_finds_what_looking_at_every_file_finds(
+    tmp_path_factory: pytest.TempPathFactory, made: list[Derived]
+) -> None:
+    folder = tmp_path_factory.mktemp("derived")
+    files = []
+    for number, derived in enumerate(made):
+        path = folder / f"{number:02}.mcap"
+        path.touch()
+        os.utime(path, ns=(number % 5, number % 5))
+        facts = DerivedFacts(info=EpisodeInfo(id="x", kind="trial"), derived=derived)
+        files.append(DerivedFile(path=path, name=path.name, sha256="", facts=facts))
+    index = DerivedIndex(files)
+    for source in "ab":
+        for plan_id in "pq":
+            for trajectory in ("planned", "executed"):
+                current = [
+                    file
+                    for file in files
+                    if file.derived.kind == "replay"
+                    and file.derived.mode == "dynamic"
+                    and (file.derived.source_episode, file.derived.plan_id) == (source, plan_id)
+                    and file.derived.trajectory == trajectory
+                    and file.derived.source_sha256 in ("", "now")
+                ]
+                newest = max(current, key=lambda file: file.age, default=None)
+                found = index.replay(
+                    source=source, source_sha256="now", plan_id=plan_id, trajectory=trajectory
+                )
+                assert found.file is newest
