@@ -46,6 +46,8 @@ class Arm:
         self._index_joints()
         self._couple_fingers()
         self._target_m = MAX_WIDTH_M / 2
+        self._arm_order: tuple[list[float], list[float]] | None = None
+        self._finger_order: tuple[float, float] | None = None
 
     def _load(self, urdf: str, mesh_hulls_m: Hulls) -> int:
         with tempfile.TemporaryDirectory(prefix="robot-gst-physics-") as folder:
@@ -140,20 +142,29 @@ class Arm:
         velocity_rad_s: Float[np.ndarray, " num_joints"],
         width_m: float,
     ) -> None:
-        """Set the position targets that the motors follow from the next step on."""
-        pybullet.setJointMotorControlArray(
-            self.id,
-            self._arm,
-            pybullet.POSITION_CONTROL,
-            targetPositions=joints_rad.tolist(),
-            targetVelocities=velocity_rad_s.tolist(),
-            forces=self._arm_forces,
-            physicsClientId=self._client,
-        )
+        """Set the position targets that the motors follow from the next step on.
+
+        Motors keep their orders: one that is already followed is not given again.
+        """
+        order = (joints_rad.tolist(), velocity_rad_s.tolist())
+        if order != self._arm_order:
+            pybullet.setJointMotorControlArray(
+                self.id,
+                self._arm,
+                pybullet.POSITION_CONTROL,
+                targetPositions=order[0],
+                targetVelocities=order[1],
+                forces=self._arm_forces,
+                physicsClientId=self._client,
+            )
+            self._arm_order = order
         self._target_m = min(max(width_m, 0.0), MAX_WIDTH_M) / 2
         self._drive_fingers(self._target_m, self._config.finger_speed_m_s)
 
     def _drive_fingers(self, target_m: float, speed_m_s: float) -> None:
+        if self._finger_order == (target_m, speed_m_s):
+            return
+        self._finger_order = (target_m, speed_m_s)
         for index in self._fingers:
             pybullet.setJointMotorControl2(
                 self.id,
@@ -192,6 +203,15 @@ class Arm:
         """Distance between the finger pads."""
         states = pybullet.getJointStates(self.id, self._fingers, physicsClientId=self._client)
         return float(sum(state[0] for state in states))
+
+    def posture(self) -> tuple[Float[np.ndarray, " num_joints"], float]:
+        """Where the arm is, and the distance between the finger pads; one question for both."""
+        states = pybullet.getJointStates(
+            self.id, [*self._arm, *self._fingers], physicsClientId=self._client
+        )
+        places = [state[0] for state in states]
+        count = len(self._arm)
+        return np.array(places[:count]), float(sum(places[count:]))
 
     def link_poses(self, links: Sequence[int]) -> list[LinkPose]:
         """Position [m] and quaternion xyzw of the frames of links, base frame."""

@@ -6,6 +6,7 @@ own hulls of meshes; both are settled here so that it simulates the robot that w
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +73,13 @@ def _replace_meshes(
 
 
 def _obj(points_m: Float[np.ndarray, "num_points 3"]) -> str:
+    return _obj_of(np.asarray(points_m, dtype=np.float64).tobytes())
+
+
+@lru_cache(maxsize=64)
+def _obj_of(points: bytes) -> str:
+    """Every world of a process loads the same robot: its hulls are written out once."""
+    points_m = np.frombuffer(points).reshape(-1, 3)
     triangles = ConvexHull(points_m).simplices + 1
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in points_m]
     lines += [f"f {a} {b} {c}" for a, b, c in triangles]

@@ -125,6 +125,8 @@ class World:
                 baseCollisionShapeIndex=shape,
                 basePosition=p.tolist(),
                 baseOrientation=[q[1], q[2], q[3], q[0]],
+                # What never moves needs no articulated body: the same bits for less.
+                useMaximalCoordinates=mass_kg == 0.0,
                 physicsClientId=self._client,
             )
         )
@@ -166,6 +168,10 @@ class World:
         """Distance between the finger pads."""
         return self._arm.width_m()
 
+    def posture(self) -> tuple[Float[np.ndarray, " num_joints"], float]:
+        """Where the arm is, and the distance between the finger pads."""
+        return self._arm.posture()
+
     def T_base_link(self, link: str) -> Float[np.ndarray, "4 4"]:
         """Pose of a link's frame."""
         return self._arm.T_base_link(link)
@@ -191,11 +197,11 @@ class World:
         """Whether a finger is in contact with an object that moves."""
         if object_id in self._soft.names:
             return self._soft.finger_touches(object_id)
+        fingers = self._arm.finger_links
         return any(
-            point[8] <= 0.0
-            for link in self._arm.finger_links
+            point[8] <= 0.0 and point[3] in fingers
             for point in pybullet.getContactPoints(
-                self._arm.id, self._free(object_id), link, -1, physicsClientId=self._client
+                self._arm.id, self._free(object_id), physicsClientId=self._client
             )
         )
 

@@ -1,6 +1,7 @@
 """Let physics answer: drive the robot along a path and watch the objects."""
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
@@ -83,6 +84,7 @@ def simulate(
         return samples.states(world)
 
 
+@lru_cache(maxsize=4)
 def _mesh_hulls(hulls: RobotHulls) -> dict[str, list[Float[np.ndarray, "num_points 3"]]]:
     found: dict[str, list[Float[np.ndarray, "num_points 3"]]] = {}
     for hull in hulls.hulls:
@@ -117,8 +119,9 @@ class _Samples:
                     return False
                 raise NotEvaluatedError(f"{name} before anything moved: {found}")
         self._stamps.append(t_ns)
-        self._joints.append(world.joints_rad())
-        self._widths.append(world.width_m())
+        joints, width = world.posture()
+        self._joints.append(joints)
+        self._widths.append(width)
         for name in self._objects:
             self._poses[name].append(world.object_pose(name))
             self._touch[name].append(world.finger_touches(name))

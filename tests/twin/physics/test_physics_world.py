@@ -7,6 +7,7 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.task.robot import ur5_with_gripper_urdf
+from twin.physics.arm import Arm
 from twin.physics.config import PhysicsConfig
 from twin.physics.world import PhysicsError, World
 from twin.robot.description import with_absolute_meshes
@@ -48,6 +49,29 @@ def test_a_dropped_cube_comes_to_rest_on_the_table(urdf: str) -> None:
 
 def test_every_run_gives_the_same_bits(urdf: str) -> None:
     assert dropped(urdf, 60)[1] == dropped(urdf, 60)[1]
+
+
+def test_orders_given_once_do_what_repeated_ones_do(
+    urdf: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    once = dropped(urdf, 60)[1]
+    command = Arm.command
+
+    def again(self: Arm, joints: np.ndarray, velocity: np.ndarray, width_m: float) -> None:
+        self._arm_order = self._finger_order = None
+        command(self, joints, velocity, width_m)
+
+    monkeypatch.setattr(Arm, "command", again)
+    assert dropped(urdf, 60)[1] == once
+
+
+def test_a_posture_is_the_joints_and_the_width(urdf: str) -> None:
+    with World(urdf, {}, PhysicsConfig()) as world:
+        world.reset_robot(HOME, 0.05)
+        joints, width = world.posture()
+        np.testing.assert_array_equal(joints, world.joints_rad())
+        np.testing.assert_allclose(joints, HOME, atol=1e-12)
+        assert width == world.width_m() == pytest.approx(0.05)
 
 
 def test_a_free_fall_follows_newton(urdf: str) -> None:
