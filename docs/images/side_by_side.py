@@ -40,15 +40,10 @@ def rows(run: RunFolder, count: int) -> list[np.ndarray]:
     return [found[place][1] for place in places]
 
 
-def main() -> None:
-    """Read the run, write one JPEG."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("run", type=Path, help="rebuilt run folder")
-    parser.add_argument("out", type=Path, help="JPEG to write")
-    parser.add_argument("--rows", type=int, default=2, help="how many views")
-    given = parser.parse_args()
+def write_rows(pictures: list[np.ndarray], out: Path) -> None:
+    """Write pictures of one width below each other as a JPEG that is small enough."""
     stack: list[np.ndarray] = []
-    for row in rows(RunFolder.open(given.run), given.rows):
+    for row in pictures:
         stack += [row, np.full((GAP_PX, row.shape[1], 3), 255, dtype=np.uint8)]
     image = Image.fromarray(np.vstack(stack[:-1]))
     height = round(image.height * ROW_WIDTH_PX / image.width)
@@ -58,8 +53,18 @@ def main() -> None:
         image.save(buffer, format="jpeg", quality=quality)
         if len(buffer.getvalue()) < MAX_BYTES:
             break
-    given.out.write_bytes(buffer.getvalue())
-    print(f"{given.out}: {len(buffer.getvalue())} bytes, quality {quality}")
+    out.write_bytes(buffer.getvalue())
+    print(f"{out}: {len(buffer.getvalue())} bytes, quality {quality}")
+
+
+def main() -> None:
+    """Read the run, write one JPEG."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, help="rebuilt run folder")
+    parser.add_argument("out", type=Path, help="JPEG to write")
+    parser.add_argument("--rows", type=int, default=2, help="how many views")
+    given = parser.parse_args()
+    write_rows(rows(RunFolder.open(given.run), given.rows), given.out)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,67 @@
+"""Write what cameras recorded of a trial beside what they would have seen of its replays.
+
+Example: .venv/bin/python docs/images/replayed.py runs/toys docs/images/replayed.jpg --camera side
+Needs robot-gst replay RUN --render. Columns: recorded, planned in the twin, executed in the twin.
+Of a plan that was never executed there is one column, and no recording beside it.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from side_by_side import GAP_PX, write_rows
+
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
+from bridge.media.color import decode_color
+from evaluator.compare.view_images import RECORDED, RENDERED, read_images
+
+FIRST, LAST = 0.12, 0.98
+"""Where in the replayed time the first and the last row are, as fractions."""
+
+
+def columns(run: RunFolder, episode_id: str, camera_id: str) -> list[dict[int, bytes]]:
+    """Images by stamp: as recorded, then of each dynamic replay that was rendered."""
+    source = Episode.open(run.episodes_dir / f"{episode_id}.mcap")
+    found = [read_images(source).color[RECORDED]]
+    for trajectory in ("planned", "executed"):
+        for path in run.derived(f"{episode_id}.replay.{trajectory}.dynamic.*"):
+            found.append(read_images(Episode.open(path)).color[RENDERED])
+    mine = [
+        {stamp: data for (name, stamp), data in of.items() if name == camera_id} for of in found
+    ]
+    return [of for of in mine if of]
+
+
+def rows(images: list[dict[int, bytes]], count: int) -> list[np.ndarray]:
+    """One picture per instant that all columns have; without any, the replay alone."""
+    common = sorted(set.intersection(*map(set, images)))
+    if not common:
+        images = images[-1:]
+        common = sorted(images[0])
+    places = np.linspace(FIRST, LAST, count) * (len(common) - 1)
+    pictures = []
+    for stamp in (common[place] for place in places.round().astype(int).tolist()):
+        shown = [decode_color(of[stamp]) for of in images]
+        gap = np.full((shown[0].shape[0], GAP_PX, 3), 255, dtype=np.uint8)
+        pictures.append(np.hstack([part for image in shown for part in (image, gap)][:-1]))
+    return pictures
+
+
+def main() -> None:
+    """Read the run, write one JPEG."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, help="run folder with rendered replays")
+    parser.add_argument("out", type=Path, help="JPEG to write")
+    parser.add_argument("--episode", default="trial_0001")
+    parser.add_argument("--camera", default="side")
+    parser.add_argument("--rows", type=int, default=3, help="how many instants")
+    given = parser.parse_args()
+    images = columns(RunFolder.open(given.run), given.episode, given.camera)
+    if not images:
+        parser.error(f"{given.episode} has no images of a camera {given.camera!r}")
+    write_rows(rows(images, given.rows), given.out)
+
+
+if __name__ == "__main__":
+    main()
