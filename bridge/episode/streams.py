@@ -1,7 +1,7 @@
 """Decode what an episode holds: joints, plans, events, cameras, poses."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from bridge.episode import schema
+from bridge.episode.alike import joints_of, poses_of
 from bridge.episode.reader import Episode
 from bridge.episode.records import (
     CameraInfo,
@@ -157,14 +158,30 @@ def joint_track(episode: Episode, ending: str = "/joint_states") -> JointTrack:
     topics = [
         topic for topic in episode.topics_of_type(schema.JOINT_STATE) if topic.endswith(ending)
     ]
-    samples = [JointSample.from_cdr(message.data) for message in episode.messages(topics)]
-    samples = [sample for sample in samples if len(sample.position)]
-    if not samples:
+    track = joint_track_of([message.data for message in episode.messages(topics)])
+    if track is None:
         raise EpisodeError(
             path=episode.path,
             found=f"no joint states on a topic ending with {ending}",
             hint="Record the robot's joint states; robot-gst info lists the topics.",
         )
+    return track
+
+
+def joint_track_of(payloads: Sequence[bytes]) -> JointTrack | None:
+    """Order sensor_msgs/JointState messages by source time; None when none holds a position.
+
+    Those who know the most joints are taken, in the order of the first of them.
+    """
+    alike = joints_of(payloads)
+    if alike is not None:
+        names, stamps_ns, position = alike
+        order = np.argsort(stamps_ns, kind="stable")
+        return JointTrack(names=names, stamps_ns=stamps_ns[order], position=position[order])
+    samples = [JointSample.from_cdr(payload) for payload in payloads]
+    samples = [sample for sample in samples if len(sample.position)]
+    if not samples:
+        return None
     samples.sort(key=lambda sample: sample.stamp_ns)
     names = max((sample.names for sample in samples), key=len)
     complete = [sample for sample in samples if set(names) <= set(sample.names)]
@@ -232,17 +249,33 @@ def execution_ns(
 
 def pose_track(episode: Episode, topic: str) -> PoseTrajectory:
     """Collect the poses of one PoseStamped topic, ordered by source time, duplicates dropped."""
-    samples = {}
-    for message in episode.messages([topic]):
-        sample = PoseSample.from_cdr(message.data)
-        samples[sample.stamp_ns] = sample.T_frame_body
-    if not samples:
+    track = pose_track_of([message.data for message in episode.messages([topic])])
+    if track is None:
         raise EpisodeError(
             path=episode.path, found=f"no poses on {topic}", hint="robot-gst info lists the topics."
         )
-    stamps = sorted(samples)
-    q, p = se3.split(np.stack([samples[stamp] for stamp in stamps]))
-    return PoseTrajectory(np.array(stamps, dtype=np.int64), p, q)
+    return track
+
+
+def pose_track_of(payloads: Sequence[bytes]) -> PoseTrajectory | None:
+    """Order geometry_msgs/PoseStamped messages by source time; of equal stamps the last counts.
+
+    None without messages.
+    """
+    if not payloads:
+        return None
+    alike = poses_of(payloads)
+    if alike is None:
+        samples = [PoseSample.from_cdr(payload) for payload in payloads]
+        stamps_ns = np.array([sample.stamp_ns for sample in samples], dtype=np.int64)
+        Ts = np.stack([sample.T_frame_body for sample in samples])
+    else:
+        stamps_ns, Ts = alike
+    order = np.argsort(stamps_ns, kind="stable")
+    is_last = np.append(np.diff(stamps_ns[order]) != 0, True)
+    order = order[is_last]
+    q, p = se3.split(Ts[order])
+    return PoseTrajectory(stamps_ns[order], p, q)
 
 
 def object_pose_topics(episode: Episode) -> dict[str, str]:

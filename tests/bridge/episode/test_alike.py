@@ -1,0 +1,160 @@
+"""Many messages read at once are what each one read by itself says, whatever their bytes."""
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bridge.episode.alike import joints_of, poses_of
+from bridge.episode.cdr import MalformedMessageError
+from bridge.episode.records import JointSample, PoseSample
+from bridge.episode.repeated import joint_messages, pose_messages
+from bridge.episode.streams import joint_track_of, pose_track_of
+from bridge.geometry import se3
+
+STAMPS = np.array([0, 1, 999_999_999, 1_000_000_000, 1_700_000_000_123_456_789])
+
+
+def transforms(count: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    q = rng.normal(size=(count, 4))
+    return se3.transform_from(
+        q / np.linalg.norm(q, axis=1, keepdims=True), rng.normal(size=(count, 3))
+    )
+
+
+def pose(stamp_ns: int, x_m: float, frame: str = "base_link") -> bytes:
+    T = np.eye(4)
+    T[0, 3] = x_m
+    return PoseSample(stamp_ns=stamp_ns, frame_id=frame, T_frame_body=T).to_cdr()
+
+
+def joints(stamp_ns: int, position: list[float], names: tuple[str, ...] = ("a", "bc")) -> bytes:
+    nothing = np.zeros(0)
+    return JointSample(
+        stamp_ns=stamp_ns,
+        names=names,
+        position=np.array(position),
+        velocity=nothing,
+        effort=nothing,
+    ).to_cdr()
+
+
+@pytest.mark.parametrize("frame", ["", "b", "base_link", "world_frame"])
+def test_poses_read_at_once_are_those_read_one_by_one(frame: str) -> None:
+    payloads = list(pose_messages(STAMPS, frame, transforms(len(STAMPS))))
+    found = poses_of(payloads)
+    assert found is not None
+    samples = [PoseSample.from_cdr(payload) for payload in payloads]
+    assert found[0].tolist() == [sample.stamp_ns for sample in samples]
+    # The very same numbers: replays are compared bit by bit.
+    np.testing.assert_array_equal(found[1], np.stack([s.T_frame_body for s in samples]))
+
+
+@settings(max_examples=30)
+@given(st.lists(st.text("abc_1", max_size=9), min_size=1, max_size=7, unique=True), st.booleans())
+def test_joints_read_at_once_are_those_read_one_by_one(names: list[str], moving: bool) -> None:
+    rng = np.random.default_rng(len(names))
+    payloads = [
+        JointSample(
+            stamp_ns=int(stamp),
+            names=tuple(names),
+            position=rng.normal(size=len(names)),
+            velocity=rng.normal(size=len(names) if moving else 0),
+            effort=rng.normal(size=len(names) if moving else 0),
+        ).to_cdr()
+        for stamp in STAMPS
+    ]
+    found = joints_of(payloads)
+    assert found is not None
+    samples = [JointSample.from_cdr(payload) for payload in payloads]
+    assert found[0] == tuple(names)
+    assert found[1].tolist() == STAMPS.tolist()
+    np.testing.assert_array_equal(found[2], np.stack([sample.position for sample in samples]))
+
+
+def test_repeated_joints_are_alike() -> None:
+    position = np.random.default_rng(0).normal(size=(len(STAMPS), 2))
+    found = joints_of(list(joint_messages(STAMPS, ("a", "bc"), position)))
+    assert found is not None
+    np.testing.assert_array_equal(found[2], position)
+
+
+def test_other_frames_and_other_joints_are_not_alike_but_read_all_the_same() -> None:
+    two_frames = [pose(1, 0.1, "one"), pose(2, 0.2, "two")]
+    assert poses_of(two_frames) is None
+    track = pose_track_of(two_frames)
+    assert track is not None
+    assert track.p_m[:, 0].tolist() == [0.1, 0.2]
+    swapped = [joints(1, [1.0, 2.0]), joints(2, [4.0, 3.0], ("bc", "a"))]
+    assert joints_of(swapped) is None
+    arm = joint_track_of(swapped)
+    assert arm is not None
+    assert arm.position.tolist() == [[1.0, 2.0], [3.0, 4.0]]
+
+
+def test_poses_are_ordered_and_of_equal_stamps_the_last_counts() -> None:
+    track = pose_track_of([pose(30, 0.3), pose(10, 0.1), pose(30, 0.4), pose(20, 0.2)])
+    assert track is not None
+    assert track.stamps_ns.tolist() == [10, 20, 30]
+    assert track.p_m[:, 0].tolist() == [0.1, 0.2, 0.4]
+
+
+def test_joints_of_several_publishers_take_those_who_know_the_most() -> None:
+    track = joint_track_of([joints(2, [0.5], ("a",)), joints(3, [2.0, 3.0]), joints(1, [0.0, 1.0])])
+    assert track is not None
+    assert track.names == ("a", "bc")
+    assert track.stamps_ns.tolist() == [1, 3]
+
+
+def test_nothing_gives_nothing() -> None:
+    assert poses_of([]) is None
+    assert joints_of([]) is None
+    assert pose_track_of([]) is None
+    assert joint_track_of([]) is None
+    assert joint_track_of([joints(1, []), joints(2, [])]) is None
+
+
+@pytest.mark.parametrize("spoil", ["short", "no_rotation", "header", "length"])
+def test_broken_poses_are_refused_as_before(spoil: str) -> None:
+    payloads = [pose(stamp, 0.1) for stamp in range(4)]
+    broken = bytearray(payloads[2])
+    if spoil == "short":
+        broken = broken[:-8]
+    elif spoil == "no_rotation":
+        broken[-32:] = struct.pack("<4d", 0, 0, 0, 0)
+    elif spoil == "header":
+        broken[1] = 7
+    else:
+        broken[12:16] = struct.pack("<I", 1 << 30)
+    payloads[2] = bytes(broken)
+    assert poses_of(payloads) is None
+    with pytest.raises(MalformedMessageError):
+        pose_track_of(payloads)
+
+
+@settings(max_examples=200)
+@given(st.lists(st.binary(max_size=120), min_size=1, max_size=3))
+def test_any_bytes_are_read_or_refused(payloads: list[bytes]) -> None:
+    for read in (pose_track_of, joint_track_of):
+        try:
+            read(payloads)
+        except MalformedMessageError:
+            continue
+
+
+def test_big_endian_messages_are_read_one_by_one() -> None:
+    little = pose(5, 0.25)
+    big = bytearray(little)
+    big[1] = 0
+    size = struct.unpack_from("<I", little, 12)[0]
+    first = 16 + size + (4 - 16 - size) % 8
+    big[4:12] = struct.pack(">iI", *struct.unpack_from("<iI", little, 4))
+    big[12:16] = struct.pack(">I", size)
+    big[first : first + 56] = struct.pack(">7d", *struct.unpack_from("<7d", little, first))
+    assert poses_of([bytes(big)] * 2) is None
+    track = pose_track_of([bytes(big)])
+    assert track is not None
+    assert track.p_m[0, 0] == 0.25
