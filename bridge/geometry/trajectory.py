@@ -34,6 +34,10 @@ class PoseTrajectory:
         q = se3.interpolate_quaternion(self.q_wxyz[before], self.q_wxyz[after], fraction)
         return PoseTrajectory(stamps_ns, p, q)
 
+    def shifted(self, shift_ns: int) -> "PoseTrajectory":
+        """Return the same poses so much later."""
+        return PoseTrajectory(self.stamps_ns + shift_ns, self.p_m, self.q_wxyz)
+
     def transforms(self) -> Float[np.ndarray, "num_poses 4 4"]:
         """Return the poses as matrices."""
         return se3.transform_from(self.q_wxyz, self.p_m)

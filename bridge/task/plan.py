@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from bridge.task.record import check_record, parse_record
+from bridge.task.record import check_record, load_record, parse_record
 
 SCHEMA_VERSION = 1
 
@@ -74,7 +74,21 @@ class Plan:
     @staticmethod
     def from_json(data: bytes) -> "Plan":
         """Parse and check. Raises ``InvalidRecordError`` naming what does not fit."""
-        record = parse_record(data, name="plan")
+        return Plan._of(parse_record(data, name="plan"))
+
+    @staticmethod
+    def outline_from_json(data: bytes) -> "Plan":
+        """Parse and check everything but the trajectory, of which the first waypoint alone is kept.
+
+        Checking every waypoint takes longer than reading the rest of an episode.
+        """
+        record = load_record(data, name="plan")
+        if isinstance(record.get("tau"), list):
+            record["tau"] = record["tau"][:1]
+        return Plan._of(dict(check_record(record, name="plan")))
+
+    @staticmethod
+    def _of(record: dict[str, Any]) -> "Plan":
         known = {name: record[name] for name in Plan.__dataclass_fields__ if name in record}
         known["stages"] = tuple(_stage(stage) for stage in record["stages"])
         known["tau"] = tuple(_waypoint(waypoint) for waypoint in record["tau"])

@@ -55,10 +55,15 @@ def _finite(text: str) -> float:
 
 def parse_record(data: bytes, *, name: str, package: str = "bridge.task") -> dict[str, Any]:
     """Parse JSON bytes and check them."""
+    return dict(check_record(load_record(data, name=name), name=name, package=package))
+
+
+def load_record(data: bytes, *, name: str) -> dict[str, Any]:
+    """Parse JSON bytes that hold one object of finite numbers, and check no more than that."""
     try:
         record = json.loads(data, parse_constant=_refuse, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         raise InvalidRecordError(name=name, where="", found=f"not JSON ({error})") from error
     if not isinstance(record, dict):
         raise InvalidRecordError(name=name, where="", found="not a JSON object")
-    return dict(check_record(record, name=name, package=package))
+    return record
