@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from evaluator.compare.cells import cell_agreement
+from evaluator.compare.cells import agreement_intervals, cell_agreement
 from evaluator.compare.decisions import decisions
 from evaluator.compare.fewer import assisted_rates, sequences, stopping_table
 from evaluator.compare.gains import gain_tests, replanning_gains
@@ -26,7 +26,6 @@ from evaluator.compare.tables import (
     success_table,
     trials_table,
 )
-from evaluator.compare.tracking import tcp_measurements
 from evaluator.compare.verdicts import agreement, gate_worth, reliability
 from evaluator.result import Measurement, Table
 
@@ -78,7 +77,6 @@ def compare_rows(
         *chosen,
         *assisted_rates(rows),
         *sequences(rows, pairs),
-        *(tcp_measurements(rows) if any(row.tcp_errors for row in rows) else ()),
     ]
     streamed = any(not row.episode for row in rows)
     tables: tuple[Table, ...] = (
@@ -86,6 +84,7 @@ def compare_rows(
         *layout_table(cells, measurements, word),
         *gains_table(gains, word),
         *remarks_table(remarks(cells, measurements)),
+        *agreement_intervals(cells),
         confusion_table(rows, word),
         *worth_tables,
         *kept_tables,

@@ -92,7 +92,7 @@ def test_plans_that_were_never_sent_are_counted_apart(six_trials: Any) -> None:
 def test_the_largest_tool_error_is_not_lost_between_samples(maker: Any) -> None:
     maker.trial("t1", num_poses=900)
     maker.replay("t1", num_poses=900, astray=301)
-    largest = compare_run(maker.run).results().get("tcp.planned.position_max_m")
+    largest = compare_run(maker.run).results().get("motion.planned.position_max_m")
     assert largest.value == pytest.approx(1.0)
 
 
@@ -100,7 +100,7 @@ def test_a_pose_that_is_not_a_number_leaves_the_tool_error_undefined(maker: Any)
     maker.trial("t1")
     maker.replay("t1", offset_m=float("nan"))
     results = compare_run(maker.run).results()
-    error = results.get("tcp.planned.position_mean_m")
+    error = results.get("motion.planned.position_mean_m")
     assert error.value is None
     assert "not finite" in str(error.reason_if_undefined)
     assert results.get("agreement.sim_planned.rate").k == 1

@@ -41,9 +41,16 @@ def line(
 
 def test_a_run_without_data_for_a_part_says_no_data(six_trials: Any) -> None:
     missing = " | ".join(compare_run(six_trials.run).missing)
-    for part in ("reliability of the success probability", "stage funnel", "recorded rate with"):
+    parts = (
+        "reliability of the success probability",
+        "stage funnel",
+        "recorded rate with",
+        "final states",
+        "label against localised predicate",
+    )
+    for part in parts:
         assert f"{part}" in missing
-    assert missing.count("no data") == 3
+    assert missing.count("no data") == len(parts)
 
 
 def test_everything_new_fits_the_schema_and_is_read_back(six_trials: Any) -> None:

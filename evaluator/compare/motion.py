@@ -1,0 +1,257 @@
+"""One motion against another, summed up: recorded against replays, and these against each other.
+
+Three questions. Recorded against the planned replay: what the controller made of the command.
+Recorded against the executed replay: how well kinematics and base calibration fit. Executed against
+the planned replay: what the twin's own arm made of the difference.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bridge.clock import NS_PER_S
+from bridge.episode.reader import Episode
+from bridge.episode.streams import JointTrack
+from bridge.geometry.trajectory import PoseTrajectory
+from evaluator.compare.tracks import Tracks, read_tracks
+from evaluator.errors import UndefinedStatisticError
+from evaluator.metrics.trajectory import NORMALISED_SAMPLES, PoseErrors, pose_errors
+from evaluator.metrics.trajectory_align import find_lag_s, without_rigid_motion
+from evaluator.metrics.trajectory_steps import joint_errors, relative_errors
+
+MOTION_VERSION = 1
+"""Raise it when the same files give another summary."""
+SAME_CLOCK_NS = 2 * NS_PER_S
+"""A replay whose stamps start this close to the execution uses the cell's clock."""
+STEPS_PER_S = 10
+"""Samples per second at which relative errors are taken, over steps of one second."""
+STEP_NS = NS_PER_S // STEPS_PER_S
+PLANNED, EXECUTED, RECORDED = "planned", "executed", "recorded"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionSummary:
+    """How far one motion of the arm lies from another one."""
+
+    episode: str
+    task: str
+    condition: str
+    plan_id: str
+    side: str
+    """Whose motion: ``recorded``, or ``executed`` for the replay of the executed joints."""
+    against: str
+    """Which replay it is compared with: ``planned`` or ``executed``."""
+    aligned_by: str
+    """``stamps``: one clock; ``starts``: clocks of their own, laid over each other where the
+    execution starts; ``normalised``: no start is known, so from first to last sample."""
+    num_samples: int
+    duration_s: float
+    """From the first to the last instant both know."""
+    position_mean_m: float
+    position_max_m: float
+    end_point_m: float
+    """At the last instant both know."""
+    rotation_mean_rad: float
+    rotation_max_rad: float
+    end_point_rad: float
+    lag_s: float | None
+    """By how much ``side`` comes later: least mean distance, offset apart; None without times."""
+    without_lag_mean_m: float | None
+    """Mean distance after that delay is taken out."""
+    without_offset_mean_m: float | None
+    """The same after the best rigid motion is taken out too; None for a straight motion."""
+    relative_mean_m: float | None
+    """Mean difference of what both do within a second; None below a second."""
+    relative_mean_rad: float | None
+    joint_rms_rad: float | None
+    """Over all joints and instants; None without joints of the same names."""
+    joint_max_rad: float | None
+    joint_worst: str | None
+    """The joint that reaches it."""
+    curve_m: tuple[float, ...]
+    """Distance at 101 instants spread evenly over the duration."""
+    joint_curve_rad: tuple[float, ...]
+    """Root mean square over the joints at such instants; empty without joints."""
+
+
+def summarise_motions(
+    recorded: Episode, replays: Mapping[str, Episode], *, plan_id: str
+) -> tuple[MotionSummary, ...]:
+    """Compare a recorded execution with its replays, and these with each other; each read once.
+
+    What has no tool poses in common with another one is left out.
+
+    Args:
+        recorded: The recorded episode.
+        replays: Its dynamic replays, ``planned`` and ``executed``, as far as there are any.
+        plan_id: Whose execution.
+
+    Raises:
+        EpisodeError: When a file turns out to be damaged.
+    """
+    tracks = {side: read_tracks(episode, plan_id) for side, episode in replays.items()}
+    own = read_tracks(recorded, plan_id)
+    pairs = [(RECORDED, own, side, tracks[side]) for side in (PLANNED, EXECUTED) if side in tracks]
+    if PLANNED in tracks and EXECUTED in tracks:
+        pairs.append((EXECUTED, tracks[EXECUTED], PLANNED, tracks[PLANNED]))
+    found = []
+    for side, tracks_of, against, others in pairs:
+        try:
+            summary = compare_tracks(tracks_of, others)
+        except UndefinedStatisticError:
+            continue
+        named = replace(summary, side=side, against=against, plan_id=plan_id)
+        found.append(_of(recorded, named))
+    return tuple(found)
+
+
+def summarise_motion(
+    recorded: Episode, replay: Episode, *, against: str, plan_id: str
+) -> MotionSummary:
+    """Compare a recorded execution with one replay.
+
+    Raises:
+        EpisodeError: When a file turns out to be damaged.
+        UndefinedStatisticError: When they have no tool poses in common.
+    """
+    summary = compare_tracks(read_tracks(recorded, plan_id), read_tracks(replay, plan_id))
+    return _of(recorded, replace(summary, against=against, plan_id=plan_id))
+
+
+def _of(recorded: Episode, summary: MotionSummary) -> MotionSummary:
+    info = recorded.info
+    return replace(summary, episode=info.id, task=info.task, condition=info.condition)
+
+
+def compare_tracks(mine: Tracks, other: Tracks) -> MotionSummary:
+    """Compare two motions on one clock, or over normalised time where there is none.
+
+    Raises:
+        UndefinedStatisticError: When they have no tool poses in common.
+    """
+    mine = mine.cut()
+    if mine.tool is None or other.tool is None:
+        raise UndefinedStatisticError(statistic="motion", reason="no tool poses on both sides")
+    aligned_by = "normalised"
+    if mine.started_ns is not None:
+        gap_ns = mine.started_ns - int(other.tool.stamps_ns[0])
+        aligned_by = "stamps" if abs(gap_ns) <= SAME_CLOCK_NS else "starts"
+        other = other if aligned_by == "stamps" else other.shifted(gap_ns)
+    else:
+        mine, other = _normalised(mine), _normalised(other.cut())
+    if mine.tool is None or other.tool is None:
+        raise UndefinedStatisticError(statistic="motion", reason="no tool poses on both sides")
+    errors = pose_errors(mine.tool, other.tool)
+    summary = _summary(aligned_by, errors)
+    summary = _with_shape(summary, mine.tool, other.tool, errors)
+    return _with_joints(summary, mine.joints, other.joints)
+
+
+def _normalised(tracks: Tracks) -> Tracks:
+    """Give a motion a clock of its own, from 0 at its first sample to 1 s at its last."""
+    tool, joints = tracks.tool, tracks.joints
+    stamps = np.linspace(0, NS_PER_S, NORMALISED_SAMPLES).round().astype(np.int64)
+    if tool is not None:
+        tool = replace(tool.normalised_time(NORMALISED_SAMPLES), stamps_ns=stamps)
+    if joints is not None:
+        asked = np.linspace(joints.stamps_ns[0], joints.stamps_ns[-1], NORMALISED_SAMPLES)
+        joints = replace(joints, stamps_ns=stamps, position=joints.at(asked))
+    return replace(tracks, tool=tool, joints=joints)
+
+
+def _summary(aligned_by: str, errors: PoseErrors) -> MotionSummary:
+    position, rotation = errors.position_m, errors.rotation_rad
+    span_ns = int(errors.stamps_ns[-1] - errors.stamps_ns[0])
+    return MotionSummary(
+        episode="",
+        task="",
+        condition="",
+        plan_id="",
+        side=RECORDED,
+        against="",
+        aligned_by=aligned_by,
+        num_samples=len(position),
+        duration_s=span_ns / NS_PER_S,
+        position_mean_m=float(position.mean()),
+        position_max_m=float(position.max()),
+        end_point_m=float(position[-1]),
+        rotation_mean_rad=float(rotation.mean()),
+        rotation_max_rad=float(rotation.max()),
+        end_point_rad=float(rotation[-1]),
+        lag_s=None,
+        without_lag_mean_m=None,
+        without_offset_mean_m=None,
+        relative_mean_m=None,
+        relative_mean_rad=None,
+        joint_rms_rad=None,
+        joint_max_rad=None,
+        joint_worst=None,
+        curve_m=_curve(errors.stamps_ns, position),
+        joint_curve_rad=(),
+    )
+
+
+def _with_shape(
+    summary: MotionSummary, mine: PoseTrajectory, other: PoseTrajectory, errors: PoseErrors
+) -> MotionSummary:
+    """Add what is left without a delay, without an offset too, and within single seconds."""
+    same = mine.at(errors.stamps_ns)
+    if summary.aligned_by == "normalised":
+        return replace(summary, without_offset_mean_m=_without_offset(same, other))
+    lag_s = _or_none(lambda: find_lag_s(same, other))
+    if lag_s is not None:
+        later = other.shifted(round(lag_s * NS_PER_S))
+        summary = replace(
+            summary,
+            lag_s=lag_s,
+            without_lag_mean_m=_or_none(lambda: float(pose_errors(same, later).position_m.mean())),
+            without_offset_mean_m=_without_offset(same, later),
+        )
+    instants = np.arange(int(errors.stamps_ns[0]), int(errors.stamps_ns[-1]) + 1, STEP_NS)
+    if len(instants) <= STEPS_PER_S:
+        return summary
+    moved, turned = relative_errors(mine.at(instants), other.at(instants), STEPS_PER_S)
+    return replace(
+        summary, relative_mean_m=float(moved.mean()), relative_mean_rad=float(turned.mean())
+    )
+
+
+def _without_offset(mine: PoseTrajectory, other: PoseTrajectory) -> float | None:
+    theirs = other.at(mine.stamps_ns)
+    return _or_none(lambda: float(without_rigid_motion(mine.p_m, theirs.p_m).mean()))
+
+
+def _with_joints(
+    summary: MotionSummary, mine: JointTrack | None, other: JointTrack | None
+) -> MotionSummary:
+    if mine is None or other is None:
+        return summary
+    try:
+        errors = joint_errors(mine, other)
+    except UndefinedStatisticError:
+        return summary
+    largest = np.abs(errors.error_rad).max(axis=0)
+    over_time = errors.over_time_rad()
+    return replace(
+        summary,
+        joint_rms_rad=float(np.sqrt((over_time**2).mean())),
+        joint_max_rad=float(largest.max()),
+        joint_worst=errors.names[int(largest.argmax())],
+        joint_curve_rad=_curve(errors.stamps_ns, over_time),
+    )
+
+
+def _curve(
+    stamps_ns: Int[np.ndarray, " num_samples"], values: Float[np.ndarray, " num_samples"]
+) -> tuple[float, ...]:
+    asked = np.linspace(stamps_ns[0], stamps_ns[-1], NORMALISED_SAMPLES)
+    return tuple(np.interp(asked, stamps_ns, values).tolist())
+
+
+def _or_none(compute: Callable[[], float]) -> float | None:
+    try:
+        return compute()
+    except UndefinedStatisticError:
+        return None

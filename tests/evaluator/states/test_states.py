@@ -1,0 +1,294 @@
+"""Predicted final states: which poses are compared, modulo what, and what has no interval."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from state_samples import (
+    IN_BOX_M,
+    PLAN_ID,
+    Seen,
+    localised_episode,
+    plan_of,
+    posed,
+    recorded_episode,
+    replay_episode,
+)
+
+from bridge.episode.reader import Episode
+from bridge.task.task_file import ObjectModel, load_task
+from evaluator.compare.final_states import state_results
+from evaluator.compare.states import StateSummary, summarise_states
+from evaluator.metrics.state import soft_box, turn_between_rad, turns_alike
+
+LIFTED_M = (0.45, -0.1, 0.25)
+Made = Callable[..., tuple[StateSummary, ...]]
+
+
+def in_box(x_m: float = 0.0, y_m: float = 0.0, yaw_rad: float = 0.0) -> np.ndarray:
+    return posed((IN_BOX_M[0] + x_m, IN_BOX_M[1] + y_m, IN_BOX_M[2]), yaw_rad)
+
+
+def model(shape: str, size_m: tuple[float, float, float], **fields: str) -> ObjectModel:
+    return ObjectModel(id="x", shape=shape, size_m=size_m, color_srgb=(0, 0, 0), **fields)
+
+
+@pytest.mark.parametrize(
+    ("thing", "count"),
+    [
+        (model("box", (0.04, 0.04, 0.04)), 24),
+        (model("box", (0.04, 0.04, 0.08)), 8),
+        (model("box", (0.04, 0.05, 0.08)), 4),
+        (model("open_box", (0.2, 0.2, 0.1)), 4),
+        (model("open_box", (0.2, 0.3, 0.1)), 2),
+        (model("mesh", (0.2, 0.3, 0.1), mesh="basket"), 2),
+        (model("mesh", (0.1, 0.1, 0.1), mesh="duck"), 1),
+        (model("scanned", (0.1, 0.1, 0.1)), 1),
+        (model("scanned", (0.1, 0.1, 0.1), symmetry="cube"), 24),
+    ],
+)
+def test_each_shape_has_its_turns(thing: ObjectModel, count: int) -> None:
+    turns = turns_alike(thing)
+    assert len(turns) == count
+    np.testing.assert_array_equal(turns[0], np.eye(3))
+    for R in turns:  # a group: every inverse is among them
+        assert np.abs(turns - R.T).max(axis=(1, 2)).min() == 0
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 1000), st.integers(0, 23), st.integers(0, 23))
+def test_turns_that_cannot_be_seen_change_nothing(seed: int, i: int, j: int) -> None:
+    rng = np.random.default_rng(seed)
+    first, second = Rotation.random(2, rng=rng).as_matrix()
+    turns = turns_alike(model("box", (0.04, 0.04, 0.04)))
+    plain = turn_between_rad(first, second, turns)
+    assert turn_between_rad(first @ turns[i], second @ turns[j], turns) == pytest.approx(plain)
+    # No two rotations of a cube are farther apart than this.
+    assert plain <= np.deg2rad(62.8)
+
+
+def test_a_squeezed_body_is_shorter_and_its_middle_moves() -> None:
+    rng = np.random.default_rng(0)
+    size = (0.16, 0.1, 0.06)
+    rest = rng.uniform(-0.5, 0.5, size=(200, 3)) * np.array(size)
+    T_rest, T_now = posed((0.4, 0.0, 0.03), 0.3), posed((0.5, 0.2, 0.04), -0.5)
+    squeezed = rest.copy()
+    squeezed[:, 0] = np.where(squeezed[:, 0] > 0, squeezed[:, 0] / 2, squeezed[:, 0])
+    middle, extents = soft_box(
+        squeezed @ T_now[:3, :3].T + T_now[:3, 3],
+        T_now,
+        rest @ T_rest[:3, :3].T + T_rest[:3, 3],
+        T_rest,
+        size,
+    )
+    np.testing.assert_allclose(extents, [0.12, 0.1, 0.06], atol=1e-3)
+    local = T_now[:3, :3].T @ (middle - T_now[:3, 3])
+    np.testing.assert_allclose(local, [-0.02, 0.0, 0.0], atol=1e-3)
+
+
+@pytest.fixture
+def cube(tmp_path: Path) -> Made:
+    """Two stages of a cube: the plan, two replays and the localisation all differ a little."""
+
+    def make(
+        *,
+        seen: Seen | None = None,
+        task: str = "cube_into_box",
+        until: int = 1_000,
+        live: bool = False,
+    ) -> tuple[StateSummary, ...]:
+        plan = plan_of({"grasp": {"cube": posed(LIFTED_M)}, "place": {"cube": posed(IN_BOX_M)}})
+        start = posed((0.45, -0.1, 0.02))
+        moved = {
+            "planned": [
+                start,
+                posed(LIFTED_M),
+                in_box(0.01),
+                in_box(),
+            ],
+            "executed": [start, posed(LIFTED_M, 0.1), in_box(0.0, 0.02, np.pi / 2)],
+        }
+        found = Seen().add("cube", in_box(0.003, 0.004, 0.2))
+        seen = found if seen is None else seen
+        recorded = recorded_episode(
+            tmp_path / "t.mcap", plan, task=task, seen=seen if live else None
+        )
+        replays: dict[str, Episode] = {
+            name: replay_episode(tmp_path / f"{name}.mcap", plan, {"cube": poses}, until=until)
+            for name, poses in moved.items()
+        }
+        localised = None if live else localised_episode(tmp_path / "l.mcap", seen)
+        return summarise_states(recorded, replays, localised, plan_id=PLAN_ID)
+
+    return make
+
+
+def pick(found: tuple[StateSummary, ...], stage: str, by: str, against: str) -> StateSummary:
+    (state,) = (s for s in found if (s.stage, s.predicted_by, s.against) == (stage, by, against))
+    return state
+
+
+def test_each_stage_is_compared_with_whoever_knows_it(cube: Made) -> None:
+    found = cube()
+    assert [(s.predicted_by, s.against) for s in found if s.stage == "grasp"] == [
+        ("plan", "planned"),
+        ("plan", "executed"),
+        ("planned", "executed"),
+    ]
+    assert len([s for s in found if s.stage == "place"]) == 6
+    lifted = pick(found, "grasp", "plan", "executed")
+    assert lifted.position_m == pytest.approx(0.0, abs=1e-12)
+    assert lifted.rotation_rad == pytest.approx(0.1)
+    assert not lifted.is_last
+
+
+def test_final_states_are_those_after_settling(cube: Made) -> None:
+    found = cube()
+    # The planned replay ends a second after the last stage, exactly where the plan says.
+    assert pick(found, "place", "plan", "planned").position_m == pytest.approx(0.0, abs=1e-12)
+    recorded = pick(found, "place", "planned", "recorded")
+    assert recorded.position_m == pytest.approx(0.005)
+    assert recorded.rotation_rad == pytest.approx(0.2)
+    assert recorded.is_last
+    # A quarter turn of a cube cannot be seen.
+    assert pick(found, "place", "plan", "executed").rotation_rad == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_cells_own_localisation_counts_without_the_twins(cube: Made) -> None:
+    found = cube(live=True)
+    assert pick(found, "place", "plan", "recorded").position_m == pytest.approx(0.005)
+
+
+def test_what_is_not_known_says_why(cube: Made) -> None:
+    lost = pick(cube(seen=Seen().add("cube", None)), "place", "plan", "recorded")
+    assert lost.position_m is None
+    assert "hidden behind the box" in str(lost.reason)
+
+
+def test_an_object_that_was_not_looked_for_says_so(cube: Made) -> None:
+    state = pick(cube(seen=Seen()), "place", "plan", "recorded")
+    assert state.reason == "it was not localised after the execution"
+
+
+def test_a_replay_that_ends_early_knows_no_later_stage(cube: Made) -> None:
+    state = pick(cube(until=0), "grasp", "plan", "planned")
+    assert state.reason == "the replay ended before the stage did"
+
+
+def test_an_unknown_task_has_positions_but_no_rotation(cube: Made) -> None:
+    state = pick(cube(task="../etc/passwd"), "place", "plan", "recorded")
+    assert state.position_m == pytest.approx(0.005)
+    assert state.rotation_rad is None
+
+
+def test_soft_objects_are_compared_by_middle_and_extents(tmp_path: Path) -> None:
+    size = np.array(load_task("sloth_into_basket").objects["sloth"].size_m)
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2 * size
+    T_start, T_end = posed((0.45, -0.1, 0.03)), posed((0.5, 0.2, 0.04), 0.5)
+    flat = corners * np.array([1.0, 1.0, 0.5])
+    plan = plan_of({"release": {"sloth": T_end}})
+    replay = replay_episode(
+        tmp_path / "r.mcap",
+        plan,
+        {"sloth": [T_start, T_end]},
+        nodes_m={
+            "sloth": [corners + T_start[:3, 3], flat @ T_end[:3, :3].T + T_end[:3, 3]],
+        },
+    )
+    seen = Seen().add("sloth", posed((0.5, 0.21, 0.04), 0.5), extents_m=(0.16, 0.1, 0.045))
+    found = summarise_states(
+        recorded_episode(tmp_path / "t.mcap", plan, task="sloth_into_basket"),
+        {"planned": replay},
+        localised_episode(tmp_path / "l.mcap", seen),
+        plan_id=PLAN_ID,
+    )
+    state = pick(found, "release", "planned", "recorded")
+    assert state.soft
+    assert state.position_m == pytest.approx(0.01, abs=1e-6)
+    assert state.extents_m == pytest.approx(0.015, abs=1e-6)
+    assert pick(found, "release", "plan", "recorded").extents_m is None
+
+
+def test_a_plan_that_is_not_there_or_predicts_nothing_gives_nothing(tmp_path: Path) -> None:
+    recorded = recorded_episode(tmp_path / "t.mcap", plan_of({"grasp": {}}))
+    assert summarise_states(recorded, {}, None, plan_id=PLAN_ID) == ()
+    assert summarise_states(recorded, {}, None, plan_id="another") == ()
+
+
+def states(count: int, *, condition: str = "with_replanning") -> list[StateSummary]:
+    rng = np.random.default_rng(0)
+    return [
+        StateSummary(
+            episode=f"{condition}_{index // 2}",
+            task="cube_into_box",
+            condition=condition,
+            plan_id="p",
+            stage="place",
+            object_id=f"cube_{index % 2}",
+            predicted_by="plan",
+            against="recorded",
+            is_last=True,
+            soft=False,
+            position_m=float(value),
+            rotation_rad=0.1,
+            extents_m=None,
+            reason=None,
+        )
+        for index, value in enumerate(rng.uniform(0.002, 0.02, size=count))
+    ]
+
+
+def test_an_episode_counts_once_and_conditions_stay_apart() -> None:
+    found = [*states(24), *states(8, condition="without_replanning")]
+    by_id = {m.id: m for m in state_results(found).measurements}
+    first = "state.plan_to_recorded.cube_into_box"
+    median = by_id[f"{first}.with_replanning.position_median_m"]
+    of_episode = [
+        (a.position_m + b.position_m) / 2
+        for a, b in zip(found[0:24:2], found[1:24:2], strict=True)
+        if a.position_m is not None and b.position_m is not None
+    ]
+    assert median.value == pytest.approx(np.median(of_episode))
+    assert (median.n, len(median.episodes)) == (24, 12)
+    assert median.interval is not None
+    assert median.interval.method == "order-statistics"
+    assert (median.interval.low, median.interval.high) == (
+        sorted(of_episode)[2],
+        sorted(of_episode)[-3],
+    )
+    assert median.interval.worst_coverage is not None
+    assert median.interval.worst_coverage >= 0.95
+    few = by_id[f"{first}.without_replanning.position_median_m"]
+    assert few.interval is None
+    assert "4 values" in str(few.reason_without_interval)
+
+
+def test_a_mean_whose_interval_would_not_hold_has_none_and_names_the_median() -> None:
+    by_id = {m.id: m for m in state_results(states(24)).measurements}
+    mean = by_id["state.plan_to_recorded.cube_into_box.with_replanning.position_mean_m"]
+    assert mean.value is not None
+    assert mean.interval is None
+    assert "use the median with its interval" in str(mean.reason_without_interval)
+
+
+def test_what_is_missing_is_named_and_stages_have_a_table() -> None:
+    lost = replace(states(1)[0], position_m=None, rotation_rad=None, reason="not found: behind it")
+    part = state_results([lost, replace(lost, stage="grasp", is_last=False, reason="x")])
+    (exclusion,) = part.exclusions
+    assert "behind it" in exclusion.reason
+    median = part.measurements[0]
+    assert median.value is None
+    assert "behind it" in str(median.reason_if_undefined)
+    stage_table = next(table for table in part.tables if table.id == "stage_states")
+    assert [row[2] for row in stage_table.rows] == ["place", "grasp"]
+
+
+def test_no_state_is_no_data() -> None:
+    part = state_results([])
+    assert part.measurements == ()
+    assert "no data" in part.missing[0]

@@ -1,0 +1,82 @@
+"""Intervals of lengths: the median's holds for any distribution, the mean's is refused early."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import quantile_test
+
+from evaluator.errors import UndefinedStatisticError
+from evaluator.statistics.bootstrap import student_interval
+from evaluator.statistics.coverage import lengths as coverage
+from evaluator.statistics.coverage import stored
+from evaluator.statistics.lengths import cluster_means, median_interval, median_rank
+
+
+@pytest.mark.parametrize(
+    ("n", "rank"), [(5, 0), (6, 1), (8, 1), (9, 2), (10, 2), (20, 6), (100, 40)]
+)
+def test_ranks_are_those_of_the_tables(n: int, rank: int) -> None:
+    # Sign-test ranks at 5 %, two-sided: Conover, Practical Nonparametric Statistics, table A3.
+    assert median_rank(n) == rank
+
+
+@pytest.mark.parametrize("n", range(6, 60))
+def test_the_interval_is_no_wider_than_scipys(n: int) -> None:
+    values = np.random.default_rng(n).lognormal(size=n)
+    ours = median_interval(values.tolist())
+    theirs = quantile_test(values, q=0, p=0.5).confidence_interval(0.95)
+    assert theirs.low <= ours.low <= ours.high <= theirs.high
+    assert coverage.of_median(n).worst >= 0.95
+
+
+@settings(max_examples=30)
+@given(st.lists(st.floats(0, 100), min_size=6, max_size=60))
+def test_a_rising_function_moves_the_interval_with_it(values: list[float]) -> None:
+    plain, doubled = median_interval(values), median_interval([2 * value + 1 for value in values])
+    assert doubled.low == pytest.approx(2 * plain.low + 1)
+    assert doubled.high == pytest.approx(2 * plain.high + 1)
+    assert plain.low <= np.median(values) <= plain.high
+
+
+def test_five_values_have_no_median_interval() -> None:
+    with pytest.raises(UndefinedStatisticError, match="5 values; at 95 % it needs at least 6"):
+        median_interval([1.0] * 5)
+
+
+def test_counted_coverage_is_what_draws_say() -> None:
+    rng = np.random.default_rng(0)
+    for n in (6, 13, 30):
+        place = median_rank(n)
+        drawn = np.sort(rng.exponential(size=(20_000, n)), axis=1)
+        truth = np.log(2)
+        held = (drawn[:, place - 1] <= truth) & (truth <= drawn[:, -place])
+        assert held.mean() == pytest.approx(coverage.of_median(n).worst, abs=0.006)
+
+
+def test_populations_have_the_mean_they_claim() -> None:
+    rng = np.random.default_rng(0)
+    for population in coverage.POPULATIONS:
+        drawn = population.draw(rng, (1, 400_000))
+        assert drawn.mean() == pytest.approx(population.mean, rel=0.02)
+
+
+def test_one_miss_in_ten_makes_students_interval_of_the_mean_too_short() -> None:
+    found = coverage.of_mean(student_interval, 10, draws=300, rng=np.random.default_rng(0))
+    assert found.worst < stored.FLOOR
+    assert "miss" in found.worst_at
+    known = stored.coverage_of("student-t:length", 10)
+    assert known is not None
+    assert known.worst == pytest.approx(found.worst, abs=0.08)
+
+
+@pytest.mark.parametrize("n", [6, 20, 100])
+def test_the_shipped_coverage_of_the_median_is_what_counting_gives(n: int) -> None:
+    known = stored.coverage_of("order-statistics", n)
+    assert known is not None
+    assert known.worst == pytest.approx(coverage.of_median(n).worst, abs=1e-6)
+
+
+def test_clusters_count_once_each() -> None:
+    assert cluster_means([1.0, 3.0, 10.0], ["a", "a", "b"]) == [2.0, 10.0]
+    assert cluster_means([], []) == []

@@ -1,0 +1,329 @@
+"""Motions against each other: laws of the errors, and what is left without delay or offset."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from bridge.episode import schema
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.repeated import joint_messages, pose_messages
+from bridge.episode.streams import JointTrack
+from bridge.episode.writer import EpisodeWriter
+from bridge.geometry.trajectory import PoseTrajectory
+from evaluator.compare.motion import (
+    MotionSummary,
+    compare_tracks,
+    summarise_motion,
+    summarise_motions,
+)
+from evaluator.compare.tracking import motion_results
+from evaluator.compare.tracks import Tracks
+from evaluator.errors import UndefinedStatisticError
+from evaluator.metrics.trajectory_align import align_rigid, find_lag_s
+from evaluator.metrics.trajectory_steps import joint_errors, relative_errors
+
+START_NS = 10_000_000_000
+STEP_NS = 20_000_000
+NUM = 151
+NAMES = ("pan", "lift", "elbow")
+
+
+def path_m(t_s: np.ndarray) -> np.ndarray:
+    """A motion that rests at both ends and is not straight."""
+    s = np.clip((t_s - 0.4) / 2.2, 0.0, 1.0)
+    s = s * s * (3 - 2 * s)
+    return np.stack([0.4 + 0.3 * s, 0.1 * np.sin(3 * s), 0.2 + 0.15 * s * s], axis=1)
+
+
+def tracks(
+    *,
+    late_s: float = 0.0,
+    shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    turn_rad: float = 0.0,
+    joint_rad: float = 0.0,
+    start_ns: int | None = START_NS,
+    first_ns: int = START_NS,
+) -> Tracks:
+    stamps = first_ns + STEP_NS * np.arange(NUM, dtype=np.int64)
+    t_s = (stamps - first_ns) * 1e-9
+    p = path_m(t_s - late_s) + np.array(shift_m)
+    q = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_quat(scalar_first=True)
+    joints = np.stack([np.sin(t_s), np.cos(t_s), 0.1 * t_s], axis=1)
+    joints[:, 1] += joint_rad
+    return Tracks(
+        tool=PoseTrajectory(stamps, p, np.tile(q, (NUM, 1))),
+        joints=JointTrack(names=NAMES, stamps_ns=stamps, position=joints),
+        started_ns=start_ns,
+        ended_ns=None if start_ns is None else start_ns + STEP_NS * NUM,
+    )
+
+
+def test_a_motion_is_nowhere_from_itself() -> None:
+    found = compare_tracks(tracks(), tracks())
+    assert found.aligned_by == "stamps"
+    assert found.num_samples == NUM
+    assert found.duration_s == pytest.approx(3.0)
+    assert (found.position_max_m, found.rotation_max_rad, found.joint_max_rad) == (0, 0, 0)
+    assert found.lag_s == 0.0
+    assert len(found.curve_m) == len(found.joint_curve_rad) == 101
+
+
+@settings(max_examples=15)
+@given(st.floats(-0.15, 0.5), st.floats(0.0, 0.05))
+def test_a_known_delay_is_found_and_taken_out(late_s: float, shift_m: float) -> None:
+    found = compare_tracks(tracks(late_s=late_s, shift_m=(0.0, 0.0, shift_m)), tracks())
+    assert found.lag_s == pytest.approx(late_s, abs=0.0051)
+    # What is left is the offset, and half a step of 10 ms at up to 0.3 m/s.
+    assert found.without_lag_mean_m == pytest.approx(shift_m, abs=0.0016)
+
+
+@settings(max_examples=15)
+@given(st.integers(0, 99))
+def test_a_rigid_motion_of_one_side_is_taken_out(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    R, shift = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+    other = tracks()
+    assert other.tool is not None
+    moved = PoseTrajectory(other.tool.stamps_ns, other.tool.p_m @ R.T + shift, other.tool.q_wxyz)
+    found = compare_tracks(
+        tracks(), Tracks(tool=moved, joints=None, started_ns=None, ended_ns=None)
+    )
+    assert found.without_offset_mean_m == pytest.approx(0.0, abs=1e-9)
+    assert found.joint_rms_rad is None
+    assert found.joint_curve_rad == ()
+
+
+@settings(max_examples=15)
+@given(st.integers(0, 99))
+def test_a_common_rigid_motion_changes_no_distance(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turn, shift = Rotation.random(rng=rng), rng.normal(size=3)
+
+    def carried(source: Tracks) -> Tracks:
+        assert source.tool is not None
+        q = turn * Rotation.from_quat(source.tool.q_wxyz, scalar_first=True)
+        tool = PoseTrajectory(
+            source.tool.stamps_ns,
+            source.tool.p_m @ turn.as_matrix().T + shift,
+            q.as_quat(scalar_first=True),
+        )
+        return Tracks(tool=tool, joints=None, started_ns=START_NS, ended_ns=None)
+
+    mine, other = tracks(late_s=0.1, turn_rad=0.2), tracks(shift_m=(0.01, 0.0, 0.0))
+    plain, moved = compare_tracks(mine, other), compare_tracks(carried(mine), carried(other))
+    for name in ("position_mean_m", "end_point_m", "rotation_mean_rad", "relative_mean_m", "lag_s"):
+        assert getattr(moved, name) == pytest.approx(getattr(plain, name), abs=1e-9)
+
+
+def test_a_constant_offset_is_no_relative_error() -> None:
+    found = compare_tracks(tracks(shift_m=(0.03, 0.0, 0.0)), tracks())
+    assert found.position_mean_m == pytest.approx(0.03)
+    assert found.relative_mean_m == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_joint_offset_is_found_with_its_joint_and_whole_turns_do_not_count() -> None:
+    found = compare_tracks(tracks(joint_rad=0.03 - 2 * np.pi), tracks())
+    assert found.joint_max_rad == pytest.approx(0.03)
+    assert found.joint_worst == "lift"
+    assert found.joint_rms_rad == pytest.approx(0.03 / np.sqrt(3))
+
+
+def test_joints_are_compared_by_name() -> None:
+    mine = JointTrack(
+        names=("a", "b"), stamps_ns=np.array([0, 10]), position=np.array([[0.0, 1.0], [0.0, 1.0]])
+    )
+    other = JointTrack(
+        names=("b", "c", "a"),
+        stamps_ns=np.array([0, 10]),
+        position=np.array([[1.0, 9.0, 0.5], [1.0, 9.0, 0.5]]),
+    )
+    errors = joint_errors(mine, other)
+    assert errors.names == ("a", "b")
+    np.testing.assert_allclose(errors.error_rad, [[-0.5, 0.0]] * 2)
+    with pytest.raises(UndefinedStatisticError, match="no name in common"):
+        joint_errors(
+            mine, JointTrack(names=("x",), stamps_ns=np.array([0]), position=np.zeros((1, 1)))
+        )
+
+
+def test_clocks_of_their_own_are_laid_over_each_other_at_the_start() -> None:
+    found = compare_tracks(tracks(shift_m=(0.0, 0.02, 0.0)), tracks(first_ns=0, start_ns=0))
+    assert found.aligned_by == "starts"
+    assert found.position_mean_m == pytest.approx(0.02)
+    assert found.joint_max_rad == pytest.approx(0.0, abs=1e-9)
+
+
+def test_without_a_start_time_is_normalised_and_nothing_is_said_of_delays() -> None:
+    slow = tracks(start_ns=None)
+    assert slow.tool is not None
+    stretched = PoseTrajectory(
+        7 * (slow.tool.stamps_ns - START_NS), slow.tool.p_m, slow.tool.q_wxyz
+    )
+    other = Tracks(tool=stretched, joints=None, started_ns=None, ended_ns=None)
+    found = compare_tracks(slow, other)
+    assert found.aligned_by == "normalised"
+    assert found.num_samples == 101
+    assert found.position_max_m == pytest.approx(0.0, abs=1e-4)  # resampled between its samples
+    assert found.lag_s is None
+    assert found.relative_mean_m is None
+
+
+def test_a_straight_motion_keeps_its_offset() -> None:
+    line = np.zeros((20, 3))
+    line[:, 0] = np.linspace(0, 1, 20)
+    with pytest.raises(UndefinedStatisticError, match="lie on a line"):
+        align_rigid(line, line + 0.1)
+
+
+def test_a_motion_that_rests_has_no_delay() -> None:
+    rest = PoseTrajectory(
+        np.arange(50, dtype=np.int64) * STEP_NS, np.zeros((50, 3)), np.tile([1.0, 0, 0, 0], (50, 1))
+    )
+    assert find_lag_s(rest, rest) == 0.0
+
+
+def test_a_motion_shorter_than_a_step_has_no_relative_error() -> None:
+    rest = PoseTrajectory(
+        np.arange(3, dtype=np.int64), np.zeros((3, 3)), np.tile([1.0, 0, 0, 0], (3, 1))
+    )
+    with pytest.raises(UndefinedStatisticError, match="3 samples"):
+        relative_errors(rest, rest, 3)
+
+
+def test_motions_without_poses_or_instants_in_common_are_refused() -> None:
+    empty = Tracks(tool=None, joints=None, started_ns=START_NS, ended_ns=None)
+    with pytest.raises(UndefinedStatisticError, match="no tool poses"):
+        compare_tracks(tracks(), empty)
+    later = Tracks(
+        tool=tracks().tool,
+        joints=None,
+        started_ns=START_NS + 10**12,
+        ended_ns=START_NS + 2 * 10**12,
+    )
+    with pytest.raises(UndefinedStatisticError, match="no tool poses"):
+        compare_tracks(later, tracks())
+
+
+def write(path: Path, source: Tracks, *, kind: str = "trial", plan_id: str = "p1") -> Episode:
+    assert source.tool is not None
+    assert source.joints is not None
+    stamps = source.tool.stamps_ns
+    with EpisodeWriter(path) as writer:
+        writer.describe(
+            EpisodeInfo(id=path.stem, kind=kind, task="cube_into_box", condition="with_replanning")
+        )
+        for kind_of, stamp in (
+            ("execution_started", source.started_ns),
+            ("execution_ended", source.ended_ns),
+        ):
+            if stamp is not None:
+                record = {
+                    "schema_version": 1,
+                    "stamp_ns": stamp,
+                    "type": kind_of,
+                    "plan_id": plan_id,
+                }
+                writer.write_json("/cell/event", record, type_name=schema.EVENT, log_time_ns=stamp)
+        poses = pose_messages(stamps, "base_link", source.tool.transforms())
+        arm = joint_messages(stamps, source.joints.names, source.joints.position)
+        for stamp, pose, joint in zip(stamps.tolist(), poses, arm, strict=True):
+            writer.write("/cell/tcp/pose", pose, type_name=schema.POSE_STAMPED, log_time_ns=stamp)
+            writer.write(
+                "/cell/joint_states", joint, type_name=schema.JOINT_STATE, log_time_ns=stamp
+            )
+    return Episode.open(path)
+
+
+def test_files_give_what_their_tracks_give_and_the_replays_are_compared_too(tmp_path: Path) -> None:
+    recorded = tracks(late_s=0.1, joint_rad=0.01)
+    planned, executed = tracks(), tracks(late_s=0.1)
+    episodes = {
+        name: write(tmp_path / f"{name}.mcap", source)
+        for name, source in (("recorded", recorded), ("planned", planned), ("executed", executed))
+    }
+    replays = {name: episodes[name] for name in ("planned", "executed")}
+    found = summarise_motions(episodes["recorded"], replays, plan_id="p1")
+    assert [(m.side, m.against) for m in found] == [
+        ("recorded", "planned"),
+        ("recorded", "executed"),
+        ("executed", "planned"),
+    ]
+    assert {(m.episode, m.task, m.condition, m.plan_id) for m in found} == {
+        ("recorded", "cube_into_box", "with_replanning", "p1")
+    }
+    direct = compare_tracks(recorded, planned)
+    assert found[0].position_mean_m == pytest.approx(direct.position_mean_m, abs=1e-9)
+    assert found[0].lag_s == direct.lag_s == 0.1
+    assert found[1].joint_max_rad == pytest.approx(0.01)
+    assert found[1].position_max_m == pytest.approx(0.0, abs=1e-9)
+    assert found[2].position_mean_m == pytest.approx(found[0].position_mean_m, abs=1e-9)
+    alone = summarise_motion(
+        episodes["recorded"], episodes["planned"], against="planned", plan_id="p1"
+    )
+    assert alone == found[0]
+
+
+def test_samples_outside_the_execution_do_not_count(tmp_path: Path) -> None:
+    recorded = tracks()
+    assert recorded.tool is not None
+    waiting = Tracks(
+        tool=recorded.tool,
+        joints=recorded.joints,
+        started_ns=START_NS + 50 * STEP_NS,
+        ended_ns=START_NS + 100 * STEP_NS,
+    )
+    found = summarise_motion(
+        write(tmp_path / "a.mcap", waiting),
+        write(tmp_path / "b.mcap", tracks()),
+        against="planned",
+        plan_id="p1",
+    )
+    assert found.num_samples == 51
+
+
+def summaries(*mean_m: float) -> list[MotionSummary]:
+    found = compare_tracks(tracks(), tracks())
+    return [
+        MotionSummary(
+            **{
+                **{name: getattr(found, name) for name in MotionSummary.__dataclass_fields__},
+                "episode": f"e{index}",
+                "against": "planned",
+                "position_mean_m": value,
+                "position_max_m": 2 * value,
+                "curve_m": (value,) * 101,
+            }
+        )
+        for index, value in enumerate(mean_m)
+    ]
+
+
+def test_numbers_are_means_over_trials_and_tables_show_the_course_and_the_worst() -> None:
+    part = motion_results(summaries(0.01, 0.02, 0.06))
+    by_id = {m.id: m for m in part.measurements}
+    mean = by_id["motion.planned.position_mean_m"]
+    assert (mean.value, mean.n, mean.counted) == (pytest.approx(0.03), 3, "trial")
+    assert "share one calibration" in str(mean.reason_without_interval)
+    assert by_id["motion.executed.position_mean_m"].value is None
+    assert by_id["motion.twin.position_mean_m"].value is None
+    tables = {table.id: table for table in part.tables}
+    assert [row[:5] for row in tables["motion_over_time"].rows] == [
+        ("planned", place, 3, 30.0, 60.0) for place in range(0, 101, 10)
+    ]
+    assert [row[1] for row in tables["motion_worst"].rows] == ["e2", "e1", "e0"]
+
+
+def test_no_motion_is_no_data() -> None:
+    part = motion_results(())
+    assert part.measurements == ()
+    assert "no data" in part.missing[0]
+
+
+def test_a_pose_that_is_no_number_leaves_the_mean_undefined() -> None:
+    by_id = {m.id: m for m in motion_results(summaries(float("nan"))).measurements}
+    assert "not finite" in str(by_id["motion.planned.position_mean_m"].reason_if_undefined)
