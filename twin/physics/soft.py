@@ -11,6 +11,7 @@ from bridge.task.meshes.catalogue import ToyMesh, toy_mesh
 from bridge.task.meshes.lattice import Lattice, make_lattice, volumes_m3
 from bridge.task.task_file import ObjectModel
 from twin.errors import TwinError
+from twin.physics.soft_coarse import coarse_lattice
 from twin.physics.soft_shape import surface_triangles
 
 POISSON_RANGE = (0.0, 0.45)
@@ -107,6 +108,9 @@ class SoftModel:
     def from_lattice(arrays: Mapping[str, np.ndarray], model: ObjectModel) -> "SoftModel":
         """Take the lattice of a rebuilt scene.
 
+        One that is finer than the task asks for (``soft.cell_m``) is replaced by a coarser lattice
+        of the same solid, with the fine surface as skin: docs/decisions/0029.
+
         Args:
             arrays: What ``objects/<id>/soft.npz`` holds: ``nodes_m``, ``tets``, ``mass_fraction``
                 and ``spacing_m`` (``twin.scene.shape.lattice``).
@@ -122,7 +126,7 @@ class SoftModel:
         ]
         if missing:
             raise SoftBodyError(found=f"a lattice without {', '.join(missing)}")
-        return _soft_model(
+        fine = _soft_model(
             model,
             np.asarray(arrays["nodes_m"], dtype=np.float32),
             np.asarray(arrays["tets"], dtype=np.int32),
@@ -130,6 +134,13 @@ class SoftModel:
             float(arrays["spacing_m"]),
             skin=None,
         )
+        coarse = coarse_lattice(fine.nodes_m, fine.tets, model.soft.cell_m)
+        if coarse is None:
+            return fine
+        nodes = coarse[0].points_m.astype(np.float32)
+        tets = coarse[0].tetrahedra.astype(np.int32)
+        skin = fine.nodes_m[np.unique(fine.surface())]
+        return _soft_model(model, nodes, tets, _lumped(nodes, tets), coarse[1], skin=skin)
 
     def volume_m3(self) -> float:
         """Volume of the tetrahedra at rest."""

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.errors import UsageError
 from bridge.task.meshes.catalogue import ToyMesh
+from bridge.task.meshes.solids import Solid
 from bridge.task.meshes.surface_net import project
 
 KEPT_DISTANCE = 0.20
@@ -46,11 +47,27 @@ def make_lattice(mesh: ToyMesh, cell_m: float) -> Lattice:
     Raises:
         UsageError: The cells are too coarse for the body: none lies inside.
     """
-    low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
+    return fill(mesh.solid, mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0), cell_m)
+
+
+def fill(
+    solid: Solid, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], cell_m: float
+) -> Lattice:
+    """Fill a solid that a box just holds, as ``make_lattice``.
+
+    Args:
+        solid: Its signed distance.
+        low: Lower corner of the box [m].
+        high: Upper corner.
+        cell_m: Edge of a cell [m].
+
+    Raises:
+        UsageError: No cell lies inside.
+    """
     counts = np.maximum(np.ceil((high - low) / cell_m).astype(int), 1)
     step = (high - low) / counts
     centres = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1)
-    distance = mesh.solid(low + step * (centres.reshape(-1, 3) + 0.5)).reshape(*counts)
+    distance = solid(low + step * (centres.reshape(-1, 3) + 0.5)).reshape(*counts)
     kept = distance < KEPT_DISTANCE * float(step.min())
     if not kept.any():
         message = f"cells of {cell_m} m are too coarse for a body of {high - low} m."
@@ -61,7 +78,7 @@ def make_lattice(mesh: ToyMesh, cell_m: float) -> Lattice:
     grid = np.stack(np.unravel_index(used, tuple(counts + 1)), axis=1)
     points = low + step * grid
     outer = _on_the_border(kept, grid)
-    points[outer] = project(mesh.solid, points[outer], MOVED_FRACTION * float(step.min()))
+    points[outer] = project(solid, points[outer], MOVED_FRACTION * float(step.min()))
     points = np.clip(points, low, high)
     tetrahedra = _tetrahedra(index.reshape(nodes.shape), cells)
     volume = volumes_m3(points, tetrahedra)
