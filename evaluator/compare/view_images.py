@@ -6,7 +6,7 @@ Topics end in ``/cam/<id>/`` and ``rendered/image``, ``recorded/image`` (or, in 
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -16,22 +16,16 @@ from bridge.episode import schema
 from bridge.episode.reader import Episode
 from bridge.episode.records import CompressedColor, DepthImage
 from bridge.errors import GstError
-from bridge.media.color import decode_color
+from bridge.media.color import JPEG_MAGIC, decode_color
+from evaluator.compare.parallel import spread
+from evaluator.compare.variants import POSE_GAIN, RAW, Variant, score_variants
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.depth import DepthScore, score_depth
-from evaluator.metrics.image import ALIGNMENTS, ImageScore, score_image
+from evaluator.metrics.image import as_float, refuse_swapped
+from evaluator.metrics.lpips import PerceptualNet
+from evaluator.metrics.scores import ImageScore, score_image
 
 RENDERED, RECORDED, POSED = "rendered", "recorded", "pose_aligned"
-POSE_GAIN = "pose_gain"
-"""Variant: rendered where pose and brightness were fitted to the recorded image."""
-VARIANTS = {
-    **{str(name): f"full frame, no mask, {text}" for name, text in ALIGNMENTS.items()},
-    POSE_GAIN: (
-        "full frame, no mask, camera pose and one gain per channel fitted to the recorded image: "
-        "not strictly held out"
-    ),
-}
-"""What each variant that any view may have stands for; masked ones are named by their mask."""
 _COLOR_TOPICS = (
     (RENDERED, re.compile(r"/cam/([^/]+)/(?:color/)?(?:rendered|replayed)(?:/image)?$")),
     (RECORDED, re.compile(r"/cam/([^/]+)/(?:color|recorded)(?:/image)?$")),
@@ -53,11 +47,18 @@ class ViewScore:
 
     camera_id: str
     stamp_ns: int
-    scores: Mapping[str, ImageScore]
-    """By variant: raw, gain, affine, pose_gain, and each mask's name."""
+    size: tuple[int, int]
+    """Height and width [px]."""
+    scores: Mapping[Variant, ImageScore]
+    """At least raw, gain and affine; pose_gain and both ways of each mask where there are any."""
     depth: DepthScore | None
     jpeg: bool
     """The rendered image was stored lossily."""
+
+    def psnr_db(self, variant: Variant = RAW) -> float | None:
+        """None where the variant is not there or both images are identical."""
+        score = self.scores.get(variant)
+        return None if score is None else score.psnr_db
 
 
 @dataclass(kw_only=True)
@@ -70,9 +71,37 @@ class Images:
     masks: dict[str, dict[Key, bytes]] = field(default_factory=dict)
     depth: dict[str, dict[Key, bytes]] = field(default_factory=lambda: {RENDERED: {}, RECORDED: {}})
 
+    def masks_of(self, key: Key) -> dict[str, np.ndarray]:
+        """Decode the masks of one view; empty ones say nothing and are left out."""
+        found = {
+            name: decode_color(of[key])[..., 0] > 127
+            for name, of in sorted(self.masks.items())
+            if key in of
+        }
+        return {name: mask for name, mask in found.items() if mask.any()}
 
-def score_views(views: Episode, source: Episode | None) -> tuple[list[ViewScore], list[str]]:
+
+def score_views(
+    images: Images, *, nets: Sequence[PerceptualNet] = ()
+) -> tuple[list[ViewScore], list[str]]:
     """Score every rendered image of a views episode; what cannot be scored is a reason.
+
+    Args:
+        images: As ``images_of`` collects them.
+        nets: For LPIPS; none leaves it out.
+    """
+    rendered = sorted(images.color[RENDERED])
+    # A network uses all cores and much memory by itself.
+    done = spread(partial(_score, images, nets), rendered, threads=1 if nets else None)
+    scores = [found for found in done if isinstance(found, ViewScore)]
+    reasons = [found for found in done if isinstance(found, str)]
+    if not rendered:
+        reasons.append("no topic .../cam/<id>/rendered/image in it")
+    return scores, reasons
+
+
+def images_of(views: Episode, source: Episode | None) -> Images:
+    """Collect the images of a views episode.
 
     Args:
         views: The derived episode.
@@ -86,20 +115,7 @@ def score_views(views: Episode, source: Episode | None) -> tuple[list[ViewScore]
             for key, data in read_images(source).color[RECORDED].items()
             if key[1] in wanted
         }
-    scores, reasons = [], []
-    for key, rendered in sorted(images.color[RENDERED].items()):
-        where = f"camera {key[0]} at {key[1]} ns"
-        recorded = images.color[RECORDED].get(key)
-        if recorded is None:
-            reasons.append(f"{where}: no recorded image with this stamp")
-            continue
-        try:
-            scores.append(_score(images, key, recorded, rendered))
-        except GstError as error:
-            reasons.append(f"{where}: {error}")
-    if not images.color[RENDERED]:
-        reasons.append("no topic .../cam/<id>/rendered/image in it")
-    return scores, reasons
+    return images
 
 
 def read_images(episode: Episode) -> Images:
@@ -133,32 +149,29 @@ def _put_depth(into: dict[Key, bytes], camera_id: str, data: bytes) -> None:
     into[camera_id, DepthImage.from_cdr(data).stamp_ns] = data
 
 
-def _score(images: Images, key: Key, recorded: bytes, rendered: bytes) -> ViewScore:
-    recorded_u8, rendered_u8 = decode_color(recorded), decode_color(rendered)
-    scores = {
-        str(alignment): score_image(recorded_u8, rendered_u8, alignment=alignment)
-        for alignment in ALIGNMENTS
-    }
-    posed = images.color[POSED].get(key)
-    if posed is not None:
-        scores[POSE_GAIN] = score_image(recorded_u8, decode_color(posed), alignment="gain")
-    for name, mask in _masks(images, key):
-        scores[name] = score_image(recorded_u8, rendered_u8, mask=mask)
+def _score(images: Images, nets: Sequence[PerceptualNet], key: Key) -> ViewScore | str:
+    where = f"camera {key[0]} at {key[1]} ns"
+    rendered, recorded = images.color[RENDERED][key], images.color[RECORDED].get(key)
+    if recorded is None:
+        return f"{where}: no recorded image with this stamp"
+    try:
+        recorded_u8, rendered_u8 = decode_color(recorded), decode_color(rendered)
+        refuse_swapped(as_float(recorded_u8), as_float(rendered_u8))
+        scores = score_variants(recorded_u8, rendered_u8, images.masks_of(key), nets=nets)
+        posed = images.color[POSED].get(key)
+        if posed is not None:
+            scores[POSE_GAIN] = score_image(recorded_u8, decode_color(posed), alignment="gain")
+        depth = _score_depth(images, key)
+    except GstError as error:
+        return f"{where}: {error}"
     return ViewScore(
         camera_id=key[0],
         stamp_ns=key[1],
+        size=(recorded_u8.shape[0], recorded_u8.shape[1]),
         scores=scores,
-        depth=_score_depth(images, key),
-        jpeg=rendered.startswith(b"\xff\xd8"),
+        depth=depth,
+        jpeg=rendered.startswith(JPEG_MAGIC),
     )
-
-
-def _masks(images: Images, key: Key) -> Iterator[tuple[str, np.ndarray]]:
-    for name, found in sorted(images.masks.items()):
-        if key in found:
-            mask = decode_color(found[key])[..., 0] > 127
-            if mask.any():
-                yield name, mask
 
 
 def _score_depth(images: Images, key: Key) -> DepthScore | None:

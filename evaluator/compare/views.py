@@ -14,15 +14,36 @@ import numpy as np
 
 from bridge.episode.reader import Episode
 from bridge.errors import GstError
+from bridge.media.color import decode_color
+from evaluator.compare.image_measurements import (
+    Protocol,
+    StampedMeasurement,
+    resolution_words,
+    stamped_measurements,
+)
+from evaluator.compare.image_tables import per_image_table, stamp_table
 from evaluator.compare.measure import measured, slug
 from evaluator.compare.replays import DerivedFile
-from evaluator.compare.view_images import VARIANTS, ViewScore, score_views
+from evaluator.compare.variants import RAW, Variant, values_by_id
+from evaluator.compare.view_images import (
+    RECORDED,
+    RENDERED,
+    Images,
+    ViewScore,
+    images_of,
+    score_views,
+)
+from evaluator.compare.view_quality import NUM_WORST, ViewQuality, shrunk_u8
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.depth import DEPTH_PROTOCOL
-from evaluator.metrics.image import LPIPS_NOT_COMPUTED, PSNR_PROTOCOL, SSIM_PROTOCOL
-from evaluator.result import Cell, Exclusion, Measurement, Table
+from evaluator.metrics.lpips import LPIPS_NOT_COMPUTED, PerceptualNet
+from evaluator.metrics.stamp import UNSTATED
+from evaluator.result import Exclusion, Measurement, Table
 
-MASKED = "only the pixels of the views' own mask {name!r}, no colour alignment"
+TWIN = "twin"
+"""What the run's own renders are called beside other methods."""
+Source = tuple[Path, str]
+"""A recorded episode: its file, and the content hash of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,61 +54,81 @@ class ViewReport:
     tables: tuple[Table, ...] = ()
     exclusions: tuple[Exclusion, ...] = ()
     missing: tuple[str, ...] = ()
+    views: tuple[ViewQuality, ...] = ()
 
 
 def compare_views(
-    files: Sequence[DerivedFile], recorded: Sequence[Episode], hashes: Mapping[Path, str]
+    files: Sequence[DerivedFile],
+    sources: Mapping[str, Source],
+    *,
+    nets: Sequence[PerceptualNet] = (),
 ) -> ViewReport:
-    """Compute PSNR and SSIM of every rendered view, per image and mean.
+    """Compute every image metric of every rendered view, per image and mean.
 
     Args:
         files: Every derived episode of the run.
-        recorded: Every recorded episode.
-        hashes: Content hash of each; views made from other bytes are stale and left out.
+        sources: Every recorded episode by its id; views made from other bytes are left out.
+        nets: For LPIPS; none leaves it out.
     """
-    now = {episode.info.id: hashes[episode.path] for episode in recorded}
-    views, stale = _current([file for file in files if file.derived.kind == "views"], now)
-    views, left_out = _newest(views)
-    left_out += stale
+    views, left_out = newest_views(files, sources)
     if not views:
         return ViewReport(
             missing=("views: no rendered views (robot-gst rebuild makes them)",),
             exclusions=tuple(left_out),
         )
-    sources = {episode.info.id: episode for episode in recorded}
     tables: list[Table] = []
     found: dict[str, list[ViewScore]] = {}
     of: dict[str, DerivedFile] = {}
+    shown: list[ViewQuality] = []
     for file in views:
         name = file.path.stem
         source = file.derived.source_episode
         try:
-            scores, reasons = score_views(file.episode, sources.get(source))
+            images = images_of(file.episode, opened(sources.get(source)))
+            scores, reasons = score_views(images, nets=nets)
         except GstError as error:
             left_out.append(Exclusion(episode=file.path.name, scope="views", reason=str(error)))
             continue
         left_out += [Exclusion(episode=name, scope="views", reason=reason) for reason in reasons]
         found[source], of[source] = scores, file
-        tables.append(_table(f"views_{len(tables)}", name, scores))
+        shown += _qualities(source, scores, images)
+        tables.append(per_image_table(f"views_{len(tables)}", f"Held-out views: {name}", scores))
     everything = [score for scores in found.values() for score in scores]
-    measurements = _measure("all", list(found), everything, _protocol(of.values()))
+    measurements, stamped = _measure("all", list(found), everything, of.values(), nets)
     for source, scores in found.items() if len(found) > 1 else ():
-        measurements += _measure(slug(source), [source], scores, _protocol([of[source]]))
+        measurements += _measure(slug(source), [source], scores, [of[source]], nets)[0]
+    tables.append(stamp_table("views_protocol", "Protocols of the held-out views", stamped))
     return ViewReport(
-        measurements=tuple(measurements), tables=tuple(tables), exclusions=tuple(left_out)
+        measurements=tuple(measurements),
+        tables=tuple(tables),
+        exclusions=tuple(left_out),
+        views=tuple(shown),
     )
 
 
+def newest_views(
+    files: Sequence[DerivedFile], sources: Mapping[str, Source]
+) -> tuple[list[DerivedFile], list[Exclusion]]:
+    """Find the newest views of each recorded episode; stale and older ones are left out by name."""
+    views, stale = _current([file for file in files if file.derived.kind == "views"], sources)
+    views, older = _newest(views)
+    return views, [*older, *stale]
+
+
+def opened(source: Source | None) -> Episode | None:
+    """Open a recorded episode, where there is one."""
+    return None if source is None else Episode.open(source[0])
+
+
 def _current(
-    views: Sequence[DerivedFile], now: Mapping[str, str]
+    views: Sequence[DerivedFile], sources: Mapping[str, Source]
 ) -> tuple[list[DerivedFile], list[Exclusion]]:
     """Leave out views that were made from another version of their recorded episode."""
-    stale = [
-        file
-        for file in views
-        if file.derived.source_sha256 not in ("", now.get(file.derived.source_episode, ""))
-        and file.derived.source_episode in now
-    ]
+    stale = []
+    for file in views:
+        source = sources.get(file.derived.source_episode)
+        if source is not None and file.derived.source_sha256 not in ("", source[1]):
+            stale.append(file)
     reason = "made from another version of the episode (its hash differs); rebuild again"
     left_out = [Exclusion(episode=f.path.name, scope="views", reason=reason) for f in stale]
     return [file for file in views if file not in stale], left_out
@@ -108,66 +149,86 @@ def _newest(views: Sequence[DerivedFile]) -> tuple[list[DerivedFile], list[Exclu
     return kept, left_out
 
 
-def _measure(
-    part: str, episodes: Sequence[str], scores: Sequence[ViewScore], protocol: str
-) -> list[Measurement]:
-    """All numbers about some views; the raw ones first."""
-    stored = "rendered images stored as JPEG" if any(s.jpeg for s in scores) else "stored lossless"
-    after = f"{stored}; mean of per-image values{protocol}"
-    found = list(dict.fromkeys(name for score in scores for name in score.scores))
-    variants = ["raw", *(name for name in found if name != "raw")]
-    measurements = []
-    for variant in variants:
-        stamp = f"{VARIANTS.get(variant) or MASKED.format(name=variant)}, {after}"
-        measurements += _measure_images(part, variant, episodes, scores, stamp)
-    measurements += _measure_depth(part, episodes, scores, after)
-    measurements.append(
-        Measurement(
-            id=f"views.{part}.lpips",
-            value=None,
-            unit="1",
-            definition="learned perceptual image patch similarity",
-            reason_if_undefined=LPIPS_NOT_COMPUTED,
-            episodes=tuple(episodes),
-        )
-    )
-    return measurements
-
-
-def _measure_images(
-    part: str, variant: str, episodes: Sequence[str], scores: Sequence[ViewScore], stamp: str
-) -> list[Measurement]:
-    mine = [score.scores[variant] for score in scores if variant in score.scores]
-    psnr = [s.psnr_db for s in mine if s.psnr_db is not None]
-    ssim = [s.ssim for s in mine if s.ssim is not None]
-    name = "" if variant == "raw" else f"_{variant}"
+def _qualities(source: str, scores: Sequence[ViewScore], images: Images) -> list[ViewQuality]:
+    """One record for each view, with pictures of those with the lowest PSNR."""
+    rated = [s for s in scores if s.psnr_db() is not None]
+    worst = sorted(rated, key=lambda s: s.psnr_db() or 0.0)[:NUM_WORST]
     return [
-        measured(
-            f"views.{part}.{measurement}",
-            partial(_mean, statistic, values),
-            unit=unit,
-            definition=f"{protocol}; {stamp}",
-            n=len(values),
-            counted="image",
-            reason_without_interval="the per-image list is in the table",
-            episodes=episodes,
+        ViewQuality(
+            episode=source,
+            view_id=f"{score.camera_id}/{score.stamp_ns}",
+            method=TWIN,
+            values=values_by_id(score.scores),
+            recorded_u8=_picture(images, RECORDED, score) if score in worst else None,
+            rendered_u8=_picture(images, RENDERED, score) if score in worst else None,
         )
-        for measurement, statistic, unit, protocol, values in (
-            (f"psnr{name}_db", "PSNR", "dB", PSNR_PROTOCOL, psnr),
-            (f"ssim{name}", "SSIM", "1", SSIM_PROTOCOL, ssim),
-        )
+        for score in scores
     ]
 
 
+def _picture(images: Images, name: str, score: ViewScore) -> np.ndarray:
+    return shrunk_u8(decode_color(images.color[name][score.camera_id, score.stamp_ns]))
+
+
+def _measure(
+    part: str,
+    episodes: Sequence[str],
+    scores: Sequence[ViewScore],
+    files: Iterable[DerivedFile],
+    nets: Sequence[PerceptualNet],
+) -> tuple[list[Measurement], list[StampedMeasurement]]:
+    """All numbers about some views; the raw ones first."""
+    prefix = f"views.{part}"
+    settings: list[Mapping[str, Any]] = [file.derived.settings for file in files]
+    said = _said(settings)
+    stored = "rendered images stored as JPEG" if any(s.jpeg for s in scores) else "stored lossless"
+    protocol = Protocol(
+        resolution=resolution_words([score.size for score in scores]),
+        split=agreed_setting(settings, "holdout") or UNSTATED,
+        stored=stored,
+        nets=nets,
+        remark=said,
+    )
+    variants: dict[Variant, None] = {}
+    for score in scores:
+        variants |= dict.fromkeys(score.scores)
+    stamped = [
+        number
+        for variant in variants or {RAW: None}
+        for number in stamped_measurements(
+            prefix,
+            variant,
+            [s.scores[variant] for s in scores if variant in s.scores],
+            protocol,
+            episodes=episodes,
+        )
+    ]
+    measurements = [number.measurement for number in stamped]
+    after = "; ".join(part for part in (stored, "mean of per-image values", said) if part)
+    measurements += _measure_depth(prefix, episodes, scores, after)
+    if not nets:
+        measurements.append(
+            Measurement(
+                id=f"{prefix}.lpips",
+                value=None,
+                unit="1",
+                definition="learned perceptual image patch similarity",
+                reason_if_undefined=LPIPS_NOT_COMPUTED,
+                episodes=tuple(episodes),
+            )
+        )
+    return measurements, stamped
+
+
 def _measure_depth(
-    part: str, episodes: Sequence[str], scores: Sequence[ViewScore], after: str
+    prefix: str, episodes: Sequence[str], scores: Sequence[ViewScore], after: str
 ) -> list[Measurement]:
     depths = [score.depth for score in scores if score.depth is not None]
     if not depths:
         return []
     return [
         measured(
-            f"views.{part}.{name}",
+            f"{prefix}.{name}",
             partial(_mean, statistic, values),
             unit="m",
             definition=f"{statistic}, {DEPTH_PROTOCOL}; {after}",
@@ -183,9 +244,17 @@ def _measure_depth(
     ]
 
 
-def _protocol(files: Iterable[DerivedFile]) -> str:
+def agreed_setting(settings: Sequence[Mapping[str, Any]], name: str) -> str:
+    """Return what all views say of one setting, or nothing."""
+    values = [each.get(name) for each in settings]
+    if not values or values[0] is None or any(value != values[0] for value in values):
+        return ""
+    value = values[0]
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _said(settings: Sequence[Mapping[str, Any]]) -> str:
     """What the views say about how their scenes were made, where they agree."""
-    said: list[Mapping[str, Any]] = [file.derived.settings for file in files]
     parts = []
     for name, text in (
         ("holdout", "held out: {}"),
@@ -196,11 +265,9 @@ def _protocol(files: Iterable[DerivedFile]) -> str:
         ("fit_cpu_seconds", "fitted in {} CPU seconds"),
         ("peak_memory_mb", "at most {} MB"),
     ):
-        values = [settings.get(name) for settings in said]
-        if values and values[0] is not None and all(value == values[0] for value in values):
-            value = values[0]
-            parts.append(text.format(", ".join(value) if isinstance(value, list) else value))
-    return f"; {'; '.join(parts)}" if parts else ""
+        if agreed := agreed_setting(settings, name):
+            parts.append(text.format(agreed))
+    return "; ".join(parts)
 
 
 def _mean(statistic: str, values: Iterable[float]) -> float:
@@ -208,34 +275,3 @@ def _mean(statistic: str, values: Iterable[float]) -> float:
     if not found:
         raise UndefinedStatisticError(statistic=statistic, reason="no pair of images has it")
     return float(np.mean(found))
-
-
-def _table(table_id: str, name: str, scores: Sequence[ViewScore]) -> Table:
-    return Table(
-        id=table_id,
-        title=f"Held-out views: {name}",
-        columns=(
-            *("camera", "stamp_ns", "PSNR (dB)", "SSIM", "pixels"),
-            *("PSNR gain (dB)", "PSNR affine (dB)", "PSNR pose and gain (dB)", "depth (mm)"),
-        ),
-        rows=tuple(
-            (
-                s.camera_id,
-                s.stamp_ns,
-                _rounded(s.scores["raw"].psnr_db, 3),
-                _rounded(s.scores["raw"].ssim, 4),
-                s.scores["raw"].num_pixels,
-                *(
-                    _rounded(s.scores[variant].psnr_db, 3) if variant in s.scores else None
-                    for variant in ("gain", "affine", "pose_gain")
-                ),
-                None if s.depth is None else round(1e3 * s.depth.mean_abs_m, 2),
-            )
-            for s in scores
-        ),
-        note=f"{PSNR_PROTOCOL}. {SSIM_PROTOCOL}. LPIPS {LPIPS_NOT_COMPUTED}.",
-    )
-
-
-def _rounded(value: float | None, digits: int) -> Cell:
-    return None if value is None else round(value, digits)

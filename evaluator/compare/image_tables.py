@@ -1,0 +1,145 @@
+"""Tables of image numbers: no row without the protocol it was measured by."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from evaluator.compare.image_measurements import StampedMeasurement
+from evaluator.compare.variants import AFFINE, GAIN, POSE_GAIN, RAW
+from evaluator.compare.view_images import ViewScore
+from evaluator.metrics.lpips import LPIPS_NOT_COMPUTED
+from evaluator.metrics.metric import ImageMetric
+from evaluator.metrics.scores import METRICS, PLAIN_METRICS
+from evaluator.metrics.stamp import Stamp, common_text
+from evaluator.result import Cell, Table
+
+PROTOCOL_COLUMN = "protocol"
+MISSING = "not computed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StampedValue:
+    """One cell of a table of image numbers."""
+
+    value: float | str | None
+    """A word where there is no number; None is undefined."""
+    stamp: Stamp
+
+
+def stamped_table(
+    table_id: str,
+    title: str,
+    heads: Sequence[str],
+    columns: Sequence[str],
+    rows: Iterable[tuple[Sequence[Cell], Sequence[StampedValue]]],
+    *,
+    note: str,
+) -> Table:
+    """Lay out rows of stamped values, with n and protocol behind the values.
+
+    Args:
+        table_id: Its name in files.
+        title: Above it.
+        heads: Names of the columns before the values.
+        columns: Names of the columns of values.
+        rows: What stands in front, and the values.
+        note: Below it.
+
+    Raises:
+        ValueError: When a row has another number of cells than columns.
+    """
+    laid = []
+    for front, values in rows:
+        if len(front) != len(heads) or len(values) != len(columns):
+            message = f"a row of table {table_id} has {len(front)} + {len(values)} cells"
+            raise ValueError(message)
+        stamps = [value.stamp for value in values]
+        numbers = [stamp.n for stamp in stamps if stamp.n]
+        views = max(numbers, default=None)
+        laid.append(
+            (*front, *(rounded(value.value) for value in values), views, common_text(stamps))
+        )
+    return Table(
+        id=table_id,
+        title=title,
+        columns=(*heads, *columns, "views", PROTOCOL_COLUMN),
+        rows=tuple(laid),
+        note=note,
+    )
+
+
+def cell_of(stamped: StampedMeasurement) -> StampedValue:
+    """Return what a table shows of a measurement."""
+    value: float | str | None = stamped.measurement.value
+    if stamped.measurement.reason_if_undefined == LPIPS_NOT_COMPUTED:
+        value = MISSING
+    return StampedValue(value=value, stamp=stamped.stamp)
+
+
+def stamp_table(table_id: str, title: str, stamped: Sequence[StampedMeasurement]) -> Table:
+    """List every number with its full stamp; the key tells numbers that may be compared."""
+    return Table(
+        id=table_id,
+        title=title,
+        columns=("id", "value", "key", PROTOCOL_COLUMN),
+        rows=tuple(
+            (
+                number.measurement.id,
+                rounded(number.measurement.value),
+                number.stamp.key,
+                number.stamp.text(),
+            )
+            for number in stamped
+        ),
+        note="Numbers may be compared where their keys are equal: then only the images and how "
+        "many there are can differ.",
+    )
+
+
+_ALIGNED = tuple(
+    (f"PSNR {words} (dB)", METRICS["psnr_db"], variant)
+    for words, variant in (("gain", GAIN), ("affine", AFFINE), ("pose and gain", POSE_GAIN))
+)
+
+
+def per_image_table(table_id: str, title: str, scores: Sequence[ViewScore]) -> Table:
+    """List every view with its raw scores, and PSNR after each alignment."""
+    others = [metric for metric in PLAIN_METRICS if metric.id not in ("psnr_db", "ssim")]
+    learned = [m for m in METRICS.values() if any(m.id in s.scores[RAW].values for s in scores)]
+    others += [metric for metric in learned if metric not in PLAIN_METRICS]
+    return Table(
+        id=table_id,
+        title=title,
+        columns=(
+            *("camera", "stamp_ns", "PSNR (dB)", "SSIM", "pixels"),
+            *(name for name, _, _ in _ALIGNED),
+            *("depth (mm)", *(metric.column for metric in others)),
+        ),
+        rows=tuple(
+            (
+                s.camera_id,
+                s.stamp_ns,
+                _rounded(s.scores[RAW].psnr_db, 3),
+                _rounded(s.scores[RAW].ssim, 4),
+                s.scores[RAW].num_pixels,
+                *(_rounded(s.psnr_db(variant), 3) for _, _, variant in _ALIGNED),
+                None if s.depth is None else round(1e3 * s.depth.mean_abs_m, 2),
+                *(_rounded(s.scores[RAW].values.get(metric.id), 4) for metric in others),
+            )
+            for s in scores
+        ),
+        note=_definitions((METRICS["psnr_db"], METRICS["ssim"], *others)),
+    )
+
+
+def _definitions(metrics: Iterable[ImageMetric]) -> str:
+    said = ". ".join(metric.definition for metric in metrics)
+    return f"{said}. LPIPS where a backbone is given. Full stamps: the table of protocols."
+
+
+def rounded(value: float | str | None) -> Cell:
+    """Return a cell with four digits behind the point; words stay as they are."""
+    return round(value, 4) if isinstance(value, float) else value
+
+
+def _rounded(value: float | None, digits: int) -> Cell:
+    return None if value is None else round(value, digits)

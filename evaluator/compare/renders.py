@@ -1,0 +1,217 @@
+"""``evaluate --renders``: whose folders are compared with what."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from bridge.episode.provenance import software
+from bridge.errors import GstError, PathNotFoundError, UsageError
+from bridge.exchange.tables import seconds_text
+from bridge.media.color import decode_color
+from evaluator.compare.image_sets import ImageSet, folder_set, list_files, read_mask
+from evaluator.compare.measure import slug
+from evaluator.compare.method_tables import method_tables
+from evaluator.compare.methods import Reference, compare_methods
+from evaluator.compare.replays import DerivedFile
+from evaluator.compare.rows import Comparison
+from evaluator.compare.view_images import RECORDED, RENDERED, Images, images_of
+from evaluator.compare.views import (
+    TWIN,
+    Source,
+    ViewReport,
+    agreed_setting,
+    newest_views,
+    opened,
+)
+from evaluator.errors import EvaluatorError
+from evaluator.metrics.lpips import PerceptualNet, open_nets
+from evaluator.metrics.options import ImageOptions
+from evaluator.metrics.stamp import UNSTATED
+
+
+def compare_folders(options: ImageOptions) -> Comparison:
+    """Compare folders of renders with a folder of recorded images, without any run.
+
+    Raises:
+        UsageError: When the reference or the renders are not named.
+        PathNotFoundError: When a folder is not there.
+        EvaluatorError: When nothing in them can be compared.
+    """
+    if options.reference is None or not options.renders:
+        message = "images alone need --reference FOLDER and --renders METHOD=FOLDER."
+        raise UsageError(message)
+    nets = open_nets(options.backbones)
+    report = _beside_folder(options, options.reference, nets)
+    return Comparison(
+        run=options.reference.resolve().name,
+        source="images",
+        stand_in=None,
+        measurements=report.measurements,
+        tables=report.tables,
+        exclusions=report.exclusions,
+        missing=report.missing,
+        views=report.views,
+        provenance={
+            "software": software(),
+            "reference": str(options.reference),
+            "methods": {name: str(folder) for name, folder in options.methods().items()},
+            "weights": [net.weights for net in nets],
+        },
+    )
+
+
+def compare_renders(
+    options: ImageOptions,
+    files: Sequence[DerivedFile],
+    sources: Mapping[str, Source],
+    *,
+    nets: Sequence[PerceptualNet] = (),
+) -> ViewReport:
+    """Compare folders of renders with the twin's own on the held-out views of a run.
+
+    A view is called ``camera/stamp_ns``; ``camera_stamp_ns`` and the names of ``export tum`` are
+    understood too. With a reference of their own, the folders are compared with that instead.
+
+    Args:
+        options: Whose folders; without any the report is empty.
+        files: Every derived episode of the run.
+        sources: Every recorded episode by its id.
+        nets: For LPIPS; none leaves it out.
+
+    Raises:
+        PathNotFoundError: When a folder is not there.
+        EvaluatorError: When the run has no views, or nothing can be compared.
+    """
+    if not options.renders:
+        options.refuse_unused()
+        return ViewReport()
+    if options.reference is not None:
+        return _beside_folder(options, options.reference, nets)
+    found, _ = newest_views(files, sources)  # what is left out, compare_views says
+    recorded, twin, masks = _sets_of(found, sources)
+    if not twin.load:
+        message = (
+            "the run has no rendered views to compare others with. Make them with robot-gst "
+            "rebuild, or name a folder of recorded images with --reference."
+        )
+        raise EvaluatorError(message)
+    split = agreed_setting([file.derived.settings for file in found], "holdout") or options.split
+    if options.masks is not None:
+        masks = {**masks, slug(options.masks.name): _masks(options.masks)}
+    reference = Reference(images=recorded, masks=masks, split=split)
+    names = _other_names(recorded.load)
+    others = [_renamed(method, names) for method in _methods(options, taken=(TWIN,))]
+    return _report(reference, [twin, *others], nets)
+
+
+def _beside_folder(
+    options: ImageOptions, folder: Path, nets: Sequence[PerceptualNet]
+) -> ViewReport:
+    images = folder_set(folder.resolve().name, folder)
+    masks = {} if options.masks is None else {slug(options.masks.name): _masks(options.masks)}
+    reference = Reference(images=images, masks=masks, split=options.split)
+    return _report(reference, _methods(options, taken=()), nets)
+
+
+def _report(
+    reference: Reference, methods: Sequence[ImageSet], nets: Sequence[PerceptualNet]
+) -> ViewReport:
+    report = compare_methods(reference, methods, nets=nets)
+    origin = ", ".join(f"{method.name} from {method.where}" for method in methods)
+    missing = []
+    if not nets:
+        missing.append("LPIPS of renders: no backbone (--lpips-vgg FILE, --lpips-alex FILE)")
+    if reference.split == UNSTATED:
+        missing.append("split of renders: nobody said which images were held out (--split TEXT)")
+    return ViewReport(
+        measurements=tuple(n.measurement for found in report.numbers.values() for n in found),
+        tables=method_tables(report, f"{origin}; recorded: {reference.images.where}"),
+        exclusions=report.exclusions,
+        missing=tuple(missing),
+        views=report.views,
+    )
+
+
+def _methods(options: ImageOptions, *, taken: Sequence[str]) -> list[ImageSet]:
+    seen = {slug(name): name for name in taken}
+    found = []
+    for name, folder in options.methods().items():
+        if slug(name) in seen:
+            message = (
+                f"--renders calls a method {name}, which ids cannot tell from {seen[slug(name)]}; "
+                "give it another name."
+            )
+            raise UsageError(message)
+        seen[slug(name)] = name
+        found.append(folder_set(name, folder))
+    return found
+
+
+def _masks(folder: Path) -> ImageSet:
+    if not folder.is_dir():
+        raise PathNotFoundError(path=folder, what="folder of masks", hint="Name a folder.")
+    return ImageSet(
+        name=folder.name,
+        where=str(folder),
+        load={view: partial(read_mask, paths[0]) for view, paths in list_files(folder).items()},
+        stored="masks",
+    )
+
+
+def _other_names(views: Iterable[str]) -> dict[str, str]:
+    """Return what else a view of the run may be called, where only one view is called so."""
+    found: dict[str, list[str]] = {}
+    for view in views:
+        camera, stamp = view.rsplit("/", 1)
+        seconds = seconds_text(int(stamp))
+        for name in (stamp, seconds, f"rgb/{seconds}"):
+            found.setdefault(name, []).append(view)
+        for name in (f"{camera}_{stamp}", f"{camera}/{seconds}", f"{camera}/rgb/{seconds}"):
+            found.setdefault(name, []).append(view)
+    return {name: of[0] for name, of in found.items() if len(of) == 1}
+
+
+def _renamed(method: ImageSet, names: Mapping[str, str]) -> ImageSet:
+    """Call the images of a method as the run calls its views."""
+    return replace(
+        method,
+        load={names.get(view, view): call for view, call in method.load.items()},
+        refused={names.get(view, view): reason for view, reason in method.refused.items()},
+    )
+
+
+def _sets_of(
+    files: Sequence[DerivedFile], sources: Mapping[str, Source]
+) -> tuple[ImageSet, ImageSet, dict[str, ImageSet]]:
+    """Return recorded images, the twin's renders, and masks of the views of a run."""
+    recorded, rendered = {}, {}
+    masks: dict[str, dict[str, partial[np.ndarray]]] = {}
+    refused = {}
+    for file in files:
+        try:
+            images = images_of(file.episode, opened(sources.get(file.derived.source_episode)))
+        except GstError as error:
+            refused[file.path.stem] = str(error)
+            continue
+        for key in images.color[RENDERED].keys() & images.color[RECORDED].keys():
+            view = f"{key[0]}/{key[1]}"
+            recorded[view] = partial(decode_color, images.color[RECORDED][key])
+            rendered[view] = partial(decode_color, images.color[RENDERED][key])
+            for name in images.masks_of(key):
+                masks.setdefault(name, {})[view] = partial(_mask, images, name, key)
+    where = "the run's views"
+    return (
+        ImageSet(name="recorded", where=where, load=recorded, refused=refused, stored="recorded"),
+        ImageSet(name=TWIN, where=where, load=rendered, stored="stored in the run's views"),
+        {
+            name: ImageSet(name=name, where=where, load=load, stored="masks")
+            for name, load in masks.items()
+        },
+    )
+
+
+def _mask(images: Images, name: str, key: tuple[str, int]) -> np.ndarray:
+    return images.masks_of(key)[name]
