@@ -17,10 +17,11 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "realsense": ("pyrealsense2",),
     "ur": ("example-robot-data",),
     "foundation": ("transformers", "safetensors"),
+    "lpips": ("torch", "safetensors", "torchmetrics"),
     "gpu": ("gsplat",),
     "cluster": ("ray",),
 }
-OPTIONAL = ("foundation", "gpu", "cluster")
+OPTIONAL = ("foundation", "lpips", "gpu", "cluster")
 """Nothing is wrong without these: all works on one machine's CPU and without weights of others."""
 NATIVE = (
     ("splat rasteriser", "twin.scene._splat", "no place can be rebuilt"),

@@ -14,7 +14,8 @@ from bridge.episode.writer import EpisodeWriter
 from evaluator.compare.run import compare_run
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.depth import score_depth
-from evaluator.metrics.image import ImageShapeError, aligned, score_image
+from evaluator.metrics.image import ImageShapeError, aligned
+from evaluator.metrics.scores import score_image
 
 STAMP = 5_000
 SIZE = (36, 44)

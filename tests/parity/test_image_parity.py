@@ -1,26 +1,44 @@
-"""PSNR and SSIM against scikit-image under the same protocol."""
+"""Image metrics against scikit-image, torchmetrics, the 3DGS convention, and plain definitions.
+
+Each reference runs under its own settings, in float64; it agrees with the metric named after it.
+"""
+
+import math
 
 import numpy as np
 import pytest
+import torch
+from scipy.signal import convolve2d
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from torch.nn import functional
 
-from evaluator.metrics.image import psnr_db, ssim
+from evaluator.metrics.gradient import gmsd
+from evaluator.metrics.image import psnr_db
+from evaluator.metrics.similarity import ms_ssim, ssim, ssim_maps
 
 pytestmark = pytest.mark.parity
+EXACT = 1e-9
+SIZES = [(12, 12), (32, 48), (61, 23)]
 
 
 def pair(seed: int, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    smooth = np.kron(rng.random((size[0] // 4, size[1] // 4, 3)), np.ones((4, 4, 1)))
+    blocks = rng.random((size[0] // 4 + 1, size[1] // 4 + 1, 3))
+    smooth = np.kron(blocks, np.ones((4, 4, 1)))[: size[0], : size[1]]
     return smooth, np.clip(smooth + rng.normal(scale=0.05, size=smooth.shape), 0, 1)
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("size", [(12, 12), (32, 48), (60, 20)])
+def tensors(images: tuple[np.ndarray, np.ndarray]) -> list[torch.Tensor]:
+    """Batches of one, channels first, float64."""
+    return [torch.from_numpy(i.copy()).permute(2, 0, 1)[None].contiguous() for i in images]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("size", SIZES)
 def test_scores_agree_with_scikit_image(seed: int, size: tuple[int, int]) -> None:
     recorded, replayed = pair(seed, size)
     assert psnr_db(recorded, replayed) == pytest.approx(
-        peak_signal_noise_ratio(recorded, replayed, data_range=1.0), abs=1e-9
+        peak_signal_noise_ratio(recorded, replayed, data_range=1.0), abs=EXACT
     )
     # use_sample_covariance=False and sigma=1.5 make scikit-image the window of Wang 2004; it
     # crops the border of half a window, as we do.
@@ -33,4 +51,137 @@ def test_scores_agree_with_scikit_image(seed: int, size: tuple[int, int]) -> Non
         sigma=1.5,
         use_sample_covariance=False,
     )
-    assert ssim(recorded, replayed) == pytest.approx(theirs, abs=1e-9)
+    assert ssim(recorded, replayed) == pytest.approx(theirs, abs=EXACT)
+
+
+@pytest.mark.slow  # loading torchmetrics takes seconds
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("size", SIZES)
+def test_scores_agree_with_torchmetrics(seed: int, size: tuple[int, int]) -> None:
+    from torchmetrics.functional.image import (
+        peak_signal_noise_ratio as their_psnr,
+    )
+    from torchmetrics.functional.image import (
+        structural_similarity_index_measure as their_ssim,
+    )
+
+    images = pair(seed, size)
+    recorded, replayed = tensors(images)
+    # torchmetrics multiplies by 10 / ln 10 in float32; in float64 it is the same number.
+    rounded = float(10 / torch.log(torch.tensor(10.0)))
+    psnr = float(their_psnr(replayed, recorded, data_range=1.0)) * (10 / math.log(10)) / rounded
+    assert psnr_db(*images) == pytest.approx(psnr, abs=EXACT)
+    similar = float(their_ssim(replayed, recorded, data_range=1.0))
+    assert ssim(*images, padding="reflect") == pytest.approx(similar, abs=EXACT)
+
+
+def splatting_ssim(recorded: torch.Tensor, replayed: torch.Tensor) -> float:
+    """SSIM as papers on 3D Gaussian splatting compute it: one 11 x 11 window, padded with zeros."""
+    reach = torch.arange(11, dtype=torch.float64) - 5
+    line = torch.exp(-(reach**2) / (2 * 1.5**2))
+    line /= line.sum()
+    window = torch.outer(line, line).expand(3, 1, 11, 11)
+
+    def windowed(image: torch.Tensor) -> torch.Tensor:
+        return functional.conv2d(image, window, padding=5, groups=3)
+
+    mean_a, mean_b = windowed(recorded), windowed(replayed)
+    var_a = windowed(recorded * recorded) - mean_a**2
+    var_b = windowed(replayed * replayed) - mean_b**2
+    cov = windowed(recorded * replayed) - mean_a * mean_b
+    top = (2 * mean_a * mean_b + 0.01**2) * (2 * cov + 0.03**2)
+    return float((top / ((mean_a**2 + mean_b**2 + 0.01**2) * (var_a + var_b + 0.03**2))).mean())
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_zero_padding_is_the_splatting_convention(size: tuple[int, int]) -> None:
+    images = pair(0, size)
+    theirs = splatting_ssim(*tensors(images))
+    assert ssim(*images, padding="zero") == pytest.approx(theirs, abs=EXACT)
+
+
+def test_the_three_customs_are_three_numbers() -> None:
+    maps = ssim_maps(*pair(0, (32, 48)))
+    found = [maps.mean(padding) for padding in ("valid", "zero", "reflect")]
+    assert min(abs(a - b) for a in found for b in found if a != b) > 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(176, 180), (201, 177)])
+def test_ms_ssim_agrees_with_torchmetrics_where_its_last_scale_is_mirrored(
+    size: tuple[int, int],
+) -> None:
+    from torchmetrics.functional.image import (
+        multiscale_structural_similarity_index_measure as theirs,
+    )
+
+    images = pair(1, size)
+    recorded, replayed = tensors(images)
+    expected = float(theirs(replayed, recorded, data_range=1.0))
+    # torchmetrics keeps the exponents as float32: 0.2856 is 0.28560001.
+    assert ms_ssim(*images, padding="reflect") == pytest.approx(expected, abs=2e-8)
+    weights = torch.tensor([0.0448, 0.2856, 0.3001, 0.2363, 0.1333])
+    ours = ms_ssim(*images, padding="reflect", weights=tuple(weights.double().tolist()))
+    assert ours == pytest.approx(expected, abs=EXACT)
+
+
+def plain_ms_ssim(recorded: np.ndarray, replayed: np.ndarray) -> float:
+    """Wang 2003 word for word with scikit-image's windows: five scales, windows inside only."""
+    product = 1.0
+    for scale, weight in enumerate((0.0448, 0.2856, 0.3001, 0.2363, 0.1333)):
+        mean, full = structural_similarity(
+            recorded,
+            replayed,
+            data_range=1.0,
+            channel_axis=-1,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+            full=True,
+        )
+        if scale == 4:
+            return product * mean**weight
+        blurred = [blur_valid(image) for image in (recorded, replayed)]
+        luminance = (2 * blurred[0] * blurred[1] + 1e-4) / (
+            blurred[0] ** 2 + blurred[1] ** 2 + 1e-4
+        )
+        product *= (full[5:-5, 5:-5] / luminance).mean() ** weight
+        recorded, replayed = (
+            i[: i.shape[0] // 2 * 2, : i.shape[1] // 2 * 2]
+            .reshape(i.shape[0] // 2, 2, i.shape[1] // 2, 2, 3)
+            .mean(axis=(1, 3))
+            for i in (recorded, replayed)
+        )
+    raise AssertionError
+
+
+def blur_valid(image: np.ndarray) -> np.ndarray:
+    line = np.exp(-0.5 * ((np.arange(11) - 5) / 1.5) ** 2)
+    line /= line.sum()
+    window = np.outer(line, line)
+    return np.stack([convolve2d(image[..., c], window, mode="valid") for c in range(3)], axis=-1)
+
+
+def test_ms_ssim_is_the_paper_s_with_windows_inside() -> None:
+    images = pair(2, (181, 190))
+    assert ms_ssim(*images) == pytest.approx(plain_ms_ssim(*images), abs=EXACT)
+
+
+@pytest.mark.parametrize("size", [(12, 12), (33, 48), (60, 21)])
+def test_gmsd_is_the_published_definition(size: tuple[int, int]) -> None:
+    recorded, replayed = pair(3, size)
+    even = size[0] // 2 * 2, size[1] // 2 * 2
+
+    def steepness(image: np.ndarray) -> np.ndarray:
+        luma = 255 * (0.299 * image[..., 0] + 0.587 * image[..., 1] + 0.114 * image[..., 2])
+        # The mean over two by two pixels, at every second of them, as the authors' program has it.
+        half = convolve2d(luma[: even[0], : even[1]], np.full((2, 2), 0.25), mode="full")[1:, 1:]
+        half = half[::2, ::2]
+        prewitt = np.array([[1, 0, -1]] * 3) / 3
+        x = convolve2d(half, prewitt, mode="same")
+        y = convolve2d(half, prewitt.T, mode="same")
+        return np.sqrt(x**2 + y**2)
+
+    g, h = steepness(recorded), steepness(replayed)
+    similar = (2 * g * h + 170) / (g**2 + h**2 + 170)
+    assert gmsd(recorded, replayed) == pytest.approx(similar.std(ddof=1), abs=EXACT)

@@ -1,0 +1,319 @@
+"""Several methods on the same views: what is compared, what is left out, and what is said."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from skimage.metrics import peak_signal_noise_ratio
+
+from bridge.episode.run import RunFolder
+from bridge.errors import PathNotFoundError, UsageError
+from evaluator.cli import evaluate
+from evaluator.compare.renders import compare_folders
+from evaluator.compare.rows import Comparison
+from evaluator.compare.run import compare_run
+from evaluator.compare.view_quality import PICTURE_WIDTH_PX, shrunk_u8
+from evaluator.errors import EvaluatorError
+from evaluator.metrics.options import ImageOptions
+
+SIZE = (48, 64)
+
+
+def picture(seed: int, size: tuple[int, int] = SIZE) -> np.ndarray:
+    blocks = np.random.default_rng(seed).integers(20, 235, (size[0] // 8, size[1] // 8, 3))
+    return np.kron(blocks, np.ones((8, 8, 1))).astype(np.uint8)
+
+
+def noisy(image: np.ndarray, scale: float) -> np.ndarray:
+    noise = np.random.default_rng(1).normal(scale=scale, size=image.shape)
+    return np.clip(image + noise, 0, 255).astype(np.uint8)
+
+
+def save(image: np.ndarray, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(image).save(path)
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> Path:
+    """``recorded`` and the methods ``good`` and ``poor``, three views each."""
+    for index in range(3):
+        recorded = picture(index)
+        save(recorded, tmp_path / "recorded" / f"{index:04}.png")
+        save(noisy(recorded, 4), tmp_path / "good" / f"{index:04}.png")
+        save(noisy(recorded, 20), tmp_path / "poor" / f"{index:04}.png")
+    return tmp_path
+
+
+def compared(folders: Path, **changes: object) -> Comparison:
+    options = {
+        "reference": folders / "recorded",
+        "renders": (f"good={folders / 'good'}", f"poor={folders / 'poor'}"),
+        **changes,
+    }
+    return compare_folders(ImageOptions(**options))  # type: ignore[arg-type]
+
+
+def reasons(comparison: Comparison) -> dict[str, str]:
+    return {e.episode: e.reason for e in comparison.exclusions if e.scope == "images"}
+
+
+def test_each_method_has_its_means_over_the_same_views(folders: Path) -> None:
+    results = compared(folders, split="every 8th frame").results()
+    psnr = results.get("image.good.psnr_db")
+    by_hand = [
+        peak_signal_noise_ratio(picture(i), noisy(picture(i), 4), data_range=255) for i in range(3)
+    ]
+    assert psnr.value == pytest.approx(np.mean(by_hand), abs=1e-9)
+    assert psnr.n == 3
+    for words in (
+        "64 x 48",
+        "every 8th frame",
+        "no colour alignment",
+        "stored as png",
+        "full frame",
+    ):
+        assert words in psnr.definition
+    assert results.get("image.poor.psnr_db").value < psnr.value
+    assert results.get("image.good.ssim_zero").value > results.get("image.poor.ssim_zero").value
+    assert results.get("image.good.gmsd").value < results.get("image.poor.gmsd").value
+    assert "176 pixels" in str(results.get("image.good.ms_ssim").reason_if_undefined)
+    results.to_record()  # fits the schema
+
+
+def test_the_headline_is_laid_out_as_the_paper_s_with_the_protocol_in_each_row(
+    folders: Path,
+) -> None:
+    tables = {table.id: table for table in compared(folders).tables}
+    table = tables["image_methods"]
+    assert table.columns == ("method", "PSNR (dB)", "SSIM", "LPIPS (vgg)", "views", "protocol")
+    assert [row[0] for row in table.rows] == ["good", "poor"]
+    assert {row[3] for row in table.rows} == {"not computed"}
+    assert all("split not stated" in str(row[-1]) for row in table.rows)
+    assert all("64 x 48" in str(row[-1]) for row in table.rows)
+    assert "not stated" in str(tables["image_paper"].rows[0][-1])
+    assert {row[1] for row in tables["image_all"].rows} == {"raw", "gain", "affine"}
+    assert len(tables["image_views"].rows) == 6
+    keys = {row[0]: row[2] for row in tables["image_protocol"].rows}
+    assert keys["image.good.ssim"] == keys["image.poor.ssim"]
+    assert keys["image.good.ssim"] != keys["image.good.ssim_zero"]
+
+
+def test_lpips_is_not_computed_without_a_backbone_and_says_so(folders: Path) -> None:
+    comparison = compared(folders)
+    assert not any("lpips" in m.id for m in comparison.measurements)
+    assert any("no backbone" in text for text in comparison.missing)
+
+
+def test_masks_are_two_more_ways_to_look(folders: Path) -> None:
+    mask = np.zeros(SIZE, dtype=np.uint8)
+    mask[16:40, 16:48] = 255
+    for index in range(3):
+        save(mask, folders / "cup" / f"{index:04}.png")
+    results = compared(folders, masks=folders / "cup").results()
+    pixels = results.get("image.good.psnr_cup_db")
+    assert "only the pixels of the mask 'cup'" in pixels.definition
+    black = results.get("image.good.ssim_cup_black")
+    assert "both images black outside the mask 'cup'" in black.definition
+    whole = results.get("image.good.ssim")
+    assert None not in (black.value, whole.value)
+    assert black.value > whole.value
+
+
+def break_views(folders: Path) -> dict[str, Callable[[], object]]:
+    """Ways to spoil the view 0001 of the method ``good``."""
+    path = folders / "good" / "0001.png"
+    image = noisy(picture(1), 4)
+    as_float = image / 255.0
+
+    def array(values: np.ndarray) -> None:
+        path.unlink()
+        np.save(path.with_suffix(".npy"), values)
+
+    def sixteen_bits() -> None:
+        path.write_bytes(rgb16_png(image))
+
+    return {
+        "no image of this name": path.unlink,
+        r"\(40, 64, 3\)": lambda: save(image[:40], path),
+        "red and blue look swapped": lambda: save(image[..., ::-1], path),
+        "is grey": lambda: save(image[..., 0], path),
+        "transparency": lambda: save(np.dstack([image, image[..., 0]]), path),
+        "16 bits for each channel": sixteen_bits,
+        "not finite": lambda: array(np.where(as_float > 0.9, np.nan, as_float)),
+        "high dynamic range, or not clamped": lambda: array(4 * as_float),
+        "uint16 values of 16 bits": lambda: array(image.astype(np.uint16) * 257),
+        "channels first": lambda: array(np.moveaxis(as_float, -1, 0)),
+        "four channels": lambda: array(np.dstack([as_float, as_float[..., 0]])),
+        "not an array of numbers": lambda: array(np.array([{"a": 1}], dtype=object)),
+        "cannot be read": lambda: path.write_bytes(path.read_bytes()[:200]),
+        "neither PNG nor JPEG": lambda: path.write_bytes(b"GIF89a"),
+        "two images of one name": lambda: save(image, path.with_suffix(".jpg")),
+        "is high dynamic range": lambda: path.rename(path.with_suffix(".exr")),
+    }
+
+
+def rgb16_png(image: np.ndarray) -> bytes:
+    """A 16-bit colour PNG, which Pillow cannot write."""
+    import struct
+    import zlib
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        checked = kind + data
+        return struct.pack(">I", len(data)) + checked + struct.pack(">I", zlib.crc32(checked))
+
+    height, width, _ = image.shape
+    wide = (image.astype(">u2") * 257).reshape(height, -1)
+    rows = b"".join(b"\0" + row.tobytes() for row in wide)
+    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
+    parts = (chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+WAYS = tuple(break_views(Path("nowhere")))
+
+
+@pytest.mark.parametrize("words", WAYS)
+def test_a_broken_view_is_named_and_counts_for_no_method(folders: Path, words: str) -> None:
+    import re
+
+    break_views(folders)[words]()
+    comparison = compared(folders)
+    left_out = reasons(comparison)
+    assert re.search(words, left_out["good: 0001"]), left_out
+    assert "left out for every method: no score of good" in left_out["0001"]
+    assert {comparison.results().get(f"image.{m}.psnr_db").n for m in ("good", "poor")} == {2}
+
+
+def test_an_opaque_alpha_channel_and_arrays_and_jpeg_are_read(folders: Path) -> None:
+    image = noisy(picture(0), 4)
+    (folders / "good" / "0000.png").unlink()
+    np.save(folders / "good" / "0000.npy", image / 255.0)
+    opaque = np.dstack([noisy(picture(1), 4), np.full(SIZE, 255, dtype=np.uint8)])
+    save(opaque, folders / "good" / "0001.png")
+    (folders / "good" / "0002.png").unlink()
+    save(noisy(picture(2), 4), folders / "good" / "0002.jpg")
+    comparison = compared(folders)
+    assert not comparison.exclusions
+    psnr = comparison.results().get("image.good.psnr_db")
+    assert psnr.n == 3
+    assert "stored as jpg, npy, png" in psnr.definition
+
+
+def test_a_broken_recorded_image_costs_its_view_only(folders: Path) -> None:
+    save(picture(1)[..., 0], folders / "recorded" / "0001.png")
+    comparison = compared(folders)
+    assert "recorded image: 0001.png is grey" in reasons(comparison)["0001"]
+    assert comparison.results().get("image.good.psnr_db").n == 2
+
+
+def test_images_the_reference_does_not_have_are_named(folders: Path) -> None:
+    save(picture(7), folders / "poor" / "train" / "0007.png")
+    assert "the reference has no such image" in reasons(compared(folders))["poor: train/0007"]
+
+
+def test_a_method_with_all_channels_swapped_is_left_out_whole(folders: Path) -> None:
+    for path in sorted((folders / "poor").iterdir()):
+        save(np.asarray(Image.open(path))[..., ::-1], path)
+    comparison = compared(folders)
+    assert "the whole method" in reasons(comparison)["poor"]
+    assert comparison.results().get("image.good.psnr_db").n == 3
+    assert not any(m.id.startswith("image.poor") for m in comparison.measurements)
+
+
+def test_identical_images_are_counted_and_not_averaged_as_infinite(folders: Path) -> None:
+    save(picture(1), folders / "good" / "0001.png")
+    psnr = compared(folders).results().get("image.good.psnr_db")
+    assert psnr.n == 2
+    assert "not in the mean: 1 of 3 images (the images are identical)" in psnr.definition
+
+
+def test_nothing_in_common_is_an_error_that_shows_both_namings(folders: Path) -> None:
+    for path in sorted((folders / "good").iterdir()):
+        path.rename(path.with_name(f"frame_{path.name}"))
+    with pytest.raises(EvaluatorError, match=r"0000.*frame_0000.*Name renders as"):
+        compared(folders, renders=(f"good={folders / 'good'}",))
+
+
+def test_wrong_use_is_told_apart(folders: Path) -> None:
+    with pytest.raises(PathNotFoundError, match="folder of images"):
+        compared(folders, reference=folders / "nowhere")
+    (folders / "empty").mkdir()
+    with pytest.raises(EvaluatorError, match="holds no image"):
+        compared(folders, reference=folders / "empty")
+    with pytest.raises(UsageError, match="two methods called"):
+        compared(folders, renders=(f"a={folders / 'good'}", f"a={folders / 'poor'}"))
+    with pytest.raises(UsageError, match="cannot tell"):
+        compared(folders, renders=(f"a b={folders / 'good'}", f"a_b={folders / 'poor'}"))
+    with pytest.raises(UsageError, match="METHOD=FOLDER"):
+        compared(folders, renders=("=x",))
+    with pytest.raises(UsageError, match="--reference"):
+        evaluate(images=ImageOptions(renders=(f"a={folders / 'good'}",)))
+
+
+def test_the_worst_views_keep_small_pictures(tmp_path: Path) -> None:
+    for index in range(6):
+        recorded = picture(index, (400, 648))
+        save(recorded, tmp_path / "recorded" / f"{index}.png")
+        save(noisy(recorded, 3 + 2 * index), tmp_path / "good" / f"{index}.png")
+    comparison = compared(tmp_path, renders=(f"good={tmp_path / 'good'}",))
+    assert len(comparison.views) == 6
+    pictured = [v for v in comparison.views if v.rendered_u8 is not None]
+    assert [v.view_id for v in pictured] == ["2", "3", "4", "5"]
+    assert all(v.rendered_u8.shape == (133, 216, 3) for v in pictured)
+    assert pictured[0].values["psnr_gain_db"] >= pictured[0].values["psnr_db"] - 0.01
+
+
+def test_pictures_are_averaged_squares() -> None:
+    image = picture(3, (96, 960))
+    small = shrunk_u8(image)
+    assert small.shape == (32, 320, 3)
+    assert small.shape[1] <= PICTURE_WIDTH_PX
+    np.testing.assert_array_equal(small[0, 0], np.rint(image[:3, :3].mean(axis=(0, 1))))
+    np.testing.assert_array_equal(shrunk_u8(image / 255.0), small)
+
+
+def test_a_run_s_views_are_compared_with_the_twin_s_own(
+    evaluation_run: RunFolder, tmp_path: Path
+) -> None:
+    views = compare_run(evaluation_run).views
+    assert {view.method for view in views} == {"twin"}
+    for view in views:
+        camera, stamp = view.view_id.split("/")
+        assert view.recorded_u8 is not None or len(views) > 4
+        if view.recorded_u8 is not None:
+            save(noisy(view.recorded_u8, 6), tmp_path / "other" / f"{camera}_{stamp}.png")
+    options = ImageOptions(renders=(f"other={tmp_path / 'other'}",))
+    comparison = compare_run(evaluation_run, images=options)
+    results = comparison.results()
+    there = len(list((tmp_path / "other").iterdir()))
+    assert {results.get(f"image.{m}.psnr_db").n for m in ("twin", "other")} == {there}
+    table = next(t for t in results.tables if t.id == "image_methods")
+    assert [row[0] for row in table.rows] == ["twin", "other"]
+    results.to_record()
+
+
+def test_the_command_writes_a_report_of_images_alone(folders: Path) -> None:
+    out = folders / "out"
+    options = ImageOptions(
+        reference=folders / "recorded", renders=(str(folders / "good"), str(folders / "poor"))
+    )
+    assert evaluate(images=options, out=out) == 0
+    record = json.loads((out / "results.json").read_text())
+    assert record["source"] == "images"
+    assert (out / "report.html").is_file()
+    assert "image_methods" in {table["id"] for table in record["tables"]}
+    assert evaluate(images=options, out=out, fail_under="image.good.psnr_db=99") == 3
+
+
+def test_views_of_a_run_may_be_called_as_export_tum_calls_them() -> None:
+    from evaluator.compare.renders import _other_names
+
+    names = _other_names(["wrist/1500000000", "side/1500000000", "side/2000000001"])
+    assert names["wrist_1500000000"] == "wrist/1500000000"
+    assert names["side/rgb/1.500000000"] == "side/1500000000"
+    assert names["rgb/2.000000001"] == "side/2000000001"
+    assert "1.500000000" not in names  # two cameras have it

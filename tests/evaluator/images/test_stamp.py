@@ -1,0 +1,68 @@
+"""The protocol stamp: nothing without it, and what it makes of several numbers in a row."""
+
+from dataclasses import replace
+
+import pytest
+
+from evaluator.compare.image_tables import StampedValue, stamped_table
+from evaluator.compare.method_tables import paper_table
+from evaluator.metrics.stamp import Stamp, common_text
+
+STAMP = Stamp(
+    metric="SSIM",
+    implementation="evaluator.metrics.similarity 1",
+    window="gaussian 11 x 11 sigma 1.5",
+    padding="zeros",
+    resolution="640 x 480",
+    alignment="no colour alignment",
+    split="every 8th frame",
+    stored="stored as png",
+    n=12,
+)
+
+
+@pytest.mark.parametrize("name", ["resolution", "split", "alignment", "mask", "stored", "window"])
+def test_a_stamp_with_a_blank_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        replace(STAMP, **{name: "  "})
+
+
+def test_the_key_changes_with_the_protocol_and_not_with_the_number_of_images() -> None:
+    assert replace(STAMP, n=40).key == STAMP.key
+    for change in ({"padding": "mirrored"}, {"resolution": "320 x 240"}, {"weights": "abc"}):
+        assert replace(STAMP, **change).key != STAMP.key
+
+
+def test_a_row_says_once_what_its_numbers_share() -> None:
+    psnr = replace(STAMP, metric="PSNR (dB)", window="none", padding="none", implementation="x 1")
+    text = common_text([psnr, STAMP])
+    assert text.count("640 x 480") == 1
+    assert "SSIM: " in text
+    assert "padding zeros" in text
+    assert "split every 8th frame" in text
+
+
+def test_a_table_has_no_row_without_a_stamp() -> None:
+    with pytest.raises(ValueError, match="at least one protocol stamp"):
+        stamped_table("t", "T", ("method",), (), [(("ours",), [])], note="")
+    with pytest.raises(TypeError):
+        StampedValue(value=1.0)  # type: ignore[call-arg]
+    table = stamped_table(
+        "t",
+        "T",
+        ("method",),
+        ("SSIM",),
+        [(("ours",), [StampedValue(value=0.91, stamp=STAMP)])],
+        note="",
+    )
+    row = dict(zip(table.columns, table.rows[0], strict=True))
+    assert row["views"] == 12
+    assert "640 x 480" in str(row["protocol"])
+
+
+def test_the_paper_s_table_is_printed_with_what_it_does_not_state() -> None:
+    table = paper_table()
+    rows = {row[0]: row for row in table.rows}
+    assert rows["Robot-GST"][1:4] == (24.64, 0.963, 0.044)
+    assert all("not stated" in str(row[-1]) for row in table.rows)
+    assert "not measured here" in table.note

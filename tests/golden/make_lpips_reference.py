@@ -1,0 +1,85 @@
+"""Write ``lpips_reference.json``: what the ``lpips`` package gives, for tests that run without it.
+
+Run in an environment of its own with ``pip install lpips==0.1.4 torch``: the package needs
+torchvision, which does not import beside a torch without CUDA, and its presence alone would change
+what other packages import. The backbones are drawn from a seed, so no download is needed; the
+linear heads are the package's own.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+PATH = Path(__file__).with_name("lpips_reference.json")
+SIZE = (70, 96)
+"""Not a multiple of what the poolings halve."""
+VGG = [
+    *((0, 3, 64, 3), (2, 64, 64, 3), (5, 64, 128, 3), (7, 128, 128, 3), (10, 128, 256, 3)),
+    *((12, 256, 256, 3), (14, 256, 256, 3), (17, 256, 512, 3), (19, 512, 512, 3)),
+    *((21, 512, 512, 3), (24, 512, 512, 3), (26, 512, 512, 3), (28, 512, 512, 3)),
+]
+ALEX = [(0, 3, 64, 11), (3, 64, 192, 5), (6, 192, 384, 3), (8, 384, 256, 3), (10, 256, 256, 3)]
+"""Index in ``features``, channels in, channels out, size."""
+
+
+def backbone(net: str) -> dict[str, np.ndarray]:
+    """Draw the weights of a network from a seed, named as torchvision names them."""
+    rng = np.random.default_rng({"vgg": 16, "alex": 8}[net])
+    state = {}
+    for index, channels_in, channels_out, size in {"vgg": VGG, "alex": ALEX}[net]:
+        shape = (channels_out, channels_in, size, size)
+        spread = np.float32(np.sqrt(2.0 / (channels_in * size * size)))
+        state[f"features.{index}.weight"] = rng.standard_normal(shape, dtype=np.float32) * spread
+        bias = rng.standard_normal(channels_out, dtype=np.float32)
+        state[f"features.{index}.bias"] = bias * np.float32(0.1)
+    return state
+
+
+def images(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Draw a pair of images (height, width, 3) in 0..1."""
+    rng = np.random.default_rng(seed)
+    blocks = np.kron(rng.random((SIZE[0] // 5, SIZE[1] // 4, 3)), np.ones((5, 4, 1)))
+    noisy = np.clip(blocks + rng.normal(scale=0.02 * (seed + 1), size=blocks.shape), 0, 1)
+    return blocks, noisy
+
+
+def stub_torchvision() -> list[object]:
+    """Let torchvision import without its CUDA operators; keep what is returned alive."""
+    import torch
+
+    library = torch.library.Library("torchvision", "DEF")
+    library.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+    library.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+    return [library]
+
+
+def main() -> None:
+    """Ask the package about three pairs, with both networks and both ranges of input."""
+    import torch
+
+    alive = stub_torchvision()
+    import lpips
+
+    cases = []
+    for net in ("vgg", "alex"):
+        model = lpips.LPIPS(net=net, pnet_rand=True, verbose=False)
+        state = {}
+        for name, value in backbone(net).items():
+            own = next(n for n in model.net.state_dict() if n.split(".", 1)[1] == name[9:])
+            state[own] = torch.from_numpy(value)
+        model.net.load_state_dict(state, strict=True)
+        for seed in range(3):
+            pair = [torch.from_numpy(i).permute(2, 0, 1)[None].float() for i in images(seed)]
+            for given, normalize in (("01", False), ("pm1", True)):
+                with torch.no_grad():
+                    value = float(model(*pair, normalize=normalize))
+                cases.append({"net": net, "seed": seed, "input": given, "value": value})
+    del alive
+    version = sys.modules["importlib.metadata"].version("lpips")
+    PATH.write_text(json.dumps({"lpips": version, "cases": cases}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
