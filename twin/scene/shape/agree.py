@@ -9,46 +9,28 @@ from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
 from twin.scene.shape.masked_view import MaskedView
+from twin.scene.shape.seen_surface import SeenSurface, seen_surface
 
-MAX_POINTS = 500
-"""Points of one view that are compared."""
-MAX_HEIGHTS = 400
-"""Points of the plane that one view contributes."""
-NORMAL_PX = 2
-"""Normals come from pixels this far to each side."""
-FLAT_M = 0.015
-"""Pixels whose neighbours differ by more have no normal."""
-NORMAL_M = 0.02
+NORMAL_M = 0.06
 """A normal turned by one radian counts like this distance: two sides of a wall do not meet."""
 NEIGHBOURS = 24
 MIN_NEIGHBOURS = 3
 """Points of other views that a point is compared with, at most and at least."""
 REACH_M = 0.012
 """Points farther from what others saw, or from the plane, are not asked."""
-PLANE_AROUND_M = 0.08
-"""How far around the object the plane is looked at."""
 POINT_SIGMA_M = 0.001
 SHARED_ERROR = 9.0
 """Standard error of a point, and how many neighbouring points share one error."""
-SHIFT_SIGMA_M, TURN_SIGMA_RAD = 0.006, 0.002
-"""How far a view may be moved; holds what the points leave open. The plane says most of the turns,
-and a small object says little about them."""
-OFFSET_SIGMA_M = 0.0005
-"""How wrong a sensor's depth may be beyond what shifts explain."""
+SHIFT_SIGMA_M, TURN_SIGMA_RAD = 0.003, 0.002
+"""How far one view may be moved by itself; holds what the points leave open."""
+MOUNT_SHIFT_SIGMA_M, MOUNT_TURN_SIGMA_RAD = 0.005, 0.006
+"""How wrong a sensor's place on what carries it may be: all its views share that."""
+OFFSET_SIGMA_M, SCALE_SIGMA = 0.002, 0.005
+"""How wrong a sensor's depth may be, at any distance and per metre."""
 CONVERGED = 2e-5
 """Smaller steps, in metres and radians, change nothing."""
-
-
-@dataclass(frozen=True)
-class _Surface:
-    """Oriented points of one view, and points of the plane around, each with its ray."""
-
-    points: Float[np.ndarray, "num_points 3"]
-    normals: Float[np.ndarray, "num_points 3"]
-    rays: Float[np.ndarray, "num_points 3"]
-    """How a point moves when depth grows."""
-    plane: Float[np.ndarray, "num_plane 3"]
-    plane_rays: Float[np.ndarray, "num_plane 3"]
+OWN, SHARED = 6, 8
+"""Unknowns of a view (shift, turn) and of a sensor (shift, turn, offset, scale)."""
 
 
 @dataclass(frozen=True)
@@ -56,24 +38,51 @@ class _State:
     """What is being found."""
 
     moves: Float[np.ndarray, "num_views 6"]
-    """Of each view: its shift [m], then its turn about the pivot [rad]."""
-    offsets_m: Float[np.ndarray, " num_sensors"]
-    """Added to the depth of each sensor."""
+    """Of each view in base: its shift [m], then its turn about the pivot [rad]."""
+    errors: Float[np.ndarray, "num_sensors 8"]
+    """Of each sensor in its own frame: shift [m], turn [rad], depth offset [m], depth scale."""
     sensors: Int[np.ndarray, " num_views"]
     """Number of each view's sensor."""
     pivot: Float[np.ndarray, "3"]
 
-    def motion(self, view: int) -> Float[np.ndarray, "4 4"]:
-        """Turn about the pivot, then shift."""
+    def pose(self, view: int, T_base_camera: Float[np.ndarray, "4 4"]) -> np.ndarray:
+        """Where a view's camera is now thought to be."""
         T = np.eye(4)
         T[:3, :3] = se3.rotation_from_vector(self.moves[view, 3:])
         T[:3, 3] = self.pivot - T[:3, :3] @ self.pivot + self.moves[view, :3]
-        return T
+        mount = np.eye(4)
+        mount[:3, :3] = se3.rotation_from_vector(self.errors[self.sensors[view], 3:6])
+        mount[:3, 3] = self.errors[self.sensors[view], :3]
+        return np.asarray(T @ T_base_camera @ mount)
 
-    def placed(self, view: int, points: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        """Points of a view where they are now thought to be."""
-        deeper = points + self.offsets_m[self.sensors[view]] * rays
-        return np.asarray(se3.apply(self.motion(view), deeper))
+    def deeper(self, view: int, points: Float[np.ndarray, "num_points 3"]) -> np.ndarray:
+        """Points of a view, in its camera's frame, with the depth as it is now thought to be."""
+        offset, scale = self.errors[self.sensors[view], 6:]
+        return np.asarray(points * (1 + scale + offset / np.maximum(points[:, 2:], 1e-9)))
+
+    @property
+    def num_unknowns(self) -> int:
+        """Those of all views, then those of all sensors."""
+        return int(self.moves.size + self.errors.size)
+
+    def columns(self, sensor: int) -> slice:
+        """Where a sensor's unknowns are."""
+        first = self.moves.size + SHARED * sensor
+        return slice(first, first + SHARED)
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """All points of all views where they are now thought to be."""
+
+    owner: Int[np.ndarray, " num_points"]
+    """View of each point."""
+    p_camera: Float[np.ndarray, "num_points 3"]
+    p_base: Float[np.ndarray, "num_points 3"]
+    normals: Float[np.ndarray, "num_points 3"]
+    """In base."""
+    Rs: Float[np.ndarray, "num_views 3 3"]
+    """Rotations camera to base."""
 
 
 def laid_together(
@@ -84,10 +93,11 @@ def laid_together(
     Robust point-to-plane steps for all views at once. Together is essential: views from around an
     object that all stand a little too far out agree with their neighbours to a fraction of the
     error, so moving one after the other hardly undoes what makes the whole too thin or too thick.
-    Each sensor's depth gets one offset: an error along the rays widens what it sees of near things
-    across, which no motion undoes. Compared with the mean of points that face the same way, not
-    with a carved shape: where views disagree carving takes away more than it leaves. What nothing
-    but the poses says (where the object is on the plane) stays as it was on average.
+    What one sensor gets wrong in every view (where it sits on what carries it, its depth by an
+    offset and by a factor) is one set of unknowns; a single view is moved little beyond that.
+    Compared with the mean of points that face the same way, not with a carved shape: where views
+    disagree carving takes away more than it leaves. On average the object stays where the poses as
+    given have it.
 
     Args:
         views: What a shape will be made from.
@@ -95,18 +105,18 @@ def laid_together(
         rounds: How many steps at most; 0 changes nothing.
 
     Returns:
-        The moved views, and the root mean square of the shifts [m].
+        The moved views, and how far they moved what they show, root mean square [m].
     """
     if rounds == 0:
         return list(views), 0.0
-    surfaces = [_surface(view, support_z_m) for view in views]
-    seen = [surface.points for surface in surfaces if len(surface.points)]
+    surfaces = [seen_surface(view, with_plane=support_z_m is not None) for view in views]
+    seen = [se3.apply(s.T_base_camera, s.points) for s in surfaces if len(s.points)]
     if not seen:
         return list(views), 0.0
     names, sensors = np.unique([view.sensor for view in views], return_inverse=True)
     state = _State(
-        moves=np.zeros((len(views), 6)),
-        offsets_m=np.zeros(len(names)),
+        moves=np.zeros((len(views), OWN)),
+        errors=np.zeros((len(names), SHARED)),
         sensors=sensors,
         pivot=np.concatenate(seen).mean(axis=0),
     )
@@ -116,97 +126,150 @@ def laid_together(
         state = replace(
             state,
             moves=state.moves + step[:split].reshape(state.moves.shape),
-            offsets_m=state.offsets_m + step[split:],
+            errors=state.errors + step[split:].reshape(state.errors.shape),
         )
         if np.abs(step).max() < CONVERGED:
             break
-    moved = [
-        replace(
-            view,
-            T_base_camera=state.motion(index) @ view.T_base_camera,
-            depth_m=_deeper(view, float(state.offsets_m[sensors[index]])),
-        )
-        for index, view in enumerate(views)
-    ]
-    return moved, float(np.sqrt(np.square(state.moves[:, :3]).sum(axis=1).mean()))
+    before, after = np.concatenate(seen), _placed(surfaces, state).p_base
+    T_back = _back(before, after, on_plane=support_z_m is not None)
+    moved = [_moved(view, index, state, T_back) for index, view in enumerate(views)]
+    away = se3.apply(T_back, after) - before
+    return moved, float(np.sqrt(np.square(away).sum(axis=1).mean()))
 
 
-def _deeper(view: MaskedView, offset_m: float) -> Float[np.ndarray, "height width"]:
+def _back(
+    before: Float[np.ndarray, "num_points 3"],
+    after: Float[np.ndarray, "num_points 3"],
+    *,
+    on_plane: bool,
+) -> Float[np.ndarray, "4 4"]:
+    """Undo what only the poses as given can say: where the object is, and which way it looks.
+
+    On the plane that is a shift along it and a turn about its normal, in the air a shift.
+    """
+    T = np.eye(4)
+    middles = before.mean(axis=0), after.mean(axis=0)
+    if on_plane:
+        a, b = (p[:, :2] - middle[:2] for p, middle in zip((before, after), middles, strict=True))
+        yaw = np.arctan2(np.sum(b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0]), np.sum(a * b))
+        T[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, yaw]))
+    T[:3, 3] = middles[0] - T[:3, :3] @ middles[1]
+    if on_plane:
+        T[2, 3] = 0.0
+    return T
+
+
+def _moved(
+    view: MaskedView, index: int, state: _State, T_back: Float[np.ndarray, "4 4"]
+) -> MaskedView:
+    offset, scale = state.errors[state.sensors[index], 6:].astype(np.float32)
     depth = view.known_depth_m()
-    return np.where(depth > 0, np.maximum(depth + np.float32(offset_m), 0.0), depth)
+    return replace(
+        view,
+        T_base_camera=T_back @ state.pose(index, view.T_base_camera),
+        depth_m=np.where(depth > 0, np.maximum(depth * (1 + scale) + offset, 0.0), depth),
+    )
 
 
 def _step(
-    surfaces: Sequence[_Surface], state: _State, support_z_m: float | None
+    surfaces: Sequence[SeenSurface], state: _State, support_z_m: float | None
 ) -> Float[np.ndarray, " num_unknowns"]:
-    """One Gauss-Newton step on the moves of all views, then the offsets of all sensors."""
+    """One Gauss-Newton step on the moves of all views, then the errors of all sensors."""
     H, gradient = _agreement(surfaces, state)
     if support_z_m is not None:
-        for index, surface in enumerate(surfaces):
-            H_plane, g_plane = _on_plane(surface, index, state, support_z_m)
-            own = np.append(np.arange(6 * index, 6 * index + 6), _column(state, index))
+        for view, surface in enumerate(surfaces):
+            H_plane, g_plane = _on_plane(surface, view, state, support_z_m)
+            shared = state.columns(int(state.sensors[view]))
+            own = np.r_[OWN * view : OWN * view + OWN, shared]
             H[np.ix_(own, own)] += H_plane
             gradient[own] += g_plane
+    own_sigma = np.repeat([SHIFT_SIGMA_M, TURN_SIGMA_RAD], 3)
+    mount_sigma = np.repeat([MOUNT_SHIFT_SIGMA_M, MOUNT_TURN_SIGMA_RAD], 3)
+    sensor_sigma = np.concatenate([mount_sigma, [OFFSET_SIGMA_M, SCALE_SIGMA]])
     sigma = np.concatenate(
-        [
-            np.tile(np.repeat([SHIFT_SIGMA_M, TURN_SIGMA_RAD], 3), len(surfaces)),
-            np.full(len(state.offsets_m), OFFSET_SIGMA_M),
-        ]
+        [np.tile(own_sigma, len(state.moves)), np.tile(sensor_sigma, len(state.errors))]
     )
-    gradient += np.concatenate([state.moves.ravel(), state.offsets_m]) / sigma**2
+    gradient += np.concatenate([state.moves.ravel(), state.errors.ravel()]) / sigma**2
     step = -np.linalg.solve(H + np.diag(1 / sigma**2), gradient)
     return np.asarray(np.clip(step, -REACH_M, REACH_M))
 
 
-def _column(state: _State, view: int) -> int:
-    return int(state.moves.size + state.sensors[view])
+def _placed(surfaces: Sequence[SeenSurface], state: _State) -> _Placed:
+    Ts = [state.pose(k, s.T_base_camera) for k, s in enumerate(surfaces)]
+    p_camera = [state.deeper(k, s.points) for k, s in enumerate(surfaces)]
+    pairs = list(zip(Ts, surfaces, strict=True))
+    return _Placed(
+        owner=np.repeat(np.arange(len(surfaces)), [len(s.points) for s in surfaces]),
+        p_camera=np.concatenate(p_camera),
+        p_base=np.concatenate([se3.apply(T, p) for T, p in zip(Ts, p_camera, strict=True)]),
+        normals=np.concatenate([s.normals @ T[:3, :3].T for T, s in pairs]),
+        Rs=np.stack([T[:3, :3] for T in Ts]),
+    )
 
 
-def _agreement(surfaces: Sequence[_Surface], state: _State) -> tuple[np.ndarray, np.ndarray]:
+def _agreement(surfaces: Sequence[SeenSurface], state: _State) -> tuple[np.ndarray, np.ndarray]:
     """Normal equations of "my point lies in the plane through the mean of the others'"."""
-    each = list(enumerate(surfaces))
-    points = np.concatenate([state.placed(k, s.points, s.rays) for k, s in each])
-    normals = np.concatenate([s.normals @ state.motion(k)[:3, :3].T for k, s in each])
-    rays = np.concatenate([s.rays for s in surfaces])
-    owner = np.repeat(np.arange(len(surfaces)), [len(s.points) for s in surfaces])
-    places = np.concatenate([points, NORMAL_M * normals], axis=1)
-    count = min(NEIGHBOURS, len(points))
+    placed = _placed(surfaces, state)
+    p, normals, owner = placed.p_base, placed.normals, placed.owner
+    places = np.concatenate([p, NORMAL_M * normals], axis=1)
+    count = min(NEIGHBOURS, len(p))
     away, index = cKDTree(places).query(places, k=count, distance_upper_bound=REACH_M)
-    away, index = away.reshape(len(points), -1), index.reshape(len(points), -1)
-    index = np.minimum(index, len(points) - 1)
+    away, index = away.reshape(len(p), -1), index.reshape(len(p), -1)
+    index = np.minimum(index, len(p) - 1)
     others = np.isfinite(away) & (owner[index] != owner[:, None])
     rows = np.flatnonzero(others.sum(axis=1) >= MIN_NEIGHBOURS)
     others, index = others[rows], index[rows]
     weight = others / np.maximum(others.sum(axis=1, keepdims=True), 1)
-    middle = np.einsum("nk,nki->ni", weight, points[index])
+    middle = np.einsum("nk,nki->ni", weight, p[index])
     slope = np.einsum("nk,nki->ni", weight, normals[index])
     slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9)
-    distance = np.einsum("ni,ni->n", slope, points[rows] - middle)
+    distance = np.einsum("ni,ni->n", slope, p[rows] - middle)
     # The others move too, each by its share of the mean; they are near enough for one lever.
     line = np.arange(len(rows))
     share = np.zeros((len(rows), len(surfaces)))
     np.add.at(share, (line[:, None], owner[index]), -weight)
     share[line, owner[rows]] += 1.0
-    lever = np.concatenate([slope, np.cross(points[rows] - state.pivot, slope)], axis=1)
-    J = np.zeros((len(rows), state.moves.size + len(state.offsets_m)))
+    lever = np.concatenate([slope, np.cross(p[rows] - state.pivot, slope)], axis=1)
+    J = np.zeros((len(rows), state.num_unknowns))
     J[:, : state.moves.size] = (share[:, :, None] * lever[:, None, :]).reshape(len(rows), -1)
-    sensor = state.moves.size + state.sensors[owner]
-    along = np.einsum("ni,nki->nk", slope, rays[index])
-    np.add.at(J, (line[:, None], sensor[index]), -weight * along)
-    J[line, sensor[rows]] += np.einsum("ni,ni->n", slope, rays[rows])
+    own = np.einsum("ni,nij->nj", slope, placed.Rs[owner[rows]])
+    mine = slope_by_sensor(own, placed.p_camera[rows])
+    turned = np.einsum("ni,nkij->nkj", slope, placed.Rs[owner[index]])
+    theirs = slope_by_sensor(turned, placed.p_camera[index])
+    for sensor in range(len(state.errors)):
+        same = (state.sensors[owner[rows]] == sensor).astype(np.float64)
+        part = weight * (state.sensors[owner[index]] == sensor)
+        J[:, state.columns(sensor)] = same[:, None] * mine - np.einsum("nk,nkc->nc", part, theirs)
     return _normal_equations(J, distance)
 
 
+def slope_by_sensor(
+    slope: Float[np.ndarray, "*batch 3"], p: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch 8"]:
+    """Derivative of a point's distance along a slope by the errors of its sensor.
+
+    Args:
+        slope: Unit vectors in the camera's frame.
+        p: The points in the camera's frame.
+    """
+    along = np.sum(slope * p, axis=-1, keepdims=True)
+    offset = along / np.maximum(p[..., 2:], 1e-9)
+    return np.concatenate([slope, np.cross(p, slope), offset, along], axis=-1)
+
+
 def _on_plane(
-    surface: _Surface, view: int, state: _State, support_z_m: float
+    surface: SeenSurface, view: int, state: _State, support_z_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Normal equations of "my plane is the plane" for one view and its sensor."""
-    p = state.placed(view, surface.plane, surface.plane_rays)
+    T = state.pose(view, surface.T_base_camera)
+    p_camera = state.deeper(view, surface.plane)
+    p = se3.apply(T, p_camera)
     height = p[:, 2] - support_z_m
     near = np.abs(height) < REACH_M
     arm = p[near] - state.pivot
     up = np.tile([0.0, 0.0, 1.0], (len(arm), 1))
-    J = np.concatenate([up, np.cross(arm, up), surface.plane_rays[near, 2:]], axis=1)
+    shared = slope_by_sensor(up @ T[:3, :3], p_camera[near])
+    J = np.concatenate([up, np.cross(arm, up), shared], axis=1)
     return _normal_equations(J, height[near])
 
 
@@ -218,51 +281,3 @@ def _normal_equations(J: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, 
     weight = 1.0 / (1.0 + (distance / (2 * scale)) ** 2) / (POINT_SIGMA_M**2 * SHARED_ERROR)
     weighted = J * weight[:, None]
     return weighted.T @ J, weighted.T @ distance
-
-
-def _surface(view: MaskedView, support_z_m: float | None) -> _Surface:
-    """Oriented points of the object, evenly picked, and points of what lies around it."""
-    camera, depth = view.camera, view.known_depth_m().astype(np.float64)
-    p = camera.unproject(depth)
-    n = NORMAL_PX
-    inner = (slice(n, -n), slice(n, -n))
-    ok = view.mask[inner] & (depth[inner] > 0)
-    ends = []
-    for rows, columns in ((0, n), (0, -n), (n, 0), (-n, 0)):
-        part = (
-            slice(n + rows, camera.height - n + rows),
-            slice(n + columns, camera.width - n + columns),
-        )
-        ok &= view.mask[part] & (np.abs(depth[part] - depth[inner]) < FLAT_M)
-        ends.append(p[part])
-    row, column = np.nonzero(ok)
-    step = max(1, len(row) // MAX_POINTS)
-    row, column = row[::step], column[::step]
-    right, left, below, above = (end[row, column] for end in ends)
-    normals = np.cross(below - above, right - left)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    points = p[inner][row, column]
-    away = np.einsum("ni,ni->n", normals, points) > 0
-    normals[away] *= -1
-    T, R = view.T_base_camera, view.T_base_camera[:3, :3]
-    rays = points / np.maximum(points[:, 2:], 1e-9)
-    points = se3.apply(T, points)
-    plane = np.zeros((0, 3))
-    if support_z_m is not None and len(points):
-        plane = _around(view, p, points)
-    plane_rays = plane / np.maximum(plane[:, 2:], 1e-9)
-    return _Surface(points, normals @ R.T, rays @ R.T, se3.apply(T, plane), plane_rays @ R.T)
-
-
-def _around(
-    view: MaskedView,
-    p_camera: Float[np.ndarray, "height width 3"],
-    points: Float[np.ndarray, "num_points 3"],
-) -> Float[np.ndarray, "num_around 3"]:
-    """Measured points around the object that are not the object's, in the camera's frame."""
-    row, column = np.nonzero(~view.mask & (p_camera[..., 2] > 0))
-    around = p_camera[row, column]
-    xy = se3.apply(view.T_base_camera, around)[:, :2]
-    low, high = points.min(axis=0) - PLANE_AROUND_M, points.max(axis=0) + PLANE_AROUND_M
-    around = around[np.all((xy > low[:2]) & (xy < high[:2]), axis=1)]
-    return np.asarray(around[:: max(1, len(around) // MAX_HEIGHTS)])

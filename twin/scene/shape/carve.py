@@ -22,7 +22,7 @@ MIN_OTHER_SHARE = 0.5
 """Shares of the views that see a voxel at all: to be free, it must be seen through in the first;
 or seen through, or at or before something else than the object, in the second."""
 BEHIND_VOXELS = 2.0
-"""So far behind a surface it still speaks: further, and it would thicken thin walls."""
+"""So far behind a surface it still speaks, unless told otherwise."""
 MIN_SOLID_VOXELS = 20
 
 
@@ -46,6 +46,7 @@ def gather(
     views: Sequence[MaskedView],
     truncation_m: float,
     min_free_views: int,
+    behind_m: float | None = None,
 ) -> Evidence:
     """Let every view say which voxels it sees through and which lie at the object's surface.
 
@@ -54,11 +55,13 @@ def gather(
         views: Depth with masks.
         truncation_m: So near to a surface a view says how far it is.
         min_free_views: So many must look through a voxel before it is free.
+        behind_m: So far behind a surface it still speaks: further than half a thin wall, and one
+            side of it would push out the other. Two voxels when None.
     """
     total = np.zeros(box.num_voxels, dtype=np.float32)
     weight = np.zeros(box.num_voxels, dtype=np.float32)
     free, other, seen = (np.zeros(box.num_voxels, dtype=np.int16) for _ in range(3))
-    behind = np.float32(BEHIND_VOXELS * box.voxel_m)
+    behind = np.float32(BEHIND_VOXELS * box.voxel_m if behind_m is None else behind_m)
     for view in views:
         sight = look(box, view)
         hit = sight.on_object & (sight.gap_m > -behind) & (sight.gap_m < truncation_m)

@@ -35,7 +35,7 @@ STANDING_M = 0.008
 """An object whose underside is at most this far from the table stands on it."""
 UPRIGHT_COSINE, LEANING_COSINE = 0.999, 0.95
 """Above the first an object's own frame is level; a toy may rest leaning, down to the second."""
-ALIGN_ROUNDS = 6
+ALIGN_ROUNDS = 8
 
 Poses = Mapping[str, Float[np.ndarray, "4 4"]]
 
@@ -52,7 +52,7 @@ def shapes_of(
         views: What the scene was fitted to, in ``base_link`` whose z = 0 is the table.
         models: Known shapes: they say which pixels are the object's, nothing more.
         Ts_base_object: Where the objects were; others are left out.
-        config: Settings; the defaults, with six rounds of view alignment, when None.
+        config: Settings; the defaults, with eight rounds of view alignment, when None.
     """
     config = ShapeConfig(align_rounds=ALIGN_ROUNDS) if config is None else config
     found: dict[str, ObjectShape | str] = {}

@@ -8,12 +8,13 @@ from jaxtyping import Bool, Float
 
 from bridge.errors import refuse_outside
 from twin.scene.shape.agree import laid_together
+from twin.scene.shape.between_voxels import signed_distances
 from twin.scene.shape.carve import Evidence, gather, solid_of
 from twin.scene.shape.cavity import Cavity, find_cavity
 from twin.scene.shape.isosurface import isosurface
 from twin.scene.shape.masked_view import MaskedView, ShapeError
 from twin.scene.shape.mesh import Faces, Vertices, face_normals, is_watertight, volume_m3
-from twin.scene.shape.sdf import SdfGrid, distances_of_solid, smoothed
+from twin.scene.shape.sdf import SdfGrid, smoothed
 from twin.scene.shape.voxels import VoxelBox
 
 PAD_VOXELS = 4
@@ -24,6 +25,9 @@ MIN_SPREAD_RAD = 0.2
 """Directions that differ by less see the same side; their free space carves nothing."""
 CELL_M = 0.004
 """A measured point counts for the extent when two views measured one in the same cell."""
+THIN_M = 0.004
+LEAST_BEHIND_VOXELS = 1.2
+"""A surface speaks for what is this far behind it, if two voxels are more: walls may be thin."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +44,7 @@ class ShapeConfig:
     """At least this: a few standard deviations of the camera's noise."""
     min_free_views: int = 2
     """Views that must look through a voxel before it is free."""
-    smoothing_voxels: float = 0.8
+    smoothing_voxels: float = 0.5
     """Standard deviation of the mean over distances that takes the stairs off."""
     max_views: int = 40
     """More views than this are thinned out evenly."""
@@ -143,9 +147,10 @@ def _carved(
 ) -> ObjectShape:
     low, high = _extent(views, support_z_m)
     box, truncation = voxel_box(low, high, config)
-    evidence = gather(box, views, truncation, config.min_free_views)
+    behind = max(min(2 * box.voxel_m, THIN_M), LEAST_BEHIND_VOXELS * box.voxel_m)
+    evidence = gather(box, views, truncation, config.min_free_views, behind)
     solid = solid_of(evidence, support_z_m, low - box.voxel_m, high + box.voxel_m)
-    distances = distances_of_solid(solid, box.voxel_m)
+    distances = signed_distances(solid, evidence, truncation)
     values = smoothed(distances, box.voxel_m, config.smoothing_voxels)
     grid = SdfGrid(values_m=values, origin_m=box.origin_m, voxel_m=box.voxel_m)
     return describe_solid(grid, evidence, solid, len(views), truncation)

@@ -11,6 +11,8 @@ from twin.scene.shape.npz import UnreadableArraysError, read_npz, write_npz
 
 MAX_VOXELS = 16_000_000
 """Larger files are refused."""
+LEVEL_STEPS = 24
+"""Halvings on the way to the level that keeps a volume."""
 _NAMES = ("values_m", "origin_m", "voxel_m", "closed")
 
 
@@ -139,16 +141,26 @@ def smoothed(
     voxel_m: float,
     sigma_voxels: float,
 ) -> Float32[np.ndarray, "num_x num_y num_z"]:
-    """Take the stairs off a solid's surface without changing how many voxels are inside.
+    """Take the stairs off a solid's surface without changing how much it holds.
 
     A mean over distances keeps them 1-Lipschitz but eats thin walls (a wall of two voxels loses
-    a fifth); the level that holds as many voxels as before becomes zero again.
+    a fifth); the level that holds as much as before becomes zero again. A voxel that the surface
+    runs through counts by the share that its distance leaves inside.
     """
-    num_inside = int((distances_m < 0).sum())
     mean = ndimage.gaussian_filter(distances_m, sigma_voxels, mode="nearest")
-    if not 0 < num_inside < mean.size:
-        return np.asarray(mean, dtype=np.float32)
-    ordered = np.partition(mean.ravel(), [num_inside - 1, num_inside])
-    level = (ordered[num_inside - 1] + ordered[num_inside]) / 2
-    level = np.clip(level, -0.5 * voxel_m, 0.5 * voxel_m)
-    return np.asarray(mean - level, dtype=np.float32)
+    wanted = _volume_voxels(distances_m.ravel() / voxel_m)
+    near = mean.ravel()[np.abs(mean.ravel()) < 2 * voxel_m] / voxel_m
+    wanted -= float((mean < -2 * voxel_m).sum())
+    low, high = -0.5, 0.5
+    for _ in range(LEVEL_STEPS):
+        level = (low + high) / 2
+        if _volume_voxels(near - level) < wanted:
+            low = level
+        else:
+            high = level
+    return np.asarray(mean - np.float32((low + high) / 2 * voxel_m), dtype=np.float32)
+
+
+def _volume_voxels(distances: np.ndarray) -> float:
+    """How many voxels are inside, by distances in voxels."""
+    return float(np.clip(0.5 - distances, 0.0, 1.0).sum(dtype=np.float64))

@@ -11,6 +11,11 @@ from twin.scene.shape.masked_view import MaskedView
 NEAR_M = 0.03
 """Voxels nearer to a camera than this are not in its sight."""
 
+BETWEEN_M = 0.03
+"""Nearer to a surface than this, depth is taken between pixels."""
+ONE_SURFACE_M = 0.012
+"""Four pixels whose depths differ by less show one surface."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelBox:
@@ -75,13 +80,37 @@ def look(box: VoxelBox, view: MaskedView) -> Sight:
     nearest = np.minimum.reduce([depth[part] for part in four]).ravel()
     around = np.logical_or.reduce([view.mask[part] for part in four]).ravel()
     measured = depth.ravel()[pixel]
+    on_object = view.mask.ravel()[pixel]
+    near = np.flatnonzero(on_object & (measured > 0) & (np.abs(measured - z) < BETWEEN_M))
+    measured[near] = _between_pixels(depth, u[near], v[near], measured[near])
     return Sight(
         ids=ids,
         gap_m=np.where(measured > 0, measured - z, np.float32(-np.inf)),
         clear_m=np.where(nearest[block] > 0, nearest[block] - z, np.float32(-np.inf)),
-        on_object=view.mask.ravel()[pixel],
+        on_object=on_object,
         near_object=around[block],
     )
+
+
+def _between_pixels(
+    depth_m: Float32[np.ndarray, "height width"],
+    u: Float32[np.ndarray, " num_near"],
+    v: Float32[np.ndarray, " num_near"],
+    nearest_m: Float32[np.ndarray, " num_near"],
+) -> Float32[np.ndarray, " num_near"]:
+    """Depth between the four pixels around; the nearest pixel's where they show two surfaces.
+
+    Seen at a slant, half a pixel is as much as the wall of a box.
+    """
+    x, y = u - np.float32(0.5), v - np.float32(0.5)
+    left, top = x.astype(np.int32), y.astype(np.int32)
+    x, y = x - left.astype(np.float32), y - top.astype(np.float32)
+    a, b = depth_m[top, left], depth_m[top, left + 1]
+    c, d = depth_m[top + 1, left], depth_m[top + 1, left + 1]
+    lowest, highest = np.minimum.reduce([a, b, c, d]), np.maximum.reduce([a, b, c, d])
+    one = (lowest > 0) & (highest - lowest < ONE_SURFACE_M)
+    between = (a * (1 - x) + b * x) * (1 - y) + (c * (1 - x) + d * x) * y
+    return np.where(one, between, nearest_m)
 
 
 def _in_camera(

@@ -1,0 +1,69 @@
+"""A carved surface lies where it was measured, not where voxels end."""
+
+import numpy as np
+import pytest
+
+from twin.scene.shape.between_voxels import signed_distances
+from twin.scene.shape.carve import Evidence
+from twin.scene.shape.isosurface import isosurface
+from twin.scene.shape.mesh import volume_m3
+from twin.scene.shape.sdf import distances_of_solid, smoothed
+from twin.scene.shape.voxels import VoxelBox
+
+VOXEL, TRUNCATION = 0.002, 0.008
+COUNTS = (24, 20, 20)
+BOX = VoxelBox(origin_m=np.zeros(3), voxel_m=VOXEL, counts=COUNTS)
+
+
+def wall(low: float, high: float, *, stretch: float = 1.0) -> tuple[np.ndarray, Evidence]:
+    """A plate across x between two places in voxels, measured from both sides.
+
+    ``stretch`` says by how much more than the distance a slanting ray measures.
+    """
+    x = np.arange(COUNTS[0], dtype=np.float64)
+    distance = np.maximum(low - x, x - high)
+    solid = np.zeros(COUNTS, dtype=bool)
+    solid[distance < 0, 2:-2, 2:-2] = True
+    measured = np.broadcast_to((stretch * distance * VOXEL)[:, None, None], COUNTS)
+    seen = np.abs(measured) < TRUNCATION
+    seen = seen & (np.arange(COUNTS[1]) > 1)[:, None] & (np.arange(COUNTS[1]) < 18)[:, None]
+    tsdf = np.where(seen, measured / TRUNCATION, 0.0).astype(np.float32)
+    return solid, Evidence(
+        box=BOX, tsdf=tsdf, weight=seen.astype(np.float32), free=~solid, empty=~solid
+    )
+
+
+@pytest.mark.parametrize("stretch", [1.0, 1.8])
+@pytest.mark.parametrize(("low", "high"), [(8.0, 11.4), (8.3, 11.1), (8.49, 11.51)])
+def test_a_thin_wall_is_as_thick_as_measured(low: float, high: float, stretch: float) -> None:
+    solid, evidence = wall(low, high, stretch=stretch)
+    values = signed_distances(solid, evidence, TRUNCATION)
+    vertices, _ = isosurface(values, BOX.origin_m, VOXEL)
+    middle = vertices[np.all(np.abs(vertices[:, 1:] - 0.019) < 0.01, axis=1), 0] / VOXEL
+    np.testing.assert_allclose(middle[middle < 9.7], low, atol=0.06)
+    np.testing.assert_allclose(middle[middle > 9.7], high, atol=0.06)
+
+
+def test_where_nobody_measured_faces_between_voxels_are_the_surface() -> None:
+    solid, evidence = wall(8.2, 11.3)
+    nothing = np.zeros_like(evidence.tsdf)
+    blind = Evidence(box=BOX, tsdf=nothing, weight=nothing, free=~solid, empty=~solid)
+    np.testing.assert_allclose(
+        signed_distances(solid, blind, TRUNCATION), distances_of_solid(solid, VOXEL), atol=1e-7
+    )
+
+
+def test_solid_stays_solid_and_free_stays_free() -> None:
+    solid, evidence = wall(8.02, 11.97)
+    values = signed_distances(solid, evidence, TRUNCATION)
+    np.testing.assert_array_equal(values < 0, solid)
+
+
+def test_smoothing_keeps_what_a_thin_wall_holds() -> None:
+    solid, evidence = wall(8.3, 11.4)
+    before = signed_distances(solid, evidence, TRUNCATION)
+    volumes = [
+        volume_m3(*isosurface(values, BOX.origin_m, VOXEL))
+        for values in (before, smoothed(before, VOXEL, 0.8))
+    ]
+    assert volumes[1] == pytest.approx(volumes[0], rel=0.04)
