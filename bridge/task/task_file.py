@@ -122,6 +122,8 @@ class Task:
     success: tuple[dict[str, Any], ...]
     cell: str = "standin"
     """Cell file the task was made for."""
+    grip_force_N: float | None = None
+    """How hard each finger presses, as the gripper is set for this task; None: not known."""
 
     def draw_start(self, rng: np.random.Generator) -> dict[str, Float[np.ndarray, "4 4"]]:
         """Draw ``T_base_object`` for every object, resting on the table top z = 0."""
@@ -178,7 +180,17 @@ def _task_from(table: dict[str, Any]) -> Task:
         stages=tuple(table["stages"]),
         success=tuple(table["success"]),
         cell=table.get("cell", "standin"),
+        grip_force_N=_grip_force_from(table.get("grip_force_N")),
     )
+
+
+def _grip_force_from(value: Any) -> float | None:
+    if value is None:
+        return None
+    if not 0 < float(value) < 1000:
+        message = f"grip_force_N {value!r}; a force of one finger, above 0 and below 1000 N"
+        raise ValueError(message)
+    return float(value)
 
 
 def _object_from(object_id: str, table: dict[str, Any]) -> ObjectModel:

@@ -61,7 +61,7 @@ def answer(question: Question) -> Verdict:
 
     Rounds of one start are tried against the same variations: their identity is the start's name.
     """
-    from twin.replay.calibrated import calibrated  # noqa: PLC0415
+    from twin.replay.calibrated import calibrated, for_task  # noqa: PLC0415
     from twin.replay.place import read_place  # noqa: PLC0415
     from twin.replay.rollout import replay_plan  # noqa: PLC0415
     from twin.replay.samples import replay_samples, with_probability  # noqa: PLC0415
@@ -74,7 +74,7 @@ def answer(question: Question) -> Verdict:
     scene = place.scene(
         question.task, question.urdf, question.Ts_base_object, covariances=question.covariances
     )
-    config = calibrated(question.config, read_calibration(run))
+    config = for_task(calibrated(question.config, read_calibration(run)), question.task)
 
     def judge(there: ReplayScene, settings: ReplayConfig) -> Verdict:
         return replay_plan(plan, there, settings).verdict

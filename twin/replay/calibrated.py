@@ -104,6 +104,16 @@ def calibrated(config: ReplayConfig, calibration: Calibration | None) -> ReplayC
     return replace(config, physics=physics, variation=replace(config.variation, calibrated=spreads))
 
 
+def for_task(config: ReplayConfig, task: Task) -> ReplayConfig:
+    """Press as hard as the task says the gripper is set, unless user or calibration said otherwise.
+
+    A force that holds a wooden cube crushes a toy.
+    """
+    if task.grip_force_N is None or config.physics.grip_force_N != PhysicsConfig().grip_force_N:
+        return config
+    return replace(config, physics=replace(config.physics, grip_force_N=task.grip_force_N))
+
+
 def physics_for(wanted: PhysicsConfig, calibration: Calibration | None) -> PhysicsConfig:
     """Calibrated physics, but for the fields that the user set to something of their own."""
     if calibration is None:

@@ -11,7 +11,7 @@ from bridge.episode.run import RunFolder
 from bridge.errors import UsageError
 from bridge.task.task_file import load_task
 from bridge.terminal import Advance, Output
-from twin.replay.calibrated import calibrated
+from twin.replay.calibrated import calibrated, for_task
 from twin.replay.config import ReplayRunConfig
 from twin.replay.job import ReplayJob, row_of_existing, row_of_failure
 from twin.replay.place import shape_hashes
@@ -180,7 +180,7 @@ def _jobs_of(
     starts = localised_starts(run, episode, task, scene_hash=scene_hash, force=relocalise)
     digest = episode.sha256()
     calibration = read_calibration(run)
-    replay = calibrated(config.replay, calibration)
+    replay = for_task(calibrated(config.replay, calibration), task)
     jobs = []
     for index, (stamp_ns, plan) in enumerate(plans):
         interval = streams.executed_interval_ns(episode, plan.id)

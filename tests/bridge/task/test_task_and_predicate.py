@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
+from bridge.task.data import dataset_file
 from bridge.task.predicate import (
     Rollout,
     all_hold,
@@ -138,6 +139,15 @@ def test_a_task_name_cannot_leave_its_folder(name: str) -> None:
 def test_a_file_that_is_no_task_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "broken.toml"
     path.write_text("schema_version = 1\nname = 'x'\n")
+    with pytest.raises(UsageError, match="not a task file"):
+        load_task(str(path))
+
+
+@pytest.mark.parametrize("force", ["0.0", "-9.0", "nan", "'strong'"])
+def test_a_grip_that_is_no_force_is_refused(tmp_path: Path, force: str) -> None:
+    text = dataset_file("tasks", "sloth_into_basket").read_text()
+    path = tmp_path / "grip.toml"
+    path.write_text(text.replace("grip_force_N = 9.0", f"grip_force_N = {force}"))
     with pytest.raises(UsageError, match="not a task file"):
         load_task(str(path))
 

@@ -17,7 +17,8 @@ from bridge.episode.run import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from twin.replay.calibrated import Correction, calibrated, correction_of
+from twin.physics.config import PhysicsConfig
+from twin.replay.calibrated import Correction, calibrated, correction_of, for_task
 from twin.replay.config import ReplayConfig
 from twin.replay.job import ReplayJob
 from twin.replay.place import read_place
@@ -142,3 +143,15 @@ def test_a_replay_puts_the_box_where_the_calibration_says(
     assert episode.derived is not None
     assert episode.derived.calibration_id == known.calibration_id
     assert json.dumps(job.settings()) != json.dumps(replace(job, calibration_id="0").settings())
+
+
+def test_the_gripper_presses_as_the_task_is_set_unless_somebody_knows_better() -> None:
+    toys, cube = load_task("sloth_into_basket"), load_task("cube_into_box")
+    assert toys.grip_force_N == 9.0, "what holds a wooden cube crushes a toy"
+    assert cube.grip_force_N is None
+    assert for_task(ReplayConfig(), toys).physics.grip_force_N == 9.0
+    assert for_task(ReplayConfig(), cube) == ReplayConfig()
+    mine = ReplayConfig(physics=PhysicsConfig(grip_force_N=15.0))
+    assert for_task(mine, toys) == mine
+    found = calibration(identified={"grip_force_N": {"value": 7.5}})
+    assert for_task(calibrated(ReplayConfig(), found), toys).physics.grip_force_N == 7.5
