@@ -18,6 +18,7 @@ from evaluator.metrics.trajectory_bands import (
     band_distance,
     mean_curve_m,
     moving_part,
+    path_distance_m,
     repeatability,
 )
 from evaluator.result import Interval, Measurement
@@ -43,9 +44,10 @@ DISTANCES: tuple[tuple[str, str, str], ...] = (
     ("end_point_over_pairs_m", "m", "distance of the end points, mean over all pairs of runs"),
     ("end_point_between_means_m", "m", "distance of the mean end points"),
     (
-        "rotation_over_pairs_rad",
+        "turned_over_pairs_rad",
         "rad",
-        "angle over normalised time, mean over all (recorded, simulated) pairs of runs",
+        "angle between what both turned since they began, over normalised time, mean over all "
+        "(recorded, simulated) pairs of runs",
     ),
 )
 SPREADS: tuple[tuple[str, str], ...] = (
@@ -136,21 +138,35 @@ def distance_measurements(task: str, real: Side, simulated: Side) -> list[Measur
                 reason_without_interval=_too_few(distance.of_recorded_m),
             )
         )
-    curves = mean_curve_m(real.tracks(moving_part)), mean_curve_m(simulated.tracks(moving_part))
-    measurements.append(
-        measured(
-            f"bands.{slug(task)}.{slug(simulated.name)}.moving_without_offset_m",
-            lambda: float(without_rigid_motion(*curves).mean()),
-            unit="m",
+    return [*measurements, *_shape(task, real, simulated, what)]
+
+
+def _shape(task: str, real: Side, simulated: Side, what: str) -> list[Measurement]:
+    """Measure the moving parts without their speed, and without a constant offset."""
+    tracks = real.tracks(moving_part), simulated.tracks(moving_part)
+    make = partial(
+        measured,
+        unit="m",
+        n=len(real.runs) * len(simulated.runs),
+        counted="pair of runs",
+        reason_without_interval=NO_INTERVAL,
+        episodes=[*real.episodes, *simulated.episodes],
+    )
+    first = f"bands.{slug(task)}.{slug(simulated.name)}.moving_"
+    return [
+        make(
+            f"{first}along_path_m",
+            lambda: path_distance_m(*tracks),
+            definition=f"{what}: distance at equal shares of the way, whatever the speed, mean "
+            f"over all (recorded, simulated) pairs of runs; {MOVING}",
+        ),
+        make(
+            f"{first}without_offset_m",
+            lambda: float(without_rigid_motion(*(mean_curve_m(side) for side in tracks)).mean()),
             definition=f"{what}: distance of the two mean curves after the best rigid motion is "
             f"taken out, mean over normalised time; {MOVING}",
-            n=len(real.runs) * len(simulated.runs),
-            counted="pair of runs",
-            reason_without_interval=NO_INTERVAL,
-            episodes=[*real.episodes, *simulated.episodes],
-        )
-    )
-    return measurements
+        ),
+    ]
 
 
 def inside_band(task: str, real: Side, simulated: Side) -> list[Measurement]:

@@ -28,8 +28,9 @@ def band_row(task: str, engine: str, by_id: Mapping[str, Measurement]) -> tuple[
         length(f"{band}.moving_mean_over_pairs_m"),
         length(f"{band}.moving_between_mean_curves_m"),
         length(f"{band}.moving_without_offset_m"),
+        length(f"{band}.moving_along_path_m"),
         length(f"{band}.end_point_over_pairs_m"),
-        degrees(by_id[f"{band}.moving_rotation_over_pairs_rad"].value),
+        degrees(by_id[f"{band}.moving_turned_over_pairs_rad"].value),
         length(f"{recorded}.mean_m"),
         length(f"{simulated}.mean_m"),
         None if inside is None else f"{100 * inside:.0f} %",
@@ -49,8 +50,9 @@ def band_table(table_id: str, task: str, rows: Sequence[tuple[Cell, ...]]) -> Ta
             "the same, moving part (mm)",
             "moving part, mean curves (mm)",
             "the same without offset (mm)",
+            "moving part, along the path (mm)",
             "end-point error (mm)",
-            "moving part, rotation (deg)",
+            "moving part, turned (deg)",
             "recorded repeatability (mm)",
             "simulated repeatability (mm)",
             "inside the recorded band",
@@ -59,7 +61,8 @@ def band_table(table_id: str, task: str, rows: Sequence[tuple[Cell, ...]]) -> Ta
         note="Unpaired runs without a common clock: uniform samples over time. The first error "
         "compares whole recordings and so counts different waiting times as error; the second cuts "
         f"waiting ({MOVING}). Errors are means over all pairs of runs unless they say mean curves. "
-        "Without offset: one mean curve laid over the other by a rigid motion. Repeatability: RMS "
+        "Without offset: one mean curve laid over the other by a rigid motion. Along the path: at "
+        "equal shares of the way, whatever the speed. Turned: since the start. Repeatability: RMS "
         f"distance from the side's mean curve; the band reaches {BAND_WIDTH:g} of the recorded.",
     )
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.trajectory import NORMALISED_SAMPLES, angles_rad
+from evaluator.metrics.trajectory import NORMALISED_SAMPLES
 
 MOVING_THRESHOLD_M = 0.01
 """A run waits while it is closer than this to where it started, or will stay."""
@@ -43,8 +44,8 @@ class BandDistance:
     end_point_over_pairs_m: float
     """Mean distance of the end points over all pairs."""
     end_point_between_means_m: float
-    rotation_over_pairs_rad: float
-    """Mean angle over all pairs and all normalised instants."""
+    turned_over_pairs_rad: float
+    """Mean angle over all pairs and instants between what both turned since they began."""
     of_recorded_m: tuple[float, ...]
     """Mean distance of each recorded run to all replayed ones."""
     profile_m: Float[np.ndarray, " num_samples"]
@@ -69,11 +70,7 @@ def band_distance(
     a, q_a = _curves(recorded, num_samples)
     b, q_b = _curves(replayed, num_samples)
     pairs = np.linalg.norm(a[:, None] - b[None, :], axis=-1)
-    shape = (len(a), len(b), num_samples, 4)
-    angles = angles_rad(
-        np.broadcast_to(q_a[:, None], shape).reshape(-1, 4),
-        np.broadcast_to(q_b[None, :], shape).reshape(-1, 4),
-    )
+    turned = np.swapaxes(_turned(q_a), -1, -2)[:, None] @ _turned(q_b)[None, :]
     profile = np.linalg.norm(a.mean(axis=0) - b.mean(axis=0), axis=-1)
     return BandDistance(
         mean_over_pairs_m=float(pairs.mean()),
@@ -81,10 +78,46 @@ def band_distance(
         max_between_mean_curves_m=float(profile.max()),
         end_point_over_pairs_m=float(pairs[:, :, -1].mean()),
         end_point_between_means_m=float(profile[-1]),
-        rotation_over_pairs_rad=float(angles.mean()),
+        turned_over_pairs_rad=float(se3.rotation_angle_rad(turned).mean()),
         of_recorded_m=tuple(pairs.mean(axis=(1, 2)).tolist()),
         profile_m=profile,
     )
+
+
+def _turned(
+    q_wxyz: Float[np.ndarray, "num_runs num_samples 4"],
+) -> Float[np.ndarray, "num_runs num_samples 3 3"]:
+    """Rotation since the first instant, in the fixed frame: whatever axes a body was given."""
+    R = se3.rotation_from_quaternion(q_wxyz)
+    return np.asarray(R @ np.swapaxes(R[:, :1], -1, -2))
+
+
+def path_distance_m(
+    recorded: Sequence[PoseTrajectory],
+    replayed: Sequence[PoseTrajectory],
+    num_samples: int = NORMALISED_SAMPLES,
+) -> float:
+    """Mean distance over all pairs at equal shares of the way: where they go, whatever the speed.
+
+    Range: 0 m and up, 0 is perfect. Undefined when: one side has no run, or a run does not move.
+
+    Raises:
+        UndefinedStatisticError: When it is undefined.
+    """
+    if not recorded or not replayed:
+        side = "recorded" if not recorded else "replayed"
+        raise UndefinedStatisticError(statistic="path distance", reason=f"no {side} run")
+    a, b = (np.stack([_by_way(run, num_samples) for run in side]) for side in (recorded, replayed))
+    return float(np.linalg.norm(a[:, None] - b[None, :], axis=-1).mean())
+
+
+def _by_way(run: PoseTrajectory, num_samples: int) -> Float[np.ndarray, "num_samples 3"]:
+    steps = np.linalg.norm(np.diff(run.p_m, axis=0), axis=1)
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    if not way[-1] > 0:
+        raise UndefinedStatisticError(statistic="path distance", reason="a run does not move")
+    asked = np.linspace(0.0, way[-1], num_samples)
+    return np.stack([np.interp(asked, way, run.p_m[:, axis]) for axis in range(3)], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)

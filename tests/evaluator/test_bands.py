@@ -8,19 +8,39 @@ from scipy.spatial.transform import Rotation
 
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.compare import compare_run
-from evaluator.metrics.trajectory_bands import band_distance, mean_curve_m
+from evaluator.errors import UndefinedStatisticError
+from evaluator.metrics.trajectory_bands import band_distance, mean_curve_m, path_distance_m
 
 
-def arc(offset_m: float = 0.0, turn_rad: float = 0.0, num: int = 41) -> PoseTrajectory:
+def arc(
+    offset_m: float = 0.0, turn_rad: float = 0.0, num: int = 41, first: Rotation | None = None
+) -> PoseTrajectory:
+    """A curved way during which the body turns evenly, beginning in any orientation."""
     t = np.linspace(0.0, 1.0, num)
     p = np.stack([t, 0.2 * np.sin(3 * t), np.full(num, offset_m)], axis=1)
-    q = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_quat(scalar_first=True)
-    return PoseTrajectory(np.arange(num, dtype=np.int64) * 10_000_000, p, np.tile(q, (num, 1)))
+    start = Rotation.identity() if first is None else first
+    q = (Rotation.from_rotvec(np.outer(t, [0.0, 0.0, turn_rad])) * start).as_quat(scalar_first=True)
+    return PoseTrajectory(np.arange(num, dtype=np.int64) * 10_000_000, p, q)
 
 
-def test_rotation_is_the_mean_angle_over_pairs() -> None:
-    distance = band_distance([arc(turn_rad=0.1), arc(turn_rad=-0.1)], [arc(turn_rad=0.3)])
-    assert distance.rotation_over_pairs_rad == pytest.approx((0.2 + 0.4) / 2)
+def test_turning_is_compared_whatever_axes_a_body_was_given() -> None:
+    other = arc(turn_rad=0.3, first=Rotation.from_rotvec([1.0, 2.0, 0.5]))
+    distance = band_distance([arc(turn_rad=0.1), arc(turn_rad=-0.1)], [other])
+    assert distance.turned_over_pairs_rad == pytest.approx((0.2 + 0.4) / 2 / 2)
+
+
+def test_along_the_path_speed_does_not_count() -> None:
+    even = arc(num=401)
+    t = np.linspace(0.0, 1.0, 401) ** 2
+    p = np.stack([t, 0.2 * np.sin(3 * t), np.full(401, 0.01)], axis=1)
+    hurried = PoseTrajectory(even.stamps_ns, p, even.q_wxyz)
+    assert band_distance([even], [hurried]).mean_over_pairs_m > 0.1
+    assert path_distance_m([even], [hurried]) == pytest.approx(0.01, abs=1e-4)
+    still = PoseTrajectory(even.stamps_ns, np.zeros((401, 3)), even.q_wxyz)
+    with pytest.raises(UndefinedStatisticError, match="does not move"):
+        path_distance_m([even], [still])
+    with pytest.raises(UndefinedStatisticError, match="no replayed run"):
+        path_distance_m([even], [])
 
 
 def test_each_recorded_run_has_its_distance() -> None:
