@@ -46,8 +46,9 @@ def write_rows(pictures: list[np.ndarray], out: Path) -> None:
     for row in pictures:
         stack += [row, np.full((GAP_PX, row.shape[1], 3), 255, dtype=np.uint8)]
     image = Image.fromarray(np.vstack(stack[:-1]))
-    height = round(image.height * ROW_WIDTH_PX / image.width)
-    image = image.resize((ROW_WIDTH_PX, height), Image.Resampling.LANCZOS)
+    width = min(image.width, ROW_WIDTH_PX)
+    size = (width, round(image.height * width / image.width))
+    image = image.resize(size, Image.Resampling.LANCZOS)
     for quality in range(90, 30, -5):
         buffer = io.BytesIO()
         image.save(buffer, format="jpeg", quality=quality)

@@ -1,0 +1,74 @@
+"""What the gate's process replays with: the run's calibration, and the force of the task."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.episode.run import RunFolder
+from bridge.geometry import se3
+from bridge.task.plan import Plan
+from bridge.task.robot import ROBOT_NAME, ur5_with_gripper_urdf
+from bridge.task.task_file import load_task
+from twin.gate.work import Question, answer
+from twin.replay import rollout
+from twin.replay.config import ReplayConfig
+from twin.replay.scene import ReplayScene
+from twin.scene.calibration import write_physics
+
+
+class SeenError(Exception):
+    """Ends the replay where it would begin."""
+
+
+def asked(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> tuple[ReplayScene, ReplayConfig]:
+    """Where and with which settings a plan for the sloth would be replayed."""
+    seen: list[tuple[ReplayScene, ReplayConfig]] = []
+
+    def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> Any:
+        seen.append((scene, config))
+        raise SeenError
+
+    monkeypatch.setattr(rollout, "replay_plan", replay_plan)
+    task = load_task("sloth_into_basket")
+    lying = se3.transform_from(np.array([1.0, 0, 0, 0]), np.array([0.5, -0.1, 0.03]))
+    plan = Plan(
+        id="p", planner="", policy="", condition="without_replanning", robot=ROBOT_NAME,
+        frame="base_link", instruction="", stages=(), tau=(),
+    )  # fmt: skip
+    question = Question(
+        run_path=run.path,
+        plan=plan,
+        task=task,
+        Ts_base_object={"sloth": lying, "basket": np.eye(4)},
+        covariances={},
+        urdf=ur5_with_gripper_urdf(),
+        config=ReplayConfig(),
+        left_s=1.0,
+    )
+    with pytest.raises(SeenError):
+        answer(question)
+    return seen[0]
+
+
+def test_a_gate_without_a_calibration_presses_as_the_task_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, config = asked(RunFolder.create(tmp_path / "run"), monkeypatch)
+    assert config.physics.grip_force_N == 9.0
+    assert scene.Ts_base_object["sloth"][:3, 3] == pytest.approx([0.5, -0.1, 0.03])
+
+
+def test_a_gate_starts_objects_where_the_calibration_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    bias = {"bias_y_m": {"value": 0.008, "low": 0.006, "high": 0.01}}
+    force = {"grip_force_N": {"value": 11.0, "low": 10.0, "high": 12.0, "sigma_log": 0.05}}
+    write_physics(run, {"promoted": True, "identified": force, "pose_bias": bias, "id": "x"})
+    scene, config = asked(run, monkeypatch)
+    assert config.physics.grip_force_N == 11.0
+    assert scene.Ts_base_object["sloth"][:3, 3] == pytest.approx([0.5, -0.092, 0.03])
+    assert scene.Ts_base_object["basket"][:3, 3] == pytest.approx([0.0, 0.008, 0.0])
+    assert scene.calibration_id is not None
