@@ -11,10 +11,12 @@ from bridge.episode import schema
 from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.records import CompressedColor, DepthImage
 from bridge.episode.writer import EpisodeWriter
+from bridge.errors import UsageError
 from evaluator.compare.run import compare_run
-from evaluator.errors import UndefinedStatisticError
+from evaluator.errors import EvaluatorError, UndefinedStatisticError
 from evaluator.metrics.depth import score_depth
 from evaluator.metrics.image import ImageShapeError, aligned
+from evaluator.metrics.options import ImageOptions
 from evaluator.metrics.scores import score_image
 
 STAMP = 5_000
@@ -151,3 +153,53 @@ def test_every_variant_of_a_view_is_measured_and_named(maker: Any) -> None:
     row = dict(zip(table.columns, table.rows[0], strict=True))
     assert row["depth (mm)"] == 10.0
     assert row["PSNR gain (dB)"] > row["PSNR (dB)"]
+
+
+def test_other_methods_stand_beside_the_twin_on_the_views_of_a_run(
+    maker: Any, tmp_path: Path
+) -> None:
+    maker.run.derived_dir.mkdir(parents=True, exist_ok=True)
+    recorded, _, mask = write_views(maker.run.derived_dir)
+    other = np.clip(recorded.astype(int) + 3, 0, 255).astype(np.uint8)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / f"wrist_{STAMP}.png").write_bytes(png(other))
+    options = ImageOptions(renders=(f"other={tmp_path / 'other'}",))
+    comparison = compare_run(maker.run, images=options)
+    results = comparison.results()
+    results.to_record()
+    found = {m: results.get(f"image.{m}.psnr_db") for m in ("twin", "other")}
+    assert found["twin"].value == results.get("views.all.psnr_db").value
+    assert found["other"].value > found["twin"].value
+    assert "every 8th frame" in found["other"].definition
+    masked = results.get("image.other.psnr_objects_db")
+    error = (recorded[mask] / 255.0 - other[mask] / 255.0) ** 2
+    assert masked.value == pytest.approx(-10 * np.log10(error.mean()), abs=1e-9)
+    table = next(t for t in results.tables if t.id == "image_methods")
+    assert [row[0] for row in table.rows] == ["twin", "other"]
+    assert {view.method for view in comparison.views} == {"twin", "other"}
+    assert all(view.rendered_u8 is not None for view in comparison.views)
+
+
+def test_a_run_without_views_cannot_be_compared_with(maker: Any, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "0.png").write_bytes(png(pair()[0]))
+    options = ImageOptions(renders=(f"other={tmp_path / 'other'}",))
+    with pytest.raises(EvaluatorError, match="no rendered views to compare others with"):
+        compare_run(maker.run, images=options)
+    with pytest.raises(UsageError, match="belong to --renders"):
+        compare_run(maker.run, images=ImageOptions(split="every 8th frame"))
+
+
+def test_every_number_about_views_has_its_stamp(maker: Any) -> None:
+    maker.run.derived_dir.mkdir(parents=True, exist_ok=True)
+    write_views(maker.run.derived_dir)
+    results = compare_run(maker.run).results()
+    numbers = [m for m in results.measurements if m.id.startswith("views.all.")]
+    for metric in ("ssim_zero", "ssim_reflect", "gmsd", "ms_ssim", "ssim_objects_black"):
+        assert any(m.id == f"views.all.{metric}" for m in numbers), metric
+    for number in numbers:
+        if number.id != "views.all.lpips" and "depth" not in number.id:
+            assert "44 x 36" in number.definition
+            assert "split every 8th frame" in number.definition
+    table = next(t for t in results.tables if t.id == "views_protocol")
+    assert len({row[2] for row in table.rows}) == len(table.rows)  # no two are alike
