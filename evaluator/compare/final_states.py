@@ -24,6 +24,12 @@ QUANTITIES: tuple[tuple[str, str, str, Callable[[StateSummary], float | None]], 
     ("rotation", "rad", "angle modulo the object's symmetry", lambda s: s.rotation_rad),
     ("extents", "m", "largest difference of a soft object's extents", lambda s: s.extents_m),
 )
+UNKNOWN = {
+    "position": "no position is known",
+    "rotation": "the task file is not known, so neither is the symmetry",
+    "extents": "not both sides know the shape",
+}
+"""Why a quantity has no value although its position has."""
 MEAN_KEY = "student-t:length"
 """Coverage of Student's interval for lengths with now and then a miss."""
 USE_MEDIAN = "the median with its interval"
@@ -58,8 +64,8 @@ def _measure(key: Group, states: Sequence[StateSummary]) -> list[Measurement]:
     found = []
     for name, unit, words, read in QUANTITIES:
         pairs = [(value, s.episode) for s in states if (value := read(s)) is not None]
-        if name == "extents" and not any(s.soft for s in states):
-            continue
+        if name == "extents" and (predicted_by == PLAN or not any(s.soft for s in states)):
+            continue  # a plan predicts a pose and no shape
         values, episodes = [value for value, _ in pairs], [episode for _, episode in pairs]
         of_episode = cluster_means(values, episodes)
         about = f"{words} after its last stage, {WHO[predicted_by]} against {WHO[against]}, in "
@@ -75,7 +81,7 @@ def _measure(key: Group, states: Sequence[StateSummary]) -> list[Measurement]:
         found.append(
             make(
                 f"{state_id(key)}.{name}_median_{unit}",
-                partial(_median, of_episode, states),
+                partial(_median, of_episode, states, name),
                 definition=f"{about}: median over {len(of_episode)} episodes of each one's mean "
                 "over its objects",
                 reason_without_interval=_too_few(of_episode),
@@ -85,7 +91,7 @@ def _measure(key: Group, states: Sequence[StateSummary]) -> list[Measurement]:
             found.append(
                 make(
                     f"{state_id(key)}.{name}_mean_{unit}",
-                    partial(_mean, of_episode, states),
+                    partial(_mean, of_episode, states, name),
                     definition=f"{about}: mean over {len(of_episode)} episodes of each one's mean "
                     "over its objects",
                     reason_without_interval=_no_mean(of_episode),
@@ -97,9 +103,9 @@ def _measure(key: Group, states: Sequence[StateSummary]) -> list[Measurement]:
 
 
 def _median(
-    values: Sequence[float], states: Sequence[StateSummary]
+    values: Sequence[float], states: Sequence[StateSummary], quantity: str
 ) -> float | tuple[float, Interval | None]:
-    _some(values, states)
+    _some(values, states, quantity)
     try:
         interval: Interval | None = median_interval(values)
     except UndefinedStatisticError:
@@ -108,9 +114,9 @@ def _median(
 
 
 def _mean(
-    values: Sequence[float], states: Sequence[StateSummary]
+    values: Sequence[float], states: Sequence[StateSummary], quantity: str
 ) -> float | tuple[float, Interval | None]:
-    _some(values, states)
+    _some(values, states, quantity)
     try:
         interval: Interval | None = student_interval(values)
     except UndefinedStatisticError:
@@ -118,13 +124,12 @@ def _mean(
     return sum(values) / len(values), interval
 
 
-def _some(values: Sequence[float], states: Sequence[StateSummary]) -> None:
+def _some(values: Sequence[float], states: Sequence[StateSummary], quantity: str) -> None:
     if values:
         return
     reasons = {state.reason for state in states if state.reason}
     raise UndefinedStatisticError(
-        statistic="final state",
-        reason="; ".join(sorted(reasons)) or "the task file is not known, so neither is the shape",
+        statistic="final state", reason="; ".join(sorted(reasons)) or UNKNOWN[quantity]
     )
 
 

@@ -288,6 +288,18 @@ def test_what_is_missing_is_named_and_stages_have_a_table() -> None:
     assert [row[2] for row in stage_table.rows] == ["place", "grasp"]
 
 
+def test_a_plan_has_no_extents_and_an_unknown_shape_says_so() -> None:
+    soft = [replace(state, soft=True, rotation_rad=None) for state in states(4)]
+    ids = {m.id: m for m in state_results(soft).measurements}
+    assert not any("extents" in name for name in ids)
+    turned = ids["state.plan_to_recorded.cube_into_box.with_replanning.rotation_median_rad"]
+    assert "symmetry" in str(turned.reason_if_undefined)
+    replayed = [replace(state, predicted_by="planned") for state in soft]
+    ids = {m.id: m for m in state_results(replayed).measurements}
+    shape = ids["state.planned_to_recorded.cube_into_box.with_replanning.extents_median_m"]
+    assert shape.reason_if_undefined == "not both sides know the shape"
+
+
 def test_no_state_is_no_data() -> None:
     part = state_results([])
     assert part.measurements == ()
