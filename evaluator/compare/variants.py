@@ -46,7 +46,7 @@ class Variant:
     @property
     def clamp_words(self) -> str:
         """What became of values outside 0..1."""
-        return "none was outside 0..1" if self.alignment == "raw" else "to 0..1 after alignment"
+        return "no value outside 0..1" if self.alignment == "raw" else "to 0..1 after alignment"
 
 
 RAW = Variant(name="raw", learned=True)

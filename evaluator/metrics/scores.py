@@ -30,6 +30,12 @@ _SSIM = (
     "mean, sRGB, data range 1, "
 )
 _IDS: dict[Padding, str] = {"valid": "ssim", "zero": "ssim_zero", "reflect": "ssim_reflect"}
+_USERS: dict[Padding, str] = {
+    "valid": "as scikit-image crops",
+    "zero": "as papers on 3D Gaussian splatting",
+    "reflect": "as torchmetrics",
+}
+"""Who computes it so."""
 _COLUMNS: dict[Padding, str] = {"valid": "SSIM", "zero": "SSIM (zero)", "reflect": "SSIM (reflect)"}
 
 PLAIN_METRICS: tuple[ImageMetric, ...] = (
@@ -44,7 +50,7 @@ PLAIN_METRICS: tuple[ImageMetric, ...] = (
         ImageMetric(
             id=_IDS[padding],
             column=_COLUMNS[padding],
-            definition=_SSIM + words,
+            definition=f"{_SSIM}{words} ({_USERS[padding]})",
             implementation="evaluator.metrics.similarity 1",
             window=GAUSSIAN,
             padding=words,

@@ -27,11 +27,11 @@ _BAND_VALUES = 1 << 15
 Padding = Literal["valid", "zero", "reflect"]
 """What a window sees beyond the border: it never reaches there, zeros, or the mirrored image."""
 PADDINGS: dict[Padding, str] = {
-    "valid": "windows inside the image only (scikit-image crops so)",
-    "zero": "zeros beyond the border, all pixels (as 3D Gaussian splatting papers)",
-    "reflect": "mirrored beyond the border without repeating it, all pixels (as torchmetrics)",
+    "valid": "windows inside the image only",
+    "zero": "zeros beyond the border",
+    "reflect": "mirrored beyond the border",
 }
-"""In words, for definitions."""
+"""In words, for stamps."""
 
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of MS-SSIM from full size to a sixteenth."""

@@ -74,6 +74,8 @@ _PLAIN = ("metric", "values", "mask", "resolution", "crop", "alignment", "clamp"
 def common_text(stamps: Sequence[Stamp]) -> str:
     """Write what several stamps share once, and behind it what is each metric's own.
 
+    Which code computed a value is left to the table of full stamps.
+
     Raises:
         ValueError: Without a stamp.
     """
@@ -83,9 +85,9 @@ def common_text(stamps: Sequence[Stamp]) -> str:
     columns = [dict(stamp._items()) for stamp in dict.fromkeys(stamps)]
     shared, own = [], []
     for name in columns[0]:
-        found = list(dict.fromkeys(column[name] for column in columns))
-        if name == "metric":
+        if name in ("metric", "implementation"):
             continue
+        found = list(dict.fromkeys(column[name] for column in columns))
         if len(found) == 1:
             if found[0] != "none":
                 shared.append(found[0] if name in _PLAIN else f"{name} {found[0]}")
