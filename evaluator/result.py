@@ -6,7 +6,7 @@ Undefined is undefined, with its reason; it is never 0, 1 or NaN.
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from bridge.units import Unit
 from bridge.whole_file import write_whole
 from evaluator.errors import EvaluatorError
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 Cell = str | int | float | bool | None
 """What a table may hold; None is printed as undefined, never as zero."""
@@ -96,7 +96,7 @@ class Results:
 
     run: str
     source: str
-    """run, trials or rates."""
+    """run, trials, rates or images."""
     stand_in: bool | None
     """None when the input does not say, as a rates CSV."""
     measurements: tuple[Measurement, ...]
@@ -122,18 +122,97 @@ class Results:
         raise EvaluatorError(message)
 
     def to_record(self) -> dict[str, Any]:
-        """Return the JSON record, checked against the schema."""
-        record = json.loads(json.dumps({"schema_version": SCHEMA_VERSION, **asdict(self)}))
-        check_record(record, name="results", package="evaluator")
-        return dict(record)
+        """Return the JSON record, checked against the schema.
+
+        Many numbers rest on the same episodes: each list of them is held once.
+        """
+        lists: dict[tuple[str, ...], int] = {}
+        measurements = [
+            {
+                **{name: getattr(item, name) for name in _PLAIN},
+                "interval": None if item.interval is None else asdict(item.interval),
+                "episodes": lists.setdefault(item.episodes, len(lists)),
+            }
+            for item in self.measurements
+        ]
+        record = {
+            "schema_version": SCHEMA_VERSION,
+            "run": self.run,
+            "source": self.source,
+            "stand_in": self.stand_in,
+            "measurements": measurements,
+            "episode_lists": [list(episodes) for episodes in lists],
+            "tables": [_table_record(table) for table in self.tables],
+            "exclusions": [asdict(item) for item in self.exclusions],
+            "missing": list(self.missing),
+            "provenance": json.loads(json.dumps(self.provenance)),
+        }
+        _check(record)
+        return record
+
+
+_PLAIN = tuple(f.name for f in fields(Measurement) if f.name not in ("interval", "episodes"))
+_CELLS = (str, int, float, bool, type(None))
+_CHECKED_ROWS = 20
+"""Rows of a table that the schema sees; the cells of the others are checked by their types."""
+
+
+def _table_record(table: Table) -> dict[str, Any]:
+    rows = [list(row) for row in table.rows]
+    columns = list(table.columns)
+    return {
+        "id": table.id, "title": table.title, "columns": columns, "rows": rows, "note": table.note
+    }  # fmt: skip
+
+
+def _check(record: dict[str, Any]) -> None:
+    """Check the record, and long tables and lists in a time that ten thousand trials allow."""
+    short = [{**table, "rows": table["rows"][:_CHECKED_ROWS]} for table in record["tables"]]
+    lists = [episodes[:_CHECKED_ROWS] for episodes in record["episode_lists"]]
+    shown = {**record, "tables": short, "episode_lists": lists}
+    check_record(shown, name="results", package="evaluator")
+    for table in record["tables"]:
+        for cell in (cell for row in table["rows"] for cell in row):
+            finite = not isinstance(cell, float) or math.isfinite(cell)
+            if not (finite and isinstance(cell, _CELLS)):
+                where = f"table {table['id']}"
+                raise InvalidRecordError(name="results", where=where, found=f"{cell!r:.60}")
+
+
+_DEEP = {"tables": 3, "provenance": 2}
+"""Levels that are written over several lines, of the parts of a record; 1 for the others."""
+
+
+def _written(record: Mapping[str, Any]) -> str:
+    """Write each number, row and list on one line: quick, and a diff names what changed."""
+    parts = [
+        f" {json.dumps(name)}: {_lines(value, 1, _DEEP.get(name, 1))}"
+        for name, value in record.items()
+    ]
+    return "{\n" + ",\n".join(parts) + "\n}\n"
+
+
+def _lines(value: Any, indent: int, deep: int) -> str:
+    if not deep or not value or not isinstance(value, list | dict):
+        return json.dumps(value, allow_nan=False)
+    pad = "\n" + " " * (indent + 1)
+    if isinstance(value, list):
+        inner = [_lines(item, indent + 1, deep - 1) for item in value]
+    else:
+        inner = [
+            f"{json.dumps(name)}: {_lines(item, indent + 1, deep - 1)}"
+            for name, item in value.items()
+        ]
+    first, last = "[]" if isinstance(value, list) else "{}"
+    return f"{first}{pad}{f',{pad}'.join(inner)}{pad[:-1]}{last}"
 
 
 def write_results(results: Results, path: Path) -> Path:
     """Write ``results.json``; a half-written file never carries the final name."""
-    text = json.dumps(results.to_record(), indent=1, allow_nan=False)
+    text = _written(results.to_record())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, f"{text}\n".encode())
+        write_whole(path, text.encode())
     except OSError as error:
         message = f"cannot write {path}: {error.strerror}. Choose another folder with --out."
         raise EvaluatorError(message) from error
@@ -161,11 +240,12 @@ def load_results(path: Path) -> Results:
 
 
 def _from_record(record: Mapping[str, Any]) -> Results:
+    lists = [tuple(episodes) for episodes in record.get("episode_lists", ())]
     return Results(
         run=record["run"],
         source=record["source"],
         stand_in=record["stand_in"],
-        measurements=tuple(_measurement(item) for item in record["measurements"]),
+        measurements=tuple(_measurement(item, lists) for item in record["measurements"]),
         tables=tuple(_table(item) for item in record["tables"]),
         exclusions=tuple(Exclusion(**item) for item in record["exclusions"]),
         missing=tuple(record["missing"]),
@@ -173,11 +253,15 @@ def _from_record(record: Mapping[str, Any]) -> Results:
     )
 
 
-def _measurement(record: Mapping[str, Any]) -> Measurement:
+def _measurement(record: Mapping[str, Any], lists: list[tuple[str, ...]]) -> Measurement:
     interval = record.get("interval")
     values = dict(record)
     values["interval"] = None if interval is None else Interval(**interval)
-    values["episodes"] = tuple(record.get("episodes", ()))
+    said = record["episodes"]
+    if isinstance(said, int) and said >= len(lists):
+        message = f"{record['id']} names list {said} of {len(lists)} lists of episodes"
+        raise ValueError(message)
+    values["episodes"] = lists[said] if isinstance(said, int) else tuple(said)
     return Measurement(**values)
 
 

@@ -1,5 +1,6 @@
 """``--fail-under``: what must be reached for an evaluation to count as passed."""
 
+import math
 from dataclasses import dataclass
 
 from bridge.errors import UsageError
@@ -57,6 +58,9 @@ def _parse(part: str) -> Threshold:
     except ValueError as error:
         message = f"--fail-under {part!r} is no number; write 0.8, r=0.8 or ID=0.8."
         raise UsageError(message) from error
+    if not math.isfinite(limit):
+        message = f"--fail-under {part!r} is no limit that anything can reach or miss."
+        raise UsageError(message)
     if name == "agreement" and not 0 <= limit <= 1:
         message = f"--fail-under {limit} is not a fraction from 0 to 1, for example 0.8."
         raise UsageError(message)

@@ -1,6 +1,6 @@
 """Trials and measurements as typed columns for pandas, DuckDB and R: ``.parquet`` beside the CSV.
 
-Importing this module loads pandas; the evaluator does so only when it writes.
+Importing this module loads pyarrow; the evaluator does so only when it writes.
 """
 
 from collections.abc import Sequence
@@ -8,15 +8,14 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bridge.exchange.trials_csv import TrialRecord
 from evaluator.result import Measurement
 
-_TEXT, _WHOLE, _NUMBER, _ANSWER = "string", "Int64", "Float64", "boolean"
-"""Column types of pandas in which unknown is unknown, never 0, False or NaN."""
+_TEXT, _WHOLE, _NUMBER, _ANSWER = pa.string(), pa.int64(), pa.float64(), pa.bool_()
+"""Column types in which unknown is null, never 0, False or NaN."""
 
 TRIAL_TYPES = {
     "trial_id": _TEXT,
@@ -57,29 +56,28 @@ MEASUREMENT_TYPES = {
 def write_trials(path: Path, trials: Sequence[TrialRecord]) -> Path:
     """Write one row per trial, the columns of ``trials.csv``; outcomes are true, false or null."""
     names = [field.name for field in fields(TrialRecord)]
-    rows = [{name: getattr(trial, name) for name in names} for trial in trials]
-    return _write(path, rows, TRIAL_TYPES)
+    columns = {name: [getattr(trial, name) for trial in trials] for name in names}
+    return _write(path, columns, TRIAL_TYPES)
 
 
 def write_measurements(path: Path, measurements: Sequence[Measurement]) -> Path:
     """Write one row per measured number, its interval in columns."""
-    return _write(path, [_row(measurement) for measurement in measurements], MEASUREMENT_TYPES)
-
-
-def _row(measurement: Measurement) -> dict[str, Any]:
-    interval = measurement.interval
-    row = {name: getattr(measurement, name, None) for name in MEASUREMENT_TYPES}
-    for name in ("low", "high", "level", "method"):
-        row[name] = None if interval is None else getattr(interval, name)
-    return row | {"episodes": " ".join(measurement.episodes)}
-
-
-def _write(path: Path, rows: Sequence[dict[str, Any]], types: dict[str, str]) -> Path:
-    columns = {
-        name: pd.array([row[name] for row in rows], dtype=kind) for name, kind in types.items()
+    columns: dict[str, list[Any]] = {
+        name: [getattr(item, name, None) for item in measurements] for name in MEASUREMENT_TYPES
     }
+    for name in ("low", "high", "level", "method"):
+        columns[name] = [getattr(item.interval, name, None) for item in measurements]
+    joined: dict[tuple[str, ...], str] = {}
+    for item in measurements:
+        joined.setdefault(item.episodes, " ".join(item.episodes))
+    columns["episodes"] = [joined[item.episodes] for item in measurements]
+    return _write(path, columns, MEASUREMENT_TYPES)
+
+
+def _write(path: Path, columns: dict[str, list[Any]], types: dict[str, pa.DataType]) -> Path:
+    arrays = [pa.array(columns[name], type=kind) for name, kind in types.items()]
+    table = pa.Table.from_arrays(arrays, names=list(types))
     part = path.with_name(path.name + ".part")
-    table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
-    pq.write_table(table, part)
+    pq.write_table(table, part, compression="zstd")
     part.replace(path)
     return path

@@ -1,4 +1,4 @@
-"""One table as CSV, Markdown, LaTeX (booktabs) and terminal text."""
+"""One table as CSV, Markdown and terminal text; ``latex`` writes the same for a paper."""
 
 import csv
 import io
@@ -12,19 +12,22 @@ from rich.text import Text
 from evaluator.report.wording import texts
 from evaluator.result import Table
 
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "&": r"\&",
-    "%": r"\%",
-    "$": r"\$",
-    "#": r"\#",
-    "_": r"\_",
-    "{": r"\{",
-    "}": r"\}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "–": "--",
-}
+
+def used_columns(table: Table) -> list[int]:
+    """Return the columns that say something in any row."""
+    return [
+        index
+        for index in range(len(table.columns))
+        if not table.rows or any(row[index] not in ("", None) for row in table.rows)
+    ]
+
+
+def is_number(table: Table, index: int) -> bool:
+    """Say whether a column holds nothing but numbers."""
+    cells = [row[index] for row in table.rows if row[index] is not None]
+    return bool(cells) and all(
+        isinstance(cell, int | float) and not isinstance(cell, bool) for cell in cells
+    )
 
 
 def as_csv(table: Table) -> str:
@@ -47,40 +50,10 @@ def _bar(cells: tuple[str, ...] | list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def as_latex(table: Table) -> str:
-    """Write a booktabs table; special characters are escaped."""
-    columns = " & ".join(rf"\textbf{{{latex(name)}}}" for name in table.columns)
-    body = [" & ".join(latex(text) for text in texts(row)) + r" \\" for row in table.rows]
-    lines = [
-        r"\begin{table}[h]",
-        r"\centering",
-        rf"\caption{{{latex(table.title)}. {latex(table.note)}}}",
-        rf"\label{{tab:{table.id}}}",
-        rf"\begin{{tabular}}{{@{{}}{'l' * len(table.columns)}@{{}}}}",
-        r"\toprule",
-        columns + r" \\",
-        r"\midrule",
-        *body,
-        r"\bottomrule",
-        r"\end{tabular}",
-        r"\end{table}",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def latex(text: str) -> str:
-    """Escape what LaTeX would read as a command."""
-    return "".join(_LATEX.get(character, character) for character in text)
-
-
 def as_text(table: Table, *, width: int | None = None) -> str:
     """Draw the table for a terminal, without the columns that are empty throughout."""
     drawn = RichTable(box=SIMPLE_HEAD, title=table.title, title_justify="left", padding=(0, 1))
-    used = [
-        index
-        for index in range(len(table.columns))
-        if any(row[index] not in ("", None) for row in table.rows)
-    ]
+    used = used_columns(table)
     for index in used:
         drawn.add_column(Text(table.columns[index]), overflow="fold")
     for row in table.rows:

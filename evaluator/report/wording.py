@@ -1,5 +1,6 @@
 """How numbers are written for people: rounding happens here and nowhere earlier."""
 
+import math
 from collections.abc import Sequence
 
 from evaluator.result import Cell, Measurement, Results
@@ -18,57 +19,126 @@ HEADLINES: tuple[tuple[str, str], ...] = (
     ("gain.pp.recorded.average", "Replanning gain, mean of tasks"),
     ("gain.relative.recorded.average", "The same, relative"),
     ("paired.mcnemar_p_mid.recorded", "Replanning, paired starts (McNemar mid-p)"),
-    ("tcp.planned.position_mean_m", "Tool: recorded to planned replay"),
-    ("tcp.executed.position_mean_m", "Tool: recorded to executed replay"),
+    ("motion.planned.position_mean_m", "Tool: recorded to planned replay"),
+    ("motion.executed.position_mean_m", "Tool: recorded to executed replay"),
     ("views.all.psnr_db", "PSNR of held-out views, raw"),
     ("views.all.psnr_gain_db", "The same after a gain per image and channel"),
     ("views.all.psnr_pose_gain_db", "The same after pose and gain fitted per image"),
     ("views.all.ssim", "SSIM of held-out views"),
+    ("views.all.ssim_zero", "The same, zeros beyond the border"),
     ("views.all.depth_mean_abs_m", "Depth of held-out views, mean error"),
     ("views.all.lpips", "LPIPS of held-out views"),
+    ("views.all.lpips_vgg_01", "LPIPS (VGG, images in 0..1) of held-out views"),
+    ("views.all.lpips_alex_pm1", "LPIPS (AlexNet, images in -1..1) of held-out views"),
 )
+
+SHOWN_UNITS: dict[str, tuple[float, str, str]] = {
+    "m": (1000.0, " mm", ".2f"),
+    "rad": (180.0 / math.pi, "°", ".2f"),
+    "dB": (1.0, " dB", ".2f"),
+    "pp": (1.0, " pp", "+.1f"),
+    "count": (1.0, "", ".0f"),
+    "s": (1.0, " s", ".3f"),
+}
+"""Factor, unit and digits in which a reader thinks."""
+PLAIN = (1.0, "", ".3f")
+SHARES = ("average.", "rate.", "proxy.recorded_rate", "sequence.recorded.")
+UNSIGNED = (
+    "agreement.mae_pp",
+    "agreement.rmse_pp",
+    "agreement.largest_gap_pp",
+    "decision.regret_pp",
+)
+"""Sizes in percentage points that are never below 0: a plus would look like a direction."""
+PLURALS = {"pair of runs": "pairs of runs", "policy": "policies"}
 
 
 def number(value: float, unit: str) -> str:
     """Write a value in the unit a reader thinks in."""
-    if unit == "m":
-        return f"{1000 * value:.2f} mm"
-    if unit == "rad":
-        return f"{value * 57.29577951308232:.2f}°"
-    if unit == "dB":
-        return f"{value:.2f} dB"
-    if unit == "pp":
-        return f"{value:+.1f} pp"
-    return f"{value:.3f}"
+    _, name, _ = SHOWN_UNITS.get(unit, PLAIN)
+    return f"{_figure(value, unit)}{name}"
+
+
+def _figure(value: float, unit: str) -> str:
+    factor, _, digits = SHOWN_UNITS.get(unit, PLAIN)
+    text = f"{factor * value:{digits}}"
+    small = value != 0 and float(text) == 0
+    return f"{factor * value:.1g}" if small else text  # small is not nothing
+
+
+def is_share(measurement: Measurement) -> bool:
+    """Say whether the value is a share of something, which people read in percent."""
+    counted = measurement.k is not None and measurement.n is not None
+    return measurement.unit == "1" and (counted or measurement.id.startswith(SHARES))
+
+
+def value_text(measurement: Measurement) -> str:
+    """Write the value alone."""
+    if measurement.value is None:
+        return "undefined"
+    if is_share(measurement):
+        return f"{100 * measurement.value:.1f} %"
+    if measurement.id.startswith("gain.relative."):
+        return f"{100 * measurement.value:+.1f} %"
+    text = number(measurement.value, measurement.unit)
+    return text.lstrip("+") if measurement.id in UNSIGNED else text
+
+
+def count_text(measurement: Measurement) -> str:
+    """Write what the value rests on: ``5/6 trials`` or ``6 cells``."""
+    if measurement.n is None:
+        return ""
+    counted = measurement.counted or ""
+    if counted and measurement.n != 1:
+        counted = PLURALS.get(counted, f"{counted}s")
+    named = f" {counted}" if counted else ""
+    if measurement.k is not None and measurement.value is not None:
+        return f"{measurement.k}/{measurement.n}{named}"
+    return f"{measurement.n}{named}"
+
+
+def ends_text(measurement: Measurement) -> str:
+    """Write the ends of the interval in the unit of the value, or nothing."""
+    interval = measurement.interval
+    if interval is None:
+        return ""
+    if is_share(measurement):
+        return f"[{100 * interval.low:.1f}, {100 * interval.high:.1f}]"
+    low, high = (_figure(end, measurement.unit) for end in (interval.low, interval.high))
+    return f"[{low}, {high}]"
+
+
+def method_text(measurement: Measurement) -> str:
+    """Write level, method and least coverage of the interval at this n, or nothing."""
+    interval = measurement.interval
+    if interval is None:
+        return ""
+    known = interval.worst_coverage
+    worst = "" if known is None else f", worst case {100 * known:.1f} %"
+    return f"{100 * interval.level:.0f} % {interval.method}{worst}"
 
 
 def measurement_text(measurement: Measurement) -> str:
     """Write value, count and interval, or why there is none."""
     if measurement.value is None:
         return f"undefined: {measurement.reason_if_undefined}"
+    text = value_text(measurement)
     if measurement.k is not None and measurement.n is not None:
-        text = f"{measurement.k}/{measurement.n} = {100 * measurement.value:.1f} %"
+        text = f"{measurement.k}/{measurement.n} = {text}"
     elif measurement.id.startswith("gain.relative."):
-        text = f"{100 * measurement.value:+.1f} % relative"
-    else:
-        text = number(measurement.value, measurement.unit)
-        if measurement.n is not None and measurement.counted:
-            text += f" (n = {measurement.n} {measurement.counted}s)"
+        text += " relative"
+    elif measurement.n is not None and measurement.counted:
+        text += f" (n = {count_text(measurement)})"
     return text + interval_text(measurement)
 
 
 def interval_text(measurement: Measurement) -> str:
     """Write the interval with its level, method and least coverage at this n, or nothing."""
-    interval = measurement.interval
-    if interval is None:
+    if measurement.interval is None:
         return ""
-    if measurement.k is not None and measurement.unit == "1":
-        ends = f"[{100 * interval.low:.1f}, {100 * interval.high:.1f}] %"
-    else:
-        ends = f"[{interval.low:.3g}, {interval.high:.3g}]"
-    known = interval.worst_coverage
-    worst = "" if known is None else f", worst case {100 * known:.1f} %"
-    return f" {ends} ({100 * interval.level:.0f} % {interval.method}{worst})"
+    _, unit, _ = SHOWN_UNITS.get(measurement.unit, PLAIN)
+    unit = " %" if is_share(measurement) else unit
+    return f" {ends_text(measurement)}{unit} ({method_text(measurement)})"
 
 
 def headlines(results: Results) -> list[tuple[str, str, Measurement]]:

@@ -1,34 +1,45 @@
 """Put one comparison on disk: results.json, tables, figures, report.html, trials.csv, Parquet."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bridge.exchange.trials_csv import TrialRecord, write_trials
 from evaluator.compare.rows import Comparison
 from evaluator.compare.spreadsheet import record_from_row
 from evaluator.errors import EvaluatorError
-from evaluator.report.figures import scatter_svg, success_svg
+from evaluator.report.figures.chosen import drawings
+from evaluator.report.figures.drawing import Drawing, NotDrawn
+from evaluator.report.figures.views import worst_pairs
+from evaluator.report.latex import as_latex
 from evaluator.report.page import page
-from evaluator.report.tables import as_csv, as_latex, as_markdown, as_text
+from evaluator.report.tables import as_csv, as_markdown, as_text
 from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
 
-SHOWN = ("published", "success", "layout", "gains", "stopping", "remarks")
+if TYPE_CHECKING:
+    from evaluator.report.figures.render import Rendered
+
+SHOWN = ("published", "success", "layout", "gains", "image_methods", "stopping", "remarks")
 """Tables a terminal shows; the others are in the report."""
 
-PARQUET_PACKAGES = ("pandas", "pyarrow")
+PARQUET_PACKAGES = ("pyarrow",)
+FIGURE_PACKAGES = ("matplotlib",)
+INSTALL = "pip install 'robot-gst[report]'"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Written:
-    """Where everything lies."""
+    """Where everything lies, and what was said."""
 
+    content: Results
+    """What ``results.json`` holds."""
     results: Path
     report: Path
     files: tuple[Path, ...]
     not_written: str | None = None
-    """Why there is no Parquet beside the CSV, or None."""
+    """Which packages are not installed and what is missing for it, or None."""
 
 
 def write_report(comparison: Comparison, folder: Path) -> Written:
@@ -37,49 +48,87 @@ def write_report(comparison: Comparison, folder: Path) -> Written:
     Raises:
         EvaluatorError: When the folder cannot be written.
     """
+    drawn, not_drawn = drawings(comparison)
     results = comparison.results()
+    if not_drawn:
+        words = "; ".join(f"{item.id} ({item.reason})" for item in not_drawn)
+        missing = f"figures without data, not drawn: {words}"
+        results = replace(results, missing=(*results.missing, missing))
     path = write_results(results, folder / "results.json")
-    word = comparison.recorded_word
-    drawn = {
-        "scatter": scatter_svg(comparison.cells, word),
-        "success": success_svg(comparison.cells, word),
-    }
-    figures = {name: svg for name, svg in drawn.items() if svg is not None}
-    texts = {folder / "report.html": page(results, list(figures.values()))}
-    texts |= {folder / "figures" / f"{name}.svg": svg for name, svg in figures.items()}
+    rendered, no_figures = _render(drawn)
+    inline = {item.drawing.id: item.inline for item in rendered}
+    text = page(
+        results,
+        [(drawing, inline.get(drawing.id)) for drawing in drawn],
+        worst_pairs(comparison.views),
+    )
+    contents = {folder / "report.html": text.encode()}
+    contents |= _figure_files(folder / "figures", drawn, rendered)
     for table in results.tables:
         for suffix, write in (("csv", as_csv), ("md", as_markdown), ("tex", as_latex)):
-            texts[folder / "tables" / f"{table.id}.{suffix}"] = write(table)
+            contents[folder / "tables" / f"{table.id}.{suffix}"] = write(table).encode()
     try:
-        for place, text in texts.items():
+        for place, data in contents.items():
             place.parent.mkdir(parents=True, exist_ok=True)
-            place.write_text(text, encoding="utf-8")
+            place.write_bytes(data)
+        _remove_old(folder, not_drawn)
         trials = [record_from_row(row) for row in comparison.rows]
         extra = [write_trials(folder / "trials.csv", trials)] if trials else []
-        parquet, reason = _write_parquet(folder, trials, results)
+        parquet, no_parquet = _write_parquet(folder, trials, results)
     except OSError as error:
         message = f"cannot write into {folder}: {error.strerror}. Choose another with --out."
         raise EvaluatorError(message) from error
     return Written(
+        content=results,
         results=path,
         report=folder / "report.html",
-        files=(*texts, *extra, *parquet),
-        not_written=reason,
+        files=(*contents, *extra, *parquet),
+        not_written="; ".join(filter(None, (no_figures, no_parquet))) or None,
     )
+
+
+def _render(drawn: Sequence[Drawing]) -> "tuple[list[Rendered], str | None]":
+    """Draw the figures, or say why not; matplotlib is heavy and may be missing."""
+    if not drawn:
+        return [], None
+    try:
+        from evaluator.report.figures import render  # noqa: PLC0415  # loads matplotlib
+    except ModuleNotFoundError as error:
+        if error.name not in FIGURE_PACKAGES:
+            raise
+        return [], f"figures not drawn: {error.name} is not installed ({INSTALL})"
+    return [render.render(drawing) for drawing in drawn], None
+
+
+def _figure_files(
+    folder: Path, drawn: Sequence[Drawing], rendered: "Sequence[Rendered]"
+) -> dict[Path, bytes]:
+    files = {folder / f"{drawing.id}.csv": as_csv(drawing.table).encode() for drawing in drawn}
+    for item in rendered:
+        files[folder / f"{item.drawing.id}.svg"] = item.svg
+        files[folder / f"{item.drawing.id}.pdf"] = item.pdf
+    return files
+
+
+def _remove_old(folder: Path, not_drawn: Sequence[NotDrawn]) -> None:
+    """Remove the figures of an earlier evaluation that this one has no data for."""
+    for item in not_drawn:
+        for ending in ("csv", "svg", "pdf"):
+            (folder / "figures" / f"{item.id}.{ending}").unlink(missing_ok=True)
 
 
 def _write_parquet(
     folder: Path, trials: Sequence[TrialRecord], results: Results
 ) -> tuple[list[Path], str | None]:
-    """Write the Parquet files, or say why not; pandas is heavy and may be missing."""
+    """Write the Parquet files, or say why not; pyarrow is heavy and may be missing."""
     try:
-        from evaluator.report import parquet  # noqa: PLC0415  # loads pandas only when writing
+        from evaluator.report import parquet  # noqa: PLC0415  # loads pyarrow only when writing
     except ModuleNotFoundError as error:
         if error.name not in PARQUET_PACKAGES:
             raise
         reason = (
             f"trials.parquet, measurements.parquet not written: {error.name} is not installed "
-            "(pip install 'robot-gst[report]')"
+            f"({INSTALL})"
         )
         return [], reason
     written = [parquet.write_measurements(folder / "measurements.parquet", results.measurements)]

@@ -1,9 +1,12 @@
 """Small invented run folders, written with the same writer the recorder uses."""
 
+import importlib.util
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -266,3 +269,36 @@ def write_table(tmp_path: Path) -> Callable[[str], Path]:
         return path
 
     return write
+
+
+def golden_script(name: str) -> ModuleType:
+    """Load a script of ``tests/golden``, which is no package."""
+    path = Path(__file__).parents[1] / "golden" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="session")
+def evaluation_run_once(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """An invented run with data for every part of an evaluation. Read it only."""
+    folder = tmp_path_factory.mktemp("golden") / "everything"
+    run = golden_script("make_evaluation_run").make_evaluation_run(folder)
+    assert isinstance(run, RunFolder)
+    return run
+
+
+@pytest.fixture
+def evaluation_run(evaluation_run_once: RunFolder, tmp_path: Path) -> RunFolder:
+    """A fresh copy of that run, for the test to spoil."""
+    return RunFolder(shutil.copytree(evaluation_run_once.path, tmp_path / "everything"))
+
+
+@pytest.fixture(scope="session")
+def load_golden_script() -> Callable[[str], ModuleType]:
+    """For tests in the folders below, which cannot import this file."""
+    return golden_script

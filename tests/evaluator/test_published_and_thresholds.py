@@ -179,3 +179,15 @@ def test_every_short_name_is_an_id_of_some_results(six_trials: Any) -> None:
 def test_evaluate_without_anything_is_wrong_use() -> None:
     with pytest.raises(UsageError, match="needs a run folder or a table"):
         evaluate()
+
+
+@pytest.mark.parametrize("text", ["r=nan", "inf", "psnr=-inf"])
+def test_a_limit_that_nothing_can_reach_or_miss_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="no limit"):
+        parse_thresholds(text)
+
+
+def test_every_file_is_there_before_a_missed_threshold_ends_the_command(tmp_path: Path) -> None:
+    assert evaluate(RATES, out=tmp_path / "out", fail_under="r=0.99, agreement.bias_pp=0") == 3
+    for name in ("report.html", "results.json", "tables/success.csv", "figures/scatter.pdf"):
+        assert (tmp_path / "out" / name).is_file()

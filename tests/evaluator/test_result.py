@@ -1,15 +1,17 @@
 """``results.json``: written, read back, and refused when it does not fit."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from bridge.errors import InvalidRecordError, PathNotFoundError
 from evaluator.compare import compare_run
 from evaluator.errors import EvaluatorError
-from evaluator.result import Interval, Measurement, Results, load_results, write_results
+from evaluator.result import Interval, Measurement, Results, Table, load_results, write_results
 
 RATE = Measurement(
     id="rate.recorded.cube",
@@ -61,17 +63,21 @@ def spoiled(name: str) -> dict[str, object]:
     measurement = record["measurements"][0]
     match name:
         case "newer":
-            record["schema_version"] = 2
+            record["schema_version"] = 3
         case "no reason":
             measurement["value"] = None
         case "unknown field":
             measurement["p"] = 0.05
         case "unnamed method":
             del measurement["interval"]["method"]
+        case "no such list":
+            measurement["episodes"] = 7
     return record
 
 
-@pytest.mark.parametrize("name", ["newer", "no reason", "unknown field", "unnamed method"])
+@pytest.mark.parametrize(
+    "name", ["newer", "no reason", "unknown field", "unnamed method", "no such list"]
+)
 def test_results_that_do_not_fit_are_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / "results.json"
     path.write_text(json.dumps(spoiled(name)))
@@ -84,3 +90,33 @@ def test_a_folder_that_cannot_be_written_is_one_clear_sentence(tmp_path: Path) -
     results = Results(run="r", source="run", stand_in=None, measurements=(RATE,))
     with pytest.raises(EvaluatorError, match="Choose another folder"):
         write_results(results, tmp_path / "file" / "results.json")
+
+
+def test_a_list_of_episodes_is_written_once(tmp_path: Path) -> None:
+    again = replace(RATE, id="rate.sim.cube")
+    results = Results(run="r", source="run", stand_in=None, measurements=(RATE, again))
+    record = results.to_record()
+    assert record["episode_lists"] == [["a", "b"]]
+    assert [item["episodes"] for item in record["measurements"]] == [0, 0]
+    path = write_results(results, tmp_path / "results.json")
+    assert json.loads(path.read_text()) == record
+    assert load_results(path) == results
+
+
+def test_results_of_version_one_are_still_read(tmp_path: Path) -> None:
+    results = Results(run="r", source="run", stand_in=None, measurements=(RATE,))
+    record = results.to_record() | {"schema_version": 1}
+    del record["episode_lists"]
+    record["measurements"][0]["episodes"] = ["a", "b"]
+    path = tmp_path / "results.json"
+    path.write_text(json.dumps(record))
+    assert load_results(path) == results
+
+
+@pytest.mark.parametrize("cell", [float("nan"), np.int64(3), Path("x")])
+def test_a_table_holds_only_what_json_can_say(cell: Any) -> None:
+    rows = (("a", 1.0),) * 30 + (("b", cell),)
+    table = Table(id="t", title="t", columns=("a", "b"), rows=rows)
+    results = Results(run="r", source="run", stand_in=None, measurements=(), tables=(table,))
+    with pytest.raises(InvalidRecordError, match="table t"):
+        results.to_record()

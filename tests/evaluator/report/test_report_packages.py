@@ -1,4 +1,4 @@
-"""Parquet says what CSV and JSON say, with types; without pandas the report is still written."""
+"""Parquet says what CSV and JSON say, with types; without a package the report is still written."""
 
 import subprocess
 import sys
@@ -9,13 +9,14 @@ from typing import Any
 import pandas as pd
 import pytest
 
+from bridge.episode.run import RunFolder
 from bridge.exchange.trials_csv import TrialRecord, read_trials
 from evaluator.compare import compare_run
 from evaluator.report.parquet import MEASUREMENT_TYPES, TRIAL_TYPES, write_trials
 from evaluator.report.write import summary_text, write_report
 from evaluator.result import load_results
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def plain(frame: pd.DataFrame) -> list[dict[str, Any]]:
@@ -67,20 +68,37 @@ def test_every_field_has_a_column() -> None:
     assert len(MEASUREMENT_TYPES) == 14
 
 
-@pytest.mark.parametrize("package", ["pandas", "pyarrow"])
-def test_without_the_package_the_report_is_written_and_says_so(
-    six_trials: Any, monkeypatch: pytest.MonkeyPatch, package: str
-) -> None:
-    for name in [name for name in sys.modules if name.startswith("evaluator.report.parquet")]:
+def take_away(monkeypatch: pytest.MonkeyPatch, package: str, user: str) -> None:
+    """Make a package uninstalled, for the module that needs it."""
+    for name in [name for name in sys.modules if name.startswith(user)]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.delattr("evaluator.report.parquet", raising=False)
+    monkeypatch.delattr(user, raising=False)
     monkeypatch.setattr(sys, "meta_path", [Missing(package), *sys.meta_path])
     for name in [name for name in sys.modules if name.split(".")[0] == package]:
         monkeypatch.delitem(sys.modules, name)
+
+
+def test_without_matplotlib_the_numbers_of_the_figures_are_written_and_it_says_so(
+    six_trials: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    take_away(monkeypatch, "matplotlib", "evaluator.report.figures.render")
+    comparison = compare_run(six_trials.run)
+    written = write_report(comparison, six_trials.run.results_dir)
+    assert "figures not drawn: matplotlib is not installed" in str(written.not_written)
+    assert (six_trials.run.results_dir / "figures" / "scatter.csv").is_file()
+    text = written.report.read_text()
+    assert "Not drawn; the numbers are below." in text
+    assert "<svg" not in text
+
+
+def test_without_pyarrow_the_report_is_written_and_says_so(
+    six_trials: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    take_away(monkeypatch, "pyarrow", "evaluator.report.parquet")
     comparison = compare_run(six_trials.run)
     written = write_report(comparison, six_trials.run.results_dir)
     text = summary_text(comparison.results(), written)
-    assert f"not written: {package} is not installed" in text
+    assert "not written: pyarrow is not installed" in text
     assert (six_trials.run.results_dir / "trials.csv").is_file()
     assert not list(six_trials.run.results_dir.glob("*.parquet"))
 
@@ -98,12 +116,31 @@ class Missing:
             raise ModuleNotFoundError(message, name=name)
 
 
-def test_pandas_is_not_loaded_before_something_is_written() -> None:
+def test_nothing_heavy_is_loaded_before_something_is_written() -> None:
     code = (
         "import sys, evaluator.report.write, evaluator.compare; "
-        "print([n for n in ('pandas', 'pyarrow') if n in sys.modules])"
+        "print([n for n in ('pandas', 'pyarrow', 'matplotlib', 'torch') if n in sys.modules])"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.slow
+def test_a_whole_evaluation_loads_neither_the_twin_nor_torch_nor_pandas(
+    evaluation_run: RunFolder,
+) -> None:
+    code = (
+        "import sys, robot_gst; code = robot_gst.run(['evaluate', sys.argv[1], '--quiet']); "
+        "heavy = ('twin', 'torch', 'pandas', 'open3d', 'mujoco', 'pybullet', 'zenoh'); "
+        "print(code, [n for n in heavy if n in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(evaluation_run.path)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=True,
+    )
+    assert done.stdout.strip().endswith("0 []")

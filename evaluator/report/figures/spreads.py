@@ -1,0 +1,204 @@
+"""Many values at once: error over time as bands, and distributions as steps."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from evaluator.compare.drawn import CurveBand, Shares
+from evaluator.report.figures.drawing import (
+    LEGEND_LINE_IN,
+    LIGHT,
+    Drawing,
+    NotDrawn,
+    framed,
+    grid,
+    legend,
+    legend_columns,
+    listed,
+    log_axis,
+    panel,
+)
+from evaluator.result import Cell, Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+COLOURS = ("sim", "rec", "third", "fourth", "ink", "soft")
+LINES = ("-", "--", "-.", ":", (0, (6, 1, 1, 1)), (0, (3, 1, 1, 1, 1, 1)))
+
+
+def motions(bands: Sequence[CurveBand]) -> Drawing | NotDrawn:
+    """Draw the distance of recorded and replayed tool over normalised time."""
+    if not bands:
+        return NotDrawn(id="motions", reason="no trial has both a recorded tool and a replayed one")
+
+    shown = bands[: len(COLOURS)]
+    head = 0.12 + LEGEND_LINE_IN * len(shown)
+
+    def draw(figure: "Figure") -> None:
+        axes = panel(figure, left=0.5, bottom=0.4, top=head)
+        grid(axes)
+        for index, band in enumerate(shown):
+            time = _percent_of(len(band.median))
+            colour = LIGHT[COLOURS[index]]
+            low, high, median = (
+                [1000 * v for v in side] for side in (band.low, band.high, band.median)
+            )
+            axes.fill_between(time, low, high, color=colour, alpha=0.18, linewidth=0)
+            axes.plot(
+                time, median, color=colour, linestyle=LINES[index], linewidth=1.5,
+                label=f"{band.name} (n = {band.num_curves})",
+            )  # fmt: skip
+        axes.set_xlim(0, 100)
+        axes.set_ylim(bottom=0)
+        axes.set_xlabel("time from start to end (%)")
+        axes.set_ylabel("distance of the tool (mm)")
+        legend(axes, columns=1)
+
+    middle = [(band, len(band.median) // 2) for band in bands]
+    return Drawing(
+        id="motions",
+        title="Recorded against replayed motion",
+        caption="Distance of the recorded tool centre point from the replayed one over normalised "
+        "time: median over trials, band from the 10th to the 90th percentile. Planned: what was "
+        "commanded, so the controller's tracking error; executed: the joints the robot reported, "
+        "so kinematics and calibration.",
+        alt="Median distance: "
+        + listed(
+            [
+                f"{band.name}: {1000 * band.median[0]:.1f} mm at the start, "
+                f"{1000 * band.median[half]:.1f} mm half-way, {1000 * band.median[-1]:.1f} mm at "
+                f"the end, {band.num_curves} trials"
+                for band, half in middle
+            ]
+        ),
+        table=Table(
+            id="figure_motions",
+            title="",
+            columns=("against", "trials", "time (%)", "median (mm)", "10th", "90th percentile"),
+            rows=tuple(
+                (
+                    band.name,
+                    band.num_curves,
+                    round(_percent_of(len(band.median))[i], 1),
+                    *(round(1000 * side[i], 3) for side in (band.median, band.low, band.high)),
+                )
+                for band in bands
+                for i in range(0, len(band.median), max(1, len(band.median) // 20))
+            ),
+        ),
+        height_in=2.35 + head,
+        draw=draw,
+    )
+
+
+def _percent_of(count: int) -> list[float]:
+    return [100 * i / max(1, count - 1) for i in range(count)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Panel:
+    """Distributions that share one axis."""
+
+    label: str
+    """With its unit."""
+    groups: tuple[Shares, ...]
+    log: bool = False
+    """Errors spread over decades; quality scores do not."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subject:
+    """The words of a figure of distributions."""
+
+    id: str
+    title: str
+    caption: str
+    reason: str
+    """Why there is none, when there are no values."""
+
+
+def distributions(subject: Subject, panels: Sequence[Panel]) -> Drawing | NotDrawn:
+    """Draw for each panel which share of the values is at most as large."""
+    panels = [panel for panel in panels if panel.groups]
+    if not panels:
+        return NotDrawn(id=subject.id, reason=subject.reason)
+    names = list(dict.fromkeys(group.name for panel in panels for group in panel.groups))
+    drawn = names[: len(COLOURS)]
+    columns = legend_columns([f"{name} (n = 100)" for name in drawn])
+    head = LEGEND_LINE_IN * -(-len(drawn) // columns) + 0.12
+    tall = 1.55
+    height = head + len(panels) * (tall + 0.52)
+
+    def draw(figure: "Figure") -> None:
+        for index, item in enumerate(panels):
+            bottom = height - head - index * (tall + 0.52) - tall
+            axes = framed(figure, (0.5, bottom, 2.88, tall))
+            grid(axes)
+            if item.log and _decades(item.groups) > 1:
+                log_axis(axes)
+            for group in item.groups:
+                if group.name not in drawn:
+                    continue
+                place = drawn.index(group.name)
+                axes.step(
+                    group.values, [100 * s for s in group.shares], where="post",
+                    color=LIGHT[COLOURS[place]], linestyle=LINES[place], linewidth=1.4,
+                    label=f"{group.name} (n = {group.n})",
+                )  # fmt: skip
+                if group.n <= 12:
+                    axes.plot(
+                        group.values, [100 * s for s in group.shares], "o", markersize=3,
+                        color=LIGHT[COLOURS[place]],
+                    )  # fmt: skip
+            axes.set_ylim(0, 103)
+            axes.set_yticks(range(0, 101, 25))
+            axes.set_xlabel(item.label, labelpad=1)
+            axes.set_ylabel("share at most (%)")
+            if index == 0:
+                legend(axes, columns=columns)
+
+    hidden = f" {len(names) - len(drawn)} more in the table." if len(names) > len(drawn) else ""
+    return Drawing(
+        id=subject.id,
+        title=subject.title,
+        caption=f"{subject.caption} Height: the share of values that are at most this large."
+        f"{hidden}",
+        alt="Distributions: "
+        + listed(
+            [
+                f"{item.label}, {group.name}: {group.values[0]:.4g} to {group.values[-1]:.4g}, "
+                f"middle {_at(group, 0.5):.4g}, n = {group.n}"
+                for item in panels
+                for group in item.groups
+            ]
+        ),
+        table=Table(
+            id=f"figure_{subject.id}",
+            title="",
+            columns=("what", "group", "n", *(f"{round(100 * s)} % are at most" for s in STEPS)),
+            rows=tuple(_row(item, group) for item in panels for group in item.groups),
+        ),
+        height_in=height,
+        draw=draw,
+    )
+
+
+STEPS = (0.10, 0.25, 0.50, 0.75, 0.90, 1.0)
+
+
+def _decades(groups: Sequence[Shares]) -> float:
+    """Powers of ten that positive values span."""
+    values = [value for group in groups for value in group.values if value > 0]
+    return math.log10(max(values) / min(values)) if values else 0.0
+
+
+def _row(item: Panel, group: Shares) -> tuple[Cell, ...]:
+    return (item.label, group.name, group.n, *(float(f"{_at(group, s):.4g}") for s in STEPS))
+
+
+def _at(group: Shares, share: float) -> float:
+    """Read a drawn distribution at one height."""
+    pairs = zip(group.values, group.shares, strict=True)
+    return next((value for value, part in pairs if part >= share - 1e-12), group.values[-1])

@@ -1,0 +1,196 @@
+"""The parts of the report, in the order a reader needs them, and what belongs to each."""
+
+import re
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+from evaluator.result import Measurement
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """One part: which numbers, tables and figures it holds. Names may end in ``*``."""
+
+    id: str
+    title: str
+    lead: str
+    """What question it answers, and what to beware of."""
+    numbers: tuple[tuple[str, str], ...] = ()
+    """Pattern of ids, and what to call the number; an empty name is made from the id."""
+    tables: tuple[str, ...] = ()
+    figures: tuple[str, ...] = ()
+
+
+SECTIONS: tuple[Section, ...] = (
+    Section(
+        id="published",
+        title="The printed figures, recomputed",
+        lead="A published table is taken at its rows; every printed figure that does not follow "
+        "from them is named.",
+        tables=("published",),
+    ),
+    Section(
+        id="success",
+        title="Success rates",
+        lead="How often a task succeeded in the twin and as labelled. Sim is planned-in-twin: the "
+        "plan actually sent, replayed with physics.",
+        tables=("success", "layout"),
+        figures=("success",),
+    ),
+    Section(
+        id="agreement",
+        title="Agreement over cells",
+        lead="Whether the twin's rates move with the labelled ones, and how far off they are. A "
+        "high r does not show that the right decision follows, nor that there is no bias.",
+        numbers=(
+            ("agreement.pearson_r", "Pearson r"),
+            ("agreement.pearson_r.without_replanning", "Pearson r, without replanning"),
+            ("agreement.pearson_r.with_replanning", "Pearson r, with replanning"),
+            ("agreement.pearson_r_remeasured", "Pearson r, were it measured again"),
+            ("agreement.spearman_rho", "Spearman's rank correlation"),
+            ("agreement.kendall_tau_b", "Kendall's tau-b"),
+            ("agreement.bias_pp", "Bias: sim minus labelled"),
+            ("agreement.mae_pp", "Mean absolute error"),
+            ("agreement.rmse_pp", "Root mean square error"),
+            ("agreement.largest_gap_pp", "Largest gap"),
+            ("agreement.calibration_slope", "Calibration line, slope"),
+            ("agreement.calibration_intercept_pp", "Calibration line, intercept"),
+            ("agreement.order_accuracy", "Pairs of cells in the right order"),
+            ("agreement.mmrv_recorded_gap", "MMRV, gap of recorded rates"),
+            ("agreement.mmrv_sim_gap", "MMRV, gap of sim rates (swapped)"),
+            ("decision.*", ""),
+        ),
+        tables=("agreement_intervals", "decisions", "leave_one_task_out"),
+        figures=("scatter",),
+    ),
+    Section(
+        id="replanning",
+        title="The gain with replanning",
+        lead="Percentage points and relative gain are two numbers for one change; each is "
+        "labelled. The tests say whether so many trials can show it at all.",
+        numbers=(
+            ("gain.pp.recorded.average", "Gain, mean of tasks, as labelled"),
+            ("gain.relative.recorded.average", "The same, relative"),
+            ("gain.pp.sim.average", "Gain, mean of tasks, in the twin"),
+            ("gain.relative.sim.average", "The same, relative, in the twin"),
+            ("paired.gain_pp.recorded", "Gain over paired starts, as labelled"),
+            ("paired.gain_pp.sim_planned", "Gain over paired starts, in the twin"),
+            ("paired.mcnemar_p_mid.recorded", "McNemar's mid-p, as labelled"),
+            ("paired.mcnemar_p_exact.recorded", "McNemar's exact p, as labelled"),
+            ("unpaired.boschloo_p.recorded.pooled", "Boschloo's p over pooled trials"),
+            ("paired.start_distance_max_m", "Largest distance of paired starts"),
+            ("sequence.replanning_evidence.recorded", "Evidence, valid at any time"),
+        ),
+        tables=("gains", "remarks"),
+        figures=("gains",),
+    ),
+    Section(
+        id="gate",
+        title="Trial by trial: what the gate is worth",
+        lead="What the twin said of each plan against how it ended, and what obeying it costs "
+        "and avoids.",
+        numbers=(
+            ("agreement.sim_planned.rate", "Sim and outcome agree"),
+            ("agreement.sim_planned.ppv", "Success when sim says success (PPV)"),
+            ("agreement.sim_planned.npv", "Failure when sim says failure (NPV)"),
+            ("agreement.sim_planned.phi", "phi of sim and outcome"),
+            ("agreement.verdict.rate", "Verdict and outcome agree"),
+            ("agreement.verdict.ppv", "Success when the gate accepted (PPV)"),
+            ("agreement.verdict.npv", "Failure when the gate refused (NPV)"),
+            ("agreement.verdict_unheeded.ppv", "PPV where the gate was not obeyed"),
+            ("agreement.verdict_unheeded.npv", "NPV where the gate was not obeyed"),
+            ("gate.break_even_price", "A refused good plan may cost (bad executions)"),
+            ("reliability.brier", "Brier score of the stated probability"),
+            ("reliability.brier_of_base_rate", "Brier score of the base rate"),
+            ("reliability.ece", "Expected calibration error"),
+        ),
+        tables=("confusion", "gate_*", "reliability"),
+        figures=("confusion", "costs", "reliability"),
+    ),
+    Section(
+        id="stages",
+        title="Where trials are lost",
+        lead="Which stage ends a trial, and what failed first on each side.",
+        numbers=(),
+        tables=("funnel", "success_curve", "failures"),
+        figures=("funnel",),
+    ),
+    Section(
+        id="motion",
+        title="Motions",
+        lead="How far the recorded robot lies from the replayed one: planned tells about the "
+        "controller, executed about kinematics and calibration.",
+        numbers=(("motion.*", ""), ("bands.*", ""), ("repeatability.*", "")),
+        tables=("motion*", "bands_*"),
+        figures=("motions",),
+    ),
+    Section(
+        id="states",
+        title="Predicted states and labels",
+        lead="Where the twin expected objects to end up, where they were localised, and where the "
+        "replay left them; and whether labels and localised goals agree.",
+        numbers=(("label.*", ""),),
+        tables=("final_states", "stage_states", "state*", "label*"),
+        figures=("states",),
+    ),
+    Section(
+        id="views",
+        title="Images",
+        lead="Rendered against held-out recorded images. No value stands without its protocol: it "
+        "is in the definition of each number below.",
+        numbers=(
+            ("views.all.psnr_db", "PSNR, raw"),
+            ("views.all.psnr_gain_db", "PSNR, after a gain per image"),
+            ("views.all.psnr_pose_gain_db", "PSNR, after pose and gain"),
+            ("views.all.ssim*", ""),
+            ("views.all.lpips*", ""),
+            ("views.all.depth*", ""),
+            ("views.all.*", ""),
+            ("image.*", ""),
+        ),
+        tables=("views*", "image*"),
+        figures=("views",),
+    ),
+    Section(
+        id="fewer",
+        title="Fewer robot trials",
+        lead="What the twin adds to few robot trials, and whether enough were made.",
+        numbers=(("proxy.*", ""), ("sequence.recorded.*", ""), ("power.*", "")),
+        tables=("stopping",),
+    ),
+)
+
+OTHER = Section(id="other", title="More tables", lead="", tables=("*",))
+TRIALS = "trials"
+"""The table that is as long as the run; it comes last."""
+
+
+def section_of(table_id: str) -> Section:
+    """Return the part a table belongs to."""
+    for section in SECTIONS:
+        if any(fnmatchcase(table_id, pattern) for pattern in section.tables):
+            return section
+    return OTHER
+
+
+def numbers_of(
+    section: Section, measurements: tuple[Measurement, ...]
+) -> list[tuple[str, Measurement]]:
+    """Return (name, measurement) of a part, in the order of its patterns."""
+    found: dict[str, tuple[str, Measurement]] = {}
+    for pattern, name in section.numbers:
+        for measurement in measurements:
+            if fnmatchcase(measurement.id, pattern):
+                found.setdefault(measurement.id, (name or name_of(measurement.id), measurement))
+    return list(found.values())
+
+
+def name_of(measurement_id: str) -> str:
+    """Write an id as words, for numbers that have no other name."""
+    plain = _UNIT.sub("", measurement_id.removesuffix(".-"))
+    words = plain.replace("_", " ").split(".")
+    return ", ".join(word for word in words if word not in ("", "-"))
+
+
+_UNIT = re.compile(r"_(m|rad|s|db|pp)$")
+"""Ends of ids that the value says again."""

@@ -1,0 +1,90 @@
+// What an accessibility checker looks for, as a list of sentences; empty is good.
+(() => {
+  const found = [];
+  const say = (what, element) => found.push(`${what}: ${element.outerHTML.slice(0, 160)}`);
+  const all = (selector) => [...document.querySelectorAll(selector)];
+  const named = (element) => {
+    const label = element.getAttribute("aria-label");
+    const by = (element.getAttribute("aria-labelledby") || "").split(" ").filter(Boolean);
+    const texts = by.map((id) => document.getElementById(id)?.textContent || "");
+    return (label || texts.join(" ") || element.textContent || "").trim();
+  };
+
+  if (document.documentElement.lang !== "en") found.push("no language");
+  if (!document.title.trim()) found.push("no title");
+  if (all("main").length !== 1) found.push("not one main");
+  if (all("h1").length !== 1) found.push("not one h1");
+  let level = 0;
+  for (const heading of all("h1,h2,h3,h4,h5,h6")) {
+    const mine = Number(heading.tagName[1]);
+    if (mine > level + 1) say("heading skips a level", heading);
+    if (!heading.textContent.trim()) say("empty heading", heading);
+    level = mine;
+  }
+  const ids = all("[id]").map((element) => element.id);
+  for (const id of ids.filter((id, place) => ids.indexOf(id) !== place)) found.push(`twice: ${id}`);
+  for (const element of all("[aria-labelledby],[aria-describedby]")) {
+    const names = `${element.getAttribute("aria-labelledby") || ""} ${element.getAttribute("aria-describedby") || ""}`;
+    for (const id of names.split(" ").filter(Boolean)) if (!document.getElementById(id)) say(`no ${id}`, element);
+  }
+  for (const table of all("table")) {
+    if (!table.caption?.textContent.trim()) say("table without caption", table);
+    for (const head of table.querySelectorAll("th")) if (!head.scope) say("th without scope", head);
+    const width = table.tHead.rows[0].cells.length;
+    for (const row of table.tBodies[0].rows) if (row.cells.length !== width) say("row of another length", row);
+  }
+  for (const image of all("img")) if (!image.alt.trim()) say("img without alt", image);
+  for (const svg of all("svg")) {
+    if (svg.getAttribute("role") !== "img" || !named(svg)) say("svg without a name", svg);
+  }
+  for (const figure of all("figure")) {
+    if (!figure.querySelector("figcaption")) say("figure without caption", figure);
+    if (figure.querySelector("svg") && !figure.querySelector("details table")) say("figure without data", figure);
+  }
+  for (const link of all("a")) {
+    if (!link.textContent.trim()) say("link without text", link);
+    if (!document.getElementById(link.getAttribute("href").slice(1))) say("link to nowhere", link);
+  }
+  for (const region of all("[role=region],nav,section")) if (!named(region)) say("region without a name", region);
+  for (const box of all("*")) {
+    const style = getComputedStyle(box);
+    const scrolls = ["auto", "scroll"].includes(style.overflowX) && box.scrollWidth > box.clientWidth + 1;
+    if (scrolls && box.tabIndex < 0) say("scrolls but not by keyboard", box);
+  }
+
+  // Contrast as WCAG 2.2 defines it, of every visible text against what lies behind it.
+  const parts = (colour) => {
+    const numbers = colour.match(/[\d.]+/g).map(Number);
+    return numbers.length === 3 ? [...numbers, 1] : numbers;
+  };
+  const over = (front, back) => front.slice(0, 3).map((v, i) => v * front[3] + back[i] * (1 - front[3]));
+  const luminance = (rgb) => {
+    const [r, g, b] = rgb.map((v) => v / 255).map((v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  };
+  const behind = (element) => {
+    const layers = [];
+    for (let at = element; at; at = at.parentElement) {
+      const colour = getComputedStyle(at).backgroundColor;
+      if (colour) layers.push(parts(colour));
+      if (parts(colour)[3] === 1) break;
+    }
+    return layers.reverse().reduce((back, layer) => over(layer, back), [255, 255, 255]);
+  };
+  let texts = 0;
+  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  while (walker.nextNode()) {
+    const element = walker.currentNode.parentElement;
+    if (!walker.currentNode.textContent.trim() || !element.getClientRects().length) continue;
+    if (element.closest("desc,title,style,.unseen")) continue;
+    const style = getComputedStyle(element);
+    const back = behind(element);
+    const ink = parts(element instanceof SVGElement ? style.fill : style.color);
+    const [a, b] = [luminance(over(ink, back)), luminance(back)];
+    const contrast = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+    texts += 1;
+    if (contrast < 4.5) say(`contrast ${contrast.toFixed(2)}`, element);
+  }
+  if (texts < 50) found.push(`only ${texts} texts were looked at`);
+  return found;
+})();

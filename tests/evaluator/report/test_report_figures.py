@@ -1,0 +1,120 @@
+"""Figures: the same bytes every time, text as text, colours of the palette, data behind each."""
+
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from bridge.episode.run import RunFolder
+from evaluator.compare import Comparison, compare_csv, compare_run
+from evaluator.report.figures.agreement import scatter, success
+from evaluator.report.figures.chosen import drawings
+from evaluator.report.figures.drawing import DARK, LIGHT, Drawing, NotDrawn
+from evaluator.report.figures.render import Rendered, render
+from evaluator.report.sections import SECTIONS
+from evaluator.report.write import write_report
+
+PAPER = Path(__file__).resolve().parents[3] / "docs" / "examples" / "paper_table_rates.csv"
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+@pytest.fixture(scope="module")
+def comparison(evaluation_run_once: RunFolder) -> Comparison:
+    return compare_run(evaluation_run_once)
+
+
+@pytest.fixture(scope="module")
+def rendered(comparison: Comparison) -> list[Rendered]:
+    drawn, not_drawn = drawings(comparison)
+    assert [item.id for item in not_drawn] == []
+    return [render(drawing) for drawing in drawn]
+
+
+def test_a_run_with_everything_has_every_figure_and_each_has_its_place(
+    rendered: list[Rendered],
+) -> None:
+    placed = [name for section in SECTIONS for name in section.figures]
+    assert sorted(item.drawing.id for item in rendered) == sorted(placed)
+    assert len(placed) == len(set(placed)) == 10
+
+
+def test_what_has_no_data_is_named_with_its_reason() -> None:
+    drawn, not_drawn = drawings(compare_csv(PAPER))
+    assert {item.id for item in drawn} == {"scatter", "success", "gains"}
+    assert {item.id for item in not_drawn} == {
+        *("confusion", "costs", "reliability", "funnel", "motions", "states", "views")
+    }
+    assert all(item.reason for item in not_drawn)
+
+
+def test_drawing_twice_gives_the_same_bytes(rendered: list[Rendered]) -> None:
+    for item in rendered[:3]:
+        again = render(item.drawing)
+        assert again.svg == item.svg
+        assert again.pdf == item.pdf
+        assert b"Date" not in item.svg
+        assert b"CreationDate" not in item.pdf
+
+
+def test_files_are_well_formed_and_their_text_can_be_selected(rendered: list[Rendered]) -> None:
+    for item in rendered:
+        root = ET.fromstring(item.svg)
+        texts = [text.text or "" for text in root.iter(f"{SVG}text")]
+        assert len(texts) > 4, item.drawing.id
+        assert not list(root.iter(f"{SVG}image"))
+        assert item.pdf.startswith(b"%PDF-1.")
+        assert b"/Type3" not in item.pdf
+        assert len(item.svg) < 200_000
+
+
+def test_pages_take_figures_in_their_own_colours(rendered: list[Rendered]) -> None:
+    ids: list[str] = []
+    for item in rendered:
+        assert not re.search(r"#[0-9a-f]{6}\b", item.inline), item.drawing.id
+        named = set(re.findall(r"var\(--([a-z]+)\)", item.inline))
+        assert named <= LIGHT.keys(), item.drawing.id
+        root = ET.fromstring(item.inline)
+        ids += [element.get("id") or "" for element in root.iter() if element.get("id")]
+        used = re.findall(r'(?:href="#|url\(#)([^")]+)', item.inline)
+        assert set(used) <= set(ids)
+    assert len(ids) == len(set(ids))
+    assert LIGHT.keys() == DARK.keys()
+    assert len(set(LIGHT.values())) == len(LIGHT)
+
+
+def test_figures_have_words_for_those_who_cannot_see_them(rendered: list[Rendered]) -> None:
+    for item in rendered:
+        drawing = item.drawing
+        root = ET.fromstring(item.inline)
+        assert root.get("role") == "img"
+        assert len(drawing.alt) > 40
+        assert root.findtext("desc") == drawing.alt
+        assert drawing.table.rows
+        assert all(len(row) == len(drawing.table.columns) for row in drawing.table.rows)
+
+
+def test_the_papers_cells_stand_in_the_data_of_the_scatter() -> None:
+    drawing = scatter(compare_csv(PAPER).cells, "real")
+    assert isinstance(drawing, Drawing)
+    columns = drawing.table.columns
+    sim, recorded = columns.index("twin (%)"), columns.index("real (%)")
+    pairs = [(row[sim], row[recorded]) for row in drawing.table.rows]
+    assert sorted(pairs) == sorted([(80, 80), (100, 90), (60, 40), (100, 80), (60, 46), (80, 70)])
+
+
+def test_there_is_no_figure_without_cells() -> None:
+    assert isinstance(scatter([], "real"), NotDrawn)
+    assert isinstance(success([], "real"), NotDrawn)
+
+
+def test_a_figure_that_has_lost_its_data_is_removed(tmp_path: Path) -> None:
+    stale = tmp_path / "figures" / "funnel.svg"
+    stale.parent.mkdir()
+    stale.write_text("<svg/>")
+    mine = tmp_path / "figures" / "mine.svg"
+    mine.write_text("<svg/>")
+    written = write_report(compare_csv(PAPER), tmp_path)
+    assert not stale.exists()
+    assert mine.exists()
+    assert any("funnel (no trial has labelled stages)" in text for text in written.content.missing)

@@ -1,0 +1,94 @@
+"""``report.html`` in a real browser: nothing from outside, no complaint, readable by everyone."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bridge.episode.run import RunFolder
+from evaluator.compare import compare_run
+from evaluator.report.page import POLICY
+from evaluator.report.write import write_report
+
+CHECKS = Path(__file__).with_name("checks.js").read_text()
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def report(evaluation_run_once: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report")
+    return write_report(compare_run(evaluation_run_once), folder).report
+
+
+def keep(browser: Any, name: str) -> None:
+    """Keep a picture where GST_PICTURES says, for a person to look at."""
+    if folder := os.environ.get("GST_PICTURES"):
+        (Path(folder) / f"{name}.png").write_bytes(browser.picture())
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+@pytest.mark.parametrize("dark", [False, True])
+def test_the_report_asks_for_nothing_complains_of_nothing_and_can_be_read(
+    browser: Any, report: Path, width: int, dark: bool
+) -> None:
+    browser.show(report, width=width, dark=dark)
+    keep(browser, f"report_{width}_{'dark' if dark else 'light'}")
+    asked = [url for url in browser.asked if not url.startswith("data:image/png;base64,")]
+    assert asked == [report.as_uri()]
+    assert browser.ask("document.documentElement.scrollWidth") <= width
+    assert browser.ask(CHECKS) == []
+    browser.ask("document.querySelectorAll('details').forEach((part) => { part.open = true })")
+    assert browser.ask("document.documentElement.scrollWidth") <= width
+    assert browser.ask(CHECKS) == []
+    assert browser.complaints == []
+
+
+def test_light_and_dark_are_two_looks_of_the_same_page(browser: Any, report: Path) -> None:
+    looks = []
+    for dark in (False, True):
+        browser.show(report, width=1280, dark=dark)
+        colours = "[document.body, document.querySelector('figure svg text')].map((e) => "
+        colours += "getComputedStyle(e)).map((s) => s.backgroundColor + s.fill)"
+        looks.append(browser.ask(colours))
+    assert looks[0][0] != looks[1][0]
+    assert looks[0][1] != looks[1][1]
+
+
+def test_the_keyboard_reaches_what_there_is_to_do(browser: Any, report: Path) -> None:
+    browser.show(report, width=1280, dark=False)
+    reached = []
+    for _ in range(400):
+        browser.press("Tab")
+        name = browser.ask(
+            "document.activeElement.tagName + '.' + document.activeElement.className"
+        )
+        if name == "BODY.":
+            break
+        reached.append(name)
+    assert reached[0] == "A.skip"
+    wanted = browser.ask("document.querySelectorAll('a,summary').length")
+    assert sum(name.startswith(("A.", "SUMMARY.")) for name in reached) == wanted
+    browser.ask("document.querySelector('summary').focus()")
+    browser.press("Enter")
+    assert browser.ask("document.querySelector('details').open")
+
+
+def test_a_printed_report_is_dark_on_white_without_its_contents(browser: Any, report: Path) -> None:
+    browser.show(report, width=1280, dark=True, media="print")
+    style = "getComputedStyle(document.querySelector('{}')).{}"
+    assert browser.ask(style.format("body", "backgroundColor")) == "rgb(255, 255, 255)"
+    assert browser.ask(style.format("nav", "display")) == "none"
+    assert browser.ask(style.format("figure svg text", "fill")) != "rgb(232, 235, 241)"
+
+
+def test_a_page_that_wants_to_load_something_is_noticed(browser: Any, report: Path) -> None:
+    spoiled = report.with_name("spoiled.html")
+    text = report.read_text().replace("<main", '<img src="other.png" alt=""><h4>x</h4><main', 1)
+    spoiled.write_text(text)
+    browser.show(spoiled, width=1280, dark=False)
+    assert POLICY in text
+    assert any("Content Security Policy" in text or "Csp" in text for text in browser.complaints)
+    found = browser.ask(CHECKS)
+    assert any(text.startswith("img without alt") for text in found)
+    assert any(text.startswith("heading skips a level") for text in found)

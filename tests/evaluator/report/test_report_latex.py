@@ -1,0 +1,126 @@
+"""LaTeX tables: a grammar holds whatever a cell says, and TeX compiles them where there is one."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evaluator.report.latex import LONG_ROWS, as_latex, latex
+from evaluator.result import Table
+
+TEX = shutil.which("pdflatex") or shutil.which("lualatex") or shutil.which("tectonic")
+NASTY = (
+    "[x]",
+    "*",
+    "50 %",
+    "a_b & c",
+    "#1 $2 {3}",
+    "~^\\",
+    "<b>",
+    'say "so"',
+    "≥ 3 °",
+    "名",
+    "a\nb",
+)
+TOKEN = re.compile(
+    r"\\(?:[A-Za-z]+|[\\&%$#_{}])"  # a command
+    r"|[{}]"
+    r"|\$(?:[^$\\]|\\[A-Za-z]+)*\$"  # a little mathematics
+    r"|&"
+    r"|%\n"  # the end of a line that is no blank
+    r"|[^\\{}$&#_%^~]"  # plain text
+)
+
+
+def tokens(text: str) -> list[str]:
+    """Split LaTeX; anything the grammar does not know ends the test."""
+    found, place = [], 0
+    while place < len(text):
+        match = TOKEN.match(text, place)
+        assert match is not None, text[max(0, place - 20) : place + 20]
+        found.append(match[0])
+        place = match.end()
+    return found
+
+
+def check(text: str, columns: int, rows: int) -> None:
+    """Braces and environments are balanced, and every line has its cells."""
+    depth = 0
+    for token in tokens(text):
+        depth += {"{": 1, "}": -1}.get(token, 0)
+        assert depth >= 0
+    assert depth == 0
+    opened: list[str] = []
+    for kind, name in re.findall(r"\\(begin|end)\{([a-z]+)\}", text):
+        if kind == "begin":
+            opened.append(name)
+        else:
+            assert opened.pop() == name
+    assert opened == []
+    body = text[text.index(r"\midrule") :].splitlines()
+    lines = [line for line in body if line.endswith(r" \\")]
+    assert len(lines) == rows
+    for line in lines:
+        assert len(re.findall(r"(?<!\\)&", line)) == columns - 1
+        assert not re.match(r"\s*[\[*]", line)  # it would be the argument of the line before
+
+
+def table(rows: list[tuple[str, ...]], note: str = "") -> Table:
+    columns = tuple(f"column {index}_%" for index in range(len(rows[0])))
+    return Table(id="t_1", title="T & co_1", columns=columns, rows=tuple(rows), note=note)
+
+
+def test_nasty_cells_stay_text() -> None:
+    made = as_latex(table([(text, "1") for text in NASTY], note="100 % [sic]"))
+    check(made, columns=2, rows=len(NASTY))
+    assert "U+540D" in made
+    assert made.count(r"\toprule") == made.count(r"\bottomrule") == 1
+
+
+@given(st.lists(st.tuples(st.text(max_size=12), st.text(max_size=12)), min_size=1, max_size=4))
+def test_any_text_is_escaped(rows: list[tuple[str, str]]) -> None:
+    kept = [("x", *row) for row in rows]
+    used = 1 + sum(any(row[i] for row in rows) for i in range(2))
+    check(as_latex(table(kept)), columns=used, rows=len(rows))
+
+
+def test_a_long_table_runs_over_pages_and_a_wide_one_is_shrunk() -> None:
+    long = as_latex(table([("a", str(i)) for i in range(LONG_ROWS + 1)]))
+    check(long, columns=2, rows=LONG_ROWS + 1)
+    assert r"\begin{longtable}" in long
+    assert r"\endhead" in long
+    wide = as_latex(table([("a" * 60, "b" * 60)]))
+    check(wide, columns=2, rows=1)
+    assert r"\resizebox{\textwidth}" in wide
+
+
+def test_numbers_stand_at_the_right_and_empty_columns_are_left_out() -> None:
+    made = as_latex(
+        Table(id="t", title="t", columns=("a", "b", "c"), rows=(("x", None, 1.5), ("y", "", 2)))
+    )
+    assert r"\begin{tabular}{@{}lr@{}}" in made
+    assert latex("−0.5 ± 1") == r"$-$0.5 $\pm$ 1"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(TEX is None, reason="no TeX (Debian: texlive-latex-recommended)")
+def test_tex_sets_the_tables(tmp_path: Path) -> None:
+    assert TEX is not None
+    tables = [
+        table([(text, "1") for text in NASTY], note="100 % [sic]"),
+        table([("a", str(i)) for i in range(60)]),
+        table([("a" * 60, "b" * 60)]),
+    ]
+    packages = r"\usepackage{booktabs,graphicx,longtable}"
+    body = "\n".join(as_latex(item) for item in tables)
+    text = f"\\documentclass{{article}}{packages}\\begin{{document}}{body}\\end{{document}}\n"
+    (tmp_path / "all.tex").write_text(text)
+    options = [] if "tectonic" in TEX else ["-interaction=nonstopmode", "-halt-on-error"]
+    done = subprocess.run(
+        [TEX, *options, "all.tex"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout[-2000:]

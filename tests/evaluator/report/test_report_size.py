@@ -1,0 +1,102 @@
+"""Large runs: the page stays small and says where the rest is; the results are complete."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluator.compare.from_rows import compare_rows
+from evaluator.compare.motion import MotionSummary
+from evaluator.compare.rows import Comparison, TrialRow
+from evaluator.report.html import SHOWN_ROWS
+from evaluator.report.write import write_report
+from evaluator.result import load_results
+
+MAX_BYTES = 5_000_000
+
+
+def many(count: int) -> Comparison:
+    """Draw trials of four tasks, with everything a trial row can say."""
+    rng = np.random.default_rng(3)
+    rows = []
+    for number in range(count):
+        recorded, said = bool(rng.random() < 0.6), bool(rng.random() < 0.7)
+        condition = "with_replanning" if number % 2 else "without_replanning"
+        rows.append(
+            TrialRow(
+                episode=f"monday_trial_{number:05d}",
+                task=f"task_{number // 2 % 4}",
+                condition=condition,
+                policy="scripted",
+                start_id=f"s{number // 2}",
+                cell="standin",
+                stand_in=True,
+                recorded=recorded,
+                sim_planned=said,
+                sim_executed=recorded,
+                verdict=said,
+                p_success=float(rng.random()),
+                first_failing=None if said else "clearance",
+                failing_detail=None if said else "collision, gripper and box, at 1.40 s",
+                stages=(("grasp", recorded or said), ("place", recorded)),
+            )
+        )
+    comparison = compare_rows(rows, run="large", source="run", stand_in=True)
+    return replace(comparison, motions=tuple(motion(rng, row, s) for row in rows for s in SIDES))
+
+
+SIDES = ("planned", "executed")
+
+
+def motion(rng: np.random.Generator, row: TrialRow, against: str) -> MotionSummary:
+    curve = (0.003 + 0.001 * rng.random(101)).tolist()
+    return MotionSummary(
+        episode=row.episode,
+        task=row.task,
+        condition=row.condition,
+        plan_id="p",
+        side="recorded",
+        against=against,
+        aligned_by="stamps",
+        num_samples=30,
+        duration_s=3.0,
+        position_mean_m=0.003,
+        position_max_m=0.004,
+        end_point_m=curve[-1],
+        rotation_mean_rad=0.01,
+        rotation_max_rad=0.02,
+        end_point_rad=0.01,
+        lag_s=None,
+        without_lag_mean_m=None,
+        without_offset_mean_m=None,
+        relative_mean_m=None,
+        relative_mean_rad=None,
+        joint_rms_rad=None,
+        joint_max_rad=None,
+        joint_worst=None,
+        curve_m=tuple(curve),
+        joint_curve_rad=(),
+    )
+
+
+@pytest.mark.slow
+def test_a_report_about_thousands_of_trials_stays_small_and_complete(tmp_path: Path) -> None:
+    comparison = many(3000)
+    written = write_report(comparison, tmp_path)
+    text = written.report.read_text()
+    assert len(text.encode()) < MAX_BYTES
+    assert f"The first {SHOWN_ROWS} of 3,000 rows; the whole is in trials.csv" in text
+    assert "monday_trial_00199" in text
+    assert "monday_trial_00200<" not in text
+    lines = (tmp_path / "trials.csv").read_text().splitlines()
+    assert len(lines) == 3001
+    results = load_results(written.results)
+    assert results == written.content
+    assert len(results.get("agreement.sim_planned.rate").episodes) == 3000
+    assert written.results.stat().st_size < 3_000_000
+
+
+def test_what_is_cut_depends_on_the_number_of_rows_alone(tmp_path: Path) -> None:
+    written = write_report(many(SHOWN_ROWS), tmp_path)
+    assert "The first 200" not in written.report.read_text()
