@@ -57,7 +57,7 @@ class MotionSummary:
     rotation_max_rad: float
     end_point_rad: float
     lag_s: float | None
-    """By how much ``side`` comes later: least mean distance, offset apart; None without times."""
+    """By how much ``side`` comes later, whatever rigid motion lies between; None without times."""
     without_lag_mean_m: float | None
     """Mean distance after that delay is taken out."""
     without_offset_mean_m: float | None

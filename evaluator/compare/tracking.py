@@ -34,7 +34,7 @@ QUANTITIES: tuple[tuple[str, str, str, str, Read], ...] = (
         "lag_s",
         "s",
         TOOL,
-        "delay of least distance, offset apart; later counts up",
+        "delay of least distance, a rigid motion apart",
         lambda s: s.lag_s,
     ),
     (

@@ -23,16 +23,19 @@ FLAT = 1e-9
 
 
 def find_lag_s(recorded: PoseTrajectory, replayed: PoseTrajectory) -> float:
-    """Find by how much the recorded motion comes later: the least mean distance, offset apart.
+    """Find by how much the recorded motion comes later, whatever rigid motion lies between the two.
 
-    The mean offset is taken out first: it is the calibration's, and would be bought off by a delay.
-
-    Of delays that fit equally well the smallest is taken, so a motion that hardly moves has none.
-    Range: -0.2 s to 0.6 s, known to 10 ms.
+    The delay of least root mean square distance after the best rigid motion: an offset is the
+    calibration's, and would else be bought off by a delay. Of delays that fit equally well the
+    smallest is taken, so a motion that hardly moves has none.
+    Range: -0.2 s to 0.6 s, known to 10 ms. Undefined when: positions are not finite.
 
     Args:
         recorded: Positions [m] over the common clock.
         replayed: The same motion; held at its ends where it is shorter.
+
+    Raises:
+        UndefinedStatisticError: When it is undefined.
     """
     choice = np.linspace(0, len(recorded) - 1, min(len(recorded), MAX_INSTANTS)).round()
     ids = np.unique(choice.astype(np.int64))
@@ -40,16 +43,25 @@ def find_lag_s(recorded: PoseTrajectory, replayed: PoseTrajectory) -> float:
     other = np.stack(
         [np.interp(asked, replayed.stamps_ns, replayed.p_m[:, axis]) for axis in range(3)], axis=-1
     )
-    apart = other - recorded.p_m[ids]
-    apart -= apart.mean(axis=1, keepdims=True)
-    costs = np.linalg.norm(apart, axis=-1).mean(axis=1)
-    if not np.isfinite(costs).all():
-        raise UndefinedStatisticError(
-            statistic="delay",
-            reason=NOT_FINITE,
-        )
+    costs = _left_over_m(other, recorded.p_m[ids])
     near = LAGS_S[costs <= costs.min() + EQUAL_M]
     return float(near[np.argmin(np.abs(near))])
+
+
+def _left_over_m(
+    p_sources_m: Float[np.ndarray, "num_lags num_poses 3"],
+    p_target_m: Float[np.ndarray, "num_poses 3"],
+) -> Float[np.ndarray, " num_lags"]:
+    """Root mean square distance after the best rigid motion: Umeyama (1991), equation 43, c = 1."""
+    sources = p_sources_m - p_sources_m.mean(axis=1, keepdims=True)
+    target = p_target_m - p_target_m.mean(axis=0)
+    covariance = np.swapaxes(sources, 1, 2) @ target / len(target)
+    if not np.isfinite(covariance).all():
+        raise UndefinedStatisticError(statistic="delay", reason=NOT_FINITE)
+    sizes = np.linalg.svd(covariance, compute_uv=False)
+    sizes[:, 2] *= np.where(np.linalg.det(covariance) < 0, -1.0, 1.0)
+    spread = (sources**2).sum(axis=2).mean(axis=1) + (target**2).sum(axis=1).mean()
+    return np.asarray(np.sqrt(np.maximum(spread - 2 * sizes.sum(axis=1), 0.0)))
 
 
 def align_rigid(
