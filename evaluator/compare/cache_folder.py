@@ -54,6 +54,7 @@ class CacheFolder:
         self._path = path
         self._say = say
         self._can_write = True
+        self._has_complained = False
         self._parquet = self._import_parquet()
 
     @property
@@ -76,7 +77,8 @@ class CacheFolder:
             found, reasons, is_whole = self._try_to_read(kind)
             if is_whole:
                 break
-        if reasons:
+        if reasons and not self._has_complained:  # the other kinds are alike
+            self._has_complained = True
             more = f" and {len(reasons) - 1} more" if len(reasons) > 1 else ""
             self._say(f"In {self._path}, {reasons[0]}{more}. The episodes are read again.")
         return found

@@ -57,58 +57,68 @@ class Inventory:
 
 @dataclass(frozen=True, kw_only=True)
 class _Seen:
-    path: Path
-    parts: tuple[Path, ...]
+    parts: list[Path]
     name: str
+    is_derived: bool
     stamp: str
     """Empty where it cannot be relied on."""
+
+    @property
+    def path(self) -> Path:
+        return self.parts[0]
 
 
 def take_inventory(run: RunFolder, cache: SummaryCache, output: Output) -> Inventory:
     """Look at every file of a run, and hash those that are new or have changed."""
     seen = list(_look(run))
     hashes, left_out = _hash(seen, cache, output)
-    files = [
-        RunFile(path=each.path, name=each.name, sha256=hashes[each.path])
-        for each in seen
-        if each.path in hashes
-    ]
-    derived = [file for file in files if file.path.parent == run.derived_dir]
-    recorded = [file for file in files if file.path.parent != run.derived_dir]
-    return Inventory(recorded=tuple(recorded), derived=tuple(derived), left_out=tuple(left_out))
+    files: dict[bool, list[RunFile]] = {False: [], True: []}
+    for each in seen:
+        if each.name in hashes:
+            file = RunFile(path=each.path, name=each.name, sha256=hashes[each.name])
+            files[each.is_derived].append(file)
+    return Inventory(
+        recorded=tuple(files[False]), derived=tuple(files[True]), left_out=tuple(left_out)
+    )
 
 
 def _look(run: RunFolder) -> Iterator[_Seen]:
     now_ns = time.time_ns()
-    names = [path.name for path in run.episodes_dir.glob("*.mcap")]
-    groups = [
-        [run.episodes_dir / part for part in parts] for parts in grouped_parts(names).values()
-    ]
-    groups += [[path] for path in run.derived()]
-    for parts in groups:
-        path = parts[0]
+    recorded, derived = run.episodes_dir, run.derived_dir
+    groups = [(recorded, parts) for parts in grouped_parts(_names(recorded)).values()]
+    groups += [(derived, [name]) for name in _names(derived)]
+    for folder, names in groups:
+        parts = [folder / name for name in names]
         yield _Seen(
-            path=path,
-            parts=tuple(parts),
-            name=path.relative_to(run.path).as_posix(),
-            stamp=trace(run, path, set(), now_ns, parts).stamp,
+            parts=parts,
+            name=f"{folder.name}/{names[0]}",
+            is_derived=folder is derived,
+            stamp=trace(run, parts[0], set(), now_ns, parts).stamp,
         )
+
+
+def _names(folder: Path) -> list[str]:
+    try:
+        return sorted(name for name in os.listdir(folder) if name.endswith(".mcap"))  # noqa: PTH208
+    except OSError:  # not there, or not ours to read
+        return []
 
 
 def _hash(
     seen: Iterable[_Seen], cache: SummaryCache, output: Output
-) -> tuple[dict[Path, str], list[Exclusion]]:
+) -> tuple[dict[str, str], list[Exclusion]]:
+    """Return the hashes by name, and what cannot be read."""
     hashes, unknown = {}, []
     for each in seen:
         known = cache.find(FileHash, _key(each)) if each.stamp else None
         if known:
-            hashes[each.path] = known[0].sha256
+            hashes[each.name] = known[0].sha256
         else:
             unknown.append(each)
     left_out = []
     for each, found in _hashed(unknown, output):
         if isinstance(found, str):
-            hashes[each.path] = found
+            hashes[each.name] = found
             if each.stamp:
                 cache.keep(FileHash, _key(each), (FileHash(sha256=found),))
         else:

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bridge.whole_file import write_whole
-from evaluator.compare.typed_json import Reader, reader, to_text, without_none
+from evaluator.compare.typed_json import Reader, as_it_is, reader, to_text, without_none
 
 Summary = TypeVar("Summary")
 Rows = Mapping[str, tuple[Any, ...]]
@@ -124,11 +124,12 @@ def _unpacked(kind: type[Summary], table: pa.Table) -> dict[str, tuple[Summary, 
             raise UnusableFileError(message)
         if pa.types.is_list(of_type):
             columns.append(_tuples(column))
-        elif unpack is _as_stored:
+        elif unpack is as_it_is:
             columns.append(column.to_pylist())
         else:
             texts = column.to_pylist()
-            columns.append([None if text is None else unpack(text) for text in texts])
+            known = {text: unpack(text) for text in set(texts) - {None}}  # many are the same
+            columns.append([None if text is None else known[text] for text in texts])
     names = [column.name for column in _columns(kind)]
     rows: dict[str, tuple[Summary, ...]] = {}
     for key, place, *values in zip(table.column(_KEY).to_pylist(), places, *columns, strict=True):
@@ -166,15 +167,11 @@ def _columns(kind: type[Any]) -> tuple[_Column, ...]:
 def _column(name: str, hint: Any) -> _Column:
     inner, is_optional = without_none(hint)
     if inner in _SCALARS:
-        return _Column(name, _SCALARS[inner], is_optional, _as_stored, _as_stored)
+        return _Column(name, _SCALARS[inner], is_optional, as_it_is, as_it_is)
     args = get_args(inner)
     if get_origin(inner) is tuple and args[1:] == (Ellipsis,) and args[0] in _SCALARS:
-        return _Column(name, pa.list_(_SCALARS[args[0]]), is_optional, list, _as_stored)
+        return _Column(name, pa.list_(_SCALARS[args[0]]), is_optional, list, as_it_is)
     return _Column(name, pa.string(), is_optional, to_text, partial(_from_text, reader(inner)))
-
-
-def _as_stored(value: Any) -> Any:
-    return value
 
 
 def _from_text(read: Reader, text: str) -> Any:

@@ -36,7 +36,7 @@ def reader(hint: Any) -> Reader:
     """
     inner, is_optional = without_none(hint)
     read = _reader(inner)
-    if is_optional:
+    if is_optional and read is not as_it_is:
         return lambda value: None if value is None else read(value)
     return read
 
@@ -44,7 +44,7 @@ def reader(hint: Any) -> Reader:
 def _reader(hint: Any) -> Reader:
     origin, args = get_origin(hint), get_args(hint)
     if hint in _AS_IT_IS or (origin is Union and all(option in _AS_IT_IS for option in args)):
-        return _as_it_is
+        return as_it_is
     if origin is tuple and len(args) == 2 and args[1] is Ellipsis:
         each = reader(args[0])
         return lambda value: tuple(map(each, value))
@@ -60,15 +60,20 @@ def _reader(hint: Any) -> Reader:
     raise TypeError(message)
 
 
-def _as_it_is(value: Any) -> Any:
+def as_it_is(value: Any) -> Any:
+    """Return a value that needs no turning back."""
     return value
 
 
 def _record_reader(kind: Any) -> Reader:
     hints = get_type_hints(kind)
-    readers = {item.name: reader(hints[item.name]) for item in fields(kind)}
+    found = {item.name: reader(hints[item.name]) for item in fields(kind)}
+    readers = [(name, read) for name, read in found.items() if read is not as_it_is]
 
     def read(value: Any) -> Any:
-        return kind(**{name: readers[name](x) for name, x in value.items()})
+        for name, turn_back in readers:
+            if name in value:
+                value[name] = turn_back(value[name])  # fresh from the text, and ours
+        return kind(**value)
 
     return read
