@@ -191,7 +191,7 @@ def write_static(
     path = folder / STATIC_FILE
     path.unlink(missing_ok=True)
     objects = [
-        partial(_from_outside, model=task.objects[key], T_base_object=T)
+        partial(from_outside_m, model=task.objects[key], T_base_object=T)
         for key, T in Ts_base_object.items()
         if task is not None
     ]
@@ -203,10 +203,13 @@ def write_static(
     return {"file": STATIC_FILE, "sha256": provenance.hash_file(path), **static.to_record()}
 
 
-def _from_outside(
+def from_outside_m(
     points: Float[np.ndarray, "num_points 3"],
     model: ObjectModel,
     T_base_object: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, " num_points"]:
+    """Signed distance of points to what an object takes up, handles and rim included [m]."""
+    if model.mesh is not None and model.soft is None:
+        return np.asarray(object_mesh(model).solid(se3.apply(se3.invert(T_base_object), points)))
     distance, _ = surface_distances(points, model, T_base_object)
     return np.asarray(distance)

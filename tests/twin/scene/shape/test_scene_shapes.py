@@ -14,7 +14,12 @@ from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.localise_result import LocalisedObject
 from twin.scene.localise_shape import pose_of, surface_distances
 from twin.scene.objects import ObjectSplats, SceneParts, write_objects
-from twin.scene.shape.from_training import masked_view, shapes_of, write_static
+from twin.scene.shape.from_training import (
+    from_outside_m,
+    masked_view,
+    shapes_of,
+    write_static,
+)
 from twin.scene.shape.masked_view import ShapeError
 from twin.scene.shape.mesh import is_watertight, volume_m3
 from twin.scene.shape.reconstruct import ObjectShape
@@ -262,3 +267,17 @@ def test_a_toy_that_could_not_be_reconstructed_keeps_its_known_mesh() -> None:
     assert is_watertight(faces)
     assert volume_m3(vertices, faces) > 0
     np.testing.assert_allclose(np.ptp(vertices, axis=0), sloth.size_m, rtol=0.02)
+
+
+def test_a_basket_takes_its_handles_and_its_rim_out_of_the_scene() -> None:
+    """What stays in the grid is an obstacle that nobody may touch: a toy goes over the handles."""
+    basket = load_task("sloth_into_basket").objects["basket"]
+    T = pose_of(np.array([0.48, 0.2, 0.0, 0.3]))
+    angle = np.linspace(0.0, np.pi, 9)
+    x, _, top = (np.array(basket.inner_m) + basket.wall_m) / [2, 2, 1]
+    arch = np.stack([np.full(9, x), 0.03 * np.cos(angle), top + 0.03 * np.sin(angle)], axis=1)
+    rim = np.array([[0.0, basket.inner_m[1] / 2 + basket.wall_m / 2, top + 0.003]])
+    inside = np.array([[0.0, 0.0, 0.05]])
+    for points, is_taken in ((arch, True), (rim, True), (inside, False)):
+        away = from_outside_m(se3.apply(T, points), basket, T)
+        assert np.all(away < 0.001) if is_taken else np.all(away > 0.03)
