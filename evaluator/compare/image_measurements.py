@@ -89,6 +89,7 @@ def _stamped(
     stamp = Stamp(
         metric=metric.column,
         implementation=metric.implementation,
+        values=metric.values,
         window=metric.window,
         padding=metric.padding,
         weights=net.weights if net is not None else "none",

@@ -52,7 +52,9 @@ def stamped_table(
         if len(front) != len(heads) or len(values) != len(columns):
             message = f"a row of table {table_id} has {len(front)} + {len(values)} cells"
             raise ValueError(message)
-        stamps = [value.stamp for value in values]
+        # What was not computed has no protocol; a row of nothing else still shows what it would be.
+        made = [value for value in values if not isinstance(value.value, str)] or values
+        stamps = [value.stamp for value in made]
         numbers = [stamp.n for stamp in stamps if stamp.n]
         views = max(numbers, default=None)
         laid.append(

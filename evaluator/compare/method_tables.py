@@ -96,6 +96,8 @@ def _unstated(column: str) -> Stamp:
         metric=column,
         implementation=UNSTATED,
         values=UNSTATED,
+        window=UNSTATED,
+        padding=UNSTATED,
         mask=UNSTATED,
         resolution=UNSTATED,
         crop=UNSTATED,

@@ -42,6 +42,7 @@ LPIPS_METRICS: tuple[ImageMetric, ...] = tuple(
         column=f"LPIPS ({net}, {'0..1' if given == '01' else '-1..1'})",
         definition=f"LPIPS 0.1 (Zhang 2018), {NET_WORDS[net]}, {words}",
         implementation="evaluator.metrics.lpips_torch 1",
+        values="sRGB, data range 0..1" if given == "01" else "sRGB, scaled to -1..1",
         window=f"receptive fields of {NET_WORDS[net]}",
         padding="zeros inside the network",
         higher_is_better=False,

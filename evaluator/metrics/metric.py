@@ -16,6 +16,8 @@ class ImageMetric:
     """With its source."""
     implementation: str
     """Module and version; the version rises whenever a value may change."""
+    values: str = "sRGB, data range 0..1"
+    """What the metric is given, for a stamp."""
     window: str = "none"
     padding: str = "none"
     higher_is_better: bool = True

@@ -71,6 +71,7 @@ PLAIN_METRICS: tuple[ImageMetric, ...] = (
         column="GMSD",
         definition="GMSD (Xue 2014), luma 0..255 at half size, Prewitt gradients, constant 170",
         implementation="evaluator.metrics.gradient 1",
+        values="luma of sRGB, data range 0..255",
         window="Prewitt 3 x 3",
         padding="zeros beyond the border",
         higher_is_better=False,

@@ -54,9 +54,7 @@ class Stamp:
 
     def text(self) -> str:
         """Write everything in one line."""
-        return "; ".join(
-            value if name in _PLAIN else f"{name} {value}" for name, value in self._items()
-        )
+        return "; ".join(_said(name, value) for name, value in self._items())
 
     @property
     def key(self) -> str:
@@ -83,19 +81,29 @@ def common_text(stamps: Sequence[Stamp]) -> str:
         message = "a row of image numbers needs at least one protocol stamp"
         raise ValueError(message)
     columns = [dict(stamp._items()) for stamp in dict.fromkeys(stamps)]
-    shared, own = [], []
+    shared: dict[str, str] = {}
+    own = []
     for name in columns[0]:
         if name in ("metric", "implementation"):
             continue
         found = list(dict.fromkeys(column[name] for column in columns))
-        if len(found) == 1:
-            if found[0] != "none":
-                shared.append(found[0] if name in _PLAIN else f"{name} {found[0]}")
-        else:
+        if len(found) > 1:
             own.append(name)
-    parts = ["; ".join(shared)]
+        elif found[0] != "none":
+            shared[name] = found[0]
+    unstated = [name for name, value in shared.items() if value == UNSTATED]
+    if "resolution" in unstated and shared.get("n") == "0":
+        unstated.append("n")  # nobody counted
+    said = [_said(name, value) for name, value in shared.items() if name not in unstated]
+    if unstated:
+        said.append(f"{UNSTATED}: {', '.join(unstated)}")
+    parts = ["; ".join(said)]
     for column in columns:
-        said = [f"{name} {column[name]}" for name in own if column[name] != "none"]
-        if said:
-            parts.append(f"{column['metric']}: {', '.join(said)}")
+        mine = [f"{name} {column[name]}" for name in own if column[name] != "none"]
+        if mine:
+            parts.append(f"{column['metric']}: {', '.join(mine)}")
     return ". ".join(part for part in parts if part)
+
+
+def _said(name: str, value: str) -> str:
+    return value if name in _PLAIN else f"{name} {value}"

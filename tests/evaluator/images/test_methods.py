@@ -90,7 +90,7 @@ def test_the_headline_is_laid_out_as_the_paper_s_with_the_protocol_in_each_row(
     assert table.columns == ("method", "PSNR (dB)", "SSIM", "LPIPS (vgg)", "views", "protocol")
     assert [row[0] for row in table.rows] == ["good", "poor"]
     assert {row[3] for row in table.rows} == {"not computed"}
-    assert all("split not stated" in str(row[-1]) for row in table.rows)
+    assert all("not stated: split" in str(row[-1]) for row in table.rows)
     assert all("64 x 48" in str(row[-1]) for row in table.rows)
     assert "not stated" in str(tables["image_paper"].rows[0][-1])
     assert {row[1] for row in tables["image_all"].rows} == {"raw", "gain", "affine"}

@@ -40,6 +40,7 @@ def test_a_row_says_once_what_its_numbers_share() -> None:
     assert "SSIM: " in text
     assert "padding zeros" in text
     assert "split every 8th frame" in text
+    assert "not stated: split" in common_text([replace(STAMP, split="not stated")])
 
 
 def test_a_table_has_no_row_without_a_stamp() -> None:
@@ -64,5 +65,7 @@ def test_the_paper_s_table_is_printed_with_what_it_does_not_state() -> None:
     table = paper_table()
     rows = {row[0]: row for row in table.rows}
     assert rows["Robot-GST"][1:4] == (24.64, 0.963, 0.044)
-    assert all("not stated" in str(row[-1]) for row in table.rows)
+    assert all(str(row[-1]).startswith("not stated: ") for row in table.rows)
+    for part in ("resolution", "split", "mask", "padding", "n"):
+        assert f" {part}" in str(rows["POGS"][-1])
     assert "not measured here" in table.note
