@@ -159,7 +159,11 @@ def _inferred_poses(
     Ts_base_tcp: Float[np.ndarray, "num_times 4 4"],
     touches: dict[str, Touch | None],
 ) -> dict[str, Float[np.ndarray, "num_times 4 4"]]:
-    """Start pose, then with the tool, then where it was found; NaN where nothing is known."""
+    """Start pose, then with the tool, then where it was found; NaN where nothing is known.
+
+    Nobody knows how a soft body bends in the hand and where it comes to lie: the box around it,
+    tilted, reaches through what it lies on. From when it is held on nothing is inferred of it.
+    """
     poses = {}
     for name, T_start in recording.scene.movable().items():
         Ts = np.repeat(T_start[None], len(times_ns), axis=0)
@@ -171,6 +175,8 @@ def _inferred_poses(
                 Ts[held] = Ts_base_tcp[held] @ se3.invert(Ts_base_tcp[first]) @ T_start
             unknown = np.full((4, 4), np.nan)
             Ts[times_ns > touch[1]] = recording.end.Ts_base_object.get(name, unknown)
+            if recording.scene.task.objects[name].soft is not None:
+                Ts[times_ns >= touch[0]] = unknown
         poses[name] = Ts
     return poses
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bridge.task.predicate import evaluate_success
+from bridge.task.task_file import SoftMaterial
 from twin.replay.compare import recorded_findings
 from twin.replay.config import ReplayConfig
 from twin.replay.execution import path_of_execution
@@ -116,3 +117,21 @@ def test_a_touch_that_no_stage_allows_is_inferred_from_the_joints(
     (contacts,) = [item for item in findings if item["kind"] == "allowed_contacts"]
     assert contacts["value"] is False
     assert contacts["detail"].startswith("inferred: ")
+
+
+def test_what_a_soft_body_touches_in_the_hand_is_not_inferred_from_the_box_around_it(
+    script: SimpleNamespace, good: ReplayResult
+) -> None:
+    recording = recorded(script, good)
+    grip = replace(recording.plan.stages[0], allowed_contacts=(("gripper", "cube"),))
+    recording = replace(recording, plan=replace(recording.plan, stages=(grip,)))
+    sunk = recording.end.Ts_base_object["cube"].copy()
+    sunk[2, 3] -= 0.03
+    end = {**recording.end.Ts_base_object, "cube": sunk}
+    recording = replace(recording, end=replace(recording.end, Ts_base_object=end))
+    assert said(recording)["allowed_contacts"] is False, "rigid: it reaches into the table"
+    task = recording.scene.task
+    soft = SoftMaterial(young_pa=5e4, poisson=0.2, damping_s=0.01, cell_m=0.01)
+    objects = {**task.objects, "cube": replace(task.objects["cube"], soft=soft)}
+    bent = replace(recording.scene, task=replace(task, objects=objects))
+    assert said(replace(recording, scene=bent))["allowed_contacts"] is True
