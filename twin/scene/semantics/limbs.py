@@ -22,6 +22,8 @@ MIN_CORE = 0.3
 """Thickness of a thick place, as a share of the largest."""
 CUTS = (0.0, 0.3, 0.45, 0.6)
 """Heights above which thick places are looked for, as shares of the whole."""
+UNDER = 0.5
+"""A thick place nearer to the head's middle than this share of its radius is its neck."""
 MIN_PIECE = 0.008
 """What sticks out has at least this share of the solid's cells."""
 
@@ -128,7 +130,8 @@ def _find_head(
 
     Near the plane a chin and two arms fill the gap that is a clear neck from above. So where the
     best head has much attached to it, thick places are looked for again above some height; if
-    there are more of them, the highest is the head.
+    there are more of them, the highest is the head. If there are not, chest and head look like one
+    at every height, and what is thickest at the top is the head, see ``_highest_ball``.
     """
     found: list[tuple[np.ndarray, list[int], int]] = []
     num_cores = 0
@@ -152,8 +155,40 @@ def _find_head(
             found.append((owner, touches, head))
             attached = [piece.sum() for piece, k in zip(pieces, touches, strict=True) if k == head]
             if sum(attached) < MAX_ATTACHED * solid.sum():
-                break
-    return found[0]
+                return found[0]
+    owner = _highest_ball(solid, thick, top)
+    if owner is None:
+        return found[0]
+    num_balls = int(owner.max())
+    return owner, [_touched(piece, owner, num_balls) for piece in pieces], num_balls - 1
+
+
+def _highest_ball(
+    solid: np.ndarray, thick: np.ndarray, top: int
+) -> Int[np.ndarray, "num_x num_y num_z"] | None:
+    """Owner of each thick cell among balls, of which the last is the head; None without a body.
+
+    The head's ball is the thickest place of the top; those of the body are the thick places from
+    further down that are not under it. A cell belongs to the ball in which it has the most power
+    (Aurenhammer 1987): the border between two balls that cut each other is where they do.
+    """
+    balls = []
+    for fraction in (CUTS[-1], CUTS[1]):
+        smooth = _smooth(thickness_of(solid, MARGIN_CELLS + int(fraction * (top - MARGIN_CELLS))))
+        inside = [np.where(core.region, smooth, 0.0) for core in find_cores(smooth)]
+        peaks = [np.unravel_index(int(values.argmax()), smooth.shape) for values in inside]
+        balls.append([(np.array(peak, dtype=np.float64), float(smooth[peak])) for peak in peaks])
+    if not balls[0]:
+        return None
+    middle, radius = head = balls[0][0]
+    body = [ball for ball in balls[1] if np.hypot(*(ball[0] - middle)[:2]) > UNDER * radius]
+    if not body:
+        return None
+    cells = np.argwhere(thick)
+    power = [np.square(cells - p).sum(axis=1) - r**2 for p, r in (*body, head)]
+    owner = np.zeros(solid.shape, dtype=np.int64)
+    owner[tuple(cells.T)] = np.argmin(power, axis=0) + 1
+    return owner
 
 
 def _grown(core: np.ndarray, radius: float) -> np.ndarray:

@@ -11,7 +11,7 @@ from bridge.geometry import se3
 from twin.scene.shape.masked_view import MaskedView
 from twin.scene.shape.seen_surface import SeenSurface, seen_surface
 
-NORMAL_M = 0.06
+NORMAL_M = 0.02
 """A normal turned by one radian counts like this distance: two sides of a wall do not meet."""
 NEIGHBOURS = 24
 MIN_NEIGHBOURS = 3
@@ -21,11 +21,11 @@ REACH_M = 0.012
 POINT_SIGMA_M = 0.001
 SHARED_ERROR = 9.0
 """Standard error of a point, and how many neighbouring points share one error."""
-SHIFT_SIGMA_M, TURN_SIGMA_RAD = 0.003, 0.002
+SHIFT_SIGMA_M, TURN_SIGMA_RAD = 0.002, 0.002
 """How far one view may be moved by itself; holds what the points leave open."""
 MOUNT_SHIFT_SIGMA_M, MOUNT_TURN_SIGMA_RAD = 0.005, 0.006
 """How wrong a sensor's place on what carries it may be: all its views share that."""
-OFFSET_SIGMA_M, SCALE_SIGMA = 0.002, 0.005
+OFFSET_SIGMA_M, SCALE_SIGMA = 0.003, 0.005
 """How wrong a sensor's depth may be, at any distance and per metre."""
 CONVERGED = 2e-5
 """Smaller steps, in metres and radians, change nothing."""

@@ -16,6 +16,8 @@ NORMAL_PX = 2
 """Normals come from pixels this far to each side."""
 FLAT_M = 0.015
 """Pixels whose neighbours differ by more have no normal."""
+BENT_M = 0.004
+"""Across an edge depth bends by more, and a normal would be that of neither side."""
 PLANE_AROUND_M = 0.08
 """How far around the object the plane is looked at."""
 
@@ -43,7 +45,7 @@ def seen_surface(view: MaskedView, *, with_plane: bool) -> SeenSurface:
     n = NORMAL_PX
     inner = (slice(n, -n), slice(n, -n))
     ok = view.mask[inner] & (depth[inner] > 0)
-    ends = []
+    ends, seen = [], []
     for rows, columns in ((0, n), (0, -n), (n, 0), (-n, 0)):
         part = (
             slice(n + rows, camera.height - n + rows),
@@ -51,6 +53,9 @@ def seen_surface(view: MaskedView, *, with_plane: bool) -> SeenSurface:
         )
         ok &= view.mask[part] & (np.abs(depth[part] - depth[inner]) < FLAT_M)
         ends.append(p[part])
+        seen.append(depth[part])
+    for before, after in ((0, 1), (2, 3)):
+        ok &= np.abs(seen[before] + seen[after] - 2 * depth[inner]) < BENT_M
     row, column = np.nonzero(ok)
     step = max(1, len(row) // MAX_POINTS)
     row, column = row[::step], column[::step]
