@@ -1,15 +1,21 @@
 """Commands of the room ``evaluator``; imports stay late so that --help is quick."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
 
 from bridge.terminal import Output
+from evaluator.live.config import LiveConfig
+from evaluator.metrics.options import ImageOptions
 
 if TYPE_CHECKING:
     from evaluator.compare import Comparison
     from evaluator.compare.published import Finding
     from evaluator.thresholds import Missed
 
+LIVE = LiveConfig()
+IMAGES = ImageOptions()
 THRESHOLD_NOT_MET = 3
 
 
@@ -22,6 +28,9 @@ def evaluate(
     check_published: Path | None = None,
     interval: Literal["wilson", "clopper-pearson", "jeffreys"] = "wilson",
     goal: float | None = None,
+    force: bool = False,
+    images: Annotated[ImageOptions, Parameter(name="*")] = IMAGES,
+    live: Annotated[LiveConfig, Parameter(name="*")] = LIVE,
     output: Output = Output(),  # noqa: B008  # frozen, and cyclopts reads the default
 ) -> int:
     """Say how far the twin can be trusted: agreement, tables, figures, report.html.
@@ -40,6 +49,9 @@ def evaluate(
         interval: Interval of success rates.
         goal: A success rate from 0 to 1: say for each cell whether its trials settle that it lies
             above or below, at any time, or how many more that may take.
+        force: Read every file of the run again, whatever RUN/results/cache remembers.
+        images: Renders to compare, and backbones of LPIPS.
+        live: Follow a session instead of evaluating what is there.
         output: How to talk.
     """
     from bridge.errors import UsageError
@@ -50,20 +62,27 @@ def evaluate(
     if goal is not None and not 0 < goal < 1:
         message = f"--goal {goal} is no success rate between 0 and 1, for example 0.8."
         raise UsageError(message)
+    if live.live:
+        return _follow(source, live, goal, output)
     thresholds = [] if fail_under is None else parse_thresholds(fail_under)
     published = None if check_published is None else recompute(check_published)
     if source is not None:
-        comparison, folder = _compare(source, interval, goal)
+        comparison, folder = _compare(source, interval, goal, images, force, output)
         if published is not None:
             comparison = _beside(comparison, published.comparison)
     elif published is not None and check_published is not None:
         comparison = published.comparison
         folder = check_published.with_name(f"{check_published.stem}_results")
+    elif images.renders:
+        comparison, folder = _compare_images(images)
     else:
-        message = "evaluate needs a run folder or a table, or --check-published TABLE."
+        message = (
+            "evaluate needs a run folder or a table, --check-published TABLE, or --reference "
+            "FOLDER with --renders METHOD=FOLDER."
+        )
         raise UsageError(message)
     written = write_report(comparison, out or folder)
-    results = comparison.results()
+    results = written.content
     output.result(results.to_record(), summary_text(results, written))
     failed = [_missed_text(item) for item in missed(thresholds, results)]
     failed += [_finding_text(item) for item in (published.failed if published else ())]
@@ -72,17 +91,54 @@ def evaluate(
     return THRESHOLD_NOT_MET if failed else 0
 
 
-def _compare(source: Path, interval: str, goal: float | None) -> "tuple[Comparison, Path]":
+def _compare(
+    source: Path,
+    interval: str,
+    goal: float | None,
+    images: ImageOptions,
+    force: bool,
+    output: Output,
+) -> "tuple[Comparison, Path]":
     from bridge.episode.run import RunFolder
+    from bridge.errors import UsageError
     from evaluator.compare import compare_csv, compare_run
+    from evaluator.compare.cache import FOLDER, SummaryCache
 
     beside = source.with_name(f"{source.stem}_results") if source.name else Path("results")
-    if not source.is_dir() and source.suffix.lower() in (".csv", ".json"):
-        return compare_csv(source, method=interval, goal=goal), beside
-    if source.is_dir() and not (source / "episodes").is_dir() and any(source.rglob("*_obj_*.mp4")):
+    is_table = not source.is_dir() and source.suffix.lower() in (".csv", ".json")
+    is_run = (source / "episodes").is_dir()
+    if is_table or (source.is_dir() and not is_run and any(source.rglob("*_obj_*.mp4"))):
+        if images != IMAGES:
+            message = "images go with a run folder, or with --reference and no table."
+            raise UsageError(message)
         return compare_csv(source, method=interval, goal=goal), beside
     run = RunFolder.open(source)
-    return compare_run(run, method=interval, goal=goal), run.results_dir
+    with SummaryCache(run.results_dir / FOLDER, fresh=force, say=output.say) as cache:
+        comparison = compare_run(
+            run, method=interval, goal=goal, images=images, cache=cache, output=output
+        )
+    return comparison, run.results_dir
+
+
+def _follow(source: Path | None, live: LiveConfig, goal: float | None, output: Output) -> int:
+    from bridge.errors import UsageError
+    from bridge.terminal import stop_signals
+    from evaluator.live.follow import follow
+
+    if source is None:
+        message = "evaluate --live needs the run folder that is recorded into."
+        raise UsageError(message)
+    with stop_signals() as stop:
+        follow(source, live, goal=goal, stop=stop, output=output)
+    return 0
+
+
+def _compare_images(images: ImageOptions) -> "tuple[Comparison, Path]":
+    """Compare renders with a folder of recorded images, without any run."""
+    from evaluator.compare.renders import compare_folders
+
+    comparison = compare_folders(images)
+    return comparison, Path(f"{comparison.run}_results")
 
 
 def _beside(comparison: "Comparison", published: "Comparison") -> "Comparison":

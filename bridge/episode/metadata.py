@@ -12,6 +12,8 @@ from typing import Any, TypeVar, get_origin
 
 SCHEMA_VERSION = 1
 KINDS = ("scan", "trial", "probe", "imported")
+WITHOUT, WITH = "without_replanning", "with_replanning"
+"""The two conditions of a trial that evaluation compares."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,6 +27,8 @@ LOCALISATION = "gst/Localisation"
 EVENT = "gst/Event"
 DROPS = "recorder/Drops"
 STATUS = "recorder/Status"
+ENTRY = "recorder/Entry"
+ADVICE = "gst/Advice"
 POSES_IN_FRAME = "foxglove.PosesInFrame"
 COMPRESSED_VIDEO = "foxglove.CompressedVideo"
 
@@ -43,6 +45,8 @@ _JSON_SCHEMAS = {
     EVENT: ("bridge.episode", "schemas/event.schema.json"),
     DROPS: ("bridge.episode", "schemas/drops.schema.json"),
     STATUS: ("bridge.episode", "schemas/status.schema.json"),
+    ENTRY: ("bridge.episode", "schemas/entry.schema.json"),
+    ADVICE: ("bridge.episode", "schemas/advice.schema.json"),
     POSES_IN_FRAME: ("bridge.episode", "schemas/poses_in_frame.schema.json"),
 }
 

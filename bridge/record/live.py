@@ -12,10 +12,12 @@ import contextlib
 import json
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from bridge.episode import schema
+from bridge.episode.catalogue.reading import read_entry
 from bridge.episode.metadata import Outcome
 from bridge.episode.recover import recover_parts
 from bridge.episode.recover_tally import RecoveryReport
@@ -56,6 +58,7 @@ class LiveRecorder:
         if config.msg_folder is not None:  # complain now, not at the first message
             read_definitions(config.msg_folder)
         self.run = run
+        self._recorder = config.recorder
         self.session = session
         reports = recover_parts(run)
         for report in reports:
@@ -77,6 +80,10 @@ class LiveRecorder:
         self._services = serve_control(session, core)
         name = f"/rec/{config.recorder}/status"
         self._status = session.publisher(name, schema.STATUS, qos=Qos.PREVIEW)
+        self._episodes = session.publisher(
+            f"/rec/{config.recorder}/episode", schema.ENTRY, qos=Qos.CONTROL
+        )
+        core.tell_of_episodes(self._say_episode)
         session.declare_alive(f"rec/{config.recorder}/alive")
         self._thread = threading.Thread(target=self._tell, name="status", daemon=True)
         self._thread.start()
@@ -95,6 +102,20 @@ class LiveRecorder:
         if self._status.has_subscribers():
             data = json.dumps(self.core.status()).encode()
             self._status.put(data, source_ns=self.session.now_ns())
+
+    def _say_episode(self, path: Path) -> None:
+        """Tell whoever follows the session what is known of an episode now."""
+        with contextlib.suppress(Exception):  # the episode is safe; this is a courtesy
+            if not self._episodes.has_subscribers():
+                return
+            about = {
+                "schema_version": 1,
+                "recorder": self._recorder,
+                "run": str(self.run.path.resolve()),
+            }
+            entry = asdict(read_entry(self.run, path))
+            data = json.dumps({**about, **entry}).encode()
+            self._episodes.put(data, source_ns=self.session.now_ns())
 
     def start(self, episode_id: str, **about: Any) -> dict[str, Any]:
         """Begin an episode; ``about`` are fields of ``EpisodeInfo``: task, operator, tags ...

@@ -11,6 +11,7 @@ import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import asdict, replace
+from pathlib import Path
 
 from bridge.clock import StepWatch
 from bridge.episode import metadata
@@ -70,6 +71,7 @@ class Recorder:
         )
         self._status = Status(run, self.config, self.intake, self._life, now_ns)
         self._steps = StepWatch(now_ns, wall_ns=wall_ns)
+        self._tell: Callable[[Path], None] = lambda path: None
         self._next_second_s = 0.0
         if self._life.is_quiet:
             self.intake.be_quiet(0)
@@ -124,7 +126,9 @@ class Recorder:
         return answer
 
     def _enter(self, episode_id: str) -> None:
-        note_finished(self._run, self._run.episodes_dir / part_name(episode_id, 1))
+        path = self._run.episodes_dir / part_name(episode_id, 1)
+        note_finished(self._run, path)
+        self._tell(path)
 
     def mark(self, text: str) -> Answer:
         """Note this instant in the episode; does not wait for images in work."""
@@ -176,6 +180,7 @@ class Recorder:
         if text and not outcome.detail:
             outcome = replace(outcome, detail=text)
         note = label_episode(self._run, name, outcome)
+        self._tell(self._run.episodes_dir / part_name(name, 1))
         return {"ok": True, "episode": name, "note": str(note)}
 
     def episodes(self, last: int) -> Answer:
@@ -199,6 +204,13 @@ class Recorder:
     def note_recovered(self, reports: list[Answer]) -> None:
         """Show in the status what was found cut off when the recorder began."""
         self._status.recovered = reports
+
+    def tell_of_episodes(self, tell: Callable[[Path], None]) -> None:
+        """Call this with the first file of every episode that was finished or labelled.
+
+        It runs on the thread that gave the command, and must not raise.
+        """
+        self._tell = tell
 
     def also_tell(self, name: str, ask: Callable[[], object]) -> None:
         """Add something to every status and episode; ``ask`` must answer at once."""

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from fractions import Fraction
 
-from evaluator.compare.cells import sides, usable_cells
+from evaluator.compare.cell_intervals import sides, usable_cells
 from evaluator.compare.measure import measured, proportion
 from evaluator.compare.rows import RateCell
 from evaluator.errors import UndefinedStatisticError

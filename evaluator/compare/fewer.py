@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 from evaluator.compare.measure import Statistic, measured
 from evaluator.compare.pairing import StartPair
@@ -17,6 +18,7 @@ from evaluator.statistics.proxy import (
     trials_saved,
 )
 from evaluator.statistics.sequential import capital_log, sequence_of, stop_or_continue
+from evaluator.statistics.sequential_pairs import pairs_sequence
 
 ALPHA = 0.05
 GOAL = 0.5
@@ -118,7 +120,7 @@ def sequences(rows: Sequence[TrialRow], pairs: Sequence[StartPair]) -> list[Meas
         if known and all(row.count == 1 for row in known):
             measurements.append(_sequence(key, known))
     if pairs:
-        measurements.append(_evidence(pairs))
+        measurements += [_evidence(pairs), _gain_sequence(pairs)]
     return measurements
 
 
@@ -176,14 +178,38 @@ def stopping_table(rows: Sequence[TrialRow], goal: float | None) -> tuple[Table,
     )
 
 
-def _evidence(pairs: Sequence[StartPair]) -> Measurement:
-    answers = [
-        (pair.before.recorded, pair.after.recorded)
+def _changes(pairs: Sequence[StartPair]) -> list[int]:
+    """Per pair with two known outcomes: +1 improved, -1 worsened, 0 the same."""
+    return [
+        int(pair.after.recorded) - int(pair.before.recorded)
         for pair in pairs
         if pair.before.recorded is not None and pair.after.recorded is not None
     ]
-    improved = sum(bool(after) and not before for before, after in answers)
-    worsened = sum(bool(before) and not after for before, after in answers)
+
+
+def _gain_sequence(pairs: Sequence[StartPair]) -> Measurement:
+    changes = _changes(pairs)
+
+    def compute() -> tuple[float, Interval | None]:
+        found = pairs_sequence(changes)
+        interval = replace(found, low=100 * found.low, high=100 * found.high)
+        return 100 * sum(changes) / len(changes), interval
+
+    return measured(
+        "sequence.gain_pp.recorded",
+        compute,
+        unit="pp",
+        definition="recorded gain with replanning over paired starts, with a betting confidence "
+        "sequence in the order of the pairs: it may be looked at after every one",
+        n=len(changes),
+        counted="pair",
+        episodes=[row.episode for pair in pairs for row in (pair.before, pair.after)],
+    )
+
+
+def _evidence(pairs: Sequence[StartPair]) -> Measurement:
+    answers = _changes(pairs)
+    improved, worsened = answers.count(1), answers.count(-1)
     return measured(
         "sequence.replanning_evidence.recorded",
         lambda: math.exp(capital_log(improved, improved + worsened, GOAL)),

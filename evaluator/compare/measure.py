@@ -29,11 +29,13 @@ def measured(
     episodes: Iterable[str] = (),
     interval_n: int | None = None,
     coverage_key: str = "",
+    instead: str = "",
 ) -> Measurement:
     """Compute one statistic; ``compute`` gives a value, or a value with its interval.
 
     What is not finite is undefined and says so: one broken pose must not end an evaluation.
-    An interval that covers too little at ``interval_n`` (``n`` without it) is left out, with why.
+    An interval that covers too little at ``interval_n`` (``n`` without it) is left out, with why
+    and what to use ``instead``.
     """
     value: float | None = None
     interval: Interval | None = None
@@ -48,7 +50,7 @@ def measured(
         reason = "the recorded or replayed data hold values that are not finite"
     if interval is not None:
         size = n if interval_n is None else interval_n
-        interval, refusal = vouch(interval, size, key=coverage_key)
+        interval, refusal = vouch(interval, size, key=coverage_key, instead=instead)
         reason_without_interval = refusal or reason_without_interval
     return Measurement(
         id=measurement_id,

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from bridge.exchange.trials_csv import SourceRow, TableError, read_rows
 from bridge.exchange.trials_rates import COLUMNS, RateRecord, printed_rate, read_rate
-from evaluator.compare.cells import sides, usable_cells
+from evaluator.compare.cell_intervals import sides, usable_cells
 from evaluator.compare.rates import compare_records
 from evaluator.compare.remarks import remarks_table
 from evaluator.compare.rows import Comparison, RateCell

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
 from bridge.exchange.trials_rates import RateRecord, read_rates
-from evaluator.compare.cells import cell_agreement
+from evaluator.compare.cells import agreement_intervals, cell_agreement
 from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import gain_tests, replanning_gains
 from evaluator.compare.measure import slug, vouched_rate
@@ -53,6 +53,7 @@ def compare_records(
             success_table(cells, word, "Rates as given."),
             *layout_table(cells, measurements, word),
             *gains_table(gains, word),
+            *agreement_intervals(cells),
             *decision_tables,
             *remarks_table(remarks(cells, measurements)),
         ),

@@ -3,14 +3,13 @@
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 
+from bridge.episode.metadata import WITH as WITH
+from bridge.episode.metadata import WITHOUT as WITHOUT
 from evaluator.compare.measure import measured, proportion, slug
 from evaluator.compare.rows import RateCell, TrialRow
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Measurement
 from evaluator.statistics.agreement import mean_rate
-
-WITHOUT = "without_replanning"
-WITH = "with_replanning"
 
 SIM_DEFINITION = (
     "successes / trials in the twin: the plan actually sent, planned trajectory, dynamic replay; "

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 
+from evaluator.compare.clause_worth import clause_worth
 from evaluator.compare.measure import measured, proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import WITH, WITHOUT, Answer, names_of
@@ -133,7 +134,9 @@ def gate_worth(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Table
         ),
         *_clauses(rows),
     ]
-    return measurements, _cost_table(counts) if counts.n else ()
+    by_clause, clause_tables = clause_worth(rows, asked)
+    tables = _cost_table(counts) if counts.n else ()
+    return [*measurements, *by_clause], (*clause_tables, *tables)
 
 
 def _clauses(rows: Sequence[TrialRow]) -> list[Measurement]:

@@ -1,23 +1,25 @@
-"""Uncertainty of agreement over cells: resampled cells, resampled policies, measured again.
+"""Uncertainty of agreement over cells: resampled cells, resampled policies, one left out.
 
-Three different questions. Points: other tasks of the same kind. Clusters: other policies, whose
-cells come together. Remeasurement: the same cells with as many new trials.
+Points: other tasks of the same kind. Clusters: other policies, whose cells come together. What the
+same cells would give when measured again is another question: ``remeasure``.
 """
 
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain, combinations
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from scipy.special import gammaln
-from scipy.stats import t
+from scipy.special import gammaln, ndtr, stdtrit
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
 from evaluator.statistics.columns import Number, exact, floats
 from evaluator.statistics.proportion import LEVEL
+from evaluator.statistics.scales import NEAR, SCALES
+from evaluator.statistics.weighted import EPSILON, STATISTICS, Values, values_of
 
 MAX_EXACT = 30_000
 """Up to so many different resamples are all visited: 9 units."""
@@ -26,12 +28,8 @@ MIN_UNITS = 4
 """Of three units, one resample in nine holds only one of them."""
 MAX_UNDEFINED = 0.05
 """The part of the resamples that may leave the statistic undefined, as all the same cell does."""
-EPSILON = 1e-12
-"""A variance of rates below this is rounding, not variation."""
-
-Rates = Float64[np.ndarray, "sets cells"]
-Values = tuple[Float64[np.ndarray, " sets"], Bool[np.ndarray, " sets"]]
-"""A statistic of each set of cells, and where it is defined."""
+METHODS = ("bootstrap", "bootstrap-expanded", "jackknife")
+"""What ``CellSample.interval`` knows, from the narrowest to the widest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +75,102 @@ def _all_counts(num_units: int) -> Int64[np.ndarray, "resamples units"]:
     return np.asarray(np.diff(edges, axis=1) - 1)
 
 
+class CellSample:
+    """Cells, what they belong to, and the interval of each statistic over them.
+
+    Resamples are drawn once, when the first method asks for them, and shared by all statistics.
+    """
+
+    def __init__(
+        self,
+        *,
+        recorded: Sequence[Number],
+        sim: Sequence[Number],
+        rng: np.random.Generator,
+        clusters: Sequence[Hashable] | None = None,
+        max_exact: int = MAX_EXACT,
+        num_resamples: int = NUM_RESAMPLES,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            recorded: Recorded rate of each cell.
+            sim: The twin's.
+            rng: Draws the resamples where they are too many to visit.
+            clusters: What each cell belongs to, for example its policy; cells alone without.
+            max_exact: All resamples are visited up to this many.
+            num_resamples: Random resamples beyond that.
+        """
+        self._recorded, self._sim = (floats(side) for side in exact("interval", recorded, sim))
+        names = list(range(len(self._recorded))) if clusters is None else list(clusters)
+        units = {name: place for place, name in enumerate(dict.fromkeys(names))}
+        self._members = np.array([units[name] for name in names])
+        self._rng, self._limits = rng, (max_exact, num_resamples)
+        self._values: dict[str, Values] = {}
+        self.num_units = len(units)
+        self.kind = "points" if clusters is None else "clusters"
+
+    @cached_property
+    def _drawn(self) -> Resamples:
+        max_exact, num = self._limits
+        return resamples(self.num_units, self._rng, max_exact=max_exact, num_resamples=num)
+
+    @cached_property
+    def _counts(self) -> Float64[np.ndarray, "resamples cells"]:
+        return self._drawn.counts[:, self._members].astype(np.float64)
+
+    def _resampled(self, statistic: str) -> Values:
+        if statistic not in self._values:
+            found = values_of(statistic, self._counts, self._recorded, self._sim)
+            self._values[statistic] = found
+        return self._values[statistic]
+
+    def interval(self, statistic: str, method: str, *, level: float = LEVEL) -> Interval:
+        """Return the interval of a statistic by one of ``METHODS``.
+
+        bootstrap: percentiles of the resampled values. bootstrap-expanded: percentiles further
+        out, as Student's t is further out than the normal (Hesterberg 2015).
+        jackknife: Student's t with the standard error of leaving one unit out (Tukey 1958), on
+        Fisher's z or the logarithm where ``scales`` says so.
+
+        Raises:
+            UndefinedStatisticError: Below 4 units, when the statistic is undefined in more than
+                5 % of the resamples, at the end of its range, or when nothing varies.
+        """
+        what = f"{method} of {self.kind}"
+        if self.num_units < MIN_UNITS:
+            reason = f"{self.num_units} units; it needs at least {MIN_UNITS}"
+            raise UndefinedStatisticError(statistic=what, reason=reason)
+        if method == "jackknife":
+            low, high = self._jackknife(statistic, what, level)
+        else:
+            tail = (1 - level) / 2
+            if method == "bootstrap-expanded":
+                tail = expanded_tail(tail, self.num_units)
+            values, defined = self._resampled(statistic)
+            low, high = weighted_ends(values, defined, self._drawn.weights, tail, what)
+        return Interval(low=low, high=high, level=level, method=f"{method}-{self.kind}")
+
+    def _jackknife(self, statistic: str, what: str, level: float) -> tuple[float, float]:
+        units = self.num_units
+        left = (np.arange(units)[:, None] != self._members[None, :]).astype(np.float64)
+        every = np.ones((1, len(self._members)))
+        (value,), (known,) = values_of(statistic, every, self._recorded, self._sim)
+        without, defined = values_of(statistic, left, self._recorded, self._sim)
+        if not known or not defined.all():
+            reason = "the statistic is undefined when one unit is left out"
+            raise UndefinedStatisticError(statistic=what, reason=reason)
+        error = math.sqrt((units - 1) / units * float(((without - without.mean()) ** 2).sum()))
+        reach = float(stdtrit(units - 1, 0.5 + level / 2)) * error
+        return SCALES[statistic].around(what, float(value), reach)
+
+
+def expanded_tail(tail: float, num_units: int) -> float:
+    """Return the tail at which a percentile is as far out as Student's t would have it."""
+    quantile = float(stdtrit(num_units - 1, tail))
+    return float(ndtr(quantile * math.sqrt(num_units / (num_units - 1))))
+
+
 def bootstrap_interval(
     statistic: str,
     *,
@@ -91,7 +185,7 @@ def bootstrap_interval(
     """Return the percentile interval of a statistic over resampled cells or clusters of cells.
 
     Args:
-        statistic: pearson, bias or mae.
+        statistic: A name in ``weighted.STATISTICS``: pearson, mae, mmrv-recorded ...
         recorded: Recorded rate of each cell.
         sim: The twin's.
         rng: Draws the resamples where they are too many to visit.
@@ -105,19 +199,18 @@ def bootstrap_interval(
             5 % of the resamples.
         ValueError: For an unknown statistic.
     """
-    if statistic not in WEIGHTED:
-        message = f"{statistic!r} has no bootstrap; there are: {', '.join(WEIGHTED)}"
+    if statistic not in STATISTICS:
+        message = f"{statistic!r} has no bootstrap; there are: {', '.join(STATISTICS)}"
         raise ValueError(message)
-    x, y = (floats(side) for side in exact(statistic, recorded, sim))
-    names = list(range(len(x))) if clusters is None else list(clusters)
-    units = list(dict.fromkeys(names))
-    kind = "points" if clusters is None else "clusters"
-    _enough(len(units), f"bootstrap of {kind}")
-    drawn = resamples(len(units), rng, max_exact=max_exact, num_resamples=num_resamples)
-    members = np.array([units.index(name) for name in names])
-    values, defined = WEIGHTED[statistic](drawn.counts[:, members].astype(np.float64), x, y)
-    low, high = _ends(values, defined, drawn.weights, level, f"bootstrap of {kind}")
-    return Interval(low=low, high=high, level=level, method=f"bootstrap-{kind}")
+    sample = CellSample(
+        recorded=recorded,
+        sim=sim,
+        rng=rng,
+        clusters=clusters,
+        max_exact=max_exact,
+        num_resamples=num_resamples,
+    )
+    return sample.interval(statistic, "bootstrap", level=level)
 
 
 def student_interval(values: Sequence[Number], *, level: float = LEVEL) -> Interval:
@@ -137,138 +230,23 @@ def student_interval(values: Sequence[Number], *, level: float = LEVEL) -> Inter
         raise UndefinedStatisticError(
             statistic="Student's interval", reason=f"all {len(x)} values are the same"
         )
-    half = float(t.ppf(0.5 + level / 2, len(x) - 1)) * spread / math.sqrt(len(x))
+    half = float(stdtrit(len(x) - 1, 0.5 + level / 2)) * spread / math.sqrt(len(x))
     mean = float(x.mean())
     return Interval(low=mean - half, high=mean + half, level=level, method="student-t")
 
 
-def remeasurement_band(
-    tables: Sequence[tuple[int, int, int, int]],
-    *,
-    rng: np.random.Generator,
-    level: float = LEVEL,
-    num_draws: int = 4_000,
-) -> Interval:
-    """Return where Pearson's r would fall if the same cells were measured again.
-
-    Each cell's table of trials (both succeed, only sim, only recorded, neither) is drawn anew from
-    a multinomial with the observed shares, 1/4 added to each count. Two measurements differ by
-    sqrt(2) times the spread of one, around the r that was found; on Fisher's scale.
-    A band of measurement noise, not an interval of a true r: the noise itself pulls r towards 0.
-
-    Raises:
-        UndefinedStatisticError: Below 3 cells, without trials, or when r is undefined or 1.
-    """
-    if any(sum(table) == 0 for table in tables):
-        raise UndefinedStatisticError(
-            statistic="remeasurement band", reason="a cell has no trial with both sides"
-        )
-    counts = np.array(tables, dtype=np.float64).reshape(-1, 4)
-    totals = counts.sum(axis=1)
-    found = (counts[:, 0] + counts[:, 2]) / totals, (counts[:, 0] + counts[:, 1]) / totals
-    recorded, sim = [], []
-    for table, total in zip(counts, totals.astype(int).tolist(), strict=True):
-        again = rng.multinomial(total, (table + 0.25) / (total + 1), size=num_draws)
-        recorded.append((again[:, 0] + again[:, 2]) / total)
-        sim.append((again[:, 0] + again[:, 1]) / total)
-    return _band(found, np.array(recorded).T, np.array(sim).T, level)
-
-
-def remeasurement_band_of_counts(
-    recorded: Sequence[tuple[int, int]],
-    sim: Sequence[tuple[int, int]],
-    *,
-    rng: np.random.Generator,
-    level: float = LEVEL,
-    num_draws: int = 4_000,
-) -> Interval:
-    """Return the same band from counts (k, n) of sides whose trials are not paired.
-
-    Raises:
-        UndefinedStatisticError: Below 3 cells, or when r is undefined or 1.
-    """
-    found, drawn = [], []
-    for side in (recorded, sim):
-        found.append(np.array([k / n for k, n in side]))
-        again = [rng.binomial(n, (k + 0.5) / (n + 1), size=num_draws) / n for k, n in side]
-        drawn.append(np.array(again).T)
-    return _band((found[0], found[1]), drawn[0], drawn[1], level)
-
-
-def _band(
-    found: tuple[Float64[np.ndarray, " cells"], Float64[np.ndarray, " cells"]],
-    recorded: Rates,
-    sim: Rates,
-    level: float,
-) -> Interval:
-    if len(found[0]) < 3:
-        raise UndefinedStatisticError(
-            statistic="remeasurement band", reason=f"{len(found[0])} cells; it needs at least 3"
-        )
-    (r,), (defined,) = _pearson_of_each(found[0][None], found[1][None])
-    if not defined or abs(r) > 1 - EPSILON:
-        raise UndefinedStatisticError(
-            statistic="remeasurement band",
-            reason="r is undefined" if not defined else f"r is {r:+.0f} exactly",
-        )
-    values, known = _pearson_of_each(recorded, sim)
-    scaled = np.arctanh(np.clip(values, -1 + 1e-6, 1 - 1e-6))
-    weights = np.full(len(values), 1 / len(values))
-    low, high = _ends(scaled, known, weights, level, "remeasurement band")
-    centre, half = math.atanh(float(r)), math.sqrt(2) * (high - low) / 2
-    return Interval(
-        low=math.tanh(centre - half),
-        high=math.tanh(centre + half),
-        level=level,
-        method="remeasurement",
-    )
-
-
-def _pearson_of_each(x: Rates, y: Rates) -> Values:
-    dx, dy = x - x.mean(axis=1, keepdims=True), y - y.mean(axis=1, keepdims=True)
-    return _ratio((dx * dy).mean(axis=1), (dx * dx).mean(axis=1), (dy * dy).mean(axis=1))
-
-
-def _weighted_pearson(
-    counts: Rates, x: Float64[np.ndarray, "*cells"], y: Float64[np.ndarray, "*cells"]
-) -> Values:
-    """Pearson's r with cells counted several times; x and y may differ between resamples."""
-    total = counts.sum(axis=1)
-    mean_x, mean_y = (counts * x).sum(axis=1) / total, (counts * y).sum(axis=1) / total
-    dx, dy = x - mean_x[:, None], y - mean_y[:, None]
-    moments = [(counts * a * b).sum(axis=1) / total for a, b in ((dx, dy), (dx, dx), (dy, dy))]
-    return _ratio(*moments)
-
-
-def _weighted_mean(counts: Rates, gaps: Float64[np.ndarray, " cells"]) -> Values:
-    return (counts @ gaps) / counts.sum(axis=1), np.ones(len(counts), dtype=bool)
-
-
-WEIGHTED: dict[str, Callable[..., Values]] = {
-    "pearson": _weighted_pearson,
-    "bias": lambda counts, x, y: _weighted_mean(counts, y - x),
-    "mae": lambda counts, x, y: _weighted_mean(counts, np.abs(y - x)),
-}
-
-
-def _ratio(
-    shared: Float64[np.ndarray, " sets"],
-    first: Float64[np.ndarray, " sets"],
-    second: Float64[np.ndarray, " sets"],
-) -> Values:
-    defined = (first > EPSILON) & (second > EPSILON)
-    scale = np.sqrt(np.where(defined, first * second, 1.0))
-    return np.clip(shared / scale, -1.0, 1.0), defined
-
-
-def _ends(
+def weighted_ends(
     values: Float64[np.ndarray, " sets"],
     defined: Bool[np.ndarray, " sets"],
     weights: Float64[np.ndarray, " sets"],
-    level: float,
+    tail: float,
     statistic: str,
 ) -> tuple[float, float]:
-    """Weighted quantiles of the defined values."""
+    """Return the weighted quantiles of the defined values that leave ``tail`` on each side.
+
+    Raises:
+        UndefinedStatisticError: When more than 5 % are undefined.
+    """
     undefined = float(weights[~defined].sum())
     if undefined > MAX_UNDEFINED:
         raise UndefinedStatisticError(
@@ -277,13 +255,20 @@ def _ends(
         )
     order = np.argsort(values[defined], kind="stable")
     ordered, mass = values[defined][order], np.cumsum(weights[defined][order])
-    tails = np.array([(1 - level) / 2, (1 + level) / 2]) * mass[-1]
+    tails = np.array([tail, 1 - tail]) * mass[-1]
     places = np.minimum(np.searchsorted(mass, tails - EPSILON), len(ordered) - 1)
     return float(ordered[places[0]]), float(ordered[places[1]])
 
 
-def _enough(num_units: int, statistic: str) -> None:
-    if num_units < MIN_UNITS:
+def refuse_no_width(interval: Interval) -> Interval:
+    """Return the interval if it has any width.
+
+    Raises:
+        UndefinedStatisticError: When it has none: it would claim to be certain.
+    """
+    if interval.high - interval.low < NEAR:
         raise UndefinedStatisticError(
-            statistic=statistic, reason=f"{num_units} units; it needs at least {MIN_UNITS}"
+            statistic=interval.method,
+            reason="nothing varies between resamples: the interval would have no width",
         )
+    return interval

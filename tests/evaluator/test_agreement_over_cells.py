@@ -11,14 +11,9 @@ from hypothesis import strategies as st
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics import agreement, correlation
-from evaluator.statistics.bootstrap import (
-    bootstrap_interval,
-    remeasurement_band,
-    remeasurement_band_of_counts,
-    resamples,
-    student_interval,
-)
+from evaluator.statistics.bootstrap import bootstrap_interval, resamples, student_interval
 from evaluator.statistics.decision import choose, over_tasks, without_each
+from evaluator.statistics.remeasure import remeasure_counts, remeasure_paired
 
 rates = st.lists(st.fractions(0, 1, max_denominator=10), min_size=3, max_size=7)
 
@@ -130,8 +125,8 @@ def test_too_few_units_and_too_many_constant_resamples_are_refused() -> None:
         bootstrap_interval("bias", recorded=[0, 1, 1], sim=[0, 1, 0], rng=rng())
     with pytest.raises(UndefinedStatisticError, match="undefined in 32 % of the resamples"):
         bootstrap_interval("pearson", recorded=[0, 1, 1, 1], sim=[0.1, 0.5, 0.2, 0.3], rng=rng())
-    with pytest.raises(ValueError, match="'mmrv' has no bootstrap"):
-        bootstrap_interval("mmrv", recorded=[0, 1], sim=[0, 1], rng=rng())
+    with pytest.raises(ValueError, match="'regret' has no bootstrap"):
+        bootstrap_interval("regret", recorded=[0, 1], sim=[0, 1], rng=rng())
 
 
 def test_student_gives_no_interval_of_no_width() -> None:
@@ -144,16 +139,17 @@ def test_student_gives_no_interval_of_no_width() -> None:
 def test_the_remeasurement_band_shrinks_with_trials_and_is_reproducible() -> None:
     few = [(5, 1, 1, 3), (8, 1, 0, 1), (2, 2, 1, 5)]
     many = [tuple(50 * v for v in table) for table in few]
-    narrow = remeasurement_band([(a, b, c, d) for a, b, c, d in many], rng=rng())
-    wide = remeasurement_band(few, rng=rng())
+    paired = remeasure_paired([(a, b, c, d) for a, b, c, d in many], rng=rng())
+    narrow = paired.band("pearson")
+    wide = remeasure_paired(few, rng=rng()).band("pearson")
     assert narrow.high - narrow.low < wide.high - wide.low
-    assert remeasurement_band(few, rng=rng()) == wide
-    unpaired = remeasurement_band_of_counts(
+    assert remeasure_paired(few, rng=rng()).band("pearson") == wide
+    unpaired = remeasure_counts(
         [(6, 10), (8, 10), (3, 10)], [(6, 10), (9, 10), (4, 10)], rng=rng()
-    )
+    ).band("pearson")
     assert -1 <= unpaired.low < unpaired.high <= 1
     with pytest.raises(UndefinedStatisticError, match="no trial with both sides"):
-        remeasurement_band([(0, 0, 0, 0), *few], rng=rng())
+        remeasure_paired([(0, 0, 0, 0), *few], rng=rng())
 
 
 def test_a_high_r_may_choose_wrongly() -> None:

@@ -5,11 +5,16 @@ import pytest
 
 from evaluator.compare.measure import measured, proportion
 from evaluator.result import Interval
+from evaluator.statistics.bootstrap import METHODS
 from evaluator.statistics.coverage import exact, simulate, stored
+from evaluator.statistics.coverage.chosen import choose_method, holds_from
+from evaluator.statistics.coverage.population import POPULATIONS, Population
+from evaluator.statistics.coverage.simulate_cells import of_agreement, of_remeasurements, truth
 from evaluator.statistics.paired import tango_difference
 from evaluator.statistics.proportion import clopper_pearson, jeffreys, wilson
 from evaluator.statistics.sequential import betting_interval
 from evaluator.statistics.unpaired import guaranteed_difference, newcombe_difference
+from evaluator.statistics.weighted import STATISTICS
 
 REQUIRED = range(5, 101)
 
@@ -76,16 +81,40 @@ def test_simulated_coverage_of_fisher_is_the_stored_one() -> None:
         return correlation.fisher_interval(correlation.pearson(*cells), len(cells[0]))
 
     rng = np.random.default_rng(1)
-    found = simulate.of_cells(make, "pearson", 10, simulate.POPULATIONS[:2], draws=100, rng=rng)
+    found = simulate.of_cells(make, "pearson", 10, POPULATIONS[:2], draws=100, rng=rng)
     known = stored.coverage_of("fisher-z", 10)
     assert known is not None
     assert abs(found.mean - known.mean) < 0.06  # 200 draws: 0.016, and fewer truths
 
 
+@pytest.mark.slow
+def test_simulated_coverage_of_every_statistic_is_the_stored_one() -> None:
+    """A few draws at one size; the shipped map has many at eight."""
+    rng = np.random.default_rng(2)
+    found = of_agreement(8, POPULATIONS[2:4], draws=60, rng=rng)
+    found |= of_remeasurements(6, POPULATIONS[2:4], draws=60, rng=rng)
+    assert len(found) == len(METHODS) * len(STATISTICS) + len(STATISTICS)
+    for name, coverage in found.items():
+        known = stored.coverage_of(name, coverage.n)
+        assert known is not None, name
+        # 120 draws of two truths against hundreds of six: noise of 3 % and other truths.
+        assert abs(coverage.mean - known.mean) < 0.12, name
+
+
+def test_truths_of_what_is_known_by_hand() -> None:
+    independent = Population(correlation=0.0, trials=1000)
+    for statistic in ("pearson", "spearman", "kendall", "slope"):
+        assert truth(statistic, independent, 5) == pytest.approx(0, abs=0.02)
+    assert truth("order", independent, 5) == pytest.approx(0.5, abs=0.02)
+    # Two independent uniform numbers are a third apart on average; here 0.9 of it.
+    assert truth("mae", independent, 5) == pytest.approx(0.3, abs=0.01)
+    assert truth("bias", independent, 5) == 0
+    few, many = (truth("mmrv-recorded", independent, n) for n in (4, 20))
+    assert few < many  # it grows with the number of cells
+
+
 def test_correlated_cells_are_drawn_as_they_are_described() -> None:
-    population = simulate.Population(
-        correlation=0.9, trials=1000, cluster_share=0.5, cells_per_cluster=2
-    )
+    population = Population(correlation=0.9, trials=1000, cluster_share=0.5, cells_per_cluster=2)
     x, y = population.draw(20_000, np.random.default_rng(2))
     assert np.corrcoef(x, y)[0, 1] == pytest.approx(0.89, abs=0.01)  # uniform marginals
     first, second = x.reshape(-1, 2).T
@@ -154,3 +183,53 @@ def test_a_measurement_without_its_interval_says_why() -> None:
     assert value.value == 0.5
     assert value.interval is None
     assert "use wilson" in str(value.reason_without_interval)
+
+
+def test_every_statistic_of_agreement_is_in_the_map_by_every_method() -> None:
+    held = stored.load_map()
+    for statistic in STATISTICS:
+        for kind in ("points", "clusters"):
+            assert {f"{method}-{kind}:{statistic}" for method in METHODS} <= held.keys()
+        assert f"remeasurement:{statistic}".removesuffix(":pearson") in held
+
+
+@pytest.mark.parametrize("kind", ["points", "clusters"])
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_no_other_method_would_have_covered_more(statistic: str, kind: str) -> None:
+    for n in (4, 8, 17, 60):
+        choice = choose_method(statistic, kind, n)
+        known = stored.coverage_of(choice.key, n)
+        assert known is not None
+        for method in METHODS:
+            other = stored.coverage_of(f"{method}-{kind}:{statistic}", n)
+            assert other is not None
+            assert min(other.worst, 0.95) <= min(known.worst, 0.95) + 1e-12
+
+
+def test_a_refusal_names_how_many_cells_would_be_enough() -> None:
+    refused = [
+        (statistic, n)
+        for statistic in STATISTICS
+        for n in (4, 5, 6)
+        if (known := stored.coverage_of(choose_method(statistic, "clusters", n).key, n))
+        and known.worst < stored.FLOOR
+    ]
+    assert refused, "four policies cannot be enough for every statistic"
+    for statistic, n in refused:
+        choice = choose_method(statistic, "clusters", n)
+        method = choice.key.partition(":")[0]
+        kept, why = stored.vouch(an_interval(method), n, key=choice.key, instead=choice.instead)
+        assert kept is None
+        assert f"use {choice.instead}" in why
+        if "policies" in choice.instead:
+            enough, name = choice.instead.split(", or ")[1].split(" policies, from where ")
+            key = f"{name.removesuffix(' holds')}:{statistic}"
+            assert int(enough) > n
+            assert holds_from(key) == int(enough)
+
+
+def test_a_statistic_that_is_not_in_the_map_is_refused() -> None:
+    kept, why = stored.vouch(an_interval("jackknife-points"), 10, key="jackknife-points:regret")
+    assert kept is None
+    assert "coverage of jackknife-points for this statistic is not known" in why
+    assert holds_from("jackknife-points:regret") is None

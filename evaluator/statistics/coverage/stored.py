@@ -21,6 +21,10 @@ INSTEAD = {
     "fisher-z": "the coefficient with its n, or more cells",
     "bootstrap-points": "fisher-z for r, student-t for means, or more cells",
     "bootstrap-clusters": "more policies: no interval holds with so few",
+    "bootstrap-expanded-points": "the value with its n, or more cells",
+    "bootstrap-expanded-clusters": "the value with its n, or more policies",
+    "jackknife-points": "the value with its n, or more cells",
+    "jackknife-clusters": "the value with its n, or more policies",
     "student-t": "the value with its n, or more cells",
     "post-stratified-beta": "wilson on the robot trials alone",
     "ppi++": "post-stratified-beta",
@@ -75,28 +79,35 @@ def coverage_of(method: str, n: int) -> Coverage | None:
     return min(found.points[place - 1 : place + 1], key=lambda point: point.worst)
 
 
-def vouch(interval: Interval, n: int | None, *, key: str = "") -> tuple[Interval | None, str]:
+def vouch(
+    interval: Interval, n: int | None, *, key: str = "", instead: str = ""
+) -> tuple[Interval | None, str]:
     """Return the interval with its worst coverage, or None and why it is not printed.
 
-    Only 95 % intervals were looked at; those of other levels pass unmarked.
+    Only 95 % intervals were looked at; those of other levels, and methods that are not in the map,
+    pass unmarked. A ``key`` that is not in the map is refused.
 
     Args:
         interval: What a method gave.
         n: What the method's coverage depends on: trials, pairs, cells, policies.
         key: Name in the map, where one method serves several statistics; its own without.
+        instead: What to use where it is refused; what the method's own entry says without.
     """
     method = interval.method.split(",")[0]
-    key = key or method
-    if n is None or interval.level != 0.95 or key not in load_map():
+    instead = instead or INSTEAD.get(method, "more data")
+    if n is None or interval.level != 0.95 or (not key and method not in load_map()):
         return interval, ""
+    key = key or method
+    if key not in load_map():
+        return None, f"the coverage of {method} for this statistic is not known; use {instead}"
     known = coverage_of(key, n)
     axis = load_map()[key].axis
     if known is None:
         reason = f"the coverage of {method} at {n} {axis} is not known"
-        return None, f"{reason}; use {INSTEAD.get(method, 'more data')}"
+        return None, f"{reason}; use {instead}"
     if method not in JUDGED_BY_MEAN and known.worst < FLOOR:
         return None, (
             f"{method} at {n} {axis} covers as little as {100 * known.worst:.1f} % where 95 % are "
-            f"claimed ({known.worst_at}); use {INSTEAD.get(method, 'more data')}"
+            f"claimed ({known.worst_at}); use {instead}"
         )
     return replace(interval, worst_coverage=round(known.worst, 4)), ""

@@ -1,0 +1,221 @@
+"""Over cells: which interval each statistic of agreement has, or why it has none."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import numpy as np
+
+from evaluator.compare.rows import RateCell
+from evaluator.errors import UndefinedStatisticError
+from evaluator.result import Cell, Interval, Table
+from evaluator.statistics.bootstrap import CellSample, refuse_no_width, student_interval
+from evaluator.statistics.correlation import fisher_interval, pearson
+from evaluator.statistics.coverage.chosen import Choice, choose_method
+from evaluator.statistics.coverage.stored import vouch
+from evaluator.statistics.remeasure import Remeasured, remeasure_counts, remeasure_paired
+
+SEED = 0
+"""Resampling is seeded: the same cells give the same interval."""
+MIN_CLUSTERS = 4
+
+
+def usable_cells(cells: Sequence[RateCell]) -> list[RateCell]:
+    """Return the cells with both rates."""
+    return [c for c in cells if c.recorded_rate is not None and c.sim_rate is not None]
+
+
+def sides(cells: Sequence[RateCell]) -> tuple[list[Fraction], list[Fraction]]:
+    """Return recorded and sim rates of usable cells."""
+    recorded = [c.recorded_rate for c in cells if c.recorded_rate is not None]
+    return recorded, [c.sim_rate for c in cells if c.sim_rate is not None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """An interval, or the reason why there is none, with where its coverage is stored."""
+
+    interval: Interval | None
+    reason: str
+    choice: Choice
+    num_units: int
+    """Cells or clusters of cells: what coverage depends on."""
+
+
+class CellIntervals:
+    """The intervals of some cells: what belongs together is found once, resamples drawn once."""
+
+    def __init__(self, cells: Sequence[RateCell]) -> None:
+        """Prepare; nothing is drawn before the first interval.
+
+        Args:
+            cells: With both rates.
+        """
+        self._cells = list(cells)
+        self.num_cells = len(self._cells)
+        self._recorded, self._sim = sides(cells)
+        self._clusters, self.num_units, self.unit = clusters_of(cells)
+        self._sample: CellSample | None = None
+
+    @property
+    def kind(self) -> str:
+        """Points where cells are independent, else clusters."""
+        return "points" if self.unit == "cells" else "clusters"
+
+    def of(self, statistic: str) -> Found:
+        """Return the interval by the method whose stored coverage is best.
+
+        Args:
+            statistic: A name in ``weighted.STATISTICS``.
+        """
+        choice = choose_method(statistic, self.kind, self.num_units)
+        if choice.method == "student-t" and not self._means():
+            key = f"jackknife-{self.kind}:{statistic}"
+            choice = replace(choice, method="jackknife", key=key)
+        interval, reason = None, ""
+        try:
+            interval = self._make(statistic, choice)
+        except UndefinedStatisticError as error:
+            reason = f"{self.num_units} {self.unit}: {error.reason}"
+            if self.num_units < MIN_CLUSTERS:
+                reason = self._too_few()
+        return Found(interval=interval, reason=reason, choice=choice, num_units=self.num_units)
+
+    def _make(self, statistic: str, choice: Choice) -> Interval:
+        if choice.method == "fisher-z":
+            return fisher_interval(pearson(self._recorded, self._sim), len(self._cells))
+        if choice.method == "student-t":
+            return student_interval(self._means())
+        if self._sample is None:
+            self._sample = CellSample(
+                recorded=self._recorded,
+                sim=self._sim,
+                rng=np.random.default_rng(SEED),
+                clusters=None if self.kind == "points" else self._clusters,
+            )
+        return refuse_no_width(self._sample.interval(statistic, choice.method))
+
+    def _means(self) -> list[Fraction]:
+        """Mean gap of each unit; none where the units differ in size, for then means do too."""
+        members: dict[str, list[Fraction]] = {}
+        for name, recorded, sim in zip(self._clusters, self._recorded, self._sim, strict=True):
+            members.setdefault(name, []).append(sim - recorded)
+        if len({len(gaps) for gaps in members.values()}) != 1:
+            return []
+        return [sum(gaps, Fraction(0)) / len(gaps) for gaps in members.values()]
+
+    def _too_few(self) -> str:
+        if self.unit == "cells":
+            return f"{self.num_units} cells; an interval over cells needs {MIN_CLUSTERS}"
+        why = "cells share tasks across conditions" if _is_shared(self._cells) else ""
+        why = why or "cells share policies or tasks"
+        return (
+            f"{why}, and {self.num_units} {self.unit} are too few to resample ({MIN_CLUSTERS} are "
+            "needed); an interval of independent cells would claim too much"
+        )
+
+    def again(self) -> Remeasured:
+        """Draw the trials of every cell anew.
+
+        Raises:
+            UndefinedStatisticError: When the number of trials of a cell is not known.
+        """
+        rng = np.random.default_rng(SEED)
+        tables = [cell.trial_table for cell in self._cells if cell.trial_table is not None]
+        if self._cells and len(tables) == len(self._cells):
+            return remeasure_paired(tables, rng=rng)
+        pairs = [cell.pair for cell in self._cells]
+        sim = [(s.k, s.n) for s, _ in pairs if s.k is not None and s.n]
+        recorded = [(r.k, r.n) for _, r in pairs if r.k is not None and r.n]
+        if self._cells and len(sim) == len(recorded) == len(self._cells):
+            return remeasure_counts(recorded, sim, rng=rng)
+        raise UndefinedStatisticError(
+            statistic="remeasured", reason="the number of trials of a cell is not known"
+        )
+
+
+def _is_shared(cells: Sequence[RateCell]) -> bool:
+    return len({(c.task, c.policy) for c in cells}) < len(cells)
+
+
+def clusters_of(cells: Sequence[RateCell]) -> tuple[list[str], int, str]:
+    """Return what each cell belongs to, how many of those there are, and their name."""
+    policies, tasks = [c.policy for c in cells], [c.task for c in cells]
+    if not _is_shared(cells) and len(set(policies)) in (1, len(cells)):
+        return [str(i) for i in range(len(cells))], len(cells), "cells"
+    if len(set(policies)) >= MIN_CLUSTERS or len(set(policies)) > len(set(tasks)):
+        return policies, len(set(policies)), "policies"
+    return tasks, len(set(tasks)), "tasks"
+
+
+OTHERS, AGAIN = "other {} like these", "the same cells measured again"
+
+
+def interval_table(
+    intervals: CellIntervals, statistics: Sequence[tuple[str, str, float]]
+) -> tuple[Table, ...]:
+    """Lay out both intervals of every statistic; none without cells.
+
+    Args:
+        intervals: Of the cells.
+        statistics: Words, name and factor to the printed unit.
+    """
+    if intervals.num_units == 0:
+        return ()
+    try:
+        again: Remeasured | None = intervals.again()
+        unknown = ""
+    except UndefinedStatisticError as error:
+        again, unknown = None, error.reason
+    rows: list[tuple[Cell, ...]] = []
+    for words, statistic, factor in statistics:
+        found = intervals.of(statistic)
+        kept, refusal = _vouched(found)
+        others = OTHERS.format(intervals.unit)
+        rows.append((words, others, *_shown(kept, refusal or found.reason, factor)))
+        rows.append((words, AGAIN, *_band(again, statistic, factor, unknown, intervals)))
+    return (
+        Table(
+            id="agreement_intervals",
+            title="How certain is the agreement?",
+            columns=("statistic", "over", "low", "high", "method", "least coverage", "reason"),
+            rows=tuple(rows),
+            note="95 %. Two questions: where the number would be for other cells of the same "
+            "kind, and where it would fall if these were measured again with as many trials. "
+            "The method is the one with the best coverage in the stored map; least coverage is "
+            "its worst case there.",
+        ),
+    )
+
+
+def _vouched(found: Found) -> tuple[Interval | None, str]:
+    if found.interval is None:
+        return None, ""
+    return vouch(
+        found.interval, found.num_units, key=found.choice.key, instead=found.choice.instead
+    )
+
+
+def _band(
+    again: Remeasured | None,
+    statistic: str,
+    factor: float,
+    unknown: str,
+    intervals: CellIntervals,
+) -> tuple[Cell, ...]:
+    if again is None:
+        return _shown(None, unknown, factor)
+    try:
+        band = again.band(statistic)
+    except UndefinedStatisticError as error:
+        return _shown(None, error.reason, factor)
+    key = f"remeasurement:{statistic}".removesuffix(":pearson")
+    kept, refusal = vouch(band, intervals.num_cells, key=key)
+    return _shown(kept, refusal, factor)
+
+
+def _shown(interval: Interval | None, reason: str, factor: float) -> tuple[Cell, ...]:
+    if interval is None:
+        return None, None, None, None, reason
+    ends = (round(factor * interval.low, 4), round(factor * interval.high, 4))
+    return *ends, interval.method, interval.worst_coverage, None

@@ -1,0 +1,167 @@
+"""Every statistic of agreement over many weighted sets of cells at once, as resampling asks for.
+
+A resample counts each cell several times: ``recorded`` and ``sim`` hold one value per cell and
+``counts`` tells the sets apart. A new measurement has other rates in each set: then both sides are
+sets x cells and every count is one. The plain forms are in ``agreement`` and ``correlation``.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.stats import rankdata
+
+EPSILON = 1e-12
+"""A variance of rates below this is rounding, not variation."""
+CHUNK = 4_000_000
+"""Numbers of sets x cells x cells held at once [32 MB]."""
+
+Counts = Float64[np.ndarray, "sets cells"]
+Side = Float64[np.ndarray, "*cells"]
+"""Rates by cell, or by set and cell."""
+Values = tuple[Float64[np.ndarray, " sets"], Bool[np.ndarray, " sets"]]
+"""A statistic of each set of cells, and where it is defined."""
+Statistic = Callable[[Counts, Side, Side], Values]
+
+
+def values_of(statistic: str, counts: Counts, recorded: Side, sim: Side) -> Values:
+    """Compute one statistic of every set.
+
+    Args:
+        statistic: A name in ``STATISTICS``.
+        counts: How often each cell is in each set.
+        recorded: Recorded rates.
+        sim: The twin's.
+    """
+    compute = STATISTICS[statistic]
+    if recorded.ndim == 1:
+        return compute(counts, recorded, sim)
+    size = max(1, CHUNK // max(1, counts.shape[1] ** 2))
+    parts = [
+        compute(counts[at : at + size], recorded[at : at + size], sim[at : at + size])
+        for at in range(0, len(counts), size)
+    ]
+    return np.concatenate([p for p, _ in parts]), np.concatenate([known for _, known in parts])
+
+
+def ratio(
+    shared: Float64[np.ndarray, " sets"],
+    first: Float64[np.ndarray, " sets"],
+    second: Float64[np.ndarray, " sets"],
+) -> Values:
+    """Return shared / sqrt(first second), undefined where a factor is 0."""
+    defined = (first > EPSILON) & (second > EPSILON)
+    scale = np.sqrt(np.where(defined, first * second, 1.0))
+    return np.clip(shared / scale, -1.0, 1.0), defined
+
+
+def _moments(counts: Counts, x: Side, y: Side) -> tuple[np.ndarray, ...]:
+    """Means of both sides, their covariance and their variances."""
+    total = counts.sum(axis=1)
+    mean_x, mean_y = (counts * x).sum(axis=1) / total, (counts * y).sum(axis=1) / total
+    dx, dy = x - mean_x[:, None], y - mean_y[:, None]
+    second = ((counts * a * b).sum(axis=1) / total for a, b in ((dx, dy), (dx, dx), (dy, dy)))
+    return (mean_x, mean_y, *second)
+
+
+def _pearson(counts: Counts, recorded: Side, sim: Side) -> Values:
+    _, _, shared, first, second = _moments(counts, recorded, sim)
+    return ratio(shared, first, second)
+
+
+def _spearman(counts: Counts, recorded: Side, sim: Side) -> Values:
+    return _pearson(counts, _ranks(counts, recorded), _ranks(counts, sim))
+
+
+def _ranks(counts: Counts, side: Side) -> Counts:
+    """Average ranks in each set; a cell that is there three times takes three ranks."""
+    if side.ndim == 2:
+        return np.asarray(rankdata(side, axis=1), dtype=np.float64)
+    below = (side[:, None] < side[None, :]).astype(np.float64)
+    same = (side[:, None] == side[None, :]).astype(np.float64)
+    return np.asarray(counts @ below + (counts @ same + 1) / 2)
+
+
+def _signs(side: Side) -> np.ndarray:
+    return np.asarray(np.sign(side[..., :, None] - side[..., None, :]))
+
+
+def _over_pairs(counts: Counts, of_pair: np.ndarray) -> Float64[np.ndarray, " sets"]:
+    """Sum over pairs of cells, each as often as it is in the set."""
+    if of_pair.ndim == 3:
+        return np.asarray(of_pair.sum(axis=(1, 2)) / 2)
+    return np.asarray(((counts @ of_pair) * counts).sum(axis=1) / 2)
+
+
+def _kendall(counts: Counts, recorded: Side, sim: Side) -> Values:
+    first, second = _signs(recorded), _signs(sim)
+    sums = (_over_pairs(counts, of) for of in (first * second, np.abs(first), np.abs(second)))
+    return ratio(*sums)
+
+
+def _order(counts: Counts, recorded: Side, sim: Side) -> Values:
+    first, second = _signs(recorded), _signs(sim)
+    differ = np.abs(first)
+    right = differ * ((first == second) + 0.5 * (second == 0))
+    pairs = _over_pairs(counts, differ)
+    defined = pairs > EPSILON
+    return _over_pairs(counts, right) / np.where(defined, pairs, 1.0), defined
+
+
+def _mmrv(counts: Counts, judge: Side, judged: Side) -> Values:
+    """Mean over cells of the largest gap to a cell in the set whose order is wrong."""
+    above = judge[..., :, None] > judge[..., None, :]
+    wrong = above != (judged[..., :, None] > judged[..., None, :])
+    violations = wrong * np.abs(judge[..., :, None] - judge[..., None, :])
+    if violations.ndim == 3:
+        worst = violations.max(axis=2)
+    else:
+        worst = np.stack([_largest_there(counts, row) for row in violations], axis=1)
+    return _weighted_mean(counts, worst)
+
+
+def _largest_there(counts: Counts, row: Float64[np.ndarray, " cells"]) -> np.ndarray:
+    """Largest violation of one cell against the cells that are in each set."""
+    order = np.argsort(-row, kind="stable")[: int((row > 0).sum())]
+    if not len(order):
+        return np.zeros(len(counts))
+    there = counts[:, order] > 0
+    first = there.argmax(axis=1)
+    return np.asarray(np.where(there.any(axis=1), row[order][first], 0.0))
+
+
+def _weighted_mean(counts: Counts, values: Side) -> Values:
+    means = (counts * values).sum(axis=1) / counts.sum(axis=1)
+    return means, np.ones(len(counts), dtype=bool)
+
+
+def _rmse(counts: Counts, recorded: Side, sim: Side) -> Values:
+    squares, defined = _weighted_mean(counts, (sim - recorded) ** 2)
+    return np.sqrt(squares), defined
+
+
+def _slope(counts: Counts, recorded: Side, sim: Side) -> Values:
+    _, _, shared, _, spread = _moments(counts, recorded, sim)
+    defined = spread > EPSILON
+    return shared / np.where(defined, spread, 1.0), defined
+
+
+def _intercept(counts: Counts, recorded: Side, sim: Side) -> Values:
+    mean_recorded, mean_sim, *_ = _moments(counts, recorded, sim)
+    slope, defined = _slope(counts, recorded, sim)
+    return mean_recorded - slope * mean_sim, defined
+
+
+STATISTICS: dict[str, Statistic] = {
+    "pearson": _pearson,
+    "spearman": _spearman,
+    "kendall": _kendall,
+    "bias": lambda counts, recorded, sim: _weighted_mean(counts, sim - recorded),
+    "mae": lambda counts, recorded, sim: _weighted_mean(counts, np.abs(sim - recorded)),
+    "rmse": _rmse,
+    "slope": _slope,
+    "intercept": _intercept,
+    "order": _order,
+    "mmrv-recorded": _mmrv,
+    "mmrv-sim": lambda counts, recorded, sim: _mmrv(counts, sim, recorded),
+}

@@ -1,0 +1,158 @@
+"""Statistics over many weighted sets at once are the plain ones, set by set."""
+
+import itertools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evaluator.errors import UndefinedStatisticError
+from evaluator.statistics import agreement, correlation
+from evaluator.statistics.bootstrap import METHODS, CellSample, bootstrap_interval, expanded_tail
+from evaluator.statistics.remeasure import remeasure_counts, remeasure_paired
+from evaluator.statistics.scales import SCALES
+from evaluator.statistics.weighted import STATISTICS, values_of
+
+PLAIN: dict[str, Callable[[Any, Any], float]] = {
+    "pearson": correlation.pearson,
+    "spearman": correlation.spearman,
+    "kendall": correlation.kendall,
+    "bias": lambda x, y: agreement.bias(recorded=x, sim=y),
+    "mae": lambda x, y: agreement.mean_absolute_error(recorded=x, sim=y),
+    "rmse": lambda x, y: agreement.root_mean_square_error(recorded=x, sim=y),
+    "slope": lambda x, y: agreement.calibration_line(recorded=x, sim=y).slope,
+    "intercept": lambda x, y: agreement.calibration_line(recorded=x, sim=y).intercept,
+    "order": lambda x, y: agreement.order_accuracy(recorded=x, sim=y).value,
+    "mmrv-recorded": lambda x, y: agreement.mmrv(recorded=x, sim=y),
+    "mmrv-sim": lambda x, y: agreement.mmrv(recorded=x, sim=y, gap="sim"),
+}
+
+
+def plain(statistic: str, recorded: list[float], sim: list[float]) -> float | None:
+    try:
+        return PLAIN[statistic](recorded, sim)
+    except UndefinedStatisticError:
+        return None
+
+
+def test_every_statistic_has_a_plain_twin_and_a_scale() -> None:
+    assert PLAIN.keys() == STATISTICS.keys() == SCALES.keys()
+
+
+@pytest.mark.parametrize("statistic", PLAIN)
+def test_counting_cells_several_times_is_repeating_them(statistic: str) -> None:
+    rng = np.random.default_rng(4)
+    recorded, sim = rng.integers(0, 6, (2, 7)) / 5  # few values, so that there are ties
+    counts = rng.multinomial(7, np.full(7, 1 / 7), size=40)
+    values, defined = values_of(statistic, counts.astype(np.float64), recorded, sim)
+    for count, value, known in zip(counts, values, defined, strict=True):
+        wanted = plain(
+            statistic, np.repeat(recorded, count).tolist(), np.repeat(sim, count).tolist()
+        )
+        assert known == (wanted is not None)
+        if wanted is not None:
+            assert value == pytest.approx(wanted, abs=1e-12)
+
+
+@pytest.mark.parametrize("statistic", PLAIN)
+def test_sets_with_rates_of_their_own_are_the_plain_statistic_of_each(statistic: str) -> None:
+    rng = np.random.default_rng(5)
+    recorded, sim = rng.integers(0, 6, (2, 60, 5)) / 5
+    values, defined = values_of(statistic, np.ones((60, 5)), recorded, sim)
+    for x, y, value, known in zip(recorded, sim, values, defined, strict=True):
+        wanted = plain(statistic, x.tolist(), y.tolist())
+        assert known == (wanted is not None)
+        if wanted is not None:
+            assert value == pytest.approx(wanted, abs=1e-12)
+
+
+@pytest.mark.parametrize("statistic", PLAIN)
+def test_an_exact_bootstrap_is_the_bootstrap_of_all_ordered_draws(statistic: str) -> None:
+    recorded, sim = [0.1, 0.5, 0.6, 0.9, 0.3], [0.2, 0.4, 0.9, 0.8, 0.35]
+    found = (
+        plain(statistic, [recorded[i] for i in draw], [sim[i] for i in draw])
+        for draw in itertools.product(range(5), repeat=5)
+    )
+    values = [value for value in found if value is not None]
+    # Sets with fewer than three different cells are undefined for the plain forms in other places.
+    interval = bootstrap_interval(
+        statistic, recorded=recorded, sim=sim, rng=np.random.default_rng(0)
+    )
+    low, high = np.quantile(values, [0.025, 0.975], method="inverted_cdf")
+    assert interval.low == pytest.approx(low, abs=1e-9)
+    assert interval.high == pytest.approx(high, abs=1e-9)
+
+
+def test_a_jackknife_of_a_mean_is_students_interval() -> None:
+    from evaluator.statistics.bootstrap import student_interval
+
+    recorded, sim = [0.1, 0.5, 0.6, 0.9, 0.3], [0.2, 0.4, 0.9, 0.8, 0.35]
+    sample = CellSample(recorded=recorded, sim=sim, rng=np.random.default_rng(0))
+    mine = sample.interval("bias", "jackknife")
+    theirs = student_interval([s - r for r, s in zip(recorded, sim, strict=True)])
+    assert (mine.low, mine.high) == pytest.approx((theirs.low, theirs.high), abs=1e-12)
+    assert mine.method == "jackknife-points"
+
+
+def test_an_expanded_bootstrap_is_wider_and_tends_to_the_plain_one() -> None:
+    assert expanded_tail(0.025, 5) < 0.01
+    assert expanded_tail(0.025, 10_000) == pytest.approx(0.025, abs=1e-4)
+    rng = np.random.default_rng(1)
+    recorded, sim = rng.random((2, 8)).tolist()
+    sample = CellSample(recorded=recorded, sim=sim, rng=rng)
+    plain_one, wide = (sample.interval("mae", method) for method in METHODS[:2])
+    assert wide.low <= plain_one.low
+    assert wide.high >= plain_one.high
+
+
+def test_no_interval_is_given_at_the_end_of_a_range_or_without_variation() -> None:
+    up = [0.1, 0.2, 0.3, 0.4, 0.5]
+    sample = CellSample(recorded=up, sim=up, rng=np.random.default_rng(0))
+    for statistic, why in (
+        ("kendall", "no width"),
+        ("mae", "no width"),
+        ("mmrv-recorded", "no width"),
+        ("slope", "no width"),
+    ):
+        with pytest.raises(UndefinedStatisticError, match=why):
+            sample.interval(statistic, "jackknife")
+    counts = [(1, 9), (3, 9), (5, 9), (7, 9)]
+    with pytest.raises(UndefinedStatisticError, match="1 exactly, the end of its range"):
+        remeasure_counts(counts, counts, rng=np.random.default_rng(0)).band("kendall")
+
+
+def test_thousands_of_resamples_take_well_under_a_second() -> None:
+    rng = np.random.default_rng(2)
+    recorded, sim = (rng.integers(0, 11, (2, 24)) / 10).tolist()
+    clusters = [i // 3 for i in range(24)]  # 8 policies: 6,435 resamples, all visited
+    start_s = time.perf_counter()
+    sample = CellSample(recorded=recorded, sim=sim, rng=rng, clusters=clusters)
+    for statistic in STATISTICS:
+        sample.interval(statistic, "bootstrap")
+    assert time.perf_counter() - start_s < 5  # about 0.3 s on an idle core
+
+
+@pytest.mark.parametrize("statistic", ["pearson", "mae", "bias", "slope", "mmrv-recorded"])
+def test_a_band_of_remeasurement_holds_what_was_found_and_shrinks_with_trials(
+    statistic: str,
+) -> None:
+    few = [(5, 1, 1, 3), (8, 1, 0, 1), (2, 2, 1, 5), (4, 0, 3, 3)]
+    many = [(a * 50, b * 50, c * 50, d * 50) for a, b, c, d in few]
+    wide = remeasure_paired(few, rng=np.random.default_rng(3)).band(statistic)
+    narrow = remeasure_paired(many, rng=np.random.default_rng(3)).band(statistic)
+    assert narrow.high - narrow.low < wide.high - wide.low
+    recorded = [(a + c) / 10 for a, _, c, _ in few]
+    sim = [(a + b) / 10 for a, b, _, _ in few]
+    value = plain(statistic, recorded, sim)
+    assert value is not None
+    assert wide.low <= value <= wide.high
+
+
+def test_paired_trials_are_redrawn_together() -> None:
+    """Sides that always agree stay equal in every redrawn table."""
+    found = remeasure_paired([(7, 0, 0, 3)] * 4, rng=np.random.default_rng(0))
+    difference = np.abs(found.recorded_again - found.sim_again).mean()
+    apart = remeasure_counts([(7, 10)] * 4, [(7, 10)] * 4, rng=np.random.default_rng(0))
+    assert difference < 0.5 * np.abs(apart.recorded_again - apart.sim_again).mean()
