@@ -156,11 +156,11 @@ def _find_head(
             attached = [piece.sum() for piece, k in zip(pieces, touches, strict=True) if k == head]
             if sum(attached) < MAX_ATTACHED * solid.sum():
                 return found[0]
-    owner = _highest_ball(solid, thick, top)
-    if owner is None:
+    by_ball = _highest_ball(solid, thick, top)
+    if by_ball is None:
         return found[0]
-    num_balls = int(owner.max())
-    return owner, [_touched(piece, owner, num_balls) for piece in pieces], num_balls - 1
+    num_balls = int(by_ball.max())
+    return by_ball, [_touched(piece, by_ball, num_balls) for piece in pieces], num_balls - 1
 
 
 def _highest_ball(
