@@ -122,7 +122,7 @@ SECTIONS: tuple[Section, ...] = (
         "controller, executed about kinematics and calibration.",
         numbers=(("motion.*", ""), ("bands.*", ""), ("repeatability.*", "")),
         tables=("motion*", "bands_*"),
-        figures=("motions",),
+        figures=("motions", "bands"),
     ),
     Section(
         id="states",

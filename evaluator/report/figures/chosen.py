@@ -6,6 +6,7 @@ from evaluator.compare.drawn import curve_bands, drawn_bins
 from evaluator.compare.motion import MotionSummary
 from evaluator.compare.rows import Comparison
 from evaluator.report.figures.agreement import scatter, success
+from evaluator.report.figures.bands import bands
 from evaluator.report.figures.drawing import Drawing, NotDrawn
 from evaluator.report.figures.gains import gains
 from evaluator.report.figures.gate import confusion, costs, reliability
@@ -27,6 +28,7 @@ def drawings(comparison: Comparison) -> tuple[list[Drawing], list[NotDrawn]]:
         reliability(drawn_bins(comparison.rows)),
         funnel(comparison.tables),
         motions(curve_bands(_curves(comparison.motions))),
+        bands(comparison.bands),
         distributions(*state_panels(comparison.states)),
         distributions(*view_panels(comparison.views)),
     )
