@@ -4,8 +4,10 @@ Text, numbers and answers are columns of their own, tuples of them are lists, an
 JSON text. Importing this module loads pyarrow; ``cache`` does so only when a cache is asked for.
 """
 
+import gc
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -76,7 +78,8 @@ def read_summaries(path: Path, kind: type[Summary], version: str) -> dict[str, t
             if said.get(_VERSION) != version.encode():
                 message = "another version of this program wrote it"
                 raise UnusableFileError(message)
-            return _unpacked(kind, file.read())
+            with _without_collecting():
+                return _unpacked(kind, file.read())
     except FileNotFoundError:
         raise
     except (*_REFUSALS, OSError, KeyError, AttributeError) as error:
@@ -139,6 +142,18 @@ def _unpacked(kind: type[Summary], table: pa.Table) -> dict[str, tuple[Summary, 
             item = kind(**dict(zip(names, values, strict=True)))
             rows[key] = (*rows[key], item) if place else (item,)
     return rows
+
+
+@contextmanager
+def _without_collecting() -> Iterator[None]:
+    """Spare the garbage collector a look at a million new objects, of which none is garbage."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def _tuples(column: pa.ChunkedArray) -> list[tuple[Any, ...] | None]:
