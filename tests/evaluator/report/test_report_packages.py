@@ -128,12 +128,12 @@ def test_nothing_heavy_is_loaded_before_something_is_written() -> None:
 
 
 @pytest.mark.slow
-def test_a_whole_evaluation_loads_neither_the_twin_nor_torch_nor_pandas(
+def test_a_whole_evaluation_loads_neither_the_twin_nor_torch(
     evaluation_run: RunFolder,
 ) -> None:
     code = (
         "import sys, robot_gst; code = robot_gst.run(['evaluate', sys.argv[1], '--quiet']); "
-        "heavy = ('twin', 'torch', 'pandas', 'open3d', 'mujoco', 'pybullet', 'zenoh'); "
+        "heavy = ('twin', 'torch', 'open3d', 'mujoco', 'pybullet', 'zenoh'); "
         "print(code, [n for n in heavy if n in sys.modules])"
     )
     done = subprocess.run(

@@ -25,7 +25,7 @@ def many(count: int) -> Comparison:
         condition = "with_replanning" if number % 2 else "without_replanning"
         rows.append(
             TrialRow(
-                episode=f"monday_trial_{number:05d}",
+                episode=f"monday-trial-{number:05d}",
                 task=f"task_{number // 2 % 4}",
                 condition=condition,
                 policy="scripted",
@@ -87,8 +87,8 @@ def test_a_report_about_thousands_of_trials_stays_small_and_complete(tmp_path: P
     text = written.report.read_text()
     assert len(text.encode()) < MAX_BYTES
     assert f"The first {SHOWN_ROWS} of 3,000 rows; the whole is in trials.csv" in text
-    assert "monday_trial_00199" in text
-    assert "monday_trial_00200<" not in text
+    assert "monday-trial-00199" in text
+    assert "monday-trial-00200<" not in text
     lines = (tmp_path / "trials.csv").read_text().splitlines()
     assert len(lines) == 3001
     results = load_results(written.results)
