@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from bridge.sources.standin.hidden import nominal_hidden
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.planner import GraspError, plan_pick_and_place
 from bridge.sources.standin.world import World as MujocoWorld
+from bridge.task.meshes.catalogue import toy_mesh
 from bridge.task.robot import ur5_with_gripper_urdf
 from bridge.task.task_file import ObjectModel, Task, load_task
 from twin.physics.config import PhysicsConfig
@@ -21,6 +23,8 @@ from twin.replay.config import ReplayConfig
 from twin.replay.path import JointPath, path_of_plan
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
+from twin.scene.shape.from_mesh import shape_of_mesh
+from twin.scene.shape.lattice import lattice
 
 SETTLE_S = 1.0
 LIFTED_M = 0.08
@@ -37,6 +41,8 @@ class Trial:
     Ts_base_object: dict[str, np.ndarray]
     path: JointPath
     physics: PhysicsConfig
+    as_scene: bool = False
+    """The toys as a rebuilt scene has them, of 9 mm; otherwise as the task has them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +84,7 @@ def one_duck() -> Task:
     )
 
 
-def draw_trial(task: Task, seed: int, *, varied: bool) -> Trial:
+def draw_trial(task: Task, seed: int, *, varied: bool, as_scene: bool = False) -> Trial:
     """Draw a start, and with ``varied`` material, friction and a grasp that misses a little."""
     rng = np.random.default_rng([808, seed])
     starts = task.draw_start(rng)
@@ -101,7 +107,11 @@ def draw_trial(task: Task, seed: int, *, varied: bool) -> Trial:
         physics = replace(physics, object_friction=friction)
     task = replace(task, objects=objects)
     return Trial(
-        task=task, Ts_base_object=starts, path=planned_path(task, starts, errors), physics=physics
+        task=task,
+        Ts_base_object=starts,
+        path=planned_path(task, starts, errors),
+        physics=physics,
+        as_scene=as_scene,
     )
 
 
@@ -133,6 +143,28 @@ def planned_path(
     return path
 
 
+def body_of(trial: Trial, key: str) -> SoftModel:
+    """What physics gets of one toy."""
+    model = trial.task.objects[key]
+    if not trial.as_scene:
+        return SoftModel.from_task(model)
+    return SoftModel.from_lattice(scene_lattice(model.mesh or "", model.size_m), model)
+
+
+@cache
+def scene_lattice(mesh: str, size_m: tuple[float, float, float]) -> dict[str, np.ndarray]:
+    """The arrays that rebuilding a scene would write of a toy that was seen from all sides."""
+    surface = toy_mesh(mesh, size_m)
+    points = surface.vertices_m
+    found = lattice(shape_of_mesh(points, surface.triangles, points))
+    return {
+        "nodes_m": found.nodes_m,
+        "tets": found.tets,
+        "mass_fraction": found.mass_fraction,
+        "spacing_m": np.array(found.spacing_m),
+    }
+
+
 def furnished(trial: Trial) -> World:
     """The twin's world with the trial's objects."""
     hulls = hulls_of(load_robot(ur5_with_gripper_urdf()))
@@ -145,7 +177,7 @@ def furnished(trial: Trial) -> World:
     for key in trial.task.containers:
         world.add_static(trial.task.objects[key].panels(), trial.Ts_base_object[key])
     for key in trial.task.soft_objects:
-        world.add_soft(key, SoftModel.from_task(trial.task.objects[key]), trial.Ts_base_object[key])
+        world.add_soft(key, body_of(trial, key), trial.Ts_base_object[key])
     return world
 
 
@@ -176,7 +208,7 @@ def replayed(trial: Trial) -> tuple[dict[str, Toy], float, float]:
 
 
 def _judge(world: World, trial: Trial, key: str, highest_m: float) -> Toy:
-    model = SoftModel.from_task(trial.task.objects[key])
+    model = body_of(trial, key)
     nodes, T = world.soft_nodes_m(key).astype(np.float64), world.T_base_object(key)
     off = (nodes - T[:3, 3]) @ T[:3, :3] - model.nodes_m
     container = trial.task.objects[trial.task.containers[0]]

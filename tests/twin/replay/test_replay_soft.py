@@ -145,6 +145,28 @@ def test_a_replay_ends_where_a_toy_bursts_and_is_rejected(
     assert terminal.first_t_ns == pytest.approx(20 / 60 * 1e9, rel=1e-6)
 
 
+def test_a_toy_whose_nodes_fly_apart_ends_the_replay_and_never_passes(
+    script: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = script.toy_scene()
+    steps, step = iter(range(100_000)), World.step
+
+    def blown_up(self: World) -> None:
+        if next(steps) == 100:
+            solver = self._soft._begun()
+            apart = np.random.default_rng(0).normal(0.0, 1e4, solver.velocities(0).shape)
+            solver.set_velocities(0, apart)
+        step(self)
+
+    monkeypatch.setattr(World, "step", blown_up)
+    result = replay_plan(script.toy_plan(scene), scene, CONFIG)
+    terminal = result.verdict.terminal
+    assert (terminal.value, terminal.cause, terminal.bodies) == (False, "exploded", ("sloth",))
+    assert result.verdict.accepted is False
+    assert "sloth" in result.broken
+    assert len(result.stamps_ns) < 60, "it ended where the toy burst"
+
+
 def test_what_a_stage_put_down_may_go_on_lying_there_and_the_gripper_may_not(
     script: SimpleNamespace,
 ) -> None:

@@ -8,6 +8,9 @@ namespace soft {
 namespace {
 
 constexpr int kMostRefined = 4;  // times the substeps asked for, for the stiffest and lightest
+// Smaller cells [m] get more substeps in proportion, or what closes on a body presses them flat
+// between two looks: at 9 mm 20 N crushed a sloth in 11 substeps, and not in 15 (measured).
+constexpr double kUsualSpacing = 0.014;
 
 }  // namespace
 
@@ -24,8 +27,10 @@ int Solver::add_body(const BodySpec& spec) {
     added.touched.assign(colliders.size(), 0);
     const double longest = added.longest_substep(substep_s());
     const int needed = static_cast<int>(std::ceil(period_s_ / longest - 1e-9));
+    const double finer = kUsualSpacing / added.spacing;
+    const int pressed = static_cast<int>(std::ceil(fewest_substeps_ * finer - 1e-9));
     const int most = kMostRefined * fewest_substeps_;
-    num_substeps_ = std::min(std::max(num_substeps_, needed), most);
+    num_substeps_ = std::min(std::max({num_substeps_, needed, pressed}), most);
     for (Body& body : bodies) body.build_blocks(substep_s());
     return static_cast<int>(bodies.size()) - 1;
 }
