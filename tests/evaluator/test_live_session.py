@@ -29,7 +29,7 @@ from bridge.wire.session import WireSample, open_session
 from evaluator.live.follow import Follower, read_news
 
 ROOT = Path(__file__).resolve().parents[2]
-WAIT_S = 30.0
+WAIT_S = 150.0
 WITHOUT, WITH = "without_replanning", "with_replanning"
 
 
