@@ -120,7 +120,18 @@ SECTIONS: tuple[Section, ...] = (
         title="Motions",
         lead="How far the recorded robot lies from the replayed one: planned tells about the "
         "controller, executed about kinematics and calibration.",
-        numbers=(("motion.*", ""), ("bands.*", ""), ("repeatability.*", "")),
+        numbers=tuple(
+            (f"motion.{against}.{quantity}", f"{words}, {against} replay")
+            for against in ("planned", "executed")
+            for quantity, words in (
+                ("position_mean_m", "Tool, mean distance"),
+                ("end_point_m", "Tool, distance at the end"),
+                ("rotation_mean_rad", "Tool, mean angle"),
+                ("lag_s", "Delay of the recorded motion"),
+                ("without_lag_mean_m", "Mean distance without the delay"),
+                ("joint_rms_rad", "Joints, root mean square"),
+            )
+        ),
         tables=("motion*", "bands_*"),
         figures=("motions", "bands"),
     ),
@@ -142,10 +153,12 @@ SECTIONS: tuple[Section, ...] = (
             ("views.all.psnr_db", "PSNR, raw"),
             ("views.all.psnr_gain_db", "PSNR, after a gain per image"),
             ("views.all.psnr_pose_gain_db", "PSNR, after pose and gain"),
-            ("views.all.ssim*", ""),
+            ("views.all.ssim", "SSIM, raw"),
+            ("views.all.ssim_gain", "SSIM, after a gain per image"),
+            ("views.all.ms_ssim", "MS-SSIM, raw"),
+            ("views.all.gmsd", "GMSD, raw"),
             ("views.all.lpips*", ""),
-            ("views.all.depth*", ""),
-            ("views.all.*", ""),
+            ("views.all.depth_mean_abs_m", "Depth, mean absolute error"),
             ("image.*", ""),
         ),
         tables=("views*", "image*"),
@@ -155,7 +168,11 @@ SECTIONS: tuple[Section, ...] = (
         id="fewer",
         title="Fewer robot trials",
         lead="What the twin adds to few robot trials, and whether enough were made.",
-        numbers=(("proxy.*", ""), ("sequence.recorded.*", ""), ("power.*", "")),
+        numbers=(
+            ("proxy.*", ""),
+            ("sequence.recorded.*", ""),
+            ("power.trials_needed.recorded.*", ""),
+        ),
         tables=("stopping",),
     ),
 )
@@ -188,7 +205,7 @@ def numbers_of(
 def name_of(measurement_id: str) -> str:
     """Write an id as words, for numbers that have no other name."""
     plain = _UNIT.sub("", measurement_id.removesuffix(".-"))
-    words = plain.replace("_", " ").split(".")
+    words = plain.removeprefix("views.all.").replace("_", " ").split(".")
     return ", ".join(word for word in words if word not in ("", "-"))
 
 

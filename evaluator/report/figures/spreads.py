@@ -22,6 +22,7 @@ from evaluator.report.figures.drawing import (
 from evaluator.result import Cell, Table
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 COLOURS = ("sim", "rec", "third", "fourth", "ink", "soft")
@@ -152,6 +153,7 @@ def distributions(subject: Subject, panels: Sequence[Panel]) -> Drawing | NotDra
                         group.values, [100 * s for s in group.shares], "o", markersize=3,
                         color=LIGHT[COLOURS[place]],
                     )  # fmt: skip
+            _widen(axes, item.groups)
             axes.set_ylim(0, 103)
             axes.set_yticks(range(0, 101, 25))
             axes.set_xlabel(item.label, labelpad=1)
@@ -186,6 +188,19 @@ def distributions(subject: Subject, panels: Sequence[Panel]) -> Drawing | NotDra
 
 
 STEPS = (0.10, 0.25, 0.50, 0.75, 0.90, 1.0)
+
+
+def _widen(axes: "Axes", groups: Sequence[Shares]) -> None:
+    """Show values that are all but equal as equal, not as noise blown up."""
+    low = min(group.values[0] for group in groups)
+    high = max(group.values[-1] for group in groups)
+    if high - low < ALIKE * max(abs(low), abs(high)) or high == low:
+        room = max(abs(high), 1.0)
+        axes.set_xlim(low - room, high + room)
+
+
+ALIKE = 1e-3
+"""Share of a value by which others may differ and still look the same."""
 
 
 def _decades(groups: Sequence[Shares]) -> float:
