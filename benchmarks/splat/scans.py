@@ -65,15 +65,15 @@ class HeldOut:
 
 def held_out(run: RunFolder, record: Mapping[str, Any]) -> dict[str, HeldOut]:
     """By variant (raw, gain, pose_gain, static), as the evaluator scores them."""
-    from evaluator.compare.view_images import score_views
+    from evaluator.compare.view_images import images_of, score_views
 
     still = {item["id"] for item in record["cameras"] if item["still"]}
     found: dict[str, list[tuple[float, float]]] = {}
     for path in run.derived("*.views.*"):
-        for view in score_views(Episode.open(path), None)[0]:
-            for name, score in view.scores.items() if view.camera_id not in still else ():
+        for view in score_views(images_of(Episode.open(path), None))[0]:
+            for way, score in view.scores.items() if view.camera_id not in still else ():
                 if score.psnr_db is not None and score.ssim is not None:
-                    found.setdefault(name, []).append((score.psnr_db, score.ssim))
+                    found.setdefault(way.name, []).append((score.psnr_db, score.ssim))
     return {
         name: HeldOut(psnr_db=float(np.mean(rows, axis=0)[0]), ssim=float(np.mean(rows, axis=0)[1]))
         for name, rows in found.items()

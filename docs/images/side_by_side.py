@@ -1,7 +1,7 @@
 """Write held-out views of a rebuilt run beside their renderings, small enough for the documents.
 
 Example: .venv/bin/python docs/images/side_by_side.py runs/cell docs/images/standin.jpg
-Takes the view with the median PSNR of each of the first cameras: neither the best nor the worst.
+Takes views spread over the ranking by PSNR: neither the best nor the worst alone.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from PIL import Image
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.media.color import decode_color
-from evaluator.compare.view_images import RECORDED, RENDERED, read_images, score_views
+from evaluator.compare.view_images import RECORDED, RENDERED, images_of, score_views
 
 MAX_BYTES = 150_000
 GAP_PX = 4
@@ -25,14 +25,13 @@ def rows(run: RunFolder, count: int) -> list[np.ndarray]:
     """Recorded beside rendered, for views spread over the ranking by PSNR, their middle first."""
     found = []
     for path in run.derived("*.views.*"):
-        episode = Episode.open(path)
-        images = read_images(episode)
-        scores, _ = score_views(episode, None)
+        images = images_of(Episode.open(path), None)
+        scores, _ = score_views(images)
         for score in scores:
             key = (score.camera_id, score.stamp_ns)
             pair = [decode_color(images.color[name][key]) for name in (RECORDED, RENDERED)]
             gap = np.full((pair[0].shape[0], GAP_PX, 3), 255, dtype=np.uint8)
-            found.append((score.scores["raw"].psnr_db or 0.0, np.hstack([pair[0], gap, pair[1]])))
+            found.append((score.psnr_db() or 0.0, np.hstack([pair[0], gap, pair[1]])))
     found.sort(key=lambda item: item[0])
     places = np.linspace(0, len(found) - 1, 2 * count + 1)[1::2].round().astype(int)
     for place in places:
