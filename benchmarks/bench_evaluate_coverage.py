@@ -130,18 +130,19 @@ def simulated_methods() -> dict[str, Callable[[], dict[str, Any]]]:
 
 def families() -> dict[str, Callable[[], dict[str, dict[str, Any]]]]:
     """Methods that are simulated together, because they share their draws."""
-    how = f"simulated, {DRAWS} draws of each truth"
+    draws = 2 * DRAWS  # the least of several truths is too low by their noise
+    how = f"simulated, {draws} draws of each truth"
 
     def agreement(sizes: Sequence[int], *, clustered: bool) -> dict[str, dict[str, Any]]:
         rng = np.random.default_rng(SEED)
         populations = CLUSTERED if clustered else POPULATIONS
-        found = [of_agreement(n, populations, draws=DRAWS, rng=rng) for n in sizes]
+        found = [of_agreement(n, populations, draws=draws, rng=rng) for n in sizes]
         over, axis = (OVER_CLUSTERED, "policies") if clustered else (OVER_CELLS, "cells")
         return by_method(found, over, axis)
 
     def bands() -> dict[str, dict[str, Any]]:
         rng = np.random.default_rng(SEED)
-        found = [of_remeasurements(n, POPULATIONS, draws=DRAWS, rng=rng) for n in BANDS]
+        found = [of_remeasurements(n, POPULATIONS, draws=draws, rng=rng) for n in BANDS]
         return by_method(found, f"the statistic of a second measurement; {OVER_CELLS}", "cells")
 
     def by_method(
