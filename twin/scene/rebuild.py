@@ -44,7 +44,7 @@ from twin.scene.store import (
 from twin.scene.view_numbers import summarise_views
 from twin.scene.views import ViewsJob, views_path, write_views
 
-METHOD_VERSION = 16
+METHOD_VERSION = 17
 """Counts changes of method that make older scenes out of date."""
 
 

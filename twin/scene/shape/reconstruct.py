@@ -26,8 +26,9 @@ MIN_SPREAD_RAD = 0.2
 CELL_M = 0.004
 """A measured point counts for the extent when two views measured one in the same cell."""
 THIN_M = 0.004
-LEAST_BEHIND_VOXELS = 1.2
-"""A surface speaks for what is this far behind it, if two voxels are more: walls may be thin."""
+LEAST_BEHIND_VOXELS = 1.6
+"""A surface speaks for what is this far behind it, if two voxels are more: walls may be thin. With
+less than 1.6 voxels a basket of 3.5 mm voxels gets a hole where noise meets."""
 
 
 @dataclass(frozen=True, kw_only=True)
