@@ -67,7 +67,7 @@ def test_rerun_accepts_every_file(demo: Path) -> None:
 
 def test_results_are_labelled_stand_in_and_say_what_is_undefined(demo: Path) -> None:
     results = json.loads((demo / "results" / "results.json").read_text())
-    assert results["schema_version"] == 1
+    assert results["schema_version"] == 2
     assert results["stand_in"] is True
     for measurement in results["measurements"]:
         assert measurement["definition"]
