@@ -78,7 +78,7 @@ class CellIntervals:
         except UndefinedStatisticError as error:
             reason = f"{self.num_units} {self.unit}: {error.reason}"
             if self.num_units < MIN_CLUSTERS:
-                reason = self._too_few()
+                reason = self._too_few(choice.method)
         return Found(interval=interval, reason=reason, choice=choice, num_units=self.num_units)
 
     def _make(self, statistic: str, choice: Choice) -> Interval:
@@ -104,9 +104,10 @@ class CellIntervals:
             return []
         return [sum(gaps, Fraction(0)) / len(gaps) for gaps in members.values()]
 
-    def _too_few(self) -> str:
+    def _too_few(self, method: str) -> str:
         if self.unit == "cells":
-            return f"{self.num_units} cells; an interval over cells needs {MIN_CLUSTERS}"
+            name = "Fisher's interval" if method == "fisher-z" else "an interval over cells"
+            return f"{self.num_units} cells; {name} needs {MIN_CLUSTERS}"
         why = "cells share tasks across conditions" if _is_shared(self._cells) else ""
         why = why or "cells share policies or tasks"
         return (

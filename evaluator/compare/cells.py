@@ -94,7 +94,7 @@ def _measure(
             )
         return factor * value(), interval
 
-    resampled = f"; interval: over {intervals.unit}" if intervals.kind == "clusters" else ""
+    resampled = f"; interval: {intervals.unit} resampled" if intervals.kind == "clusters" else ""
     return measured(
         name,
         compute,
