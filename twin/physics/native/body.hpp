@@ -17,6 +17,7 @@ struct Contact {
     std::int32_t sample;
     std::int32_t collider;
     bool holds = false;        // it touched in the last substep
+    std::int32_t face = -1;    // of the piece, through which the sample came in
     Float3 anchor{0, 0, 0};    // where friction holds it, in the piece's frame
 };
 

@@ -111,6 +111,14 @@ void solve_contacts(Body& body, std::vector<Collider>& colliders, float step_s) 
                 contact.holds = false;
                 continue;
             }
+            // Pressed in deeply a sample may come nearer to a side: pushed out there, the body would
+            // hook itself onto the piece.
+            if (contact.holds) {
+                face = &piece.planes[contact.face];
+                best = dot(face->n, q) - face->d;
+            } else {
+                contact.face = static_cast<std::int32_t>(face - piece.planes.data());
+            }
             const Float3 normal = frame.outward(face->n);
             const Double3 place = widen(p) + body.origin;
             Float3 slip = p - body.sample_started(sample);
