@@ -1,8 +1,10 @@
 """Serve the review pages until stopped: address, token, signals."""
 
+import os
 import secrets
 import signal
 import socket
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -93,10 +95,17 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
         )
     )
     text = f"Dashboard: {address.url}\nFrom another computer: {address.ssh_line}\nStop with Ctrl-C."
-    Thread(target=_ask_ahead, args=(library,), daemon=True).start()
+    asking = Thread(target=_ask_ahead, args=(library,), daemon=True)
+    asking.start()
     with listener, _ending_on_signals(server):
         output.result({"url": address.url, "ssh": address.ssh_line, "runs": [*library.runs]}, text)
         server.run(sockets=[listener])
+    if asking.is_alive():
+        # Python ends threads by unwinding them, which aborts the process inside native code. What
+        # the evaluator keeps is written whole, so nothing is left half done.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
     return 0
 
 

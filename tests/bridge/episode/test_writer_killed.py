@@ -16,7 +16,7 @@ from bridge.episode.run import RunFolder
 
 CHILD = Path(__file__).with_name("writer_child.py")
 MAX_TAIL_NS = 500_000_000
-KILLS = int(os.environ.get("GST_KILLS", "30"))
+KILLS = int(os.environ.get("GST_KILLS", "15"))
 """`make soak` kills a hundred times, which takes four minutes."""
 
 

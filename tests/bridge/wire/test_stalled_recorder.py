@@ -53,8 +53,8 @@ def recorder(endpoint: str, tmp_path: Path) -> Iterator["subprocess.Popen[str]"]
 
 def slowest_puts(
     recorder: "subprocess.Popen[str]", endpoint: str, preset: str
-) -> tuple[float, float, int]:
-    """Slowest put() before and during the stop [s], and how many were made during it."""
+) -> tuple[float, float, float]:
+    """Slowest put() before and during the stop [s], and puts a second during over before it."""
     child = spawn(str(CHILD), endpoint, preset, str(1.0 + CALM_S + STALL_S + AFTER_S))
     try:
         assert child.stdout is not None
@@ -78,23 +78,24 @@ def slowest_puts(
         f"{max(during) * 1e3:.2f} ms while the recorder was stopped; {len(during)} puts in "
         f"{STALL_S:g} s, load {os.getloadavg()[0]:.1f}"
     )
-    return max(before), max(during), len(during)
+    # Compared with the same machine a moment before: a busy one does not reach 500 Hz either way.
+    return max(before), max(during), len(during) * (stop_s - calm_s) / (len(before) * STALL_S)
 
 
 def test_a_stopped_recorder_does_not_slow_a_control_publisher(
     recorder: "subprocess.Popen[str]", endpoint: str
 ) -> None:
     for _ in range(ATTEMPTS):
-        before_s, during_s, puts = slowest_puts(recorder, endpoint, "control")
-        if during_s <= max(1.2 * before_s, NOISE_S) and puts > 0.9 * STALL_S * 500:
+        before_s, during_s, pace = slowest_puts(recorder, endpoint, "control")
+        if during_s <= max(1.2 * before_s, NOISE_S) and pace > 0.9:
             return
-    pytest.fail("the slowest put() exceeded 1.2 times that before the stop in every attempt")
+    pytest.fail("a put() took 1.2 times as long, or fewer were made, in every attempt")
 
 
 def test_a_stopped_recorder_does_stall_a_reliable_publisher(
     recorder: "subprocess.Popen[str]", endpoint: str
 ) -> None:
     """The reason for the other preset; when this fails, the test above proves nothing."""
-    _, during_s, puts = slowest_puts(recorder, endpoint, "reliable")
+    _, during_s, pace = slowest_puts(recorder, endpoint, "reliable")
     assert during_s > 1.0
-    assert puts < 0.9 * STALL_S * 500
+    assert pace < 0.9

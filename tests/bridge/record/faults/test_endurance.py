@@ -15,8 +15,8 @@ from fault_messages import MIX
 
 pytestmark = pytest.mark.slow
 
-EPISODES = int(os.environ.get("GST_EPISODES", "250"))
-SOAK_S = float(os.environ.get("GST_SOAK_S", "60"))
+EPISODES = int(os.environ.get("GST_EPISODES", "150"))
+SOAK_S = float(os.environ.get("GST_SOAK_S", "30"))
 WARM_UP_S = 15.0
 MAX_MB_PER_MIN = 3.0
 MAX_GROWTH_MB = 20.0
