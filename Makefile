@@ -39,9 +39,10 @@ test: $(READY)
 	@$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not gpu and not hardware and not network" $(TEST)
 
 soak: $(READY)
-	@GST_KILLS=100 GST_EPISODES=1000 GST_SOAK_S=60 GST_LISTED=10000 $(BIN)/python -m pytest -q -rA -m slow \
+	@GST_KILLS=100 GST_RECORDER_KILLS=12 GST_EPISODES=1000 GST_SOAK_S=60 GST_LISTED=10000 \
+		$(BIN)/python -m pytest -q -rA -m slow \
 		tests/bridge/episode/test_writer_killed.py tests/bridge/episode/test_catalogue_at_scale.py \
-		tests/bridge/record/faults/test_endurance.py
+		tests/bridge/record/faults/test_killed_recorders.py tests/bridge/record/faults/test_endurance.py
 
 fast: $(READY)
 	@$(BIN)/python -m pytest -q -n 2 --dist loadfile $(TEST)

@@ -18,7 +18,7 @@ from fault_messages import MIX
 
 TAIL_S = 0.5
 MIXES = {"joints": ("joints",), "mix": MIX}
-KILLS = int(os.environ.get("GST_KILLS", "12"))
+KILLS = int(os.environ.get("GST_RECORDER_KILLS", "6"))
 KILLER = str(Path(__file__).with_name("killing_recorder.py"))
 
 
