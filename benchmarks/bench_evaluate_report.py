@@ -57,7 +57,7 @@ def main() -> None:
         runs.append(json.loads(done.stdout))
     middle = {name: sorted(run[name] for run in runs)[len(runs) // 2] for name in runs[0]}
     report_targets(
-        "bench_evaluate_report",
+        "evaluate_report",
         [
             Target(what="report written", measured=middle["seconds"], limit=SECONDS, unit="s"),
             Target(what="report.html", measured=middle["page_bytes"], limit=BYTES, unit="bytes"),
