@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from bridge.episode.metadata import WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
@@ -90,31 +91,20 @@ def standing_of(trials: Sequence[LiveTrial], goal: float | None) -> Standing:
 
 def _rate(key: Key, outcomes: Sequence[bool], goal: float | None) -> RateStanding:
     task, condition, policy = key
-    k, n = sum(outcomes), len(outcomes)
-    try:
-        sequence = sequence_of(outcomes)
-    except UndefinedStatisticError as error:
-        return RateStanding(
-            task=task,
-            condition=condition,
-            policy=policy,
-            k=k,
-            n=n,
-            low=0.0,
-            high=1.0,
-            advice=None,
-            changed=error.reason,
-        )
-    return RateStanding(
+    standing = partial(
+        RateStanding,
         task=task,
         condition=condition,
         policy=policy,
-        k=k,
-        n=n,
-        low=sequence.low,
-        high=sequence.high,
-        advice=None if goal is None else stop_or_continue(sequence, goal),
+        k=sum(outcomes),
+        n=len(outcomes),
     )
+    try:
+        sequence = sequence_of(outcomes)
+    except UndefinedStatisticError as error:
+        return standing(low=0.0, high=1.0, advice=None, changed=error.reason)
+    advice = None if goal is None else stop_or_continue(sequence, goal)
+    return standing(low=sequence.low, high=sequence.high, advice=advice)
 
 
 def changes_of(known: Sequence[LiveTrial], task: str, policy: str) -> list[int]:
@@ -139,28 +129,18 @@ def changes_of(known: Sequence[LiveTrial], task: str, policy: str) -> list[int]:
 def _gain(task: str, policy: str, changes: Sequence[int]) -> GainStanding | None:
     if not changes:
         return None
-    improved, worsened = sum(c > 0 for c in changes), sum(c < 0 for c in changes)
+    standing = partial(
+        GainStanding,
+        task=task,
+        policy=policy,
+        improved=sum(c > 0 for c in changes),
+        worsened=sum(c < 0 for c in changes),
+        n=len(changes),
+    )
     try:
         interval = pairs_sequence(changes)
     except UndefinedStatisticError as error:
-        return GainStanding(
-            task=task,
-            policy=policy,
-            improved=improved,
-            worsened=worsened,
-            n=len(changes),
-            low=-1.0,
-            high=1.0,
-            advice=Advice(stop=False, answer="open", more_trials=None),
-            changed=error.reason,
-        )
-    return GainStanding(
-        task=task,
-        policy=policy,
-        improved=improved,
-        worsened=worsened,
-        n=len(changes),
-        low=interval.low,
-        high=interval.high,
-        advice=pairs_advice(changes, interval),
-    )
+        advice = Advice(stop=False, answer="open", more_trials=None)
+        return standing(low=-1.0, high=1.0, advice=advice, changed=error.reason)
+    advice = pairs_advice(changes, interval)
+    return standing(low=interval.low, high=interval.high, advice=advice)

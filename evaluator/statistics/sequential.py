@@ -5,7 +5,7 @@ confidence sequence holds at every n at once.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -180,6 +180,11 @@ def _trials_to_decide(rate: float, goal: float, at_least: int, level: float) -> 
         interval = betting_interval(round(rate * n), n, level=level)
         return interval.low > goal or interval.high < goal
 
+    return fewest(decided, at_least)
+
+
+def fewest(decided: Callable[[int], bool], at_least: int) -> int | None:
+    """Return from how many on something is decided, ``at_least`` or more; None beyond the most."""
     high = max(1, at_least)
     while not decided(high):
         high *= 2

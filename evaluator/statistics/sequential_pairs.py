@@ -13,7 +13,7 @@ from scipy.special import gammaln, xlogy
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
 from evaluator.statistics.proportion import LEVEL, ImpossibleCountError
-from evaluator.statistics.sequential import MAX_TRIALS, PRIOR, Advice
+from evaluator.statistics.sequential import PRIOR, Advice, fewest
 
 BISECTIONS = 50
 SURE = "sequence of pairs"
@@ -136,13 +136,4 @@ def _pairs_to_decide(better: float, worse: float, at_least: int, level: float) -
 
     if better == worse:
         return None
-    high = max(1, at_least)
-    while not decided(high):
-        high *= 2
-        if high > MAX_TRIALS:
-            return None
-    low = high // 2
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if decided(middle) else (middle, high)
-    return max(high, at_least)
+    return fewest(decided, at_least)
