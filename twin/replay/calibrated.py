@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from bridge.geometry import se3
 from bridge.task.task_file import Task
 from twin.calibrate.physics.drive import shifted
 from twin.calibrate.physics.parameters import BIAS, MASS_SCALE
@@ -15,6 +16,7 @@ from twin.replay.config import ReplayConfig
 from twin.replay.starts import StartState
 from twin.replay.variation import RIGID_MASSES
 from twin.scene.calibration import Calibration
+from twin.scene.shape.static import StaticSdf
 
 INTERVAL_SIGMAS = 2 * 1.96
 """Width of a 95 % interval in standard deviations."""
@@ -41,6 +43,28 @@ class Correction:
             return dict(Ts_base_object)
         shift = np.array(self.bias)
         return {name: shifted(T, shift) for name, T in Ts_base_object.items()}
+
+    def as_seen(self, T_base_object: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+        """Where the cameras would have localised an object that is there for the robot."""
+        return shifted(T_base_object, -np.array(self.bias)) if any(self.bias) else T_base_object
+
+    def nodes_as_seen(
+        self, nodes_m: Float[np.ndarray, "num_nodes 3"], T_base_object: Float[np.ndarray, "4 4"]
+    ) -> Float[np.ndarray, "num_nodes 3"]:
+        """The same for the nodes of a soft object: moved as its pose is."""
+        if not any(self.bias):
+            return nodes_m
+        T_seen_base = self.as_seen(T_base_object) @ se3.invert(T_base_object)
+        return se3.apply(T_seen_base, nodes_m.astype(np.float64))
+
+    def static(self, seen: StaticSdf) -> StaticSdf:
+        """Distances to what stands still as the robot would find it.
+
+        It is shifted and not turned: the turn is about each object's own vertical, and of what has
+        no name nobody knows where that is.
+        """
+        x_m, y_m, _ = self.bias
+        return seen.shifted(np.array([x_m, y_m, 0.0])) if x_m or y_m else seen
 
     def state(self, seen: StartState) -> StartState:
         """A localised state as the robot would find it."""

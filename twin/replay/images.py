@@ -1,8 +1,10 @@
 """What the recorded cameras would have seen of a replay: the rebuilt scene's Gaussians, moved.
 
 The background stands still, links follow the replayed joints, rigid objects their replayed poses
-and soft ones their nodes. A plan that was executed is seen from where the cameras were while it
-was; one that never was, from the fixed cameras and from where the hand would have carried others.
+and soft ones their nodes. Everything is drawn where cameras see it: the pose bias of a calibration,
+which put objects where the robot finds them, is taken back. A plan that was executed is seen from
+where the cameras were while it was; one that never was, from the fixed cameras and from where the
+hand would have carried others.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,13 +21,14 @@ from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
 from bridge.media.color import encode_jpeg
 from bridge.task.robot import BASE_FRAME
+from twin.replay.calibrated import Correction
 from twin.replay.furnish import soft_models
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
 from twin.scene.backend import open_rasteriser
 from twin.scene.compose import carried_camera
 from twin.scene.gaussians import GaussianCloud, concatenate
-from twin.scene.objects import ObjectSplats, moved_cloud
+from twin.scene.objects import moved_cloud
 from twin.scene.parts import read_objects, read_pose
 from twin.scene.robot_splats import posed, read_links
 from twin.scene.skin import Binding, bind, pose_cloud
@@ -42,24 +45,26 @@ class _Stage:
     """Everything that can be drawn, ready to be moved."""
 
     still: GaussianCloud
-    objects: Mapping[str, ObjectSplats]
+    objects: Mapping[str, GaussianCloud]
     """Those that can move, in their own frames."""
     bindings: Mapping[str, Binding]
     """Of soft ones: which nodes carry which Gaussians."""
     links: Mapping[str, GaussianCloud]
     T_root_base: Float[np.ndarray, "4 4"]
+    correction: Correction
 
     def at(self, result: ReplayResult, scene: ReplayScene, index: int) -> GaussianCloud:
         """The scene at one of the replay's states."""
         parts = [self.still]
-        for name, item in self.objects.items():
+        for name, cloud in self.objects.items():
+            Ts = result.Ts_base_object.get(name)
+            T = scene.Ts_base_object[name] if Ts is None else Ts[index]
             nodes = result.nodes_m.get(name)
             if nodes is not None and name in self.bindings:
-                parts.append(pose_cloud(item.cloud, self.bindings[name], nodes[index]))
-                continue
-            Ts = result.Ts_base_object.get(name)
-            T = scene.Ts_base_object.get(name, item.T_base_object) if Ts is None else Ts[index]
-            parts.append(moved_cloud(item.cloud, T))
+                seen = self.correction.nodes_as_seen(nodes[index], T)
+                parts.append(pose_cloud(cloud, self.bindings[name], seen))
+            else:
+                parts.append(moved_cloud(cloud, self.correction.as_seen(T)))
         if self.links:
             robot = posed(
                 self.links,
@@ -79,6 +84,7 @@ def render_replay(
     *,
     start_ns: int,
     executed: bool,
+    correction: Correction,
 ) -> Iterator[tuple[str, CompressedColor]]:
     """Yield camera ids with JPEG images, stamped with source times.
 
@@ -89,11 +95,12 @@ def render_replay(
         scene: Where it happened.
         start_ns: Source time that is the replay's time 0.
         executed: Whether the plan was executed then, so that the cameras were where it is told.
+        correction: What moved localised objects into the replay's scene.
 
     Raises:
         PathNotFoundError: When the run was not rebuilt.
     """
-    stage = _set_up(run, scene, result)
+    stage = _set_up(run, scene, result, correction)
     rasteriser = open_rasteriser()
     tree = streams.transform_tree(episode)
     for camera_id in streams.camera_ids(episode):
@@ -117,15 +124,19 @@ def render_replay(
             )
 
 
-def _set_up(run: RunFolder, scene: ReplayScene, result: ReplayResult) -> _Stage:
+def _set_up(
+    run: RunFolder, scene: ReplayScene, result: ReplayResult, correction: Correction
+) -> _Stage:
     rebuilt = read_scene(run)
     objects = read_objects(run, rebuilt.record)
-    still = [
-        moved_cloud(item.cloud, scene.Ts_base_object.get(name, item.T_base_object))
-        for name, item in objects.items()
-        if name not in scene.movable()
-    ]
-    movable = {name: item for name, item in objects.items() if name in scene.movable()}
+    places = {name: correction.as_seen(T) for name, T in scene.containers().items()}
+    # What the task does not know stands where it was scanned; what it knows and nobody found is
+    # absent here too.
+    places |= {
+        name: item.T_base_object for name, item in objects.items() if name not in scene.task.objects
+    }
+    still = [moved_cloud(objects[name].cloud, T) for name, T in places.items() if name in objects]
+    movable = {name: item.cloud for name, item in objects.items() if name in scene.movable()}
     soft = {name: body for name, body in soft_models(scene).items() if name in movable}
     root = rebuilt.record.get("robot", {}).get("T_base_root")
     T_base_root = np.eye(4) if root is None else read_pose(root, run.scene_dir / SCENE_FILE)
@@ -133,12 +144,13 @@ def _set_up(run: RunFolder, scene: ReplayScene, result: ReplayResult) -> _Stage:
         still=concatenate([rebuilt.background, *still]),
         objects=movable,
         bindings={
-            name: bind(movable[name].cloud.means_m, body.nodes_m)
+            name: bind(movable[name].means_m, body.nodes_m)
             for name, body in soft.items()
-            if name in result.nodes_m and len(movable[name].cloud)
+            if name in result.nodes_m and len(movable[name])
         },
         links=read_links(run, rebuilt.record),
         T_root_base=se3.invert(T_base_root),
+        correction=correction,
     )
 
 

@@ -35,14 +35,15 @@ class Place:
 
     scene_hash: str | None = None
     static_sdf: StaticSdf | None = None
-    """Distances to what stands still; None: only the table and the containers are known."""
+    """Distances to what stands still, where the robot finds it; None: only the table and the
+    containers are known."""
     lattices: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
     """Soft objects by the arrays of their ``soft.npz``, object frame."""
     shape_sources: Mapping[str, str] = field(default_factory=dict)
     """Per object: where its shape comes from."""
     calibration_id: str | None = None
     correction: Correction = field(default_factory=Correction)
-    """What a calibration says of localised poses and of masses."""
+    """What a calibration says of localised poses and of masses; ``static_sdf`` is moved already."""
     remarks: tuple[str, ...] = ()
     """What was there and could not be used."""
 
@@ -100,7 +101,7 @@ def read_place(run: RunFolder, task: Task) -> Place:
         arrays, sources[key] = _lattice(run.scene_dir / "objects" / key, task.objects[key])
         if arrays is not None:
             lattices[key] = arrays
-    static, remark = _static(run.scene_dir / "sdf.npz")
+    static, remark = _static(run.scene_dir / "sdf.npz", place.correction)
     remarks += [remark] if remark else []
     return replace(
         place,
@@ -161,15 +162,16 @@ def _watertight(path: Path) -> bool:
     return isinstance(geometry, dict) and geometry.get("watertight") is True
 
 
-def _static(path: Path) -> tuple[StaticSdf | None, str]:
+def _static(path: Path, correction: Correction) -> tuple[StaticSdf | None, str]:
     if not path.is_file():
         return None, "the scene has no sdf.npz: only the table and the containers are in the way"
     try:
-        return _load_static(path, path.stat().st_mtime_ns), ""
+        return _load_static(path, path.stat().st_mtime_ns, correction), ""
     except UnreadableArraysError as error:
         return None, str(error)
 
 
 @lru_cache(maxsize=2)
-def _load_static(path: Path, mtime_ns: int) -> StaticSdf:
-    return StaticSdf.load(path)
+def _load_static(path: Path, mtime_ns: int, correction: Correction) -> StaticSdf:
+    """One and the same grid each time: what is derived from it is remembered by its identity."""
+    return correction.static(StaticSdf.load(path))

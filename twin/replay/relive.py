@@ -49,7 +49,8 @@ class _Source:
     events: list[dict[str, Any]]
     scene: ReplayScene
     correction: Correction
-    """Applied to the scene already, and still to be to what was localised afterwards."""
+    """Applied to the scene already, still to be to what was localised afterwards, and to be taken
+    back for pictures."""
 
     @property
     def executed(self) -> bool:
@@ -170,6 +171,7 @@ def _images(source: _Source, result: ReplayResult) -> tuple[tuple[str, Compresse
             source.scene,
             start_ns=source.job.start_ns,
             executed=source.job.end_ns is not None,
+            correction=source.correction,
         )
     )
 

@@ -9,6 +9,7 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
+from twin.replay.calibrated import Correction
 from twin.replay.clearance import SCENE, ClearanceMonitor
 from twin.replay.clearance.candidates import candidate_clearance
 from twin.replay.clearance.grid import GridLookup
@@ -368,3 +369,15 @@ def test_an_object_that_leaps_did_not_fly_through_what_lies_between(
         T[:3, 3] = box + np.array([offset, 0.0, 0.03])
         monitor.measure(t_ns, joints, WIDTH_M, {"cube": T})
     assert not monitor.failures
+
+
+def test_a_pose_bias_moves_what_was_seen_of_a_container_with_the_container() -> None:
+    """Left where cameras saw it, a part of its own wall would be in the way as "scene"."""
+    extents, seen = np.array([0.1, 0.1, 0.08]), np.eye(4)
+    seen[:3, 3] = (0.55, 0.1, 0.05)
+    static = static_of((tuple(seen[:3, 3].tolist()), tuple(extents.tolist())), table_m=None)
+    correction = Correction(bias=(0.021, -0.026, 0.0))
+    moved = correction.poses({"box": seen})["box"]
+    assert unnamed_scene(static, 0.0, None, [(moved, extents)]) is not None
+    assert unnamed_scene(correction.static(static), 0.0, None, [(moved, extents)]) is None
+    assert unnamed_scene(static, 0.0, None, [(seen, extents)]) is None

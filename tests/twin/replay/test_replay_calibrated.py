@@ -26,6 +26,8 @@ from twin.replay.relive import run_job
 from twin.replay.samples import draw_variation, sample_rng
 from twin.replay.starts import StartState
 from twin.scene.calibration import Calibration, read_calibration, write_physics
+from twin.scene.shape.sdf import SdfGrid
+from twin.scene.shape.static import StaticSdf
 
 T0 = 1_700_000_000_000_000_000
 BIAS = {
@@ -155,3 +157,31 @@ def test_the_gripper_presses_as_the_task_is_set_unless_somebody_knows_better() -
     assert for_task(mine, toys) == mine
     found = calibration(identified={"grip_force_N": {"value": 7.5}})
     assert for_task(calibrated(ReplayConfig(), found), toys).physics.grip_force_N == 7.5
+
+
+def test_distances_are_found_where_the_robot_finds_them(tmp_path: Path) -> None:
+    run, rng = RunFolder.create(tmp_path / "run"), np.random.default_rng(0)
+    grid = SdfGrid(
+        values_m=rng.normal(size=(6, 7, 8)).astype(np.float32), origin_m=np.zeros(3), voxel_m=0.01
+    )
+    seen = StaticSdf(
+        conservative=grid, observed=grid, state=np.zeros((6, 7, 8), dtype=np.uint8),
+        truncation_m=0.03, table_z_m=0.0,
+    )  # fmt: skip
+    run.scene_dir.mkdir(exist_ok=True)
+    seen.save(run.scene_dir / "sdf.npz")
+    record = {"schema_version": 1, "key": "k", "scene_hash": "abc", "background": {},
+              "sources": [], "views": []}  # fmt: skip
+    (run.scene_dir / "scene.json").write_text(json.dumps(record))
+    task, points = load_task("cube_into_box"), rng.uniform(0.0, 0.05, (50, 3))
+    plain = read_place(run, task).static_sdf
+    with_calibration(run, pose_bias=BIAS)
+    moved = read_place(run, task).static_sdf
+    assert plain is not None
+    assert moved is not None
+    for name in ("conservative", "observed"):
+        before, after = getattr(plain, name), getattr(moved, name)
+        found = after.distance(points + np.array([0.006, -0.004, 0.0]))
+        np.testing.assert_allclose(found, before.distance(points), atol=1e-9)
+    assert read_place(run, task).static_sdf is moved, "what is derived from it is remembered"
+    assert moved.table_z_m == 0.0

@@ -7,7 +7,7 @@ the unseen for solid; the observed one takes it for free. Beyond the grid nothin
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +113,16 @@ class StaticSdf:
             state=state,
             truncation_m=float(found["truncation_m"]),
             table_z_m=None if np.isnan(table) else table,
+        )
+
+    def shifted(self, offset_m: Float[np.ndarray, "3"]) -> "StaticSdf":
+        """The same place as it is found ``offset_m`` away; values are not copied."""
+        height_m = float(offset_m[2])
+        return replace(
+            self,
+            conservative=replace(self.conservative, origin_m=self.conservative.origin_m + offset_m),
+            observed=replace(self.observed, origin_m=self.observed.origin_m + offset_m),
+            table_z_m=None if self.table_z_m is None else self.table_z_m + height_m,
         )
 
     def to_record(self) -> dict[str, Any]:
