@@ -52,7 +52,7 @@ def as_float(
 ) -> Float[np.ndarray, "height width 3"]:
     """Scale an 8-bit image to 0..1, or take one that is; no gamma is undone."""
     if image.dtype == np.uint8:
-        return image.astype(np.float64) / 255.0
+        return np.asarray(np.divide(image, 255.0, dtype=np.float64))
     return np.asarray(image, dtype=np.float64)
 
 

@@ -15,14 +15,12 @@ from evaluator.metrics.metric import ImageMetric
 from evaluator.metrics.similarity import (
     MS_SSIM_MIN_PX,
     PADDINGS,
-    SIGMA,
-    WINDOW,
-    Padding,
     SsimMaps,
     ms_ssim,
     ssim_maps,
 )
 from evaluator.metrics.stamp import MaskMode
+from evaluator.metrics.window import SIGMA, WINDOW, Padding
 
 GAUSSIAN = f"gaussian {WINDOW} x {WINDOW} sigma {SIGMA}"
 _SSIM = (

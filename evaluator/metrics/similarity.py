@@ -1,9 +1,6 @@
-"""SSIM with its three customs at the border of an image, and MS-SSIM, in float64.
+"""SSIM with its three customs at the border of an image, and MS-SSIM, in float64."""
 
-The window runs row by row over bands that stay in the cache, as sums of shifted rows: on one core
-this takes about as long as a float32 convolution, and a broken pixel spoils only its own windows.
-"""
-
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -13,19 +10,8 @@ from jaxtyping import Bool, Float
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.image import check_same_shape
+from evaluator.metrics.window import BORDER, WINDOW, Padding, SlidWindow
 
-WINDOW = 11
-SIGMA = 1.5
-C1 = 0.01**2
-C2 = 0.03**2
-BORDER = WINDOW // 2
-_BELL = np.exp(-0.5 * ((np.arange(WINDOW) - BORDER) / SIGMA) ** 2)
-_WINDOW = tuple(float(weight) for weight in _BELL / _BELL.sum())
-_BAND_VALUES = 1 << 15
-"""Values of one plane that are worked on at a time: 256 kB, so that a band stays in the cache."""
-
-Padding = Literal["valid", "zero", "reflect"]
-"""What a window sees beyond the border: it never reaches there, zeros, or the mirrored image."""
 PADDINGS: dict[Padding, str] = {
     "valid": "windows inside the image only",
     "zero": "zeros beyond the border",
@@ -86,21 +72,14 @@ def ssim_maps(
         ImageShapeError: When the sizes differ.
         UndefinedStatisticError: When the image is smaller than the window.
     """
-    check_same_shape(recorded, replayed)
-    if min(recorded.shape[:2]) < WINDOW:
-        raise UndefinedStatisticError(
-            statistic="SSIM",
-            reason=f"the image is smaller than the {WINDOW} x {WINDOW} window",
-        )
-    zero, structure = _terms(_padded(recorded, "constant"), _padded(replayed, "constant"))
-    a, b = _padded(recorded, "reflect"), _padded(replayed, "reflect")
-    reflect = zero.copy()
-    near, far, whole = slice(None, BORDER), slice(-BORDER, None), slice(None)
-    for rows, columns in ((near, whole), (far, whole), (whole, near), (whole, far)):
-        seen = _seen(rows), _seen(columns)
-        reflect[rows, columns] = _terms(a[seen], b[seen])[0]
-    inner = structure[BORDER:-BORDER, BORDER:-BORDER]
-    return SsimMaps(zero=zero, reflect=reflect, structure=inner)
+    _refuse_small(recorded, replayed)
+    zero, structure = _maps(recorded, replayed, "zero")
+    inner = slice(BORDER, -BORDER)
+    return SsimMaps(
+        zero=zero,
+        reflect=_with_mirrored_border(zero, recorded, replayed),
+        structure=structure[inner, inner],
+    )
 
 
 def ssim(
@@ -120,7 +99,11 @@ def ssim(
         ImageShapeError: When the sizes differ.
         UndefinedStatisticError: With the reason.
     """
-    return ssim_maps(recorded, replayed).mean(padding, mask=mask)
+    _refuse_small(recorded, replayed)
+    if mask is not None:
+        return ssim_maps(recorded, replayed).mean(padding, mask=mask)
+    window = SlidWindow(recorded, replayed, padding)
+    return math.fsum(float(band.similar.sum()) for band in window.bands()) / window.size
 
 
 def ms_ssim(
@@ -159,10 +142,10 @@ def ms_ssim(
         )
     product = 1.0
     for weight in weights[:-1]:
-        structure = first.structure if first is not None else _terms(recorded, replayed)[1]
-        product *= max(float(structure.mean()), 0.0) ** weight
+        structure = _structure(recorded, replayed) if first is None else first.structure.mean()
+        product *= max(float(structure), 0.0) ** weight
         recorded, replayed, first = _halved(recorded), _halved(replayed), None
-    last = ssim_maps(recorded, replayed).mean(padding)
+    last = ssim(recorded, replayed, padding=padding)
     return float(product * max(last, 0.0) ** weights[-1])
 
 
@@ -173,66 +156,47 @@ def _halved(image: np.ndarray) -> np.ndarray:
     return np.asarray((upper + even[1::2, 0::2] + even[1::2, 1::2]) / 4.0)
 
 
-def _padded(image: np.ndarray, mode: Literal["constant", "reflect"]) -> np.ndarray:
-    edges = ((BORDER, BORDER), (BORDER, BORDER), (0, 0))
-    return np.pad(np.asarray(image, dtype=np.float64), edges, mode=mode)
-
-
-def _seen(centres: slice) -> slice:
-    """Return which padded rows the windows around these rows of the image see."""
-    if centres.stop is not None:
-        return slice(None, centres.stop + 2 * BORDER)
-    if centres.start is not None:
-        return slice(centres.start - 2 * BORDER, None)
-    return centres
-
-
-def _terms(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return SSIM, and its contrast-structure factor, of every window that fits inside."""
-    height, width, channels = a.shape
-    size = (height - 2 * BORDER, width - 2 * BORDER, channels)
-    a = np.ascontiguousarray(a, dtype=np.float64).reshape(height, -1)
-    b = np.ascontiguousarray(b, dtype=np.float64).reshape(height, -1)
-    similar = np.empty((size[0], size[1] * channels))
-    structure = np.empty_like(similar)
-    step = max(1, _BAND_VALUES // a.shape[1])
-    for start in range(0, size[0], step):
-        stop = min(start + step, size[0])
-        _fill_band(
-            a[start : stop + 2 * BORDER],
-            b[start : stop + 2 * BORDER],
-            channels,
-            similar[start:stop],
-            structure[start:stop],
+def _refuse_small(recorded: np.ndarray, replayed: np.ndarray) -> None:
+    check_same_shape(recorded, replayed)
+    if min(recorded.shape[:2]) < WINDOW:
+        raise UndefinedStatisticError(
+            statistic="SSIM",
+            reason=f"the image is smaller than the {WINDOW} x {WINDOW} window",
         )
-    return similar.reshape(size), structure.reshape(size)
 
 
-def _fill_band(
-    a: np.ndarray, b: np.ndarray, channels: int, similar: np.ndarray, structure: np.ndarray
-) -> None:
-    mean_a, mean_b = _blur(a, channels), _blur(b, channels)
-    # Only the sum of both variances is needed: four windowed planes instead of five.
-    power = _blur(a * a + b * b, channels)
-    cross = _blur(a * b, channels)
-    means = mean_a * mean_b
-    squares = mean_a * mean_a + mean_b * mean_b
-    np.divide(2.0 * (cross - means) + C2, power - squares + C2, out=structure)
-    np.multiply((2.0 * means + C1) / (squares + C1), structure, out=similar)
+def _structure(recorded: np.ndarray, replayed: np.ndarray) -> float:
+    """Average contrast times structure over the windows inside the image."""
+    window = SlidWindow(recorded, replayed, "valid")
+    return math.fsum(float(band.structure.sum()) for band in window.bands()) / window.size
 
 
-def _blur(plane: np.ndarray, channels: int) -> np.ndarray:
-    """Slide the window over rows, then over pixels; channels lie side by side in a row."""
-    down = _weighted([plane[k : len(plane) - 2 * BORDER + k] for k in range(WINDOW)])
-    length = down.shape[1] - 2 * BORDER * channels
-    return _weighted([down[:, k * channels : k * channels + length] for k in range(WINDOW)])
+def _maps(
+    recorded: np.ndarray, replayed: np.ndarray, padding: Padding
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return SSIM, and its contrast-structure factor, around every window centre."""
+    window = SlidWindow(recorded, replayed, padding)
+    similar = np.empty((window.channels, window.rows, window.columns))
+    structure = np.empty_like(similar)
+    for band in window.bands():
+        similar[band.channel, band.rows] = band.similar
+        structure[band.channel, band.rows] = band.structure
+    return np.moveaxis(similar, 0, -1), np.moveaxis(structure, 0, -1)
 
 
-def _weighted(shifted: list[np.ndarray]) -> np.ndarray:
-    total = shifted[BORDER] * _WINDOW[BORDER]
-    pair = np.empty_like(total)
-    for k in range(BORDER):
-        np.add(shifted[k], shifted[-1 - k], out=pair)
-        pair *= _WINDOW[k]
-        total += pair
-    return np.asarray(total)
+def _with_mirrored_border(
+    zero: np.ndarray, recorded: np.ndarray, replayed: np.ndarray
+) -> np.ndarray:
+    """Compute the windows that reach over the border again; the others see the same."""
+    reflect = zero.copy(order="K")
+    both, before, after = (BORDER, BORDER), (BORDER, 0), (0, BORDER)
+    near, far, whole = slice(None, 2 * BORDER), slice(-2 * BORDER, None), slice(None)
+    for seen, beyond, rows, columns in (
+        ((near, whole), (before, both), slice(None, BORDER), whole),
+        ((far, whole), (after, both), slice(-BORDER, None), whole),
+        ((whole, near), (both, before), whole, slice(None, BORDER)),
+        ((whole, far), (both, after), whole, slice(-BORDER, None)),
+    ):
+        a, b = (np.pad(i[seen], (*beyond, (0, 0)), mode="reflect") for i in (recorded, replayed))
+        reflect[rows, columns] = _maps(a, b, "valid")[0]
+    return reflect

@@ -1,0 +1,85 @@
+"""The sliding window as matrix products: what plain sums over every window say, at every size."""
+
+import numpy as np
+import pytest
+
+from evaluator.metrics.similarity import PADDINGS, ssim, ssim_maps
+from evaluator.metrics.window import BORDER, C1, C2, SIGMA, WINDOW, SlidWindow
+
+MODES = {"zero": "constant", "reflect": "reflect"}
+SIZES = [(11, 11), (11, 40), (43, 12), (26, 27), (37, 101), (64, 48)]
+
+
+def pair(size: tuple[int, int], channels: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(size)
+    first = rng.random((*size, channels))
+    return first, np.clip(first + rng.normal(0, 0.2, first.shape), 0, 1)
+
+
+def plain_map(first: np.ndarray, second: np.ndarray, padding: str) -> np.ndarray:
+    """SSIM as its definition has it: weighted means over each window, one window at a time."""
+    if padding != "valid":
+        edges = ((BORDER, BORDER), (BORDER, BORDER), (0, 0))
+        first, second = (np.pad(i, edges, mode=MODES[padding]) for i in (first, second))
+    bell = np.exp(-0.5 * ((np.arange(WINDOW) - BORDER) / SIGMA) ** 2)
+    weights = np.outer(bell, bell) / bell.sum() ** 2
+    views = [
+        np.lib.stride_tricks.sliding_window_view(image, (WINDOW, WINDOW), axis=(0, 1))
+        for image in (first, second)
+    ]
+    a, b = views
+    mean_a, mean_b = ((v * weights).sum(axis=(-2, -1)) for v in views)
+    var_a = ((a - mean_a[..., None, None]) ** 2 * weights).sum(axis=(-2, -1))
+    var_b = ((b - mean_b[..., None, None]) ** 2 * weights).sum(axis=(-2, -1))
+    shared = (a - mean_a[..., None, None]) * (b - mean_b[..., None, None])
+    cov = (shared * weights).sum(axis=(-2, -1))
+    bright = (2 * mean_a * mean_b + C1) / (mean_a**2 + mean_b**2 + C1)
+    return np.asarray(bright * (2 * cov + C2) / (var_a + var_b + C2))
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("padding", PADDINGS)
+def test_every_window_says_what_its_definition_says(size: tuple[int, int], padding: str) -> None:
+    first, second = pair(size)
+    expected = plain_map(first, second, padding)
+    found = getattr(ssim_maps(first, second), padding)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)
+    assert ssim(first, second, padding=padding) == pytest.approx(expected.mean(), abs=1e-12)
+
+
+def test_bands_hold_each_window_once() -> None:
+    first, second = pair((70, 51), channels=3)
+    for padding in PADDINGS:
+        window = SlidWindow(first, second, padding)
+        seen = np.zeros((window.channels, window.rows, window.columns), dtype=int)
+        for band in window.bands():
+            seen[band.channel, band.rows] += 1
+            assert band.similar.shape == seen[band.channel, band.rows].shape
+        assert (seen == 1).all()
+        assert seen.size == window.size
+
+
+@pytest.mark.parametrize("padding", PADDINGS)
+@pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf])
+def test_a_value_that_is_not_finite_spoils_the_windows_that_see_it(
+    padding: str, broken: float
+) -> None:
+    first, second = pair((40, 30))
+    whole = getattr(ssim_maps(first, second), padding)
+    second[3, 20, 1] = broken
+    spoilt = getattr(ssim_maps(first, second), padding)
+    np.testing.assert_array_equal(spoilt[..., 0], whole[..., 0])
+    far = np.ones(whole.shape[:2], dtype=bool)
+    moved = BORDER if padding == "valid" else 0
+    far[: max(0, 3 + BORDER + 1 - moved), 20 - BORDER - moved : 20 + BORDER + 1 - moved] = False
+    np.testing.assert_array_equal(np.isnan(spoilt[..., 1]), ~far)
+    np.testing.assert_array_equal(spoilt[far][:, 1], whole[far][:, 1])
+
+
+def test_images_of_any_memory_layout_say_the_same() -> None:
+    first, second = pair((48, 33), channels=3)
+    expected = ssim(first, second)
+    turned = [np.asfortranarray(i) for i in (first, second)]
+    assert ssim(*turned) == pytest.approx(expected, abs=1e-14)
+    strided = [np.repeat(i, 2, axis=1)[:, ::2] for i in (first, second)]
+    assert ssim(*strided) == expected
