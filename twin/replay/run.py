@@ -8,7 +8,7 @@ from typing import Any
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
-from bridge.errors import UsageError
+from bridge.errors import PathNotFoundError, UsageError
 from bridge.task.task_file import load_task
 from bridge.terminal import Advance, Output
 from twin.replay.calibrated import calibrated, for_task
@@ -21,10 +21,11 @@ from twin.replay.relive import run_job
 from twin.replay.starts import localised_starts
 from twin.replay.table import against_recorded, executions_of, recorded_labels
 from twin.replay.table import count_verdicts as count_verdicts
-from twin.replay.table import describe_run as describe_run
+from twin.replay.table_text import describe_run as describe_run
+from twin.replay.undrawn import describe_undrawn
 from twin.replay.worker import Failed, do
 from twin.scene.calibration import read_calibration
-from twin.scene.store import scene_hash_of
+from twin.scene.store import SCENE_FILE, read_record, scene_hash_of
 
 
 def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[str, Any]:
@@ -36,10 +37,15 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
 
     Raises:
         UsageError: When an episode named in the configuration is not in the run.
+        PathNotFoundError: When pictures are asked for and no scene was rebuilt.
     """
-    scene_hash = _scene_hash(run, output)
+    scene_hash = _scene_hash(run, config, output)
     with runner_for(config) as runner:
         jobs, skipped = _all_jobs(run, scene_hash, config, runner, output)
+        if config.render:
+            tasks = sorted({job.task for job in jobs})
+            for remark in describe_undrawn(read_record(run) or {}, tasks):
+                output.say(remark)
         rows, todo = _there_already(jobs, config)
         run.derived_dir.mkdir(parents=True, exist_ok=True)  # Ray asks each node whether it is there
         with output.progress("replay", len(todo)) as advance:
@@ -138,9 +144,12 @@ def _prepare(
     return failed
 
 
-def _scene_hash(run: RunFolder, output: Output) -> str | None:
+def _scene_hash(run: RunFolder, config: ReplayRunConfig, output: Output) -> str | None:
     scene_hash = scene_hash_of(run)
     if scene_hash is None:
+        if config.render:
+            hint = "--render draws it. Make it: robot-gst rebuild RUN, or leave --render out."
+            raise PathNotFoundError(path=run.scene_dir / SCENE_FILE, what="scene", hint=hint)
         output.say(
             "No scene has been rebuilt (scene/scene.json is missing): replays use the task's "
             "shapes and the table plane, and carry no scene hash."

@@ -1,4 +1,4 @@
-"""The tables of ``robot-gst replay``: verdicts, planned and executed against recorded, partings."""
+"""What the tables of ``robot-gst replay`` count: verdicts, and what was said against the label."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,6 @@ from bridge.episode.catalogue.labels import outcome_of
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.errors import GstError
-from twin.replay.failure import NOT_EVALUATED
 
 WORDS = {True: "accepted", False: "rejected", None: "undecided"}
 LABELS = ("success", "failure", "unknown")
@@ -126,99 +125,3 @@ def against_recorded(executions: Rows) -> dict[str, dict[str, Any]]:
         task: {"counts": cross_table(mine), "agreement": agreement_of(mine)}
         for task, mine in sorted(by_task.items())
     }
-
-
-def describe_run(summary: Mapping[str, Any]) -> str:
-    """The final tables as text."""
-    skipped = _skipped_lines(summary.get("skipped_episodes", {}))
-    if not summary["rows"]:
-        return "\n".join(["No trial with a plan to replay.", *skipped])
-    lines = _count_lines(summary["counts"])
-    executions = summary.get("executions", [])
-    if executions:
-        lines += ["", *_cross_lines(executions), "", *_parting_lines(executions)]
-    lines += _sample_lines(summary["rows"])
-    rejected = [row for row in summary["rows"] if row["accepted"] is False]
-    if rejected:
-        lines += ["", "rejected:"]
-    lines += [
-        f"  {row['episode']} {row['plan']} {row['trajectory']} {row['mode']}: {row['reason']}"
-        for row in rejected
-    ]
-    lines += skipped
-    kept = sum(row["skipped"] for row in summary["rows"])
-    if kept:
-        lines.append(f"{kept} of {len(summary['rows'])} were there already; --force redoes them.")
-    return "\n".join(lines)
-
-
-def _skipped_lines(skipped: Mapping[str, str]) -> list[str]:
-    """Episodes of which nothing could be replayed."""
-    lines = [
-        f"  {name}: {NOT_EVALUATED}{why.removeprefix(NOT_EVALUATED)}"
-        for name, why in sorted(skipped.items())
-    ]
-    return ["", "episodes that cannot be replayed:", *lines] if lines else []
-
-
-def _sample_lines(rows: Rows) -> list[str]:
-    """How sure each verdict is, where varied replays were asked for."""
-    lines = []
-    for row in rows:
-        p = row.get("p_success")
-        if p is not None:
-            lines.append(
-                f"  {row['episode']} {row['plan']} {row['trajectory']}: "
-                f"{p['k']:g} of {p['n']:g}, {p['value']:.0%} [{p['low']:.0%}, {p['high']:.0%}]"
-            )
-    return ["", "varied replays that succeed:", *lines] if lines else []
-
-
-def _count_lines(counts: Counts) -> list[str]:
-    width = max(len(key) for key in counts)
-    lines = [
-        f"{'':{width}}  {'n':>5} {'accepted':>9} {'rejected':>9} {'undecided':>9} {'failed':>7}"
-    ]
-    return lines + [
-        f"{key:{width}}  {c['n']:>5} {c['accepted']:>9} {c['rejected']:>9} {c['undecided']:>9} "
-        f"{c['failed']:>7}"
-        for key, c in sorted(counts.items())
-    ]
-
-
-def _cross_lines(executions: Rows) -> list[str]:
-    """One table per task, because what they ask is not the same."""
-    lines: list[str] = []
-    tables = against_recorded(executions)
-    for task, table in tables.items():
-        lines += ["", f"{task}:"] if len(tables) > 1 else []
-        lines += _cross_of(table["counts"], table["agreement"])
-    return lines
-
-
-def _cross_of(counts: Mapping[str, Counts], agreement: Counts) -> list[str]:
-    lines = [
-        f"{'':28}  {'recorded:':>9} {'success':>8} {'failure':>8} {'unlabelled':>10} {'agree':>9}"
-    ]
-    for name, rows in counts.items():
-        agree = f"{agreement[name]['k']} of {agreement[name]['n']}"
-        for word, cells in rows.items():
-            lines.append(
-                f"{name:<17} {word:<10}  {'':>9} {cells['success']:>8} {cells['failure']:>8} "
-                f"{cells['unknown']:>10} {agree:>9}".rstrip()
-            )
-            agree = ""
-    return lines
-
-
-def _parting_lines(executions: Rows) -> list[str]:
-    lines = ["where planned, executed and recorded part first:"]
-    for entry in executions:
-        apart = entry["apart"]
-        if apart is None:
-            said = "nowhere" if entry["executed"] is not None else "not compared"
-        else:
-            said = f"{apart['first_t_ns'] * 1e-9:.2f} s: {apart['detail']} ({apart['attribution']})"
-        lag = "" if entry["lag_s"] is None else f", lag {entry['lag_s'] * 1e3:.0f} ms"
-        lines.append(f"  {entry['episode']} {entry['plan']}: {said}{lag}")
-    return lines

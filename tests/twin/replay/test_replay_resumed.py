@@ -23,7 +23,8 @@ from twin.replay.job import ReplayJob, row_of_existing
 from twin.replay.ray_cluster import RayClusterError, RayRunner, code_version, is_loopback
 from twin.replay.relive import run_job
 from twin.replay.starts import StartState
-from twin.replay.table import count_verdicts, describe_run
+from twin.replay.table import count_verdicts
+from twin.replay.table_text import describe_run
 from twin.replay.worker import Failed
 
 T0 = 1_700_000_000_000_000_000

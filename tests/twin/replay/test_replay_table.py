@@ -9,9 +9,9 @@ from twin.replay.table import (
     against_recorded,
     count_verdicts,
     cross_table,
-    describe_run,
     executions_of,
 )
+from twin.replay.table_text import describe_run
 
 
 def row(episode: str, trajectory: str, accepted: bool | None, **more: Any) -> dict[str, Any]:
@@ -89,3 +89,17 @@ def test_tasks_have_a_table_each() -> None:
 def test_an_attached_grasp_is_counted_apart_and_named() -> None:
     attached = row("a", "planned", True, engine="pybullet-1+attach")
     assert list(count_verdicts([*ROWS, attached]))[-1] == "planned dynamic, attached grasp"
+
+
+def test_every_answer_that_is_no_yes_is_listed_with_its_reason_once() -> None:
+    rows = [
+        row("a", "planned", None, reason="undecided: cube (hidden)"),
+        row("a", "executed", None, mode="kinematic", reason="undecided: no physics"),
+        row("b", "planned", False, reason="ik: unreachable"),
+        row("c", "planned", None, reason="not evaluated: NaN", error="not evaluated: NaN"),
+    ]
+    text = describe_run({**summary(), "rows": rows, "counts": count_verdicts(rows)})
+    assert "undecided:\n  a p planned dynamic: cube (hidden)\n" in text
+    assert "rejected:\n  b p planned dynamic: ik: unreachable\n" in text
+    assert "not evaluated:\n  c p planned dynamic: NaN" in text
+    assert "no physics" not in text, "said of every kinematic replay"
