@@ -13,6 +13,7 @@ NATIVE := $(wildcard twin/scene/native/* bridge/media/native/* bridge/episode/na
 RUN ?= runs/demo
 BENCH ?=
 export OMP_WAIT_POLICY ?= passive
+unexport PYTHONDONTWRITEBYTECODE # else every process a test starts would compile the rooms again
 
 .PHONY: help setup demo test soak fast check format bench clean
 
@@ -26,10 +27,12 @@ $(READY): pyproject.toml constraints.txt CMakeLists.txt $(NATIVE)
 	@.ci/system-packages $(PYTHON)
 	@test -x $(BIN)/python || { echo "Making .venv with $(PYTHON)"; $(PYTHON) -m venv .venv; }
 	@echo "Installing packages into .venv (about 5 GB the first time)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
-		"scikit-build-core>=1.0" nanobind cmake ninja torch==2.13.0
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
-		--no-build-isolation -e '.[all,dev]'
+	@$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check \
+		-c constraints.txt "scikit-build-core>=1.0" nanobind cmake ninja torch==2.13.0
+	@$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check \
+		-c constraints.txt --no-build-isolation -e '.[all,dev]'
+	@# pip compiles 28000 files on one core; a few of them are templates and do not compile
+	@$(BIN)/python -W ignore -m compileall -qq -j 0 .venv/lib || true
 	@touch $@
 
 demo: $(READY)
@@ -39,9 +42,11 @@ test: $(READY)
 	@$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not gpu and not hardware and not network" $(TEST)
 
 soak: $(READY)
-	@GST_KILLS=100 GST_RECORDER_KILLS=12 GST_EPISODES=1000 GST_SOAK_S=60 GST_LISTED=10000 \
+	@GST_KILLS=100 GST_RECORDER_KILLS=12 GST_KILL_NUMBERS=1,2,3,5 GST_EPISODES=1000 \
+		GST_SOAK_S=60 GST_LISTED=10000 GST_CUT_MESSAGES=12 GST_FUZZ_S=30 \
 		$(BIN)/python -m pytest -q -rA -m slow \
 		tests/bridge/episode/test_writer_killed.py tests/bridge/episode/test_catalogue_at_scale.py \
+		tests/bridge/episode/test_recover.py tests/fuzz \
 		tests/bridge/record/faults/test_killed_recorders.py tests/bridge/record/faults/test_endurance.py
 
 fast: $(READY)
