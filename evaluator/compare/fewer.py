@@ -3,10 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 from evaluator.compare.measure import Statistic, measured
 from evaluator.compare.pairing import StartPair
 from evaluator.compare.rows import TrialRow
+from evaluator.compare.start_overlap import StartOverlap
 from evaluator.compare.success import Key, group_rows, names_of, rate_id, trials_in
 from evaluator.compare.verdicts import confusion_of
 from evaluator.errors import UndefinedStatisticError
@@ -47,20 +49,24 @@ def _assisted_rate(
     alone_n = trials_in(alone)
     alone_k = trials_in(row for row in alone if row.sim_planned)
     many = f"{counts.n} trials with an outcome and {alone_n} starts that only the twin has"
+    overlap = StartOverlap(paired, alone)
 
     def p_random() -> float:
         return applicability(counts.said_success, counts.n, alone_k, alone_n)
 
     def checked() -> None:
-        try:
-            p = p_random()
-        except UndefinedStatisticError:
-            return  # too many tables to count out: the check is undefined and says so itself
-        if p < ALPHA:
-            raise UndefinedStatisticError(
-                statistic="rate from the twin",
-                reason=f"the tried starts are no random part of the twin's (p = {p:.3g})",
-            )
+        for look, words in (
+            (p_random, "the tried starts are no random part of the twin's"),
+            (overlap.p_alike, "the tried starts lie elsewhere than the twin's others"),
+        ):
+            try:
+                p = look()
+            except UndefinedStatisticError:
+                continue  # the check is undefined and says so itself
+            if p < ALPHA:
+                raise UndefinedStatisticError(
+                    statistic="rate from the twin", reason=f"{words} (p = {p:.3g})"
+                )
 
     def stratified() -> tuple[float, Interval | None]:
         checked()
@@ -82,7 +88,7 @@ def _assisted_rate(
 
     def make(name: str, compute: Statistic, unit: str, words: str) -> Measurement:
         return measured(
-            rate_id(name, key).replace("rate.", "proxy.", 1),
+            _proxy_id(key, name),
             compute,
             unit=unit,
             definition=f"{words}; {many}",
@@ -109,7 +115,12 @@ def _assisted_rate(
             "p of Boschloo's test that the twin succeeds as often on the tried starts as on the "
             "others: small forbids the estimates",
         ),
+        *overlap.measurements(partial(_proxy_id, key)),
     ]
+
+
+def _proxy_id(key: Key, name: str) -> str:
+    return rate_id(name, key).replace("rate.", "proxy.", 1)
 
 
 def sequences(rows: Sequence[TrialRow], pairs: Sequence[StartPair]) -> list[Measurement]:
