@@ -19,8 +19,11 @@ from twin.replay.failure import NOT_EVALUATED
 from twin.replay.rollout import KINEMATIC_ENGINE, engine_of
 from twin.replay.starts import StartState
 
-REPLAY_VERSION = 10
+REPLAY_VERSION = 11
 """Raise it when the same inputs give another replay, so that old files are redone."""
+
+MAY_STAY_OPEN = ("settled", "shape")
+"""Predicates that a recording without an answer to them may succeed without."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,6 +204,16 @@ def judged(
 
 
 def predicates_hold(verdict: Verdict) -> bool | None:
-    """Whether every success predicate that could be decided holds; None when none could."""
-    values = [item["value"] for item in verdict.findings if item["value"] is not None]
-    return all(values) if values else None
+    """Whether the success predicates hold; None when what is known does not say.
+
+    One look afterwards seldom tells whether a thing lies still or kept its shape: those may stay
+    open. A thing that nobody found was not seen to be where it belongs.
+    """
+    values = [
+        item["value"]
+        for item in verdict.findings
+        if item["value"] is not None or item["kind"] not in MAY_STAY_OPEN
+    ]
+    if False in values:
+        return False
+    return None if None in values or not values else True

@@ -48,11 +48,14 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
                 output.say(remark)
         rows, todo = _there_already(jobs, config)
         run.derived_dir.mkdir(parents=True, exist_ok=True)  # Ray asks each node whether it is there
+        told: set[tuple[str, str, str]] = set()  # one cause spoils all replays of a plan
         with output.progress("replay", len(todo)) as advance:
             for done, row in enumerate(_replayed(todo, runner, output), start=1):
                 rows.append(row)
                 advance(done, f"{row['episode']} {row['trajectory']} {row['mode']}")
-                if row["error"]:
+                what = (row["episode"], row["plan"], row["error"])
+                if row["error"] and what not in told:
+                    told.add(what)
                     output.say(f"{row['episode']} {row['plan']}: {row['error']}")
     rows.sort(key=lambda row: (row["episode"], row["plan"], row["trajectory"], row["mode"]))
     executions = executions_of(rows, recorded_labels(run, sorted({row["episode"] for row in rows})))

@@ -43,15 +43,19 @@ def _reason_lines(rows: Rows) -> list[str]:
     lines = []
     for title, listed in lists:
         lines += ["", title] if listed else []
-        for row in listed:
-            name = f"{row['episode']} {row['plan']} {row['trajectory']} {row['mode']}"
-            lines.append(f"  {name}: {_bare(row['reason'], title)}")
+        for (episode, plan, reason), which in _by_reason(listed).items():
+            bare = (reason or "no reason given").removeprefix(f"{title} ")
+            lines.append(f"  {episode} {plan} {', '.join(which)}: {bare}")
     return lines
 
 
-def _bare(reason: str | None, title: str) -> str:
-    """The reason without the word that is the list's title."""
-    return (reason or "no reason given").removeprefix(f"{title} ")
+def _by_reason(rows: Rows) -> dict[tuple[str, str, str | None], list[str]]:
+    """Which replays of a plan have the same reason, in the order of the rows."""
+    found: dict[tuple[str, str, str | None], list[str]] = {}
+    for row in rows:
+        key = (row["episode"], row["plan"], row["reason"])
+        found.setdefault(key, []).append(f"{row['trajectory']} {row['mode']}")
+    return found
 
 
 def _skipped_lines(skipped: Mapping[str, str]) -> list[str]:

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from bridge.task.verdict import Factor, Verdict
+from twin.replay.job import predicates_hold
 from twin.replay.table import (
     EXECUTED,
     PLANNED,
@@ -103,3 +105,30 @@ def test_every_answer_that_is_no_yes_is_listed_with_its_reason_once() -> None:
     assert "rejected:\n  b p planned dynamic: ik: unreachable\n" in text
     assert "not evaluated:\n  c p planned dynamic: NaN" in text
     assert "no physics" not in text, "said of every kinematic replay"
+
+
+def test_one_cause_that_spoils_every_replay_of_a_plan_is_one_line() -> None:
+    spoilt = {"accepted": None, "reason": "not evaluated: NaN", "error": "not evaluated: NaN"}
+    rows = [row("c", name, **spoilt) for name in ("planned", "executed")]
+    text = describe_run({**summary(), "rows": rows, "counts": count_verdicts(rows)})
+    assert "\n  c p planned dynamic, executed dynamic: NaN" in text
+
+
+def seen(*findings: tuple[str, bool | None]) -> Verdict:
+    """What a recording says of each predicate."""
+    nothing = Factor(value=None)
+    return Verdict(
+        plan_id="p", trajectory="executed", mode="kinematic", ik=nothing, clearance=nothing,
+        terminal=nothing, engine="e", seed=0,
+        findings=tuple({"kind": kind, "value": value} for kind, value in findings),
+    )  # fmt: skip
+
+
+def test_what_nobody_found_was_not_seen_to_succeed() -> None:
+    contacts = ("allowed_contacts", True)
+    assert predicates_hold(seen(("inside", True), ("settled", None), contacts)) is True
+    assert predicates_hold(seen(("inside", None), ("settled", None), contacts)) is None
+    assert predicates_hold(seen(("inside", True), ("inside", None), contacts)) is None
+    assert predicates_hold(seen(("inside", False), ("inside", None), contacts)) is False
+    assert predicates_hold(seen(("settled", None))) is None
+    assert predicates_hold(seen()) is None
