@@ -1,9 +1,11 @@
 """Shapes of tetrahedra in motion: surface, rigid fit, and points that follow."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int, Int32
+from scipy.sparse import csr_array
 
 
 def rigid_fit(
@@ -51,7 +53,13 @@ class Skin:
         self, nodes_m: Float[np.ndarray, "num_nodes 3"]
     ) -> Float[np.ndarray, "num_points 3"]:
         """Where the points are."""
-        return np.asarray(np.einsum("nk,nkc->nc", self.weights, nodes_m[self.node_ids]))
+        return np.asarray(self._followed @ nodes_m[: self._followed.shape[1]])
+
+    @cached_property
+    def _followed(self) -> csr_array:
+        rows = np.repeat(np.arange(len(self.node_ids)), 4)
+        shape = (len(self.node_ids), int(self.node_ids.max()) + 1)
+        return csr_array((self.weights.ravel(), (rows, self.node_ids.ravel())), shape=shape)
 
 
 def bind_points(

@@ -39,6 +39,8 @@ class _SoftBody:
     model: SoftModel
     skin: Skin | None
     rest_extents_m: Float[np.ndarray, "3"]
+    rest_m: Float[np.ndarray, "num_nodes 3"]
+    weights: Float[np.ndarray, " num_nodes"]
 
 
 class SoftWorld:
@@ -70,6 +72,7 @@ class SoftWorld:
         self._reaction: Reaction | None = None
         self._states: dict[str, LinkPose] = {}
         self._pushed: list[int] = []
+        self._fits: dict[str, Float[np.ndarray, "4 4"]] = {}
         self._pushes: Float[np.ndarray, "num_pieces 15"] = np.zeros((0, 15))
 
     def add_static(
@@ -182,7 +185,12 @@ class SoftWorld:
             points = model.skin_m.astype(np.float64)
             skin = bind_points(points, rest, model.tets)
         self.names[object_id] = _SoftBody(
-            index=index, model=model, skin=skin, rest_extents_m=np.ptp(points, axis=0)
+            index=index,
+            model=model,
+            skin=skin,
+            rest_extents_m=np.ptp(points, axis=0),
+            rest_m=rest,
+            weights=model.mass_fraction.astype(np.float64),
         )
 
     def push_rigid(self) -> None:
@@ -194,6 +202,7 @@ class SoftWorld:
         """Advance the soft bodies to where PyBullet is."""
         if self._solver is None:
             return
+        self._fits.clear()
         states = self._arm.link_poses(self._link_ids)
         self._states = dict(zip(self._links, states, strict=True))
         poses = [
@@ -235,12 +244,13 @@ class SoftWorld:
 
     def T_base_object(self, object_id: str) -> Float[np.ndarray, "4 4"]:
         """Rigid motion nearest to a body's nodes; of a body that burst no numbers."""
-        model = self.names[object_id].model
-        return rigid_fit(
-            model.nodes_m.astype(np.float64),
-            self.nodes_m(object_id),
-            model.mass_fraction.astype(np.float64),
-        )
+        # Pose and extents of one state ask for the same fit.
+        if object_id not in self._fits:
+            body = self.names[object_id]
+            fit = rigid_fit(body.rest_m, self.nodes_m(object_id), body.weights)
+            fit.setflags(write=False)
+            self._fits[object_id] = fit
+        return self._fits[object_id]
 
     def pose(self, object_id: str) -> tuple[float, ...]:
         """Position [m] and quaternion wxyz of that motion, seven numbers."""
@@ -253,9 +263,11 @@ class SoftWorld:
     def extents_m(self, object_id: str) -> Float[np.ndarray, "3"]:
         """Extents of a body's surface along the axes of its pose."""
         body, nodes = self.names[object_id], self.nodes_m(object_id)
-        points = nodes if body.skin is None else body.skin.points_m(nodes)
-        local = points @ self.T_base_object(object_id)[:3, :3]
-        return np.asarray(np.ptp(local, axis=0) / body.rest_extents_m * body.model.size_m)
+        local = nodes @ self.T_base_object(object_id)[:3, :3]
+        points = local if body.skin is None else body.skin.points_m(local)
+        # Column by column: NumPy takes ten times as long along the long axis of three columns.
+        extents = np.array([np.ptp(np.ascontiguousarray(column)) for column in points.T])
+        return np.asarray(extents / body.rest_extents_m * body.model.size_m)
 
     def health(self, object_id: str) -> SoftHealth:
         """Whether a body is sound."""

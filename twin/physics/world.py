@@ -190,6 +190,8 @@ class World:
 
     def T_base_object(self, object_id: str) -> Float[np.ndarray, "4 4"]:
         """Pose of an object that moves, as ``object_pose``."""
+        if object_id in self._soft.names:
+            return self._soft.T_base_object(object_id).copy()
         pose = np.array(self.object_pose(object_id))
         return se3.transform_from(pose[3:], pose[:3])
 

@@ -6,9 +6,8 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from bridge.geometry import se3
 from twin.physics.attach import Attachment
-from twin.physics.soft import MAX_STRETCH, SoftHealth, SoftModel
+from twin.physics.soft import BURST_STRETCH, SoftHealth, SoftModel
 from twin.physics.world import World
 from twin.replay.config import ReplayConfig
 from twin.replay.failure import NotEvaluatedError
@@ -103,7 +102,7 @@ class _Samples:
         self._stamps: list[int] = []
         self._joints: list[Float[np.ndarray, " num_joints"]] = []
         self._widths: list[float] = []
-        self._poses: dict[str, list[tuple[float, ...]]] = {name: [] for name in self._objects}
+        self._poses: dict[str, list[Float[np.ndarray, "4 4"]]] = {n: [] for n in self._objects}
         self._touch: dict[str, list[bool]] = {name: [] for name in self._objects}
         self._nodes: dict[str, list[Float32[np.ndarray, "num_nodes 3"]]] = {n: [] for n in soft}
         self._extents: dict[str, list[np.ndarray]] = {name: [] for name in soft}
@@ -123,7 +122,7 @@ class _Samples:
         self._joints.append(joints)
         self._widths.append(width)
         for name in self._objects:
-            self._poses[name].append(world.object_pose(name))
+            self._poses[name].append(world.T_base_object(name))
             self._touch[name].append(world.finger_touches(name))
         for name in self._soft:
             self._nodes[name].append(world.soft_nodes_m(name).copy())
@@ -131,10 +130,7 @@ class _Samples:
         return True
 
     def states(self, world: World) -> States:
-        poses = {}
-        for name, items in self._poses.items():
-            table = np.array(items)
-            poses[name] = se3.transform_from(table[:, 3:], table[:, :3])
+        poses = {name: np.stack(items) for name, items in self._poses.items()}
         poses |= {
             name: np.repeat(T[None], len(self._stamps), axis=0) for name, T in self._still.items()
         }
@@ -163,5 +159,5 @@ class _Samples:
 
 def burst_of(health: SoftHealth) -> str | None:
     """Say in what way a soft body has burst; None when it has not."""
-    burst = not health.is_finite or not health.max_stretch < MAX_STRETCH
+    burst = not health.is_finite or not health.max_stretch < BURST_STRETCH
     return health.describe() if burst else None

@@ -12,7 +12,7 @@ import pytest
 from bridge.geometry import se3
 from bridge.task.meshes.lattice import volumes_m3
 from twin.physics.colliders import box_piece
-from twin.physics.soft import SoftModel, health_of
+from twin.physics.soft import BURST_STRETCH, MAX_STRETCH, SoftModel, health_of
 from twin.physics.soft_shape import rigid_fit
 from twin.physics.soft_solver import SoftSolver, add_body
 
@@ -175,6 +175,24 @@ def test_a_fast_body_does_not_pass_a_thin_wall(box_of_cells: Boxes) -> None:
     solver.set_velocities(index, np.tile([0.0, 0.0, -3.0], (len(masses), 1)))
     run(solver, 60)
     assert solver.nodes(index)[:, 2].min() > 0.003
+
+
+def test_a_finger_that_comes_down_dents_a_toy_and_does_not_burst_it(box_of_cells: Boxes) -> None:
+    solver = empty()
+    slab(solver, pose(0, 0, -0.2), (2.0, 2.0, 0.4), 0.8)
+    model = box_of_cells((5, 4, 4), young_pa=8e4, friction=0.8)
+    index, _ = put(solver, model, 0.0, 0.0, 0.028)
+    high, low, steps = 0.056 + 0.036, 0.016 + 0.035, 28
+    finger = slab(solver, pose(0, 0.012, high), (0.02, 0.012, 0.07), 0.0)
+    worst = 0.0
+    for share in np.sin(np.linspace(0, np.pi, 2 * steps)) ** 2:
+        at = pose(0, 0.012, high + share * (low - high))
+        solver.step(np.array([finger], dtype=np.int32), at[None])
+        worst = max(worst, health_of(model, solver.nodes(index)).max_stretch)
+    run(solver, 120)
+    assert MAX_STRETCH < worst < BURST_STRETCH, "far from rest, and a dent explains it"
+    assert health_of(model, solver.nodes(index)).sound
+    assert np.ptp(solver.nodes(index), axis=0) == pytest.approx(model.size_m, rel=0.05)
 
 
 def test_bodies_stack_and_do_not_pass_each_other(box_of_cells: Boxes) -> None:

@@ -13,7 +13,7 @@ from twin.replay.calibrated import Correction
 from twin.replay.clearance import SCENE, ClearanceMonitor
 from twin.replay.clearance.candidates import candidate_clearance
 from twin.replay.clearance.grid import GridLookup
-from twin.replay.clearance.nodes import distance_to_box_m, planes_of
+from twin.replay.clearance.nodes import distances_to_boxes_m, planes_of
 from twin.replay.clearance.shells import shell_of
 from twin.replay.clearance.surroundings import standing_links
 from twin.replay.clearance.sweep import Reach, State
@@ -331,13 +331,17 @@ def test_a_finger_in_a_soft_body_is_as_deep_as_its_nodes_say(
 
 def test_distances_of_points_to_a_box_are_exact() -> None:
     T = se3.transform_from(np.array([0.9, 0.1, 0.2, 0.3]), np.array([0.1, 0.2, 0.3]))
-    panel = (T, np.array([0.2, 0.1, 0.4]))
+    T_box_base = np.stack([se3.invert(T), np.eye(4)])
+    half = np.array([[0.1, 0.05, 0.2], [1.0, 1.0, 1.0]])
     for local, expected in (
         ([0.2, 0.0, 0.0], 0.1),
         ([0.13, 0.09, 0.0], 0.05),
         ([0.0, 0.03, 0.0], -0.02),
     ):
-        assert distance_to_box_m(se3.apply(T, np.array([local])), panel) == pytest.approx(expected)
+        points = se3.apply(T, np.array([local, [5.0, 5.0, 5.0]]))
+        found = distances_to_boxes_m(points, T_box_base[:, :3, :3], T_box_base[:, :3, 3], half)
+        assert found[0] == pytest.approx(expected)
+        assert found[1] == pytest.approx(np.abs(points[0]).max() - 1.0), "the box at the base"
 
 
 def test_before_the_grasp_a_toy_is_as_large_as_its_mesh(script: SimpleNamespace) -> None:

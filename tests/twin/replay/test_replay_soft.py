@@ -96,6 +96,7 @@ def test_extents_that_are_far_from_rest_or_no_numbers_fail(
     [
         (SOUND, False),
         (replace(SOUND, num_inverted=2), False),
+        (replace(SOUND, max_stretch=3.0), False),
         (replace(SOUND, max_stretch=5.0), True),
         (replace(SOUND, max_stretch=float("nan")), True),
         (replace(SOUND, is_finite=False), True),

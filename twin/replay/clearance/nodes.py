@@ -12,8 +12,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
-from bridge.geometry import se3
-from twin.replay.clearance.unnamed import Panel
 from twin.robot.collision import RobotHulls
 
 
@@ -46,9 +44,15 @@ def planes_of(hulls: RobotHulls) -> tuple[Planes, ...]:
     return tuple(found)
 
 
-def distance_to_box_m(points_m: Float[np.ndarray, "num_points 3"], panel: Panel) -> float:
-    """Smallest signed distance of points to a box [m]."""
-    T, extents = panel
-    q = np.abs(se3.apply(se3.invert(T), points_m)) - extents / 2
-    outside = np.linalg.norm(np.maximum(q, 0.0), axis=1)
-    return float((outside + np.minimum(q.max(axis=1), 0.0)).min())
+def distances_to_boxes_m(
+    points_m: Float[np.ndarray, "num_points 3"],
+    R_box_base: Float[np.ndarray, "num_boxes 3 3"],
+    p_box_base: Float[np.ndarray, "num_boxes 3"],
+    half_m: Float[np.ndarray, "num_boxes 3"],
+) -> Float[np.ndarray, " num_boxes"]:
+    """Smallest signed distance of points to each box around the origin of its frame [m]."""
+    local = R_box_base @ points_m.T + p_box_base[:, :, None]
+    q = np.abs(local) - half_m[:, :, None]
+    out = np.maximum(q, 0.0)
+    outside = np.sqrt(np.einsum("bcn,bcn->bn", out, out))
+    return np.asarray((outside + np.minimum(q.max(axis=1), 0.0)).min(axis=1))

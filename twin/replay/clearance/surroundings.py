@@ -19,7 +19,7 @@ from twin.replay.clearance.bodies import (
     solid_of,
 )
 from twin.replay.clearance.grid import GridLookup
-from twin.replay.clearance.nodes import distance_to_box_m, planes_of
+from twin.replay.clearance.nodes import distances_to_boxes_m, planes_of
 from twin.replay.clearance.shells import Shells, shell_of, shells_of_robot
 from twin.replay.clearance.unnamed import Foot, unnamed_scene
 from twin.replay.scene import ReplayScene
@@ -149,8 +149,11 @@ class Surroundings:
                     found[link.body, index, name, 0] = gap
         for name, nodes in moved_m.items():
             found[name, -1, TABLE, 0] = float(nodes[:, 2].min()) - self._table_height_m
-            for container, piece, panel in self._panels:
-                found[name, -1, container, piece] = distance_to_box_m(nodes, panel)
+            if self._panels:
+                panels = self._R_panel_base, self._p_panel_base, self._half_m
+                distances = distances_to_boxes_m(nodes, *panels).tolist()
+                for (container, piece, _), distance in zip(self._panels, distances, strict=True):
+                    found[name, -1, container, piece] = distance
             if self.lookup is not None:
                 found[name, -1, SCENE, 0] = float(self.lookup.distance(nodes).min())
         return found
