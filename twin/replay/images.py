@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from bridge.episode import schema, streams
+from bridge.episode import streams
 from bridge.episode.reader import Episode
-from bridge.episode.records import CompressedColor
+from bridge.episode.records import CompressedColor, color_from_message
 from bridge.episode.run import RunFolder
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
@@ -159,18 +159,13 @@ def _stamps(
 ) -> list[int]:
     """When images were recorded during the replayed time, or a grid where none could be."""
     end_ns = start_ns + int(result.stamps_ns[-1])
-    if executed:
-        topics = [
-            topic
-            for name in (schema.COMPRESSED_IMAGE, schema.IMAGE)
-            for topic in episode.topics_of_type(name)
-            if topic.endswith(f"/cam/{camera_id}/color/image") and not schema.is_truth(topic)
-        ]
-        stamps = [
-            message.publish_time_ns
-            for message in episode.messages(topics)
-            if start_ns <= message.publish_time_ns <= end_ns
-        ]
+    topic = streams.find_camera_topic(episode, camera_id, "color/image")
+    if executed and topic is not None:
+        found = (
+            color_from_message(message.type_name, message.data).stamp_ns
+            for message in episode.messages([topic])
+        )
+        stamps = [stamp_ns for stamp_ns in found if start_ns <= stamp_ns <= end_ns]
     else:
         stamps = np.arange(start_ns, end_ns, round(1e9 / RATE_HZ)).tolist()
     step = -(-len(stamps) // MAX_IMAGES) or 1

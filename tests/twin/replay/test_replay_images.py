@@ -39,6 +39,8 @@ from twin.scene.store import background_hash, write_record
 
 T0 = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
+LATE_NS = 80_000_000
+"""Images are sent this long after they were taken."""
 CAMERA = Camera(width=160, height=120, fx=130.0, fy=130.0, cx=80.0, cy=60.0)
 HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
 AWAY = HOME + np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0])
@@ -118,7 +120,8 @@ def write_recording(run: RunFolder, urdf: str) -> Episode:
                 say(f"/cell/{topic}", sample.to_cdr(), schema.JOINT_STATE, stamp)
             for name in poses if index % 5 == 0 else ():
                 image = CompressedColor(stamp_ns=stamp, frame_id=name, format="jpeg", data=b"-")
-                say(f"/cell/cam/{name}/color/image", image.to_cdr(), schema.COMPRESSED_IMAGE, stamp)
+                topic, sent = f"/cell/cam/{name}/color/image", stamp + LATE_NS
+                say(topic, image.to_cdr(), schema.COMPRESSED_IMAGE, sent)
     return Episode.open(path)
 
 
