@@ -87,7 +87,7 @@ def _rows(payloads: Sequence[bytes]) -> UInt8[np.ndarray, "num_messages num_byte
     size = len(payloads[0])
     if size < _FRAME_AT or payloads[0][1] != _LITTLE_ENDIAN:
         return None
-    if any(len(payload) != size for payload in payloads):
+    if set(map(len, payloads)) != {size}:
         return None
     return np.frombuffer(b"".join(payloads), dtype=np.uint8).reshape(len(payloads), size)
 

@@ -9,6 +9,7 @@ from mcap.summary import Summary
 
 from bridge.episode import metadata, schema
 from bridge.episode.mcap.file import McapFile, damaged
+from bridge.episode.mcap.gather import gathered
 from bridge.episode.mcap.merge import Selection, merged
 from bridge.episode.mcap.walk import DAMAGE
 from bridge.episode.parts import open_parts
@@ -54,7 +55,9 @@ class Episode:
         self.files = files
         self.missing_parts = missing_parts
         """Parts of a split episode that are not there or cannot be read."""
-        self._records = _joined_records(files)
+        self._texts = _joined_texts(files)
+        self._records: dict[str, dict[str, Any]] = {}
+        self._topics: dict[str, TopicSummary] | None = None
 
     @staticmethod
     def open(path: Path) -> "Episode":
@@ -78,7 +81,7 @@ class Episode:
                 hint="If a recorder was killed while writing it: robot-gst recover FILE.",
             ) from error
         episode = Episode(parts.files, parts.missing)
-        found = episode._records.get("episode", {}).get("schema_version", metadata.SCHEMA_VERSION)
+        found = episode._record("episode").get("schema_version", metadata.SCHEMA_VERSION)
         if isinstance(found, int) and found > metadata.SCHEMA_VERSION:
             raise SchemaVersionError(
                 path=path, name="episode metadata", found=found, known=metadata.SCHEMA_VERSION
@@ -115,10 +118,10 @@ class Episode:
         return self._metadata("derived", metadata.Derived)
 
     def _metadata(self, name: str, of_type: type[Record]) -> Record | None:
-        if name not in self._records:
+        if name not in self._texts:
             return None
         try:
-            return metadata.build(of_type, self._records[name])
+            return metadata.build(of_type, self._record(name))
         except (TypeError, ValueError) as error:
             raise EpisodeError(
                 path=self.path,
@@ -129,7 +132,13 @@ class Episode:
     @property
     def metadata_records(self) -> dict[str, dict[str, Any]]:
         """All metadata records by name, values parsed where they are JSON."""
-        return self._records
+        return {name: self._record(name) for name in self._texts}
+
+    def _record(self, name: str) -> dict[str, Any]:
+        """Parse a metadata record, once; empty where there is none."""
+        if name not in self._records:
+            self._records[name] = metadata.from_strings(self._texts.get(name, {}))
+        return self._records[name]
 
     @property
     def start_ns(self) -> int:
@@ -154,6 +163,11 @@ class Episode:
 
     def topics(self) -> dict[str, TopicSummary]:
         """Return every topic with its type and number of messages."""
+        if self._topics is None:
+            self._topics = self._summed_up()
+        return dict(self._topics)
+
+    def _summed_up(self) -> dict[str, TopicSummary]:
         topics: dict[str, TopicSummary] = {}
         for file in self.files:
             statistics = file.summary.statistics
@@ -207,6 +221,16 @@ class Episode:
                 item.data,
             )
 
+    def payloads(self, *groups: Iterable[str]) -> list[list[bytes]]:
+        """Return the bytes of all messages of each group of topics, in log order, in one pass.
+
+        What ``messages`` yields one by one, quicker; everything asked for is held in memory.
+
+        Raises:
+            EpisodeError: When a file turns out to be damaged.
+        """
+        return gathered(self.files, [frozenset(topics) for topics in groups])
+
     def attachment(self, name: str) -> bytes | None:
         """Return the bytes of the first attachment of this name with its CRC checked, or None.
 
@@ -223,10 +247,10 @@ class Episode:
         return None
 
 
-def _joined_records(files: tuple[McapFile, ...]) -> dict[str, dict[str, Any]]:
-    joined: dict[str, dict[str, Any]] = {}
+def _joined_texts(files: tuple[McapFile, ...]) -> dict[str, dict[str, str]]:
+    joined: dict[str, dict[str, str]] = {}
     for file in files:
-        of_part = {record.name: metadata.from_strings(record.metadata) for record in file.metadata}
+        of_part = {record.name: record.metadata for record in file.metadata}
         for name, values in of_part.items():
             if name in LAST_PART_WINS or name not in joined:
                 joined[name] = values

@@ -29,7 +29,11 @@ def rotation_from_quaternion(
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    R = np.empty((*q_wxyz.shape[:-1], 3, 3), dtype=w.dtype)
+    for i, row in enumerate(rows):
+        for j, value in enumerate(row):
+            R[..., i, j] = value
+    return R
 
 
 def quaternion_from_rotation(
@@ -37,46 +41,35 @@ def quaternion_from_rotation(
 ) -> Float[np.ndarray, "*batch 4"]:
     """Turn rotation matrices into unit quaternions with w >= 0 (Shepperd's method)."""
     trace = np.trace(R, axis1=-2, axis2=-1)
-    r = [[R[..., i, j] for j in range(3)] for i in range(3)]
+    pivots = np.stack([trace, R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]], axis=-1)
+    best = np.argmax(pivots, axis=-1)
+    q = np.empty((*R.shape[:-2], 4), dtype=R.dtype)
     # Four candidates, one per dominant component; each is exact where its pivot is largest.
-    candidates = np.stack(
-        [
-            np.stack([1 + trace, r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]], -1),
-            np.stack(
-                [
-                    r[2][1] - r[1][2],
-                    1 + r[0][0] - r[1][1] - r[2][2],
-                    r[0][1] + r[1][0],
-                    r[0][2] + r[2][0],
-                ],
-                -1,
-            ),
-            np.stack(
-                [
-                    r[0][2] - r[2][0],
-                    r[0][1] + r[1][0],
-                    1 - r[0][0] + r[1][1] - r[2][2],
-                    r[1][2] + r[2][1],
-                ],
-                -1,
-            ),
-            np.stack(
-                [
-                    r[1][0] - r[0][1],
-                    r[0][2] + r[2][0],
-                    r[1][2] + r[2][1],
-                    1 - r[0][0] - r[1][1] + r[2][2],
-                ],
-                -1,
-            ),
-        ],
-        axis=-2,
-    )
-    pivots = np.stack([trace, r[0][0], r[1][1], r[2][2]], axis=-1)
-    best = np.argmax(pivots, axis=-1)[..., None, None]
-    q = np.take_along_axis(candidates, best, axis=-2)[..., 0, :]
+    for dominant in range(4):
+        mask = best == dominant
+        if mask.any():
+            q[mask] = _by_dominant(dominant, R[mask], trace[mask])
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.asarray(np.where(q[..., :1] < 0, -q, q))
+
+
+def _by_dominant(
+    dominant: int, R: Float[np.ndarray, "num 3 3"], trace: Float[np.ndarray, " num"]
+) -> Float[np.ndarray, "num 4"]:
+    """Return quaternions of any length, exact where this component, 0 for w, is the largest."""
+    r = [[R[:, i, j] for j in range(3)] for i in range(3)]
+    if dominant == 0:
+        parts = 1 + trace, r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]
+    elif dominant == 1:
+        x = 1 + r[0][0] - r[1][1] - r[2][2]
+        parts = r[2][1] - r[1][2], x, r[0][1] + r[1][0], r[0][2] + r[2][0]
+    elif dominant == 2:
+        y = 1 - r[0][0] + r[1][1] - r[2][2]
+        parts = r[0][2] - r[2][0], r[0][1] + r[1][0], y, r[1][2] + r[2][1]
+    else:
+        z = 1 - r[0][0] - r[1][1] + r[2][2]
+        parts = r[1][0] - r[0][1], r[0][2] + r[2][0], r[1][2] + r[2][1], z
+    return np.stack(parts, axis=-1)
 
 
 def split(

@@ -25,14 +25,35 @@ class PoseTrajectory:
         if len(self) == 1:
             index = np.zeros(len(stamps_ns), dtype=np.int64)
             return PoseTrajectory(stamps_ns, self.p_m[index], self.q_wxyz[index])
+        before, fraction = self._between(stamps_ns)
+        q = se3.interpolate_quaternion(self.q_wxyz[before], self.q_wxyz[before + 1], fraction)
+        return PoseTrajectory(stamps_ns, self._positions(before, fraction), q)
+
+    def positions_at(
+        self, stamps_ns: Int[np.ndarray, " num_queries"]
+    ) -> Float[np.ndarray, "num_queries 3"]:
+        """Return the positions of ``at``, to the bit, without turning anything."""
+        if len(self) == 1:
+            return self.p_m[np.zeros(len(stamps_ns), dtype=np.int64)]
+        return self._positions(*self._between(stamps_ns))
+
+    def _between(
+        self, stamps_ns: Int[np.ndarray, " num_queries"]
+    ) -> tuple[Int[np.ndarray, " num_queries"], Float[np.ndarray, " num_queries"]]:
+        """Index of the pose before each stamp, and how far it is to the next one, 0 to 1."""
         after = np.clip(np.searchsorted(self.stamps_ns, stamps_ns), 1, len(self) - 1)
         before = after - 1
         span = (self.stamps_ns[after] - self.stamps_ns[before]).astype(np.float64)
         offset = (stamps_ns - self.stamps_ns[before]).astype(np.float64)
-        fraction = np.clip(offset / np.maximum(span, 1.0), 0.0, 1.0)
-        p = self.p_m[before] + fraction[:, None] * (self.p_m[after] - self.p_m[before])
-        q = se3.interpolate_quaternion(self.q_wxyz[before], self.q_wxyz[after], fraction)
-        return PoseTrajectory(stamps_ns, p, q)
+        return before, np.clip(offset / np.maximum(span, 1.0), 0.0, 1.0)
+
+    def _positions(
+        self,
+        before: Int[np.ndarray, " num_queries"],
+        fraction: Float[np.ndarray, " num_queries"],
+    ) -> Float[np.ndarray, "num_queries 3"]:
+        first = self.p_m[before]
+        return np.asarray(first + fraction[:, None] * (self.p_m[before + 1] - first))
 
     def shifted(self, shift_ns: int) -> "PoseTrajectory":
         """Return the same poses so much later."""

@@ -5,18 +5,31 @@ import math
 from collections.abc import Mapping
 from functools import cache
 from importlib import resources
-from typing import Any
-
-from jsonschema import Draft202012Validator
+from typing import TYPE_CHECKING, Any
 
 from bridge.errors import InvalidRecordError
+from bridge.task.quick_check import Check, compile_check
+
+if TYPE_CHECKING:
+    from jsonschema import Draft202012Validator
 
 
 @cache
-def validator(package: str, path: str) -> Draft202012Validator:
+def _schema(package: str, path: str) -> Any:
     """Load one of our JSON Schemas, once."""
-    text = resources.files(package).joinpath(path).read_text()
-    return Draft202012Validator(json.loads(text))
+    return json.loads(resources.files(package).joinpath(path).read_text())
+
+
+@cache
+def _quick_check(package: str, path: str) -> Check:
+    return compile_check(_schema(package, path))
+
+
+@cache
+def _validator(package: str, path: str) -> "Draft202012Validator":
+    from jsonschema import Draft202012Validator  # noqa: PLC0415  # only what does not fit needs it
+
+    return Draft202012Validator(_schema(package, path))
 
 
 def check_record(
@@ -27,16 +40,18 @@ def check_record(
     Raises:
         InvalidRecordError: With the place and the value that does not fit.
     """
-    checker = validator(package, f"schemas/{name}.schema.json")
+    path = f"schemas/{name}.schema.json"
     version = record.get("schema_version")
-    known = checker.schema["version"]
+    known = _schema(package, path)["version"]
     if isinstance(version, int) and version > known:
         raise InvalidRecordError(
             name=name,
             where="schema_version",
             found=f"version {version} is newer than the {known} this reader knows; upgrade",
         )
-    error = next(iter(checker.iter_errors(record)), None)
+    if _quick_check(package, path)(record):
+        return record
+    error = next(iter(_validator(package, path).iter_errors(record)), None)
     if error is not None:
         where = "/".join(str(part) for part in error.absolute_path)
         raise InvalidRecordError(name=name, where=where, found=error.message[:300])

@@ -17,7 +17,12 @@ from bridge.episode.streams import JointTrack
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.compare.tracks import Tracks, read_tracks
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.trajectory import NORMALISED_SAMPLES, PoseErrors, pose_errors
+from evaluator.metrics.trajectory import (
+    NORMALISED_SAMPLES,
+    PoseErrors,
+    pose_errors,
+    position_errors,
+)
 from evaluator.metrics.trajectory_align import find_lag_s, without_rigid_motion
 from evaluator.metrics.trajectory_steps import joint_errors, relative_errors
 
@@ -197,17 +202,21 @@ def _with_shape(
     summary: MotionSummary, mine: PoseTrajectory, other: PoseTrajectory, errors: PoseErrors
 ) -> MotionSummary:
     """Add what is left without a delay, without an offset too, and within single seconds."""
-    same = mine.at(errors.stamps_ns)
+    stamps_ns = errors.stamps_ns
+    same_m = mine.positions_at(stamps_ns)
     if summary.aligned_by == "normalised":
-        return replace(summary, without_offset_mean_m=_without_offset(same, other))
-    lag_s = _or_none(lambda: find_lag_s(same, other))
+        left_m = _without_offset_m(same_m, other.positions_at(stamps_ns))
+        return replace(summary, without_offset_mean_m=left_m)
+    lag_s = _or_none(lambda: find_lag_s(stamps_ns, same_m, other))
     if lag_s is not None:
         later = other.shifted(round(lag_s * NS_PER_S))
         summary = replace(
             summary,
             lag_s=lag_s,
-            without_lag_mean_m=_or_none(lambda: float(pose_errors(same, later).position_m.mean())),
-            without_offset_mean_m=_without_offset(same, later),
+            without_lag_mean_m=_or_none(
+                lambda: float(position_errors(stamps_ns, same_m, later).mean())
+            ),
+            without_offset_mean_m=_without_offset_m(same_m, later.positions_at(stamps_ns)),
         )
     instants = np.arange(int(errors.stamps_ns[0]), int(errors.stamps_ns[-1]) + 1, STEP_NS)
     if len(instants) <= STEPS_PER_S:
@@ -218,9 +227,10 @@ def _with_shape(
     )
 
 
-def _without_offset(mine: PoseTrajectory, other: PoseTrajectory) -> float | None:
-    theirs = other.at(mine.stamps_ns)
-    return _or_none(lambda: float(without_rigid_motion(mine.p_m, theirs.p_m).mean()))
+def _without_offset_m(
+    p_mine_m: Float[np.ndarray, "num_samples 3"], p_other_m: Float[np.ndarray, "num_samples 3"]
+) -> float | None:
+    return _or_none(lambda: float(without_rigid_motion(p_mine_m, p_other_m).mean()))
 
 
 def _with_joints(

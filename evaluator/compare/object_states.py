@@ -1,5 +1,6 @@
 """Where objects were after a stage: as the plan says, as a replay has it, as it was localised."""
 
+import json
 from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Mapping
@@ -65,6 +66,7 @@ def read_sent(recorded: Episode, plan_id: str) -> Sent | None:
     names = (schema.PLAN, schema.EVENT, schema.LOCALISATION)
     topics = [topic for name in names for topic in recorded.topics_of_type(name)]
     plan: Plan | None = None
+    named = json.dumps(plan_id, ensure_ascii=False).encode()  # a plan takes long to parse
     events, found = [], []
     for message in recorded.messages(topics):
         if message.type_name == schema.LOCALISATION:
@@ -73,7 +75,7 @@ def read_sent(recorded: Episode, plan_id: str) -> Sent | None:
             if b"execution_" in message.data:
                 data = message.data
                 events.append(parse_record(data, name="event", package="bridge.episode"))
-        elif plan_id.encode() in message.data:
+        elif named in message.data:
             candidate = Plan.outline_from_json(message.data)
             plan = candidate if candidate.id == plan_id else plan
     if plan is None:

@@ -1,6 +1,5 @@
 """Read what a motion comparison needs of one episode, in one pass: tool, joints, start and end."""
 
-from collections import defaultdict
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,18 +83,16 @@ def read_tracks(episode: Episode, plan_id: str) -> Tracks:
     poses = [t for t in episode.topics_of_type(schema.POSE_STAMPED) if t.endswith(TOOL)]
     joints = [t for t in episode.topics_of_type(schema.JOINT_STATE) if t.endswith(JOINTS)]
     events = episode.topics_of_type(schema.EVENT)
-    payloads: dict[str, list[bytes]] = defaultdict(list)
-    for message in episode.messages([*poses[:1], *joints, *events]):
-        payloads[message.type_name].append(message.data)
+    of_tool, of_joints, of_events = episode.payloads(poses[:1], joints, events)
     records = [
         parse_record(data, name="event", package="bridge.episode")
-        for data in payloads[schema.EVENT]
+        for data in of_events
         if b"execution_" in data
     ]
     started_ns, ended_ns = execution_ns(records, plan_id)
     return Tracks(
-        tool=_tool(payloads[schema.POSE_STAMPED]),
-        joints=_joints(payloads[schema.JOINT_STATE]),
+        tool=_tool(of_tool),
+        joints=_joints(of_joints),
         started_ns=started_ns,
         ended_ns=ended_ns,
     )

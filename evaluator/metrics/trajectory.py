@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.errors import UndefinedStatisticError
@@ -30,13 +30,7 @@ def pose_errors(recorded: PoseTrajectory, replayed: PoseTrajectory) -> PoseError
     Raises:
         UndefinedStatisticError: When the stamps do not overlap.
     """
-    first = max(int(recorded.stamps_ns[0]), int(replayed.stamps_ns[0]))
-    last = min(int(recorded.stamps_ns[-1]), int(replayed.stamps_ns[-1]))
-    common = (recorded.stamps_ns >= first) & (recorded.stamps_ns <= last)
-    if not common.any():
-        raise UndefinedStatisticError(
-            statistic="trajectory error", reason="recorded and replayed stamps do not overlap"
-        )
+    common = _common(recorded.stamps_ns, replayed)
     stamps = recorded.stamps_ns[common]
     other = replayed.at(stamps)
     return PoseErrors(
@@ -44,6 +38,34 @@ def pose_errors(recorded: PoseTrajectory, replayed: PoseTrajectory) -> PoseError
         position_m=np.linalg.norm(recorded.p_m[common] - other.p_m, axis=1),
         rotation_rad=angles_rad(recorded.q_wxyz[common], other.q_wxyz),
     )
+
+
+def position_errors(
+    stamps_ns: Int[np.ndarray, " num_samples"],
+    p_recorded_m: Float[np.ndarray, "num_samples 3"],
+    replayed: PoseTrajectory,
+) -> Float[np.ndarray, " num_common"]:
+    """Return the distances [m] of ``pose_errors``, to the bit, where no angle is asked for.
+
+    Raises:
+        UndefinedStatisticError: When the stamps do not overlap.
+    """
+    common = _common(stamps_ns, replayed)
+    other_m = replayed.positions_at(stamps_ns[common])
+    return np.asarray(np.linalg.norm(p_recorded_m[common] - other_m, axis=1))
+
+
+def _common(
+    stamps_ns: Int[np.ndarray, " num_samples"], replayed: PoseTrajectory
+) -> Bool[np.ndarray, " num_samples"]:
+    first = max(int(stamps_ns[0]), int(replayed.stamps_ns[0]))
+    last = min(int(stamps_ns[-1]), int(replayed.stamps_ns[-1]))
+    common = (stamps_ns >= first) & (stamps_ns <= last)
+    if not common.any():
+        raise UndefinedStatisticError(
+            statistic="trajectory error", reason="recorded and replayed stamps do not overlap"
+        )
+    return common
 
 
 def angles_rad(

@@ -5,7 +5,7 @@ is taken out belongs to neither.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from bridge.clock import NS_PER_S
 from bridge.geometry.trajectory import PoseTrajectory
@@ -22,7 +22,11 @@ FLAT = 1e-9
 """A second singular value below this share of the first: positions on a line."""
 
 
-def find_lag_s(recorded: PoseTrajectory, replayed: PoseTrajectory) -> float:
+def find_lag_s(
+    stamps_ns: Int[np.ndarray, " num_samples"],
+    p_recorded_m: Float[np.ndarray, "num_samples 3"],
+    replayed: PoseTrajectory,
+) -> float:
     """Find by how much the recorded motion comes later, whatever rigid motion lies between the two.
 
     The delay of least root mean square distance after the best rigid motion: an offset is the
@@ -31,19 +35,20 @@ def find_lag_s(recorded: PoseTrajectory, replayed: PoseTrajectory) -> float:
     Range: -0.2 s to 0.6 s, known to 10 ms. Undefined when: positions are not finite.
 
     Args:
-        recorded: Positions [m] over the common clock.
+        stamps_ns: Instants on the common clock.
+        p_recorded_m: Where the recorded motion was.
         replayed: The same motion; held at its ends where it is shorter.
 
     Raises:
         UndefinedStatisticError: When it is undefined.
     """
-    choice = np.linspace(0, len(recorded) - 1, min(len(recorded), MAX_INSTANTS)).round()
+    choice = np.linspace(0, len(stamps_ns) - 1, min(len(stamps_ns), MAX_INSTANTS)).round()
     ids = np.unique(choice.astype(np.int64))
-    asked = recorded.stamps_ns[ids][None, :] - (LAGS_S[:, None] * NS_PER_S).round().astype(np.int64)
+    asked = stamps_ns[ids][None, :] - (LAGS_S[:, None] * NS_PER_S).round().astype(np.int64)
     other = np.stack(
         [np.interp(asked, replayed.stamps_ns, replayed.p_m[:, axis]) for axis in range(3)], axis=-1
     )
-    costs = _left_over_m(other, recorded.p_m[ids])
+    costs = _left_over_m(other, p_recorded_m[ids])
     near = LAGS_S[costs <= costs.min() + EQUAL_M]
     return float(near[np.argmin(np.abs(near))])
 

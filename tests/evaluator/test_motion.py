@@ -184,7 +184,7 @@ def test_a_motion_that_rests_has_no_delay() -> None:
     rest = PoseTrajectory(
         np.arange(50, dtype=np.int64) * STEP_NS, np.zeros((50, 3)), np.tile([1.0, 0, 0, 0], (50, 1))
     )
-    assert find_lag_s(rest, rest) == 0.0
+    assert find_lag_s(rest.stamps_ns, rest.p_m, rest) == 0.0
 
 
 def test_a_motion_shorter_than_a_step_has_no_relative_error() -> None:

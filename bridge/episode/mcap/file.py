@@ -4,13 +4,22 @@ import zlib
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 from mcap import records
 from mcap.summary import Summary
 
 from bridge.episode.mcap import format as mcap_format
-from bridge.episode.mcap.format import FOOTER_FIELDS, MAGIC, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from bridge.episode.mcap.format import (
+    CHANNEL,
+    FOOTER_FIELDS,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+    SCHEMA,
+)
 from bridge.episode.mcap.rebuild import rebuild_summary
 from bridge.episode.mcap.walk import (
     BrokenRecordError,
@@ -21,6 +30,7 @@ from bridge.episode.mcap.walk import (
     parse,
     read_body,
     walk,
+    walk_section,
 )
 from bridge.errors import EpisodeError
 
@@ -183,10 +193,22 @@ def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> 
         message = "its summary has another CRC than it declares"
         raise BrokenRecordError(message)
     summary = Summary()
-    for place in walk(stream, footer.summary_start, footer_at):
-        body = section[place.offset + RECORD_HEAD.size - footer.summary_start :][: place.length]
-        _add(summary, parse(place.opcode, body))
+    start = footer.summary_start
+    for place in walk_section(section[: footer_at - start], start):
+        body = section[place.offset + RECORD_HEAD.size - start : place.end - start]
+        is_shared = place.opcode in (SCHEMA, CHANNEL) and place.length <= _SHARED_BYTES
+        _add(summary, (_parse_once if is_shared else parse)(place.opcode, body))
     return summary
+
+
+_SHARED_BYTES = 1 << 14
+"""Longer definitions are not remembered."""
+
+
+@lru_cache(maxsize=1024)
+def _parse_once(opcode: int, body: bytes) -> records.McapRecord | None:
+    """Thousands of episodes repeat the same schemas and channels; nobody changes a record."""
+    return parse(opcode, body)
 
 
 def _add(summary: Summary, record: records.McapRecord | None) -> None:

@@ -11,10 +11,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, UInt16, UInt64
 from mcap import records
 
 from bridge.episode.mcap.file import McapFile, damaged
 from bridge.episode.mcap.format import CHUNK, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from bridge.episode.mcap.table import MessageTable, mask_of, message_table, refuse_strays
 from bridge.episode.mcap.walk import (
     DAMAGE,
     BrokenRecordError,
@@ -24,7 +26,6 @@ from bridge.episode.mcap.walk import (
     message_head,
     parse_chunk,
     read_body,
-    records_in,
     unpack_chunk,
     walk,
 )
@@ -56,12 +57,6 @@ class Selection(NamedTuple):
     end_ns: int | None = None
     """Excluded."""
 
-    def has_time(self, log_time_ns: int) -> bool:
-        """Whether a log time is wanted."""
-        return (self.start_ns is None or log_time_ns >= self.start_ns) and (
-            self.end_ns is None or log_time_ns < self.end_ns
-        )
-
     def overlaps(self, start_ns: int, end_ns: int) -> bool:
         """Whether a stretch of time, ends included, holds a wanted one."""
         return (self.start_ns is None or end_ns >= self.start_ns) and (
@@ -81,6 +76,8 @@ class _OpenFile:
             for channel_id, channel in file.summary.channels.items()
             if select.topics is None or channel.topic in select.topics
         }
+        self._announced = mask_of(file.summary.channels)
+        self._chosen = mask_of(self.wanted_channels)
         self.pending = 0
         """Sources that still have messages."""
         self._stream: ByteStream | None = None
@@ -95,13 +92,19 @@ class _OpenFile:
             self._stream.close()
             self._stream = None
 
-    def wants(self, channel_id: int, log_time_ns: int) -> bool:
-        if channel_id in self.wanted_channels:
-            return self.select.has_time(log_time_ns)
-        if channel_id not in self.file.summary.channels:
-            message = f"a message is of channel {channel_id}, which was never announced"
-            raise BrokenRecordError(message)
-        return False
+    def wanted(
+        self,
+        log_times_ns: UInt64[np.ndarray, " num_messages"],
+        channel_ids: UInt16[np.ndarray, " num_messages"],
+    ) -> Bool[np.ndarray, " num_messages"]:
+        """Say of each message whether it is wanted; raises BrokenRecordError for a stray one."""
+        refuse_strays(channel_ids, self._announced)
+        wanted: Bool[np.ndarray, " num_messages"] = self._chosen[channel_ids]
+        if self.select.start_ns is not None:
+            wanted &= log_times_ns >= self.select.start_ns
+        if self.select.end_ns is not None:
+            wanted &= log_times_ns < self.select.end_ns
+        return wanted
 
 
 class _Chunk:
@@ -109,6 +112,7 @@ class _Chunk:
 
     def __init__(self, file: _OpenFile, index: records.ChunkIndex) -> None:
         self.file = file
+        self.index = index
         self.offset: int = index.chunk_start_offset
         self.size: int = index.uncompressed_size
         self.next_ns: int = index.message_start_time
@@ -122,15 +126,9 @@ class _Chunk:
         return self._wanted is not None
 
     def load(self) -> None:
-        stream = self.file.stream()
-        place = next(walk(stream, self.offset, self.file.file.data_end), None)
-        if place is None or place.opcode != CHUNK:
-            message = f"the index points at byte {self.offset}, where no chunk lies"
-            raise BrokenRecordError(message)
-        chunk = parse_chunk(read_body(stream, place))
-        self._data = unpack_chunk(chunk, whose=f"the chunk at byte {self.offset}")
+        self._data, table = read_chunk(self.file.stream(), self.index, self.file.file.data_end)
         self.size = len(self._data)
-        self._wanted = _wanted_in(self._data, self.file)
+        self._wanted = _wanted_of(table, self.file)
         self._look_ahead()
 
     def unload(self) -> None:
@@ -166,24 +164,34 @@ class _Wanted(NamedTuple):
     places: array = array("Q")  # type: ignore[type-arg]
 
 
-def _wanted_in(data: bytes, file: _OpenFile) -> _Wanted:
-    times_ns, places = array("Q"), array("Q")
-    in_order, before = True, -1
-    for opcode, at, _ in records_in(data):
-        if opcode != MESSAGE:
-            continue
-        _, _, channel_id, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(data, at)
-        if file.wants(channel_id, log_time_ns):
-            times_ns.append(log_time_ns)
-            places.append(at)
-            in_order = in_order and log_time_ns >= before
-            before = log_time_ns
-    if in_order:
-        return _Wanted(times_ns, places)
-    unsorted = np.frombuffer(times_ns, dtype=np.uint64)
-    order = np.argsort(unsorted, kind="stable")
-    by_time = array("Q", unsorted[order].tobytes())
-    return _Wanted(by_time, array("Q", np.frombuffer(places, dtype=np.uint64)[order].tobytes()))
+def _wanted_of(table: MessageTable, file: _OpenFile) -> _Wanted:
+    mask = file.wanted(table.log_times_ns, table.channel_ids)
+    times_ns, places = table.log_times_ns[mask], table.starts[mask]
+    if (times_ns[1:] < times_ns[:-1]).any():
+        order = np.argsort(times_ns, kind="stable")
+        times_ns, places = times_ns[order], places[order]
+    return _Wanted(array("Q", times_ns.tobytes()), array("Q", places.tobytes()))
+
+
+def read_chunk(
+    stream: ByteStream, index: records.ChunkIndex, data_end: int
+) -> tuple[bytes, MessageTable]:
+    """Unpack a chunk, its CRC checked, and list its messages.
+
+    Raises:
+        BrokenRecordError: When there is none where the index says, or it is damaged.
+    """
+    offset = index.chunk_start_offset
+    place = next(walk(stream, offset, data_end), None)
+    if place is None or place.opcode != CHUNK:
+        message = f"the index points at byte {offset}, where no chunk lies"
+        raise BrokenRecordError(message)
+    chunk = parse_chunk(read_body(stream, place))
+    # Whatever claims more than there is cannot be the index of this chunk.
+    length = index.message_index_length
+    listed = stream.read(length) if length <= data_end - place.end else b""
+    data = unpack_chunk(chunk, whose=f"the chunk at byte {offset}")
+    return data, message_table(data, listed)
 
 
 class _Loose:
@@ -197,9 +205,7 @@ class _Loose:
         self.file = file
         found = file.file.loose()
         times = np.array(found.log_times_ns, dtype=np.uint64)
-        wanted = np.fromiter(
-            map(file.wants, found.channel_ids, found.log_times_ns), dtype=bool, count=len(times)
-        )
+        wanted = file.wanted(times, np.array(found.channel_ids, dtype=np.uint16))
         order = np.argsort(times[wanted], kind="stable")
         self._times_ns = times[wanted][order]
         self._offsets = np.array(found.offsets, dtype=np.uint64)[wanted][order]
@@ -263,7 +269,7 @@ def merged(files: Sequence[McapFile], select: Selection) -> Iterator[Stored]:
 
 
 def _sources(file: _OpenFile) -> Iterable[_Source]:
-    if file.wanted_channels:
+    if file.wanted_channels and file.file.loose().offsets:
         loose = _Loose(file)
         if not loose.is_done:
             yield loose

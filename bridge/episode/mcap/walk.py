@@ -17,6 +17,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 
 from bridge.episode.mcap import format as mcap_format
+from bridge.episode.mcap.checksum import crc32
 from bridge.episode.mcap.format import CHUNK_FIELDS, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
 
 ByteStream = BufferedReader | BytesIO
@@ -80,20 +81,41 @@ def walk(stream: ByteStream, start: int, end: int) -> Iterator[Place]:
     at = start
     while at < end:
         stream.seek(at)
-        head = stream.read(RECORD_HEAD.size)
-        if len(head) < RECORD_HEAD.size:
-            message = f"the record at byte {at} is cut off"
-            raise BrokenRecordError(message)
-        opcode, length = RECORD_HEAD.unpack(head)
-        place = Place(opcode, at, length)
-        if opcode == 0:
-            message = f"the record at byte {at} is of kind 0, which there is not"
-            raise BrokenRecordError(message)
-        if place.end > end:
-            message = f"the record at byte {at} claims {place.length} bytes, {end - at} are left"
-            raise BrokenRecordError(message)
+        place = _place(stream.read(RECORD_HEAD.size), at, end)
         yield place
         at = place.end
+
+
+def walk_section(section: bytes, start: int) -> Iterator[Place]:
+    """Yield the places of all records of a section of a file that is in memory.
+
+    Args:
+        section: Whole records.
+        start: Where it begins in the file.
+
+    Raises:
+        BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
+    """
+    at, end = start, start + len(section)
+    while at < end:
+        front = at - start
+        place = _place(section[front : front + RECORD_HEAD.size], at, end)
+        yield place
+        at = place.end
+
+
+def _place(head: bytes, at: int, end: int) -> Place:
+    if len(head) < RECORD_HEAD.size:
+        message = f"the record at byte {at} is cut off"
+        raise BrokenRecordError(message)
+    opcode, length = RECORD_HEAD.unpack(head)
+    if opcode == 0:
+        message = f"the record at byte {at} is of kind 0, which there is not"
+        raise BrokenRecordError(message)
+    if length > end - at - RECORD_HEAD.size:
+        message = f"the record at byte {at} claims {length} bytes, {end - at} are left"
+        raise BrokenRecordError(message)
+    return Place(opcode, at, length)
 
 
 def read_body(stream: ByteStream, place: Place) -> bytes:
@@ -106,14 +128,53 @@ def read_body(stream: ByteStream, place: Place) -> bytes:
     return body
 
 
-class _ExactStream(ReadDataStream):
-    """The ``mcap`` package takes fewer bytes than asked for without a word; this does not."""
+class _Fields(ReadDataStream):
+    """Takes the fields of one record off its bytes; what runs past their end is an error.
+
+    The ``mcap`` package's own stream takes fewer bytes than asked for without a word, and needs a
+    microsecond and a half for a number.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(BytesIO())
+        self._data = data
 
     def read(self, length: int) -> bytes:
-        data = super().read(length)
+        at = self._count
+        self._count = at + length
+        data = self._data[at : at + length]
         if len(data) != length:
             raise EndOfFile
-        return bytes(data)
+        return data
+
+    def read1(self) -> int:
+        return self._number(_U8)
+
+    def read2(self) -> int:
+        return self._number(_U16)
+
+    def read4(self) -> int:
+        return self._number(_U32)
+
+    def read8(self) -> int:
+        return self._number(_U64)
+
+    def _number(self, kind: struct.Struct) -> int:
+        (value,) = kind.unpack_from(self._data, self._count)
+        self._count += kind.size
+        return int(value)
+
+    def read_prefixed_string(self) -> str:
+        (length,) = _U32.unpack_from(self._data, self._count)
+        at = self._count + _U32.size
+        self._count = at + length
+        data = self._data[at : at + length]
+        if len(data) != length:
+            raise EndOfFile
+        return data.decode()
+
+
+_U8, _U16, _U32, _U64 = map(struct.Struct, ("<B", "<H", "<I", "<Q"))
 
 
 def parse(opcode: int, body: bytes) -> records.McapRecord | None:
@@ -126,7 +187,7 @@ def parse(opcode: int, body: bytes) -> records.McapRecord | None:
     if kind is None:
         return None
     try:
-        found: records.McapRecord = kind.read(_ExactStream(BytesIO(body)))
+        found: records.McapRecord = kind.read(_Fields(body))
     except (McapError, struct.error, ValueError) as error:
         message = f"a {kind.__name__} record of {len(body)} bytes cannot be read"
         raise BrokenRecordError(message) from error
@@ -188,7 +249,7 @@ def unpack_chunk(chunk: ChunkHead, *, whose: str = "a chunk") -> bytes:
     if len(data) != chunk.size:
         message = f"{whose} has {len(data)} bytes, {chunk.size} are declared"
         raise BrokenRecordError(message)
-    if chunk.crc and zlib.crc32(data) != chunk.crc:
+    if chunk.crc and crc32(data, 0) != chunk.crc:
         message = f"{whose} has another CRC than it declares"
         raise BrokenRecordError(message)
     return data
@@ -273,7 +334,7 @@ def attachment_of(stream: ByteStream, place: Place, *, keep: bool = True) -> Fou
     """
     head_bytes = min(place.length, PIECE_BYTES)
     stream.seek(place.offset + RECORD_HEAD.size)
-    front = _ExactStream(BytesIO(stream.read(head_bytes)))
+    front = _Fields(stream.read(head_bytes))
     try:
         log_ns, create_ns = front.read8(), front.read8()
         name, media_type = front.read_prefixed_string(), front.read_prefixed_string()

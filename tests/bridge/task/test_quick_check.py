@@ -1,0 +1,139 @@
+"""The quick look at a record says yes only where jsonschema finds nothing wrong."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from jsonschema import Draft202012Validator
+
+import bridge
+import evaluator
+from bridge.errors import InvalidRecordError
+from bridge.task.quick_check import compile_check
+from bridge.task.record import check_record
+from bridge.task.verdict import Factor, Verdict
+
+SCHEMAS = {
+    path.name.removesuffix(".schema.json"): json.loads(path.read_text())
+    for package in (bridge, evaluator)
+    for path in sorted(Path(str(package.__file__)).parent.rglob("*.schema.json"))
+}
+CHECKS = {name: compile_check(schema) for name, schema in SCHEMAS.items()}
+VALIDATORS = {name: Draft202012Validator(schema) for name, schema in SCHEMAS.items()}
+
+scalars = (
+    st.none()
+    | st.booleans()
+    | st.integers(-1, 40)
+    | st.sampled_from([0.0, 1.0, 2.5, -3.0])
+    | st.sampled_from(["", "a", "success", "planned"])
+)
+anything = st.recursive(
+    scalars,
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from("abc"), inner, max_size=2)
+    ),
+    max_leaves=6,
+)
+
+
+@st.composite
+def like(draw: st.DrawFn, schema: Any, root: Any, *, odd: bool) -> Any:
+    """Draw a value that fits a schema; with ``odd``, one that here and there may not."""
+    if odd and draw(st.integers(0, 14)) == 0:
+        return draw(anything)
+    if isinstance(schema, bool):
+        return draw(anything)
+    if "$ref" in schema:
+        return draw(like(root["$defs"][schema["$ref"].rpartition("/")[2]], root, odd=odd))
+    if "const" in schema:
+        return schema["const"]
+    if "enum" in schema:
+        return draw(st.sampled_from(schema["enum"]))
+    if "oneOf" in schema:
+        return draw(like(draw(st.sampled_from(schema["oneOf"])), root, odd=odd))
+    kinds = schema.get("type", "null")
+    kind = draw(st.sampled_from([kinds] if isinstance(kinds, str) else kinds))
+    if kind == "object":
+        return draw(_object(schema, root, odd=odd))
+    if kind == "array":
+        least = schema.get("minItems", 0)
+        size = draw(st.integers(least, schema.get("maxItems", least + 2)))
+        size = max(0, size + draw(st.sampled_from([0] * 9 + [-1, 1]))) if odd else size
+        return [draw(like(schema.get("items", True), root, odd=odd)) for _ in range(size)]
+    if kind == "string":
+        pattern = schema.get("pattern")
+        return draw(st.sampled_from(["ab", "c_1"]) if pattern else st.text("ab", min_size=1))
+    if kind == "number":
+        return draw(st.integers(1, 9) | st.sampled_from([0.25, 0.5]))
+    return draw({"integer": st.integers(1, 9), "boolean": st.booleans(), "null": st.none()}[kind])
+
+
+@st.composite
+def _object(draw: st.DrawFn, schema: Any, root: Any, *, odd: bool) -> dict[str, Any]:
+    needed = schema.get("required", ())
+    found = {
+        name: draw(like(inner, root, odd=odd))
+        for name, inner in schema.get("properties", {}).items()
+        if name in needed or draw(st.booleans())
+    }
+    if isinstance(schema.get("additionalProperties"), dict):
+        found["other"] = draw(like(schema["additionalProperties"], root, odd=odd))
+    if odd and found and draw(st.integers(0, 9)) == 0:
+        found.pop(draw(st.sampled_from(sorted(found))))
+    if odd and draw(st.integers(0, 9)) == 0:
+        found["unheard_of"] = draw(anything)
+    return found
+
+
+@given(st.sampled_from(sorted(SCHEMAS)), st.data())
+def test_yes_is_never_said_to_what_jsonschema_refuses(name: str, data: st.DataObject) -> None:
+    record = data.draw(like(SCHEMAS[name], SCHEMAS[name], odd=True))
+    assert not CHECKS[name](record) or VALIDATORS[name].is_valid(record)
+
+
+@given(st.sampled_from(sorted(SCHEMAS.keys() - {"results"})), st.data())
+def test_yes_is_said_to_what_fits(name: str, data: st.DataObject) -> None:
+    record = data.draw(like(SCHEMAS[name], SCHEMAS[name], odd=False))
+    assert VALIDATORS[name].is_valid(record)
+    assert CHECKS[name](record)
+
+
+@pytest.mark.parametrize(
+    ("schema", "record"),
+    [
+        ({"const": 1}, True),
+        ({"enum": [0, 1]}, False),
+        ({"type": "integer"}, True),
+        ({"minimum": 2}, 1),
+        ({"maximum": 2}, 3),
+        ({"exclusiveMaximum": 2}, 2),
+        ({"exclusiveMinimum": 2}, 2),
+        ({"minLength": 2}, "a"),
+        ({"pattern": "^a"}, "ba"),
+        ({"additionalProperties": {"type": "string"}}, {"a": 1}),
+        ({"anyOf": [{"type": "null"}, {"minimum": 2}]}, 1),
+        ({"oneOf": [{"type": "integer"}, {"type": "number"}]}, 1),
+        ({"uniqueItems": True}, [1, 1]),
+        ({"$ref": "#/properties/a"}, 1),
+        (False, 1),
+    ],
+)
+def test_what_is_wrong_or_not_known_is_not_sure(schema: Any, record: object) -> None:
+    assert not compile_check({"items": schema})([record])
+
+
+def test_what_does_not_fit_is_still_named_by_jsonschema() -> None:
+    fine = Factor(value=True)
+    verdict = Verdict(
+        plan_id="p", trajectory="planned", mode="dynamic", ik=fine, clearance=fine, terminal=fine,
+        engine="e", seed=1,
+    )  # fmt: skip
+    record = json.loads(verdict.to_json())
+    assert check_record(record, name="verdict") is record
+    record["ik"]["bodies"] = ["arm", 7]
+    with pytest.raises(InvalidRecordError, match=r"ik/bodies/1.*7 is not of type 'string'"):
+        check_record(record, name="verdict")
