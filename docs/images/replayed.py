@@ -34,11 +34,13 @@ def columns(run: RunFolder, episode_id: str, camera_id: str) -> list[dict[int, b
 
 
 def rows(images: list[dict[int, bytes]], count: int) -> list[np.ndarray]:
-    """One picture per instant that all columns have; without any, the replay alone."""
+    """One picture per instant that all columns have; a replay that shares none stands alone.
+
+    Plans that were never executed share none with the recording and are left out beside others.
+    """
+    beside = [images[0], *(of for of in images[1:] if of.keys() & images[0].keys())]
+    images = beside if len(beside) > 1 else images[-1:]
     common = sorted(set.intersection(*map(set, images)))
-    if not common:
-        images = images[-1:]
-        common = sorted(images[0])
     places = np.linspace(FIRST, LAST, count) * (len(common) - 1)
     pictures = []
     for stamp in (common[place] for place in places.round().astype(int).tolist()):
