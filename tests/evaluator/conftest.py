@@ -274,6 +274,8 @@ def write_table(tmp_path: Path) -> Callable[[str], Path]:
 def golden_script(name: str) -> ModuleType:
     """Load a script of ``tests/golden``, which is no package."""
     path = Path(__file__).parents[1] / "golden" / f"{name}.py"
+    if str(path.parent) not in sys.path:
+        sys.path.insert(0, str(path.parent))  # scripts find their own parts beside them
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
