@@ -1,9 +1,17 @@
 """Settings for all tests."""
 
 import os
+import sys
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import lean_checks
+
+lean_checks.install()  # before any room is imported
 
 # Time limits of single examples say more about the machine's other work than about the code.
 settings.register_profile("robot-gst", deadline=None)
@@ -14,16 +22,19 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 LONG_FILES = (
-    "test_writer_killed.py",
     "test_demo.py",
-    "test_endurance.py",
     "test_real_input.py",
+    "test_endurance.py",
+    "test_killed_recorders.py",
     "test_standin_session.py",
+    "test_stalled_recorder.py",
+    "test_writer_killed.py",
 )
-"""Files of a minute or more. Workers take whole files in this order: one that came last would leave
-the other worker idle."""
+"""Files of half a minute or more. Workers take whole files in this order: one that came last would
+leave the other worker idle."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the longest files."""
-    items.sort(key=lambda item: item.path.name not in LONG_FILES)
+    order = {name: place for place, name in enumerate(LONG_FILES)}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))

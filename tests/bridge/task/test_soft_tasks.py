@@ -120,7 +120,7 @@ def test_a_basket_is_stood_in_for_by_an_open_box_and_a_toy_by_the_box_around_it(
         ('shape = "mesh"\nmesh = "sloth"', 'shape = "mesh"', "takes one of"),
         ('shape = "mesh"\nmesh = "sloth"', 'shape = "box"', "toys need a soft table"),
         ("soft = {", "# soft = {", "toys need a soft table"),
-        ("young_pa", "young_kpa", "young_pa"),
+        ("young_pa", "young_kpa", "unexpected keyword argument 'young_kpa'"),
     ],
 )
 def test_half_a_toy_is_refused(tmp_path: Path, old: str, new: str, match: str) -> None:
