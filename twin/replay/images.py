@@ -2,9 +2,9 @@
 
 The background stands still, links follow the replayed joints, rigid objects their replayed poses
 and soft ones their nodes. Everything is drawn where cameras see it: the pose bias of a calibration,
-which put objects where the robot finds them, is taken back. A plan that was executed is seen from
-where the cameras were while it was; one that never was, from the fixed cameras and from where the
-hand would have carried others.
+which put objects where the robot finds them, is taken back. An execution is seen from where the
+cameras were meanwhile. A plan is seen by the fixed cameras, and by those in the hand from where its
+own hand would have carried them: the recorded hand lags behind, and would get into their view.
 """
 
 from collections.abc import Iterator, Mapping
@@ -84,6 +84,7 @@ def render_replay(
     *,
     start_ns: int,
     executed: bool,
+    planned: bool,
     correction: Correction,
 ) -> Iterator[tuple[str, CompressedColor]]:
     """Yield camera ids with JPEG images, stamped with source times.
@@ -94,7 +95,8 @@ def render_replay(
         result: The replay.
         scene: Where it happened.
         start_ns: Source time that is the replay's time 0.
-        executed: Whether the plan was executed then, so that the cameras were where it is told.
+        executed: Whether the plan was executed then, so that there are instants to compare with.
+        planned: Whether the hand moves as planned, and cameras in it with it.
         correction: What moved localised objects into the replay's scene.
 
     Raises:
@@ -105,7 +107,7 @@ def render_replay(
     tree = streams.transform_tree(episode)
     for camera_id in streams.camera_ids(episode):
         info = streams.camera_info(episode, camera_id)
-        T_tcp_camera = None if executed else _mounting(episode, tree, info.frame_id, result)
+        T_tcp_camera = _mounting(episode, tree, info.frame_id, result) if planned else None
         for stamp_ns in _stamps(episode, camera_id, result, start_ns, executed=executed):
             index = int(np.abs(result.stamps_ns - (stamp_ns - start_ns)).argmin())
             if T_tcp_camera is None:

@@ -171,6 +171,7 @@ def _images(source: _Source, result: ReplayResult) -> tuple[tuple[str, Compresse
             source.scene,
             start_ns=source.job.start_ns,
             executed=source.job.end_ns is not None,
+            planned=source.job.trajectory == "planned",
             correction=source.correction,
         )
     )
