@@ -68,7 +68,7 @@ def compare_run(
     rows = [*(trial.row for trial in trials), *imported]
     summaries = sum_up(trials, cache, output)
     nets = open_nets(images.backbones)
-    views = compare_views(contents.derived, contents.sources, nets=nets)
+    views = compare_views(contents.derived, contents.sources, nets=nets, cache=cache)
     methods = compare_renders(images, contents.derived, contents.sources, nets=nets)
     bands = _bands(contents)
     parts = (

@@ -15,6 +15,7 @@ import numpy as np
 from bridge.episode.reader import Episode
 from bridge.errors import GstError
 from bridge.media.color import decode_color
+from evaluator.compare.cache import SummaryCache
 from evaluator.compare.image_measurements import (
     Protocol,
     StampedMeasurement,
@@ -31,9 +32,9 @@ from evaluator.compare.view_images import (
     Images,
     ViewScore,
     images_of,
-    score_views,
 )
 from evaluator.compare.view_quality import NUM_WORST, ViewQuality, shrunk_u8
+from evaluator.compare.view_summary import scored_views
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.depth import DEPTH_PROTOCOL
 from evaluator.metrics.lpips import LPIPS_NOT_COMPUTED, PerceptualNet
@@ -62,6 +63,7 @@ def compare_views(
     sources: Mapping[str, Source],
     *,
     nets: Sequence[PerceptualNet] = (),
+    cache: SummaryCache | None = None,
 ) -> ViewReport:
     """Compute every image metric of every rendered view, per image and mean.
 
@@ -69,7 +71,9 @@ def compare_views(
         files: Every derived episode of the run.
         sources: Every recorded episode by its id; views made from other bytes are left out.
         nets: For LPIPS; none leaves it out.
+        cache: What earlier evaluations scored; without one every view is.
     """
+    cache = SummaryCache(None) if cache is None else cache
     views, left_out = newest_views(files, sources)
     if not views:
         return ViewReport(
@@ -84,8 +88,10 @@ def compare_views(
         name = file.path.stem
         source = file.derived.source_episode
         try:
-            images = images_of(file.episode, opened(sources.get(source)))
-            scores, reasons = score_views(images, nets=nets)
+            recorded = sources.get(source)
+            images = images_of(file.episode, opened(recorded))
+            key = f"{file.sha256} {'-' if recorded is None else recorded[1]}"
+            scores, reasons = scored_views(images, key, cache, nets=nets)
         except GstError as error:
             left_out.append(Exclusion(episode=file.path.name, scope="views", reason=str(error)))
             continue

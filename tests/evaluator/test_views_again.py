@@ -1,0 +1,71 @@
+"""Rendered views are scored once: the second evaluation takes what is kept and says the same."""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from bridge.episode.run import RunFolder
+from evaluator.compare import Comparison, compare_run, view_summary
+from evaluator.compare.cache import FOLDER, SummaryCache
+from evaluator.result import write_results
+
+
+@pytest.fixture
+def run(tmp_path: Path, load_golden_script: Callable[[str], ModuleType]) -> RunFolder:
+    run = RunFolder.create(tmp_path / "run")
+    load_golden_script("evaluation_others").write_views(run, np.random.default_rng(1))
+    return run
+
+
+@pytest.fixture
+def scored(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many views were scored, each time."""
+    counts: list[int] = []
+    really = view_summary.score_views
+
+    def noted(images: object, **asked: object) -> object:
+        found = really(images, **asked)  # type: ignore[arg-type]
+        counts.append(len(found[0]))
+        return found
+
+    monkeypatch.setattr(view_summary, "score_views", noted)
+    return counts
+
+
+def again(run: RunFolder) -> Comparison:
+    with SummaryCache(run.results_dir / FOLDER) as cache:
+        return compare_run(run, cache=cache)
+
+
+@pytest.mark.slow
+def test_views_are_scored_once_and_again_when_they_change(
+    run: RunFolder, scored: list[int], load_golden_script: Callable[[str], ModuleType]
+) -> None:
+    results = [again(run), again(run), compare_run(run)]
+    assert scored == [6, 6]  # the first time, and without a cache
+    texts = [write_results(r.results(), run.path / "r.json").read_bytes() for r in results]
+    assert texts[0] == texts[1] == texts[2]
+    for first, second in zip(results[0].views, results[1].views, strict=True):
+        assert first.view_id == second.view_id
+        assert first.values == second.values
+        assert (first.rendered_u8 is None) == (second.rendered_u8 is None)
+        if first.rendered_u8 is not None:
+            np.testing.assert_array_equal(first.rendered_u8, second.rendered_u8)
+    next(iter(run.derived())).unlink()
+    load_golden_script("evaluation_others").write_views(run, np.random.default_rng(2))
+    other = again(run)
+    assert scored == [6, 6, 6]
+    assert other.results().get("views.all.psnr_db") != results[0].results().get("views.all.psnr_db")
+
+
+def test_what_cannot_be_scored_keeps_its_reason(tmp_path: Path, scored: list[int]) -> None:
+    with SummaryCache(tmp_path) as cache:
+        summary = view_summary.ViewSummary(reason="camera front at 1 ns: no picture", scores={})
+        cache.keep(view_summary.ViewSummary, "k", (summary,))
+    with SummaryCache(tmp_path) as cache:
+        found = view_summary.scored_views(view_summary.Images(), "k", cache)
+    assert found == ([], ["camera front at 1 ns: no picture"])
+    assert scored == []
