@@ -70,6 +70,9 @@ def test_a_publisher_killed_and_come_back_is_no_gap(cell: FaultCell) -> None:
     asker, first = cell.publisher(), cell.publisher()
     asker.ask("start", {"id": "t1", "info": {"cell": "cell"}})
     first.flow(60.0, *MIX)
+    end_s = time.monotonic() + 60.0
+    while not first.sent() and time.monotonic() < end_s:
+        time.sleep(0.02)
     time.sleep(0.6)
     first.kill()
     second = cell.publisher()
