@@ -25,7 +25,10 @@ def columns(run: RunFolder, episode_id: str, camera_id: str) -> list[dict[int, b
     source = Episode.open(run.episodes_dir / f"{episode_id}.mcap")
     found = [read_images(source).color[RECORDED]]
     for trajectory in ("planned", "executed"):
-        for path in run.derived(f"{episode_id}.replay.{trajectory}.dynamic.*"):
+        paths = run.derived(f"{episode_id}.replay.{trajectory}.dynamic.*")
+        paths.sort(key=lambda path: path.stat().st_mtime_ns)
+        newest = {path.name.split(".")[-4]: path for path in paths}  # by plan
+        for path in newest.values():
             found.append(read_images(Episode.open(path)).color[RENDERED])
     mine = [
         {stamp: data for (name, stamp), data in of.items() if name == camera_id} for of in found
