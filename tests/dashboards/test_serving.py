@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -25,18 +24,11 @@ from dashboards.guard import Admission, host_name, is_loopback
 from dashboards.library import derived_paths, episode_path
 from dashboards.server import Address, listen
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from headless import CHROMIUM, FLAGS, NO_CHROMIUM
+
 ROOT = Path(__file__).parents[2]
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-)
 
 
 def test_a_taken_port_is_one_clear_sentence() -> None:
@@ -196,7 +188,7 @@ def test_a_taken_port_ends_the_command_with_one(shared_run: RunFolder) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine (Debian: chromium)")
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
 @pytest.mark.parametrize("page", ["", "episode/trial_0001?t=2.5", "twin"])
 def test_a_real_browser_draws_the_page_without_complaint(
     shared_run: RunFolder, tmp_path: Path, page: str

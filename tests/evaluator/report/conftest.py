@@ -2,8 +2,8 @@
 
 import json
 import os
-import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,19 +11,9 @@ from typing import IO, Any
 
 import pytest
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--hide-scrollbars",
-    "--remote-debugging-pipe",
-)
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from headless import CHROMIUM, FLAGS, NO_CHROMIUM
 
 
 @dataclass
@@ -124,14 +114,15 @@ KEYS: dict[str, dict[str, Any]] = {
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     """Start Chromium once for all tests of a session."""
     if CHROMIUM is None:
-        pytest.skip("no chromium on this machine (Debian: chromium)")
+        pytest.skip(NO_CHROMIUM)
     home = tmp_path_factory.mktemp("browser")
     to_read, commands = os.pipe()
     answers, to_write = os.pipe()
     # Chromium reads commands from 3 and answers on 4.
     shell = f'exec "$@" 3<&{to_read} 4>&{to_write}'
+    flags = (*FLAGS, "--hide-scrollbars", "--remote-debugging-pipe")
     process = subprocess.Popen(
-        ["bash", "-c", shell, "bash", CHROMIUM, *FLAGS, f"--user-data-dir={home / 'profile'}"],
+        ["bash", "-c", shell, "bash", CHROMIUM, *flags, f"--user-data-dir={home / 'profile'}"],
         pass_fds=(to_read, to_write),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
