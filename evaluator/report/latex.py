@@ -1,10 +1,11 @@
 """Tables for a paper: LaTeX with booktabs, its special characters escaped."""
 
 import re
+from functools import lru_cache
 
 from evaluator.report.tables import is_number, used_columns
-from evaluator.report.wording import texts
-from evaluator.result import Table
+from evaluator.report.wording import cell_text, texts
+from evaluator.result import Cell, Table
 
 _COMMANDS = {
     "\\": r"\textbackslash{}",
@@ -64,10 +65,8 @@ def as_latex(table: Table) -> str:
     used = used_columns(table)
     align = "".join("r" if is_number(table, index) else "l" for index in used)
     head = " & ".join(latex(table.columns[index]) for index in used)
-    body = [
-        " & ".join(latex(cells[index]) for index in used) + r" \\"
-        for cells in (texts(row) for row in table.rows)
-    ]
+    written = lru_cache(maxsize=None, typed=True)(_cell)  # tables say the same again and again
+    body = [" & ".join([written(row[i]) for i in used]) + r" \\" for row in table.rows]
     columns = f"@{{}}{align}@{{}}"
     caption = rf"\caption{{{latex(table.title)}}}"
     label = rf"\label{{tab:{_NAME.sub('-', table.id)}}}"
@@ -113,6 +112,10 @@ def _is_wide(table: Table, used: list[int]) -> bool:
     """Say whether the longest cells of all columns would not fit beside each other."""
     lines = [table.columns, *(texts(row) for row in table.rows)]
     return sum(max(len(line[index]) for line in lines) + 2 for index in used) > WIDE_CHARACTERS
+
+
+def _cell(cell: Cell) -> str:
+    return latex(cell_text(cell))
 
 
 def latex(text: str) -> str:

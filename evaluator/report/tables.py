@@ -3,14 +3,15 @@
 import csv
 import io
 import shutil
+from functools import lru_cache
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from evaluator.report.wording import texts
-from evaluator.result import Table
+from evaluator.report.wording import cell_text, texts
+from evaluator.result import Cell, Table
 
 
 def used_columns(table: Table) -> list[int]:
@@ -42,8 +43,13 @@ def as_csv(table: Table) -> str:
 def as_markdown(table: Table) -> str:
     """Write a Markdown table with its title and note."""
     lines = [f"**{table.title}**", "", _bar(table.columns), _bar(["---"] * len(table.columns))]
-    lines += [_bar([text.replace("|", r"\|") for text in texts(row)]) for row in table.rows]
+    written = lru_cache(maxsize=None, typed=True)(_markdown_cell)
+    lines += [_bar([written(cell) for cell in row]) for row in table.rows]
     return "\n".join(lines) + (f"\n\n{table.note}\n" if table.note else "\n")
+
+
+def _markdown_cell(cell: Cell) -> str:
+    return cell_text(cell).replace("|", r"\|")
 
 
 def _bar(cells: tuple[str, ...] | list[str]) -> str:

@@ -164,7 +164,7 @@ def cell_text(cell: Cell) -> str:
         return "–"
     if isinstance(cell, bool):
         return "yes" if cell else "no"
-    return f"{cell:g}" if isinstance(cell, float) else str(cell)
+    return f"{cell + 0.0:g}" if isinstance(cell, float) else str(cell)  # -0.0 is 0
 
 
 def texts(row: Sequence[Cell]) -> list[str]:

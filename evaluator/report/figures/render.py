@@ -14,6 +14,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from evaluator.report.figures.drawing import LIGHT, Drawing
+from evaluator.report.figures.fonts import shared_cuts
 
 PX_PER_IN = 126
 """A figure's width on the page: 8 pt text becomes 14 px."""
@@ -66,7 +67,8 @@ def render(drawing: Drawing) -> Rendered:
         about = {"Title": drawing.title, "Creator": "robot-gst"}
         figure.savefig(svg, format="svg", metadata={**about, "Date": None})
         undated = {"CreationDate": None, "Producer": None}
-        figure.savefig(pdf, format="pdf", metadata={**about, **undated})
+        with shared_cuts():
+            figure.savefig(pdf, format="pdf", metadata={**about, **undated})
     return Rendered(
         drawing=drawing,
         svg=svg.getvalue(),

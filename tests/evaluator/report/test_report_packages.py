@@ -12,7 +12,12 @@ import pytest
 from bridge.episode.run import RunFolder
 from bridge.exchange.trials_csv import TrialRecord, read_trials
 from evaluator.compare import compare_run
-from evaluator.report.parquet import MEASUREMENT_TYPES, TRIAL_TYPES, write_trials
+from evaluator.report.parquet import (
+    MEASUREMENT_TYPES,
+    TRIAL_TYPES,
+    write_measurements,
+    write_trials,
+)
 from evaluator.report.write import summary_text, write_report
 from evaluator.result import load_results
 
@@ -144,3 +149,25 @@ def test_a_whole_evaluation_loads_neither_the_twin_nor_torch(
         check=True,
     )
     assert done.stdout.strip().endswith("0 []")
+
+
+def test_parquet_is_written_without_pandas_and_numbers_keep_their_last_bit(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; "
+        "from bridge.exchange.trials_csv import TrialRecord; "
+        "from evaluator.report.parquet import write_trials; "
+        "trial = TrialRecord(trial_id='a', task='t', p_success=0.1 + 0.2); "
+        "write_trials(Path(sys.argv[1]), [trial]); "
+        "print('pandas' in sys.modules)"
+    )
+    path = tmp_path / "t.parquet"
+    command = [sys.executable, "-c", code, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout.strip() == "False"
+    assert pd.read_parquet(path)["p_success"].tolist() == [0.1 + 0.2]
+
+
+def test_no_measurement_is_a_table_without_rows(tmp_path: Path) -> None:
+    frame = pd.read_parquet(write_measurements(tmp_path / "m.parquet", []))
+    assert list(frame.columns) == list(MEASUREMENT_TYPES)
+    assert len(frame) == 0
