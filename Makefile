@@ -1,6 +1,6 @@
 # make demo    the whole loop on a stand-in cell, ends with the dashboard's address
 # make test    all tests that need no device   make check   lint, types, import contracts
-# make soak    kills and endurance at full size (minutes), which make test runs smaller
+# make soak    kills, cuts, fuzzing, endurance at full size (minutes), smaller in make test
 # make bench   benchmarks against named references; BENCH=record picks those of the recorder
 # Everything lives in .venv; the first target run makes it (about 5 GB, a few minutes).
 
