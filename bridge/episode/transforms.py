@@ -75,6 +75,21 @@ class TransformTree:
             frame = self._parents[frame]
         return frame
 
+    def stamps_ns(self, frame: str) -> Int[np.ndarray, " num_stamps"]:
+        """When a frame's pose was stated; in between it is interpolated.
+
+        Of several transforms on the way to the root, the one that was stated most often counts.
+
+        Raises:
+            FrameNotFoundError: When no transform names the frame.
+            AmbiguousFrameError: When transforms lead to several places.
+        """
+        root, stamps = self.root_of(frame), np.zeros(0, dtype=np.int64)
+        while frame != root:
+            stamps = max(stamps, self._tracks[frame].stamps_ns, key=len)
+            frame = self._parents[frame]
+        return stamps
+
     def T_root_frame(self, frame: str, stamp_ns: int) -> Float[np.ndarray, "4 4"]:
         """Pose of a frame in its root at one instant.
 

@@ -167,7 +167,10 @@ def carried_camera(
         return None
     tree = streams.transform_tree(episode)
     robot = load_robot(track.urdf)
-    stamps = np.linspace(episode.start_ns, episode.end_ns, PROBES).astype(np.int64)
+    # By the source's clock, which may have little to do with when messages arrived; and where the
+    # camera's pose was stated, because in a fast motion what lies between may be off by much.
+    stated = np.array([t for t in tree.stamps_ns(frame_id).tolist() if track.covers(t)])
+    stamps = stated[np.linspace(0, len(stated) - 1, min(PROBES, len(stated))).round().astype(int)]
     pairs = [
         (robot.T_base_tcp(track.at(stamp).joints_rad), tree.T_root_frame(frame_id, stamp))
         for stamp in stamps.tolist()

@@ -20,6 +20,7 @@ from bridge.episode.records import (
     transforms_to_cdr,
 )
 from bridge.episode.run import RunFolder
+from bridge.episode.transforms import FrameNotFoundError, TransformTree
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
@@ -39,6 +40,8 @@ from twin.scene.store import background_hash, write_record
 
 T0 = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
+ARRIVED_NS = 3600 * SECOND
+"""The recorder's clock is far from the sources'."""
 LATE_NS = 80_000_000
 """Images are sent this long after they were taken."""
 CAMERA = Camera(width=160, height=120, fx=130.0, fy=130.0, cx=80.0, cy=60.0)
@@ -94,7 +97,8 @@ def write_recording(run: RunFolder, urdf: str) -> Episode:
         writer.describe(EpisodeInfo(id="trial_0001", kind="trial", task="cube_into_box"))
 
         def say(topic: str, data: bytes, kind: str, stamp: int) -> None:
-            writer.write(topic, data, type_name=kind, log_time_ns=stamp, publish_time_ns=stamp)
+            arrived = stamp + ARRIVED_NS
+            writer.write(topic, data, type_name=kind, log_time_ns=arrived, publish_time_ns=stamp)
 
         say("/robot_description", string_to_cdr(urdf), schema.STRING, T0)
         for name in ("side", "wrist"):
@@ -296,3 +300,16 @@ def test_what_nobody_found_is_not_drawn_where_the_scan_had_it(
     scene = script.scene(missing=("cube",))
     result = replace(result_of(full, "cube"), Ts_base_object={}, finger_contact={})
     assert np.isnan(middle_of(pictures(run, episode, result, scene)["side"][0], RED)).all()
+
+
+def test_a_camera_is_asked_for_when_its_pose_was_stated() -> None:
+    """A camera bolted to a hand that moves: the hand's transforms say when, not the bolt's."""
+
+    def at(stamp: int, parent: str, child: str) -> FrameTransform:
+        return FrameTransform(stamp_ns=stamp, parent=parent, child=child, T_parent_child=np.eye(4))
+
+    tree = TransformTree([*(at(t, "base", "hand") for t in (5, 1, 9)), at(3, "hand", "camera")])
+    assert tree.stamps_ns("camera").tolist() == [1, 5, 9]
+    assert tree.stamps_ns("base").tolist() == []
+    with pytest.raises(FrameNotFoundError):
+        tree.stamps_ns("side")
