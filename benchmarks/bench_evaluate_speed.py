@@ -81,7 +81,7 @@ def spent(work: Callable[[], object]) -> Spent:
 
 def evaluate(run: RunFolder) -> Ran:
     """Run the whole command in a process of its own."""
-    command = [sys.executable, "robot_gst.py", "evaluate", str(run.path), "--quiet"]
+    command = [sys.executable, str(ROOT / "robot_gst.py"), "evaluate", str(run.path), "--quiet"]
     began_s = time.perf_counter()
     pid = os.posix_spawn(
         command[0],

@@ -83,7 +83,8 @@ def evaluate(
         raise UsageError(message)
     written = write_report(comparison, out or folder)
     results = written.content
-    output.result(results.to_record(), summary_text(results, written))
+    record = results.to_record() if output.json else {}  # of a large run it takes a second
+    output.result(record, summary_text(results, written))
     failed = [_missed_text(item) for item in missed(thresholds, results)]
     failed += [_finding_text(item) for item in (published.failed if published else ())]
     for text in failed:

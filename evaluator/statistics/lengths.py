@@ -8,7 +8,7 @@ import math
 from collections.abc import Hashable, Sequence
 
 import numpy as np
-from scipy.stats import binom
+from scipy.special import bdtr
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
@@ -44,8 +44,10 @@ def median_interval(values: Sequence[float], *, level: float = LEVEL) -> Interva
 
 def median_rank(n: int, level: float = LEVEL) -> int:
     """Return l, counted from 1; 0 where no two values keep the level."""
-    below = binom.cdf(np.arange(n // 2 + 1), n, 0.5)  # P(B <= l - 1) for l = 1, 2 ..
-    return int((1 - 2 * below >= level).sum()) if n else 0
+    if not n:
+        return 0
+    below = bdtr(np.arange(n // 2 + 1), n, 0.5)  # P(B <= l - 1) for l = 1, 2 ..
+    return int((1 - 2 * below >= level).sum())
 
 
 def cluster_means(values: Sequence[float], clusters: Sequence[Hashable]) -> list[float]:

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 from scipy.special import ndtr
-from scipy.stats import binom
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics.proportion import normal_quantile
@@ -110,6 +109,8 @@ def power_paired(
         raise UndefinedStatisticError(
             statistic="paired power", reason=f"{num_pairs} pairs; it is counted out for 1 to 400"
         )
+    from scipy.stats import binom  # noqa: PLC0415  # half a second; beyond 400 pairs not needed
+
     total = 0.0
     for discordant in range(1, num_pairs + 1):
         chance = float(binom.pmf(discordant, num_pairs, differ))

@@ -9,7 +9,6 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy.stats import rankdata
 
 EPSILON = 1e-12
 """A variance of rates below this is rounding, not variation."""
@@ -76,7 +75,9 @@ def _spearman(counts: Counts, recorded: Side, sim: Side) -> Values:
 def _ranks(counts: Counts, side: Side) -> Counts:
     """Average ranks in each set; a cell that is there three times takes three ranks."""
     if side.ndim == 2:
-        return np.asarray(rankdata(side, axis=1), dtype=np.float64)
+        fewer = (side[:, None, :] < side[:, :, None]).sum(axis=2)
+        alike = (side[:, None, :] == side[:, :, None]).sum(axis=2)
+        return np.asarray(fewer + (alike + 1) / 2)
     below = (side[:, None] < side[None, :]).astype(np.float64)
     same = (side[:, None] == side[None, :]).astype(np.float64)
     return np.asarray(counts @ below + (counts @ same + 1) / 2)

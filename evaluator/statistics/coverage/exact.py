@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.special import gammaln, xlogy
-from scipy.stats import binom
 
 from evaluator.result import Interval
 
@@ -30,6 +29,8 @@ class Coverage:
 
 def of_rate(interval: Callable[[int, int], Interval], n: int) -> Coverage:
     """Coverage of a binomial interval at n trials, over rates 0.05 .. 0.95."""
+    from scipy.stats import binom  # noqa: PLC0415  # half a second, and only the map is made of it
+
     ends = np.array([(i.low, i.high) for i in (interval(k, n) for k in range(n + 1))])
     held = (ends[:, :1] <= RATES + ROOM) & (ends[:, 1:] >= RATES - ROOM)
     chances = binom.pmf(np.arange(n + 1)[:, None], n, RATES)
@@ -39,6 +40,8 @@ def of_rate(interval: Callable[[int, int], Interval], n: int) -> Coverage:
 
 def of_difference(interval: Callable[[int, int, int, int], Interval], n: int) -> Coverage:
     """Coverage of an interval of second - first with n trials in each of two groups."""
+    from scipy.stats import binom  # noqa: PLC0415  # as above
+
     counts = range(n + 1)
     made = [[interval(first, n, second, n) for second in counts] for first in counts]
     low = np.array([[item.low for item in row] for row in made])
