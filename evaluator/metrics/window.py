@@ -108,11 +108,14 @@ class SlidWindow:
         a, b = (image[..., channel] for image in self._images)
         height, width = a.shape
         last = first + seen.shape[1]
-        inside, columns = slice(max(first, 0), min(last, height)), slice(self._room, None)
+        start = min(max(first, 0), height)
+        inside = slice(start, max(start, min(last, height)))  # empty: a band below the image
+        columns = slice(self._room, None)
         for plane, combine in ((0, np.add), (1, np.subtract)):
             into = seen[plane, :, columns][:, :width]
-            combine(a[inside], b[inside], out=into[inside.start - first : inside.stop - first])
-            for row in (*range(first, 0), *range(height, last)):
+            if inside.stop > inside.start:
+                combine(a[inside], b[inside], out=into[inside.start - first : inside.stop - first])
+            for row in (*range(first, 0), *range(max(height, first), last)):
                 beyond = -row if row < 0 else 2 * height - 2 - row
                 into[row - first] = combine(a[beyond], b[beyond]) if self._mirrored else 0.0
         if self._mirrored:

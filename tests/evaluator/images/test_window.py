@@ -47,6 +47,16 @@ def test_every_window_says_what_its_definition_says(size: tuple[int, int], paddi
     assert ssim(first, second, padding=padding) == pytest.approx(expected.mean(), abs=1e-12)
 
 
+@pytest.mark.parametrize("height", range(WINDOW, 46))
+def test_a_last_band_may_lie_wholly_below_the_image(height: int) -> None:
+    first, second = pair((height, 13), channels=1)
+    for padding in ("zero", "reflect"):
+        found = getattr(ssim_maps(first, second), padding)
+        np.testing.assert_allclose(
+            found, plain_map(first, second, padding), rtol=0, atol=1e-11, err_msg=padding
+        )
+
+
 def test_bands_hold_each_window_once() -> None:
     first, second = pair((70, 51), channels=3)
     for padding in PADDINGS:
