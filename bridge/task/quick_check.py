@@ -24,7 +24,10 @@ _TYPES: dict[str, frozenset[type]] = {
 """Exactly these: 1.0 counts as an integer too, and is left to jsonschema as subclasses are."""
 _PLAIN = frozenset[type]().union(*_TYPES.values())
 _SCALARS = _PLAIN - {list, dict}
-_SAYING_NOTHING = frozenset({"$schema", "$defs", "title", "description", "version", "type"})
+_SAYING_NOTHING = frozenset(
+    {"$schema", "$defs", "title", "description", "version", "type", "then", "else"}
+)
+"""``then`` and ``else`` are read where their ``if`` is, and mean nothing without it."""
 
 
 def compile_check(schema: Mapping[str, Any]) -> Check:
@@ -127,6 +130,62 @@ class _Compiler:
             return _never
         return self.any_of(wanted, {})
 
+    def condition(self, wanted: Any, schema: Mapping[str, Any]) -> Check:
+        """Sure where the side that applies is, or both are; a side left out takes everything."""
+        fits, refused = self.compile(wanted), _refusal(wanted)
+        then, otherwise = (self.compile(schema.get(side, True)) for side in ("then", "else"))
+        return lambda value: (refused(value) or then(value)) and (fits(value) or otherwise(value))
+
+
+def _refusal(schema: Any) -> Check:
+    """Return what says yes to values in which jsonschema surely finds something wrong.
+
+    That no check was sure of a value does not say so. One keyword that refuses is enough, so what
+    is not known here is passed over.
+    """
+    if isinstance(schema, bool):
+        return _never if schema else (lambda value: True)
+    checks = [
+        _REFUSALS[keyword](wanted) for keyword, wanted in schema.items() if keyword in _REFUSALS
+    ]
+    return lambda value: any(refused(value) for refused in checks)
+
+
+def _type_refused(wanted: str | Sequence[str]) -> Check:
+    names = [wanted] if isinstance(wanted, str) else wanted
+    fitting = frozenset[type]().union(*(_TYPES[name] for name in names))
+    if int in fitting:
+        fitting |= {float}  # 1.0 is an integer
+    others = _PLAIN - fitting
+    return lambda value: type(value) in others
+
+
+def _options_refused(wanted: Sequence[Any]) -> Check:
+    """Python holds more for equal than JSON does: what it tells apart is not equal in JSON."""
+    return lambda value: type(value) in _SCALARS and value not in wanted
+
+
+def _required_refused(wanted: Sequence[str]) -> Check:
+    names = frozenset(wanted)
+    return lambda value: type(value) is dict and not names <= value.keys()
+
+
+def _properties_refused(wanted: Mapping[str, Any]) -> Check:
+    checks = [(name, _refusal(inner)) for name, inner in wanted.items()]
+    return lambda value: (
+        type(value) is dict
+        and any(name in value and refused(value[name]) for name, refused in checks)
+    )
+
+
+_REFUSALS: dict[str, Callable[[Any], Check]] = {
+    "type": _type_refused,
+    "const": lambda wanted: _options_refused([wanted]),
+    "enum": _options_refused,
+    "required": _required_refused,
+    "properties": _properties_refused,
+}
+
 
 def _all_of(allowed: frozenset[type], checks: Sequence[Check]) -> Check:
     if not checks:
@@ -202,6 +261,7 @@ _KEYWORDS: dict[str, Callable[[_Compiler, Any, Mapping[str, Any]], Check | None]
     "items": _Compiler.items,
     "anyOf": _Compiler.any_of,
     "oneOf": _Compiler.one_of,
+    "if": _Compiler.condition,
     "const": _const,
     "enum": _enum,
     "required": _required,

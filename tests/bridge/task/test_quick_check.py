@@ -1,11 +1,12 @@
 """The quick look at a record says yes only where jsonschema finds nothing wrong."""
 
+import copy
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
@@ -15,6 +16,7 @@ from bridge.errors import InvalidRecordError
 from bridge.task.quick_check import compile_check
 from bridge.task.record import check_record
 from bridge.task.verdict import Factor, Verdict
+from evaluator.result import Exclusion, Interval, Measurement, Results, Table
 
 SCHEMAS = {
     path.name.removesuffix(".schema.json"): json.loads(path.read_text())
@@ -68,7 +70,8 @@ def like(draw: st.DrawFn, schema: Any, root: Any, *, odd: bool) -> Any:
         pattern = schema.get("pattern")
         return draw(st.sampled_from(["ab", "c_1"]) if pattern else st.text("ab", min_size=1))
     if kind == "number":
-        return draw(st.integers(1, 9) | st.sampled_from([0.25, 0.5]))
+        below_one = st.sampled_from([0.25, 0.5])
+        return draw(below_one if "exclusiveMaximum" in schema else st.integers(1, 9) | below_one)
     return draw({"integer": st.integers(1, 9), "boolean": st.booleans(), "null": st.none()}[kind])
 
 
@@ -82,6 +85,12 @@ def _object(draw: st.DrawFn, schema: Any, root: Any, *, odd: bool) -> dict[str, 
     }
     if isinstance(schema.get("additionalProperties"), dict):
         found["other"] = draw(like(schema["additionalProperties"], root, odd=odd))
+    if "if" in schema:
+        side = "then" if Draft202012Validator(schema["if"]).is_valid(found) else "else"
+        for name, inner in schema[side]["properties"].items():
+            if name in found and not (odd and draw(st.booleans())):
+                both = {**schema["properties"][name], **inner}
+                found[name] = draw(like(both, root, odd=odd))
     if odd and found and draw(st.integers(0, 9)) == 0:
         found.pop(draw(st.sampled_from(sorted(found))))
     if odd and draw(st.integers(0, 9)) == 0:
@@ -95,11 +104,111 @@ def test_yes_is_never_said_to_what_jsonschema_refuses(name: str, data: st.DataOb
     assert not CHECKS[name](record) or VALIDATORS[name].is_valid(record)
 
 
-@given(st.sampled_from(sorted(SCHEMAS.keys() - {"results"})), st.data())
+@given(st.sampled_from(sorted(SCHEMAS)), st.data())
 def test_yes_is_said_to_what_fits(name: str, data: st.DataObject) -> None:
     record = data.draw(like(SCHEMAS[name], SCHEMAS[name], odd=False))
     assert VALIDATORS[name].is_valid(record)
     assert CHECKS[name](record)
+
+
+def places(record: Any) -> list[tuple[Any, Any]]:
+    """Return each container inside a record with each of its keys or indexes."""
+    if not isinstance(record, dict | list):
+        return []
+    keys = sorted(record) if isinstance(record, dict) else range(len(record))
+    return [(record, key) for key in keys] + [p for key in keys for p in places(record[key])]
+
+
+RESULTS = Results(
+    run="r",
+    source="run",
+    stand_in=None,
+    measurements=(
+        Measurement(
+            id="a", value=0.5, unit="1", definition="d", k=1, n=2,
+            interval=Interval(low=0.1, high=0.9, level=0.95, method="wilson"), episodes=("a", "b"),
+        ),
+        Measurement(id="b", value=None, unit="m", definition="d", reason_if_undefined="none"),
+    ),
+    tables=(Table(id="t", title="t", columns=("a", "b"), rows=(("x", 1),)),),
+    exclusions=(Exclusion(episode="c", scope="views", reason="none"),),
+).to_record()  # fmt: skip
+
+
+@settings(max_examples=200)
+@given(st.data())
+def test_one_change_to_results_that_fit_is_judged_as_jsonschema_does(data: st.DataObject) -> None:
+    assert CHECKS["results"](RESULTS)
+    spoiled = copy.deepcopy(RESULTS)
+    where = places(spoiled["measurements"]) if data.draw(st.integers(0, 4)) else places(spoiled)
+    holder, key = data.draw(st.sampled_from(where))
+    if data.draw(st.integers(0, 3)):
+        holder[key] = data.draw(anything)
+    else:
+        del holder[key]
+    fits = VALIDATORS["results"].is_valid(spoiled)
+    sure = CHECKS["results"](spoiled)
+    assert sure == fits or (fits and "1.0" in repr(spoiled))  # which is an integer, and not sure
+
+
+known = st.sampled_from(
+    [
+        True, False, {}, {"type": "integer"}, {"type": "number"}, {"type": ["null", "string"]},
+        {"const": 1}, {"const": None}, {"const": [1]}, {"enum": [0, True, "a"]}, {"minimum": 2},
+        {"required": ["a"]}, {"additionalProperties": False}, {"items": {"type": "integer"}},
+    ]
+)  # fmt: skip
+unknown = st.sampled_from([{"not": {"type": "null"}}, {"uniqueItems": True}, {"multipleOf": 2}])
+conditions = st.recursive(
+    known | unknown,
+    lambda inner: (
+        st.dictionaries(st.sampled_from("ab"), inner, min_size=1).map(lambda p: {"properties": p})
+        | st.dictionaries(st.sampled_from(["if", "then", "else"]), inner, min_size=1)
+    ),
+    max_leaves=6,
+)
+
+
+@given(conditions, conditions, conditions, anything)
+def test_a_condition_never_lets_pass_what_jsonschema_refuses(
+    wanted: Any, then: Any, otherwise: Any, value: Any
+) -> None:
+    for sides in ({"then": then}, {"else": otherwise}, {"then": then, "else": otherwise}):
+        schema = {"if": wanted, **sides}
+        assert not compile_check(schema)(value) or Draft202012Validator(schema).is_valid(value)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "value", "side"),
+    [
+        (True, 1, "then"),
+        (False, 1, "else"),
+        ({"type": "null"}, None, "then"),
+        ({"type": "null"}, 1, "else"),
+        ({"const": 1}, 1, "then"),
+        ({"const": 1}, 2, "else"),
+        ({"enum": [1, "a"]}, "b", "else"),
+        ({"required": ["a"]}, {}, "else"),
+        ({"required": ["a"]}, 3, "then"),
+        ({"properties": {"a": {"type": "null"}}}, {"a": 1}, "else"),
+        ({"properties": {"a": {"type": "null"}}}, {}, "then"),
+        ({"type": "integer"}, 1.0, None),
+        ({"const": 1}, True, None),
+        ({"const": 1}, 1.0, None),
+        ({"minimum": 2}, 1, None),
+        ({"uniqueItems": True}, [1], None),
+    ],
+)
+def test_a_condition_picks_one_side_where_it_is_sure_and_else_asks_for_both(
+    wanted: Any, value: Any, side: str | None
+) -> None:
+    assert compile_check({"if": wanted, "then": False})(value) == (side == "else")
+    assert compile_check({"if": wanted, "else": False})(value) == (side == "then")
+    assert compile_check({"if": wanted, "then": True, "else": True})(value)
+
+
+def test_sides_without_a_condition_mean_nothing() -> None:
+    assert compile_check({"then": False, "else": False})(1)
 
 
 @pytest.mark.parametrize(
