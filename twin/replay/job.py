@@ -19,7 +19,7 @@ from twin.replay.failure import NOT_EVALUATED
 from twin.replay.rollout import KINEMATIC_ENGINE, engine_of
 from twin.replay.starts import StartState
 
-REPLAY_VERSION = 13
+REPLAY_VERSION = 14
 """Raise it when the same inputs give another replay, so that old files are redone."""
 
 MAY_STAY_OPEN = ("settled", "shape")

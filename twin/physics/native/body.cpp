@@ -192,6 +192,23 @@ void Body::look_around() {
     top_speed = std::sqrt(fastest);
     box = {origin + widen(low), origin + widen(high)};
     recentre(widen(low + high) * 0.5);
+    update_normals();
+}
+
+void Body::update_normals() {
+    normals.assign(num_nodes, Float3{0, 0, 0});
+    for (std::size_t t = 0; t < triangles.size(); t += 3) {
+        const std::int32_t* ids = triangles.data() + t;
+        const Float3 a = at(ids[0]);
+        const Float3 normal = soft::cross(at(ids[1]) - a, at(ids[2]) - a);
+        for (int k = 0; k < 3; ++k) normals[ids[k]] = normals[ids[k]] + normal;
+    }
+}
+
+Float3 Body::sample_facing(const Sample& s) const {
+    const Float3 sum = normals[s.ids[0]] + normals[s.ids[1]];
+    const float length = norm(sum);
+    return length > 0.0f ? sum * (1.0f / length) : Float3{0, 0, 0};
 }
 
 void Body::recentre(const Double3& middle) {

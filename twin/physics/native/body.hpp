@@ -18,6 +18,7 @@ struct Contact {
     std::int32_t collider;
     bool holds = false;        // it touched in the last substep
     std::int32_t face = -1;    // of the piece, through which the sample came in
+    Float3 facing{0, 0, 0};    // outward normal of the body's surface there, base frame
     Float3 anchor{0, 0, 0};    // where friction holds it, in the piece's frame
 };
 
@@ -59,6 +60,7 @@ class Body {
     Material material;
     std::vector<Sample> samples;
     std::vector<std::int32_t> triangles;
+    std::vector<Float3> normals;  // of the surface, by node, of no particular length
     double friction, damping_s, damping_rate, spacing;
     int num_nodes;
     bool lost = false;          // its nodes are no numbers any more
@@ -86,6 +88,7 @@ class Body {
     Float3 sample_started(const Sample& s) const {
         return (started(s.ids[0]) + started(s.ids[1])) * 0.5f;
     }
+    Float3 sample_facing(const Sample& s) const;  // length 1, or 0 where the surface has none
     // What a force on a sample accelerates it by, and how a shift of the sample moves its nodes.
     float sample_inverse_mass(const Sample& s) const {
         return s.ids[0] == s.ids[1] ? inverse_mass(s.ids[0])
@@ -93,7 +96,7 @@ class Body {
     }
     void shift_sample(const Sample& s, const Float3& by, float sample_inverse_mass);
 
-    void look_around();                       // box, speed, origin
+    void look_around();                       // box, speed, origin, normals
     void predict(double gravity, float step_s, const Kernels& kernels);
     void relax(const Kernels& kernels) {
         kernels.relax(blocks.data(), static_cast<int>(blocks.size()), p.data(), start.data(),
@@ -113,6 +116,7 @@ class Body {
     double mass_ = 0.0;
 
     Tet tet_of(std::int32_t t, double step_s) const;
+    void update_normals();
     void recentre(const Double3& middle);
 };
 

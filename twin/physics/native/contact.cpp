@@ -14,6 +14,9 @@ namespace soft {
 namespace {
 
 constexpr double kMargin = 0.002;       // contacts are looked for this far off the surface [m]
+// A face that a surface does not look at counts as farther, by this share of a cell per unit of
+// cosine. Measured: with 1/16 toys hang on a finger's rim, with 1 the softest slip out of the hand.
+constexpr float kFacing = 0.125f;
 constexpr float kEasing = 0.1f;         // speed at which bodies that already overlap part [m/s]
 
 bool overlap(const Box& a, const Box& b, double margin) {
@@ -44,6 +47,28 @@ float eased(float depth, float approach, float step_s) {
     return std::min(depth, std::max(approach, 0.0f) + kEasing * step_s);
 }
 
+bool inside(const Collider& piece, const Float3& q) {
+    for (const Plane& plane : piece.planes)
+        if (dot(plane.n, q) > plane.d) return false;
+    return !piece.planes.empty();
+}
+
+// The face by which a sample came in: one that is near, and that its surface looks at. Nearness
+// alone lets what bulges beside a finger come down onto the finger's rim, which then carries it.
+std::int32_t entered(const Collider& piece, const Float3& q, const Float3& facing, float spacing) {
+    std::int32_t best = 0;
+    float least = std::numeric_limits<float>::max();
+    for (std::size_t k = 0; k < piece.planes.size(); ++k) {
+        const Plane& plane = piece.planes[k];
+        const float way = plane.d - dot(plane.n, q) + kFacing * spacing * dot(plane.n, facing);
+        if (way < least) {
+            least = way;
+            best = static_cast<std::int32_t>(k);
+        }
+    }
+    return best;
+}
+
 Float3 friction_shift(const Float3& slip, const Float3& n, float reach) {
     const Float3 along = slip - n * dot(slip, n);
     const float length = norm(along);
@@ -67,7 +92,10 @@ void find_contacts(Body& body, const Collider& collider, int index, double perio
                 near = false;
                 break;
             }
-        if (near) body.contacts.push_back({s, index});
+        if (!near) continue;
+        Contact contact{s, index};
+        contact.facing = body.sample_facing(body.samples[s]);
+        body.contacts.push_back(contact);
     }
 }
 
@@ -80,7 +108,10 @@ void keep_anchors(Body& body) {
     for (Contact& contact : body.contacts) {
         while (old < body.past_contacts.size() && before(body.past_contacts[old], contact)) ++old;
         if (old == body.past_contacts.size()) return;
-        if (!before(contact, body.past_contacts[old])) contact = body.past_contacts[old];
+        if (before(contact, body.past_contacts[old])) continue;
+        const Float3 facing = contact.facing;
+        contact = body.past_contacts[old];
+        contact.facing = facing;
     }
 }
 
@@ -91,34 +122,23 @@ void solve_contacts(Body& body, std::vector<Collider>& colliders, float step_s) 
         Collider& piece = colliders[index];
         const Frame frame(piece.rotation(), piece.position(), body.origin);
         const float mu = static_cast<float>(piece.friction * body.friction);
+        const float spacing = static_cast<float>(body.spacing);
         Double3 push{0, 0, 0};
         for (; n < body.contacts.size() && body.contacts[n].collider == index; ++n) {
             Contact& contact = body.contacts[n];
             const Sample& sample = body.samples[contact.sample];
             const Float3 p = body.sample_at(sample);
             const Float3 q = frame.inward(p) + frame.offset;
-            float best = -std::numeric_limits<float>::max();
-            const Plane* face = nullptr;
-            for (const Plane& plane : piece.planes) {
-                const float d = dot(plane.n, q) - plane.d;
-                if (d > best) {
-                    best = d;
-                    face = &plane;
-                }
-                if (best > 0.0f) break;
-            }
-            if (best > 0.0f || !face) {
+            if (!inside(piece, q)) {
                 contact.holds = false;
                 continue;
             }
             // Pressed in deeply a sample may come nearer to a side: pushed out there, the body would
             // hook itself onto the piece.
-            if (contact.holds) {
-                face = &piece.planes[contact.face];
-                best = dot(face->n, q) - face->d;
-            } else {
-                contact.face = static_cast<std::int32_t>(face - piece.planes.data());
-            }
+            if (!contact.holds)
+                contact.face = entered(piece, q, frame.inward(contact.facing), spacing);
+            const Plane* face = &piece.planes[contact.face];
+            const float best = dot(face->n, q) - face->d;
             const Float3 normal = frame.outward(face->n);
             const Double3 place = widen(p) + body.origin;
             Float3 slip = p - body.sample_started(sample);
