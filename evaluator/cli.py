@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from bridge.terminal import Output
+from evaluator.collecting import without_collecting
 from evaluator.live.config import LiveConfig
 from evaluator.metrics.options import ImageOptions
 
@@ -56,6 +57,7 @@ def evaluate(
     """
     from bridge.errors import UsageError
     from evaluator.compare.published import check_published as recompute
+    from evaluator.report.figures.beside import beside
     from evaluator.report.write import summary_text, write_report
     from evaluator.thresholds import missed, parse_thresholds
 
@@ -66,6 +68,7 @@ def evaluate(
         return _follow(source, live, goal, output)
     thresholds = [] if fail_under is None else parse_thresholds(fail_under)
     published = None if check_published is None else recompute(check_published)
+    second = beside(source)
     if source is not None:
         comparison, folder = _compare(source, interval, goal, images, force, output)
         if published is not None:
@@ -81,7 +84,8 @@ def evaluate(
             "FOLDER with --renders METHOD=FOLDER."
         )
         raise UsageError(message)
-    written = write_report(comparison, out or folder)
+    with without_collecting():
+        written = write_report(comparison, out or folder, second)
     results = written.content
     record = results.to_record() if output.json else {}  # of a large run it takes a second
     output.result(record, summary_text(results, written))
@@ -92,6 +96,7 @@ def evaluate(
     return THRESHOLD_NOT_MET if failed else 0
 
 
+@without_collecting()
 def _compare(
     source: Path,
     interval: str,

@@ -68,16 +68,16 @@ def read_contents(run: RunFolder, cache: SummaryCache, output: Output) -> RunCon
     )
     return RunContents(
         recorded=tuple(
-            RecordedFile(file=file, facts=recorded[file.path])
+            RecordedFile(file=file, facts=recorded[file.name])
             for file in inventory.recorded
-            if file.path in recorded
+            if file.name in recorded
         ),
         derived=tuple(
             DerivedFile(
-                path=file.path, name=file.name, sha256=file.sha256, facts=derived[file.path]
+                path=file.path, name=file.name, sha256=file.sha256, facts=derived[file.name]
             )
             for file in inventory.derived
-            if file.path in derived
+            if file.name in derived
         ),
         left_out=(*inventory.left_out, *left_out, *broken),
     )
@@ -101,14 +101,15 @@ def _read(
     read: Callable[[RunFile], Facts],
     cache: SummaryCache,
     output: Output,
-) -> tuple[dict[Path, Facts], list[Exclusion]]:
-    facts: dict[Path, Facts] = {}
+) -> tuple[dict[str, Facts], list[Exclusion]]:
+    """Return what the files say of themselves, by name, and the files left out."""
+    facts: dict[str, Facts] = {}
     unknown: list[RunFile] = []
     left_out: list[Exclusion] = []
     for file in files:
         kept = cache.find(kind, key(file))
         if kept:
-            facts[file.path] = kept[0]
+            facts[file.name] = kept[0]
         else:
             unknown.append(file)
     if not unknown:
@@ -120,7 +121,7 @@ def _read(
             except ODD as error:
                 left_out.append(broken(file.path.name, error))
             else:
-                facts[file.path] = made
+                facts[file.name] = made
                 if not made.broken:  # a message names the folder, which may move
                     cache.keep(kind, key(file), (made,))
             advance(done, file.path.name)

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.episode.catalogue.entry import trace
+from bridge.episode.catalogue.entry import stamp_of
 from bridge.episode.provenance import hash_files
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder, grouped_parts
@@ -57,7 +57,9 @@ class Inventory:
 
 @dataclass(frozen=True, kw_only=True)
 class _Seen:
-    parts: list[Path]
+    folder: Path
+    names: list[str]
+    """Of all parts."""
     name: str
     is_derived: bool
     stamp: str
@@ -65,7 +67,11 @@ class _Seen:
 
     @property
     def path(self) -> Path:
-        return self.parts[0]
+        return self.folder / self.names[0]
+
+    @property
+    def parts(self) -> list[Path]:
+        return [self.folder / name for name in self.names]
 
 
 def take_inventory(run: RunFolder, cache: SummaryCache, output: Output) -> Inventory:
@@ -88,12 +94,12 @@ def _look(run: RunFolder) -> Iterator[_Seen]:
     groups = [(recorded, parts) for parts in grouped_parts(_names(recorded)).values()]
     groups += [(derived, [name]) for name in _names(derived)]
     for folder, names in groups:
-        parts = [folder / name for name in names]
         yield _Seen(
-            parts=parts,
+            folder=folder,
+            names=names,
             name=f"{folder.name}/{names[0]}",
             is_derived=folder is derived,
-            stamp=trace(run, parts[0], set(), now_ns, parts).stamp,
+            stamp=stamp_of([os.path.join(folder, name) for name in names], now_ns),  # noqa: PTH118
         )
 
 

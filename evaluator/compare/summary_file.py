@@ -4,10 +4,8 @@ Text, numbers and answers are columns of their own, tuples of them are lists, an
 JSON text. Importing this module loads pyarrow; ``cache`` does so only when a cache is asked for.
 """
 
-import gc
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -18,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bridge.whole_file import write_whole
+from evaluator.collecting import without_collecting
 from evaluator.compare.typed_json import Reader, as_it_is, reader, to_text, without_none
 
 Summary = TypeVar("Summary")
@@ -79,7 +78,7 @@ def read_summaries(path: Path, kind: type[Summary], version: str) -> dict[str, t
             if said.get(_VERSION) != version.encode():
                 message = "another version of this program wrote it"
                 raise UnusableFileError(message)
-            with _without_collecting():
+            with without_collecting():
                 return _unpacked(kind, file.read())
     except FileNotFoundError:
         raise
@@ -161,18 +160,6 @@ def _maker(kind: type[Summary]) -> Callable[[Iterable[tuple[str, Any]]], Summary
         return item
 
     return make
-
-
-@contextmanager
-def _without_collecting() -> Iterator[None]:
-    """Spare the garbage collector a look at a million new objects, of which none is garbage."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
 
 
 def _values(column: pa.ChunkedArray) -> list[Any]:

@@ -5,6 +5,7 @@ Opens no file, so that listing what is known costs no more than a look at the fo
 
 import os
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -104,17 +105,22 @@ def trace(
     label = f"{path.stem}{LABEL_SUFFIX}"
     if labels is None or label in labels:
         files.append(run.notes_dir / label)
+    return Trace(path, stamp_of(files, now_ns))
+
+
+def stamp_of(files: Iterable[Path | str], now_ns: int) -> str:
+    """Return size, times and inode of each file; "" when one changed a moment ago."""
     marks = []
     for file in files:
         try:
-            found = file.stat()
+            found = os.stat(file)  # noqa: PTH116  # half the time of the method, for many files
         except OSError:
             marks.append("-")
             continue
         if abs(now_ns - found.st_mtime_ns) < UNSETTLED_NS:
-            return Trace(path, "")
+            return ""
         marks.append(f"{found.st_size}.{found.st_mtime_ns}.{found.st_ctime_ns}.{found.st_ino}")
-    return Trace(path, " ".join(marks))
+    return " ".join(marks)
 
 
 def printable(text: str) -> str:

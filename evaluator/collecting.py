@@ -1,0 +1,22 @@
+"""Spare the garbage collector a look at millions of objects of which none is garbage."""
+
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def without_collecting() -> Iterator[None]:
+    """Let only reference counts free memory, as long as the block lasts.
+
+    An evaluation makes frozen records by the million and drops them all at its end. Looking for
+    cycles among them took a fifth of its time. For blocks that end: what follows a session does
+    not use it.
+    """
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
