@@ -1,25 +1,22 @@
 """Put one comparison on disk: results.json, tables, figures, report.html, trials.csv, Parquet."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from bridge.exchange.trials_csv import TrialRecord, write_trials
 from evaluator.compare.rows import Comparison
 from evaluator.compare.spreadsheet import record_from_row
 from evaluator.errors import EvaluatorError
-from evaluator.report.figures.chosen import drawings
-from evaluator.report.figures.drawing import Drawing, NotDrawn
+from evaluator.report.figures.beside import Beside
+from evaluator.report.figures.chosen import drawable, drawings_of
+from evaluator.report.figures.drawing import Drawing, NotDrawn, Rendered
 from evaluator.report.figures.views import worst_pairs
 from evaluator.report.latex import as_latex
 from evaluator.report.page import page
 from evaluator.report.tables import as_csv, as_markdown, as_text
 from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
-
-if TYPE_CHECKING:
-    from evaluator.report.figures.render import Rendered
 
 SHOWN = ("published", "success", "layout", "gains", "image_methods", "stopping", "remarks")
 """Tables a terminal shows; the others are in the report."""
@@ -42,39 +39,42 @@ class Written:
     """Which packages are not installed and what is missing for it, or None."""
 
 
-def write_report(comparison: Comparison, folder: Path) -> Written:
+def write_report(comparison: Comparison, folder: Path, beside: Beside | None = None) -> Written:
     """Write every file of one evaluation into ``folder``, replacing an earlier one.
+
+    Args:
+        comparison: What to report.
+        folder: Where to.
+        beside: Draws the figures meanwhile; they are the same without it.
 
     Raises:
         EvaluatorError: When the folder cannot be written.
     """
-    drawn, not_drawn = drawings(comparison)
+    shown = drawable(comparison)
+    if beside is not None:
+        beside.send(shown)
+    drawn, not_drawn = drawings_of(shown)
     results = comparison.results()
     if not_drawn:
         words = "; ".join(f"{item.id} ({item.reason})" for item in not_drawn)
         missing = f"figures without data, not drawn: {words}"
         results = replace(results, missing=(*results.missing, missing))
     path = write_results(results, folder / "results.json")
-    rendered, no_figures = _render(drawn)
-    inline = {item.drawing.id: item.inline for item in rendered}
-    text = page(
-        results,
-        [(drawing, inline.get(drawing.id)) for drawing in drawn],
-        worst_pairs(comparison.views),
-    )
-    contents = {folder / "report.html": text.encode()}
-    contents |= _figure_files(folder / "figures", drawn, rendered)
-    for table in results.tables:
-        for suffix, write in (("csv", as_csv), ("md", as_markdown), ("tex", as_latex)):
-            contents[folder / "tables" / f"{table.id}.{suffix}"] = write(table).encode()
     try:
-        for place, data in contents.items():
-            place.parent.mkdir(parents=True, exist_ok=True)
-            place.write_bytes(data)
+        tables = _write(_table_files(folder / "tables", results))
         _remove_old(folder, not_drawn)
         trials = [record_from_row(row) for row in comparison.rows]
         extra = [write_trials(folder / "trials.csv", trials)] if trials else []
         parquet, no_parquet = _write_parquet(folder, trials, results)
+        rendered, no_figures = _render(drawn, beside)
+        inline = {item.drawing.id: item.inline for item in rendered}
+        text = page(
+            results,
+            [(drawing, inline.get(drawing.id)) for drawing in drawn],
+            worst_pairs(comparison.views),
+        )
+        report = {folder / "report.html": text.encode()}
+        shown_files = _write(report | _figure_files(folder / "figures", drawn, rendered))
     except OSError as error:
         message = f"cannot write into {folder}: {error.strerror}. Choose another with --out."
         raise EvaluatorError(message) from error
@@ -82,15 +82,20 @@ def write_report(comparison: Comparison, folder: Path) -> Written:
         content=results,
         results=path,
         report=folder / "report.html",
-        files=(*contents, *extra, *parquet),
+        files=(*shown_files, *tables, *extra, *parquet),
         not_written="; ".join(filter(None, (no_figures, no_parquet))) or None,
     )
 
 
-def _render(drawn: Sequence[Drawing]) -> "tuple[list[Rendered], str | None]":
+def _render(
+    drawn: Sequence[Drawing], beside: Beside | None
+) -> tuple[Sequence[Rendered], str | None]:
     """Draw the figures, or say why not; matplotlib is heavy and may be missing."""
     if not drawn:
         return [], None
+    found = None if beside is None else beside.take(drawn)
+    if found is not None:
+        return found, None
     try:
         from evaluator.report.figures import render  # noqa: PLC0415  # loads matplotlib
     except ModuleNotFoundError as error:
@@ -100,8 +105,23 @@ def _render(drawn: Sequence[Drawing]) -> "tuple[list[Rendered], str | None]":
     return [render.render(drawing) for drawing in drawn], None
 
 
+def _write(contents: Mapping[Path, bytes]) -> list[Path]:
+    for place, data in contents.items():
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(data)
+    return list(contents)
+
+
+def _table_files(folder: Path, results: Results) -> dict[Path, bytes]:
+    return {
+        folder / f"{table.id}.{suffix}": write(table).encode()
+        for table in results.tables
+        for suffix, write in (("csv", as_csv), ("md", as_markdown), ("tex", as_latex))
+    }
+
+
 def _figure_files(
-    folder: Path, drawn: Sequence[Drawing], rendered: "Sequence[Rendered]"
+    folder: Path, drawn: Sequence[Drawing], rendered: Sequence[Rendered]
 ) -> dict[Path, bytes]:
     files = {folder / f"{drawing.id}.csv": as_csv(drawing.table).encode() for drawing in drawn}
     for item in rendered:

@@ -60,6 +60,18 @@ class Drawing:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Rendered:
+    """One figure, ready to be written."""
+
+    drawing: Drawing
+    svg: bytes
+    """A file of its own, in the colours of print."""
+    pdf: bytes
+    inline: str
+    """For a page that defines the colours; its ids start with the figure's."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class NotDrawn:
     """A figure without data."""
 

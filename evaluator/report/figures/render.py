@@ -6,14 +6,13 @@ the clock, on chance or on the fonts of the machine, so the same results give th
 
 import io
 import re
-from dataclasses import dataclass
 from html import escape
 from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from evaluator.report.figures.drawing import LIGHT, Drawing
+from evaluator.report.figures.drawing import LIGHT, Drawing, Rendered
 from evaluator.report.figures.fonts import shared_cuts
 
 PX_PER_IN = 126
@@ -46,18 +45,6 @@ _COLOURS = {value: name for name, value in LIGHT.items()}
 _COLOUR = re.compile("|".join(_COLOURS))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rendered:
-    """One figure, ready to be written."""
-
-    drawing: Drawing
-    svg: bytes
-    """A file of its own, in the colours of print."""
-    pdf: bytes
-    inline: str
-    """For a page that defines the colours; its ids start with the figure's."""
-
-
 def render(drawing: Drawing) -> Rendered:
     """Draw one figure in all forms."""
     with mpl.rc_context(STYLE):
@@ -75,6 +62,16 @@ def render(drawing: Drawing) -> Rendered:
         pdf=pdf.getvalue(),
         inline=_inline(svg.getvalue().decode(), drawing),
     )
+
+
+def warm_up() -> None:
+    """Load what the first figure would: fonts, writers of both kinds, a cut of the font."""
+    with mpl.rc_context(STYLE):
+        figure = Figure()
+        figure.add_subplot().text(0.5, 0.5, "%")
+        figure.savefig(io.BytesIO(), format="svg")
+        with shared_cuts():
+            figure.savefig(io.BytesIO(), format="pdf")
 
 
 def _inline(svg: str, drawing: Drawing) -> str:

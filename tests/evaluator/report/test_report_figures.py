@@ -10,8 +10,8 @@ from bridge.episode.run import RunFolder
 from evaluator.compare import Comparison, compare_csv, compare_run
 from evaluator.report.figures.agreement import scatter, success
 from evaluator.report.figures.chosen import drawings
-from evaluator.report.figures.drawing import DARK, LIGHT, Drawing, NotDrawn
-from evaluator.report.figures.render import Rendered, render
+from evaluator.report.figures.drawing import DARK, LIGHT, Drawing, NotDrawn, Rendered
+from evaluator.report.figures.render import render
 from evaluator.report.sections import SECTIONS
 from evaluator.report.write import write_report
 

@@ -1,0 +1,145 @@
+"""Draw the figures of a large run in a second process, while the first compares and writes.
+
+Loading matplotlib and drawing take three seconds that nothing else of an evaluation waits for. The
+process speaks over its standard streams alone, so it ends when the command that started it ends,
+however that ends; and whatever becomes of it, the same figures can be drawn without it.
+"""
+
+import os
+import pickle
+import queue
+import subprocess
+import sys
+import threading
+import weakref
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from evaluator.report.figures.drawing import Drawing, Rendered
+
+if TYPE_CHECKING:
+    from evaluator.report.figures.chosen import Drawable
+
+MIN_FILES = 2000
+"""Recorded and derived files from which a second process is worth it.
+
+It needs about two seconds until it can draw; comparing 2000 kept files takes about one, and the
+second core is not there for nothing: for smaller runs it would be waited for.
+"""
+MAX_WAIT_S = 60.0
+"""For what takes three seconds; a process that hangs must not hold the report."""
+Forms = tuple[bytes, bytes, str]
+"""SVG, PDF and the SVG for the page."""
+
+
+class Beside:
+    """A second process that draws; it ends with this object, or with the program."""
+
+    def __init__(self) -> None:
+        """Start it; it loads matplotlib at once.
+
+        Raises:
+            OSError: When the system gives no further process.
+        """
+        places = os.pathsep.join(place or os.getcwd() for place in sys.path)  # noqa: PTH109
+        self.process = subprocess.Popen(
+            [sys.executable, "-P", "-m", __name__],  # the program's own main module stays unloaded
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": places},
+        )
+        self.end = weakref.finalize(self, _end, self.process)
+        """End the process and wait for it; does nothing the second time."""
+
+    def send(self, data: "Drawable") -> None:
+        """Hand over what is to be drawn, and go on."""
+        assert self.process.stdin is not None  # noqa: S101  # for the type checker
+        with suppress(OSError):  # it has ended, and ``take`` says so
+            self.process.stdin.write(pickle.dumps(data))
+            self.process.stdin.flush()
+
+    def take(self, drawn: Sequence[Drawing]) -> list[Rendered] | None:
+        """Wait for the figures and end the process.
+
+        Args:
+            drawn: What the data that was sent is drawn as.
+
+        Returns:
+            The figures in this order, or None when the process did not bring them to an end.
+        """
+        assert self.process.stdout is not None  # noqa: S101  # for the type checker
+        limit = threading.Timer(MAX_WAIT_S, self.process.kill)
+        limit.start()
+        try:
+            found: dict[str, Forms] = pickle.load(self.process.stdout)
+            return [_rendered(drawing, found[drawing.id]) for drawing in drawn]
+        except (EOFError, OSError, pickle.UnpicklingError):
+            return None
+        finally:
+            limit.cancel()
+            self.end()
+
+
+def beside(source: Path | None) -> Beside | None:
+    """Start a process for the figures of a large run; None where drawing here is as quick."""
+    if source is None or (os.cpu_count() or 1) < 2:
+        return None
+    try:
+        files = sum(len(os.listdir(source / name)) for name in ("episodes", "derived"))  # noqa: PTH208
+        return Beside() if files >= MIN_FILES else None
+    except OSError:  # no run folder, or no process to be had
+        return None
+
+
+def _rendered(drawing: Drawing, forms: Forms) -> Rendered:
+    svg, pdf, inline = forms
+    return Rendered(drawing=drawing, svg=svg, pdf=pdf, inline=inline)
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    process.kill()
+    with suppress(OSError), process:  # closes the pipes, one perhaps half written, and waits
+        pass
+
+
+def serve(inbox: BinaryIO, outbox: BinaryIO) -> None:
+    """Load what drawing needs, then draw what arrives; end as soon as nobody is left to draw for.
+
+    Args:
+        inbox: Brings one pickled ``Drawable``, then nothing until whoever sent it has ended.
+        outbox: Takes a pickled dictionary: the forms of each figure by its id.
+    """
+    arrived: queue.SimpleQueue[Drawable] = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(inbox, arrived), daemon=True).start()
+    from evaluator.report.figures.chosen import drawings_of  # noqa: PLC0415  # loads the numbers
+    from evaluator.report.figures.render import render, warm_up  # noqa: PLC0415  # and matplotlib
+
+    warm_up()
+    found: dict[str, Forms] = {}
+    for drawing in drawings_of(arrived.get())[0]:
+        item = render(drawing)
+        found[drawing.id] = (item.svg, item.pdf, item.inline)
+    outbox.write(pickle.dumps(found))
+    outbox.flush()
+
+
+def _listen(inbox: BinaryIO, arrived: "queue.SimpleQueue[Drawable]") -> None:
+    with suppress(EOFError, OSError):
+        arrived.put(pickle.load(inbox))
+        inbox.read(1)
+    os._exit(0)  # in the middle of a figure too: nobody waits for it
+
+
+def _main() -> None:
+    to_parent = os.dup(1)
+    with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
+        os.dup2(nowhere.fileno(), 1)  # a library that prints must not speak to the parent
+    with open(0, "rb", closefd=False) as inbox, open(to_parent, "wb") as outbox:  # noqa: PTH123
+        serve(inbox, outbox)
+
+
+if __name__ == "__main__":
+    _main()
