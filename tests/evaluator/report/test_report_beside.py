@@ -133,7 +133,8 @@ def test_the_process_ends_with_its_object_and_with_the_program() -> None:
 
 
 INTERRUPTED = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in a background
 import robot_gst
 import evaluator.compare
 from evaluator.report.figures import beside
