@@ -6,11 +6,15 @@ where jsonschema finds nothing wrong (``test_quick_check`` compares the two); wh
 jsonschema, which alone says what does not fit and where.
 """
 
+import operator
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Sized
 from typing import Any
 
 Check = Callable[[Any], bool]
+Comparison = Callable[[Any, Any], bool]
+Keyword = Callable[["_Compiler", Any, Mapping[str, Any]], Check | None]
+"""Makes the check of one keyword from what it asks for and the schema it stands in."""
 
 _TYPES: dict[str, frozenset[type]] = {
     "string": frozenset({str}),
@@ -221,16 +225,8 @@ def _required(_: _Compiler, wanted: Sequence[str], __: Mapping[str, Any]) -> Che
     return lambda value: type(value) is not dict or names <= value.keys()
 
 
-def _min_items(_: _Compiler, wanted: int, __: Mapping[str, Any]) -> Check:
-    return lambda value: type(value) is not list or len(value) >= wanted
-
-
-def _max_items(_: _Compiler, wanted: int, __: Mapping[str, Any]) -> Check:
-    return lambda value: type(value) is not list or len(value) <= wanted
-
-
-def _min_length(_: _Compiler, wanted: int, __: Mapping[str, Any]) -> Check:
-    return lambda value: type(value) is not str or len(value) >= wanted
+def _sized(kind: type[Sized], holds: Comparison) -> Keyword:
+    return lambda _, wanted, __: lambda value: type(value) is not kind or holds(len(value), wanted)
 
 
 def _pattern(_: _Compiler, wanted: str, __: Mapping[str, Any]) -> Check:
@@ -238,23 +234,13 @@ def _pattern(_: _Compiler, wanted: str, __: Mapping[str, Any]) -> Check:
     return lambda value: type(value) is not str or found(value) is not None
 
 
-def _minimum(_: _Compiler, wanted: int | float, __: Mapping[str, Any]) -> Check:
-    return lambda value: type(value) not in (int, float) or value >= wanted
+def _bound(holds: Comparison) -> Keyword:
+    return lambda _, wanted, __: (
+        lambda value: type(value) not in (int, float) or holds(value, wanted)
+    )
 
 
-def _maximum(_: _Compiler, wanted: int | float, __: Mapping[str, Any]) -> Check:
-    return lambda value: type(value) not in (int, float) or value <= wanted
-
-
-def _above(_: _Compiler, wanted: int | float, __: Mapping[str, Any]) -> Check:
-    return lambda value: type(value) not in (int, float) or value > wanted
-
-
-def _below(_: _Compiler, wanted: int | float, __: Mapping[str, Any]) -> Check:
-    return lambda value: type(value) not in (int, float) or value < wanted
-
-
-_KEYWORDS: dict[str, Callable[[_Compiler, Any, Mapping[str, Any]], Check | None]] = {
+_KEYWORDS: dict[str, Keyword] = {
     "$ref": _Compiler.reference,
     "properties": _Compiler.properties,
     "additionalProperties": _Compiler.additional,
@@ -265,12 +251,12 @@ _KEYWORDS: dict[str, Callable[[_Compiler, Any, Mapping[str, Any]], Check | None]
     "const": _const,
     "enum": _enum,
     "required": _required,
-    "minItems": _min_items,
-    "maxItems": _max_items,
-    "minLength": _min_length,
+    "minItems": _sized(list, operator.ge),
+    "maxItems": _sized(list, operator.le),
+    "minLength": _sized(str, operator.ge),
     "pattern": _pattern,
-    "minimum": _minimum,
-    "maximum": _maximum,
-    "exclusiveMinimum": _above,
-    "exclusiveMaximum": _below,
+    "minimum": _bound(operator.ge),
+    "maximum": _bound(operator.le),
+    "exclusiveMinimum": _bound(operator.gt),
+    "exclusiveMaximum": _bound(operator.lt),
 }

@@ -77,21 +77,12 @@ class StartOverlap:
         self._others = others
 
     @cached_property
-    def _places(self) -> StartPlaces | UndefinedStatisticError:
-        try:
-            return start_places(self._tried, self._others)
-        except UndefinedStatisticError as error:
-            return error
-
-    def _known(self) -> StartPlaces:
-        if isinstance(self._places, UndefinedStatisticError):
-            raise self._places
-        return self._places
+    def _places(self) -> StartPlaces:
+        return start_places(self._tried, self._others)
 
     @cached_property
     def _p_alike(self) -> float:
-        places = self._known()
-        return starts_alike(places.tried, places.others)
+        return starts_alike(self._places.tried, self._places.others)
 
     def p_alike(self) -> float:
         """Return the p-value that both were drawn alike.
@@ -102,8 +93,7 @@ class StartOverlap:
         return self._p_alike
 
     def _covered(self) -> float:
-        places = self._known()
-        covered, total = starts_covered(places.tried, places.others)
+        covered, total = starts_covered(self._places.tried, self._places.others)
         return covered / total
 
     def measurements(self, id_of: Callable[[str], str]) -> list[Measurement]:
@@ -112,15 +102,17 @@ class StartOverlap:
         Args:
             id_of: Makes the id of a measurement from its name.
         """
-        places = self._places if isinstance(self._places, StartPlaces) else None
-        compared = "" if places is None else f"; {places.words}"
+        try:
+            compared, num_others = f"; {self._places.words}", len(self._places.others)
+        except UndefinedStatisticError:  # each measurement gives the reason
+            compared, num_others = "", 0
         return [
             measured(
                 id_of(name),
                 compute,
                 unit="1",
                 definition=f"{words}{compared}",
-                n=0 if places is None else len(places.others),
+                n=num_others,
                 counted="start",
                 reason_without_interval=why,
                 episodes=names_of([*self._tried, *self._others]),

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from headless import CHROMIUM, FLAGS, NO_CHROMIUM
 
 import robot_gst
 from bridge.episode.metadata import EpisodeInfo
@@ -23,10 +24,6 @@ from dashboards.errors import AddressTakenError, NotHereError
 from dashboards.guard import Admission, host_name, is_loopback
 from dashboards.library import derived_paths, episode_path
 from dashboards.server import Address, listen
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from headless import CHROMIUM, FLAGS, NO_CHROMIUM
 
 ROOT = Path(__file__).parents[2]
 

@@ -11,7 +11,7 @@ from jaxtyping import UInt64
 
 from bridge.episode.mcap.file import McapFile, damaged
 from bridge.episode.mcap.format import MESSAGE_HEAD
-from bridge.episode.mcap.merge import Selection, merged, read_chunk
+from bridge.episode.mcap.merge import Selection, may_hold, merged, read_chunk
 from bridge.episode.mcap.table import mask_of, refuse_strays
 from bridge.episode.mcap.walk import DAMAGE
 
@@ -83,11 +83,7 @@ def _one_by_one(
 def _gather(file: McapFile, found: Sequence[_Gathered], every: frozenset[str]) -> None:
     channels = file.summary.channels
     wanted = {channel_id for channel_id, channel in channels.items() if channel.topic in every}
-    chunks = [
-        index
-        for index in file.summary.chunk_indexes
-        if not index.message_index_offsets or not wanted.isdisjoint(index.message_index_offsets)
-    ]
+    chunks = [index for index in file.summary.chunk_indexes if may_hold(index, wanted)]
     if not wanted or not chunks:
         return
     announced = mask_of(channels)

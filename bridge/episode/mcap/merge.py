@@ -7,7 +7,7 @@ would pass ``MEMORY_BYTES``, the one needed last is forgotten and unpacked again
 
 import heapq
 from array import array
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
@@ -276,9 +276,14 @@ def _sources(file: _OpenFile) -> Iterable[_Source]:
     for index in file.file.summary.chunk_indexes:
         if not file.select.overlaps(index.message_start_time, index.message_end_time):
             continue
-        channels = index.message_index_offsets
-        if not channels or not file.wanted_channels.isdisjoint(channels):
+        if may_hold(index, file.wanted_channels):
             yield _Chunk(file, index)
+
+
+def may_hold(index: records.ChunkIndex, channel_ids: Set[int]) -> bool:
+    """Whether a chunk may hold messages of some channels; one without an index may hold any."""
+    listed = index.message_index_offsets
+    return not listed or not channel_ids.isdisjoint(listed)
 
 
 def _drained(heap: list[_Entry]) -> Iterator[Stored]:

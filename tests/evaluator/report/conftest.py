@@ -3,16 +3,12 @@
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
-
 from headless import CHROMIUM, FLAGS, NO_CHROMIUM
 
 
