@@ -11,11 +11,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bridge.whole_file import write_whole
+from evaluator.arrow_columns import ANSWER, NUMBER, TEXT, WHOLE, column_of, values_of
 from evaluator.collecting import without_collecting
 from evaluator.compare.typed_json import Reader, as_it_is, reader, to_text, without_none
 
@@ -27,7 +27,7 @@ _KEY, _PLACE = "_key", "_place"
 NOTHING = -1
 """Place of the one row of a key under which there is no summary."""
 _KIND, _VERSION = b"gst.kind", b"gst.version"
-_SCALARS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
+_SCALARS = {str: TEXT, int: WHOLE, float: NUMBER, bool: ANSWER}
 _REFUSALS = (pa.ArrowException, OverflowError, ValueError, TypeError)
 """What packing raises: a number beyond 64 bits, text that is no Unicode, another type."""
 
@@ -96,11 +96,11 @@ def _packed(kind: type[Any], rows: Rows, version: str) -> pa.Table:
             keys.append(key)
             places.append(place)
             items.append(item)
-    arrays = [pa.array(keys, pa.string()), pa.array(places, pa.int32())]
+    arrays = [column_of(keys, TEXT), column_of(places, pa.int32())]
     for name, of_type, _, pack, _ in _columns(kind):
         values = (None if item is None else getattr(item, name) for item in items)
         packed = [None if value is None else pack(value) for value in values]
-        arrays.append(pa.array(packed, of_type))
+        arrays.append(column_of(packed, of_type))
     about = {_KIND: kind.__name__.encode(), _VERSION: version.encode()}
     return pa.Table.from_arrays(arrays, schema=_schema(kind).with_metadata(about))
 
@@ -117,26 +117,24 @@ def _unpacked(kind: type[Summary], table: pa.Table) -> dict[str, tuple[Summary, 
     if not table.schema.equals(_schema(kind)):
         message = "its columns are others"
         raise UnusableFileError(message)
-    places = _values(table.column(_PLACE))
+    places = values_of(table.column(_PLACE))
     nothing = places.count(NOTHING)
     columns = []
-    for name, of_type, is_optional, _, unpack in _columns(kind):
+    for name, _, is_optional, _, unpack in _columns(kind):
         column = table.column(name)
         if not is_optional and column.null_count != nothing:
             message = f"{name} is missing"
             raise UnusableFileError(message)
-        if pa.types.is_list(of_type):
-            columns.append(_tuples(column))
-        elif unpack is as_it_is:
-            columns.append(_values(column))
+        values = values_of(column)
+        if unpack is as_it_is:
+            columns.append(values)
         else:
-            texts = _values(column)
-            known = {text: unpack(text) for text in set(texts) - {None}}  # many are the same
-            columns.append([None if text is None else known[text] for text in texts])
+            known = {text: unpack(text) for text in set(values) - {None}}  # many are the same
+            columns.append([None if text is None else known[text] for text in values])
     names = [column.name for column in _columns(kind)]
     make = _maker(kind)
     rows: dict[str, tuple[Summary, ...]] = {}
-    for key, place, *values in zip(_values(table.column(_KEY)), places, *columns, strict=True):
+    for key, place, *values in zip(values_of(table.column(_KEY)), places, *columns, strict=True):
         if place == NOTHING:
             rows[key] = ()
         else:
@@ -160,32 +158,6 @@ def _maker(kind: type[Summary]) -> Callable[[Iterable[tuple[str, Any]]], Summary
         return item
 
     return make
-
-
-def _values(column: pa.ChunkedArray) -> list[Any]:
-    """Unpack texts, numbers or answers at once: one by one takes a second for a million of them."""
-    if pa.types.is_string(column.type) or not column.null_count:
-        return list(column.to_numpy().tolist())  # a text that is not there is None
-    there = column.is_valid().to_numpy()
-    values = column.drop_null().to_numpy().tolist()
-    found: list[Any] = [None] * len(there)
-    for place, value in zip(np.flatnonzero(there).tolist(), values, strict=True):
-        found[place] = value
-    return found
-
-
-def _tuples(column: pa.ChunkedArray) -> list[tuple[Any, ...] | None]:
-    """Unpack lists at once: element by element takes a second for a million numbers."""
-    array = column.combine_chunks()
-    is_number = pa.types.is_primitive(array.type.value_type) and not array.values.null_count
-    values = array.values
-    flat = values.to_numpy(zero_copy_only=False).tolist() if is_number else values.to_pylist()
-    ends = array.offsets.to_numpy().tolist()
-    is_there = array.is_valid().to_numpy(zero_copy_only=False).tolist()
-    return [
-        tuple(flat[first:last]) if there else None
-        for first, last, there in zip(ends, ends[1:], is_there, strict=False)
-    ]
 
 
 def _schema(kind: type[Any]) -> pa.Schema:

@@ -8,51 +8,45 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bridge.exchange.trials_csv import TrialRecord
+from evaluator.arrow_columns import ANSWER, NUMBER, TEXT, WHOLE, column_of
 from evaluator.result import Measurement
 
-_TEXT, _WHOLE, _NUMBER, _ANSWER = pa.string(), pa.int64(), pa.float64(), pa.bool_()
-"""Column types in which unknown is null, never 0, False or NaN."""
-_NUMPY = {_WHOLE: np.int64, _NUMBER: np.float64}
-_MOST_BYTES = 2**31 - 1
-"""Of one column of texts, whose places have 32 bits."""
-
 TRIAL_TYPES = {
-    "trial_id": _TEXT,
-    "task": _TEXT,
-    "condition": _TEXT,
-    "policy": _TEXT,
-    "start_id": _TEXT,
-    "unit": _TEXT,
-    "k": _WHOLE,
-    "n": _WHOLE,
-    "recorded": _ANSWER,
-    "sim_planned": _ANSWER,
-    "sim_executed": _ANSWER,
-    "verdict": _ANSWER,
-    "p_success": _NUMBER,
-    "cell": _TEXT,
-    "stand_in": _ANSWER,
+    "trial_id": TEXT,
+    "task": TEXT,
+    "condition": TEXT,
+    "policy": TEXT,
+    "start_id": TEXT,
+    "unit": TEXT,
+    "k": WHOLE,
+    "n": WHOLE,
+    "recorded": ANSWER,
+    "sim_planned": ANSWER,
+    "sim_executed": ANSWER,
+    "verdict": ANSWER,
+    "p_success": NUMBER,
+    "cell": TEXT,
+    "stand_in": ANSWER,
 }
 MEASUREMENT_TYPES = {
-    "id": _TEXT,
-    "value": _NUMBER,
-    "unit": _TEXT,
-    "definition": _TEXT,
-    "low": _NUMBER,
-    "high": _NUMBER,
-    "level": _NUMBER,
-    "method": _TEXT,
-    "k": _WHOLE,
-    "n": _WHOLE,
-    "counted": _TEXT,
-    "reason_if_undefined": _TEXT,
-    "reason_without_interval": _TEXT,
-    "episodes": _TEXT,
+    "id": TEXT,
+    "value": NUMBER,
+    "unit": TEXT,
+    "definition": TEXT,
+    "low": NUMBER,
+    "high": NUMBER,
+    "level": NUMBER,
+    "method": TEXT,
+    "k": WHOLE,
+    "n": WHOLE,
+    "counted": TEXT,
+    "reason_if_undefined": TEXT,
+    "reason_without_interval": TEXT,
+    "episodes": TEXT,
 }
 """``low``, ``high``, ``level`` and ``method`` are the interval; episodes are joined by blanks."""
 
@@ -80,31 +74,8 @@ def write_measurements(path: Path, measurements: Sequence[Measurement]) -> Path:
 
 def _write(path: Path, columns: dict[str, list[Any]], types: dict[str, pa.DataType]) -> Path:
     part = path.with_name(path.name + ".part")
-    arrays = [_array(columns[name], kind) for name, kind in types.items()]
+    arrays = [column_of(columns[name], kind) for name, kind in types.items()]
     table = pa.Table.from_arrays(arrays, names=list(types))
     pq.write_table(table, part, compression="zstd")
     part.replace(path)
     return path
-
-
-def _array(values: list[Any], kind: pa.DataType) -> pa.Array | pa.ChunkedArray:
-    """Fill a typed column; ``pyarrow.array`` would load pandas, which takes a third of a second."""
-    there = np.array([value is not None for value in values], dtype=bool)
-    buffers = [_buffer(np.packbits(there, bitorder="little"))]
-    if kind == _TEXT:
-        texts = [b"" if value is None else value.encode() for value in values]
-        ends = np.cumsum([0, *map(len, texts)])
-        if ends[-1] > _MOST_BYTES:
-            return pa.array(values, type=kind)  # which cuts it into pieces
-        buffers += [_buffer(ends.astype(np.int32)), pa.py_buffer(b"".join(texts))]
-    elif kind == _ANSWER:
-        yes = np.array([bool(value) for value in values], dtype=bool)
-        buffers.append(_buffer(np.packbits(yes, bitorder="little")))
-    else:
-        numbers = [0 if value is None else value for value in values]
-        buffers.append(_buffer(np.array(numbers, dtype=_NUMPY[kind])))
-    return pa.Array.from_buffers(kind, len(values), buffers)
-
-
-def _buffer(array: np.ndarray) -> pa.Buffer:
-    return pa.py_buffer(array.tobytes())

@@ -1,0 +1,80 @@
+"""Columns hold what was put in, agree with pyarrow's own ways, and never load pandas."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evaluator.arrow_columns import ANSWER, NUMBER, TEXT, WHOLE, column_of, values_of
+
+ROOT = Path(__file__).resolve().parents[2]
+_SCALARS = {
+    TEXT: st.text(max_size=5),
+    WHOLE: st.integers(-(2**63), 2**63 - 1),
+    NUMBER: st.floats(allow_nan=False),
+    ANSWER: st.booleans(),
+}
+
+
+@st.composite
+def columns(draw: st.DrawFn) -> tuple[pa.DataType, list[Any]]:
+    """Return a type and values of it; some are missing."""
+    scalar = draw(st.sampled_from(list(_SCALARS)))
+    values = _SCALARS[scalar] | st.none()
+    if draw(st.booleans()):
+        lists = st.lists(values, max_size=4).map(tuple) | st.none()
+        return pa.list_(scalar), draw(st.lists(lists, max_size=9))
+    return scalar, draw(st.lists(values, max_size=20))
+
+
+@given(columns(), st.integers(0, 20), st.integers(0, 20))
+def test_a_column_is_what_pyarrow_makes_and_comes_back_whole_and_in_pieces(
+    column: tuple[pa.DataType, list[Any]], one: int, other: int
+) -> None:
+    kind, values = column
+    array = column_of(values, kind)
+    array.validate(full=True)
+    assert array.equals(pa.array(values, kind))
+    first, last = sorted((one, other))
+    pieces = pa.chunked_array([array[:first], array[first:last], array[last:]], kind)
+    assert values_of(pieces) == values
+    assert values_of(pa.chunked_array([pa.array(values, kind)])) == values
+
+
+@pytest.mark.parametrize(
+    ("values", "kind", "error"),
+    [
+        ([1.5], WHOLE, TypeError),
+        (["1"], NUMBER, TypeError),
+        ([1], TEXT, TypeError),
+        ([True], WHOLE, TypeError),
+        ([1], ANSWER, TypeError),
+        ([2**63], WHOLE, OverflowError),
+        (["\ud800"], TEXT, ValueError),
+        ([("a", 1)], pa.list_(TEXT), TypeError),
+    ],
+)
+def test_what_a_type_does_not_hold_is_refused_never_bent(
+    values: list[Any], kind: pa.DataType, error: type[Exception]
+) -> None:
+    with pytest.raises(error):
+        column_of(values, kind)
+
+
+def test_neither_direction_loads_pandas() -> None:
+    code = (
+        "import sys, pyarrow as pa; "
+        "from evaluator.arrow_columns import column_of, values_of, TEXT, NUMBER; "
+        "found = [values_of(pa.chunked_array([column_of(v, k)])) for v, k in "
+        "(([1.0, None], NUMBER), (['a', None], TEXT), ([(1.0,), None], pa.list_(NUMBER)))]; "
+        "print('pandas' in sys.modules, len(found))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stdout.strip() == "False 3"
