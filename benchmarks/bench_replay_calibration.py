@@ -7,7 +7,7 @@ before any of this was written. Frictions are compared with the incline test in 
 cell's coefficients, settled poses with what ``standin_settled`` names.
 
 Arguments: number of seeds (10), first seed (3100), rounds of probes (5), trials (0: they
-cost five times a probe and show little), workers (2).
+cost five times a probe and show little), workers (2; 0: only record).
 Every seed is stored when it is done, under GST_BENCH_WORK (or a folder beside the results), and is
 not done again: the benchmark can be stopped and started. Its recordings stay too: who changes the
 calibration deletes ``seed_*.json`` and records nothing again.
@@ -142,6 +142,9 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
     for seed in range(first, first + seeds):
+        if workers == 0:
+            record(RunFolder.create(folder / f"run_{seed}"), seed, rounds, trials)
+            continue
         rows.append(measure_seed(seed, folder, rounds, trials, workers))
         row = rows[-1]
         for name, text in COMPARED.items():
@@ -156,6 +159,8 @@ def main() -> None:
             for item in [row["parameters"][name]]
         )
         print(f"seed {seed}: {told}; {row['calibrated_s']:.0f} s", flush=True)
+    if not rows:
+        return
     report_targets(
         "replay_calibration",
         targets_of(rows),
