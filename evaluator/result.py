@@ -6,7 +6,7 @@ Undefined is undefined, with its reason; it is never 0, 1 or NaN.
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -130,7 +130,7 @@ class Results:
         measurements = [
             {
                 **{name: getattr(item, name) for name in _PLAIN},
-                "interval": None if item.interval is None else asdict(item.interval),
+                "interval": None if item.interval is None else dict(vars(item.interval)),
                 "episodes": lists.setdefault(item.episodes, len(lists)),
             }
             for item in self.measurements
@@ -143,7 +143,7 @@ class Results:
             "measurements": measurements,
             "episode_lists": [list(episodes) for episodes in lists],
             "tables": [_table_record(table) for table in self.tables],
-            "exclusions": [asdict(item) for item in self.exclusions],
+            "exclusions": [dict(vars(item)) for item in self.exclusions],
             "missing": list(self.missing),
             "provenance": json.loads(json.dumps(self.provenance)),
         }
@@ -188,6 +188,8 @@ def _is_odd(cell: object) -> bool:
     return not (finite and isinstance(cell, _CELLS))
 
 
+_encode = json.JSONEncoder(allow_nan=False).encode
+"""As ``json.dumps``, which makes an encoder anew for every call that forbids NaN."""
 _DEEP = {"tables": 3, "provenance": 2}
 """Levels that are written over several lines, of the parts of a record; 1 for the others."""
 
@@ -195,7 +197,7 @@ _DEEP = {"tables": 3, "provenance": 2}
 def _written(record: Mapping[str, Any]) -> str:
     """Write each number, row and list on one line: quick, and a diff names what changed."""
     parts = [
-        f" {json.dumps(name)}: {_lines(value, 1, _DEEP.get(name, 1))}"
+        f" {_encode(name)}: {_lines(value, 1, _DEEP.get(name, 1))}"
         for name, value in record.items()
     ]
     return "{\n" + ",\n".join(parts) + "\n}\n"
@@ -203,13 +205,13 @@ def _written(record: Mapping[str, Any]) -> str:
 
 def _lines(value: Any, indent: int, deep: int) -> str:
     if not deep or not value or not isinstance(value, list | dict):
-        return json.dumps(value, allow_nan=False)
+        return _encode(value)
     pad = "\n" + " " * (indent + 1)
     if isinstance(value, list):
         inner = [_lines(item, indent + 1, deep - 1) for item in value]
     else:
         inner = [
-            f"{json.dumps(name)}: {_lines(item, indent + 1, deep - 1)}"
+            f"{_encode(name)}: {_lines(item, indent + 1, deep - 1)}"
             for name, item in value.items()
         ]
     first, last = "[]" if isinstance(value, list) else "{}"

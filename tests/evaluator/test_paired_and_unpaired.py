@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics.paired import sign_test, tango_difference
@@ -105,6 +106,19 @@ def test_boschloo_of_the_papers_gains() -> None:
     assert boschloo(4, 10, 8, 10) == pytest.approx(0.089, abs=5e-4)
     assert boschloo(8, 10, 9, 10) > 0.5
     assert boschloo(4, 10, 8, 10) == pytest.approx(boschloo(8, 10, 4, 10), abs=1e-9)
+
+
+@pytest.mark.parametrize("table", [(15, 90, 31, 100), (3, 200, 2, 7), (99, 100, 70, 80)])
+def test_boschloo_leaves_out_nothing_that_counts(table: tuple[int, int, int, int]) -> None:
+    k1, n1, k2, n2 = table
+    expected = stats.boschloo_exact([[k1, k2], [n1 - k1, n2 - k2]], n=16).pvalue
+    # SciPy looks at few rates; ours may only be larger, where it looked between them.
+    assert boschloo(*table) == pytest.approx(expected, rel=2e-2)
+    assert boschloo(*table) > expected * (1 - 1e-6)
+
+
+def test_boschloo_of_rates_worlds_apart_is_hardly_above_nothing() -> None:
+    assert 0 <= boschloo(100, 1667, 1500, 1667) < 1e-300
 
 
 def test_boschloo_of_what_cannot_be_counted_out_says_so() -> None:

@@ -124,7 +124,8 @@ def test_results_of_version_one_are_still_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize("cell", [float("nan"), np.int64(3), Path("x")])
 def test_a_table_holds_only_what_json_can_say(cell: Any) -> None:
     rows = (("a", 1.0),) * 30 + (("b", cell),)
-    table = Table(id="t", title="t", columns=("a", "b"), rows=rows)
+    table = Table(id="t", title="t", columns=("a", "b"), rows=())
     results = Results(run="r", source="run", stand_in=None, measurements=(), tables=(table,))
+    object.__setattr__(table, "rows", rows)  # past the checks of tests, which see cells by chance
     with pytest.raises(InvalidRecordError, match="table t"):
         results.to_record()
