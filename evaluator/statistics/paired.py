@@ -50,8 +50,9 @@ def sign_test(improved: int, worsened: int) -> tuple[float, float]:
     """Return the two-sided exact p and mid-p of Binomial(improved + worsened, 1/2)."""
     discordant, smaller = improved + worsened, min(improved, worsened)
     # Whole numbers as long as possible: exact for any count.
-    below = sum(math.comb(discordant, i) for i in range(smaller))
-    here = math.comb(discordant, smaller)
+    below, here = 0, 1
+    for i in range(smaller):  # each binomial coefficient from the one before
+        below, here = below + here, here * (discordant - i) // (i + 1)
     total = 2**discordant
     p_exact, p_mid = 2 * (below + here) / total, (2 * below + here) / total
     return min(1.0, p_exact), min(1.0, p_mid)

@@ -108,7 +108,7 @@ def _fisher(n_first: int, n_second: int) -> Float[np.ndarray, "first second"]:
     both = _log_choose(n_first + n_second)
     logs = np.add.outer(first, second)
     logs -= sliding_window_view(both, n_second + 1)  # row k: of the totals k, k + 1, ...
-    fisher = np.exp(logs, out=logs)
+    fisher: np.ndarray = np.exp(logs, out=logs)
     for k in range(1, n_first + 1):
         # Same total, one success less in the first group: the anti-diagonal neighbour.
         fisher[k, :-1] += fisher[k - 1, 1:]
