@@ -168,7 +168,7 @@ def clearance_rows(num_states: int) -> list[Target]:
     from bridge.task.robot import ur5_with_gripper_urdf
     from bridge.task.task_file import load_task
     from twin.replay.clearance.surroundings import Surroundings
-    from twin.replay.scene import ReplayScene
+    from twin.replay.place.scene import ReplayScene
     from twin.robot.collision import hulls_of, signed_distance
     from twin.robot.model import load_robot
 

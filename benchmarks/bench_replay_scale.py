@@ -67,7 +67,7 @@ def killed_and_resumed(run: Path, whole_s: float, *options: str) -> tuple[float,
 
 def ray_start_s() -> float:
     """How long a cluster on this machine takes to start and to stop [s]."""
-    from twin.replay.ray_cluster import RayRunner
+    from twin.replay.crew.cluster import RayRunner
 
     before = time.monotonic()
     with RayRunner("local", 2):

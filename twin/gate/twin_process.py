@@ -15,7 +15,7 @@ from bridge.terminal import Output
 from twin.gate.config import GateConfig
 from twin.gate.judge import UndecidedError
 from twin.gate.work import Look, Question, answer, get_ready, look
-from twin.replay.worker import Failed, Function, TimeIsUpError, Worker, WorkerDiedError
+from twin.replay.crew.worker import Failed, Function, TimeIsUpError, Worker, WorkerDiedError
 
 
 class TwinProcess:

@@ -44,8 +44,8 @@ class Question:
 
 def get_ready(_: None) -> None:
     """Import what takes seconds, so that the first plan does not wait for it."""
-    import twin.replay.place  # noqa: PLC0415
-    import twin.replay.rollout  # noqa: PLC0415
+    import twin.replay.place.rebuilt  # noqa: PLC0415
+    import twin.replay.verdict.rollout  # noqa: PLC0415
     import twin.scene.localise  # noqa: F401, PLC0415
 
 
@@ -61,11 +61,11 @@ def answer(question: Question) -> Verdict:
 
     Rounds of one start are tried against the same variations: their identity is the start's name.
     """
-    from twin.replay.calibrated import calibrated, for_task  # noqa: PLC0415
-    from twin.replay.place import read_place  # noqa: PLC0415
-    from twin.replay.rollout import replay_plan  # noqa: PLC0415
-    from twin.replay.samples import replay_samples, with_probability  # noqa: PLC0415
-    from twin.replay.scene import ReplayScene  # noqa: PLC0415
+    from twin.replay.chance.samples import replay_samples, with_probability  # noqa: PLC0415
+    from twin.replay.place.calibrated import calibrated, for_task  # noqa: PLC0415
+    from twin.replay.place.rebuilt import read_place  # noqa: PLC0415
+    from twin.replay.place.scene import ReplayScene  # noqa: PLC0415
+    from twin.replay.verdict.rollout import replay_plan  # noqa: PLC0415
     from twin.scene.calibration import read_calibration  # noqa: PLC0415
 
     started_s = time.monotonic()

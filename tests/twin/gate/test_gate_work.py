@@ -12,9 +12,9 @@ from bridge.task.plan import Plan
 from bridge.task.robot import ROBOT_NAME, ur5_with_gripper_urdf
 from bridge.task.task_file import load_task
 from twin.gate.work import Question, answer
-from twin.replay import rollout
 from twin.replay.config import ReplayConfig
-from twin.replay.scene import ReplayScene
+from twin.replay.place.scene import ReplayScene
+from twin.replay.verdict import rollout
 from twin.scene.calibration import write_physics
 
 

@@ -16,7 +16,7 @@ from bridge.episode.run import RunFolder
 from bridge.errors import UsageError
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
-from twin.replay.run import replay_run
+from twin.replay.run.trajectories import replay_run
 from twin.scene import parts as parts_module
 from twin.scene.frames import choose_frames, find_sources
 from twin.scene.initialise import fuse

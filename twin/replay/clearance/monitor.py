@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
+from bridge.task.contact import Contact
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan, Stage
 from twin.replay.clearance.bodies import GRIPPER, Solid, box_solid, group_of, placement_of
@@ -23,8 +24,7 @@ from twin.replay.clearance.surroundings import Pair, Surroundings
 from twin.replay.clearance.sweep import MAX_LEAP_M, Reach, State, half_way, object_travel_m
 from twin.replay.config import ReplayConfig
 from twin.replay.failure import Failure
-from twin.replay.result import Contact
-from twin.replay.scene import ReplayScene
+from twin.replay.place.scene import ReplayScene
 from twin.robot.collision import RobotHulls, signed_distance
 
 Poses = Mapping[str, Float[np.ndarray, "4 4"]]

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from bridge.task.robot import GRIPPER_LINKS, MAX_WIDTH_M
 from twin.replay.clearance.surroundings import Surroundings
 from twin.replay.config import ReplayConfig
-from twin.replay.scene import ReplayScene
+from twin.replay.place.scene import ReplayScene
 from twin.robot.collision import RobotHulls
 
 

@@ -22,7 +22,7 @@ from twin.replay.clearance.grid import GridLookup
 from twin.replay.clearance.nodes import distances_to_boxes_m, planes_of
 from twin.replay.clearance.shells import Shells, shell_of, shells_of_robot
 from twin.replay.clearance.unnamed import Foot, unnamed_scene
-from twin.replay.scene import ReplayScene
+from twin.replay.place.scene import ReplayScene
 from twin.robot.collision import RobotHulls, signed_distance
 
 Pair = tuple[str, int, str, int]

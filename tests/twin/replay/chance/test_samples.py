@@ -1,0 +1,327 @@
+"""Varied replays: what is drawn, from what, the same everywhere, and what they add up to."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from bridge.errors import GstError, UsageError
+from bridge.geometry import se3
+from bridge.task.task_file import load_task
+from bridge.task.verdict import Factor, Verdict
+from twin.errors import TwinError
+from twin.physics.config import PhysicsConfig
+from twin.replay.chance.draw import draw_variation, given_standing, sample_rng
+from twin.replay.chance.samples import Sample, replay_samples, with_probability
+from twin.replay.config import ReplayConfig, ReplayRunConfig
+from twin.replay.follow.path import path_of_plan
+from twin.replay.place.calibrated import calibrated
+from twin.replay.place.scene import ReplayScene
+from twin.replay.variation import VariationConfig
+from twin.robot.model import load_robot
+from twin.scene.calibration import Calibration
+
+UNSURE = np.diag([4e-6, 9e-6, 1e-6, 1e-4, 1e-4, 4e-4])
+CORRELATED = UNSURE.copy()
+CORRELATED[0, 1] = CORRELATED[1, 0] = 4e-6
+
+
+def scene_with(script: SimpleNamespace, covariance: np.ndarray | None = CORRELATED) -> ReplayScene:
+    scene = script.scene()
+    spreads = {} if covariance is None else dict.fromkeys(scene.Ts_base_object, covariance)
+    return replace(scene, covariances=spreads)
+
+
+def draws(scene: ReplayScene, count: int, **settings: Any) -> list[Any]:
+    config = ReplayConfig(variation=VariationConfig(**settings))
+    return [draw_variation(sample_rng(0, "start", k), scene, config) for k in range(count)]
+
+
+def verdict(accepted: bool | None) -> Verdict:
+    yes = Factor(value=True)
+    return Verdict(
+        plan_id="p",
+        trajectory="planned",
+        mode="dynamic",
+        ik=yes,
+        clearance=yes,
+        terminal=Factor(value=accepted, cause="inside" if accepted is False else None),
+        engine="fake",
+        seed=0,
+    )
+
+
+def test_what_stands_goes_on_standing_and_moves_as_far_as_localisation_is_unsure(
+    script: SimpleNamespace,
+) -> None:
+    scene = scene_with(script)
+    T = scene.Ts_base_object["cube"]
+    moved = np.array([draw.Ts_base_object["cube"] for draw in draws(scene, 800)])
+    np.testing.assert_array_equal(moved[:, 2, 3], T[2, 3])
+    np.testing.assert_allclose(moved[:, 2, 2], 1.0, atol=1e-12)
+    shifts = moved[:, :2, 3] - T[:2, 3]
+    # Compared with the sampling error of 800 draws (5 standard errors).
+    np.testing.assert_allclose(np.cov(shifts.T), CORRELATED[:2, :2], atol=5 * 9e-6 / np.sqrt(400))
+    turns = np.arctan2(*(T[:3, :3].T @ moved[:, :3, :3])[:, (1, 0), 0].T)
+    assert np.std(turns) == pytest.approx(0.02, rel=0.12)
+
+
+def test_an_object_in_the_air_moves_in_all_six_directions(script: SimpleNamespace) -> None:
+    scene = scene_with(script)
+    lifted = scene.Ts_base_object["cube"].copy()
+    lifted[2, 3] += 0.1
+    scene = replace(scene, Ts_base_object={**scene.Ts_base_object, "cube": lifted})
+    moved = np.array([draw.Ts_base_object["cube"] for draw in draws(scene, 500)])
+    steps = np.concatenate(
+        [
+            moved[:, :3, 3] - lifted[:3, 3],
+            se3.vector_from_rotation(moved[:, :3, :3] @ lifted[:3, :3].T),
+        ],
+        axis=1,
+    )
+    np.testing.assert_allclose(np.std(steps, axis=0), np.sqrt(np.diag(CORRELATED)), rtol=0.16)
+
+
+def test_given_standing_is_the_conditional_distribution() -> None:
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(6, 6)) * 1e-2
+    covariance = root @ root.T
+    left = given_standing(covariance)
+    precision = np.linalg.inv(covariance)
+    keep = [0, 1, 5]  # a conditional covariance is the inverse of that block of the precision
+    np.testing.assert_allclose(
+        left[np.ix_(keep, keep)], np.linalg.inv(precision[np.ix_(keep, keep)]), rtol=1e-8
+    )
+    assert not left[[2, 3, 4]].any()
+
+
+def test_a_cube_turned_by_a_quarter_is_the_same_cube(script: SimpleNamespace) -> None:
+    anyhow = np.diag([0.0, 0.0, 0.0, 0.0, 0.0, 100.0])
+    scene = scene_with(script, anyhow)
+    cube = scene.Ts_base_object["cube"]
+    turns = [
+        se3.rotation_angle_rad(cube[:3, :3].T @ draw.Ts_base_object["cube"][:3, :3])
+        for draw in draws(scene, 200)
+    ]
+    assert np.max(turns) <= np.pi / 4 + 1e-9
+    assert np.max(turns) > 0.6
+
+
+def test_a_toy_looks_different_from_every_side() -> None:
+    task = load_task("sloth_into_basket")
+    T = np.eye(4)
+    T[2, 3] = task.objects["sloth"].rest_height_m
+    scene = ReplayScene(
+        task=task,
+        Ts_base_object={"sloth": T},
+        urdf="",
+        covariances={"sloth": np.diag([0.0, 0.0, 0.0, 0.0, 0.0, 100.0])},
+    )
+    yaws = [np.arctan2(*d.Ts_base_object["sloth"][(1, 0), 0]) for d in draws(scene, 200)]
+    assert stats.kstest(yaws, "uniform", args=(-np.pi, 2 * np.pi)).pvalue > 1e-3
+
+
+def test_without_a_covariance_the_prior_says_how_unsure_a_pose_is(script: SimpleNamespace) -> None:
+    scene = scene_with(script, None)
+    moved = np.array([d.Ts_base_object["cube"] for d in draws(scene, 300, unknown_pose_m=0.01)])
+    assert np.std(moved[:, 0, 3]) == pytest.approx(0.01, rel=0.2)
+
+
+def test_physics_is_log_normal_around_what_the_nominal_replay_uses(
+    script: SimpleNamespace,
+) -> None:
+    scene = scene_with(script)
+    found = draws(scene, 600, friction_log=0.3)
+    frictions = np.log([draw.physics.object_friction / 0.8 for draw in found])
+    assert stats.kstest(frictions / 0.3, "norm").pvalue > 1e-3
+    masses = np.log([draw.objects["cube"].mass_kg for draw in found])
+    assert np.exp(np.median(masses)) == pytest.approx(scene.task.objects["cube"].mass_kg, rel=0.05)
+    assert all(draw.objects["box"] == scene.task.objects["box"] for draw in found)
+    delays = [draw.grip_delay_s for draw in found]
+    assert stats.kstest(delays, "uniform", args=(0.0, 0.1)).pvalue > 1e-3
+
+
+def test_a_calibration_replaces_the_priors_of_what_it_identified(script: SimpleNamespace) -> None:
+    found = draws(scene_with(script), 200, calibrated=(("object_friction", 0.01),))
+    assert np.std(np.log([d.physics.object_friction for d in found])) == pytest.approx(
+        0.01, rel=0.2
+    )
+    assert np.std(np.log([d.physics.finger_friction for d in found])) == pytest.approx(0.2, rel=0.2)
+
+
+def test_the_same_start_draws_the_same_whatever_else_is_asked(script: SimpleNamespace) -> None:
+    """Common random numbers: one more object, or another order of samples, changes nothing."""
+    scene = scene_with(script)
+    config = ReplayConfig()
+    first = [draw_variation(sample_rng(1, "a", k), scene, config) for k in (0, 1, 2)]
+    again = [draw_variation(sample_rng(1, "a", k), scene, config) for k in (2, 1, 0)]
+    for one, other in zip(first, reversed(again), strict=True):
+        assert one.to_record(config) == other.to_record(config)
+    others = [sample_rng(2, "a", 0), sample_rng(1, "b", 0), sample_rng(1, "a", 1)]
+    values = {rng.random() for rng in [sample_rng(1, "a", 0), *others]}
+    assert len(values) == 4
+
+
+def test_a_lost_object_does_not_change_what_the_others_draw(script: SimpleNamespace) -> None:
+    scene = scene_with(script)
+    only = replace(scene, Ts_base_object={"cube": scene.Ts_base_object["cube"]})
+    config = ReplayConfig()
+    whole = draw_variation(sample_rng(0, "s", 0), scene, config)
+    part = draw_variation(sample_rng(0, "s", 0), only, config)
+    np.testing.assert_array_equal(whole.Ts_base_object["cube"], part.Ts_base_object["cube"])
+    assert set(part.Ts_base_object) == {"cube"}
+
+
+def asked(script: SimpleNamespace, replay: Any, count: int, **more: Any) -> tuple[Sample, ...]:
+    return replay_samples(
+        replay,
+        scene_with(script),
+        ReplayConfig(samples=count),
+        plan_id="p",
+        identity="start",
+        **more,
+    )
+
+
+def test_every_sample_is_a_record_and_the_share_has_wilsons_interval(
+    script: SimpleNamespace,
+) -> None:
+    seen: list[tuple[ReplayScene, ReplayConfig]] = []
+
+    def replay(scene: ReplayScene, config: ReplayConfig) -> Verdict:
+        seen.append((scene, config))
+        return verdict(len(seen) % 4 != 0)
+
+    samples = asked(script, replay, 8)
+    assert [sample.index for sample in samples] == list(range(8))
+    assert [sample.accepted for sample in samples] == [True, True, True, False] * 2
+    assert samples[3].first_failing == "terminal"
+    for sample, (scene, config) in zip(samples, seen, strict=True):
+        record = sample.to_record()
+        assert record["variation"]["physics"]["grip_force_N"] == config.physics.grip_force_N
+        assert record["variation"]["mass_kg"]["cube"] == scene.task.objects["cube"].mass_kg
+        assert config.samples == 0
+    p = with_probability(verdict(True), samples).p_success
+    # Wilson (1927), by hand: centre (k + z2/2) / (n + z2), n = 8, k = 6.
+    z2 = stats.norm.ppf(0.975) ** 2
+    centre, half = (6 + z2 / 2) / (8 + z2), np.sqrt(z2 * (6 * 2 / 8 + z2 / 4)) / (8 + z2)
+    assert p == {
+        "value": 0.75,
+        "low": pytest.approx(centre - half),
+        "high": pytest.approx(centre + half),
+        "k": 6,
+        "n": 8,
+    }
+
+
+@given(st.lists(st.sampled_from([True, False, None]), max_size=30))
+def test_the_interval_holds_the_share_and_undecided_is_no_success(said: list[bool | None]) -> None:
+    samples = [
+        Sample(plan_id="p", index=k, variation={}, accepted=a, first_failing=None, reason=None)
+        for k, a in enumerate(said)
+    ]
+    p = with_probability(verdict(True), samples).p_success
+    if not said:
+        assert p is None
+        return
+    assert p is not None
+    assert p["k"] == said.count(True)
+    assert p["n"] == len(said)
+    assert 0 <= p["low"] <= p["value"] <= p["high"] <= 1
+
+
+def test_a_variation_that_cannot_be_replayed_costs_only_itself(script: SimpleNamespace) -> None:
+    answers = iter([verdict(True), TwinError("the cube lies inside the box"), verdict(True)])
+
+    def replay(scene: ReplayScene, config: ReplayConfig) -> Verdict:
+        answer = next(answers)
+        if isinstance(answer, GstError):
+            raise answer
+        return answer
+
+    samples = asked(script, replay, 3)
+    assert [sample.accepted for sample in samples] == [True, None, True]
+    assert samples[1].reason == "the cube lies inside the box"
+
+
+def test_as_many_samples_are_run_as_fit_and_no_more_are_claimed(script: SimpleNamespace) -> None:
+    clock = [0.0]
+
+    def replay(scene: ReplayScene, config: ReplayConfig) -> Verdict:
+        clock[0] += 2.0
+        return verdict(True)
+
+    samples = asked(script, replay, 100, ends_s=11.0, expected_s=2.0, monotonic=lambda: clock[0])
+    assert clock[0] <= 11.0
+    assert len(samples) == 5
+    assert (with_probability(verdict(True), samples).p_success or {})["n"] == 5
+    assert asked(script, replay, 9, ends_s=2.0, expected_s=2.0, monotonic=lambda: 0.0) == ()
+
+
+def test_a_kinematic_replay_has_no_probability(script: SimpleNamespace) -> None:
+    config = ReplayConfig(mode="kinematic", samples=3)
+    with pytest.raises(UsageError, match="moves no objects: it has no success probability"):
+        replay_samples(
+            lambda *_: verdict(True), scene_with(script), config, plan_id="p", identity="s"
+        )
+
+
+def test_a_spread_that_is_none_is_refused() -> None:
+    with pytest.raises(UsageError, match="--friction-log"):
+        VariationConfig(friction_log=-0.1)
+
+
+def test_a_late_gripper_lags_behind_the_arm(
+    script: SimpleNamespace,
+) -> None:
+    scene = script.scene()
+    config = ReplayConfig()
+    path, _, _ = path_of_plan(script.plan(scene), load_robot(scene.urdf), config)
+    late = path.with_late_gripper(0.2)
+    times = np.arange(0, path.end_ns(), 10_000_000)
+    np.testing.assert_array_equal(late.joints_at(times), path.joints_at(times))
+    np.testing.assert_array_equal(late.width_at(times + 200_000_000), path.width_at(times))
+    assert path.first_close_ns is not None
+    assert late.first_close_ns == path.first_close_ns + 200_000_000
+    assert path.with_late_gripper(0.0) is path
+
+
+def test_what_was_identified_of_pairs_is_not_varied_once_more(script: SimpleNamespace) -> None:
+    found = draws(scene_with(script), 50, calibrated=(("finger_friction", 0.05),))
+    assert {draw.physics.object_friction for draw in found} == {0.8}
+
+
+def calibration(**identified: Any) -> Calibration:
+    return Calibration(record={"physics": {"identified": identified}}, cameras={})
+
+
+def test_calibrated_settings_have_its_values_and_its_spreads() -> None:
+    known = calibration(
+        grip_force_N={"value": 14.0, "sigma_log": 0.05}, finger_friction={"value": 0.9}
+    )
+    config = calibrated(ReplayConfig(), known)
+    assert config.physics.grip_force_N == 14.0
+    assert config.variation.calibrated == (("grip_force_N", 0.05),)
+    assert config.variation.physics_spreads()["grip_force_N"] == 0.05
+    assert calibrated(ReplayConfig(), None) == ReplayConfig()
+    assert calibrated(ReplayConfig(), calibration()) == ReplayConfig()
+
+
+def test_what_the_user_set_is_varied_by_the_prior() -> None:
+    known = calibration(grip_force_N={"value": 14.0, "sigma_log": 0.05})
+    mine = ReplayConfig(physics=PhysicsConfig(grip_force_N=11.0))
+    config = calibrated(mine, known)
+    assert config.physics.grip_force_N == 11.0
+    assert config.variation.calibrated == ()
+
+
+def test_numbers_with_which_nothing_can_be_replayed_are_refused() -> None:
+    with pytest.raises(UsageError, match="--workers 0 makes no sense"):
+        ReplayRunConfig(workers=0)
+    with pytest.raises(UsageError, match="--samples -1 makes no sense"):
+        ReplayRunConfig(samples=-1)

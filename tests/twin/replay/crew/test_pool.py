@@ -1,0 +1,158 @@
+"""Work on several processes: a death costs one piece, a bug one answer, and nothing is lost.
+
+What the processes do here are expressions, so that they need nothing of this file.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from twin.replay.crew.pool import ATTEMPTS, Alone, Crew
+from twin.replay.crew.worker import Failed, TimeIsUpError, Worker, WorkerDiedError
+
+KILL_ITSELF = "__import__('os').kill(__import__('os').getpid(), 9)"
+
+
+def run(runner: Any, items: Sequence[str], cost: Any = len) -> dict[str, Any]:
+    with runner as open_runner:
+        return dict(open_runner.run(eval, items, cost))
+
+
+def test_every_piece_comes_back_with_its_answer_from_another_process() -> None:
+    items = [f"({k} ** 2, __import__('os').getpid())" for k in range(6)]
+    answers = run(Crew(2), items)
+    assert [answers[item][0] for item in items] == [k**2 for k in range(6)]
+    pids = {pid for _, pid in answers.values()}
+    assert len(pids) <= 2
+    assert os.getpid() not in pids
+
+
+def test_one_process_gives_the_same_answers_in_order() -> None:
+    with Alone() as runner:
+        assert list(runner.run(eval, ["1 + 1", "2 + 2"], len)) == [("1 + 1", 2), ("2 + 2", 4)]
+
+
+@pytest.mark.parametrize("runner", [Alone(), Crew(2)])
+def test_what_goes_wrong_with_one_piece_is_its_answer_and_the_others_go_on(runner: Any) -> None:
+    answers = run(runner, ["1 / 0", "2 + 2", "nonsense"])
+    assert answers["2 + 2"] == 4
+    failed = answers["1 / 0"]
+    assert isinstance(failed, Failed)
+    assert failed.message == "internal error: ZeroDivisionError: division by zero"
+    assert not failed.known
+    assert "Traceback" in failed.trace
+    assert "NameError" in answers["nonsense"].message
+
+
+def test_a_killed_process_costs_only_what_it_was_doing(tmp_path: Path) -> None:
+    """What dies each time is tried once more and then named; all others are answered."""
+    log = tmp_path / "log"
+    deadly = f"open({str(log)!r}, 'a').write('x') and {KILL_ITSELF}"
+    answers = run(Crew(2), [deadly, *(f"{k}" for k in range(8))])
+    assert [answers[f"{k}"] for k in range(8)] == list(range(8))
+    failed = answers[deadly]
+    assert isinstance(failed, Failed)
+    assert failed.known
+    assert "ended by SIGKILL, perhaps by a machine short of memory, 2 times" in failed.message
+    assert len(log.read_text()) == ATTEMPTS == 2
+
+
+def test_what_died_by_accident_is_done_at_the_second_try(tmp_path: Path) -> None:
+    flag = tmp_path / "was here"
+    item = f"(__import__('pathlib').Path({str(flag)!r}).exists() or open({str(flag)!r}, 'x') and "
+    item += f"{KILL_ITSELF}) and 'done'"
+    assert run(Crew(1), [item, "1"]) == {item: "done", "1": 1}
+
+
+def test_a_process_killed_while_it_was_idle_is_replaced() -> None:
+    with Crew(1) as crew:
+        ((_, pid),) = crew.run(eval, ["__import__('os').getpid()"], len)
+        os.kill(pid, signal.SIGKILL)
+        ends = time.monotonic() + 5
+        while time.monotonic() < ends and Path(f"/proc/{pid}/cmdline").exists():
+            if not Path(f"/proc/{pid}/cmdline").read_bytes():  # a zombie: dead, not yet collected
+                break
+            time.sleep(0.01)
+        assert list(crew.run(eval, ["40 + 2"], len)) == [("40 + 2", 42)]
+
+
+def test_the_longest_are_begun_first() -> None:
+    with Crew(1) as crew:
+        order = [item for item, _ in crew.run(eval, ["1", "333", "22"], len)]
+    assert order == ["333", "22", "1"]
+
+
+def test_processes_have_one_thread_each_and_this_one_keeps_its_settings(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    item = "[__import__('os').environ.get(n) for n in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS')]"
+    assert run(Crew(1), [item]) == {item: ["1", "1"]}
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+    assert "OPENBLAS_NUM_THREADS" not in os.environ
+
+
+def test_processes_end_with_their_owner_also_when_it_is_killed() -> None:
+    code = (
+        "import os, sys\n"
+        "from twin.replay.crew.pool import Crew\n"
+        "if __name__ == '__main__':\n"
+        "    crew = Crew(1)\n"
+        "    ((_, pid),) = crew.run(eval, ['__import__(\"os\").getpid()'], len)\n"
+        "    print(pid, flush=True)\n"
+        "    sys.stdin.read()\n"
+    )
+    root = Path(__file__).parents[4]
+    owner = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=root,
+    )
+    with owner:
+        assert owner.stdout is not None
+        pid = int(owner.stdout.readline())
+        assert _alive(pid)
+        owner.kill()
+        owner.wait(10)
+        ends = time.monotonic() + 10
+        while _alive(pid) and time.monotonic() < ends:
+            time.sleep(0.02)
+        assert not _alive(pid)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        return bool(Path(f"/proc/{pid}/cmdline").read_bytes())
+    except OSError:
+        return False
+
+
+def test_a_worker_that_hangs_is_noticed_and_ended() -> None:
+    worker = Worker()
+    worker.begin(time.sleep, 60)
+    with pytest.raises(TimeIsUpError, match=r"no answer within 0\.05 s"):
+        worker.finish(0.05)
+    assert worker.busy
+    pid = worker.pid
+    started = time.monotonic()
+    worker.close()
+    assert time.monotonic() - started < 5
+    assert pid is not None
+    assert not _alive(pid)
+
+
+def test_a_worker_that_ends_says_how() -> None:
+    worker = Worker()
+    worker.begin(os._exit, 3)
+    with pytest.raises(WorkerDiedError, match="with exit code 3"):
+        worker.finish(20.0)
+    worker.close()

@@ -1,0 +1,315 @@
+"""Pictures of a replay: things are drawn where they were, in the eyes of the recorded cameras."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bridge.episode import schema
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.records import (
+    CameraInfo,
+    CompressedColor,
+    FrameTransform,
+    JointSample,
+    string_to_cdr,
+    transforms_to_cdr,
+)
+from bridge.episode.run import RunFolder
+from bridge.episode.transforms import FrameNotFoundError, TransformTree
+from bridge.episode.writer import EpisodeWriter
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.media.color import decode_color
+from bridge.task.robot import ARM_JOINTS
+from bridge.task.verdict import Factor, Verdict
+from twin.physics.soft import SoftModel
+from twin.replay.episode.images import RATE_HZ, render_replay
+from twin.replay.place.calibrated import Correction
+from twin.replay.place.scene import ReplayScene
+from twin.replay.verdict.result import ReplayResult
+from twin.robot.model import load_robot
+from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.ply import write_ply
+from twin.scene.robot_splats import write_links
+from twin.scene.store import background_hash, write_record
+
+T0 = 1_700_000_000_000_000_000
+SECOND = 1_000_000_000
+ARRIVED_NS = 3600 * SECOND
+"""The recorder's clock is far from the sources'."""
+LATE_NS = 80_000_000
+"""Images are sent this long after they were taken."""
+CAMERA = Camera(width=160, height=120, fx=130.0, fy=130.0, cx=80.0, cy=60.0)
+HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
+AWAY = HOME + np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0])
+T_BASE_SIDE = se3.look_at(np.array([1.2, -0.8, 0.9]), np.array([0.45, 0.0, 0.22]), np.eye(3)[2])
+T_TCP_WRIST = se3.transform_from(np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, -0.08, -0.1]))
+RED, GREEN, BLUE, GREY = (0.95, 0.02, 0.02), (0.02, 0.9, 0.02), (0.02, 0.02, 0.95), (0.3,) * 3
+BIAS = Correction(bias=(0.03, -0.04, 0.3))
+
+
+def cloud(points_m: np.ndarray, color: tuple[float, ...], radius_m: float = 0.005) -> GaussianCloud:
+    count = len(points_m)
+    return GaussianCloud(
+        means_m=as_float32(points_m),
+        quats_wxyz=as_float32(np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))),
+        scales_log=as_float32(np.full((count, 3), np.log(radius_m))),
+        opacities_logit=as_float32(np.full(count, 5.0)),
+        colors=as_float32(np.tile(color, (count, 1))),
+    )
+
+
+def block(size_m: float = 0.03) -> np.ndarray:
+    steps = np.linspace(-size_m / 2, size_m / 2, 5)
+    return np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+
+
+def write_scene(run: RunFolder, scene: ReplayScene, movable: str, points_m: np.ndarray) -> None:
+    """Grey far away, a red movable, a green container, a blue tool; scanned at other places."""
+    run.scene_dir.mkdir()
+    write_ply(run.scene_dir / "background.ply", cloud(np.array([[0.0, 3.0, 0.0]]), GREY))
+    container = next(iter(scene.containers()))
+    for name, color, points in ((movable, RED, points_m), (container, GREEN, block())):
+        place = run.scene_dir / "objects" / name
+        place.mkdir(parents=True)
+        write_ply(place / "gaussians.ply", cloud(points, color))
+        pose = {
+            "p_m": [0.1, 0.5, 0.3],
+            "q_wxyz": [1.0, 0.0, 0.0, 0.0],
+        }
+        (place / "object.json").write_text(json.dumps({"T_base_object": pose}))
+    links = write_links(run, {"tool0": cloud(block(), BLUE)})
+    record = {"schema_version": 1, "key": "k", "scene_hash": background_hash(run),
+              "background": {}, "sources": [], "views": [], "robot": {"links": links},
+              "objects": {movable: {}, container: {}}}  # fmt: skip
+    write_record(run, record)
+
+
+def write_recording(run: RunFolder, urdf: str) -> Episode:
+    """A camera that stands, one in the hand; a motion over two seconds, three images each."""
+    robot, path = load_robot(urdf), run.episodes_dir / "trial_0001.mcap"
+    with EpisodeWriter(path) as writer:
+        writer.describe(EpisodeInfo(id="trial_0001", kind="trial", task="cube_into_box"))
+
+        def say(topic: str, data: bytes, kind: str, stamp: int) -> None:
+            arrived = stamp + ARRIVED_NS
+            writer.write(topic, data, type_name=kind, log_time_ns=arrived, publish_time_ns=stamp)
+
+        say("/robot_description", string_to_cdr(urdf), schema.STRING, T0)
+        for name in ("side", "wrist"):
+            info = CameraInfo(stamp_ns=T0, frame_id=name, camera=CAMERA)
+            say(f"/cell/cam/{name}/color/info", info.to_cdr(), schema.CAMERA_INFO, T0)
+        for index, share in enumerate(np.linspace(0.0, 1.0, 11)):
+            stamp = T0 + index * SECOND // 5
+            joints = HOME + share * (AWAY - HOME)
+            poses = {"side": T_BASE_SIDE, "wrist": robot.T_base_tcp(joints) @ T_TCP_WRIST}
+            transforms = [
+                FrameTransform(stamp_ns=stamp, parent="base_link", child=name, T_parent_child=T)
+                for name, T in poses.items()
+            ]
+            say("/tf", transforms_to_cdr(transforms), schema.TF_MESSAGE, stamp)
+            for topic, names, values in (
+                ("joint_states", ARM_JOINTS, joints),
+                ("gripper/state", ("gripper_width",), np.array([0.05])),
+            ):
+                sample = JointSample(
+                    stamp_ns=stamp, names=names, position=values,
+                    velocity=np.zeros(0), effort=np.zeros(0),
+                )  # fmt: skip
+                say(f"/cell/{topic}", sample.to_cdr(), schema.JOINT_STATE, stamp)
+            for name in poses if index % 5 == 0 else ():
+                image = CompressedColor(stamp_ns=stamp, frame_id=name, format="jpeg", data=b"-")
+                topic, sent = f"/cell/cam/{name}/color/image", stamp + LATE_NS
+                say(topic, image.to_cdr(), schema.COMPRESSED_IMAGE, sent)
+    return Episode.open(path)
+
+
+def result_of(scene: ReplayScene, movable: str, nodes_m: np.ndarray | None = None) -> ReplayResult:
+    """The arm goes from home to away, the movable along the table and round, the box stays."""
+    share = np.linspace(0.0, 1.0, 61)
+    joints = HOME + share[:, None] * (AWAY - HOME)
+    robot = load_robot(scene.urdf)
+    Ts = np.tile(scene.Ts_base_object[movable], (61, 1, 1))
+    for T, s in zip(Ts, share, strict=True):
+        T[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, s])) @ T[:3, :3]
+        T[:3, 3] += s * np.array([-0.05, 0.1, 0.08])
+    yes = Factor(value=True)
+    return ReplayResult(
+        verdict=Verdict(
+            plan_id="p", trajectory="planned", mode="dynamic", ik=yes, clearance=yes,
+            terminal=yes, engine="e", seed=0,
+        ),
+        stamps_ns=np.linspace(0, 2 * SECOND, 61).round().astype(np.int64),
+        joints_rad=joints,
+        width_m=np.full(61, 0.05),
+        Ts_base_tcp=np.stack([robot.T_base_tcp(q) for q in joints]),
+        Ts_base_object={movable: Ts},
+        finger_contact={movable: np.zeros(61, dtype=bool)},
+        clearance_m=np.ones(61),
+        contacts=[],
+        nodes_m={}
+        if nodes_m is None
+        else {movable: np.stack([se3.apply(T, nodes_m) for T in Ts]).astype(np.float32)},
+    )  # fmt: skip
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    return RunFolder.create(tmp_path / "run")
+
+
+def pictures(
+    run: RunFolder,
+    episode: Episode,
+    result: ReplayResult,
+    scene: ReplayScene,
+    *,
+    executed: bool = True,
+    planned: bool = False,
+    correction: Correction = BIAS,
+) -> dict[str, dict[int, np.ndarray]]:
+    """Images by camera and stamp, 0..1."""
+    found: dict[str, dict[int, np.ndarray]] = {}
+    for camera_id, image in render_replay(
+        run,
+        episode,
+        result,
+        scene,
+        start_ns=T0,
+        executed=executed,
+        planned=planned,
+        correction=correction,
+    ):
+        found.setdefault(camera_id, {})[image.stamp_ns - T0] = decode_color(image.data) / 255.0
+    return found
+
+
+def middle_of(image: np.ndarray, color: tuple[float, ...]) -> np.ndarray:
+    """Centre of the pixels that have a colour [px]; NaN when there are none."""
+    other = [channel for channel in range(3) if color[channel] < 0.5]
+    own = int(np.argmax(color))
+    share = image[..., own] - image[..., other].max(axis=-1)
+    rows, columns = np.nonzero(share > 0.4)
+    return np.array([columns.mean() + 0.5, rows.mean() + 0.5]) if len(rows) else np.full(2, np.nan)
+
+
+def seen_at(T_base_camera: np.ndarray, p_m: np.ndarray) -> np.ndarray:
+    return CAMERA.project(se3.apply(se3.invert(T_base_camera), p_m[None]))[0][0]
+
+
+def whole(pixel: np.ndarray) -> bool:
+    """Whether a thing there lies in the picture with all of itself."""
+    return bool(((pixel > 15) & (pixel < [CAMERA.width - 15, CAMERA.height - 15])).all())
+
+
+@pytest.mark.parametrize("correction", [Correction(), BIAS])
+def test_everything_lies_where_the_recorded_cameras_would_have_seen_it(
+    run: RunFolder, script: SimpleNamespace, correction: Correction
+) -> None:
+    """With a pose bias too: what the cameras saw lies beside where the robot finds it."""
+    seen = script.scene()
+    scene = replace(seen, Ts_base_object=correction.poses(seen.Ts_base_object))
+    write_scene(run, scene, "cube", block())
+    episode = write_recording(run, scene.urdf)
+    result = result_of(scene, "cube")
+    images = pictures(run, episode, result, scene, correction=correction)
+    assert {name: len(found) for name, found in images.items()} == {"side": 3, "wrist": 3}
+    x_m, y_m, _ = correction.bias
+    back = np.array([-x_m, -y_m, 0.0])
+    robot = load_robot(scene.urdf)
+    for t_ns, index in ((0, 0), (SECOND, 30), (2 * SECOND, 60)):
+        view = images["side"][t_ns]
+        cube = result.Ts_base_object["cube"][index][:3, 3] + back
+        tool = robot.T_base_link("tool0", result.joints_rad[index])[:3, 3]
+        box = seen.Ts_base_object["box"][:3, 3]
+        for p_m, color in ((cube, RED), (tool, BLUE), (box, GREEN)):
+            np.testing.assert_allclose(
+                middle_of(view, color), seen_at(T_BASE_SIDE, p_m), atol=1.0, err_msg=str(color)
+            )
+        T_wrist = robot.T_base_tcp(result.joints_rad[index]) @ T_TCP_WRIST
+        if whole(expected := seen_at(T_wrist, cube)):
+            found = middle_of(images["wrist"][t_ns], RED)
+            np.testing.assert_allclose(found, expected, atol=1.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("executed", "count"), [(False, int(2 * RATE_HZ)), (True, 3)])
+def test_a_plan_is_seen_from_the_hand_that_carries_it_out(
+    run: RunFolder, script: SimpleNamespace, *, executed: bool, count: int
+) -> None:
+    """The arm goes the other way round than when images were taken, if any were."""
+    scene = script.scene()
+    write_scene(run, scene, "cube", block())
+    episode = write_recording(run, scene.urdf)
+    forward = result_of(scene, "cube")
+    result = replace(
+        forward, joints_rad=forward.joints_rad[::-1], Ts_base_tcp=forward.Ts_base_tcp[::-1]
+    )
+    images = pictures(run, episode, result, scene, executed=executed, planned=True)
+    assert {name: len(found) for name, found in images.items()} == {"side": count, "wrist": count}
+    robot = load_robot(scene.urdf)
+    checked = 0
+    for t_ns, view in images["wrist"].items():
+        index = int(np.abs(result.stamps_ns - t_ns).argmin())
+        T_wrist = robot.T_base_tcp(result.joints_rad[index]) @ T_TCP_WRIST
+        p_m = BIAS.as_seen(result.Ts_base_object["cube"][index])[:3, 3]
+        expected, found = seen_at(T_wrist, p_m), middle_of(view, RED)
+        if whole(expected):
+            np.testing.assert_allclose(found, expected, atol=1.5)
+            checked += 1
+    assert checked >= count // 3
+    first, last = images["side"][0], images["side"][max(images["side"])]
+    assert np.linalg.norm(middle_of(first, BLUE) - middle_of(last, BLUE)) > 8
+
+
+@pytest.mark.slow
+def test_a_toy_bends_with_its_nodes_wherever_the_robot_finds_it(
+    run: RunFolder, script: SimpleNamespace
+) -> None:
+    """The red ones sit at one end of the toy, which is lifted; the rest stays."""
+    scene = script.toy_scene()
+    body = SoftModel.from_task(scene.task.objects["sloth"])
+    nodes = body.nodes_m.astype(np.float64)
+    axis = int(np.argmax(np.ptp(nodes, axis=0)))
+    end = nodes[nodes[:, axis] > np.quantile(nodes[:, axis], 0.9)]
+    write_scene(run, scene, "sloth", end)
+    episode = write_recording(run, scene.urdf)
+    lifted = nodes + np.outer(np.clip(nodes[:, axis], 0.0, None), np.array([0.0, 0.0, 1.0]))
+    flat, bent = (result_of(scene, "sloth", rest) for rest in (nodes, lifted))
+    for correction in (Correction(), BIAS):
+        for result in (flat, bent):
+            view = pictures(run, episode, result, scene, correction=correction)["side"][0]
+            T = result.Ts_base_object["sloth"][0]
+            moved = se3.apply(T, (nodes if result is flat else lifted)[np.isin(nodes, end).all(1)])
+            expected = correction.as_seen(T) @ se3.invert(T)
+            p_m = se3.apply(expected, moved).mean(axis=0)
+            np.testing.assert_allclose(middle_of(view, RED), seen_at(T_BASE_SIDE, p_m), atol=2.0)
+
+
+def test_what_nobody_found_is_not_drawn_where_the_scan_had_it(
+    run: RunFolder, script: SimpleNamespace
+) -> None:
+    full = script.scene()
+    write_scene(run, full, "cube", block())
+    episode = write_recording(run, full.urdf)
+    scene = script.scene(missing=("cube",))
+    result = replace(result_of(full, "cube"), Ts_base_object={}, finger_contact={})
+    assert np.isnan(middle_of(pictures(run, episode, result, scene)["side"][0], RED)).all()
+
+
+def test_a_camera_is_asked_for_when_its_pose_was_stated() -> None:
+    """A camera bolted to a hand that moves: the hand's transforms say when, not the bolt's."""
+
+    def at(stamp: int, parent: str, child: str) -> FrameTransform:
+        return FrameTransform(stamp_ns=stamp, parent=parent, child=child, T_parent_child=np.eye(4))
+
+    tree = TransformTree([*(at(t, "base", "hand") for t in (5, 1, 9)), at(3, "hand", "camera")])
+    assert tree.stamps_ns("camera").tolist() == [1, 5, 9]
+    assert tree.stamps_ns("base").tolist() == []
+    with pytest.raises(FrameNotFoundError):
+        tree.stamps_ns("side")

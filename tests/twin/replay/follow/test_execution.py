@@ -1,0 +1,127 @@
+"""Recorded finger distances become commands that press."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bridge.episode.streams import JointTrack
+from bridge.task.robot import ARM_JOINTS
+from twin.replay.config import ReplayConfig
+from twin.replay.follow.execution import (
+    check_covers,
+    closed_mask,
+    cut_track,
+    path_of_execution,
+    stages_as_executed,
+)
+from twin.replay.follow.path import UnusablePlanError
+
+OPEN_M, HELD_M = 0.085, 0.040
+
+
+def recorded_grasp(lag_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Open, close onto a 40 mm cube at 1.1 s, open at 4.2 s (the scripted plan at pace 2)."""
+    t = np.arange(0.0, 5.5, 0.008)
+    knots = [0.0, 1.1 + lag_s, 1.4 + lag_s, 4.2 + lag_s, 4.5 + lag_s, 6.0]
+    width = np.interp(t, knots, [OPEN_M, OPEN_M, HELD_M, HELD_M, OPEN_M, OPEN_M])
+    noise = np.random.default_rng(0).normal(0, 2e-4, len(t))
+    return (t * 1e9).astype(np.int64), width + noise
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.3, 0.8])
+def test_the_grasp_is_found_also_when_it_comes_late(script: SimpleNamespace, lag_s: float) -> None:
+    times, width = recorded_grasp(lag_s)
+    closed = closed_mask(times, width, script.plan(script.scene()))
+    found = times[closed] * 1e-9
+    assert found[0] == pytest.approx(1.4 + lag_s, abs=0.03)
+    assert found[-1] == pytest.approx(4.2 + lag_s, abs=0.03)
+    assert np.all(np.diff(np.flatnonzero(closed)) == 1)
+
+
+def test_the_command_presses_only_while_something_is_held(script: SimpleNamespace) -> None:
+    times, width = recorded_grasp(0.2)
+    track = JointTrack(names=ARM_JOINTS, stamps_ns=times, position=np.zeros((len(times), 6)))
+    widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
+    path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig())
+    at = {t: float(path.width_at(np.array([round(t * 1e9)]))[0]) for t in (0.5, 3.0, 5.2)}
+    assert at[0.5] == pytest.approx(OPEN_M, abs=1e-3)
+    assert at[3.0] == pytest.approx(HELD_M - 0.01, abs=1e-3)
+    assert at[5.2] == pytest.approx(OPEN_M, abs=1e-3)
+    assert path.first_close_ns is not None
+    assert path.first_close_ns * 1e-9 == pytest.approx(1.3, abs=0.05)
+
+
+def test_stamps_count_from_the_first_one_and_repeats_are_dropped(script: SimpleNamespace) -> None:
+    times, width = recorded_grasp(0.0)
+    stamps = np.concatenate([times, times[-1:]]) + 1_700_000_000_000_000_000
+    width = np.append(width, width[-1])
+    track = JointTrack(names=ARM_JOINTS, stamps_ns=stamps, position=np.zeros((len(stamps), 6)))
+    widths = JointTrack(names=("gripper_width",), stamps_ns=stamps, position=width[:, None])
+    path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig())
+    assert path.times_ns[0] == 0
+    assert np.all(np.diff(path.times_ns) > 0)
+    assert path.end_ns() == times[-1]
+
+
+def test_a_kinematic_path_keeps_the_recorded_width(script: SimpleNamespace) -> None:
+    times, width = recorded_grasp(0.2)
+    track = JointTrack(names=ARM_JOINTS, stamps_ns=times, position=np.zeros((len(times), 6)))
+    widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
+    config = ReplayConfig(mode="kinematic")
+    path = path_of_execution(track, widths, script.plan(script.scene()), config)
+    assert np.array_equal(path.width_m, width)
+
+
+def test_stages_take_the_times_the_recording_gives_them(script: SimpleNamespace) -> None:
+    plan = script.plan(script.scene())
+    start = 1_000_000_000_000
+    events = [
+        {"type": "stage_started", "plan_id": plan.id, "stage_id": "place", "stamp_ns": start + 7},
+        {"type": "stage_ended", "plan_id": plan.id, "stage_id": "grasp", "stamp_ns": start + 6},
+        {"type": "stage_started", "plan_id": "other", "stage_id": "grasp", "stamp_ns": start + 99},
+        {"type": "mark", "plan_id": plan.id, "stamp_ns": start},
+    ]
+    grasp, place = stages_as_executed(plan, events, start)
+    assert (grasp.t_start_ns, grasp.t_end_ns) == (0, 6)
+    assert (place.t_start_ns, place.t_end_ns) == (7, plan.stages[1].t_end_ns)
+    assert stages_as_executed(plan, [], start) == plan.stages
+
+
+def test_joints_that_were_not_recorded_are_not_made_up(script: SimpleNamespace) -> None:
+    times, width = recorded_grasp(0.0)
+    plan = script.plan(script.scene())
+    widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
+    there = (times < 2_000_000_000) | (times > 3_000_000_000)
+    track = JointTrack(
+        names=ARM_JOINTS, stamps_ns=times[there], position=np.zeros((int(there.sum()), 6))
+    )
+    with pytest.raises(UnusablePlanError, match=r"for 1\.0 s from 2\.0 s on"):
+        path_of_execution(track, widths, plan, ReplayConfig())
+
+
+def test_a_recording_that_stops_early_or_starts_late_is_refused(script: SimpleNamespace) -> None:
+    stamps = np.arange(2_000_000_000, 4_000_000_000, 8_000_000)
+    track = JointTrack(names=ARM_JOINTS, stamps_ns=stamps, position=np.zeros((len(stamps), 6)))
+    plan = script.plan(script.scene())
+    cut = cut_track(track, 2_000_000_000, 5_000_000_000)
+    check_covers(cut, 4_400_000_000, plan)
+    with pytest.raises(UnusablePlanError, match=r"for 1\.0 s at its end"):
+        check_covers(cut, 5_000_000_000, plan)
+    late = cut_track(track, 1_000_000_000, 3_000_000_000)
+    with pytest.raises(UnusablePlanError, match=r"for 1\.0 s from 0\.0 s on"):
+        path_of_execution(late, late, plan, ReplayConfig())
+
+
+def test_a_grasp_of_something_soft_begins_where_the_fingers_stop_though_they_creep_on(
+    script: SimpleNamespace,
+) -> None:
+    """57 mm at the touch, 45 mm a second later, as a plush toy was recorded."""
+    t = np.arange(0.0, 5.5, 0.008)
+    knots = [0.0, 1.2, 1.39, 2.4, 4.2, 4.5, 6.0]
+    width = np.interp(t, knots, [OPEN_M, OPEN_M, 0.057, 0.047, 0.045, OPEN_M, OPEN_M])
+    width += np.random.default_rng(0).normal(0, 2e-4, len(t))
+    closed = closed_mask((t * 1e9).astype(np.int64), width, script.plan(script.scene()))
+    found = t[closed]
+    assert found[0] == pytest.approx(1.4, abs=0.05)
+    assert found[-1] == pytest.approx(4.2, abs=0.05)

@@ -1,0 +1,201 @@
+"""Whichever robot a recording names: what cannot be judged says why in one sentence."""
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bridge.errors import GstError
+from bridge.geometry import se3
+from bridge.task.plan import Plan, Waypoint
+from bridge.task.robot import ROBOT_NAME, ur5_with_gripper_urdf
+from twin.replay.config import ReplayConfig
+from twin.replay.follow.path import UnusablePlanError, check_path, path_of_plan
+from twin.replay.verdict.rollout import replay_plan
+from twin.robot.collision import hulls_of
+from twin.robot.description import RobotDescriptionError
+from twin.robot.model import RobotModel, load_robot
+
+KINEMATIC = ReplayConfig(mode="kinematic")
+HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
+
+
+def plan_through(Ts: np.ndarray, step_s: float = 0.04) -> Plan:
+    """A plan of poses only."""
+    tau = []
+    for index, T in enumerate(Ts):
+        q, p = se3.split(T)
+        tau.append(
+            Waypoint(
+                t_ns=round(index * step_s * 1e9),
+                p_m=tuple(p.tolist()),
+                q_wxyz=tuple(q.tolist()),
+                g=0,
+                width_m=0.08,
+            )
+        )
+    return Plan(
+        id="poses",
+        planner="test",
+        policy="scripted",
+        condition="without_replanning",
+        robot=ROBOT_NAME,
+        frame="base_link",
+        instruction="",
+        stages=(),
+        tau=tuple(tau),
+    )
+
+
+def test_a_plan_for_another_robot_is_refused_with_both_names(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = replace(script.plan(scene), robot="panda")
+    with pytest.raises(UnusablePlanError, match=rf"'panda'.*'{ROBOT_NAME}'"):
+        replay_plan(plan, scene, KINEMATIC)
+
+
+def test_a_missing_mesh_is_named(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    lost = replace(scene, urdf=scene.urdf.replace("collision/forearm.stl", "collision/gone.stl"))
+    with pytest.raises(GstError, match=r"gone\.stl.* is not there") as caught:
+        replay_plan(script.plan(scene), lost, KINEMATIC)
+    assert str(caught.value).count("\n") == 0
+
+
+def test_a_mimicking_finger_moves_with_the_one_it_mimics() -> None:
+    urdf = ur5_with_gripper_urdf().replace("gripper_right_finger_joint", "other_finger_joint")
+    plain = RobotModel(urdf)
+    mimic = '<mimic joint="gripper_left_finger_joint" multiplier="0.5" offset="0.001"/>'
+    following = RobotModel(
+        re.sub(r'(<joint name="other_finger_joint".*?)(</joint>)', rf"\g<1>{mimic}\g<2>", urdf)
+    )
+    width = 0.04
+    still = plain.T_base_link("gripper_right_finger", HOME, 0.0)
+    moved = following.T_base_link("gripper_right_finger", HOME, width)
+    expected = 0.5 * width / 2 + 0.001
+    assert np.linalg.norm(moved[:3, 3] - still[:3, 3]) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("mimic", "found"),
+    [
+        ('<mimic joint="thumb"/>', "thumb"),
+        ('<mimic joint="gripper_left_finger_joint" multiplier="twice"/>', "no number"),
+        ('<mimic joint="gripper_left_finger_joint" multiplier="nan"/>', "no number"),
+    ],
+)
+def test_a_joint_that_mimics_nothing_is_refused_by_name(mimic: str, found: str) -> None:
+    urdf = re.sub(
+        r'(<joint name="gripper_right_finger_joint".*?)(</joint>)',
+        rf"\g<1>{mimic}\g<2>",
+        ur5_with_gripper_urdf(),
+    )
+    with pytest.raises(RobotDescriptionError, match=rf"gripper_right_finger_joint.*{found}"):
+        RobotModel(urdf)
+
+
+def test_an_endless_joint_is_refused_by_name() -> None:
+    urdf = re.sub(
+        r'(<joint name="wrist_3_joint" type=")revolute', r"\g<1>continuous", ur5_with_gripper_urdf()
+    )
+    with pytest.raises(RobotDescriptionError, match=r"wrist_3_joint.*without end"):
+        RobotModel(urdf)
+
+
+def test_a_pose_that_is_not_a_number_is_refused(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.plan(scene)
+    tau = (plan.tau[0], replace(plan.tau[1], p_m=(float("nan"), 0.0, 0.2)), *plan.tau[2:])
+    with pytest.raises(UnusablePlanError, match="not finite"):
+        replay_plan(replace(plan, tau=tau), scene, KINEMATIC)
+
+
+def test_straight_motion_through_a_wrist_singularity_is_a_named_jump() -> None:
+    """The tool passes just beside the pose where its axis is along the fourth: the wrist flips."""
+    robot = load_robot(ur5_with_gripper_urdf())
+    start = HOME.copy()
+    start[4] = -0.35
+    end = HOME.copy()
+    end[[3, 4, 5]] += [0.0, 0.35 - HOME[4], 0.0]
+    T_start, T_end = robot.T_base_tcp(start), robot.T_base_tcp(end)
+    # Turn the way a little, so that the straight line misses the singular pose.
+    T_end[:3, :3] = T_end[:3, :3] @ se3.rotation_from_vector(np.array([0.02, 0.0, 0.0]))
+    Ts = np.stack([T_start, T_end])
+    plan = plan_through(Ts, step_s=0.4)
+    path, failures, unreachable = path_of_plan(plan, robot, ReplayConfig())
+    assert unreachable is None
+    failures = failures + check_path(path, robot, hulls_of(robot), ReplayConfig())
+    causes = {failure.cause for failure in failures}
+    assert causes & {"joint_jump", "joint_speed"}
+    for failure in failures:
+        assert failure.detail
+        assert 0 <= failure.t_ns <= plan.tau[-1].t_ns
+
+
+def test_a_plan_of_poses_keeps_its_branch_all_along() -> None:
+    robot = load_robot(ur5_with_gripper_urdf())
+    wanted = HOME + np.linspace(0, 1, 40)[:, None] * np.array([0.8, 0.2, -0.2, 0.1, 0.3, 0.5])
+    path, failures, _ = path_of_plan(plan_through(robot.Ts_base_tcp(wanted)), robot, ReplayConfig())
+    assert not failures
+    assert not check_path(path, robot, hulls_of(robot), ReplayConfig())
+    np.testing.assert_allclose(
+        robot.Ts_base_tcp(path.joints_rad), robot.Ts_base_tcp(wanted), atol=1e-7
+    )
+
+
+def test_a_branch_that_touches_is_not_taken_where_another_is_free() -> None:
+    """Somebody stands where the elbow would be."""
+    robot = load_robot(ur5_with_gripper_urdf())
+    wanted = HOME + np.linspace(0, 1, 10)[:, None] * np.array([0.3, 0.1, -0.1, 0.1, 0.1, 0.1])
+    plan = plan_through(robot.Ts_base_tcp(wanted))
+    up, _, _ = path_of_plan(plan, robot, ReplayConfig())
+    sign = np.sign(up.joints_rad[0, 2])
+    down, failures, _ = path_of_plan(
+        plan,
+        robot,
+        ReplayConfig(),
+        clearance=lambda q: np.where(np.sign(q[:, 2]) == sign, -0.01, 0.01),
+    )
+    assert not failures
+    assert np.all(np.sign(down.joints_rad[:, 2]) == -sign)
+
+
+def test_every_failure_along_a_path_names_its_first_instant() -> None:
+    """Limit, jump and self-collision, each put in on purpose at a known time."""
+    from twin.replay.follow.path import JointPath
+
+    robot = load_robot(ur5_with_gripper_urdf())
+    hulls = hulls_of(robot)
+    times = np.arange(0, 2_000_000_001, 40_000_000, dtype=np.int64)
+
+    def checked(joints: np.ndarray) -> dict[str, tuple[int, tuple[str, ...]]]:
+        path = JointPath(
+            times_ns=times,
+            joints_rad=joints,
+            width_times_ns=times[:1],
+            width_m=np.array([0.08]),
+            first_close_ns=None,
+        )
+        found = check_path(path, robot, hulls, ReplayConfig())
+        return {failure.cause: (failure.t_ns, failure.bodies) for failure in found}
+
+    still = np.tile(HOME, (len(times), 1))
+    assert checked(still) == {}
+    jump = still.copy()
+    jump[20:, 1] += 0.5
+    assert checked(jump)["joint_jump"] == (times[19], ("shoulder_lift_joint",))
+    limit = still.copy()
+    limit[:, 2] = np.linspace(3.0, 3.3, len(times))
+    first = int(np.argmax(limit[:, 2] > robot.upper_rad[2] + 1e-3))
+    assert checked(limit)["joint_limit"] == (times[first], ("elbow_joint",))
+    fold = still.copy()
+    fold[:, 2] = np.linspace(1.6, 3.0, len(times))
+    t_ns, bodies = checked(fold)["self_collision"]
+    index = int(np.searchsorted(times, t_ns))
+    hulls.place(fold[index], 0.08)
+    assert hulls.self_distance().distance_m <= 0
+    hulls.place(fold[index - 1], 0.08)
+    assert hulls.self_distance().distance_m > 0
+    assert len(bodies) == 2

@@ -1,0 +1,119 @@
+"""What a rebuilt scene adds: lattices that can be trusted, distances, calibrated physics."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.episode.run import RunFolder
+from bridge.task.task_file import load_task
+from twin.physics.config import PhysicsConfig
+from twin.physics.soft import SoftModel
+from twin.replay.place.calibrated import physics_for
+from twin.replay.place.rebuilt import TASK_SHAPE, read_place, shape_hashes
+from twin.scene.calibration import Calibration
+from twin.scene.shape.lattice import Lattice
+
+TASK = load_task("sloth_into_basket")
+
+
+def lattice_of_task(stretch: float = 1.0) -> Lattice:
+    """The task's own lattice as a scene would hold it."""
+    body = SoftModel.from_task(TASK.objects["sloth"])
+    nodes = body.nodes_m * np.array([stretch, 1.0, 1.0], dtype=np.float32)
+    edges = body.edges().astype(np.int32)
+    lengths = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
+    return Lattice(
+        nodes_m=nodes.astype(np.float32),
+        springs=edges,
+        rest_lengths_m=lengths.astype(np.float32),
+        tets=body.tets,
+        mass_fraction=body.mass_fraction,
+        spacing_m=body.spacing_m,
+    )
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    """A scene with a lattice of the sloth and nothing else."""
+    folder = RunFolder.create(tmp_path / "run")
+    place = folder.scene_dir / "objects" / "sloth"
+    place.mkdir(parents=True)
+    lattice_of_task().save(place / "soft.npz")
+    write_object(folder, watertight=True)
+    record = {"schema_version": 1, "key": "k", "scene_hash": "abc", "background": {},
+              "sources": [], "views": []}  # fmt: skip
+    (folder.scene_dir / "scene.json").write_text(json.dumps(record))
+    return folder
+
+
+def write_object(run: RunFolder, *, watertight: bool) -> None:
+    about = {"geometry": {"watertight": watertight}}
+    (run.scene_dir / "objects" / "sloth" / "object.json").write_text(json.dumps(about))
+
+
+def test_without_a_scene_the_task_file_says_everything(tmp_path: Path) -> None:
+    place = read_place(RunFolder.create(tmp_path / "run"), TASK)
+    assert (place.scene_hash, place.static_sdf, dict(place.lattices)) == (None, None, {})
+    assert set(place.shape_sources.values()) == {TASK_SHAPE}
+
+
+def test_the_lattice_of_the_scene_is_taken_and_named(run: RunFolder) -> None:
+    place = read_place(run, TASK)
+    assert place.scene_hash == "abc"
+    assert place.shape_sources["sloth"].startswith("lattice of the scene")
+    body = SoftModel.from_lattice(place.lattices["sloth"], TASK.objects["sloth"])
+    assert len(body.nodes_m) == len(SoftModel.from_task(TASK.objects["sloth"]).nodes_m)
+    assert any("sdf.npz" in remark for remark in place.remarks)
+
+
+def test_a_mesh_that_is_not_watertight_is_not_believed(run: RunFolder) -> None:
+    write_object(run, watertight=False)
+    place = read_place(run, TASK)
+    assert not place.lattices
+    assert "not watertight" in place.shape_sources["sloth"]
+
+
+def test_a_lattice_of_another_size_is_another_body(run: RunFolder) -> None:
+    lattice_of_task(stretch=1.5).save(run.scene_dir / "objects" / "sloth" / "soft.npz")
+    place = read_place(run, TASK)
+    assert not place.lattices
+    assert "% off)" in place.shape_sources["sloth"]
+
+
+def test_damaged_files_are_passed_over_with_the_reason(run: RunFolder) -> None:
+    (run.scene_dir / "objects" / "sloth" / "soft.npz").write_bytes(b"no arrays")
+    (run.scene_dir / "sdf.npz").write_bytes(b"none either")
+    place = read_place(run, TASK)
+    assert not place.lattices
+    assert "soft.npz" in place.shape_sources["sloth"]
+    assert any("sdf.npz" in remark for remark in place.remarks)
+    assert place.static_sdf is None
+
+
+def test_other_shapes_are_other_replays(run: RunFolder) -> None:
+    before = shape_hashes(run)
+    assert list(before) == ["objects/sloth/soft.npz"]
+    lattice_of_task(stretch=1.1).save(run.scene_dir / "objects" / "sloth" / "soft.npz")
+    assert shape_hashes(run) != before
+
+
+def calibration(**identified: object) -> Calibration:
+    record = {"calibration_id": "12345678", "physics": {"identified": identified}}
+    return Calibration(record=record, cameras={})
+
+
+def test_calibrated_physics_is_used_where_the_user_said_nothing() -> None:
+    found = calibration(object_friction=0.42, grip_force_N={"value": 9.0}, gravity_m_s2=None)
+    physics = physics_for(PhysicsConfig(), found)
+    assert (physics.object_friction, physics.grip_force_N) == (0.42, 9.0)
+    assert physics.gravity_m_s2 == PhysicsConfig().gravity_m_s2
+    mine = physics_for(replace(PhysicsConfig(), object_friction=0.7), found)
+    assert (mine.object_friction, mine.grip_force_N) == (0.7, 9.0)
+
+
+def test_without_a_calibration_nothing_is_moved() -> None:
+    assert physics_for(PhysicsConfig(), None) == PhysicsConfig()
+    assert physics_for(PhysicsConfig(), calibration(unheard_of=3.0)) == PhysicsConfig()

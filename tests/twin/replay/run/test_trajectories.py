@@ -1,0 +1,224 @@
+"""``robot-gst replay``: which trajectories are replayed, into which files, and what they hold."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from bridge.episode import schema, streams
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.records import JointSample, string_to_cdr
+from bridge.episode.run import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import UsageError
+from bridge.terminal import Output
+from twin.replay.config import ReplayConfig, ReplayRunConfig
+from twin.replay.place.starts import StartState, StartStates
+from twin.replay.run import trajectories
+from twin.replay.run.table import count_verdicts
+from twin.replay.run.text import describe_run
+from twin.replay.run.trajectories import replay_run
+from twin.replay.verdict.result import ReplayResult
+from twin.replay.work.job import ReplayJob, divergence_of
+from twin.scene.localise_episode import Phase
+
+T0 = 1_700_000_000_000_000_000
+START = T0 + 2_000_000_000
+QUIET = Output(quiet=True)
+
+
+@pytest.fixture
+def run(
+    tmp_path: Path, script: SimpleNamespace, good: ReplayResult, monkeypatch: pytest.MonkeyPatch
+) -> RunFolder:
+    """One trial: a plan that was executed, and one that never was."""
+    folder = RunFolder.create(tmp_path / "run")
+    scene = script.scene()
+    executed = script.plan(scene, plan_id="round-1")
+    refused = replace(executed, id="round-0")
+    track, widths = script.recorded_tracks(good, start_ns=START)
+    with EpisodeWriter(folder.episodes_dir / "trial_0001.mcap") as writer:
+        writer.describe(
+            EpisodeInfo(id="trial_0001", kind="trial", task="cube_into_box", cell="standin")
+        )
+        writer.write(
+            "/robot_description", string_to_cdr(scene.urdf), type_name=schema.STRING, log_time_ns=T0
+        )
+        for offset_s, plan in ((0, refused), (1, executed)):
+            writer.write(
+                "/standin/plan",
+                plan.to_json(),
+                type_name=schema.PLAN,
+                log_time_ns=T0 + offset_s * 10**9,
+            )
+        for kind, stamp in (
+            ("execution_started", START),
+            ("execution_ended", int(track.stamps_ns[-1])),
+        ):
+            event = {"schema_version": 1, "stamp_ns": stamp, "type": kind, "plan_id": "round-1"}
+            writer.write_json("/standin/event", event, type_name=schema.EVENT, log_time_ns=stamp)
+        for topic, recorded in (("joint_states", track), ("gripper/state", widths)):
+            for stamp, position in zip(recorded.stamps_ns, recorded.position, strict=True):
+                sample = JointSample(
+                    stamp_ns=int(stamp),
+                    names=recorded.names,
+                    position=position,
+                    velocity=np.zeros(0),
+                    effort=np.zeros(0),
+                )
+                writer.write(
+                    f"/standin/{topic}",
+                    sample.to_cdr(),
+                    type_name=schema.JOINT_STATE,
+                    log_time_ns=int(stamp),
+                )
+    with EpisodeWriter(folder.episodes_dir / "scan.mcap") as writer:
+        writer.describe(EpisodeInfo(id="scan", kind="scan"))
+
+    def starts(*_: object, **__: object) -> StartStates:
+        phase = Phase(name="start", plan_id=None, after_ns=None, before_ns=START)
+        return StartStates(scene.task, [phase], [StartState(Ts_base_object=scene.Ts_base_object)])
+
+    monkeypatch.setattr(trajectories, "localised_starts", starts)
+    return folder
+
+
+QUICK = ReplayConfig(settle_after_s=0.5)
+
+
+@pytest.mark.slow
+def test_every_plan_and_every_execution_becomes_one_episode(
+    run: RunFolder, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    summary = replay_run(run, ReplayRunConfig(replay=QUICK), QUIET)
+    assert {(r["plan"], r["trajectory"], r["mode"]): r["accepted"] for r in summary["rows"]} == {
+        ("round-0", "planned", "dynamic"): True,
+        ("round-1", "planned", "dynamic"): True,
+        ("round-1", "executed", "dynamic"): True,
+        ("round-1", "executed", "kinematic"): None,
+    }
+    assert not any(row["error"] for row in summary["rows"])
+    assert summary["scene_hash"] is None
+    assert len(run.derived("*.replay.*")) == 4
+    _check_file(run, "trial_0001.replay.planned.dynamic.round-1.pybullet.*")
+    (execution,) = summary["executions"]
+    assert (execution["planned"], execution["executed"]) == (True, True)
+    assert execution["recorded"] == "unknown", "nobody labelled it"
+    assert execution["lag_s"] is not None, "compared with the plan, replayed before"
+    (path,) = run.derived("trial_0001.replay.executed.dynamic.*")
+    record = divergence_of(Episode.open(path))
+    assert record is not None
+    assert all(item["between"] != ["planned", "executed"] for item in record["partings"])
+
+    stamps = {path: path.stat().st_mtime_ns for path in run.derived()}
+    again = replay_run(run, ReplayRunConfig(replay=QUICK), QUIET)
+    assert all(row["skipped"] for row in again["rows"])
+    assert {path: path.stat().st_mtime_ns for path in run.derived()} == stamps
+    assert again["counts"] == summary["counts"]
+    QUIET.result(again, describe_run(again))
+    assert "planned dynamic, never executed" in capsys.readouterr().out
+
+    done: list[ReplayJob] = []
+    monkeypatch.setattr(trajectories, "run_job", lambda job: done.append(job) or again["rows"][0])
+    replay_run(run, ReplayRunConfig(replay=QUICK), QUIET)
+    assert not done
+    replay_run(run, ReplayRunConfig(replay=QUICK, force=True), QUIET)
+    assert len(done) == 4
+    assert {job.path() for job in done} == set(run.derived("*.replay.*"))
+    stricter = replace(QUICK, eps_col_m=0.003)
+    replay_run(run, ReplayRunConfig(replay=stricter), QUIET)
+    assert not {job.path() for job in done[4:]} & {job.path() for job in done[:4]}
+    assert len(done) == 8
+
+
+def _check_file(run: RunFolder, pattern: str) -> None:
+    (path,) = run.derived(pattern)
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        header = reader.get_header()
+        counts: dict[str, int] = {}
+        times = []
+        for record, channel, message in reader.iter_messages():
+            assert record is not None
+            counts[channel.topic] = counts.get(channel.topic, 0) + 1
+            times.append(message.log_time)
+    assert header.profile == "ros2"
+    assert times == sorted(times)
+    assert counts["/standin/plan"] == counts["/standin/verdict"] == 1
+    assert counts["/standin/joint_states"] == counts["/standin/replay/clearance"]
+    assert counts["/standin/object/cube/pose"] == counts["/standin/tcp/pose"]
+    assert counts["/robot_description"] == 1
+    assert counts["/standin/replay/contact"] > 2
+
+    episode = Episode.open(path)
+    assert episode.derived is not None
+    assert episode.derived.plan_id == "round-1"
+    assert episode.derived.source_episode == "trial_0001"
+    assert episode.info.task == "cube_into_box"
+    track = streams.joint_track(episode)
+    assert track.stamps_ns[0] == START
+    assert streams.executed_interval_ns(episode, "round-1") is not None
+    ((_, verdict),) = streams.verdicts(episode)
+    assert verdict.accepted is True
+    cube = streams.pose_track(episode, streams.object_pose_topics(episode)["cube"])
+    assert np.linalg.norm(cube.p_m[-1] - cube.p_m[0]) > 0.2
+
+
+@pytest.mark.slow
+def test_two_processes_say_what_one_process_says(run: RunFolder) -> None:
+    """Only replays are compared: the processes also localise, which the fixture does here."""
+    config = ReplayRunConfig(replay=QUICK)
+    replay_run(run, config, QUIET)
+    before = {path.name: _messages(path) for path in run.derived("*.replay.*")}
+    summary = replay_run(run, replace(config, workers=2, force=True), QUIET)
+    assert not any(row["skipped"] or row["error"] for row in summary["rows"])
+    assert {path.name: _messages(path) for path in run.derived("*.replay.*")} == before
+
+
+def _messages(path: Path) -> list[tuple[str, int, bytes]]:
+    return [(m.topic, m.publish_time_ns, m.data) for m in Episode.open(path).messages()]
+
+
+def test_an_unknown_episode_lists_those_that_exist(run: RunFolder) -> None:
+    with pytest.raises(UsageError, match="trial_0001"):
+        replay_run(run, ReplayRunConfig(episode=("trial_9",)), QUIET)
+
+
+def test_a_run_without_plans_says_so(tmp_path: Path) -> None:
+    summary = replay_run(RunFolder.create(tmp_path / "empty"), ReplayRunConfig(), QUIET)
+    assert describe_run(summary) == "No trial with a plan to replay."
+    json.dumps(summary)
+
+
+def test_counts_keep_never_executed_plans_apart() -> None:
+    rows = [
+        {"trajectory": "planned", "mode": "dynamic", "executed": e, "accepted": a, "error": x}
+        for e, a, x in ((True, True, None), (False, False, None), (True, None, "broken"))
+    ]
+    counts = count_verdicts(rows)
+    assert counts["planned dynamic"] == {
+        "n": 2, "accepted": 1, "rejected": 0, "undecided": 0, "failed": 1
+    }  # fmt: skip
+    assert counts["planned dynamic, never executed"]["rejected"] == 1
+
+
+def test_a_plan_made_during_an_execution_has_no_known_start(script: SimpleNamespace) -> None:
+    task = script.scene().task
+    phases = [
+        Phase(name="start", plan_id=None, after_ns=None, before_ns=100),
+        Phase(name="end", plan_id="a", after_ns=200, before_ns=300),
+    ]
+    first = StartState(Ts_base_object={"cube": np.eye(4)})
+    second = StartState(Ts_base_object={"box": np.eye(4)})
+    starts = StartStates(task, phases, [first, second])
+    assert starts.at(100) is first
+    assert starts.at(250) is second
+    assert starts.at(300) is second
+    during = starts.at(150)
+    assert not during.Ts_base_object
+    assert "being executed" in during.reasons["cube"]

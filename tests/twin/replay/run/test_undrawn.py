@@ -1,0 +1,35 @@
+"""What pictures will lack is said before they are drawn, and none are tried without a scene."""
+
+from pathlib import Path
+
+import pytest
+
+from bridge.episode.run import RunFolder
+from bridge.errors import PathNotFoundError
+from bridge.terminal import Output
+from twin.replay.config import ReplayRunConfig
+from twin.replay.run.trajectories import replay_run
+from twin.replay.run.undrawn import describe_undrawn
+
+
+def test_pictures_without_a_scene_are_refused_before_anything_is_replayed(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    with pytest.raises(PathNotFoundError, match=r"--render draws it.*robot-gst rebuild RUN"):
+        replay_run(run, ReplayRunConfig(render=True), Output(quiet=True))
+
+
+def test_objects_and_a_robot_that_the_scene_lacks_are_named_with_the_reason() -> None:
+    record = {
+        "objects": {"box": {}},
+        "objects_remark": "cube not found: hidden",
+        "robot": {"links": {}, "remark": "no joints"},
+    }
+    assert describe_undrawn(record, ["cube_into_box"]) == [
+        "cube: not in the scene, not in pictures (cube not found: hidden)",
+        "robot: not in the scene, not in pictures (no joints)",
+    ]
+
+
+def test_a_whole_scene_lacks_nothing() -> None:
+    whole = {"objects": {"box": {}, "cube": {}}, "robot": {"links": {"tool0": {}}}}
+    assert describe_undrawn(whole, ["cube_into_box"]) == []

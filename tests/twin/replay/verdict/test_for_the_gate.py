@@ -1,0 +1,50 @@
+"""The gate's process with the real replay behind it."""
+
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.episode.run import RunFolder
+from bridge.terminal import Output
+from twin.gate.config import GateConfig
+from twin.gate.judge import UndecidedError
+from twin.gate.twin_process import TwinProcess
+from twin.replay.config import ReplayConfig
+from twin.replay.verdict.result import ReplayResult
+
+
+def soon(seconds: float) -> float:
+    return time.monotonic() + seconds
+
+
+def as_localised(scene: Any) -> dict[str, Any]:
+    unsure = np.diag([1e-8, 1e-8, 0.0, 0.0, 0.0, 1e-8])
+    return {
+        name: SimpleNamespace(found=True, reason=None, T_base_object=T, covariance=unsure)
+        for name, T in scene.Ts_base_object.items()
+    }
+
+
+@pytest.mark.slow
+def test_the_gates_process_says_what_the_replay_says_and_adds_samples(
+    tmp_path: Path, script: SimpleNamespace, good: ReplayResult
+) -> None:
+    scene = script.scene()
+    plan, found = script.plan(scene), as_localised(scene)
+    config = GateConfig(samples=1, replay=ReplayConfig())
+    run = RunFolder.create(tmp_path / "run")
+    with TwinProcess(run.path, scene.task, config, Output(quiet=True)) as twin:
+        first = twin.replay(plan, found, scene.urdf, soon(120))
+        assert first.p_success is not None
+        assert (first.p_success["k"], first.p_success["n"]) == (1, 1)
+        assert replace(first, p_success=None) == good.verdict
+        nowhere = replace(plan.tau[3], p_m=(math.nan, 0.0, 0.2))
+        lost = replace(plan, tau=(*plan.tau[:3], nowhere, *plan.tau[4:]))
+        with pytest.raises(UndecidedError, match="not finite"):
+            twin.replay(lost, found, scene.urdf, soon(60))

@@ -1,0 +1,344 @@
+"""I(tau): what is accepted, what is rejected, by which factor, when and between whom."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bridge.errors import UsageError
+from bridge.geometry import se3
+from twin.replay.config import Mode, ReplayConfig
+from twin.replay.follow.path import UnusablePlanError
+from twin.replay.verdict.result import ReplayResult
+from twin.replay.verdict.rollout import replay_joints, replay_plan
+
+KINEMATIC = ReplayConfig(mode="kinematic")
+
+
+def test_a_good_plan_is_accepted(good: ReplayResult) -> None:
+    verdict = good.verdict
+    assert (verdict.ik.value, verdict.clearance.value, verdict.terminal.value) == (True,) * 3
+    assert verdict.accepted is True
+    assert verdict.engine.startswith("pybullet-")
+    assert (verdict.trajectory, verdict.mode) == ("planned", "dynamic")
+
+
+def test_the_cube_is_carried_between_the_fingers(good: ReplayResult) -> None:
+    """While held, the cube moves with the tool: the slip is millimetres."""
+    held = good.finger_contact["cube"] & (good.Ts_base_object["cube"][:, 2, 3] > 0.08)
+    assert held.sum() > 60
+    T_tcp_cube = se3.invert(good.Ts_base_tcp[held]) @ good.Ts_base_object["cube"][held]
+    slip = np.linalg.norm(T_tcp_cube[:, :3, 3] - T_tcp_cube[0, :3, 3], axis=1)
+    assert slip.max() < 4e-3
+
+
+def test_all_tracks_of_a_replay_have_one_length(good: ReplayResult) -> None:
+    n = len(good.stamps_ns)
+    assert good.stamps_ns[0] == 0
+    assert np.all(np.diff(good.stamps_ns) > 0)
+    tracks = [good.joints_rad, good.width_m, good.Ts_base_tcp, good.clearance_m]
+    tracks += [*good.Ts_base_object.values(), *good.finger_contact.values()]
+    assert {len(track) for track in tracks} == {n}
+    assert set(good.Ts_base_object) == {"cube", "box"}
+
+
+@pytest.mark.slow
+def test_a_grasp_beside_the_cube_is_rejected_by_the_terminal_state(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.plan(scene, grasp_offset_m=(0.06, 0.0, 0.0))
+    verdict = replay_plan(plan, scene, ReplayConfig()).verdict
+    assert verdict.terminal.value is False
+    assert verdict.terminal.cause == "inside"
+    assert verdict.terminal.bodies == ("cube", "box")
+    assert verdict.accepted is False
+
+
+@pytest.mark.parametrize("mode", ["kinematic", pytest.param("dynamic", marks=pytest.mark.slow)])
+def test_a_dip_below_the_table_is_rejected_by_clearance(
+    script: SimpleNamespace, mode: Mode
+) -> None:
+    scene = script.scene()
+    plan = script.plan(scene, grasp_offset_m=(0.12, 0.0, -0.04))
+    clearance = replay_plan(plan, scene, ReplayConfig(mode=mode)).verdict.clearance
+    assert clearance.value is False
+    assert clearance.bodies[0].startswith("gripper_")
+    assert clearance.bodies[1] == "table"
+    assert clearance.first_t_ns is not None
+    assert 0.7e9 < clearance.first_t_ns < 1.1e9, "the tool arrives at 1 s"
+
+
+def test_the_clearance_of_a_dip_is_its_depth(script: SimpleNamespace) -> None:
+    """The tips are 10 mm below the tool: at tool height -0.02 they are 30 mm in the table."""
+    scene = script.scene()
+    result = replay_plan(script.plan(scene, grasp_offset_m=(0.12, 0.0, -0.04)), scene, KINEMATIC)
+    assert result.clearance_m.min() == pytest.approx(-0.03, abs=1e-4)
+
+
+def test_a_finger_that_lands_on_the_cube_is_named(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    T = scene.Ts_base_object["cube"]
+    along_opening = T[:3, 1] * 0.035
+    plan = script.plan(scene, grasp_offset_m=tuple(along_opening.tolist()))
+    clearance = replay_plan(plan, scene, KINEMATIC).verdict.clearance
+    assert clearance.value is False
+    assert clearance.cause == "pre_grasp_penetration"
+    assert clearance.bodies[1] == "cube"
+    assert "finger" in clearance.bodies[0]
+
+
+@pytest.mark.slow
+def test_a_contact_the_stage_does_not_allow_is_rejected(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.plan(scene)
+    strict = tuple(replace(stage, allowed_contacts=()) for stage in plan.stages)
+    clearance = replay_plan(replace(plan, stages=strict), scene, ReplayConfig()).verdict.clearance
+    assert clearance.value is False
+    assert "cube" in clearance.bodies
+
+
+def test_a_carry_through_the_wall_of_the_box_is_rejected(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.plan(scene, carry_height_m=0.03)
+    clearance = replay_plan(plan, scene, KINEMATIC).verdict.clearance
+    assert clearance.value is False
+    assert clearance.cause == "deep_contact"
+    assert clearance.bodies[1] == "box"
+
+
+def test_an_unreachable_waypoint_is_rejected_by_ik_at_its_time(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.with_joints(script.plan(scene), scene)
+    tau = list(plan.tau)
+    tau[40] = replace(tau[40], p_m=(2.0, 0.0, 0.3), joints_rad=None)
+    verdict = replay_plan(replace(plan, tau=tuple(tau)), scene, KINEMATIC).verdict
+    assert verdict.ik.value is False
+    assert verdict.ik.cause == "unreachable"
+    assert verdict.ik.first_t_ns == tau[40].t_ns
+    assert verdict.clearance.value is None, "what comes after the pose is not known"
+    assert verdict.accepted is False
+
+
+def test_an_unreachable_first_waypoint_gives_a_verdict_too(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.plan(scene)
+    tau = (replace(plan.tau[0], p_m=(0.0, 0.0, 3.0)), *plan.tau[1:])
+    verdict = replay_plan(replace(plan, tau=tau), scene, ReplayConfig()).verdict
+    assert (verdict.ik.value, verdict.ik.first_t_ns) == (False, 0)
+    assert verdict.terminal.value is None
+
+
+def test_joints_that_contradict_the_pose_are_rejected(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.with_joints(script.plan(scene), scene)
+    tau = list(plan.tau)
+    joints = np.array(tau[10].joints_rad) + np.array([0.01, 0, 0, 0, 0, 0])
+    tau[10] = replace(tau[10], joints_rad=tuple(joints.tolist()))
+    ik = replay_plan(replace(plan, tau=tuple(tau)), scene, KINEMATIC).verdict.ik
+    assert (ik.value, ik.cause, ik.first_t_ns) == (False, "joints_disagree", tau[10].t_ns)
+
+
+def test_given_joints_and_solved_joints_lead_to_the_same_motion(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.plan(scene)
+    solved = replay_plan(plan, scene, KINEMATIC)
+    given = replay_plan(script.with_joints(plan, scene), scene, KINEMATIC)
+    assert given.verdict.ik.value is True
+    path = np.array(
+        [
+            np.interp(given.stamps_ns, solved.stamps_ns, solved.Ts_base_tcp[:, i, 3])
+            for i in range(3)
+        ]
+    ).T
+    gap = np.linalg.norm(path - given.Ts_base_tcp[:, :3, 3], axis=1)
+    assert gap.max() < 5e-3, "waypoints each 40 ms cut the corners by a few millimetres"
+
+
+def test_a_branch_flip_is_a_joint_jump(script: SimpleNamespace) -> None:
+    """Full turns of the wrist reach the same pose, but nobody turns so fast."""
+    scene = script.scene()
+    plan = script.with_joints(script.plan(scene), scene)
+    turned = np.array([0, 0, 0, 0, 0, 2 * np.pi])
+    tau = list(plan.tau)
+    sign = -1.0 if tau[60].joints_rad[5] > 0 else 1.0
+    for index in range(60, len(tau)):
+        joints = np.array(tau[index].joints_rad) + sign * turned
+        tau[index] = replace(tau[index], joints_rad=tuple(joints.tolist()))
+    ik = replay_plan(replace(plan, tau=tuple(tau)), scene, KINEMATIC).verdict.ik
+    assert (ik.value, ik.cause) == (False, "joint_jump")
+    assert ik.bodies == ("wrist_3_joint",)
+    assert abs(ik.first_t_ns - tau[59].t_ns) <= 40_000_000
+
+
+def test_a_kinematic_replay_leaves_the_terminal_state_open(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    result = replay_plan(script.plan(scene), scene, KINEMATIC)
+    assert result.verdict.ik.value is True
+    assert result.verdict.clearance.value is True
+    assert result.verdict.terminal.value is None
+    assert "kinematic" in (result.verdict.terminal.detail or "")
+    assert result.verdict.accepted is None
+    assert set(result.Ts_base_object) == {"box"}, "nothing is known of the cube"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", ["cube", "box"])
+def test_an_object_that_was_not_localised_leaves_the_verdict_open(
+    script: SimpleNamespace, lost: str
+) -> None:
+    plan = script.plan(script.scene())
+    scene = replace(script.scene(missing=(lost,)), reasons={lost: "hidden by the arm"})
+    verdict = replay_plan(plan, scene, ReplayConfig()).verdict
+    assert verdict.terminal.value is None
+    assert verdict.clearance.value is None
+    assert "hidden by the arm" in (verdict.reason or "")
+    assert verdict.accepted is None
+
+
+@pytest.mark.slow
+def test_a_recorded_execution_ends_as_the_motion_it_recorded(
+    script: SimpleNamespace, good: ReplayResult
+) -> None:
+    scene = script.scene()
+    track, widths = script.recorded_tracks(good, start_ns=1_700_000_000_000_000_000)
+    result = replay_joints(track, widths, scene, ReplayConfig(), plan=script.plan(scene))
+    assert result.verdict.trajectory == "executed"
+    assert result.verdict.accepted is True, result.verdict.reason
+    end = result.Ts_base_object["cube"][-1, :3, 3] - good.Ts_base_object["cube"][-1, :3, 3]
+    assert np.linalg.norm(end) < 0.01
+
+
+def test_a_kinematic_replay_follows_recorded_joints_exactly(
+    script: SimpleNamespace, good: ReplayResult
+) -> None:
+    scene = script.scene()
+    track, widths = script.recorded_tracks(good)
+    result = replay_joints(track, widths, scene, KINEMATIC, plan=script.plan(scene))
+    assert np.allclose(result.joints_rad, track.at(result.stamps_ns), atol=1e-9)
+    assert result.verdict.clearance.value is True
+
+
+def test_recorded_joints_in_another_order_are_sorted_by_name(
+    script: SimpleNamespace, good: ReplayResult
+) -> None:
+    scene = script.scene()
+    track, widths = script.recorded_tracks(good)
+    mixed = replace(track, names=track.names[::-1], position=track.position[:, ::-1])
+    plan = script.plan(scene)
+    one = replay_joints(track, widths, scene, KINEMATIC, plan=plan)
+    other = replay_joints(mixed, widths, scene, KINEMATIC, plan=plan)
+    assert np.array_equal(one.joints_rad, other.joints_rad)
+
+
+def test_recorded_joints_that_jump_are_rejected(
+    script: SimpleNamespace, good: ReplayResult
+) -> None:
+    scene = script.scene()
+    track, widths = script.recorded_tracks(good)
+    position = track.position.copy()
+    position[300:, 0] += 0.6
+    result = replay_joints(
+        replace(track, position=position), widths, scene, KINEMATIC, plan=script.plan(scene)
+    )
+    assert result.verdict.ik.cause == "joint_jump"
+
+
+def test_a_recording_without_the_arm_is_refused_by_name(
+    script: SimpleNamespace, good: ReplayResult
+) -> None:
+    scene = script.scene()
+    track, widths = script.recorded_tracks(good)
+    with pytest.raises(UnusablePlanError, match="shoulder_pan_joint"):
+        replay_joints(widths, widths, scene, KINEMATIC, plan=script.plan(scene))
+    assert track.names[0] == "shoulder_pan_joint"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"tau": ()}, "no waypoints"),
+        ({"frame": "camera"}, "frame 'camera'"),
+        ({"joint_names": ("a", "b")}, "names the joints a, b"),
+    ],
+)
+def test_a_plan_that_cannot_be_replayed_is_refused(
+    script: SimpleNamespace, change: dict[str, object], message: str
+) -> None:
+    scene = script.scene()
+    with pytest.raises(UnusablePlanError, match=message):
+        replay_plan(replace(script.plan(scene), **change), scene, KINEMATIC)
+
+
+def test_waypoints_out_of_order_are_refused(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.plan(scene)
+    with pytest.raises(UnusablePlanError, match="do not increase"):
+        replay_plan(replace(plan, tau=plan.tau[::-1]), scene, KINEMATIC)
+
+
+def test_a_pose_that_is_not_a_number_is_refused(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.plan(scene)
+    tau = (replace(plan.tau[0], p_m=(float("nan"), 0.0, 0.3)), *plan.tau[1:])
+    with pytest.raises(UnusablePlanError, match="not finite"):
+        replay_plan(replace(plan, tau=tau), scene, KINEMATIC)
+
+
+@pytest.mark.parametrize("change", [{"width_m": float("nan")}, {"joints_rad": (float("inf"),) * 6}])
+def test_a_command_that_is_not_a_number_is_refused(
+    script: SimpleNamespace, change: dict[str, object]
+) -> None:
+    scene = script.scene()
+    plan = script.plan(scene)
+    tau = (*plan.tau[:-1], replace(plan.tau[-1], **change))
+    with pytest.raises(UnusablePlanError, match="not finite"):
+        replay_plan(replace(plan, tau=tau), scene, KINEMATIC)
+
+
+def test_a_plan_of_one_waypoint_stands_still(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.plan(scene)
+    result = replay_plan(replace(plan, tau=plan.tau[:1]), scene, ReplayConfig(settle_after_s=0.3))
+    assert result.verdict.ik.value is True
+    assert result.verdict.terminal.value is not True
+    assert result.verdict.accepted is not True
+
+
+def test_quaternions_of_another_length_mean_the_same_path(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.plan(scene)
+    longer = tuple(replace(w, q_wxyz=tuple(2.0 * q for q in w.q_wxyz)) for w in plan.tau)
+    one = replay_plan(plan, scene, KINEMATIC)
+    two = replay_plan(replace(plan, tau=longer), scene, KINEMATIC)
+    np.testing.assert_allclose(two.joints_rad, one.joints_rad, atol=1e-6)
+
+
+def test_a_sample_rate_that_does_not_divide_the_physics_rate_is_refused() -> None:
+    with pytest.raises(UsageError, match="does not divide"):
+        ReplayConfig(sample_rate_hz=50)
+
+
+@pytest.mark.slow
+def test_two_replays_of_one_plan_are_the_same_bits(
+    script: SimpleNamespace, good: ReplayResult
+) -> None:
+    scene = script.scene()
+    again = replay_plan(script.plan(scene), scene, ReplayConfig())
+    assert np.array_equal(again.joints_rad, good.joints_rad)
+    assert np.array_equal(again.clearance_m, good.clearance_m)
+    for name, Ts in good.Ts_base_object.items():
+        assert Ts.tobytes() == again.Ts_base_object[name].tobytes()
+    assert again.verdict == good.verdict
+
+
+@pytest.mark.slow
+def test_twelve_seconds_replay_in_a_few_seconds_of_one_core(script: SimpleNamespace) -> None:
+    """2 s is the target on an idle machine; the limit leaves room for a slower one."""
+    import time
+
+    scene = script.scene()
+    plan = script.plan(scene, pace=1.0)
+    start = time.process_time()
+    result = replay_plan(plan, scene, ReplayConfig())
+    assert result.stamps_ns[-1] == 12_000_000_000
+    assert time.process_time() - start < 6.0

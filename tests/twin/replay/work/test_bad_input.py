@@ -1,0 +1,95 @@
+"""What cannot be judged says so in one sentence, and the run goes on."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bridge.episode import schema
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.records import JointSample
+from bridge.episode.writer import EpisodeWriter
+from twin.replay.config import ReplayConfig
+from twin.replay.failure import NotEvaluatedError
+from twin.replay.follow.clock import check_clock
+from twin.replay.follow.execution import path_of_execution
+from twin.replay.follow.path import UnusablePlanError
+from twin.replay.place.starts import StartState
+from twin.replay.verdict.result import ReplayResult
+from twin.replay.work.job import ReplayJob, row_of_failure
+
+T0 = 1_700_000_000_000_000_000
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize(("which", "word"), [(0, "joints"), (1, "gripper widths")])
+def test_numbers_that_are_none_in_a_log_are_named_with_their_time(
+    script: SimpleNamespace, good: ReplayResult, which: int, word: str, value: float
+) -> None:
+    tracks = list(script.recorded_tracks(good))
+    position = tracks[which].position.copy()
+    position[125, 0] = value
+    tracks[which] = replace(tracks[which], position=position)
+    plan = script.plan(script.scene())
+    with pytest.raises(UnusablePlanError, match=rf"{word} that are no numbers at 1\.00 s"):
+        path_of_execution(*tracks, plan, ReplayConfig())
+
+
+def episode_with(path: Path, stamps_s: list[float]) -> Episode:
+    """Joint states in the order in which they arrived, with the source's times."""
+    with EpisodeWriter(path) as writer:
+        writer.describe(EpisodeInfo(id=path.stem, kind="trial"))
+        for index, stamp_s in enumerate(stamps_s):
+            stamp_ns = T0 + round(stamp_s * 1e9)
+            sample = JointSample(
+                stamp_ns=stamp_ns, names=("a",), position=np.zeros(1),
+                velocity=np.zeros(0), effort=np.zeros(0),
+            )  # fmt: skip
+            writer.write(
+                "/cell/joint_states",
+                sample.to_cdr(),
+                type_name=schema.JOINT_STATE,
+                log_time_ns=T0 + index * 10**7,
+                publish_time_ns=stamp_ns,
+            )
+    return Episode.open(path)
+
+
+def checked(episode: Episode, start_s: float, end_s: float) -> None:
+    start, end = (T0 + round(value * 1e9) for value in (start_s, end_s))
+    check_clock(episode, ("/joint_states",), start, end, "p")
+
+
+def test_time_that_goes_backwards_during_an_execution_is_refused(tmp_path: Path) -> None:
+    episode = episode_with(tmp_path / "a.mcap", [0.0, 0.1, 0.2, 0.3, 0.05, 0.15])
+    with pytest.raises(NotEvaluatedError, match=r"goes back by 0\.25 s at 0\.20 s of plan 'p'"):
+        checked(episode, 0.1, 0.4)
+
+
+def test_messages_that_overtake_each_other_by_little_are_no_jump(tmp_path: Path) -> None:
+    checked(episode_with(tmp_path / "a.mcap", [0.0, 0.1, 0.09, 0.2, 0.19, 0.3]), 0.0, 0.3)
+
+
+def test_a_jump_before_the_execution_is_none_of_its_business(tmp_path: Path) -> None:
+    checked(episode_with(tmp_path / "a.mcap", [5.0, 5.1, 0.0, 0.1, 0.2]), 0.0, 0.2)
+
+
+def test_an_execution_that_took_no_time_is_refused(tmp_path: Path) -> None:
+    episode = episode_with(tmp_path / "a.mcap", [0.0, 0.1])
+    with pytest.raises(NotEvaluatedError, match=r"ended 0\.10 s before it started"):
+        checked(episode, 0.2, 0.1)
+
+
+def test_what_was_not_evaluated_says_so_once_in_its_row(tmp_path: Path) -> None:
+    job = ReplayJob(
+        episode_path=tmp_path / "trial.mcap", episode_sha256="", plan_id="p", plan_index=0,
+        trajectory="planned", start_ns=0, end_ns=None, task="cube_into_box", start=StartState(),
+        scene_hash=None, config=ReplayConfig(), folder=tmp_path,
+    )  # fmt: skip
+    for message in ("it broke", str(NotEvaluatedError("it broke"))):
+        row = row_of_failure(job, message)
+        assert row["error"] == row["reason"] == "not evaluated: it broke"
+        assert row["accepted"] is None

@@ -1,0 +1,1 @@
+"""Varied replays: success as a probability."""

@@ -1,0 +1,221 @@
+"""The same work on a Ray cluster, which is never spoken to without a token.
+
+Ray 2.60 without a token runs anybody's code, and its control service listens on every interface
+even where a loopback address was asked for (measured), so a cluster without one is refused.
+"""
+
+import ipaddress
+import os
+import secrets
+import socket
+import tempfile
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from bridge.episode import provenance
+from bridge.errors import GstError, MissingDependencyError, UsageError
+from twin.errors import TwinError
+from twin.physics.engine import ENGINE_VERSION
+from twin.replay.crew.pool import ATTEMPTS, Item, lost
+from twin.replay.crew.worker import Answer, Failed, Function, do
+from twin.replay.work.job import REPLAY_VERSION
+
+LOCAL = "local"
+LOOPBACK = "127.0.0.1"
+WINDOW = 4
+"""Tasks per processor that are handed over before the first are back."""
+MODE, TOKEN, TOKEN_PATH = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
+NICENESS = "RAY_worker_niceness"
+"""Ray gives way to everything else on a machine (15) unless told otherwise."""
+ENVIRONMENT = (MODE, TOKEN, TOKEN_PATH, NICENESS)
+TOKEN_FILE = Path(".ray") / "auth_token"
+"""Below the home folder; where Ray itself looks last."""
+
+
+class RayClusterError(TwinError):
+    """The cluster cannot be reached or used."""
+
+
+@runtime_checkable
+class NeedsPaths(Protocol):
+    """Work that reads and writes files by their path."""
+
+    def needed_paths(self) -> tuple[Path, ...]:
+        """What must be there."""
+
+
+class RayRunner:
+    """Does pieces of work as Ray tasks; see ``twin.replay.crew.pool.Runner``."""
+
+    def __init__(self, address: str, workers: int) -> None:
+        """Connect later.
+
+        Args:
+            address: HOST:PORT of a running cluster, or local.
+            workers: Processors of a cluster started here.
+        """
+        self._address, self._workers = address, workers
+        self._ray: Any = None
+        self._before: dict[str, str | None] = {}
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+
+    def __enter__(self) -> "RayRunner":
+        """Connect, or start a cluster on the loopback address.
+
+        Raises:
+            MissingDependencyError: Without ray.
+            UsageError: Without a token.
+            RayClusterError: When nobody answers there, or not to our token.
+        """
+        self._before = {name: os.environ.get(name) for name in ENVIRONMENT}
+        if self._address == LOCAL:
+            # Ray leaves its logs behind, a hundred files for each start.
+            self._folder = tempfile.TemporaryDirectory(
+                prefix="gst-ray-", ignore_cleanup_errors=True
+            )
+        try:
+            self._ray = _connect(
+                self._address, self._workers, None if self._folder is None else self._folder.name
+            )
+        except BaseException:
+            self._restore()
+            raise
+        return self
+
+    def run(
+        self, function: Function, items: Sequence[Item], cost: Callable[[Item], float]
+    ) -> Iterator[tuple[Item, Answer | Failed]]:
+        """See ``Runner``. A task whose process or node dies is tried once more by Ray itself."""
+        ray = self._ray
+        task = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_task)
+        todo = deque(sorted(items, key=cost, reverse=True))
+        window = WINDOW * max(1, int(ray.cluster_resources().get("CPU", 1)))
+        running: dict[Any, Item] = {}
+        while todo or running:
+            while todo and len(running) < window:
+                item = todo.popleft()
+                running[task.remote(function, item, code_version())] = item
+            done, _ = ray.wait(list(running), num_returns=1)
+            for reference in done:
+                item = running.pop(reference)
+                try:
+                    answer = ray.get(reference)
+                except ray.exceptions.RayError as error:
+                    answer = lost(f"Ray lost it: {_first_line(error)}")
+                yield item, answer
+
+    def __exit__(self, *_: object) -> None:
+        """Leave; a cluster started here ends, any other one goes on."""
+        if self._ray is not None:
+            self._ray.shutdown()
+            self._ray = None
+        self._restore()
+
+    def _restore(self) -> None:
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
+        for name, value in self._before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _connect(address: str, workers: int, folder: str | None) -> Any:
+    settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address == LOCAL:
+        os.environ[TOKEN] = secrets.token_hex(32)
+        os.environ.pop(TOKEN_PATH, None)
+        os.environ.setdefault(NICENESS, "0")  # as processes without Ray have
+        settings |= {"num_cpus": workers, "include_dashboard": False, "_temp_dir": folder}
+    else:
+        _check_token()
+    if address == LOCAL or is_loopback(address):
+        # Otherwise Ray replaces the loopback address by the machine's own, where nobody answers.
+        settings["_node_ip_address"] = LOOPBACK
+    os.environ[MODE] = "token"
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        import ray  # noqa: PLC0415  # seconds, and only with --ray
+    except ImportError as error:
+        raise MissingDependencyError(package="ray", extra="cluster", purpose="--ray") from error
+    try:
+        ray.init(address=address, **settings)
+    except (ConnectionError, RuntimeError, ValueError, OSError, ray.exceptions.RayError) as error:
+        ray.shutdown()
+        message = (
+            f"no Ray cluster to use at {address}: {_first_line(error)}. It must have been started "
+            f"with {MODE}=token and the same token as here; see docs/scale.md."
+        )
+        raise RayClusterError(message) from error
+    return ray
+
+
+def _check_token() -> None:
+    """Refuse to speak to a cluster that lets anybody in.
+
+    Raises:
+        UsageError: When authentication is switched off, or there is no token to show.
+    """
+    if os.environ.get(MODE, "token") != "token":
+        message = f"{MODE} is {os.environ[MODE]!r}: --ray only speaks to a cluster with tokens."
+        raise UsageError(message)
+    if os.environ.get(TOKEN) or os.environ.get(TOKEN_PATH):
+        return
+    if not (Path.home() / TOKEN_FILE).is_file():
+        message = (
+            f"--ray needs the cluster's token: set {TOKEN_PATH} to the file that holds it "
+            f"(or put it at ~/{TOKEN_FILE}). docs/scale.md says how to make one."
+        )
+        raise UsageError(message)
+
+
+def is_loopback(address: str) -> bool:
+    """Say whether HOST:PORT can only be this machine."""
+    host = address.rpartition(":")[0].strip("[]") or address
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def code_version() -> str:
+    """What decides the bytes of a replay, besides its job."""
+    about = provenance.software()
+    return f"{about['version']}, replays {REPLAY_VERSION}, {ENGINE_VERSION}"
+
+
+def _task(function: Function, item: Any, version: str) -> Answer | Failed:
+    """One piece of work on some node."""
+    problem = _out_of_place(item, version)
+    return do(function, item) if problem is None else Failed(message=problem, known=True)
+
+
+def _out_of_place(item: Any, version: str) -> str | None:
+    """Say in a sentence why a node cannot do a piece of work; None when it can."""
+    node = socket.gethostname()
+    if version != code_version():
+        return (
+            f"node {node} runs robot-gst {code_version()}, not {version} as here: install the same "
+            "version on every node"
+        )
+    paths = item.needed_paths() if isinstance(item, NeedsPaths) else ()
+    for path in paths:
+        if not path.exists():
+            return (
+                f"node {node} does not see {path}: every node reads and writes the run folder "
+                "under the same path, so share it between them"
+            )
+    return None
+
+
+def _first_line(error: BaseException) -> str:
+    if isinstance(error, GstError):
+        return str(error)
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return (lines[0] if lines else type(error).__name__).rstrip(".")

@@ -1,0 +1,1 @@
+"""A replay as an episode: its messages and its pictures."""

@@ -1,0 +1,1 @@
+"""From waypoints or recorded joints to a path, and what physics answers to it."""

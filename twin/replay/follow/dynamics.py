@@ -1,0 +1,163 @@
+"""Let physics answer: drive the robot along a path and watch the objects."""
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from twin.physics.attach import Attachment
+from twin.physics.soft import BURST_STRETCH, SoftHealth, SoftModel
+from twin.physics.world import World
+from twin.replay.config import ReplayConfig
+from twin.replay.failure import NotEvaluatedError
+from twin.replay.follow.furnish import furnish, soft_models
+from twin.replay.follow.path import JointPath
+from twin.replay.place.scene import ReplayScene
+from twin.robot.collision import RobotHulls
+
+
+@dataclass(frozen=True, kw_only=True)
+class Burst:
+    """A soft body that stopped being one."""
+
+    object_id: str
+    t_ns: int
+    found: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class States:
+    """What a replay saw, settling at the end included."""
+
+    stamps_ns: Int[np.ndarray, " num_steps"]
+    joints_rad: Float[np.ndarray, "num_steps num_joints"]
+    width_m: Float[np.ndarray, " num_steps"]
+    Ts_base_object: dict[str, Float[np.ndarray, "num_steps 4 4"]]
+    finger_contact: dict[str, Bool[np.ndarray, " num_steps"]]
+    nodes_m: dict[str, Float32[np.ndarray, "num_steps _ 3"]] = field(default_factory=dict)
+    """Of soft objects, base frame [m]."""
+    extents_m: dict[str, Float[np.ndarray, "num_steps 3"]] = field(default_factory=dict)
+    """Of soft objects, along their own axes [m]."""
+    broken: dict[str, str] = field(default_factory=dict)
+    """Soft objects that are no bodies any more at the end, and what was found."""
+    burst: Burst | None = None
+    """The first that burst; the replay ended there."""
+
+
+def simulate(
+    path: JointPath, scene: ReplayScene, hulls: RobotHulls, config: ReplayConfig
+) -> States:
+    """Follow a path with position-controlled motors and free objects.
+
+    Every run of the same inputs gives the same bits: one fresh client, fixed steps. A soft body
+    that bursts ends it: what comes after would be noise.
+    """
+    rate = config.physics.rate_hz
+    stride = rate // config.sample_rate_hz
+    moving_steps = int(np.ceil(path.end_ns() * 1e-9 * rate))
+    # Whole samples, so that the last one lies at the end of settling.
+    total = -(-(moving_steps + round(config.settle_after_s * rate)) // stride) * stride
+    times_ns = (np.arange(total + 1) * (1e9 / rate)).round().astype(np.int64)
+    targets = path.joints_at(times_ns)
+    velocities = np.diff(targets, axis=0) * rate
+    widths = path.width_at(times_ns).tolist()
+    stamps = times_ns.tolist()
+    soft = soft_models(scene)
+    samples = _Samples(scene, soft)
+    with World(hulls.robot.urdf, _mesh_hulls(hulls), config.physics) as world:
+        furnish(world, scene, soft)
+        world.reset_robot(targets[0], widths[0])
+        world.command(targets[0], np.zeros(targets.shape[1]), widths[0])
+        for _ in range(round(config.settle_before_s * rate)):
+            world.step()
+        samples.take(world, 0)
+        tie = Attachment(world) if config.grasp == "attach" else None
+        for step in range(total):
+            world.command(targets[step + 1], velocities[step], widths[step])
+            world.step()
+            if tie is not None:
+                tie.update(widths[step])
+            if (step + 1) % stride == 0 and not samples.take(world, stamps[step + 1]):
+                break
+        return samples.states(world)
+
+
+@lru_cache(maxsize=4)
+def _mesh_hulls(hulls: RobotHulls) -> dict[str, list[Float[np.ndarray, "num_points 3"]]]:
+    found: dict[str, list[Float[np.ndarray, "num_points 3"]]] = {}
+    for hull in hulls.hulls:
+        if hull.from_mesh:
+            found.setdefault(hull.link, []).append(hull.points_m)
+    return found
+
+
+class _Samples:
+    """Collects states while a world runs."""
+
+    def __init__(self, scene: ReplayScene, soft: dict[str, SoftModel]) -> None:
+        self._objects = list(scene.movable())
+        self._soft = list(soft)
+        self._still = scene.containers()
+        self._stamps: list[int] = []
+        self._joints: list[Float[np.ndarray, " num_joints"]] = []
+        self._widths: list[float] = []
+        self._poses: dict[str, list[Float[np.ndarray, "4 4"]]] = {n: [] for n in self._objects}
+        self._touch: dict[str, list[bool]] = {name: [] for name in self._objects}
+        self._nodes: dict[str, list[Float32[np.ndarray, "num_nodes 3"]]] = {n: [] for n in soft}
+        self._extents: dict[str, list[np.ndarray]] = {name: [] for name in soft}
+        self._burst: Burst | None = None
+
+    def take(self, world: World, t_ns: int) -> bool:
+        """Keep the state; False, and nothing kept, when a soft body has burst."""
+        for name in self._soft:
+            found = burst_of(world.soft_health(name))
+            if found is not None:
+                self._burst = Burst(object_id=name, t_ns=t_ns, found=found)
+                if self._stamps:
+                    return False
+                raise NotEvaluatedError(f"{name} before anything moved: {found}")
+        self._stamps.append(t_ns)
+        joints, width = world.posture()
+        self._joints.append(joints)
+        self._widths.append(width)
+        for name in self._objects:
+            self._poses[name].append(world.T_base_object(name))
+            self._touch[name].append(world.finger_touches(name))
+        for name in self._soft:
+            self._nodes[name].append(world.soft_nodes_m(name).copy())
+            self._extents[name].append(world.soft_extents_m(name))
+        return True
+
+    def states(self, world: World) -> States:
+        poses = {name: np.stack(items) for name, items in self._poses.items()}
+        poses |= {
+            name: np.repeat(T[None], len(self._stamps), axis=0) for name, T in self._still.items()
+        }
+        return States(
+            stamps_ns=np.array(self._stamps, dtype=np.int64),
+            joints_rad=np.stack(self._joints),
+            width_m=np.array(self._widths),
+            Ts_base_object=poses,
+            finger_contact={name: np.array(items) for name, items in self._touch.items()},
+            nodes_m={name: np.stack(items) for name, items in self._nodes.items()},
+            extents_m={name: np.array(rows, dtype=float) for name, rows in self._extents.items()},
+            broken=self._broken(world),
+            burst=self._burst,
+        )
+
+    def _broken(self, world: World) -> dict[str, str]:
+        found = {}
+        if self._burst is not None:
+            found[self._burst.object_id] = self._burst.found
+        for name in self._soft:
+            health = world.soft_health(name)
+            if not health.sound and name not in found:
+                found[name] = f"at the end: {health.describe()}"
+        return found
+
+
+def burst_of(health: SoftHealth) -> str | None:
+    """Say in what way a soft body has burst; None when it has not."""
+    burst = not health.is_finite or not health.max_stretch < BURST_STRETCH
+    return health.describe() if burst else None

@@ -1,0 +1,1 @@
+"""Planned, executed and recorded laid over each other: where they part first."""

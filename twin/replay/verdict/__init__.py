@@ -1,0 +1,1 @@
+"""One trajectory replayed and judged: I(tau)."""

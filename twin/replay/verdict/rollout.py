@@ -1,0 +1,188 @@
+"""Replay one trajectory, planned or executed, and judge it: I(tau) = ik x clearance x terminal."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bridge.episode.streams import JointTrack
+from bridge.task.plan import Plan
+from bridge.task.task_file import Task
+from bridge.task.verdict import Factor, Verdict
+from twin.physics.engine import ENGINE_VERSION
+from twin.replay.clearance import ClearanceMonitor
+from twin.replay.clearance.postures import posture_clearance
+from twin.replay.config import ReplayConfig
+from twin.replay.failure import Failure, factor_from
+from twin.replay.follow.dynamics import States, simulate
+from twin.replay.follow.execution import path_of_execution
+from twin.replay.follow.furnish import soft_models
+from twin.replay.follow.overlap import free_start
+from twin.replay.follow.path import JointPath, check_path, path_of_plan
+from twin.replay.place.scene import ReplayScene
+from twin.replay.verdict.judge import findings_of, reason_of, terminal_factor, warnings_of
+from twin.replay.verdict.result import ReplayResult
+from twin.robot.collision import hulls_of
+from twin.robot.model import load_robot
+
+KINEMATIC_ENGINE = "pinocchio"
+SOFT_ENGINE = "xpbd"
+
+
+def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> ReplayResult:
+    """Replay what a plan commands: waypoints, inverse kinematics, motors, objects.
+
+    Raises:
+        UnusablePlanError: When the plan has no usable waypoints.
+    """
+    robot = load_robot(scene.urdf)
+    free = posture_clearance(scene, hulls_of(robot), config)
+    path, failures, unreachable_ns = path_of_plan(plan, robot, config, clearance=free)
+    path = path.with_late_gripper(config.grip_delay_s)
+    return _replay(path, failures, unreachable_ns, plan, scene, config, trajectory="planned")
+
+
+def replay_joints(
+    track: JointTrack,
+    widths: JointTrack,
+    scene: ReplayScene,
+    config: ReplayConfig,
+    *,
+    plan: Plan,
+) -> ReplayResult:
+    """Replay what the joint encoders and the gripper said during an execution.
+
+    Args:
+        track: Recorded arm joints, cut to the execution; its first stamp becomes time 0.
+        widths: Recorded distance between the finger pads over the same stamps.
+        scene: Where it happens.
+        config: How it is replayed.
+        plan: The plan that was executed: its stages and when it wanted the gripper closed.
+
+    Raises:
+        UnusablePlanError: When a track is empty or names other joints.
+    """
+    path = path_of_execution(track, widths, plan, config)
+    return _replay(path, [], None, plan, scene, config, trajectory="executed")
+
+
+def _replay(
+    path: JointPath,
+    failures: list[Failure],
+    unreachable_ns: int | None,
+    plan: Plan,
+    scene: ReplayScene,
+    config: ReplayConfig,
+    *,
+    trajectory: str,
+) -> ReplayResult:
+    robot = load_robot(scene.urdf)
+    hulls = hulls_of(robot)
+    failures = failures + check_path(path, robot, hulls, config)
+    dynamic = config.mode == "dynamic"
+    if dynamic:
+        scene = free_start(scene, soft_models(scene), config.start_overlap_m)
+    states = simulate(path, scene, hulls, config) if dynamic else follow(path, scene, config)
+    monitor = ClearanceMonitor(scene, plan, hulls, config)
+    _pre_grasp(monitor, path, config)
+    movable = scene.movable()
+    known = {name: Ts for name, Ts in states.Ts_base_object.items() if name in movable}
+    clearance = [
+        monitor.measure(
+            int(t_ns),
+            states.joints_rad[index],
+            float(states.width_m[index]),
+            {name: Ts[index] for name, Ts in known.items()},
+            {name: nodes[index] for name, nodes in states.nodes_m.items()},
+        )
+        for index, t_ns in enumerate(states.stamps_ns)
+    ]
+    result = ReplayResult(
+        verdict=_undecided(plan, trajectory, config, scene),
+        stamps_ns=states.stamps_ns,
+        joints_rad=states.joints_rad,
+        width_m=states.width_m,
+        Ts_base_tcp=robot.Ts_base_tcp(states.joints_rad),
+        Ts_base_object=states.Ts_base_object,
+        finger_contact=states.finger_contact,
+        clearance_m=np.array(clearance),
+        contacts=monitor.contacts(),
+        nodes_m=states.nodes_m,
+        extents_m=states.extents_m,
+        broken=states.broken,
+    )
+    verdict = replace(
+        result.verdict,
+        ik=factor_from(failures),
+        clearance=factor_from(
+            monitor.failures, undecided=_clearance_undecided(scene, unreachable_ns, states)
+        ),
+        terminal=terminal_factor(
+            result, scene, config, unreachable_ns=unreachable_ns, burst=states.burst
+        ),
+        warnings=warnings_of(scene, result),
+        findings=tuple(findings_of(scene.task, result.rollout(), "replayed")) if dynamic else (),
+    )
+    return replace(result, verdict=replace(verdict, reason=reason_of(verdict)))
+
+
+def follow(path: JointPath, scene: ReplayScene, config: ReplayConfig) -> States:
+    """Follow the joints exactly; no physics, so nothing is known of objects that can move."""
+    count = int(np.ceil(path.end_ns() * 1e-9 * config.sample_rate_hz)) + 1
+    stamps: Int[np.ndarray, " num_steps"] = (
+        np.linspace(0, path.end_ns(), count).round().astype(np.int64)
+    )
+    still: dict[str, Float[np.ndarray, "num_steps 4 4"]] = {
+        name: np.repeat(T[None], count, axis=0) for name, T in scene.containers().items()
+    }
+    return States(
+        stamps_ns=stamps,
+        joints_rad=path.joints_at(stamps),
+        width_m=path.width_at(stamps),
+        Ts_base_object=still,
+        finger_contact={},
+    )
+
+
+def _pre_grasp(monitor: ClearanceMonitor, path: JointPath, config: ReplayConfig) -> None:
+    times = path.dense_times_ns(config.path_step_s)
+    if path.first_close_ns is not None:
+        times = times[times < path.first_close_ns]
+    for t_ns, joints, width in zip(times, path.joints_at(times), path.width_at(times), strict=True):
+        monitor.check_pre_grasp(int(t_ns), joints, float(width))
+
+
+def _undecided(plan: Plan, trajectory: str, config: ReplayConfig, scene: ReplayScene) -> Verdict:
+    open_factor = Factor(value=None)
+    return Verdict(
+        plan_id=plan.id,
+        trajectory=trajectory,
+        mode=config.mode,
+        ik=open_factor,
+        clearance=open_factor,
+        terminal=open_factor,
+        engine=engine_of(scene.task, config),
+        seed=config.seed,
+        scene_hash=scene.scene_hash,
+        calibration_id=scene.calibration_id,
+    )
+
+
+def engine_of(task: Task, config: ReplayConfig) -> str:
+    """Name what moved things: a grasp that is no friction grasp is part of the name."""
+    if config.mode == "kinematic":
+        return KINEMATIC_ENGINE
+    soft = f"+{SOFT_ENGINE}" if task.soft_objects else ""
+    return f"{ENGINE_VERSION}{soft}{'+attach' if config.grasp == 'attach' else ''}"
+
+
+def _clearance_undecided(
+    scene: ReplayScene, unreachable_ns: int | None, states: States
+) -> str | None:
+    if states.burst is not None:
+        return f"known only until {states.burst.object_id} burst"
+    if unreachable_ns is not None:
+        return f"known only up to the unreachable pose at {unreachable_ns * 1e-9:.2f} s"
+    if scene.missing():
+        return f"not localised: {scene.describe_missing()}"
+    return None

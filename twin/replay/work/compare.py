@@ -1,0 +1,86 @@
+"""Compare a replayed execution with its plan in the twin and with the recording."""
+
+from typing import Any
+
+from bridge.episode import streams
+from bridge.episode.reader import Episode
+from bridge.errors import GstError
+from bridge.task.predicate import evaluate_success
+from bridge.task.task_file import load_task
+from twin.replay.config import ReplayConfig
+from twin.replay.parting.divergence import Divergence, diverge
+from twin.replay.parting.recorded import (
+    CONTACT_M,
+    Recording,
+    rollout_of_recording,
+    states_of_recording,
+    trace_of_recording,
+)
+from twin.replay.parting.trace import Trace, trace_of_file, trace_of_result
+from twin.replay.verdict.judge import findings_of
+from twin.replay.verdict.result import ReplayResult
+from twin.replay.work.job import ReplayJob
+from twin.robot.collision import hulls_of
+from twin.robot.model import load_robot
+
+Findings = dict[tuple[str, str], bool | None]
+
+
+def recorded_findings(recording: Recording, config: ReplayConfig) -> tuple[dict[str, Any], ...]:
+    """What the success predicates, and the one on contacts, say of the recording itself."""
+    robot = load_robot(recording.scene.urdf)
+    rollout = rollout_of_recording(recording, robot, hulls_of(robot), config)
+    task = recording.scene.task
+    return tuple(findings_of(task, rollout, "recorded", tolerance_m=CONTACT_M))
+
+
+def compare(job: ReplayJob, result: ReplayResult, recording: Recording, end_ns: int) -> Divergence:
+    """Lay the executed replay, the planned one if it is there, and the recording over each other.
+
+    Args:
+        job: The executed replay's; names the planned replay's file.
+        result: The executed replay.
+        recording: What was measured.
+        end_ns: When the execution ended, from its start.
+    """
+    robot = load_robot(recording.scene.urdf)
+    executed = trace_of_result(result, "executed", end_ns)
+    recorded = trace_of_recording(recording, robot, job.config.sample_rate_hz)
+    traces = [executed, recorded]
+    task = load_task(job.task)
+    findings = {
+        "executed": _findings(findings_of(task, result.rollout(), "replayed")),
+        "recorded": {
+            (finding.kind, finding.object_id): finding.value
+            for finding in evaluate_success(task, states_of_recording(recording, robot))
+        },
+    }
+    planned, said = _planned(job, recording)
+    if isinstance(planned, str):
+        missing = [planned]
+    else:
+        traces.append(planned)
+        findings["planned"] = said
+        missing = []
+    missing += [
+        f"{name} was not localised after the execution: {reason}"
+        for name, reason in recording.end.reasons.items()
+        if name in recording.scene.movable()
+    ]
+    return diverge(job.plan_id, traces, job.config.parting, findings=findings, not_compared=missing)
+
+
+def _planned(job: ReplayJob, recording: Recording) -> tuple[Trace | str, Findings]:
+    path = job.planned().path()
+    if not path.is_file():
+        return "the plan was not replayed: nothing planned to compare with", {}
+    try:
+        trace = trace_of_file(path, "planned", job.start_ns, recording.plan.tau[-1].t_ns)
+        verdict = streams.verdicts(Episode.open(path))[-1][1]
+    except (GstError, IndexError, StopIteration) as error:
+        return f"{path.name} cannot be read: {error}", {}
+    return trace, _findings([f for f in verdict.findings if f["side"] == "replayed"])
+
+
+def _findings(said: list[dict[str, Any]]) -> Findings:
+    return {(item["kind"], str(item.get("object", ""))): item["value"] for item in said}
