@@ -101,7 +101,7 @@ def ask(episode: Any, config: Any, twin: Any) -> tuple[Any, float]:
     """Let the gate see what came before the plan, and judge it."""
     from bridge.episode import schema, streams
     from twin.gate.service import make_gate
-    from twin.scene.live import LiveView
+    from twin.scene.localise.live import LiveView
 
     ((stamp_ns, plan),) = streams.plans(episode)
     eyes = LiveView(config.cell)

@@ -14,7 +14,7 @@ JOINT_OFFSET_RAD = 0.0015
 
 def main() -> None:
     """Align from anywhere, four postures, one percent of depth bias; compare with a rigid fit."""
-    sys.path.insert(0, str(ROOT / "tests" / "twin" / "align"))
+    sys.path.insert(0, str(ROOT / "tests" / "twin" / "scene" / "align"))
     import cell_views
 
     from twin.robot.surface import sample_surface

@@ -38,9 +38,9 @@ def measure(
 
     from bridge.sources.standin.cell_file import load_cell
     from bridge.task.task_file import load_task
-    from twin.scene.localise import LocaliseConfig, localise_objects
-    from twin.scene.localise_points import fuse_stills, object_points
-    from twin.scene.localise_shape import yaw_period_rad
+    from twin.scene.localise.objects import LocaliseConfig, localise_objects
+    from twin.scene.localise.points import fuse_stills, object_points
+    from twin.scene.shape.known import yaw_period_rad
 
     config = LocaliseConfig()
     first = load_cell(load_task(task_name).cell).development_seeds[0]

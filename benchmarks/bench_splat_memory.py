@@ -32,11 +32,11 @@ def work() -> None:
 
     from splat.quality import MAX_DEPTH_M, MAX_POINTS
 
-    from twin.scene.fit import fit
-    from twin.scene.initialise import fuse
-    from twin.scene.points import DepthLimits, FrameSurface
+    from twin.scene.fit.initialise import fuse
+    from twin.scene.fit.run import fit
+    from twin.scene.frames.points import DepthLimits, FrameSurface
+    from twin.scene.frames.training_view import training_view
     from twin.scene.settings import FitConfig, InitialiseConfig
-    from twin.scene.training_view import training_view
 
     limits = DepthLimits(max_depth_m=MAX_DEPTH_M, flying_fraction=0.03)
     stride = max(1, round((NUM_FRAMES * 640 * 480 / MAX_POINTS) ** 0.5))

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from measure import ROOT, Target, report_targets
 
-from twin.scene.owners import owners
+from twin.scene.objects.owners import owners
 
 NUM_VIEWS, NOISE = 20, 0.004
 BASKET_INNER_M = (0.26, 0.20, 0.08)

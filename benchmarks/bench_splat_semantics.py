@@ -26,7 +26,7 @@ import shelf
 import table_scene
 from noisy_masks import spoil
 
-from twin.scene.raster import RasterConfig, Rasteriser
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.associate import AssociateConfig
 from twin.scene.semantics.describe import scene_from_masks
 from twin.scene.semantics.from_view import points_of

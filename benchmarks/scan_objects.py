@@ -8,19 +8,20 @@ from localise_cell import Start, look_around
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.task.meshes.catalogue import object_mesh
-from twin.scene.fit import fit
-from twin.scene.gaussians import GaussianCloud
-from twin.scene.initialise import fuse
-from twin.scene.localise import LocaliseConfig, localise_objects
-from twin.scene.localise_result import LocalisedObject
-from twin.scene.objects import SceneParts, moved_cloud, shape_mesh, split_objects
-from twin.scene.owners import object_poses
-from twin.scene.points import DepthLimits, FrameSurface
+from twin.scene.fit.initialise import fuse
+from twin.scene.fit.run import fit
+from twin.scene.frames.points import DepthLimits, FrameSurface
+from twin.scene.frames.training_view import TrainingView, training_view
+from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.gaussians.moved import moved_cloud
+from twin.scene.localise.objects import LocaliseConfig, localise_objects
+from twin.scene.localise.result import LocalisedObject
+from twin.scene.objects.owners import object_poses
+from twin.scene.objects.split import SceneParts, shape_mesh, split_objects
 from twin.scene.settings import FitConfig, InitialiseConfig
 from twin.scene.shape.from_training import shapes_of
 from twin.scene.shape.mesh import volume_m3
 from twin.scene.shape.reconstruct import ObjectShape
-from twin.scene.training_view import TrainingView, training_view
 
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.03)
 GRIPPER_M = 0.28

@@ -11,8 +11,8 @@ from bridge.geometry import se3
 from bridge.task.meshes.surface_net import mesh_of
 from bridge.task.meshes.toys import DESIGNS
 from bridge.task.task_file import ObjectModel
-from twin.scene.gaussians import concatenate
-from twin.scene.raster import RasterConfig, Rasteriser
+from twin.scene.gaussians.cloud import concatenate
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default
 from twin.scene.semantics.query import query
 from twin.scene.semantics.result import Instance, SemanticScene

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from bridge.episode.streams import RgbdFrame
-from twin.scene.camera_correction import align_view
-from twin.scene.fit import FitResult, fit
-from twin.scene.gaussians import GaussianCloud
-from twin.scene.initialise import fuse
-from twin.scene.losses import psnr_db
-from twin.scene.points import DepthLimits, FrameSurface
-from twin.scene.raster import RasterConfig, Rasteriser
+from twin.scene.fit.camera_correction import align_view
+from twin.scene.fit.initialise import fuse
+from twin.scene.fit.run import FitResult, fit
+from twin.scene.frames.points import DepthLimits, FrameSurface
+from twin.scene.frames.training_view import training_view
+from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.raster.losses import psnr_db
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import FitConfig, InitialiseConfig
-from twin.scene.training_view import training_view
 
 MAX_DEPTH_M = 5.0
 MAX_POINTS = 3_000_000

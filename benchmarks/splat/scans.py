@@ -48,7 +48,7 @@ def shelf_scan(source: Path, folder: Path) -> RunFolder:
 
 def rebuilt(run: RunFolder, budget_s: float) -> Mapping[str, Any]:
     """Rebuild with held-out views drawn also where they fit best; the content of scene.json."""
-    from twin.scene.rebuild import rebuild
+    from twin.scene.rebuild.run import rebuild
     from twin.scene.settings import FitConfig, FrameConfig, RebuildConfig
 
     config = RebuildConfig(frames=FrameConfig(align_holdout=True), fit=FitConfig(budget_s=budget_s))

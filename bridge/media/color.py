@@ -65,6 +65,15 @@ def encode_jpeg(
     )
 
 
+def encode_png(image: np.ndarray) -> bytes:
+    """Compress an 8-bit sRGB or a 16-bit grey image without loss."""
+    from PIL import Image as pillow  # noqa: PLC0415  # heavy, only for PNG
+
+    buffer = io.BytesIO()
+    pillow.fromarray(image).save(buffer, format="png", compress_level=3)
+    return buffer.getvalue()
+
+
 def decode_color(data: bytes) -> UInt8[np.ndarray, "height width 3"]:
     """Decode JPEG or PNG bytes to an sRGB image."""
     if data[:2] == JPEG_MAGIC:

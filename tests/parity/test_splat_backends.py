@@ -15,12 +15,13 @@ from bridge.episode.run import RunFolder
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from twin.scene import backend, raster_cuda
-from twin.scene.backend import open_rasteriser
-from twin.scene.gaussians import GaussianCloud, arrays, as_float32
-from twin.scene.raster import RasterConfig, Rasteriser
-from twin.scene.raster_cuda import CudaMissingError, CudaRasteriser
-from twin.scene.render import render
+from twin.scene.draw.render import render
+from twin.scene.gaussians.cloud import GaussianCloud, arrays, as_float32
+from twin.scene.raster import backend
+from twin.scene.raster import cuda as raster_cuda
+from twin.scene.raster.backend import open_rasteriser
+from twin.scene.raster.cuda import CudaMissingError, CudaRasteriser
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import RenderConfig
 
 torch = pytest.importorskip("torch")

@@ -10,8 +10,8 @@ from scipy.linalg import expm
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from twin.scene.gaussians import GaussianCloud, arrays, as_float32
-from twin.scene.raster import RasterConfig, Rasteriser, available_isas
+from twin.scene.gaussians.cloud import GaussianCloud, arrays, as_float32
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, available_isas
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.parity
@@ -204,7 +204,7 @@ def test_all_instruction_sets_agree(isa: str) -> None:
 @pytest.mark.parametrize("isa", ISAS)
 @pytest.mark.parametrize(("height", "width"), [(23, 31), (3, 2), (171, 133), (80, 270)])
 def test_ssim_agrees_with_a_torch_convolution(isa: str, height: int, width: int) -> None:
-    from twin.scene.raster import load_native
+    from twin.scene.raster.rasteriser import load_native
 
     rng = np.random.default_rng(5)
     x = rng.uniform(size=(3, height, width)).astype(np.float32)
@@ -230,7 +230,7 @@ def test_ssim_agrees_with_a_torch_convolution(isa: str, height: int, width: int)
 
 
 def test_adam_agrees_with_torch() -> None:
-    from twin.scene.raster import load_native
+    from twin.scene.raster.rasteriser import load_native
 
     rng = np.random.default_rng(6)
     values = rng.normal(size=1000).astype(np.float32)

@@ -17,7 +17,7 @@ from twin.calibrate.fixed_camera import FixedCamera, find_fixed_camera
 from twin.calibrate.pairs import PosePairs, read_pairs, recorded_pairs, target_cameras
 from twin.calibrate.placement import MOVING, NO_DEPTH, depth_cameras, placement
 from twin.calibrate.target import TargetCamera, find_camera
-from twin.scene.calibration import CALIBRATION_FILE, write_calibration
+from twin.scene.store.calibration import CALIBRATION_FILE, write_calibration
 
 
 class NothingToCalibrateError(UsageError):

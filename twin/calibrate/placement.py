@@ -7,7 +7,7 @@ import numpy as np
 from bridge.episode import schema, streams
 from bridge.episode.reader import Episode
 from bridge.errors import BridgeError
-from twin.scene.still import same_pose
+from twin.scene.frames.still import same_pose
 
 FIXED, MOVING, NO_DEPTH = "fixed", "moving", "no depth"
 STILL_M, STILL_RAD = 0.002, 0.0035

@@ -36,7 +36,7 @@ class UndecidedError(TwinError):
 
 @runtime_checkable
 class Eyes(Protocol):
-    """What the gate sees of the cell: ``twin.scene.live.LiveView``, or a fake."""
+    """What the gate sees of the cell: ``twin.scene.localise.live.LiveView``, or a fake."""
 
     def urdf(self) -> str | None:
         """The robot description."""

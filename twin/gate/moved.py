@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.task.task_file import ObjectModel, Task
-from twin.scene.localise_shape import yaw_period_rad
+from twin.scene.shape.known import yaw_period_rad
 
 SIGMAS = 4.0
 """What localisation says of its own errors, so many times, is no motion."""

@@ -77,7 +77,7 @@ def watch_cell(session: Any, cell: str, take: Callable[[str, bytes, int, str], N
 def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     """Judge plans until SIGINT or SIGTERM; both end with exit code 0."""
     from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
-    from twin.scene.live import LiveView  # noqa: PLC0415
+    from twin.scene.localise.live import LiveView  # noqa: PLC0415
 
     if not CELL_NAME.match(config.cell):
         raise GateError(f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'.")

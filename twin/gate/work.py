@@ -46,12 +46,12 @@ def get_ready(_: None) -> None:
     """Import what takes seconds, so that the first plan does not wait for it."""
     import twin.replay.place.rebuilt  # noqa: PLC0415
     import twin.replay.verdict.rollout  # noqa: PLC0415
-    import twin.scene.localise  # noqa: F401, PLC0415
+    import twin.scene.localise.objects  # noqa: F401, PLC0415
 
 
 def look(item: Look) -> dict[str, Any]:
     """Find the objects."""
-    from twin.scene.localise import localise_objects  # noqa: PLC0415
+    from twin.scene.localise.objects import localise_objects  # noqa: PLC0415
 
     return dict(localise_objects(item.frames, item.task))
 
@@ -66,7 +66,7 @@ def answer(question: Question) -> Verdict:
     from twin.replay.place.rebuilt import read_place  # noqa: PLC0415
     from twin.replay.place.scene import ReplayScene  # noqa: PLC0415
     from twin.replay.verdict.rollout import replay_plan  # noqa: PLC0415
-    from twin.scene.calibration import read_calibration  # noqa: PLC0415
+    from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
 
     started_s = time.monotonic()
     run, plan = RunFolder.open(question.run_path), question.plan

@@ -28,14 +28,14 @@ from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
 from twin.calibrate.pairs import recorded_pairs
 from twin.calibrate.placement import placement
 from twin.robot.model import load_robot
-from twin.scene.calibration import (
+from twin.scene.store.calibration import (
     UnreadableCalibrationError,
     calibrated_tree,
     read_calibration,
     write_calibration,
 )
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "align"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "scene" / "align"))
 import cell_views
 
 URDF = ur5_with_gripper_urdf()

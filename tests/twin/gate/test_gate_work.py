@@ -15,7 +15,7 @@ from twin.gate.work import Question, answer
 from twin.replay.config import ReplayConfig
 from twin.replay.place.scene import ReplayScene
 from twin.replay.verdict import rollout
-from twin.scene.calibration import write_physics
+from twin.scene.store.calibration import write_physics
 
 
 class SeenError(Exception):

@@ -18,7 +18,7 @@ from bridge.episode.records import (
 from bridge.episode.transcode import depth_to_compact
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
-from twin.scene.live import KEPT_IMAGES, LiveFrames, LiveView
+from twin.scene.localise.live import KEPT_IMAGES, LiveFrames, LiveView
 
 S = 1_000_000_000
 CAMERA = Camera(width=8, height=6, fx=10.0, fy=10.0, cx=4.0, cy=3.0)

@@ -1,4 +1,4 @@
-"""Lets the tests of this folder import the module ``textured_room`` that lies beside them."""
+"""Lets the tests of these rooms import the module ``textured_room`` that lies beside them."""
 
 import sys
 from pathlib import Path

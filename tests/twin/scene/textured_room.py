@@ -17,7 +17,7 @@ from bridge.episode.streams import RgbdFrame
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from twin.scene.views import encode_png
+from bridge.media.color import encode_png
 
 COLOR = Camera(width=64, height=48, fx=60.0, fy=60.0, cx=31.0, cy=24.5)
 DEPTH = Camera(width=72, height=54, fx=75.0, fy=75.0, cx=36.0, cy=27.0)

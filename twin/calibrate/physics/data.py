@@ -20,9 +20,9 @@ from bridge.terminal import Output
 from twin.calibrate.physics.case import PLANAR, Case, planar
 from twin.errors import TwinError
 from twin.robot.model import load_robot
-from twin.scene.localise_episode import write_localised
-from twin.scene.localise_shape import yaw_period_rad
-from twin.scene.store import scene_hash_of
+from twin.scene.localise.episode import write_localised
+from twin.scene.shape.known import yaw_period_rad
+from twin.scene.store.folder import scene_hash_of
 
 KINDS = ("probe", "trial")
 NEAR_M = 0.085

@@ -16,7 +16,7 @@ from twin.calibrate.physics.local import cloud_size
 from twin.calibrate.physics.parameters import rigid_parameters
 from twin.calibrate.physics.record import physics_record
 from twin.physics.config import PhysicsConfig
-from twin.scene.calibration import write_physics
+from twin.scene.store.calibration import write_physics
 
 
 def calibrate_physics(

@@ -17,7 +17,7 @@ from twin.physics.config import PhysicsConfig
 from twin.replay.config import ReplayConfig
 from twin.replay.place.scene import ReplayScene
 from twin.replay.variation import VariationConfig
-from twin.scene.localise_shape import yaw_period_rad
+from twin.scene.shape.known import yaw_period_rad
 
 UPRIGHT = 0.98
 """Cosine of the tilt up to which an object stands."""

@@ -25,14 +25,14 @@ from twin.replay.follow.furnish import soft_models
 from twin.replay.place.calibrated import Correction
 from twin.replay.place.scene import ReplayScene
 from twin.replay.verdict.result import ReplayResult
-from twin.scene.backend import open_rasteriser
-from twin.scene.compose import carried_camera
-from twin.scene.gaussians import GaussianCloud, concatenate
-from twin.scene.objects import moved_cloud
-from twin.scene.parts import read_objects, read_pose
-from twin.scene.robot_splats import posed, read_links
-from twin.scene.skin import Binding, bind, pose_cloud
-from twin.scene.store import SCENE_FILE, read_scene
+from twin.scene.draw.compose import carried_camera
+from twin.scene.gaussians.cloud import GaussianCloud, concatenate
+from twin.scene.gaussians.moved import moved_cloud
+from twin.scene.gaussians.skin import Binding, bind, pose_cloud
+from twin.scene.objects.parts import read_objects, read_pose
+from twin.scene.raster.backend import open_rasteriser
+from twin.scene.robot.splats import posed, read_links
+from twin.scene.store.folder import SCENE_FILE, read_scene
 
 RATE_HZ = 5.0
 """Of the images of a plan that was never executed."""

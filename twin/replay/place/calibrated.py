@@ -15,8 +15,8 @@ from twin.physics.config import PhysicsConfig
 from twin.replay.config import ReplayConfig
 from twin.replay.place.starts import StartState
 from twin.replay.variation import RIGID_MASSES
-from twin.scene.calibration import Calibration
 from twin.scene.shape.static import StaticSdf
+from twin.scene.store.calibration import Calibration
 
 INTERVAL_SIGMAS = 2 * 1.96
 """Width of a 95 % interval in standard deviations."""

@@ -18,11 +18,11 @@ from bridge.episode.run import RunFolder
 from bridge.task.task_file import ObjectModel, Task
 from twin.replay.place.calibrated import Correction, correction_of
 from twin.replay.place.scene import ReplayScene
-from twin.scene.calibration import read_calibration
 from twin.scene.shape.lattice import Lattice
 from twin.scene.shape.npz import UnreadableArraysError
 from twin.scene.shape.static import StaticSdf
-from twin.scene.store import read_record
+from twin.scene.store.calibration import read_calibration
+from twin.scene.store.folder import read_record
 
 TASK_SHAPE = "shape of the task file"
 MOST_OFF = 0.25

@@ -11,7 +11,7 @@ from bridge.episode.run import RunFolder
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.task.task_file import Task
-from twin.scene.localise_episode import Phase, quiet_phases, write_localised
+from twin.scene.localise.episode import Phase, quiet_phases, write_localised
 
 
 @dataclass(frozen=True, kw_only=True)

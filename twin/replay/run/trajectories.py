@@ -22,8 +22,8 @@ from twin.replay.run.table import against_recorded, count_verdicts, executions_o
 from twin.replay.run.undrawn import describe_undrawn
 from twin.replay.work.job import ReplayJob, row_of_existing, row_of_failure
 from twin.replay.work.relive import run_job
-from twin.scene.calibration import read_calibration
-from twin.scene.store import SCENE_FILE, read_record, scene_hash_of
+from twin.scene.store.calibration import read_calibration
+from twin.scene.store.folder import SCENE_FILE, read_record, scene_hash_of
 
 
 def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry.camera import Camera
 from twin.robot.posture import Posture
-from twin.scene.points import NORMAL_REACH_PX, DepthLimits, trusted_depth_mask
+from twin.scene.frames.points import NORMAL_REACH_PX, DepthLimits, trusted_depth_mask
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,8 @@ from bridge.episode.streams import RgbdFrame
 from bridge.task.task_file import Task
 from bridge.terminal import Output
 from twin.scene.foundation.stage import ModelFindings, ask_models, embed_things, spread
-from twin.scene.frames import FrameChoice, load
-from twin.scene.gaussians import GaussianCloud
+from twin.scene.frames.choice import FrameChoice, load
+from twin.scene.gaussians.cloud import GaussianCloud
 from twin.scene.semantics.store import read_semantics
 from twin.scene.settings import ModelConfig
 

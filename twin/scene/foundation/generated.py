@@ -23,9 +23,9 @@ from twin.scene.foundation.sam3d import (
     GeneratorInput,
     run_generator,
 )
-from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.objects import moved_cloud
-from twin.scene.ply import read_ply
+from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.gaussians.moved import moved_cloud
+from twin.scene.store.ply import read_ply
 
 Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """From the axes of the glb file to those of the Gaussians and the pose."""

@@ -26,8 +26,8 @@ from twin.scene.foundation.open import (
 )
 from twin.scene.foundation.sam3 import Sam3Segmenter
 from twin.scene.foundation.weights import WeightsKind, check_folder, weights_hash
-from twin.scene.gaussians import GaussianCloud
-from twin.scene.raster import RasterConfig, Rasteriser
+from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.features import (
     FeatureBasis,
     SceneFeatures,

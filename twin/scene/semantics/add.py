@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from twin.scene.gaussians import GaussianCloud, concatenate
-from twin.scene.raster import RasterConfig, Rasteriser
+from twin.scene.gaussians.cloud import GaussianCloud, concatenate
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default, scene_from_masks
 from twin.scene.semantics.features import FEATURES_FILE, SceneFeatures, save_features
 from twin.scene.semantics.lift import Viewpoint

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt16
 from scipy.spatial import cKDTree
 
-from twin.scene.gaussians import GaussianCloud
-from twin.scene.raster import Rasteriser
+from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.semantics.associate import AssociateConfig, associate
 from twin.scene.semantics.colour import colour_name
 from twin.scene.semantics.form import CONTAINER, measure_form

@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
-from twin.scene.gaussians import GaussianCloud
-from twin.scene.points import DepthLimits, FrameSurface
-from twin.scene.raster import Rasteriser
+from twin.scene.frames.points import DepthLimits, FrameSurface
+from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.semantics.cluster import SurfacePoints
 from twin.scene.semantics.lift import Viewpoint, render_labels
 from twin.scene.semantics.result import Mask, MaskSet

@@ -7,7 +7,7 @@ from jaxtyping import Float32
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.gaussians.cloud import GaussianCloud, as_float32
 from twin.scene.semantics.colour import lab_from_srgb, without_shading
 
 

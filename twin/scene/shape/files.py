@@ -14,6 +14,8 @@ from twin.scene.shape.mesh import Faces, Vertices, mesh_ply, read_mesh
 from twin.scene.shape.reconstruct import ObjectShape
 
 MESH, SDF, SOFT, COLLISION = "mesh.ply", "sdf.npz", "soft.npz", "collision"
+TASK_SHAPE = "task file"
+"""Source of a shape that no view and no generator gave."""
 
 
 def remove_shape(folder: Path) -> None:

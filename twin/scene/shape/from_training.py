@@ -19,12 +19,12 @@ from bridge.geometry.camera import Camera
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.errors import TwinError
-from twin.scene.localise_shape import surface_distances
+from twin.scene.frames.training_view import TrainingView
 from twin.scene.shape.from_mesh import shape_of_mesh
+from twin.scene.shape.known import surface_distances
 from twin.scene.shape.masked_view import MaskedView
 from twin.scene.shape.reconstruct import ObjectShape, ShapeConfig, moved_views, reconstruct
 from twin.scene.shape.static import StaticConfig, static_sdf
-from twin.scene.training_view import TrainingView
 
 STATIC_FILE = "sdf.npz"
 MASK_MARGIN_M = 0.008

@@ -25,7 +25,7 @@ from twin.calibrate.physics.parameters import SURFACE_FRICTION, rigid_parameters
 from twin.calibrate.physics.record import describe_physics
 from twin.physics.config import PhysicsConfig
 from twin.replay.place.calibrated import physics_of
-from twin.scene.calibration import read_calibration, write_calibration, write_physics
+from twin.scene.store.calibration import read_calibration, write_calibration, write_physics
 
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[4] / "benchmarks"))

@@ -24,7 +24,7 @@ from twin.replay.place.calibrated import calibrated
 from twin.replay.place.scene import ReplayScene
 from twin.replay.variation import VariationConfig
 from twin.robot.model import load_robot
-from twin.scene.calibration import Calibration
+from twin.scene.store.calibration import Calibration
 
 UNSURE = np.diag([4e-6, 9e-6, 1e-6, 1e-4, 1e-4, 4e-4])
 CORRELATED = UNSURE.copy()

@@ -33,10 +33,10 @@ from twin.replay.place.calibrated import Correction
 from twin.replay.place.scene import ReplayScene
 from twin.replay.verdict.result import ReplayResult
 from twin.robot.model import load_robot
-from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.ply import write_ply
-from twin.scene.robot_splats import write_links
-from twin.scene.store import background_hash, write_record
+from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.robot.splats import write_links
+from twin.scene.store.folder import background_hash, write_record
+from twin.scene.store.ply import write_ply
 
 T0 = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000

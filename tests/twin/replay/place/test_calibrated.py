@@ -25,9 +25,9 @@ from twin.replay.place.rebuilt import read_place
 from twin.replay.place.starts import StartState
 from twin.replay.work.job import ReplayJob
 from twin.replay.work.relive import run_job
-from twin.scene.calibration import Calibration, read_calibration, write_physics
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import StaticSdf
+from twin.scene.store.calibration import Calibration, read_calibration, write_physics
 
 T0 = 1_700_000_000_000_000_000
 BIAS = {

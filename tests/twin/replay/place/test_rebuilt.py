@@ -13,8 +13,8 @@ from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
 from twin.replay.place.calibrated import physics_for
 from twin.replay.place.rebuilt import TASK_SHAPE, read_place, shape_hashes
-from twin.scene.calibration import Calibration
 from twin.scene.shape.lattice import Lattice
+from twin.scene.store.calibration import Calibration
 
 TASK = load_task("sloth_into_basket")
 

@@ -25,7 +25,7 @@ from twin.replay.place.starts import StartState, StartStates
 from twin.replay.run import trajectories
 from twin.replay.run.text import describe_run
 from twin.replay.run.trajectories import replay_run
-from twin.scene.localise_episode import Phase
+from twin.scene.localise.episode import Phase
 
 T0 = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000

@@ -25,7 +25,7 @@ from twin.replay.run.text import describe_run
 from twin.replay.run.trajectories import replay_run
 from twin.replay.verdict.result import ReplayResult
 from twin.replay.work.job import ReplayJob, divergence_of
-from twin.scene.localise_episode import Phase
+from twin.scene.localise.episode import Phase
 
 T0 = 1_700_000_000_000_000_000
 START = T0 + 2_000_000_000

@@ -28,10 +28,10 @@ from twin.scene.foundation.stage import (
     viewpoint_of,
 )
 from twin.scene.foundation.weights import WeightsError
-from twin.scene.frames import choose_frames, find_sources
-from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.raster import Rasteriser
-from twin.scene.rebuild import rebuild
+from twin.scene.frames.choice import choose_frames, find_sources
+from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.raster.rasteriser import Rasteriser
+from twin.scene.rebuild.run import rebuild
 from twin.scene.semantics.features import load_features
 from twin.scene.semantics.query import query
 from twin.scene.semantics.result import Instance, SemanticScene
@@ -271,7 +271,7 @@ def test_a_rebuild_asks_the_models_it_is_given(
     assert record["features"]["source"] == "DINOv3"
     assert record["vectors"]["source"] == "CLIP"
     json.dumps(record)  # it is part of scene.json
-    monkeypatch.setattr("twin.scene.rebuild.learn", None)  # nothing is learnt a second time
+    monkeypatch.setattr("twin.scene.rebuild.run.learn", None)  # nothing is learnt a second time
     rebuild(run, config, Output(quiet=True))
     (run.scene_dir / "features.npz").unlink()
     with pytest.raises(TypeError):

@@ -3,7 +3,7 @@ import pytest
 import table_scene
 from table_scene import BLUE, GREEN, RED, World, box, duck, ellipsoid, iou, make_world, table
 
-from twin.scene.raster import RasterConfig, Rasteriser
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default
 from twin.scene.semantics.from_view import masks_from_labels, points_of, segment_frame
 from twin.scene.semantics.segment import Segmentation, SegmentConfig, segment_points

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.gaussians.cloud import GaussianCloud, as_float32
 from twin.scene.semantics.smooth import SmoothConfig, smooth_shares
 
 

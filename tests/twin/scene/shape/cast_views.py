@@ -7,7 +7,7 @@ import open3d as o3d
 
 from bridge.geometry.camera import Camera
 from bridge.task.task_file import load_task
-from twin.scene.objects import shape_mesh
+from twin.scene.objects.split import shape_mesh
 from twin.scene.shape.isosurface import isosurface
 from twin.scene.shape.masked_view import MaskedView
 

@@ -10,22 +10,22 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.localise_result import LocalisedObject
-from twin.scene.localise_shape import pose_of, surface_distances
-from twin.scene.objects import ObjectSplats, SceneParts, write_objects
+from twin.scene.frames.training_view import Target, TrainingView
+from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.localise.result import LocalisedObject
+from twin.scene.objects.split import ObjectSplats, SceneParts, write_objects
 from twin.scene.shape.from_training import (
     from_outside_m,
     masked_view,
     shapes_of,
     write_static,
 )
+from twin.scene.shape.known import pose_of, surface_distances
 from twin.scene.shape.masked_view import ShapeError
 from twin.scene.shape.mesh import is_watertight, volume_m3
 from twin.scene.shape.reconstruct import ObjectShape
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import FREE, SURFACE, UNSEEN, StaticConfig, StaticSdf, static_sdf
-from twin.scene.training_view import Target, TrainingView
 
 TASK = cast_views.TASK
 POSES = {

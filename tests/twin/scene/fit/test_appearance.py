@@ -1,0 +1,194 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import textured_room
+from scipy.linalg import lstsq
+
+from twin.scene.fit.appearance import (
+    RIDGE_COLOR,
+    RIDGE_HARMONICS,
+    Observation,
+    conjugate_gradients,
+    gain_between,
+    solve_appearance,
+    solve_gains,
+)
+from twin.scene.fit.initialise import fuse
+from twin.scene.frames.points import DepthLimits, FrameSurface
+from twin.scene.frames.training_view import training_view
+from twin.scene.gaussians.cloud import (
+    GaussianCloud,
+    as_float32,
+    harmonic_basis,
+    view_directions,
+    with_harmonics,
+)
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.settings import InitialiseConfig
+
+LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
+GAINS = np.array([[1.1, 0.9, 1.0], [0.8, 1.2, 1.05], [1.1, 0.9, 0.95]])
+
+
+@pytest.fixture(scope="module")
+def room() -> tuple[GaussianCloud, list[Observation]]:
+    """Sixty Gaussians and three half-size images, each with a hole and a brightness of its own."""
+    surfaces = [FrameSurface(textured_room.frame(i, 3), LIMITS) for i in range(3)]
+    cloud = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=80))
+    observations = []
+    for index, surface in enumerate(surfaces):
+        view = training_view(surface)
+        mask = view.half.static_mask.copy()
+        mask[5:12, 6 + 4 * index : 14 + 4 * index] = False
+        observations.append(
+            Observation(
+                target=replace(view.half, static_mask=mask),
+                T_base_camera=view.T_base_color,
+                gain=GAINS[index],
+            )
+        )
+    return cloud, observations
+
+
+def rasteriser() -> Rasteriser:
+    return Rasteriser(RasterConfig(threads=1))
+
+
+def weights(cloud: GaussianCloud, item: Observation) -> np.ndarray:
+    """The matrix A of one view, (pixels, Gaussians): each column drawn by itself in white."""
+    draw = rasteriser()
+    columns = []
+    for first in range(0, len(cloud), 3):
+        colors = np.zeros((len(cloud), 3), dtype=np.float32)
+        for channel, index in enumerate(range(first, min(first + 3, len(cloud)))):
+            colors[index, channel] = 1.0
+        plain = replace(with_harmonics(cloud, 0), colors=colors)
+        columns += list(draw.draw_planes(plain, item.target.camera, item.T_base_camera)[:3])
+    return np.stack([column.ravel() for column in columns[: len(cloud)]], axis=1)
+
+
+@pytest.mark.parametrize("num_harmonics", [0, 3])
+def test_the_solution_is_that_of_a_dense_least_squares(
+    room: tuple[GaussianCloud, list[Observation]], num_harmonics: int
+) -> None:
+    cloud, observations = room
+    start = with_harmonics(cloud, num_harmonics)
+    solved = solve_appearance(start, observations, rasteriser(), steps=150).cloud
+    count, terms = len(cloud), 1 + num_harmonics
+    ridge = np.repeat([RIDGE_COLOR] + [RIDGE_HARMONICS] * num_harmonics, count)
+    origin = np.concatenate([start.colors[:, None], start.harmonics], axis=1)
+    for channel in range(3):
+        rows, wanted = [], []
+        for item in observations:
+            A = weights(cloud, item).astype(np.float64)
+            towards = view_directions(cloud.means_m, item.T_base_camera[:3, 3])
+            basis = np.concatenate([np.ones((count, 1)), harmonic_basis(towards)], axis=1)
+            seen = item.target.static_mask.ravel()
+            blocks = [A * basis[:, term] for term in range(terms)]
+            rows.append(item.gain[channel] * np.concatenate(blocks, axis=1)[seen])
+            wanted.append(item.target.image()[channel].ravel()[seen])
+        x0 = origin[:, :, channel].T.ravel()
+        rows.append(np.diag(np.sqrt(ridge)))
+        wanted.append(np.sqrt(ridge) * x0)
+        expected = lstsq(np.concatenate(rows), np.concatenate(wanted))[0].reshape(terms, count)
+        found = np.concatenate([solved.colors[:, None], solved.harmonics], axis=1)[..., channel].T
+        np.testing.assert_allclose(found, expected, atol=3e-3)
+
+
+def test_a_few_steps_already_explain_the_images_much_better(
+    room: tuple[GaussianCloud, list[Observation]],
+) -> None:
+    cloud, observations = room
+    grey = replace(cloud, colors=np.full_like(cloud.colors, 0.5))
+    draw = rasteriser()
+
+    def error_after(steps: int) -> float:
+        solved = solve_appearance(grey, observations, draw, steps=steps).cloud
+        return solve_appearance(solved, observations, draw, steps=0).mse_before
+
+    assert error_after(4) < 0.4 * error_after(0)
+    assert error_after(4) < 1.1 * error_after(200)
+
+
+def test_what_a_mask_hides_does_not_matter(
+    room: tuple[GaussianCloud, list[Observation]],
+) -> None:
+    cloud, observations = room
+    spoilt = []
+    for item in observations:
+        planes = item.target.planes_u8.copy()
+        planes[:, ~item.target.static_mask] = 255
+        spoilt.append(replace(item, target=replace(item.target, planes_u8=planes)))
+    clean, other = (
+        solve_appearance(cloud, items, rasteriser(), steps=3).cloud
+        for items in (observations, spoilt)
+    )
+    np.testing.assert_array_equal(clean.colors, other.colors)
+    np.testing.assert_array_equal(
+        solve_gains(cloud, observations, rasteriser()), solve_gains(cloud, spoilt, rasteriser())
+    )
+
+
+def test_a_gaussian_that_no_pixel_shows_keeps_its_colour(
+    room: tuple[GaussianCloud, list[Observation]],
+) -> None:
+    cloud, observations = room
+    means = cloud.means_m.copy()
+    means[7] = (0.0, -30.0, 0.0)
+    moved = replace(cloud, means_m=means)
+    solved = solve_appearance(moved, observations, rasteriser(), steps=3).cloud
+    np.testing.assert_array_equal(solved.colors[7], cloud.colors[7])
+    assert not np.array_equal(solved.colors[8], cloud.colors[8])
+
+
+def test_gains_are_found_up_to_their_mean(
+    room: tuple[GaussianCloud, list[Observation]],
+) -> None:
+    cloud, observations = room
+    true = np.array([[0.8, 1.0, 0.9], [0.9, 0.7, 0.6], [0.7, 0.8, 0.9]])
+    draw = rasteriser()
+    exposed = []
+    for item, gain in zip(observations, true, strict=True):
+        planes = draw.draw_planes(cloud, item.target.camera, item.T_base_camera)[:3]
+        recorded = np.rint(np.clip(planes * gain[:, None, None], 0, 1) * 255).astype(np.uint8)
+        exposed.append(replace(item, target=replace(item.target, planes_u8=recorded)))
+    found = solve_gains(cloud, exposed, draw)
+    np.testing.assert_allclose(found, true / true.mean(axis=0), rtol=5e-3)
+    np.testing.assert_allclose(found.mean(axis=0), 1.0, rtol=1e-12)
+
+
+def test_a_saturated_pixel_says_nothing_about_the_gain(
+    room: tuple[GaussianCloud, list[Observation]],
+) -> None:
+    cloud, observations = room
+    item = observations[0]
+    drawn = rasteriser().draw_planes(cloud, item.target.camera, item.T_base_camera)[:3]
+    recorded = np.rint(np.clip(drawn, 0, 0.9) * 255).astype(np.uint8)
+    recorded[:, :4] = 255
+    target = replace(item.target, planes_u8=recorded)
+    np.testing.assert_allclose(gain_between(as_float32(drawn), target), 1.0, atol=0.03)
+
+
+def test_an_image_that_is_masked_everywhere_has_gain_one(
+    room: tuple[GaussianCloud, list[Observation]],
+) -> None:
+    cloud, observations = room
+    item = observations[0]
+    target = replace(item.target, static_mask=np.zeros_like(item.target.static_mask))
+    drawn = rasteriser().draw_planes(cloud, target.camera, item.T_base_camera)[:3]
+    np.testing.assert_array_equal(gain_between(drawn, target), 1.0)
+
+
+def test_conjugate_gradients_end_after_as_many_steps_as_unknowns() -> None:
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(5, 5))
+    A = (A @ A.T + np.eye(5)).astype(np.float32)
+    right = rng.normal(size=(5, 1, 2)).astype(np.float32)
+    diagonal = np.ones_like(right) * np.diag(A)[:, None, None]
+    x, steps = conjugate_gradients(
+        lambda v: np.einsum("ij,jkc->ikc", A, v), right, diagonal, steps=50
+    )
+    assert steps < 20
+    expected = np.linalg.solve(A.astype(np.float64), right[:, 0])
+    np.testing.assert_allclose(x[:, 0], expected, atol=2e-4)

@@ -1,0 +1,130 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import textured_room
+
+from bridge.geometry import se3
+from twin.scene.fit.appearance import Observation
+from twin.scene.fit.densify import Scores, densify, score
+from twin.scene.fit.initialise import fuse
+from twin.scene.frames.points import DepthLimits, FrameSurface
+from twin.scene.frames.training_view import training_view
+from twin.scene.gaussians.cloud import GaussianCloud, arrays, as_float32
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.settings import InitialiseConfig
+
+LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
+
+
+@pytest.fixture(scope="module")
+def room() -> tuple[GaussianCloud, list[Observation]]:
+    surfaces = [FrameSurface(textured_room.frame(i, 3), LIMITS) for i in range(3)]
+    cloud = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=400))
+    views = [training_view(surface) for surface in surfaces]
+    return cloud, [
+        Observation(target=view.full, T_base_camera=view.T_base_color, gain=np.ones(3))
+        for view in views
+    ]
+
+
+def even_scores(cloud: GaussianCloud) -> Scores:
+    """Everything is seen well and wrong alike."""
+    ones = np.ones(len(cloud), dtype=np.float32)
+    return Scores(error=ones, pixels=10 * ones, size_px=3 * ones, size_fraction=0.01 * ones)
+
+
+def test_the_error_of_a_pixel_goes_to_the_gaussians_that_made_it(
+    room: tuple[GaussianCloud, list[Observation]],
+) -> None:
+    cloud, observations = room
+    rasteriser = Rasteriser(RasterConfig(threads=1))
+    before = score(cloud, observations, rasteriser)
+    wrong = int(np.argmax(before.pixels))
+    colors = cloud.colors.copy()
+    colors[wrong] += 0.8
+    after = score(replace(cloud, colors=colors), observations, rasteriser)
+    assert np.argmax(after.error - before.error) == wrong
+    np.testing.assert_array_equal(after.pixels, before.pixels)
+    total = sum(float(item.target.static_mask.sum()) for item in observations)
+    assert 0.5 * total < before.pixels.sum() <= total * 1.001
+
+
+def test_the_worst_are_split_and_the_budget_holds(
+    room: tuple[GaussianCloud, list[Observation]],
+) -> None:
+    cloud = room[0]
+    scores = even_scores(cloud)
+    scores.error[[3, 50, 91]] = 5.0
+    done = densify(cloud, scores, max_splats=len(cloud) + 3, most=100)
+    assert done.num_split == 3
+    assert len(done.cloud) == len(cloud) + 3
+    parents, counts = np.unique(done.parents, return_counts=True)
+    np.testing.assert_array_equal(parents, np.arange(len(cloud)))
+    np.testing.assert_array_equal(parents[counts == 2], [3, 50, 91])
+    assert len(densify(cloud, scores, max_splats=len(cloud) + 3, most=2).cloud) == len(cloud) + 2
+    assert densify(cloud, scores, max_splats=10, most=100).num_split == 0
+
+
+def test_two_halves_have_the_mean_and_the_covariance_of_the_whole(
+    room: tuple[GaussianCloud, list[Observation]],
+) -> None:
+    cloud = room[0].take(np.array([11]))
+    cloud = replace(cloud, scales_log=as_float32(np.log([[0.02, 0.05, 0.004]])))
+    halves = densify(cloud, even_scores(cloud), max_splats=2, most=1).cloud
+
+    def covariances(of: GaussianCloud) -> np.ndarray:
+        R = se3.rotation_from_quaternion(of.quats_wxyz.astype(np.float64))
+        RS = R * np.exp(of.scales_log.astype(np.float64))[:, None, :]
+        return RS @ np.swapaxes(RS, 1, 2)
+
+    middle = halves.means_m.mean(axis=0)
+    np.testing.assert_allclose(middle, cloud.means_m[0], atol=1e-6)
+    apart = (halves.means_m - middle).astype(np.float64)
+    mixed = covariances(halves).mean(axis=0) + apart.T @ apart / 2
+    np.testing.assert_allclose(mixed, covariances(cloud)[0], rtol=0.02, atol=1e-7)
+    np.testing.assert_array_equal(halves.colors, cloud.colors[[0, 0]])
+
+
+def test_what_is_transparent_unseen_or_huge_goes(
+    room: tuple[GaussianCloud, list[Observation]],
+) -> None:
+    cloud = room[0]
+    opacities = cloud.opacities_logit.copy()
+    opacities[5] = -6.0
+    scores = even_scores(cloud)
+    scores.pixels[6] = 0.0
+    scores.size_fraction[7] = 0.5
+    faded = replace(cloud, opacities_logit=opacities)
+    done = densify(faded, scores, max_splats=len(cloud) - 3, most=10)
+    assert done.num_pruned == 3
+    assert not set(done.parents.tolist()) & {5, 6, 7}
+    assert len(done.cloud) == len(cloud) - 3
+
+
+def test_what_no_image_can_resolve_is_not_split(
+    room: tuple[GaussianCloud, list[Observation]],
+) -> None:
+    cloud = room[0]
+    scores = replace(even_scores(cloud), size_px=np.full(len(cloud), 0.2, dtype=np.float32))
+    assert densify(cloud, scores, max_splats=10_000, most=100).num_split == 0
+
+
+def test_nothing_is_lost_when_nothing_is_seen(
+    room: tuple[GaussianCloud, list[Observation]],
+) -> None:
+    cloud = room[0]
+    scores = replace(even_scores(cloud), pixels=np.zeros(len(cloud), dtype=np.float32))
+    assert len(densify(cloud, scores, max_splats=len(cloud), most=0).cloud) == len(cloud)
+
+
+def test_the_same_again_gives_the_same(
+    room: tuple[GaussianCloud, list[Observation]],
+) -> None:
+    cloud, observations = room
+    results = []
+    for threads in (1, 2):
+        scores = score(cloud, observations, Rasteriser(RasterConfig(threads=threads)))
+        results.append(densify(cloud, scores, max_splats=len(cloud) + 50, most=50).cloud)
+    for name, rows in arrays(results[0]):
+        np.testing.assert_array_equal(rows, getattr(results[1], name))

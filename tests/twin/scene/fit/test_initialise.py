@@ -1,0 +1,122 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import textured_room
+
+from bridge.geometry import se3
+from twin.scene.fit.initialise import NoSurfaceError, fuse
+from twin.scene.frames.points import DepthLimits, FrameSurface, trusted_depth_mask
+from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.settings import InitialiseConfig
+
+LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
+
+
+def room_cloud(config: InitialiseConfig) -> GaussianCloud:
+    surfaces = [FrameSurface(textured_room.frame(i, 6), LIMITS) for i in range(6)]
+    return fuse([surface.points() for surface in surfaces], config)
+
+
+def test_points_lie_on_the_surfaces_and_carry_their_colour() -> None:
+    points = FrameSurface(textured_room.frame(2, 6), LIMITS).points()
+    assert len(points.p_m) > 1000
+    on_table = np.abs(points.p_m[:, 2]) < 0.003
+    on_wall = np.abs(points.p_m[:, 1] - 0.6) < 0.003
+    assert (on_table | on_wall).mean() > 0.999
+    # The colour image was looked up through its own camera, 3 cm beside the depth camera.
+    error = np.abs(points.colors - textured_room.texture(points.p_m))
+    assert np.median(error) < 0.01
+    assert np.quantile(error, 0.99) < 0.05
+
+
+def test_normals_face_the_camera() -> None:
+    points = FrameSurface(textured_room.frame(2, 6), LIMITS).points()
+    table = (np.abs(points.p_m[:, 2]) < 0.003) & (points.p_m[:, 1] < 0.5)
+    np.testing.assert_allclose(np.median(points.normals[table], axis=0), [0, 0, 1], atol=0.05)
+
+
+def test_pixels_without_a_measurement_never_enter() -> None:
+    item = textured_room.frame(2, 6)
+    depth = item.depth_m.copy()
+    depth[:, ::2] = 0.0
+    depth[::5] = np.float32(65.535)
+    surface = FrameSurface(replace(item, depth_m=depth), LIMITS)
+    assert not surface.trusted[:, ::2].any()
+    assert not surface.trusted[::5].any()
+    assert surface.depth_in_color_camera().max() < 5.0
+
+
+def test_a_flying_pixel_is_not_trusted() -> None:
+    depth = np.full((9, 9), 1.0, dtype=np.float32)
+    depth[:, 5:] = 2.0
+    depth[4, 4] = 1.5
+    trusted = trusted_depth_mask(depth, LIMITS)
+    assert not trusted[4, 4]
+    assert trusted[1, 1]
+    assert trusted[1, 8]
+
+
+def test_depth_moves_to_the_colour_camera() -> None:
+    item = textured_room.frame(3, 6)
+    expected, _ = textured_room.depth_and_points(textured_room.COLOR, item.T_base_color)
+    found = FrameSurface(item, LIMITS).depth_in_color_camera()
+    known = found > 0
+    assert known.mean() > 0.6
+    assert np.median(np.abs(found - expected)[known]) < 0.01
+
+
+@pytest.mark.parametrize("budget", [200, 1000])
+def test_the_budget_of_gaussians_is_kept(budget: int) -> None:
+    assert budget / 4 < len(room_cloud(InitialiseConfig(max_splats=budget))) <= budget
+
+
+def test_gaussians_lie_flat_on_their_surface() -> None:
+    cloud = room_cloud(InitialiseConfig(max_splats=800))
+    thin_axis = se3.rotation_from_quaternion(cloud.quats_wxyz.astype(np.float64))[..., 2]
+    table = (np.abs(cloud.means_m[:, 2]) < 0.005) & (cloud.means_m[:, 1] < 0.4)
+    assert np.median(np.abs(thin_axis[table, 2])) > 0.99
+    np.testing.assert_allclose(
+        cloud.scales_log[:, 2] - cloud.scales_log[:, 0], np.log(0.1), atol=1e-4
+    )
+
+
+def test_the_first_gaussians_already_show_the_room() -> None:
+    cloud = room_cloud(InitialiseConfig())
+    item = textured_room.frame(2, 6)
+    view = Rasteriser(RasterConfig(threads=1)).view(cloud, item.color_camera, item.T_base_color)
+    middle = (slice(8, -8), slice(8, -8))
+    error = np.abs(view.image[middle] - item.image_u8[middle] / 255.0)
+    assert error.mean() < 0.06
+    expected, _ = textured_room.depth_and_points(item.color_camera, item.T_base_color)
+    assert np.median(np.abs(view.depth_m - expected)[middle]) < 0.01
+
+
+def test_frames_without_depth_are_refused() -> None:
+    item = textured_room.frame(0, 1)
+    empty = replace(item, depth_m=np.zeros_like(item.depth_m))
+    with pytest.raises(NoSurfaceError, match="0 usable points"):
+        fuse([FrameSurface(empty, LIMITS).points()], InitialiseConfig())
+
+
+@pytest.mark.parametrize("nothing", [np.nan, np.inf])
+def test_depth_that_is_no_number_is_no_measurement(nothing: float) -> None:
+    """Neither it nor its neighbours are trusted, as with 0."""
+    item = textured_room.frame(2, 6)
+    depth = item.depth_m.copy()
+    depth[10, 10] = nothing
+    surface = FrameSurface(replace(item, depth_m=depth), LIMITS)
+    zero = depth.copy()
+    zero[10, 10] = 0.0
+    np.testing.assert_array_equal(
+        surface.trusted, FrameSurface(replace(item, depth_m=zero), LIMITS).trusted
+    )
+    assert np.isfinite(surface.depth_in_color_camera()).all()
+
+
+def test_a_frame_without_any_depth_has_no_points() -> None:
+    item = textured_room.frame(2, 6)
+    surface = FrameSurface(replace(item, depth_m=np.zeros_like(item.depth_m)), LIMITS)
+    assert len(surface.points().p_m) == 0
+    assert not surface.depth_in_color_camera().any()

@@ -1,0 +1,302 @@
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+import textured_room
+
+from bridge.geometry import se3
+from twin.scene.fit.camera_correction import corrected_pose
+from twin.scene.fit.initialise import fuse
+from twin.scene.fit.run import fit
+from twin.scene.fit.state import Checkpoint
+from twin.scene.frames.points import DepthLimits, FrameSurface
+from twin.scene.frames.training_view import TrainingView, training_view
+from twin.scene.gaussians.cloud import GaussianCloud, arrays
+from twin.scene.raster.losses import Loss, psnr_db
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.settings import FitConfig, InitialiseConfig
+
+LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
+Kind = Literal["3dgs", "paper"]
+ADAM_ALONE = FitConfig(
+    iterations=1, threads=1, appearance_steps=0, harmonics=0, gain=False, densify=False
+)
+
+
+@pytest.mark.parametrize("kind", ["3dgs", "paper"])
+def test_the_gradient_of_the_loss_agrees_with_finite_differences(kind: Kind) -> None:
+    rng = np.random.default_rng(0)
+    planes = rng.uniform(0.1, 0.9, size=(5, 12, 14)).astype(np.float32)
+    target = rng.uniform(size=(3, 12, 14)).astype(np.float32)
+    depth = rng.uniform(0.5, 2.0, size=(12, 14)).astype(np.float32)
+    depth[:4] = 0.0
+    loss = Loss(kind, depth_weight=0.3, threads=1)
+    direction = rng.normal(size=planes.shape).astype(np.float32)
+    # |x| has a kink: keep every difference at least ten steps away from it.
+    step = np.float32(1e-4)
+    target += 0.01 * np.sign(target - planes[:3])
+    gradient = loss(planes, target, depth)[2]
+    ahead, behind = (loss(planes + s * step * direction, target, depth)[0] for s in (1, -1))
+    assert (ahead - behind) / (2 * step) == pytest.approx(
+        float((gradient * direction).sum()), rel=0.03, abs=3e-3
+    )
+
+
+def test_unmeasured_depth_does_not_count() -> None:
+    rng = np.random.default_rng(0)
+    planes = rng.uniform(size=(5, 8, 8)).astype(np.float32)
+    _, _, gradient = Loss("paper", depth_weight=1.0, threads=1)(
+        planes, planes[:3].copy(), np.zeros((8, 8), dtype=np.float32)
+    )
+    assert np.abs(gradient).max() == 0.0
+
+
+def test_the_paper_loss_is_the_squared_error_plus_weighted_depth() -> None:
+    rng = np.random.default_rng(0)
+    planes = rng.uniform(size=(5, 8, 8)).astype(np.float32)
+    target = rng.uniform(size=(3, 8, 8)).astype(np.float32)
+    depth = np.full((8, 8), 2.0, dtype=np.float32)
+    value, mse, _ = Loss("paper", depth_weight=0.5, threads=1)(planes, target, depth)
+    assert mse == pytest.approx(float(np.mean((planes[:3] - target) ** 2)), rel=1e-5)
+    relative = np.abs(planes[3] - planes[4] * 2.0) / 2.0
+    assert value == pytest.approx(mse + 0.5 * float(relative.mean()), rel=1e-5)
+
+
+@pytest.fixture(scope="module")
+def room() -> tuple[GaussianCloud, list[TrainingView]]:
+    surfaces = [FrameSurface(textured_room.frame(i, 4), LIMITS) for i in range(4)]
+    start = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=1000))
+    return start, [training_view(surface) for surface in surfaces]
+
+
+@pytest.mark.parametrize("kind", ["3dgs", "paper"])
+def test_fitting_improves_the_images(
+    room: tuple[GaussianCloud, list[TrainingView]], kind: Kind
+) -> None:
+    seen: list[str] = []
+    config = replace(ADAM_ALONE, iterations=40, loss=kind)
+    fitted = fit(*room, config, lambda done, note: seen.append(note))
+    barely = fit(*room, replace(config, iterations=4), lambda *_: None)
+    assert fitted.iterations == 40
+    assert fitted.coarse_iterations == 24
+    assert fitted.train_psnr_db > barely.train_psnr_db + 1.0
+    assert "PSNR" in seen[-1]
+    assert "s left" in seen[-1]
+
+
+def test_solved_colours_are_ahead_of_adam_alone(
+    room: tuple[GaussianCloud, list[TrainingView]],
+) -> None:
+    start, views = room
+    rasteriser = Rasteriser(RasterConfig(threads=1))
+
+    def error(config: FitConfig) -> float:
+        cloud = fit(start, views, config, lambda *_: None).cloud
+        drawn = [rasteriser.draw_planes(cloud, v.full.camera, v.T_base_color)[:3] for v in views]
+        pairs = zip(drawn, views, strict=True)
+        return float(np.mean([np.square(d - v.full.image()).mean() for d, v in pairs]))
+
+    alone = replace(ADAM_ALONE, iterations=20)
+    assert error(replace(alone, appearance_steps=3)) < 0.95 * error(alone)
+
+
+def test_frames_of_different_exposure_are_told_from_the_scene(
+    room: tuple[GaussianCloud, list[TrainingView]],
+) -> None:
+    start, views = room
+    gains = np.array([0.7, 0.9, 0.8, 0.6])
+    exposed = [
+        replace(
+            view,
+            half=replace(view.half, planes_u8=(view.half.planes_u8 * gain).astype(np.uint8)),
+            full=replace(view.full, planes_u8=(view.full.planes_u8 * gain).astype(np.uint8)),
+        )
+        for view, gain in zip(views, gains, strict=True)
+    ]
+    config = FitConfig(iterations=30, threads=1, densify=False)
+    told = fit(start, exposed, config, lambda *_: None)
+    untold = fit(start, exposed, replace(config, gain=False), lambda *_: None)
+    assert told.train_psnr_db > untold.train_psnr_db + 1.0
+    np.testing.assert_allclose(told.gains.mean(axis=0), 1.0, rtol=1e-9)
+    np.testing.assert_allclose(told.gains / gains[:, None] * gains.mean(), 1.0, atol=0.06)
+    np.testing.assert_array_equal(untold.gains, 1.0)
+
+
+def test_gaussians_are_added_within_their_budget_and_only_if_wanted(
+    room: tuple[GaussianCloud, list[TrainingView]],
+) -> None:
+    start, views = room
+    most = len(start) + 120
+    config = FitConfig(iterations=20, threads=1)
+    grown = fit(start, views, config, lambda *_: None, max_splats=most)
+    assert len(start) < len(grown.cloud) <= most
+    assert grown.num_split - grown.num_pruned == len(grown.cloud) - len(start)
+    fixed = fit(start, views, replace(config, densify=False), lambda *_: None, max_splats=most)
+    assert len(fixed.cloud) == len(start)
+    assert len(fit(start, views, config, lambda *_: None).cloud) <= len(start)
+
+
+@pytest.mark.slow
+def test_refining_poses_brings_shaken_cameras_back() -> None:
+    surfaces = [FrameSurface(textured_room.frame(i, 8), LIMITS) for i in range(8)]
+    start = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=1000))
+    views = [training_view(surface) for surface in surfaces]
+    rng = np.random.default_rng(1)
+    shaken = list(views)
+    for index in (3, 5):
+        pose = corrected_pose(views[index].T_base_color, rng.normal(0, 0.004, 6))
+        shaken[index] = replace(views[index], T_base_color=pose)
+    config = FitConfig(iterations=240, threads=1, refine_poses=True, densify=False)
+    fitted = fit(start, shaken, config, lambda *_: None)
+
+    def off_px(index: int, pose: np.ndarray) -> float:
+        """How far points of the room appear from where they should [px]."""
+        camera, p = views[index].full.camera, start.means_m.astype(np.float64)
+        seen = [
+            camera.project(se3.apply(se3.invert(T), p))[0]
+            for T in (pose, views[index].T_base_color)
+        ]
+        return float(np.linalg.norm(seen[0] - seen[1], axis=1).mean())
+
+    before = [off_px(index, shaken[index].T_base_color) for index in (3, 5)]
+    after = [off_px(index, fitted.Ts_base_color[index]) for index in (3, 5)]
+    assert np.mean(after) < 0.75 * np.mean(before)
+    np.testing.assert_array_equal(fitted.Ts_base_color[0], views[0].T_base_color)
+    still = fit(start, shaken, replace(config, iterations=2, refine_poses=False), lambda *_: None)
+    np.testing.assert_array_equal(still.Ts_base_color[3], shaken[3].T_base_color)
+
+
+class StopError(Exception):
+    """The power went out."""
+
+
+def stop_after(count: int) -> Callable[[int, str], None]:
+    def advance(done: int, note: str) -> None:
+        if note.startswith(f"image {count},"):
+            raise StopError
+
+    return advance
+
+
+def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(
+    room: tuple[GaussianCloud, list[TrainingView]], tmp_path: Path
+) -> None:
+    start, views = room
+    config = FitConfig(iterations=14, threads=1, refine_poses=True)
+    most = len(start) + 50
+    whole = fit(start, views, config, lambda *_: None, max_splats=most)
+    kept = Checkpoint(path=tmp_path / "fit.npz", key="this fit", period_s=0.0)
+    with pytest.raises(StopError):
+        fit(start, views, config, stop_after(9), max_splats=most, checkpoint=kept)
+    steps: list[str] = []
+    resumed = fit(
+        start,
+        views,
+        config,
+        lambda done, note: steps.append(note),
+        max_splats=most,
+        checkpoint=kept,
+    )
+    assert len(steps) == 14 - 8
+    for name, rows in arrays(whole.cloud):
+        np.testing.assert_array_equal(rows, getattr(resumed.cloud, name))
+    np.testing.assert_array_equal(whole.Ts_base_color, resumed.Ts_base_color)
+    assert whole.train_psnr_db == resumed.train_psnr_db
+
+
+def test_a_state_of_other_settings_or_a_damaged_one_is_not_used(
+    room: tuple[GaussianCloud, list[TrainingView]], tmp_path: Path
+) -> None:
+    start, views = room
+    path = tmp_path / "fit.npz"
+    config = replace(ADAM_ALONE, iterations=3)
+    done: list[int] = []
+
+    def run(key: str) -> int:
+        done.clear()
+        checkpoint = Checkpoint(path=path, key=key, period_s=0.0)
+        fit(start, views, config, lambda *_: done.append(1), checkpoint=checkpoint)
+        return len(done)
+
+    assert run("one") == 3
+    assert run("one") == 0
+    assert run("another") == 3
+    path.write_bytes(path.read_bytes()[:5000])
+    assert run("another") == 3
+    path.write_bytes(b"no archive")
+    assert run("another") == 3
+
+
+def test_a_number_of_images_repeats_bit_for_bit_with_any_threads(
+    room: tuple[GaussianCloud, list[TrainingView]],
+) -> None:
+    results = [
+        fit(*room, FitConfig(iterations=6, threads=threads), lambda *_: None).cloud
+        for threads in (1, 2)
+    ]
+    for name, rows in arrays(results[0]):
+        np.testing.assert_array_equal(rows, getattr(results[1], name))
+
+
+def test_another_seed_gives_another_result(
+    room: tuple[GaussianCloud, list[TrainingView]],
+) -> None:
+    first, second = (
+        fit(*room, FitConfig(iterations=3, threads=1, seed=seed), lambda *_: None).cloud
+        for seed in (0, 1)
+    )
+    assert not np.array_equal(first.colors, second.colors)
+
+
+def test_a_time_budget_is_kept(room: tuple[GaussianCloud, list[TrainingView]]) -> None:
+    result = fit(*room, FitConfig(budget_s=0.2, threads=1), lambda *_: None)
+    assert result.iterations >= 1
+    assert result.seconds >= 0.2
+
+
+def test_psnr_of_a_known_error() -> None:
+    assert psnr_db(0.01) == pytest.approx(20.0)
+    assert psnr_db(0.0) == float("inf")
+
+
+def test_pixels_that_are_passed_over_do_not_make_the_fit_look_better(
+    room: tuple[GaussianCloud, list[TrainingView]],
+) -> None:
+    start, views = room
+    config = replace(ADAM_ALONE, coarse_fraction=0.0)
+
+    def masked(view: TrainingView, shown: slice) -> TrainingView:
+        mask = np.zeros_like(view.full.static_mask)
+        mask[:, shown] = True
+        return replace(view, full=replace(view.full, static_mask=mask))
+
+    halves = [
+        fit(start, [masked(views[0], side)], config, lambda *_: None).train_psnr_db
+        for side in (slice(None, 32), slice(32, None))
+    ]
+    whole = fit(start, views[:1], config, lambda *_: None).train_psnr_db
+    nothing = fit(start, [masked(views[0], slice(0, 0))], config, lambda *_: None)
+    mse = np.mean([10 ** (-half / 10) for half in halves])
+    assert whole == pytest.approx(psnr_db(float(mse)), abs=1e-3)
+    assert nothing.train_psnr_db is None
+
+
+def test_half_an_odd_image_keeps_every_pixel_in_its_place() -> None:
+    """A block of 2 x 2 pixels is one pixel of the half-size camera, also at the far edge."""
+    item = textured_room.frame(1, 4)
+    odd = replace(
+        item,
+        image_u8=item.image_u8[:47, :63],
+        color_camera=replace(item.color_camera, width=63, height=47),
+    )
+    view = training_view(FrameSurface(odd, LIMITS))
+    camera = view.half.camera
+    assert (camera.width, camera.height) == (32, 24)
+    assert view.half.planes_u8.shape == (3, 24, 32)
+    p_camera = np.array([[0.3, 0.2, 1.0]])
+    np.testing.assert_allclose(
+        camera.project(p_camera)[0] * 2, odd.color_camera.project(p_camera)[0], rtol=1e-12
+    )

@@ -1,0 +1,138 @@
+"""Which frames of a scan are learnt from."""
+
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+import textured_room
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.episode.run import RunFolder
+from bridge.errors import UsageError
+from twin.scene.frames.choice import choose_frames, find_sources
+from twin.scene.frames.select import path_length_m, pick, sharpness, smear_px
+from twin.scene.settings import FrameConfig
+
+
+def rated(values: Mapping[int, float]) -> Callable[[Collection[int]], dict[int, float]]:
+    """Answer how sharp images are from a table."""
+    return lambda wanted: {stamp: values[stamp] for stamp in wanted}
+
+
+def test_a_camera_that_pauses_gives_no_more_frames_there() -> None:
+    stamps = np.arange(100)
+    path = np.concatenate(
+        [np.linspace(0, 1, 10), 1 + 1e-6 * np.arange(80), np.linspace(1.1, 2, 10)]
+    )
+    picked = pick(stamps, path, np.zeros(100), 10, rated(dict.fromkeys(range(100), 1.0)))
+    assert len(picked) <= 10
+    assert ((picked >= 10) & (picked < 90)).sum() <= 2
+
+
+def test_the_sharpest_of_the_still_frames_of_a_stretch_is_taken() -> None:
+    stamps = np.arange(30)
+    smear = np.where(stamps % 10 < 5, 10.0, 0.1)
+    sharp = {int(s): 100.0 if s % 10 < 5 else float(s % 10) for s in stamps}
+    picked = pick(stamps, np.linspace(0, 1, 30), smear, 3, rated(sharp))
+    assert (picked % 10).tolist() == [9, 9, 9]
+
+
+def test_a_frame_much_blurrier_than_its_neighbours_is_left_out() -> None:
+    stamps = np.arange(12)
+    values = {int(s): 1.0 if s == 5 else 10.0 for s in stamps}
+    picked = pick(
+        stamps,
+        np.linspace(0, 1, 12),
+        np.zeros(12),
+        20,
+        rated(values),
+    )
+    assert picked.tolist() == [s for s in range(12) if s != 5]
+
+
+@given(st.integers(1, 60), st.integers(1, 30), st.integers(0, 1000))
+def test_never_more_frames_than_wanted_always_in_order_always_the_same(
+    num_frames: int, count: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    stamps = np.arange(num_frames) * 7
+    path = (
+        np.cumsum(rng.exponential(size=num_frames) * rng.integers(0, 2, num_frames)) + 1e-6 * stamps
+    )
+    path -= path[0]
+    smear = rng.uniform(0, 2, num_frames)
+    values = {int(s): float(v) for s, v in zip(stamps, rng.uniform(1, 2, num_frames), strict=True)}
+    picked = pick(stamps, path, smear, count, rated(values))
+    again = pick(stamps, path, smear, count, rated(values))
+    assert 1 <= len(picked) <= count
+    assert picked.tolist() == sorted(set(picked.tolist())) == again.tolist()
+    assert set(picked.tolist()) <= set(stamps.tolist())
+
+
+def test_blurring_an_image_makes_it_less_sharp() -> None:
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 255, (40, 60, 3)).astype(np.uint8)
+    smooth = image.astype(float)
+    smooth = (smooth + np.roll(smooth, 1, 1) + np.roll(smooth, 2, 1) + np.roll(smooth, 3, 1)) / 4
+    assert sharpness(smooth.astype(np.uint8)) < 0.7 * sharpness(image)
+    assert sharpness(np.zeros((3, 2, 3), dtype=np.uint8)) == 0.0
+
+
+def test_turning_counts_as_path_and_standing_still_hardly_does() -> None:
+    turned = np.stack([textured_room.camera_pose(k, 5) for k in range(5)])
+    turned[:, :3, 3] = 0.0
+    path = path_length_m(turned)
+    assert path[-1] > 0.3
+    assert (np.diff(path) > 0).all()
+    still = path_length_m(np.stack([np.eye(4)] * 3))
+    assert 0 < still[-1] < 1e-4
+
+
+def test_smear_is_focal_length_times_angular_speed_times_exposure(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path)
+    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9)
+    (choice,) = choose_frames(find_sources(run), FrameConfig())
+    stamps = np.array([1_400_000_000])
+    (found,) = smear_px(choice.poses.tree, "wrist_color_optical", stamps, 60.0)
+    a, b = textured_room.camera_pose(3, 9), textured_room.camera_pose(5, 9)
+    speed = np.linalg.norm(a[:3, 3] - b[:3, 3]) / 0.2 / 0.7
+    turn = np.arccos((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2) / 0.2
+    assert found == pytest.approx(60.0 * 0.01 * (speed + turn), rel=0.05)
+
+
+def test_a_fixed_protocol_learns_from_every_fifth_and_holds_out_the_one_two_after(
+    tmp_path: Path,
+) -> None:
+    run = RunFolder.create(tmp_path)
+    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=20)
+    (choice,) = choose_frames(
+        find_sources(run), FrameConfig(train_every=5, holdout_every=5, holdout_offset=2)
+    )
+    index = {1_000_000_000 + 100_000_000 * k: k for k in range(20)}
+    assert sorted(index[s] for s in choice.train_ns) == [0, 5, 10, 15]
+    assert sorted(index[s] for s in choice.holdout_ns) == [2, 7, 12, 17]
+
+
+def test_the_choice_is_the_same_every_time(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path)
+    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=24)
+    config = FrameConfig(max_train_frames=9)
+    first, second = (choose_frames(find_sources(run), config)[0] for _ in range(2))
+    assert first.train_ns == second.train_ns
+    assert len(first.train_ns) <= 9
+    assert not first.train_ns & first.holdout_ns
+
+
+@pytest.mark.parametrize(
+    ("settings", "found"),
+    [
+        ({"holdout_offset": 8}, "beyond the first"),
+        ({"holdout_offset": -1}, "too small"),
+        ({"train_every": -1}, "too small"),
+    ],
+)
+def test_protocols_that_make_no_sense_are_refused(settings: dict[str, int], found: str) -> None:
+    with pytest.raises(UsageError, match=found):
+        FrameConfig(**settings)  # type: ignore[arg-type]

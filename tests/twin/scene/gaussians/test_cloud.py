@@ -1,0 +1,135 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import sph_harm_y
+
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from twin.errors import TwinError
+from twin.scene.gaussians.cloud import (
+    GaussianCloud,
+    arrays,
+    as_float32,
+    concatenate,
+    effective_colors,
+    harmonic_basis,
+    with_harmonics,
+)
+from twin.scene.gaussians.moved import moved_cloud
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.store.ply import read_ply, write_ply
+
+CAMERA = Camera(width=40, height=33, fx=60.0, fy=60.0, cx=20.0, cy=16.5)
+
+
+def plain_cloud(count: int = 30) -> GaussianCloud:
+    rng = np.random.default_rng(4)
+    return GaussianCloud(
+        means_m=as_float32(rng.uniform([-0.4, -0.3, 0.6], [0.4, 0.3, 1.5], size=(count, 3))),
+        quats_wxyz=as_float32(rng.normal(size=(count, 4))),
+        scales_log=as_float32(np.log(rng.uniform(0.02, 0.08, size=(count, 3)))),
+        opacities_logit=as_float32(rng.normal(size=count)),
+        colors=as_float32(rng.uniform(size=(count, 3))),
+    )
+
+
+def shiny_cloud(count: int = 30) -> GaussianCloud:
+    harmonics = np.random.default_rng(5).normal(scale=0.3, size=(count, 3, 3))
+    return GaussianCloud(
+        **(dict(arrays(plain_cloud(count))) | {"harmonics": as_float32(harmonics)})
+    )
+
+
+def some_motion() -> np.ndarray:
+    return se3.look_at(
+        np.array([0.3, -0.2, -0.4]), np.array([0.0, 0.1, 1.0]), np.array([0.2, -1.0, 0.1])
+    )
+
+
+def test_a_cloud_made_without_harmonics_has_none() -> None:
+    cloud = plain_cloud()
+    assert cloud.harmonics.shape == (30, 0, 3)
+    assert [name for name, _ in arrays(cloud)][-1] == "colors"
+    assert cloud.take(np.arange(5)).harmonics.shape == (5, 0, 3)
+    assert effective_colors(cloud, np.zeros(3)) is cloud.colors
+
+
+def test_two_harmonics_are_refused() -> None:
+    with pytest.raises(TwinError, match="2 harmonics per colour"):
+        with_harmonics(plain_cloud(), 2)
+
+
+def test_harmonics_follow_selection_and_concatenation() -> None:
+    shiny, plain = shiny_cloud(6), plain_cloud(4)
+    np.testing.assert_array_equal(shiny.take(np.array([5, 0])).harmonics, shiny.harmonics[[5, 0]])
+    both = concatenate([plain, shiny])
+    assert both.num_harmonics == 3
+    assert not both.harmonics[:4].any()
+    np.testing.assert_array_equal(both.harmonics[4:], shiny.harmonics)
+    assert with_harmonics(both, 0).num_harmonics == 0
+
+
+def test_the_basis_is_the_real_part_of_the_complex_harmonics() -> None:
+    directions = np.random.default_rng(6).normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    polar = np.arccos(directions[:, 2])
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+    first = sph_harm_y(1, 1, polar, azimuth)
+    expected = np.stack(
+        [
+            np.sqrt(2) * first.imag,
+            sph_harm_y(1, 0, polar, azimuth).real,
+            np.sqrt(2) * first.real,
+        ],
+        axis=1,
+    )
+    np.testing.assert_allclose(harmonic_basis(directions), expected, atol=1e-12)
+
+
+def test_a_cloud_moved_with_its_camera_looks_the_same() -> None:
+    cloud, T = shiny_cloud(), some_motion()
+    rasteriser = Rasteriser(RasterConfig(threads=1))
+    before = rasteriser.draw_planes(cloud, CAMERA, np.eye(4))
+    after = rasteriser.draw_planes(moved_cloud(cloud, T), CAMERA, T)
+    assert np.quantile(np.abs(before - after), 0.99) < 1e-4
+    still = rasteriser.draw_planes(with_harmonics(cloud, 0), CAMERA, np.eye(4))
+    assert np.abs(before - still)[:3].max() > 0.02
+
+
+def test_colours_change_with_the_side_they_are_seen_from() -> None:
+    cloud = shiny_cloud()
+    middle, away = cloud.means_m.mean(axis=0), np.array([0.0, 0.0, 9.0])
+    front = effective_colors(cloud, middle - away)
+    back = effective_colors(cloud, middle + away)
+    # Degree 1 is odd: what one side gains the other loses.
+    np.testing.assert_allclose((front + back) / 2, cloud.colors, atol=0.02)
+    assert np.abs(front - back).max() > 0.1
+
+
+def test_harmonics_are_written_and_read_back(tmp_path: Path) -> None:
+    cloud = shiny_cloud(7)
+    write_ply(tmp_path / "a.ply", cloud)
+    again = read_ply(tmp_path / "a.ply")
+    np.testing.assert_array_equal(again.harmonics, cloud.harmonics)
+    np.testing.assert_allclose(again.colors, cloud.colors, atol=1e-6)
+    head = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")[0].decode().split()
+    assert head[head.index("f_dc_2") + 3] == "f_rest_0"
+    assert head[head.index("f_rest_8") + 3] == "opacity"
+
+
+@pytest.mark.parametrize("degree", [2, 3])
+def test_degree_one_is_found_in_files_of_higher_degree(tmp_path: Path, degree: int) -> None:
+    cloud = shiny_cloud(3)
+    per_color = (degree + 1) ** 2 - 1
+    rest = np.full((3, 3, per_color), 7.0, dtype=np.float32)
+    rest[:, :, :3] = np.swapaxes(cloud.harmonics, 1, 2)
+    write_ply(tmp_path / "a.ply", with_harmonics(cloud, 0))
+    head, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    table = np.frombuffer(body, dtype="<f4").reshape(3, -1)
+    names = "".join(f"property float f_rest_{index}\n" for index in range(3 * per_color))
+    wider = np.concatenate([table, rest.reshape(3, -1)], axis=1)
+    (tmp_path / "b.ply").write_bytes(
+        head + names.encode() + b"end_header\n" + wider.astype("<f4").tobytes()
+    )
+    np.testing.assert_array_equal(read_ply(tmp_path / "b.ply").harmonics, cloud.harmonics)

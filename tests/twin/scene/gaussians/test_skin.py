@@ -1,0 +1,107 @@
+"""Gaussians follow soft bodies: rigid motions exactly, bending smoothly."""
+
+import numpy as np
+import pytest
+
+from bridge.geometry import se3
+from twin.scene.gaussians.cloud import GaussianCloud, effective_colors
+from twin.scene.gaussians.moved import moved_cloud
+from twin.scene.gaussians.skin import SkinError, bind, node_rotations, pose_cloud
+
+
+@pytest.fixture
+def nodes() -> np.ndarray:
+    steps = np.arange(5) * 0.015
+    return np.stack(np.meshgrid(steps, steps, steps[:3]), axis=-1).reshape(-1, 3)
+
+
+@pytest.fixture
+def cloud(nodes: np.ndarray) -> GaussianCloud:
+    rng = np.random.default_rng(3)
+    count = 300
+    means = rng.uniform(nodes.min(axis=0) - 0.005, nodes.max(axis=0) + 0.005, (count, 3))
+    return GaussianCloud(
+        means_m=means.astype(np.float32),
+        quats_wxyz=rng.normal(size=(count, 4)).astype(np.float32),
+        scales_log=rng.normal(-6, 0.3, (count, 3)).astype(np.float32),
+        opacities_logit=rng.normal(size=count).astype(np.float32),
+        colors=rng.uniform(size=(count, 3)).astype(np.float32),
+        harmonics=rng.normal(0, 0.1, (count, 3, 3)).astype(np.float32),
+    )
+
+
+def covariances(cloud: GaussianCloud) -> np.ndarray:
+    q = cloud.quats_wxyz.astype(np.float64)
+    R = se3.rotation_from_quaternion(q / np.linalg.norm(q, axis=1, keepdims=True))
+    scaled = R * np.exp(cloud.scales_log.astype(np.float64))[:, None, :]
+    return np.asarray(scaled @ np.swapaxes(scaled, 1, 2))
+
+
+def some_pose(angle_rad: float = 2.6) -> np.ndarray:
+    axis = np.array([0.48, -0.6, 0.64])
+    T = np.eye(4)
+    T[:3, :3] = se3.rotation_from_vector(axis * angle_rad)
+    T[:3, 3] = 0.3, -0.2, 0.15
+    return T
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 0.4, 2.6, np.pi])
+def test_a_rigid_motion_of_the_nodes_moves_every_gaussian_rigidly(
+    cloud: GaussianCloud, nodes: np.ndarray, angle_rad: float
+) -> None:
+    T = some_pose(angle_rad)
+    posed = pose_cloud(cloud, bind(cloud.means_m, nodes), se3.apply(T, nodes))
+    expected = moved_cloud(cloud, T)
+    np.testing.assert_allclose(posed.means_m, expected.means_m, atol=1e-6)
+    np.testing.assert_allclose(covariances(posed), covariances(expected), rtol=1e-4, atol=1e-11)
+    eye = np.array([1.0, 2.0, 3.0])
+    np.testing.assert_allclose(
+        effective_colors(posed, eye), effective_colors(expected, eye), atol=1e-5
+    )
+
+
+def test_gaussians_on_nodes_go_where_the_nodes_go(nodes: np.ndarray, cloud: GaussianCloud) -> None:
+    rng = np.random.default_rng(5)
+    on_nodes = cloud.take(np.arange(len(nodes)))
+    moved = GaussianCloud(
+        means_m=nodes.astype(np.float32),
+        quats_wxyz=on_nodes.quats_wxyz,
+        scales_log=on_nodes.scales_log,
+        opacities_logit=on_nodes.opacities_logit,
+        colors=on_nodes.colors,
+    )
+    bent = nodes + 0.001 * rng.normal(size=nodes.shape)
+    posed = pose_cloud(moved, bind(moved.means_m, nodes), bent)
+    # Neighbours pull a little: less than the bending itself.
+    assert np.abs(posed.means_m - bent).max() < 0.003
+
+
+def test_bending_turns_the_ends_by_different_angles(nodes: np.ndarray) -> None:
+    radius = 0.1
+    angle = nodes[:, 0] / radius
+    bent = np.stack(
+        [np.sin(angle) * (radius + nodes[:, 2]), nodes[:, 1],
+         np.cos(angle) * (radius + nodes[:, 2]) - radius], axis=1
+    )  # fmt: skip
+    binding = bind(nodes, nodes)
+    R = node_rotations(nodes, bent, binding.neighbours)
+    turned = np.arctan2(R[:, 0, 2], R[:, 2, 2])
+    inner = (nodes[:, 0] > 0.01) & (nodes[:, 0] < 0.05)
+    np.testing.assert_allclose(turned[inner], angle[inner], atol=0.06)
+
+
+def test_weights_are_shares_of_eight_nodes(nodes: np.ndarray, cloud: GaussianCloud) -> None:
+    weights = bind(cloud.means_m, nodes).weights
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-12)
+    assert weights.data.min() >= 0.0
+    assert (np.diff(weights.indptr) == 8).all()
+
+
+def test_what_does_not_fit_is_refused(nodes: np.ndarray, cloud: GaussianCloud) -> None:
+    binding = bind(cloud.means_m, nodes)
+    with pytest.raises(SkinError, match="300 Gaussians and 74 nodes"):
+        pose_cloud(cloud, binding, nodes[1:])
+    with pytest.raises(SkinError, match="burst"):
+        pose_cloud(cloud, binding, np.full_like(nodes, np.nan))
+    with pytest.raises(SkinError, match="finer"):
+        bind(cloud.means_m, nodes[:6])

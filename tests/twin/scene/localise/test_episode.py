@@ -1,0 +1,240 @@
+"""Localisation of recorded episodes: which frames count, what is written, what is never read."""
+
+import ast
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.episode import schema, streams
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.records import (
+    CameraInfo,
+    CompressedColor,
+    DepthImage,
+    FrameTransform,
+    PoseSample,
+    transforms_to_cdr,
+)
+from bridge.episode.run import RunFolder
+from bridge.episode.streams import RgbdFrame
+from bridge.episode.writer import EpisodeWriter
+from bridge.media.color import encode_jpeg
+from bridge.task.task_file import Task
+from twin.scene.frames.choice import rgbd_camera_ids
+from twin.scene.localise.episode import (
+    localise_episode,
+    quiet_phases,
+    still_frames,
+    write_localised,
+)
+from twin.scene.shape.known import pose_of
+
+S = 1_000_000_000
+EYE, TARGET = (1.05, -0.1, 0.6), (0.48, 0.0, 0.0)
+START = {
+    "cube": pose_of(np.array([0.50, -0.15, 0.02, 0.4])),
+    "box": pose_of(np.array([0.49, 0.19, 0.0, -0.1])),
+}
+END = {**START, "cube": START["box"] @ pose_of(np.array([0.0, 0.01, 0.026, 0.2]))}
+
+
+def put_frame(writer: EpisodeWriter, frame: RgbdFrame, stamp_ns: int, prefix: str) -> None:
+    color = CompressedColor(
+        stamp_ns=stamp_ns,
+        frame_id="side_color_optical",
+        format="jpeg",
+        data=encode_jpeg(frame.image_u8),
+    )
+    depth = DepthImage(
+        stamp_ns=stamp_ns,
+        frame_id="side_depth_optical",
+        depth_mm=np.rint(frame.depth_m * 1e3).astype(np.uint16),
+    )
+    for topic, record, type_name in (
+        ("color/image", color, schema.COMPRESSED_IMAGE),
+        ("depth/image", depth, schema.IMAGE),
+    ):
+        writer.write(
+            f"{prefix}/{topic}",
+            record.to_cdr(),
+            type_name=type_name,
+            log_time_ns=stamp_ns,
+            publish_time_ns=stamp_ns,
+        )
+
+
+def put_calibration(writer: EpisodeWriter, frame: RgbdFrame, prefix: str) -> None:
+    for stream, camera in (("color", frame.color_camera), ("depth", frame.depth_camera)):
+        info = CameraInfo(stamp_ns=0, frame_id=f"side_{stream}_optical", camera=camera)
+        writer.write(
+            f"{prefix}/{stream}/info",
+            info.to_cdr(),
+            type_name=schema.CAMERA_INFO,
+            log_time_ns=0,
+        )
+    poses = {"color": frame.T_base_color, "depth": frame.T_base_depth}
+    transforms = [
+        FrameTransform(
+            stamp_ns=0, parent="base_link", child=f"side_{stream}_optical", T_parent_child=T
+        )
+        for stream, T in poses.items()
+    ]
+    writer.write(
+        "/tf_static", transforms_to_cdr(transforms), type_name=schema.TF_MESSAGE, log_time_ns=0
+    )
+
+
+def put_event(writer: EpisodeWriter, kind: str, stamp_ns: int) -> None:
+    record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, "plan_id": "plan_1"}
+    writer.write_json(
+        "/standin/event",
+        record,
+        type_name=schema.EVENT,
+        log_time_ns=stamp_ns,
+        publish_time_ns=stamp_ns,
+    )
+
+
+@pytest.fixture(scope="module")
+def frames() -> dict[str, RgbdFrame]:
+    return {}
+
+
+@pytest.fixture
+def episode(
+    tmp_path: Path, stage: Callable[..., Any], task: Task, frames: dict[str, RgbdFrame]
+) -> Episode:
+    """Start at 1, 2, 3 s; execution from 4 to 6 s; the cube is in the box at 7 and 8 s.
+
+    A truth camera and a truth pose beside them lie: they show the cube elsewhere.
+    """
+    if not frames:
+        rng = np.random.default_rng(0)
+        for name, poses in (("start", START), ("end", END)):
+            frames[name] = stage(poses).frame("side", EYE, TARGET, rng)
+    run = RunFolder.create(tmp_path / "run")
+    with EpisodeWriter(run.episodes_dir / "trial_1.mcap") as writer:
+        prefix, truth = "/standin/cam/side", "/standin/truth/cam/spy"
+        put_calibration(writer, frames["start"], prefix)
+        put_calibration(writer, frames["start"], truth)
+        put_frame(writer, frames["end"], 1, truth)
+        lie = PoseSample(stamp_ns=1, frame_id="base_link", T_frame_body=np.eye(4))
+        writer.write(
+            "/standin/truth/object/cube/pose",
+            lie.to_cdr(),
+            type_name=schema.POSE_STAMPED,
+            log_time_ns=1,
+        )
+        for second in (1, 2, 3):
+            put_frame(writer, frames["start"], second * S, prefix)
+        put_event(writer, "execution_started", 4 * S)
+        put_frame(writer, frames["end"], 5 * S, prefix)
+        put_event(writer, "execution_ended", 6 * S)
+        for second in (7, 8):
+            put_frame(writer, frames["end"], second * S, prefix)
+        writer.describe(EpisodeInfo(id="trial_1", kind="trial", cell="standin", stand_in=True))
+    return Episode.open(run.episodes_dir / "trial_1.mcap")
+
+
+def test_only_frames_before_the_execution_count(episode: Episode, task: Task) -> None:
+    found = localise_episode(episode, task)
+    assert found["cube"].found, found["cube"].reason
+    assert found["cube"].stamp_ns == 3 * S
+    distance = np.linalg.norm(found["cube"].T_base_object[:3, 3] - START["cube"][:3, 3])
+    assert distance < 0.003
+
+
+def test_held_out_frames_are_not_looked_at(episode: Episode, task: Task) -> None:
+    found = localise_episode(episode, task, held_out_ns={"side": {3 * S}})
+    assert found["cube"].stamp_ns == 2 * S
+
+
+def test_truth_cameras_and_truth_poses_are_never_read(episode: Episode) -> None:
+    assert "/standin/truth/cam/spy/color/image" in episode.topics()
+    assert rgbd_camera_ids(episode) == ["side"]
+    assert streams.object_pose_topics(episode) == {}
+    assert {frame.camera_id for frame in still_frames(episode, 3, None, None)} == {"side"}
+
+
+def test_phases_are_the_start_and_what_follows_each_execution(episode: Episode) -> None:
+    phases = [(p.name, p.plan_id, p.after_ns, p.before_ns) for p in quiet_phases(episode)]
+    assert phases == [("start", None, None, 4 * S), ("end", "plan_1", 6 * S, None)]
+
+
+def test_the_derived_episode_holds_start_and_end_with_provenance(
+    episode: Episode, task: Task
+) -> None:
+    run = RunFolder(episode.path.parents[1])
+    path = write_localised(run, episode, task, scene_hash="0123456789abcdef")
+    assert path.name == "trial_1.localised.0123456789ab.mcap"
+    derived = Episode.open(path)
+    assert derived.derived is not None
+    assert derived.derived.kind == "localised"
+    assert derived.derived.source_episode == "trial_1"
+    assert derived.info.stand_in
+    records = streams.localisations(derived)
+    assert [(r["object"], r["phase"], r["found"]) for r in records] == [
+        ("cube", "start", True),
+        ("box", "start", True),
+        ("cube", "end", True),
+        ("box", "end", True),
+    ]
+    track = streams.pose_track(derived, "/standin/object/cube/pose")
+    np.testing.assert_allclose(track.p_m[0], START["cube"][:3, 3], atol=0.003)
+    np.testing.assert_allclose(track.p_m[1], END["cube"][:3, 3], atol=0.004)
+    assert track.stamps_ns.tolist() == [3 * S, 8 * S]
+
+
+def test_a_derived_episode_is_kept_until_its_settings_change(episode: Episode, task: Task) -> None:
+    run = RunFolder(episode.path.parents[1])
+    path = write_localised(run, episode, task)
+    first = path.stat().st_mtime_ns
+    assert write_localised(run, episode, task).stat().st_mtime_ns == first
+    content = path.read_bytes()
+    assert write_localised(run, episode, task, force=True).stat().st_mtime_ns > first
+    assert path.read_bytes() == content  # same input, same bytes
+
+
+def test_an_episode_without_cameras_finds_nothing_and_says_so(tmp_path: Path, task: Task) -> None:
+    with EpisodeWriter(tmp_path / "empty.mcap") as writer:
+        writer.describe(EpisodeInfo(id="empty", kind="trial"))
+    found = localise_episode(Episode.open(tmp_path / "empty.mcap"), task)
+    assert not found["cube"].found
+    assert "no frames" in str(found["cube"].reason)
+
+
+TWIN = Path(__file__).resolve().parents[4] / "twin"
+
+
+def test_the_twin_names_neither_the_stand_in_code_nor_its_truth() -> None:
+    """Reads the syntax tree of every module: imports, and text outside docstrings."""
+    files = sorted(TWIN.rglob("*.py"))
+    assert len(files) > 5
+    for path in files:
+        tree = ast.parse(path.read_text())
+        docstrings = {
+            id(node.body[0].value)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+            and node.body
+            and isinstance(node.body[0], ast.Expr)
+        }
+        for node in ast.walk(tree):
+            names = [alias.name for alias in getattr(node, "names", []) if hasattr(alias, "name")]
+            names.append(str(getattr(node, "module", "")))
+            assert not any(name.startswith("bridge.sources") for name in names), path
+            if isinstance(node, ast.Constant) and id(node) not in docstrings:
+                assert "truth" not in str(node.value), f"{path}:{node.lineno}"
+            if isinstance(node, ast.Attribute | ast.Name):
+                name = node.attr if isinstance(node, ast.Attribute) else node.id
+                assert name != "TRUTH_PREFIX", f"{path}:{node.lineno}"
+
+
+def test_records_of_the_derived_episode_are_plain_json(episode: Episode, task: Task) -> None:
+    for item in localise_episode(episode, task).values():
+        assert json.loads(json.dumps(item.to_record()))["found"] is True

@@ -1,0 +1,86 @@
+"""A scene in parts: reading gives the parts back, and putting together gives the scene."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.episode.run import RunFolder
+from bridge.geometry import se3
+from bridge.task.task_file import load_task
+from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.localise.result import LocalisedObject
+from twin.scene.objects.parts import put_together, read_objects
+from twin.scene.objects.split import split_objects, write_objects
+
+
+def cube_on_table(T_base_cube: np.ndarray) -> GaussianCloud:
+    rng = np.random.default_rng(0)
+    face = rng.uniform(-0.02, 0.02, (600, 3))
+    face[np.arange(600), rng.integers(0, 3, 600)] = np.sign(rng.normal(size=600)) * 0.02
+    cube = se3.apply(T_base_cube, face)
+    table = np.column_stack(
+        [rng.uniform(0.2, 0.8, 900), rng.uniform(-0.4, 0.4, 900), np.zeros(900)]
+    )
+    means = np.concatenate([cube, table])
+    colors = np.tile([0.55, 0.42, 0.30], (1500, 1))
+    colors[:600] = np.array([200, 45, 40]) / 255
+    return GaussianCloud(
+        means_m=as_float32(means),
+        quats_wxyz=as_float32(np.tile([1.0, 0, 0, 0], (1500, 1))),
+        scales_log=as_float32(np.full((1500, 3), np.log(0.002))),
+        opacities_logit=as_float32(np.full(1500, 3.0)),
+        colors=as_float32(colors),
+    )
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> tuple[RunFolder, dict, GaussianCloud, np.ndarray]:
+    T = se3.transform_from(np.array([0.97, 0, 0, 0.24]), np.array([0.5, -0.1, 0.02]))
+    cloud, task = cube_on_table(T), load_task("cube_into_box")
+    found = LocalisedObject(
+        object_id="cube",
+        found=True,
+        T_base_object=T,
+        covariance=None,
+        confidence=1.0,
+        method="given",
+        reason="",
+        stamp_ns=1,
+    )
+    parts = split_objects(cloud, {"cube": found}, task)
+    run = RunFolder.create(tmp_path / "run")
+    run.scene_dir.mkdir()
+    record = {"objects": write_objects(run.scene_dir, parts, {"cube": found}, task)}
+    return run, record, parts.background, T
+
+
+def test_the_cube_is_read_back_where_it_was(
+    written: tuple[RunFolder, dict, GaussianCloud, np.ndarray],
+) -> None:
+    run, record, _, T = written
+    cube = read_objects(run, record)["cube"]
+    assert len(cube.cloud) >= 590
+    assert np.linalg.norm(cube.T_base_object[:3, 3] - T[:3, 3]) < 2e-3
+    assert np.abs(cube.cloud.means_m).max() < 0.026
+
+
+def test_putting_together_gives_every_gaussian_back(
+    written: tuple[RunFolder, dict, GaussianCloud, np.ndarray],
+) -> None:
+    run, record, background, _ = written
+    objects = read_objects(run, record)
+    whole = put_together(background, objects)
+    assert len(whole) == len(background) + len(objects["cube"].cloud)
+    moved_to = np.eye(4)
+    moved_to[:3, 3] = [0.3, 0.3, 0.02]
+    moved = put_together(background, objects, {"cube": moved_to})
+    centre = moved.means_m[len(background) :].mean(axis=0)
+    np.testing.assert_allclose(centre, [0.3, 0.3, 0.02], atol=2e-3)
+
+
+def test_an_object_name_cannot_leave_the_scene_folder(tmp_path: Path) -> None:
+    from bridge.errors import UsageError
+
+    with pytest.raises(UsageError, match="not usable as a file name"):
+        read_objects(RunFolder(tmp_path), {"objects": {"../../etc": {}}})

@@ -1,0 +1,201 @@
+"""Laws of the rasteriser's linear maps, and what strange Gaussians do to it."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bridge.geometry.camera import Camera
+from twin.scene.gaussians.cloud import GaussianCloud, arrays, as_float32, effective_colors
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, available_isas
+
+CAMERA = Camera(width=50, height=35, fx=60.0, fy=60.0, cx=25.0, cy=17.5)
+"""Neither edge is a whole number of tiles."""
+
+
+def shiny_cloud(count: int, seed: int = 0) -> GaussianCloud:
+    rng = np.random.default_rng(seed)
+    return GaussianCloud(
+        means_m=as_float32(rng.uniform([-0.6, -0.5, 0.4], [0.6, 0.5, 3.0], size=(count, 3))),
+        quats_wxyz=as_float32(rng.normal(size=(count, 4))),
+        scales_log=as_float32(np.log(rng.uniform(0.002, 0.08, size=(count, 3)))),
+        opacities_logit=as_float32(rng.normal(1.0, 2.0, size=count)),
+        colors=as_float32(rng.uniform(size=(count, 3))),
+        harmonics=as_float32(rng.normal(scale=0.2, size=(count, 3, 3))),
+    )
+
+
+def drawn(cloud: GaussianCloud, config: RasterConfig) -> Rasteriser:
+    rasteriser = Rasteriser(config)
+    rasteriser.draw_planes(cloud, CAMERA, np.eye(4))
+    return rasteriser
+
+
+@pytest.mark.parametrize("isa", available_isas())
+@pytest.mark.parametrize("channels", [1, 5, 16, 33])
+def test_lifting_is_the_adjoint_of_drawing(isa: str, channels: int) -> None:
+    cloud = shiny_cloud(800)
+    rasteriser = drawn(cloud, RasterConfig(threads=1, isa=isa))
+    rng = np.random.default_rng(1)
+    features = as_float32(rng.normal(size=(800, channels)))
+    maps = as_float32(rng.normal(size=(channels, CAMERA.height, CAMERA.width)))
+    left = (rasteriser.draw_features(features).astype(np.float64) * maps).sum()
+    right = (rasteriser.lift(maps).astype(np.float64) * features).sum()
+    size = np.linalg.norm(features) * np.linalg.norm(maps)
+    assert abs(left - right) < 1e-6 * size
+
+
+def test_colours_depth_and_alpha_are_features_too() -> None:
+    cloud = shiny_cloud(500)
+    rasteriser = Rasteriser(RasterConfig(threads=1))
+    planes = rasteriser.draw_planes(cloud, CAMERA, np.eye(4))
+    depth, one = cloud.means_m[:, 2:], np.ones((500, 1), np.float32)
+    features = np.concatenate([effective_colors(cloud, np.zeros(3)), depth, one], axis=1)
+    np.testing.assert_allclose(rasteriser.draw_features(features), planes, atol=2e-5)
+
+
+def test_the_gradient_on_colours_is_what_lifting_gives() -> None:
+    cloud = shiny_cloud(500)
+    rasteriser = Rasteriser(RasterConfig(threads=1))
+    planes = rasteriser.draw_planes(cloud, CAMERA, np.eye(4))
+    upstream = np.random.default_rng(2).normal(size=planes.shape).astype(np.float32)
+    upstream[3:] = 0
+    gradient = rasteriser.pull_back(planes, upstream)
+    np.testing.assert_allclose(rasteriser.lift(upstream[:3]), gradient.colors, atol=1e-4)
+
+
+def test_the_label_with_most_weight_wins() -> None:
+    cloud = shiny_cloud(600)
+    rasteriser = drawn(cloud, RasterConfig(threads=1))
+    known = np.array([0, 3, 7, 65535], dtype=np.uint16)
+    labels = known[np.random.default_rng(3).integers(0, 4, size=600)]
+    ids, weight = rasteriser.label_map(labels)
+    sums = rasteriser.draw_features(as_float32(labels[:, None] == known))
+    np.testing.assert_allclose(weight, sums.max(axis=0), atol=1e-5)
+    ordered = np.sort(sums, axis=0)
+    clear = ordered[-1] - ordered[-2] > 1e-5
+    np.testing.assert_array_equal(ids[clear], known[sums.argmax(axis=0)][clear])
+    assert set(np.unique(ids)) == set(known.tolist())
+
+
+def test_weights_of_one_label_add_up_and_nothing_is_zero() -> None:
+    cloud = shiny_cloud(1)
+    twice = GaussianCloud(**{name: np.concatenate([rows, rows]) for name, rows in arrays(cloud)})
+    rasteriser = Rasteriser(RasterConfig(threads=1))
+    alpha = rasteriser.draw_planes(twice, CAMERA, np.eye(4))[4]
+    ids, weight = rasteriser.label_map(np.array([4, 4], dtype=np.uint16))
+    np.testing.assert_allclose(weight, alpha, atol=1e-6)
+    np.testing.assert_array_equal(ids, np.where(alpha > 0, 4, 0))
+    # The one in front hides some of the one behind: equal depths keep the order of the rows.
+    ids, _ = rasteriser.label_map(np.array([9, 4], dtype=np.uint16))
+    assert set(np.unique(ids)) == {0, 9}
+
+
+def test_any_number_of_threads_gives_the_same_bits() -> None:
+    cloud = shiny_cloud(9000, seed=4)  # enough for several stretches of the depth order
+    rng = np.random.default_rng(5)
+    features = as_float32(rng.normal(size=(9000, 7)))
+    maps = as_float32(rng.normal(size=(7, CAMERA.height, CAMERA.width)))
+    upstream = rng.normal(size=(5, CAMERA.height, CAMERA.width)).astype(np.float32)
+    labels = rng.integers(0, 9, size=9000).astype(np.uint16)
+    results = []
+    for threads in (1, 2, 3, 4):
+        rasteriser = Rasteriser(RasterConfig(threads=threads))
+        planes = rasteriser.draw_planes(cloud, CAMERA, np.eye(4))
+        gradient = rasteriser.pull_back(planes, upstream)
+        results.append(
+            [
+                planes,
+                *(getattr(gradient, name) for name, _ in arrays(cloud)),
+                gradient.T_camera_base,
+                rasteriser.draw_features(features),
+                rasteriser.lift(maps),
+                *rasteriser.label_map(labels),
+            ]
+        )
+    for other in results[1:]:
+        for first, second in zip(results[0], other, strict=True):
+            np.testing.assert_array_equal(first, second)
+
+
+def test_tables_and_maps_of_another_size_are_refused() -> None:
+    rasteriser = drawn(shiny_cloud(20), RasterConfig(threads=1))
+    with pytest.raises(ValueError, match="one row per Gaussian"):
+        rasteriser.draw_features(np.zeros((19, 3), np.float32))
+    with pytest.raises(ValueError, match="one row per Gaussian"):
+        rasteriser.label_map(np.zeros(21, np.uint16))
+    with pytest.raises(ValueError, match="last draw"):
+        rasteriser.lift(np.zeros((3, CAMERA.height, CAMERA.width + 1), np.float32))
+
+
+def test_nothing_can_be_lifted_before_something_was_drawn() -> None:
+    with pytest.raises(ValueError, match="last draw"):
+        Rasteriser(RasterConfig(threads=1)).lift(np.zeros((1, 4, 4), np.float32))
+
+
+def test_no_channels_are_no_planes() -> None:
+    rasteriser = drawn(shiny_cloud(20), RasterConfig(threads=1))
+    assert rasteriser.draw_features(np.zeros((20, 0), np.float32)).shape == (0, 35, 50)
+    assert rasteriser.lift(np.zeros((0, 35, 50), np.float32)).shape == (20, 0)
+
+
+STRANGE = st.sampled_from([np.nan, np.inf, -np.inf, 0.0, 1e30, -1e30, 1e-30, -50.0, 80.0])
+
+
+@settings(max_examples=60)
+@given(
+    spoiled=st.lists(
+        st.tuples(
+            st.sampled_from(["means_m", "quats_wxyz", "scales_log", "opacities_logit"]),
+            st.integers(0, 29),
+            STRANGE,
+        ),
+        max_size=12,
+    ),
+    size=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    isa=st.sampled_from(available_isas()),
+)
+def test_strange_gaussians_and_sizes_never_spoil_the_image(
+    spoiled: list[tuple[str, int, float]], size: tuple[int, int], isa: str
+) -> None:
+    cloud = shiny_cloud(30)
+    for name, row, value in spoiled:
+        getattr(cloud, name)[row] = value
+    camera = Camera(width=size[0], height=size[1], fx=40.0, fy=40.0, cx=size[0] / 2, cy=size[1] / 2)
+    rasteriser = Rasteriser(RasterConfig(threads=1, isa=isa))
+    planes = rasteriser.draw_planes(cloud, camera, np.eye(4))
+    assert planes.shape == (5, size[1], size[0])
+    assert np.isfinite(planes).all()
+    assert planes[4].min() >= 0.0
+    assert planes[4].max() <= 1.0 + 1e-5
+    gradient = rasteriser.pull_back(planes, np.ones_like(planes))
+    sound = [row for row in range(30) if row not in {entry[1] for entry in spoiled}]
+    for name, _ in arrays(cloud):
+        assert np.isfinite(getattr(gradient, name)[sound]).all(), name
+    total = rasteriser.lift(np.ones((1, size[1], size[0]), np.float32)).sum()
+    assert total == pytest.approx(planes[4].sum(), rel=1e-4, abs=1e-3)
+
+
+@pytest.mark.parametrize("offset", [-0.5, 0.0, 0.25, 0.5])
+@pytest.mark.parametrize("edge", [0, 16, 32, 48])
+def test_a_gaussian_on_a_tile_edge_is_whole(edge: int, offset: float) -> None:
+    """The same ellipse inside a tile and across an edge has the same sum."""
+
+    def alpha_sum(x_px: float) -> float:
+        x = (x_px - CAMERA.cx) / CAMERA.fx
+        cloud = GaussianCloud(
+            means_m=as_float32(np.array([[x, 0.0, 1.0]])),
+            quats_wxyz=as_float32(np.array([[1.0, 0.0, 0.0, 0.0]])),
+            scales_log=np.full((1, 3), np.log(0.02), dtype=np.float32),
+            opacities_logit=np.zeros(1, dtype=np.float32),
+            colors=np.ones((1, 3), dtype=np.float32),
+        )
+        wide = Camera(width=120, height=35, fx=60.0, fy=60.0, cx=25.0 + 40, cy=17.5)
+        rasteriser = Rasteriser(RasterConfig(threads=1, alpha_cut=1e-4))
+        return float(rasteriser.draw_planes(cloud, wide, np.eye(4))[4].sum())
+
+    # Off the axis the affine approximation stretches the ellipse a little.
+    inside = alpha_sum(edge + offset + 8.0)
+    assert alpha_sum(edge + offset) == pytest.approx(inside, rel=0.12)
+    neighbours = [alpha_sum(edge + offset + shift) for shift in (-0.01, 0.0, 0.01)]
+    assert max(neighbours) - min(neighbours) < 2e-3 * inside

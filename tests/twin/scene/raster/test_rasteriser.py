@@ -1,0 +1,210 @@
+import numpy as np
+import pytest
+
+from bridge.geometry.camera import Camera
+from twin.scene.gaussians.cloud import GaussianCloud, arrays, as_float32
+from twin.scene.raster import rasteriser as raster
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, SplatExtensionMissingError
+
+CAMERA = Camera(width=40, height=33, fx=60.0, fy=60.0, cx=20.0, cy=16.5)
+IDENTITY = np.eye(4)
+
+
+def one_gaussian(
+    *,
+    x_px: float,
+    y_px: float,
+    depth_m: float = 1.0,
+    sigma_m: float = 0.02,
+    opacity_logit: float = 3.0,
+) -> GaussianCloud:
+    """A round Gaussian whose centre projects to one place of the image."""
+    mean = [(x_px - CAMERA.cx) / CAMERA.fx * depth_m, (y_px - CAMERA.cy) / CAMERA.fy * depth_m]
+    return GaussianCloud(
+        means_m=as_float32(np.array([[*mean, depth_m]])),
+        quats_wxyz=as_float32(np.array([[1.0, 0.0, 0.0, 0.0]])),
+        scales_log=np.full((1, 3), np.log(sigma_m), dtype=np.float32),
+        opacities_logit=np.full(1, opacity_logit, dtype=np.float32),
+        colors=as_float32(np.array([[0.2, 0.5, 0.9]])),
+    )
+
+
+def many_gaussians(count: int = 3000, seed: int = 7) -> GaussianCloud:
+    rng = np.random.default_rng(seed)
+    return GaussianCloud(
+        means_m=as_float32(rng.uniform([-0.5, -0.4, 0.5], [0.5, 0.4, 3.0], size=(count, 3))),
+        quats_wxyz=as_float32(rng.normal(size=(count, 4))),
+        scales_log=as_float32(np.log(rng.uniform(0.002, 0.05, size=(count, 3)))),
+        opacities_logit=as_float32(rng.normal(size=count)),
+        colors=as_float32(rng.uniform(size=(count, 3))),
+    )
+
+
+def draw(cloud: GaussianCloud, config: RasterConfig | None = None) -> np.ndarray:
+    return Rasteriser(config or RasterConfig(threads=1)).draw_planes(cloud, CAMERA, IDENTITY)
+
+
+def test_a_single_gaussian_lands_on_its_pixel() -> None:
+    planes = draw(one_gaussian(x_px=12.5, y_px=7.5))
+    row, column = np.unravel_index(np.argmax(planes[4]), planes[4].shape)
+    assert (row, column) == (7, 12)
+    # The centre of pixel (12, 7) is (12.5, 7.5): its neighbours see the Gaussian alike.
+    assert planes[4, 7, 11] == pytest.approx(planes[4, 7, 13], rel=1e-5)
+    assert planes[4, 6, 12] == pytest.approx(planes[4, 8, 12], rel=1e-5)
+
+
+def test_a_gaussian_between_two_pixels_shows_in_both_alike() -> None:
+    planes = draw(one_gaussian(x_px=12.0, y_px=7.5))
+    assert planes[4, 7, 11] == pytest.approx(planes[4, 7, 12], rel=1e-5)
+
+
+def test_alpha_of_a_single_gaussian_is_the_closed_form() -> None:
+    planes = draw(one_gaussian(x_px=12.5, y_px=7.5, sigma_m=0.05, opacity_logit=1.0))
+    variance = (CAMERA.fx * 0.05) ** 2
+    # Slightly off the axis the affine approximation stretches the ellipse by a few per cent.
+    opacity = 1 / (1 + np.exp(-1.0)) * variance / (variance + 0.1)
+    assert planes[4, 7, 12] == pytest.approx(opacity, rel=5e-3)
+    assert planes[4, 7, 15] == pytest.approx(
+        opacity * np.exp(-0.5 * 9 / (variance + 0.1)), rel=3e-2
+    )
+
+
+def test_colour_and_depth_are_weighted_by_alpha() -> None:
+    planes = draw(one_gaussian(x_px=20.0, y_px=16.5, depth_m=1.5))
+    alpha = planes[4, 16, 20]
+    assert alpha > 0.3
+    np.testing.assert_allclose(planes[:3, 16, 20], alpha * np.array([0.2, 0.5, 0.9]), rtol=1e-5)
+    assert planes[3, 16, 20] == pytest.approx(1.5 * alpha, rel=1e-5)
+
+
+def test_the_nearer_gaussian_hides_the_farther_whatever_their_order() -> None:
+    near = one_gaussian(x_px=20.5, y_px=16.5, depth_m=1.0, sigma_m=0.1, opacity_logit=8.0)
+    far = one_gaussian(x_px=20.5, y_px=16.5, depth_m=2.0, sigma_m=0.2, opacity_logit=8.0)
+    images = []
+    for order in ([near, far], [far, near]):
+        stacked = {
+            name: as_float32(np.concatenate([getattr(cloud, name) for cloud in order]))
+            for name, _ in arrays(near)
+        }
+        images.append(draw(GaussianCloud(**stacked)))
+    np.testing.assert_array_equal(images[0], images[1])
+    assert images[0][3, 16, 20] / images[0][4, 16, 20] == pytest.approx(1.0, abs=0.02)
+
+
+def test_any_number_of_threads_gives_the_same_bits() -> None:
+    cloud = many_gaussians()
+    upstream = np.random.default_rng(1).normal(size=(5, 33, 40)).astype(np.float32)
+    results = []
+    for threads in (1, 2, 5):
+        rasteriser = Rasteriser(RasterConfig(threads=threads))
+        planes = rasteriser.draw_planes(cloud, CAMERA, IDENTITY)
+        gradient = rasteriser.pull_back(planes, upstream)
+        results.append([planes, *(getattr(gradient, name) for name, _ in arrays(cloud))])
+    assert np.abs(results[0][1]).max() > 0
+    for other in results[1:]:
+        for first, second in zip(results[0], other, strict=True):
+            np.testing.assert_array_equal(first, second)
+
+
+def test_equal_depths_and_uneven_shares_show_no_threads() -> None:
+    """Ties go by index, and threads that have little to sort are no exception."""
+    cloud = many_gaussians(9000)
+    cloud.means_m[:, 2] = np.round(cloud.means_m[:, 2] * 4) / 4
+    cloud.means_m[2500:8000, 2] *= -1.0
+    drawn = [draw(cloud, RasterConfig(threads=threads)) for threads in (1, 2, 3, 4, 7)]
+    assert drawn[0][4].max() > 0.5
+    for other in drawn[1:]:
+        np.testing.assert_array_equal(drawn[0], other)
+
+
+def test_a_gaussian_behind_the_camera_is_not_drawn() -> None:
+    cloud = one_gaussian(x_px=20.0, y_px=16.5)
+    behind = GaussianCloud(**(dict(arrays(cloud)) | {"means_m": -cloud.means_m}))
+    assert draw(cloud)[4].max() > 0.3
+    assert draw(behind).max() == 0.0
+
+
+@pytest.mark.parametrize("broken", ["means_m", "scales_log", "opacities_logit", "colors"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
+def test_a_broken_gaussian_does_not_spoil_the_others(broken: str, value: float) -> None:
+    cloud = many_gaussians(50)
+    spoiled = {name: rows.copy() for name, rows in arrays(cloud)}
+    spoiled[broken][10] = value
+    rasteriser = Rasteriser(RasterConfig(threads=1))
+    planes = rasteriser.draw_planes(GaussianCloud(**spoiled), CAMERA, IDENTITY)
+    if not (broken == "colors" and np.isfinite(value)):
+        assert np.isfinite(planes).all()
+    gradient = rasteriser.pull_back(planes, np.ones_like(planes))
+    others = np.arange(50) != 10
+    if not (broken == "colors" and np.isfinite(value)):
+        assert all(np.isfinite(getattr(gradient, n)[others]).all() for n, _ in arrays(cloud))
+
+
+def test_a_zero_quaternion_is_left_out() -> None:
+    cloud = many_gaussians(50)
+    cloud.quats_wxyz[3] = 0.0
+    rasteriser = Rasteriser(RasterConfig(threads=1))
+    assert np.isfinite(rasteriser.draw_planes(cloud, CAMERA, IDENTITY)).all()
+    assert not rasteriser.visible_mask()[3]
+
+
+def test_a_transparent_gaussian_changes_nothing() -> None:
+    planes = draw(one_gaussian(x_px=20.0, y_px=16.5, opacity_logit=-20.0))
+    assert planes.max() == 0.0
+
+
+def test_an_empty_cloud_draws_black() -> None:
+    planes = draw(many_gaussians(1).take(np.zeros(0, dtype=int)))
+    assert planes.shape == (5, 33, 40)
+    assert planes.max() == 0.0
+
+
+def test_tables_of_different_length_are_refused() -> None:
+    cloud = many_gaussians(5)
+    native = raster.load_native().Rasteriser(1, "auto")
+    pose = np.eye(4, dtype=np.float32)[:3].copy()
+    tables = [rows for _, rows in arrays(cloud)][:4]
+    with pytest.raises(ValueError, match="one row per Gaussian"):
+        native.draw(*tables, cloud.colors[:3], pose, (40, 33, 60.0, 60.0, 20.0, 16.5), 0.01, 0.0)
+
+
+def test_double_precision_is_refused_instead_of_copied() -> None:
+    cloud = many_gaussians(5)
+    native = raster.load_native().Rasteriser(1, "auto")
+    pose = np.eye(4, dtype=np.float32)[:3].copy()
+    tables = [rows.astype(np.float64) for _, rows in arrays(cloud)]
+    with pytest.raises(TypeError):
+        native.draw(*tables, pose, (40, 33, 60.0, 60.0, 20.0, 16.5), 0.01, 0.0)
+
+
+def test_an_unknown_instruction_set_is_refused() -> None:
+    with pytest.raises(ValueError, match="'auto', 'base', 'v3' or 'v4'"):
+        Rasteriser(RasterConfig(isa="sparc"))
+
+
+def test_the_widest_instruction_set_is_chosen() -> None:
+    names = raster.available_isas()
+    assert names[0] == "base"
+    assert Rasteriser(RasterConfig(threads=1)).isa == names[-1]
+    for name in names:
+        assert Rasteriser(RasterConfig(threads=1, isa=name)).isa == name
+
+
+def test_the_view_gives_depth_only_where_the_image_is_solid() -> None:
+    view = Rasteriser(RasterConfig(threads=1)).view(
+        one_gaussian(x_px=20.5, y_px=16.5, depth_m=1.25, sigma_m=0.05), CAMERA, IDENTITY
+    )
+    assert view.depth_m[16, 20] == pytest.approx(1.25, rel=1e-4)
+    assert view.depth_m[0, 0] == 0.0
+    assert view.image_u8().dtype == np.uint8
+
+
+def test_a_missing_extension_says_how_to_build_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    import twin.scene
+
+    monkeypatch.setitem(sys.modules, "twin.scene._splat", None)
+    monkeypatch.delattr(twin.scene, "_splat", raising=False)
+    with pytest.raises(SplatExtensionMissingError, match="pip install"):
+        raster.load_native()

@@ -1,0 +1,234 @@
+"""A fused step equals drawing, comparing, pulling back and Adam one after another."""
+
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from twin.scene.frames.training_view import Target
+from twin.scene.gaussians.cloud import GaussianCloud, arrays, as_float32
+from twin.scene.raster.losses import Loss
+from twin.scene.raster.rasteriser import (
+    FitSession,
+    RasterConfig,
+    Rasteriser,
+    available_isas,
+    load_native,
+)
+
+CAMERA = Camera(width=61, height=94, fx=70.0, fy=70.0, cx=30.0, cy=47.0)
+RATES = {
+    "means_m": 1e-3,
+    "quats_wxyz": 1e-2,
+    "scales_log": 2e-2,
+    "opacities_logit": 5e-2,
+    "colors": 2e-2,
+    "harmonics": 3e-3,
+}
+GAIN = (0.9, 1.05, 1.2)
+
+
+def some_cloud(count: int = 400, num_harmonics: int = 3) -> GaussianCloud:
+    rng = np.random.default_rng(1)
+    return GaussianCloud(
+        means_m=as_float32(rng.uniform([-0.5, -0.7, 0.8], [0.5, 0.7, 2.0], size=(count, 3))),
+        quats_wxyz=as_float32(rng.normal(size=(count, 4))),
+        scales_log=as_float32(np.log(rng.uniform(0.02, 0.1, size=(count, 3)))),
+        opacities_logit=as_float32(rng.normal(size=count)),
+        colors=as_float32(rng.uniform(size=(count, 3))),
+        harmonics=as_float32(rng.normal(scale=0.1, size=(count, num_harmonics, 3))),
+    )
+
+
+def some_target(*, masked: bool = True) -> Target:
+    rng = np.random.default_rng(2)
+    size = (CAMERA.height, CAMERA.width)
+    static = np.ones(size, dtype=bool)
+    if masked:
+        static[20:40, 10:35] = False
+    depth = rng.uniform(0.8, 2.0, size).astype(np.float32)
+    depth[rng.uniform(size=size) < 0.2] = 0.0
+    return Target(
+        camera=CAMERA,
+        planes_u8=rng.integers(0, 256, (3, *size), dtype=np.uint8),
+        depth_m=np.where(static, depth, np.float32(0.0)),
+        static_mask=static,
+    )
+
+
+def a_pose() -> np.ndarray:
+    return se3.look_at(
+        np.array([0.1, -0.1, -0.2]), np.array([0.0, 0.0, 1.4]), np.array([0.0, -1.0, 0.0])
+    )
+
+
+class SeparateSteps:
+    """What ``FitSession`` fuses, written with the public parts."""
+
+    def __init__(self, cloud: GaussianCloud, loss: Loss) -> None:
+        """Copy the cloud; moments start at zero."""
+        self.cloud = GaussianCloud(**{name: rows.copy() for name, rows in arrays(cloud)})
+        self.loss = loss
+        self.moments = {
+            name: (np.zeros_like(rows), np.zeros_like(rows)) for name, rows in arrays(cloud)
+        }
+        self.rasteriser = Rasteriser(RasterConfig(threads=1))
+        self.steps = 0
+
+    def step(self, target: Target, gain: tuple[float, ...]) -> tuple[float, float, np.ndarray]:
+        self.steps += 1
+        planes = self.rasteriser.draw_planes(self.cloud, target.camera, a_pose())
+        factor = np.array([*gain, 1.0, 1.0], dtype=np.float32)[:, None, None]
+        seen = planes * factor
+        wanted = np.where(target.static_mask, target.image(), seen[:3])
+        value, mse, upstream = self.loss(seen, wanted, target.depth_m)
+        gradient = self.rasteriser.pull_back(planes, upstream * factor)
+        for name, rows in arrays(self.cloud):
+            first, second = self.moments[name]
+            load_native().adam_step(
+                rows, getattr(gradient, name), first, second, self.steps, RATES[name]
+            )
+        d_gain = (upstream[:3].astype(np.float64) * planes[:3]).sum(axis=(1, 2))
+        self.gradient = gradient
+        return value, mse / float(target.static_mask.mean()), d_gain
+
+
+@pytest.mark.parametrize("kind", ["3dgs", "paper"])
+@pytest.mark.parametrize("num_harmonics", [0, 3])
+def test_a_fused_step_equals_the_separate_steps(
+    kind: Literal["3dgs", "paper"], num_harmonics: int
+) -> None:
+    cloud, target = some_cloud(num_harmonics=num_harmonics), some_target()
+    session = FitSession(cloud, RasterConfig(threads=1), loss=kind, depth_weight=0.3)
+    separate = SeparateSteps(cloud, Loss(kind, depth_weight=0.3, threads=1))
+    for count in range(4):
+        report = session.step(target, a_pose(), RATES, GAIN)
+        loss, mse, d_gain = separate.step(target, GAIN)
+        assert report.loss == pytest.approx(loss, rel=1e-4)
+        assert report.mse == pytest.approx(mse, rel=1e-4)
+        np.testing.assert_allclose(report.gain, d_gain, rtol=2e-3, atol=1e-5)
+        pose = separate.gradient.T_camera_base
+        assert np.abs(report.T_camera_base - pose).max() < 5e-3 * np.abs(pose).max()
+        if count == 0:
+            found = session.gradient(report)
+            for name, _ in arrays(cloud):
+                wanted = getattr(separate.gradient, name)
+                error = np.linalg.norm(getattr(found, name) - wanted)
+                assert error < 1e-4 * np.linalg.norm(wanted), name
+    for name, rows in arrays(separate.cloud):
+        moved = np.abs(rows - getattr(cloud, name)).max()
+        difference = np.abs(getattr(session.cloud, name) - rows)
+        assert moved > 0
+        # Adam divides by the gradient's size: where that is rounding, directions may differ.
+        assert np.quantile(difference, 0.98) < 0.02 * moved, name
+
+
+def test_a_step_follows_a_finite_difference_of_the_gain() -> None:
+    cloud, target = some_cloud(), some_target()
+    session = FitSession(cloud, RasterConfig(threads=1, alpha_cut=2.0**-24), loss="paper")
+    gradient = session.step(target, a_pose(), {}, GAIN).gain
+    for channel in range(3):
+        losses = []
+        for sign in (1, -1):
+            gain = np.array(GAIN)
+            gain[channel] += sign * 1e-2
+            losses.append(session.step(target, a_pose(), {}, gain).loss)
+        assert (losses[0] - losses[1]) / 2e-2 == pytest.approx(gradient[channel], rel=1e-2)
+
+
+def test_arrays_without_a_rate_stay() -> None:
+    cloud = some_cloud()
+    session = FitSession(cloud, RasterConfig(threads=1))
+    session.step(some_target(), a_pose(), {"colors": 0.01})
+    for name, rows in arrays(cloud):
+        assert np.array_equal(getattr(session.cloud, name), rows) == (name != "colors")
+
+
+def test_the_callers_cloud_is_not_altered() -> None:
+    cloud = some_cloud()
+    for _, rows in arrays(cloud):
+        rows.flags.writeable = False
+    FitSession(cloud, RasterConfig(threads=1)).step(some_target(), a_pose(), RATES)
+
+
+@pytest.mark.parametrize("isa", available_isas())
+def test_fitting_one_view_lowers_its_loss(isa: str) -> None:
+    session = FitSession(some_cloud(), RasterConfig(threads=1, isa=isa))
+    target = some_target(masked=False)
+    losses = [session.step(target, a_pose(), RATES).loss for _ in range(30)]
+    assert losses[-1] < 0.9 * losses[0]
+
+
+def test_any_number_of_threads_fits_the_same_bits() -> None:
+    results = []
+    for threads in (1, 2, 3):
+        session = FitSession(some_cloud(5000), RasterConfig(threads=threads))
+        reports = [session.step(some_target(), a_pose(), RATES, GAIN) for _ in range(3)]
+        results.append(
+            [
+                *(rows for _, rows in arrays(session.cloud)),
+                np.array([report.loss for report in reports]),
+                reports[-1].gain,
+                reports[-1].T_camera_base,
+                session.planes(),
+            ]
+        )
+    for other in results[1:]:
+        for first, second in zip(results[0], other, strict=True):
+            np.testing.assert_array_equal(first, second)
+
+
+def test_an_image_that_is_masked_everywhere_teaches_nothing() -> None:
+    target = some_target()
+    nothing = Target(
+        camera=CAMERA,
+        planes_u8=target.planes_u8,
+        depth_m=np.zeros_like(target.depth_m),
+        static_mask=np.zeros_like(target.static_mask),
+    )
+    cloud = some_cloud()
+    session = FitSession(cloud, RasterConfig(threads=1), loss="paper")
+    report = session.step(nothing, a_pose(), RATES)
+    assert report.mse is None
+    assert report.loss == 0.0
+    for name, rows in arrays(cloud):
+        np.testing.assert_array_equal(getattr(session.cloud, name), rows)
+
+
+def test_moments_go_along_with_their_gaussians() -> None:
+    session = FitSession(some_cloud(10), RasterConfig(threads=1))
+    session.step(some_target(), a_pose(), RATES)
+    moved = session.cloud.take(np.array([7, 7, 2]))
+    twin = FitSession(session.cloud, RasterConfig(threads=1))
+    session.rearrange(moved, np.array([7, -1, 2]))
+    assert session.steps == 1
+    twin.rearrange(moved)
+    report = session.step(some_target(), a_pose(), RATES)
+    other = twin.step(some_target(), a_pose(), RATES)
+    assert report.loss == other.loss
+    assert not np.array_equal(session.cloud.means_m[0], twin.cloud.means_m[0])
+
+
+def test_an_image_of_another_size_is_refused() -> None:
+    target = some_target()
+    other = Target(
+        camera=Camera(width=60, height=94, fx=70.0, fy=70.0, cx=30.0, cy=47.0),
+        planes_u8=target.planes_u8,
+        depth_m=target.depth_m,
+        static_mask=target.static_mask,
+    )
+    session = FitSession(some_cloud(10), RasterConfig(threads=1))
+    with pytest.raises(ValueError, match="camera's size"):
+        session.step(other, a_pose(), RATES)
+
+
+def test_an_empty_cloud_is_a_black_image() -> None:
+    empty = some_cloud().take(np.zeros(0, dtype=int))
+    session = FitSession(empty, RasterConfig(threads=1))
+    report = session.step(some_target(), a_pose(), RATES)
+    assert np.isfinite(report.loss)
+    assert not session.planes().any()
+    assert not report.T_camera_base.any()
+    assert len(session.gradient(report).means_m) == 0

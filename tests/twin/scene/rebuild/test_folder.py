@@ -1,0 +1,162 @@
+"""The scene folder: what vouches for what, what is damaged, and what is never looked at."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import textured_room
+
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
+from bridge.errors import UsageError
+from bridge.terminal import Output
+from twin.replay.config import ReplayRunConfig
+from twin.replay.run.trajectories import replay_run
+from twin.scene.fit.initialise import fuse
+from twin.scene.frames.choice import choose_frames, find_sources
+from twin.scene.frames.points import DepthLimits, FrameSurface
+from twin.scene.localise.result import LocalisedObject
+from twin.scene.objects import parts as parts_module
+from twin.scene.objects.parts import read_objects, take_apart
+from twin.scene.rebuild.run import rebuild
+from twin.scene.settings import FitConfig, FrameConfig, InitialiseConfig, RebuildConfig
+from twin.scene.store.folder import UnreadableSceneError, read_record, read_scene, scene_hash_of
+
+QUIET = Output(quiet=True)
+CONFIG = RebuildConfig(
+    fit=FitConfig(iterations=6, threads=1),
+    initialise=InitialiseConfig(max_splats=300, flying_fraction=0.1),
+)
+LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = RunFolder.create(tmp_path_factory.mktemp("run") / "monday")
+    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9)
+    rebuild(run, CONFIG, QUIET)
+    return run.path
+
+
+@pytest.fixture
+def room(made: Path, tmp_path: Path) -> RunFolder:
+    return RunFolder(shutil.copytree(made, tmp_path / "monday"))
+
+
+def change_record(run: RunFolder, change: Callable[[dict[str, Any]], object]) -> None:
+    path = run.scene_dir / "scene.json"
+    record = json.loads(path.read_text())
+    change(record)
+    path.write_text(json.dumps(record))
+
+
+def test_one_scene_has_one_name_everywhere(room: RunFolder) -> None:
+    """Verdicts of the gate, replays, localisations and views must name the same scene."""
+    scene_hash = scene_hash_of(room)
+    assert scene_hash is not None
+    assert replay_run(room, ReplayRunConfig(), QUIET)["scene_hash"] == scene_hash
+    (views,) = room.derived("*.views.*")
+    assert scene_hash in views.name
+
+
+@pytest.mark.parametrize("lost", ["scene_hash", "views", "sources"])
+def test_a_scene_file_without_what_its_readers_need_is_refused(room: RunFolder, lost: str) -> None:
+    change_record(room, lambda record: record.pop(lost))
+    with pytest.raises(UnreadableSceneError, match=f"without {lost}"):
+        read_record(room)
+
+
+def test_a_background_that_is_not_the_described_one_is_refused_and_made_again(
+    room: RunFolder,
+) -> None:
+    path = room.scene_dir / "background.ply"
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(UnreadableSceneError, match="describes scene"):
+        read_scene(room)
+    rebuild(room, CONFIG, QUIET)
+    assert len(read_scene(room).background) > 0
+
+
+def test_a_lost_object_file_is_made_again(room: RunFolder) -> None:
+    lost = {"folder": "objects/cube", "files": {"gaussians.ply": "0" * 64}}
+    change_record(room, lambda record: record["objects"].update(cube=lost))
+    before = (room.scene_dir / "background.ply").stat().st_mtime_ns
+    assert rebuild(room, CONFIG, QUIET)["objects"] == {}
+    assert (room.scene_dir / "background.ply").stat().st_mtime_ns > before
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "{", "[]", '{"T_base_object": null}', '{"T_base_object": {"p_m": [0], "q_wxyz": [1]}}',
+     '{"T_base_object": {"p_m": [0, 0, 0], "q_wxyz": [0, 0, 0, 0]}}',
+     '{"T_base_object": {"p_m": [NaN, 0, 0], "q_wxyz": [1, 0, 0, 0]}}'],
+)  # fmt: skip
+def test_a_damaged_object_file_is_refused(room: RunFolder, text: str) -> None:
+    folder = room.scene_dir / "objects" / "cube"
+    folder.mkdir(parents=True)
+    shutil.copy(room.scene_dir / "background.ply", folder / "gaussians.ply")
+    (folder / "object.json").write_text(text)
+    with pytest.raises(UnreadableSceneError, match=r"object\.json"):
+        read_objects(room, {"objects": {"cube": {}}})
+
+
+def test_objects_are_not_looked_for_in_held_out_frames(
+    room: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: dict[str, Any] = {}
+
+    def localise(episode: Episode, task: object, **given: Any) -> dict[str, LocalisedObject]:
+        asked.update(given)
+        return {}
+
+    monkeypatch.setattr(parts_module, "localise_episode", localise)
+    monkeypatch.setattr(Episode, "info", EpisodeInfo(id="s", kind="scan", task="cube_into_box"))
+    sources = find_sources(room)
+    choices = choose_frames(sources, FrameConfig(holdout_every=3))
+    cloud = fuse(
+        [FrameSurface(textured_room.frame(0, 9), LIMITS).points()], InitialiseConfig(max_splats=50)
+    )
+    take_apart(sources, cloud, choices)
+    assert len(choices[0].holdout_ns) == 3
+    assert asked["held_out_ns"] == {"wrist": choices[0].holdout_ns}
+
+
+def test_frames_are_known_by_their_own_stamp_and_not_by_when_they_were_sent(
+    tmp_path: Path,
+) -> None:
+    """Other recorders put the time of receiving where ours puts the source's."""
+    run = RunFolder.create(tmp_path / "run")
+    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9, sent_late_ns=7_000)
+    record = rebuild(run, CONFIG, QUIET)
+    assert record["cameras"][0]["train_frames"] == 8
+    assert len(record["views"]["images"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("make", "found"),
+    [
+        (lambda: FrameConfig(holdout_every=1), "--holdout-every 1 is too small"),
+        (lambda: FrameConfig(holdout_every=0), "at least 2"),
+        (lambda: FrameConfig(max_train_frames=0), "--max-train-frames"),
+        (lambda: InitialiseConfig(max_splats=0), "--max-splats"),
+        (lambda: InitialiseConfig(opacity=1.0), "--opacity"),
+        (lambda: FitConfig(budget_s=0.0), "--budget"),
+        (lambda: FitConfig(iterations=-1), "--iterations"),
+    ],
+)
+def test_settings_that_nothing_can_be_made_with_are_refused(
+    make: Callable[[], object], found: str
+) -> None:
+    with pytest.raises(UsageError, match=found):
+        make()
+
+
+def test_a_count_of_images_needs_no_time_budget() -> None:
+    assert replace(FitConfig(iterations=3), budget_s=0.0).iterations == 3

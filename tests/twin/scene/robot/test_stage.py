@@ -1,0 +1,124 @@
+"""The robot's part of a rebuild: in the robot's own frame, in a foreign one, and without joints."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.episode import schema
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.records import (
+    CameraInfo,
+    CompressedColor,
+    DepthImage,
+    FrameTransform,
+    JointSample,
+    string_to_cdr,
+    transforms_to_cdr,
+)
+from bridge.episode.run import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.geometry import se3
+from bridge.media.color import encode_png
+from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
+from bridge.terminal import Output
+from twin.scene.frames.choice import choose_frames, find_sources
+from twin.scene.learn.read import learn
+from twin.scene.robot.stage import find_robot, write_robot
+from twin.scene.settings import FrameConfig, InitialiseConfig, RebuildConfig
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "align"))
+import cell_views
+
+QUIET = Output(quiet=True)
+SECOND = 1_000_000_000
+
+
+def write_scan(path: Path, root: str, T_root_base: np.ndarray, *, with_joints: bool = True) -> None:
+    """A side camera with exact depth sees the robot stop at four postures."""
+    camera = cell_views.load_cell("standin").cameras["side"].camera
+    pose = FrameTransform(
+        stamp_ns=1,
+        parent=root,
+        child="side_optical",
+        T_parent_child=T_root_base @ cell_views.side_camera_pose(),
+    )
+    info = CameraInfo(stamp_ns=1, frame_id="side_optical", camera=camera).to_cdr()
+    grey = encode_png(np.full((camera.height, camera.width, 3), 128, dtype=np.uint8))
+    with EpisodeWriter(path) as writer:
+
+        def put(topic: str, data: bytes, type_name: str, stamp_ns: int) -> None:
+            writer.write(topic, data, type_name=type_name, log_time_ns=stamp_ns)
+
+        writer.describe(EpisodeInfo(id=path.stem, kind="scan", cell="c", stand_in=True))
+        put("/tf_static", transforms_to_cdr([pose]), schema.TF_MESSAGE, 1)
+        put("/robot_description", string_to_cdr(ur5_with_gripper_urdf()), schema.STRING, 1)
+        for stream in ("color", "depth"):
+            put(f"/c/cam/side/{stream}/info", info, schema.CAMERA_INFO, 1)
+        for index, joints in enumerate(cell_views.POSTURES):
+            stamp = 2 * (index + 1) * SECOND
+            for part in (-0.4, 0.0, 0.4) if with_joints else ():
+                sample = JointSample(
+                    stamp_ns=stamp + round(part * SECOND),
+                    names=tuple(ARM_JOINTS),
+                    position=np.array(joints),
+                    velocity=np.zeros(0),
+                    effort=np.zeros(0),
+                )
+                put("/c/joint_states", sample.to_cdr(), schema.JOINT_STATE, sample.stamp_ns)
+            depth_m = cell_views.take(joints, cell_views.CellErrors(), seed=index, width_m=0.0)
+            color = CompressedColor(
+                stamp_ns=stamp, frame_id="side_optical", format="png", data=grey
+            )
+            depth = DepthImage(
+                stamp_ns=stamp,
+                frame_id="side_optical",
+                depth_mm=np.rint(depth_m * 1e3).astype(np.uint16),
+            )
+            put("/c/cam/side/color/image", color.to_cdr(), schema.COMPRESSED_IMAGE, stamp)
+            put("/c/cam/side/depth/image", depth.to_cdr(), schema.IMAGE, stamp)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    return RunFolder.create(tmp_path / "run")
+
+
+def test_in_the_robots_own_frame_its_links_are_collected(run: RunFolder) -> None:
+    write_scan(run.episodes_dir / "scan.mcap", "base_link", np.eye(4))
+    choices = choose_frames(find_sources(run), FrameConfig(), QUIET)
+    learnt = learn(choices, RebuildConfig(), QUIET)
+    assert learnt.robot.alignment is None
+    assert learnt.robot.remark == ""
+    links = learnt.robot.frames.links(InitialiseConfig())
+    assert {"base_link", "upper_arm_link"} <= set(links)
+    record = write_robot(run, learnt.robot, links)["robot"]
+    assert set(record["links"]) == set(links)
+    assert "T_base_root" not in record
+    assert all((run.scene_dir / item["file"]).is_file() for item in record["links"].values())
+
+
+@pytest.mark.slow
+def test_in_a_foreign_frame_the_robot_is_found_by_what_it_looks_like(run: RunFolder) -> None:
+    T_root_base = cell_views.anywhere(3)
+    write_scan(run.episodes_dir / "scan.mcap", "room", T_root_base)
+    choices = choose_frames(find_sources(run), FrameConfig(), QUIET)
+    found = find_robot(choices, QUIET)
+    assert found.alignment is not None
+    change = found.frames.T_base_root @ T_root_base
+    assert np.linalg.norm(change[:3, 3]) < 0.003
+    assert se3.rotation_angle_rad(change[:3, :3]) < 0.003
+    record = write_robot(run, found, {})["robot"]
+    assert record["alignment"]["yaw_margin"] > 1.3
+    np.testing.assert_allclose(record["T_base_root"]["p_m"], found.frames.T_base_root[:3, 3])
+
+
+def test_without_joints_everything_stays_and_the_record_says_why(run: RunFolder) -> None:
+    write_scan(run.episodes_dir / "scan.mcap", "room", np.eye(4), with_joints=False)
+    choices = choose_frames(find_sources(run), FrameConfig(), QUIET)
+    found = find_robot(choices, QUIET)
+    assert found.alignment is None
+    assert "joint states" in found.remark
+    assert "'room'" in found.remark
+    assert found.frames.links(InitialiseConfig()) == {}

@@ -1,0 +1,97 @@
+"""Draw the rebuilt scene from a recorded or a given camera pose."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode import streams
+from bridge.episode.reader import Episode
+from bridge.episode.run import RunFolder
+from bridge.errors import UsageError
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.media.color import encode_png
+from bridge.task.robot import BASE_FRAME
+from twin.scene.draw.compose import carried_camera, compose
+from twin.scene.raster.backend import open_rasteriser
+from twin.scene.raster.rasteriser import RasterConfig
+from twin.scene.settings import RenderConfig
+from twin.scene.store.folder import Scene, read_scene
+
+UP = np.array([0.0, 0.0, 1.0])
+"""The root frame's z axis points up (table top at z = 0)."""
+
+
+def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
+    """Write one PNG of the scene and return what was drawn.
+
+    Raises:
+        UsageError: When the episode, the camera or an object is unknown (lists those that exist),
+            or joints are given for a robot that the scene does not have.
+        MissingDependencyError: When the backend cuda was asked for and cannot run here.
+    """
+    rasteriser = open_rasteriser(RasterConfig(backend=config.backend))
+    scene = read_scene(run)
+    episode = _episode(run, scene, config.episode)
+    camera_id = _camera_id(episode, config.camera)
+    stamp_ns = episode.start_ns + round(config.at_s * 1e9)
+    composed = compose(run, scene, episode, stamp_ns, config)
+    camera, T_base_camera = _view_of(episode, camera_id, config)
+    view = rasteriser.view(composed.cloud, camera, T_base_camera)
+    path = config.out or run.results_dir / "render.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(encode_png(view.image_u8()))
+    written = [str(path)]
+    if config.depth:
+        depth_path = path.with_name(f"{path.stem}_depth{path.suffix}")
+        depth_path.write_bytes(encode_png(np.rint(view.depth_m * 1e3).astype(np.uint16)))
+        written.append(str(depth_path))
+    return {
+        "files": written,
+        "scene_hash": scene.scene_hash,
+        "episode": episode.info.id,
+        "camera": camera_id,
+        "robot": composed.robot,
+        "coverage_fraction": float(view.alpha.mean()),
+    }
+
+
+def _episode(run: RunFolder, scene: Scene, wanted: str) -> Episode:
+    name = wanted or scene.record["sources"][0]["id"]
+    episodes = {episode.info.id: episode for episode in map(Episode.open, run.episodes())}
+    if name not in episodes:
+        message = f"no episode {name!r} in {run.path}. There are: {', '.join(episodes) or 'none'}."
+        raise UsageError(message)
+    return episodes[name]
+
+
+def _camera_id(episode: Episode, wanted: str) -> str:
+    ids = streams.camera_ids(episode)
+    if not ids or (wanted and wanted not in ids):
+        found = ", ".join(ids) or "none"
+        message = f"no camera {wanted!r} in episode {episode.info.id}. There are: {found}."
+        raise UsageError(message)
+    return wanted or ids[0]
+
+
+def _view_of(
+    episode: Episode, camera_id: str, config: RenderConfig
+) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
+    info = streams.camera_info(episode, camera_id)
+    if (config.eye is None) != (config.target is None):
+        message = "--eye and --target belong together: where to stand, and what to look at."
+        raise UsageError(message)
+    if config.eye is not None and config.target is not None:
+        eye, target = np.array(config.eye), np.array(config.target)
+        if np.linalg.norm(np.cross(target - eye, UP)) < 1e-6:
+            message = "--eye is straight above or below --target; move it a little sideways."
+            raise UsageError(message)
+        return info.camera, se3.look_at(eye, target, UP)
+    tree = streams.transform_tree(episode)
+    if config.joints is not None and tree.root_of(info.frame_id) == BASE_FRAME:
+        T_base_camera = carried_camera(episode, info.frame_id, np.array(config.joints))
+        if T_base_camera is not None:
+            return info.camera, T_base_camera
+    stamp_ns = episode.start_ns + round(config.at_s * 1e9)
+    return info.camera, tree.T_root_frame(info.frame_id, stamp_ns)

@@ -1,0 +1,1 @@
+"""Gaussians fitted to images: begin, step, split, solve colours, correct cameras."""

@@ -1,0 +1,246 @@
+"""Colours in closed form: with the geometry fixed, an image is linear in them.
+
+A view is A c with A = alpha T, the weight of each Gaussian in each pixel (paper Eq. 2 with the
+product transmittance). All views together make a least-squares problem that a few steps of
+conjugate gradients solve; A is never stored, only drawn (A c) and lifted (A^T image).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from twin.scene.fit.allowance import UNLIMITED, Allowance
+from twin.scene.frames.training_view import Target
+from twin.scene.gaussians.cloud import (
+    NUM_FIRST,
+    GaussianCloud,
+    as_float32,
+    harmonic_basis,
+)
+from twin.scene.raster.rasteriser import Rasteriser
+
+RIDGE_COLOR = 0.05
+"""Pull of a colour towards its start, in squared weights of a pixel."""
+RIDGE_HARMONICS = 0.5
+"""Stronger: a Gaussian seen from few directions says little about the others."""
+SATURATED = 250 / 255
+"""A channel brighter than this no longer follows the exposure."""
+LEAST_STEPS = 2
+"""With fewer steps a solution is not worth its time: Adam uses it better."""
+GAIN_PRIOR = 1e-3
+"""Pull of a gain towards 1, as a mean squared brightness: decides only black images."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observation:
+    """One image at one size, where it was seen from, and how bright it came out."""
+
+    target: Target
+    T_base_camera: Float[np.ndarray, "4 4"]
+    gain: Float[np.ndarray, "3"]
+    """Recorded over drawn brightness, per channel."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Appearance:
+    """The outcome of one closed-form solution."""
+
+    cloud: GaussianCloud
+    mse_before: float | None
+    """Mean squared colour error of the start, over the pixels that count; None when there was no
+    time to look at all of them."""
+    steps: int
+    """Conjugate gradient steps done; 0: the cloud is as it was."""
+
+
+def solve_appearance(
+    cloud: GaussianCloud,
+    observations: Sequence[Observation],
+    rasteriser: Rasteriser,
+    *,
+    steps: int,
+    allowance: Allowance = UNLIMITED,
+) -> Appearance:
+    """Minimise sum |g A (c + sum_k Y_k h_k) - I|^2 + ridge |x - x_start|^2 over colours x = (c, h).
+
+    Conjugate gradients with a diagonal preconditioner, the three channels side by side. The
+    diagonal is A^T A 1, which bounds A^T A from above. Pixels outside a static mask do not enter,
+    Gaussians that no pixel shows keep their colours.
+
+    Args:
+        cloud: Where to start; its harmonics are solved too if it has any.
+        observations: Images with their gains.
+        rasteriser: Draws and lifts.
+        steps: Conjugate gradient steps, at most; more than six follow the noise.
+        allowance: Fewer steps are made, or none, when so many do not fit; what is begun and does
+            not end in time is dropped.
+    """
+    model = _ImageModel(cloud, observations, rasteriser, allowance)
+    start = np.concatenate([cloud.colors[:, None], cloud.harmonics], axis=1)
+    affordable = model.affordable_passes(start) - 1  # one pass sets the equations up
+    equations = None if affordable < min(steps, LEAST_STEPS) else model.right_side(start)
+    if equations is None:
+        return Appearance(cloud=cloud, mse_before=None, steps=0)
+    right, diagonal, mse = equations
+    change, done = conjugate_gradients(
+        model.normal, right, diagonal, steps=int(min(steps, affordable))
+    )
+    solved = start + change
+    painted = replace(cloud, colors=as_float32(solved[:, 0]), harmonics=as_float32(solved[:, 1:]))
+    return Appearance(cloud=painted, mse_before=mse, steps=done)
+
+
+def solve_gains(
+    cloud: GaussianCloud,
+    observations: Sequence[Observation],
+    rasteriser: Rasteriser,
+    allowance: Allowance = UNLIMITED,
+) -> Float[np.ndarray, "num_views 3"]:
+    """Brightness of each image relative to the drawn one, per channel; their mean is 1.
+
+    Least squares over static pixels that are not saturated. The mean is the gauge: all images
+    twice as bright and all colours half as bright would look the same. Images that there is no
+    time for keep the gains they have.
+    """
+    gains = np.array([item.gain for item in observations], dtype=np.float64)
+    for index, item in enumerate(observations):
+        if allowance.is_over():
+            break
+        drawn = rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)[:3]
+        gains[index] = gain_between(drawn, item.target)
+    return np.asarray(gains / gains.mean(axis=0))
+
+
+def gain_between(
+    drawn: Float32[np.ndarray, "3 height width"], target: Target
+) -> Float[np.ndarray, "3"]:
+    """The factor per channel that brings a drawn image closest to the recorded one."""
+    wanted = target.image()
+    usable = target.static_mask & (wanted < SATURATED).all(axis=0)
+    recorded, own = wanted[:, usable].astype(np.float64), drawn[:, usable].astype(np.float64)
+    prior = GAIN_PRIOR * max(int(usable.sum()), 1)
+    both = (recorded * own).sum(axis=1) + prior
+    return np.asarray(both / (np.square(own).sum(axis=1) + prior))
+
+
+def conjugate_gradients(
+    apply: Callable[[np.ndarray], np.ndarray | None],
+    right: Float32[np.ndarray, "num_splats num_terms channels"],
+    diagonal: Float32[np.ndarray, "num_splats num_terms channels"],
+    *,
+    steps: int,
+) -> tuple[Float32[np.ndarray, "num_splats num_terms channels"], int]:
+    """Solve ``apply(x) = right`` from zero, each channel a system of its own.
+
+    Hestenes and Stiefel 1952 with a diagonal preconditioner. Ends early when ``apply`` gives None.
+    Returns x and the steps taken.
+    """
+    x = np.zeros_like(right)
+    residual = right.copy()
+    scaled = residual / diagonal
+    direction = scaled.copy()
+    size = _dots(residual, scaled)
+    enough = 1e-12 * size
+    for step in range(steps):
+        if np.all(size <= enough):
+            return x, step
+        applied = apply(direction)
+        if applied is None:
+            return x, step
+        length = size / np.maximum(_dots(direction, applied), 1e-30)
+        x += length.astype(np.float32) * direction
+        residual -= length.astype(np.float32) * applied
+        scaled = residual / diagonal
+        before, size = size, _dots(residual, scaled)
+        direction = scaled + (size / np.maximum(before, 1e-30)).astype(np.float32) * direction
+    return x, steps
+
+
+def _dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Inner product per channel; summed in double precision."""
+    return np.asarray(np.einsum("nkc,nkc->c", a, b, dtype=np.float64))
+
+
+class _ImageModel:
+    """The normal equations of all images, one image in memory at a time."""
+
+    def __init__(
+        self,
+        cloud: GaussianCloud,
+        observations: Sequence[Observation],
+        rasteriser: Rasteriser,
+        allowance: Allowance,
+    ) -> None:
+        self._cloud = cloud
+        self._allowance = allowance
+        self._observations = observations
+        self._rasteriser = rasteriser
+        ridge = [RIDGE_COLOR] + [RIDGE_HARMONICS] * (NUM_FIRST if cloud.num_harmonics else 0)
+        self._ridge = np.array(ridge, dtype=np.float32)[None, :, None]
+
+    def affordable_passes(self, start: np.ndarray) -> float:
+        """How often all images fit into the allowance, judged by the first."""
+        if self._allowance.until_s == np.inf:
+            return np.inf
+        if self._allowance.is_over():
+            return 0.0
+        began_s = self._allowance.clock()
+        self._lifted(start, self._observations[0])
+        took_s = max(self._allowance.clock() - began_s, 1e-9) * len(self._observations)
+        return float(np.floor(self._allowance.left_s() / took_s))
+
+    def right_side(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+        """Pull of all images on the start, the preconditioner, and the mean squared error.
+
+        None when the time is over before all images were drawn.
+        """
+        right, diagonal = np.zeros_like(start), np.zeros_like(start)
+        diagonal += self._ridge
+        error, count = 0.0, 0
+        for item in self._observations:
+            if self._allowance.is_over():
+                return None
+            gain = item.gain.astype(np.float32)[:, None, None]
+            mask = item.target.static_mask
+            basis = self._basis(item)
+            planes = self._draw(start, item)
+            missing = (item.target.image() - gain * planes[:3]) * mask
+            error += float(np.square(missing, dtype=np.float64).sum())
+            count += 3 * int(mask.sum())
+            maps = np.concatenate([gain * missing, (planes[4] * mask)[None]])
+            lifted = self._rasteriser.lift(maps)
+            right += basis[:, :, None] * lifted[:, None, :3]
+            squared = np.square(item.gain).astype(np.float32) * lifted[:, 3:]
+            diagonal += np.square(basis)[:, :, None] * squared[:, None, :]
+        return right, diagonal, error / max(count, 1)
+
+    def normal(self, x: np.ndarray) -> np.ndarray | None:
+        """Carry a change of colours into all images and back: (A^T A + ridge) x; None: no time."""
+        total = self._ridge * x
+        for item in self._observations:
+            if self._allowance.is_over():
+                return None
+            total += self._lifted(x, item)
+        return np.asarray(total)
+
+    def _lifted(self, x: np.ndarray, item: Observation) -> np.ndarray:
+        """A change of colours carried into one image and back."""
+        squared = np.square(item.gain).astype(np.float32)[:, None, None]
+        drawn = self._draw(x, item)[:3]
+        lifted = self._rasteriser.lift(squared * drawn * item.target.static_mask)
+        return np.asarray(self._basis(item)[:, :, None] * lifted[:, None, :])
+
+    def _basis(self, item: Observation) -> Float32[np.ndarray, "num_splats num_terms"]:
+        """Value of each unknown's harmonic along the ray to each Gaussian; 1 for the colour."""
+        basis = np.ones((len(self._cloud), self._ridge.shape[1]), dtype=np.float32)
+        if basis.shape[1] > 1:
+            ray = self._cloud.means_m - item.T_base_camera[:3, 3].astype(np.float32)
+            ray /= np.sqrt(np.einsum("ni,ni->n", ray, ray))[:, None] + np.float32(1e-12)
+            basis[:, 1:] = harmonic_basis(ray)
+        return basis
+
+    def _draw(self, x: np.ndarray, item: Observation) -> np.ndarray:
+        cloud = replace(self._cloud, colors=as_float32(x[:, 0]), harmonics=as_float32(x[:, 1:]))
+        return self._rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)

@@ -1,0 +1,161 @@
+"""Where a camera was at each of its images: from ``/tf``, or from the images themselves."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Int
+
+from bridge.episode import streams
+from bridge.episode.reader import Episode
+from bridge.episode.records import FrameTransform
+from bridge.episode.transforms import TransformTree
+from bridge.geometry import se3
+from bridge.terminal import Output
+from twin.scene.frames.odometry import CameraPath, TrackConfig, follow_camera
+from twin.scene.settings import FrameConfig
+from twin.scene.store.calibration import Calibration, calibrated_tree
+
+ODOMETRY_FRAME = "odometry"
+"""Begin of the name of the root frame of a scan without poses: the depth camera at the first frame
+that is not held out. Each recording has its own."""
+SAYS = {
+    "tf": "/tf of the recording",
+    "hand-eye": "robot-gst calibrate",
+    "odometry": "RGB-D odometry of the images themselves",
+}
+PoseSource = Literal["tf", "hand-eye", "odometry"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraPoses:
+    """Poses of one camera's images, and how much to think of them."""
+
+    tree: TransformTree
+    """Knows the camera's colour and depth frame."""
+    source: PoseSource
+    unposed_ns: frozenset[int] = frozenset()
+    """Images whose pose is not known."""
+    depth_scale: float = 1.0
+    """True depth divided by measured depth, where a calibration knows it."""
+    quality: Mapping[str, Any] = field(default_factory=dict)
+    """What the odometry says of itself."""
+
+
+def find_poses(
+    episode: Episode,
+    camera_id: str,
+    stamps_ns: Int[np.ndarray, " num_frames"],
+    held_out_ns: frozenset[int],
+    config: FrameConfig,
+    output: Output,
+    calibration: Calibration | None = None,
+) -> CameraPoses:
+    """Take what ``calibrate`` found, else the poses of ``/tf``, else follow the images.
+
+    Frames that are held out get a pose from the odometry too, but nothing is learnt from them:
+    neither the path of the camera nor its loop closures.
+
+    Raises:
+        FrameNotFoundError: When ``/tf`` is asked for and does not know the camera.
+        LostError: When the odometry cannot follow the camera.
+    """
+    place = None if calibration is None else calibration.cameras.get(camera_id)
+    if config.poses == "auto" and calibration is not None and place is not None:
+        return CameraPoses(
+            tree=calibrated_tree(episode, camera_id, place, stamps_ns),
+            source="hand-eye",
+            depth_scale=place.depth_scale,
+            quality={"calibration_id": calibration.calibration_id},
+        )
+    tree = streams.transform_tree(episode)
+    if config.poses == "tf" or (config.poses == "auto" and places_camera(tree, episode, camera_id)):
+        frame = streams.camera_info(episode, camera_id).frame_id
+        with np.errstate(invalid="ignore"):
+            broken = ~np.isfinite(tree.Ts_root_frame(frame, stamps_ns)).all(axis=(1, 2))
+        unposed = frozenset(stamps_ns[broken].tolist())
+        if unposed:
+            output.say(
+                f"{len(unposed)} of {len(stamps_ns)} frames of camera {camera_id} have a pose "
+                "that is not finite and are left out"
+            )
+        return CameraPoses(tree=tree, source="tf", unposed_ns=unposed)
+    bare = _bare_tree(tree, episode, camera_id)
+    with output.progress(f"follow camera {camera_id}", len(stamps_ns)) as advance:
+        path = follow_camera(
+            streams.rgbd_frames(episode, camera_id, bare),
+            held_out_ns,
+            TrackConfig(max_depth_m=config.max_depth_m),
+            advance,
+        )
+    lost = frozenset(set(stamps_ns.tolist()) - path.Ts_first_depth.keys())
+    output.say(f"camera {camera_id} of {episode.info.id}: {_describe(path, len(lost))}")
+    return CameraPoses(
+        tree=_tree_of(path, bare, episode, camera_id),
+        source="odometry",
+        unposed_ns=lost,
+        quality=path.quality,
+    )
+
+
+def places_camera(tree: TransformTree, episode: Episode, camera_id: str) -> bool:
+    """Say whether ``/tf`` holds more of a camera than how its own parts lie to each other."""
+    frame = streams.camera_info(episode, camera_id).frame_id
+    if frame not in tree.frames():
+        return False
+    root = tree.root_of(frame)
+    own = {frame, streams.camera_info(episode, camera_id, "depth").frame_id}
+    return root not in own and not root.startswith(f"{camera_id}_")
+
+
+def _bare_tree(tree: TransformTree, episode: Episode, camera_id: str) -> TransformTree:
+    """The camera's own frames, its depth camera in the origin."""
+    color, depth = _frame_ids(episode, camera_id)
+    edges = [_edge(_root_name(episode, camera_id), depth, np.eye(4), 0)]
+    if color != depth:
+        T_depth_color = np.eye(4)
+        known = set(tree.frames())
+        if {color, depth} <= known and tree.root_of(color) == tree.root_of(depth):
+            at = episode.start_ns
+            T_depth_color = se3.invert(tree.T_root_frame(depth, at)) @ tree.T_root_frame(color, at)
+        edges.append(_edge(depth, color, T_depth_color, 0))
+    return TransformTree(edges)
+
+
+def _tree_of(
+    path: CameraPath, bare: TransformTree, episode: Episode, camera_id: str
+) -> TransformTree:
+    color, depth = _frame_ids(episode, camera_id)
+    edges = [
+        _edge(_root_name(episode, camera_id), depth, T_first_depth, stamp_ns)
+        for stamp_ns, T_first_depth in path.Ts_first_depth.items()
+    ]
+    if color != depth:
+        edges.append(_edge(depth, color, bare.T_root_frame(color, 0), 0))
+    return TransformTree(edges)
+
+
+def _root_name(episode: Episode, camera_id: str) -> str:
+    return f"{ODOMETRY_FRAME}_{episode.info.id}_{camera_id}"
+
+
+def _frame_ids(episode: Episode, camera_id: str) -> tuple[str, str]:
+    color, depth = (
+        streams.camera_info(episode, camera_id, stream).frame_id for stream in ("color", "depth")
+    )
+    return color, depth
+
+
+def _edge(parent: str, child: str, T: np.ndarray, stamp_ns: int) -> FrameTransform:
+    return FrameTransform(stamp_ns=stamp_ns, parent=parent, child=child, T_parent_child=T)
+
+
+def _describe(path: CameraPath, num_lost: int) -> str:
+    quality = path.quality
+    text = (
+        f"/tf has no poses; followed by RGB-D odometry: {quality['keyframes']} keyframes, "
+        f"{quality['loop_closures']} loop closures, {100 * quality['agreement']:.0f} % of the "
+        "depth agrees between them"
+    )
+    return text if num_lost == 0 else f"{text}; {num_lost} frames could not be placed"

@@ -1,0 +1,278 @@
+"""Choose posed RGB-D frames of a run: some to learn from, some held out."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bridge.episode import schema, streams
+from bridge.episode.reader import Episode
+from bridge.episode.records import DepthImage, color_from_message
+from bridge.episode.run import RunFolder
+from bridge.episode.streams import RgbdFrame
+from bridge.terminal import Output
+from twin.errors import TwinError
+from twin.scene.frames import select
+from twin.scene.frames.camera_poses import CameraPoses, find_poses
+from twin.scene.frames.odometry import LostError
+from twin.scene.frames.still import same_pose
+from twin.scene.settings import FrameConfig
+from twin.scene.store.calibration import Calibration
+
+STILL_M = 0.002
+STILL_RAD = 0.0035
+"""A camera whose pose varies less than these stands still."""
+STILL_TRAIN_FRAMES = 4
+STILL_HOLDOUT_FRAMES = 2
+"""A camera that stands still shows the same again and again; this many frames are enough."""
+QUIET = Output(quiet=True)
+
+
+class NoFramesError(TwinError):
+    """There is nothing to rebuild from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameChoice:
+    """Stamps of one camera of one episode: what to learn from and what to hold out."""
+
+    episode: Episode
+    camera_id: str
+    still: bool
+    train_ns: frozenset[int]
+    holdout_ns: frozenset[int]
+    """Nothing is learnt from these, the objects' places included."""
+    poses: CameraPoses
+    spare_ns: frozenset[int] = frozenset()
+    """Neither chosen nor held out: the background does not need them, the robot may."""
+    corrections: Mapping[int, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
+    """``T_new_old`` in the root frame for frames whose pose was improved, by stamp."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sources:
+    """The episodes a scene is made from."""
+
+    episodes: tuple[Episode, ...]
+    remark: str
+    """Empty when there are scans."""
+
+
+def find_sources(run: RunFolder) -> Sources:
+    """Take all scans; without a scan, every episode that has posed RGB-D frames.
+
+    Raises:
+        NoFramesError: When no episode has a camera with colour, depth and intrinsics.
+    """
+    usable = [e for path in run.episodes() if rgbd_camera_ids(e := Episode.open(path))]
+    scans = [episode for episode in usable if episode.info.kind == "scan"]
+    if scans:
+        return Sources(episodes=tuple(scans), remark="")
+    if not usable:
+        message = (
+            f"no episode in {run.episodes_dir} has colour and depth images with intrinsics. "
+            "Record a scan, or import an RGB-D folder: robot-gst import rgbd FOLDER RUN."
+        )
+        raise NoFramesError(message)
+    kinds = sorted({episode.info.kind for episode in usable})
+    remark = f"no scan in this run: using {len(usable)} episode(s) of kind {', '.join(kinds)}"
+    return Sources(episodes=tuple(usable), remark=remark)
+
+
+def rgbd_camera_ids(episode: Episode) -> list[str]:
+    """Cameras with colour and depth, both with intrinsics; never those of stand-in truth."""
+    topics = {topic for topic in episode.topics() if not schema.is_truth(topic)}
+    tails = ("color/image", "color/info", "depth/image", "depth/info")
+    stems = {topic.removesuffix(tails[0]) for topic in topics if topic.endswith("/" + tails[0])}
+    return sorted(
+        stem.split("/")[-2] for stem in stems if all(stem + tail in topics for tail in tails)
+    )
+
+
+def choose_frames(
+    sources: Sources,
+    config: FrameConfig,
+    output: Output = QUIET,
+    calibration: Calibration | None = None,
+) -> list[FrameChoice]:
+    """Hold out every n-th frame of each camera, then choose training frames from the others.
+
+    Which frames are held out depends on their number alone, never on what they show.
+
+    Raises:
+        NoFramesError: When nothing is left to learn from.
+        LostError: When a camera without poses cannot be followed.
+    """
+    found = [
+        (episode, camera_id)
+        for episode in sources.episodes
+        for camera_id in rgbd_camera_ids(episode)
+    ]
+    shared = replace(
+        config,
+        max_train_frames=max(1, config.max_train_frames // max(len(found), 1)),
+        max_holdout_frames=max(1, config.max_holdout_frames // max(len(found), 1)),
+    )
+    choices, lost = [], []
+    for episode, camera_id in found:
+        try:
+            choices.append(_choose(episode, camera_id, shared, output, calibration))
+        except LostError as error:
+            lost.append(error)
+            output.say(f"camera {camera_id} of {episode.info.id} is left out: {error}")
+    if lost and not choices:
+        raise lost[0]
+    choices = _in_one_frame(choices, output)
+    if not any(choice.train_ns for choice in choices):
+        message = "the cameras of this run have no frames to learn from. Record a longer scan."
+        raise NoFramesError(message)
+    return choices
+
+
+def _in_one_frame(choices: list[FrameChoice], output: Output) -> list[FrameChoice]:
+    """Keep the cameras whose poses share a root frame with the first, recorded poses first."""
+    ordered = sorted(choices, key=lambda choice: choice.poses.source == "odometry")
+    if not ordered:
+        return choices
+    kept = [choice for choice in choices if root_frame(choice) == root_frame(ordered[0])]
+    for choice in choices:
+        if root_frame(choice) != root_frame(ordered[0]):
+            output.say(
+                f"camera {choice.camera_id} of {choice.episode.info.id} is left out: its poses are "
+                f"in frame {root_frame(choice)!r}, and nothing says where that is in "
+                f"{root_frame(ordered[0])!r}"
+            )
+    return kept
+
+
+def root_frame(choice: FrameChoice) -> str:
+    """Name of the frame a choice's poses are in.
+
+    Odometry of every recording starts anew, so its frames carry the recording's name.
+    """
+    frame_id = streams.camera_info(choice.episode, choice.camera_id).frame_id
+    return choice.poses.tree.root_of(frame_id)
+
+
+def _choose(
+    episode: Episode,
+    camera_id: str,
+    config: FrameConfig,
+    output: Output,
+    calibration: Calibration | None,
+) -> FrameChoice:
+    stamps = np.array(list(_paired_stamps(episode, camera_id)), dtype=np.int64)
+    held = stamps[config.first_holdout :: config.holdout_every]
+    poses = find_poses(
+        episode, camera_id, stamps, frozenset(held.tolist()), config, output, calibration
+    )
+    unposed = np.array(sorted(poses.unposed_ns), dtype=np.int64)
+    still = _stands_still(episode, camera_id, poses, np.setdiff1d(stamps, unposed))
+    train_count, holdout_count = config.max_train_frames, config.max_holdout_frames
+    if still:
+        train_count = min(train_count, STILL_TRAIN_FRAMES)
+        holdout_count = min(holdout_count, STILL_HOLDOUT_FRAMES)
+    held = np.setdiff1d(held, unposed)
+    if config.train_every:
+        rest = np.setdiff1d(stamps[:: config.train_every], np.concatenate([held, unposed]))
+        train = spread(rest, train_count)
+    else:
+        rest = np.setdiff1d(stamps, np.concatenate([held, unposed]))
+        train = _pick(episode, camera_id, poses, rest, train_count, still=still)
+    return FrameChoice(
+        episode=episode,
+        camera_id=camera_id,
+        still=still,
+        train_ns=frozenset(train.tolist()),
+        holdout_ns=frozenset(spread(held, holdout_count).tolist()),
+        poses=poses,
+        spare_ns=frozenset(np.setdiff1d(rest, train).tolist()),
+    )
+
+
+def _pick(
+    episode: Episode,
+    camera_id: str,
+    poses: CameraPoses,
+    stamps: Int[np.ndarray, " num_frames"],
+    count: int,
+    *,
+    still: bool,
+) -> Int[np.ndarray, " num_picked"]:
+    if len(stamps) == 0:
+        return stamps
+    info = streams.camera_info(episode, camera_id)
+    if still:
+        smear = select.robot_smear_px(episode, stamps, info.camera.fx)
+    else:
+        smear = select.smear_px(poses.tree, info.frame_id, stamps, info.camera.fx)
+    path = select.path_length_m(poses.tree.Ts_root_frame(info.frame_id, stamps))
+    return select.pick(
+        stamps,
+        path,
+        smear,
+        count,
+        lambda wanted: select.sharpness_at(episode, camera_id, wanted),
+    )
+
+
+def spread(values: np.ndarray, count: int) -> np.ndarray:
+    """Pick at most ``count`` values at even distances, both ends included."""
+    if len(values) <= count:
+        return values
+    return np.asarray(values[np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))])
+
+
+def _stands_still(
+    episode: Episode, camera_id: str, poses: CameraPoses, stamps: Int[np.ndarray, " num_frames"]
+) -> bool:
+    frame_id = streams.camera_info(episode, camera_id).frame_id
+    Ts = poses.tree.Ts_root_frame(frame_id, spread(stamps, 40))
+    still = all(same_pose(Ts[0], T, distance_m=STILL_M, angle_rad=STILL_RAD) for T in Ts)
+    return still and len(stamps) > 1
+
+
+def _paired_stamps(episode: Episode, camera_id: str) -> Iterator[int]:
+    """Header stamps of colour images with a depth image nearby, as ``load`` will see them."""
+    ending = f"/cam/{camera_id}/"
+    colors, depths = (
+        np.array(
+            [
+                read(message.type_name, message.data).stamp_ns
+                for topic in episode.topics()
+                if topic.endswith(f"{ending}{stream}/image") and not schema.is_truth(topic)
+                for message in episode.messages([topic])
+            ],
+            dtype=np.int64,
+        )
+        for stream, read in (("color", color_from_message), ("depth", DepthImage.from_message))
+    )
+    for stamp in np.unique(colors).tolist() if len(depths) else ():
+        if np.abs(depths - stamp).min() <= streams.PAIRING_TOLERANCE_NS:
+            yield stamp
+
+
+def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:
+    """Yield the frames of a choice that carry one of the stamps, with the poses it chose."""
+    if not stamps_ns:
+        return
+    last = max(stamps_ns)
+    for frame in streams.rgbd_frames(choice.episode, choice.camera_id, choice.poses.tree):
+        if frame.stamp_ns in stamps_ns:
+            yield _corrected(frame, choice)
+        if frame.stamp_ns >= last:
+            return
+
+
+def _corrected(frame: RgbdFrame, choice: FrameChoice) -> RgbdFrame:
+    if choice.poses.depth_scale != 1.0:
+        frame = replace(frame, depth_m=frame.depth_m * choice.poses.depth_scale)
+    T_new_old = choice.corrections.get(frame.stamp_ns)
+    if T_new_old is None:
+        return frame
+    return replace(
+        frame,
+        T_base_color=T_new_old @ frame.T_base_color,
+        T_base_depth=T_new_old @ frame.T_base_depth,
+    )

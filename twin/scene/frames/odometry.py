@@ -1,0 +1,362 @@
+"""Follow a hand-held RGB-D camera by its own images, where nobody recorded poses.
+
+Each frame is laid onto the last keyframe by Open3D's hybrid photometric and geometric odometry
+(Park, Zhou, Koltun 2017); keyframes that see the same place again are tied together, and the
+pose graph is solved (Choi, Zhou, Koltun 2015). The gauge is the first keyframe.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode.streams import RgbdFrame
+from bridge.errors import MissingDependencyError
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.terminal import Advance
+from twin.errors import TwinError
+from twin.scene.frames.thumb import Thumb, colors_in_depth, meet, thumb_of
+
+SURE = 0.9
+"""A frame that fits this nearly as well as the one before needs no second guess."""
+
+
+class LostError(TwinError):
+    """The camera cannot be followed by its images."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackConfig:
+    """How a camera is followed."""
+
+    max_depth_m: float
+    """Depth beyond is not used."""
+    width_px: int = 320
+    """Images are thinned to about this width."""
+    depth_difference_m: float = 0.07
+    """Pixels whose depths differ by more under the present guess are not the same point."""
+    key_shift_m: float = 0.12
+    key_turn_rad: float = 0.2
+    """A camera that has come this far from its keyframe gets a new one."""
+    min_overlap: float = 0.3
+    min_agreement: float = 0.5
+    min_likeness: float = 0.6
+    """A pose is believed when two images meet and agree by these shares, and their brightness
+    correlates: depth alone lets a plane slide along itself."""
+    pyramid: tuple[int, ...] = (20, 20, 10, 5)
+    """Iterations per level, the coarsest first."""
+    loop_shift_m: float = 0.6
+    loop_turn_rad: float = 0.6
+    """Keyframes nearer to each other than both are tied."""
+    max_loops: int = 30
+    min_placed: float = 0.5
+    """With a smaller share of frames placed, the camera counts as lost."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraPath:
+    """Poses of the depth camera in the frame of the first keyframe."""
+
+    Ts_first_depth: Mapping[int, Float[np.ndarray, "4 4"]]
+    """By colour stamp [ns]; frames that could not be placed are missing."""
+    quality: Mapping[str, Any]
+    """Counts, and the share of depth that agrees between neighbouring keyframes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step:
+    """One image laid onto another."""
+
+    T_target_source: Float[np.ndarray, "4 4"]
+    information: Float[np.ndarray, "6 6"]
+    score: float
+    """Agreement of depth times likeness of brightness."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Look:
+    """What is kept of one frame."""
+
+    thumb: Thumb
+    image: Any
+
+
+class Aligner:
+    """Lays one RGB-D image onto another."""
+
+    def __init__(self, config: TrackConfig) -> None:
+        """Load Open3D."""
+        try:
+            import open3d  # noqa: PLC0415  # heavy, and only scans without poses need it
+        except ImportError as error:
+            raise MissingDependencyError(
+                package="open3d", extra="twin", purpose="following a camera without poses"
+            ) from error
+        self.config = config
+        self.open3d: Any = open3d
+        self._term = open3d.pipelines.odometry.RGBDOdometryJacobianFromHybridTerm()
+        self._option = open3d.pipelines.odometry.OdometryOption(
+            iteration_number_per_pyramid_level=open3d.utility.IntVector(config.pyramid),
+            depth_diff_max=config.depth_difference_m,
+            depth_min=0.05,
+            depth_max=config.max_depth_m,
+        )
+
+    def look(self, frame: RgbdFrame) -> Look:
+        """Thin a frame; colour is looked up for each depth pixel."""
+        thumb = thumb_of(frame, self.config.width_px)
+        step = round(frame.depth_camera.fx / thumb.camera.fx)
+        colors = np.ascontiguousarray(colors_in_depth(frame, step))
+        thumb = replace(thumb, grey=colors.mean(axis=2, dtype=np.float32))
+        image = self.open3d.geometry.RGBDImage.create_from_color_and_depth(
+            self.open3d.geometry.Image(colors),
+            self.open3d.geometry.Image(np.ascontiguousarray(thumb.depth_m)),
+            depth_scale=1.0,
+            depth_trunc=self.config.max_depth_m,
+            convert_rgb_to_intensity=True,
+        )
+        return Look(thumb=thumb, image=image)
+
+    def lay(self, source: Look, target: Look, T_guess: Float[np.ndarray, "4 4"]) -> Step | None:
+        """Lay one frame onto another, from a guess; None when they then disagree."""
+        success, T, information = self.open3d.pipelines.odometry.compute_rgbd_odometry(
+            source.image,
+            target.image,
+            self._pinhole(source.thumb.camera),
+            T_guess,
+            self._term,
+            self._option,
+        )
+        T = np.array(T)
+        if not success or not np.isfinite(T).all():
+            return None
+        met = meet(source.thumb, target.thumb, T)
+        config = self.config
+        if met.overlap < config.min_overlap or met.agreement < config.min_agreement:
+            return None
+        if met.likeness < config.min_likeness:
+            return None
+        score = met.agreement * met.likeness
+        return Step(T_target_source=T, information=np.array(information), score=score)
+
+    def _pinhole(self, camera: Camera) -> Any:
+        fx, fy, cx, cy = camera.to_ros()
+        return self.open3d.camera.PinholeCameraIntrinsic(
+            camera.width, camera.height, fx, fy, cx, cy
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Keyframe:
+    """A frame others are laid onto."""
+
+    look: Look
+    T_first_key: Float[np.ndarray, "4 4"]
+    from_previous: Step | None
+    """How it lies to the keyframe before it."""
+
+
+class _Follower:
+    """Goes through the frames in time order."""
+
+    def __init__(self, aligner: Aligner) -> None:
+        self.aligner = aligner
+        self.keys: list[Keyframe] = []
+        self.places: dict[int, tuple[int, np.ndarray]] = {}
+        """Keyframe and ``T_key_frame`` of each placed frame."""
+        self._last: tuple[Look, Step] | None = None
+        self._motion = np.eye(4)
+        self._early: list[Look] = []
+
+    def take(self, look: Look, *, held_out: bool) -> None:
+        """Place one frame; one that is held out leaves no trace in what comes after."""
+        if not self.keys:
+            if held_out:
+                self._early.append(look)
+                return
+            self._begin(look)
+            return
+        step = self._place(look, may_promote=not held_out)
+        if step is None:
+            self._motion = self._motion if held_out else np.eye(4)
+            return
+        self.places[look.thumb.stamp_ns] = (len(self.keys) - 1, step.T_target_source)
+        if not held_out:
+            before = np.eye(4) if self._last is None else self._last[1].T_target_source
+            self._motion = se3.invert(before) @ step.T_target_source
+            self._last = (look, step)
+            if self._is_far(step.T_target_source):
+                self._promote()
+
+    def _begin(self, look: Look) -> None:
+        self.keys.append(Keyframe(look=look, T_first_key=np.eye(4), from_previous=None))
+        self.places[look.thumb.stamp_ns] = (0, np.eye(4))
+        for early in self._early:
+            self.take(early, held_out=True)
+
+    def _place(self, look: Look, *, may_promote: bool) -> Step | None:
+        """Lay a frame onto the keyframe, or else onto the last frame, made a keyframe."""
+        last = np.eye(4) if self._last is None else self._last[1].T_target_source
+        best = self._best(look, (last @ self._motion, last))
+        if best is not None or not may_promote or self._last is None:
+            return best
+        self._promote()
+        return self._best(look, (self._motion, np.eye(4)))
+
+    def _best(self, look: Look, guesses: tuple[np.ndarray, ...]) -> Step | None:
+        """The better of what several guesses lead to: with the motion so far, and without."""
+        usual = 0.0 if self._last is None else SURE * self._last[1].score
+        found = []
+        for guess in guesses:
+            step = self.aligner.lay(look, self.keys[-1].look, guess)
+            if step is not None:
+                found.append(step)
+                if 0.0 < usual <= step.score:
+                    break
+        return max(found, key=lambda step: step.score) if found else None
+
+    def _promote(self) -> None:
+        """Make the last frame a keyframe."""
+        if self._last is None:
+            return
+        look, step = self._last
+        T_first_key = self.keys[-1].T_first_key @ step.T_target_source
+        self.keys.append(Keyframe(look=look, T_first_key=T_first_key, from_previous=step))
+        self.places[look.thumb.stamp_ns] = (len(self.keys) - 1, np.eye(4))
+        self._last = None
+
+    def _is_far(self, T_key_frame: np.ndarray) -> bool:
+        config = self.aligner.config
+        turn = float(se3.rotation_angle_rad(T_key_frame[:3, :3]))
+        shift = float(np.linalg.norm(T_key_frame[:3, 3]))
+        return turn > config.key_turn_rad or shift > config.key_shift_m
+
+
+def follow_camera(
+    frames: Iterable[RgbdFrame],
+    held_out_ns: frozenset[int],
+    config: TrackConfig,
+    advance: Advance,
+) -> CameraPath:
+    """Follow a camera through its frames.
+
+    Args:
+        frames: In time order; their poses are not looked at, except how colour lies to depth.
+        held_out_ns: Stamps of frames that are placed, but do not help to place others.
+        config: Settings.
+        advance: Told how many frames are done.
+
+    Raises:
+        LostError: When most frames cannot be placed.
+        MissingDependencyError: Without Open3D.
+    """
+    aligner = Aligner(config)
+    follower = _Follower(aligner)
+    total = 0
+    for total, frame in enumerate(frames, start=1):
+        follower.take(aligner.look(frame), held_out=frame.stamp_ns in held_out_ns)
+        advance(total, f"{len(follower.keys)} keyframes")
+    if not follower.keys or len(follower.places) < max(2, config.min_placed * total):
+        message = (
+            f"/tf has no poses for this camera, and RGB-D odometry could place only "
+            f"{len(follower.places)} of its {total} frames. Record the camera's poses on /tf, or "
+            "scan again slowly with textured surfaces near the camera."
+        )
+        raise LostError(message)
+    loops = _find_loops(follower.keys, aligner)
+    Ts_first_key = _solve(follower.keys, loops, aligner)
+    moved = [
+        float(np.linalg.norm(T[:3, 3] - key.T_first_key[:3, 3]))
+        for T, key in zip(Ts_first_key, follower.keys, strict=True)
+    ]
+    return CameraPath(
+        Ts_first_depth={
+            stamp_ns: Ts_first_key[index] @ T_key_frame
+            for stamp_ns, (index, T_key_frame) in sorted(follower.places.items())
+        },
+        quality={
+            "frames": total,
+            "placed": len(follower.places),
+            "keyframes": len(follower.keys),
+            "loop_closures": len(loops),
+            "largest_correction_m": round(max(moved), 4),
+            "agreement": round(_agreement(follower.keys, Ts_first_key), 4),
+        },
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Loop:
+    source: int
+    target: int
+    step: Step
+
+
+def _find_loops(keys: list[Keyframe], aligner: Aligner) -> list[_Loop]:
+    """Tie keyframes that see the same place, but do not follow each other; nearest first."""
+    config = aligner.config
+    near = []
+    for target in range(len(keys)):
+        for source in range(target + 2, len(keys)):
+            guess = se3.invert(keys[target].T_first_key) @ keys[source].T_first_key
+            shift = float(np.linalg.norm(guess[:3, 3]))
+            turn = float(se3.rotation_angle_rad(guess[:3, :3]))
+            if shift < config.loop_shift_m and turn < config.loop_turn_rad:
+                near.append((shift + 0.5 * turn, source, target, guess))
+    near.sort(key=lambda item: item[:3])
+    loops = []
+    for _, source, target, guess in near[: config.max_loops]:
+        step = aligner.lay(keys[source].look, keys[target].look, guess)
+        if step is not None:
+            loops.append(_Loop(source=source, target=target, step=step))
+    return loops
+
+
+def _solve(
+    keys: list[Keyframe], loops: list[_Loop], aligner: Aligner
+) -> list[Float[np.ndarray, "4 4"]]:
+    """Spread what the loops say over the path; the first keyframe stays."""
+    if not loops:
+        return [key.T_first_key for key in keys]
+    tools = aligner.open3d.pipelines.registration
+    graph = tools.PoseGraph()
+    graph.nodes.extend([tools.PoseGraphNode(key.T_first_key) for key in keys])
+    for index, key in enumerate(keys):
+        if key.from_previous is not None:
+            graph.edges.append(_edge(tools, index, index - 1, key.from_previous, uncertain=False))
+    for loop in loops:
+        graph.edges.append(_edge(tools, loop.source, loop.target, loop.step, uncertain=True))
+    tools.global_optimization(
+        graph,
+        tools.GlobalOptimizationLevenbergMarquardt(),
+        tools.GlobalOptimizationConvergenceCriteria(),
+        tools.GlobalOptimizationOption(
+            max_correspondence_distance=aligner.config.depth_difference_m,
+            edge_prune_threshold=0.25,
+            reference_node=0,
+        ),
+    )
+    T_key_first = se3.invert(np.array(graph.nodes[0].pose))
+    return [T_key_first @ np.array(node.pose) for node in graph.nodes]
+
+
+def _edge(tools: Any, source: int, target: int, step: Step, *, uncertain: bool) -> Any:
+    return tools.PoseGraphEdge(
+        source, target, step.T_target_source, step.information, uncertain=uncertain
+    )
+
+
+def _agreement(keys: list[Keyframe], Ts_first_key: list[np.ndarray]) -> float:
+    """Mean share of the depth that agrees between neighbouring keyframes."""
+    met = [
+        meet(
+            keys[i + 1].look.thumb,
+            keys[i].look.thumb,
+            se3.invert(Ts_first_key[i]) @ Ts_first_key[i + 1],
+        ).agreement
+        for i in range(len(keys) - 1)
+    ]
+    return float(np.mean(met)) if met else 1.0

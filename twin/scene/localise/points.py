@@ -1,0 +1,227 @@
+"""From frames to the coloured points of one object: average stills, back-project, cluster."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from bridge.episode.streams import RgbdFrame
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.task.task_file import ObjectModel, Task
+from twin.scene.frames.still import same_pose
+from twin.scene.localise.colour import ColourConfig, likeness, linear_from_srgb
+
+STILL_DISTANCE_M = 5e-4
+STILL_ANGLE_RAD = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointConfig:
+    """Which points belong to an object."""
+
+    min_likeness: float = 0.6
+    """Of a point's colour, see ``likeness``."""
+    min_height_m: float = 0.003
+    """Above the table; lower points may be a reflection or a shadow's fringe."""
+    max_height_m: float = 0.5
+    """Above the table."""
+    margin_m: float = 0.25
+    """How far beyond its start range an object is looked for."""
+    voxel_m: float = 0.002
+    """Points of one voxel are averaged."""
+    cluster_gap_m: float = 0.008
+    """Wider gaps separate clusters."""
+    min_points: int = 40
+    """Fewer voxels than this do not make an object."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One camera pose: the mean of its still frames, with the points it sees."""
+
+    camera_id: str
+    stamp_ns: int
+    num_frames: int
+    image_linear: Float[np.ndarray, "height width 3"]
+    depth_m: Float[np.ndarray, "depth_height depth_width"]
+    color_camera: Camera
+    depth_camera: Camera
+    T_base_color: Float[np.ndarray, "4 4"]
+    T_base_depth: Float[np.ndarray, "4 4"]
+    p_base: Float[np.ndarray, "num_points 3"]
+    """Points with valid depth over the searched part of the table [m]."""
+    color_linear: Float[np.ndarray, "num_points 3"]
+    """Linear light of each point; 0 where the colour camera does not see it."""
+
+
+def fuse_stills(
+    frames: Sequence[RgbdFrame], max_frames: int, max_views: int, task: Task, config: PointConfig
+) -> list[View]:
+    """Average the last frames of each camera that were taken from one pose.
+
+    Frames of a camera that moved in between make separate views, the newest are kept. Depth is
+    averaged over the frames that measured a pixel, if at least half of them did.
+    """
+    groups: list[list[RgbdFrame]] = []
+    for frame in sorted(frames, key=lambda item: -item.stamp_ns):
+        for group in groups:
+            if _same_pose(group[0], frame):
+                group.append(frame)
+                break
+        else:
+            groups.append([frame])
+    views: list[View] = []
+    for group in groups:
+        if sum(view.camera_id == group[0].camera_id for view in views) < max_views:
+            views.append(_view(group[:max_frames], task, config))
+    return sorted(views, key=lambda view: (view.camera_id, view.stamp_ns))
+
+
+def _same_pose(a: RgbdFrame, b: RgbdFrame) -> bool:
+    if a.camera_id != b.camera_id or a.depth_m.shape != b.depth_m.shape:
+        return False
+    return same_pose(
+        a.T_base_depth, b.T_base_depth, distance_m=STILL_DISTANCE_M, angle_rad=STILL_ANGLE_RAD
+    )
+
+
+def _view(frames: Sequence[RgbdFrame], task: Task, config: PointConfig) -> View:
+    newest = frames[0]
+    depths = np.stack([frame.depth_m for frame in frames]).astype(np.float64)
+    measured = np.isfinite(depths) & (depths > 0)
+    count = measured.sum(axis=0)
+    depth = np.where(measured, depths, 0.0).sum(axis=0) / np.maximum(count, 1)
+    depth[2 * count < len(frames)] = 0.0
+    image = np.mean([linear_from_srgb(frame.image_u8) for frame in frames], axis=0)
+    p_base = se3.apply(newest.T_base_depth, newest.depth_camera.unproject(depth)[depth > 0])
+    p_base = p_base[_in_search_area(p_base, task, config)]
+    return View(
+        camera_id=newest.camera_id,
+        stamp_ns=newest.stamp_ns,
+        num_frames=len(frames),
+        image_linear=image,
+        depth_m=depth,
+        color_camera=newest.color_camera,
+        depth_camera=newest.depth_camera,
+        T_base_color=newest.T_base_color,
+        T_base_depth=newest.T_base_depth,
+        p_base=p_base,
+        color_linear=_sample(image, newest.color_camera, newest.T_base_color, p_base),
+    )
+
+
+def _sample(
+    image: Float[np.ndarray, "height width 3"],
+    camera: Camera,
+    T_base_camera: Float[np.ndarray, "4 4"],
+    p_base: Float[np.ndarray, "num_points 3"],
+) -> Float[np.ndarray, "num_points 3"]:
+    """Nearest pixel's colour of each point; 0 outside the image."""
+    p_camera = se3.apply(se3.invert(T_base_camera), p_base)
+    ahead = p_camera[:, 2] > 1e-6
+    p_camera[~ahead, 2] = 1.0
+    uv, _ = camera.project(p_camera)
+    inside = ahead & np.all((uv >= 0) & (uv < (camera.width, camera.height)), axis=1)
+    column_row = np.where(inside[:, None], uv, 0.0).astype(np.int64)
+    return np.where(inside[:, None], image[column_row[:, 1], column_row[:, 0]], 0.0)
+
+
+def moved(view: View, T_new_old: Float[np.ndarray, "4 4"], depth_factor: float) -> View:
+    """The same view with its cameras moved in the base frame and its depth scaled."""
+    T_base_depth = T_new_old @ view.T_base_depth
+    p_depth = se3.apply(se3.invert(view.T_base_depth), view.p_base) * depth_factor
+    return replace(
+        view,
+        depth_m=view.depth_m * depth_factor,
+        T_base_color=T_new_old @ view.T_base_color,
+        T_base_depth=T_base_depth,
+        p_base=se3.apply(T_base_depth, p_depth),
+    )
+
+
+def _in_search_area(
+    p_base: Float[np.ndarray, "num_points 3"], task: Task, config: PointConfig
+) -> Bool[np.ndarray, " num_points"]:
+    """Points over the part of the table where any object of the task may be."""
+    wanted: Bool[np.ndarray, " num_points"] = np.abs(p_base[:, 2]) < config.max_height_m
+    starts = task.start.values()
+    for axis, limits in enumerate(([s.x_m for s in starts], [s.y_m for s in starts])):
+        if limits:
+            low = min(limit[0] for limit in limits) - config.margin_m
+            high = max(limit[1] for limit in limits) + config.margin_m
+            wanted &= (p_base[:, axis] >= low) & (p_base[:, axis] <= high)
+    return wanted
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cluster:
+    """Points that belong together, and the view each came from."""
+
+    p_base: Float[np.ndarray, "num_points 3"]
+    view_ids: Int[np.ndarray, " num_points"]
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.p_base)
+
+    def thinned(self, max_points: int) -> "Cluster":
+        """Keep every so many points, evenly."""
+        step = -(-len(self) // max_points) if len(self) else 1
+        return Cluster(p_base=self.p_base[::step], view_ids=self.view_ids[::step])
+
+
+def object_points(
+    views: Sequence[View], model: ObjectModel, config: PointConfig, colour: ColourConfig
+) -> list[Cluster]:
+    """Clusters of voxel-averaged points of an object's colour, largest first."""
+    parts = []
+    for view in views:
+        p = view.p_base
+        wanted = p[:, 2] > config.min_height_m
+        p, color = p[wanted], view.color_linear[wanted]
+        alike = likeness(color, model.color_srgb, colour) >= config.min_likeness
+        parts.append(voxel_mean(p[alike], config.voxel_m))
+    if not parts:
+        return []
+    view_ids = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    return clusters(np.concatenate(parts), view_ids, config.cluster_gap_m)
+
+
+def voxel_mean(
+    points: Float[np.ndarray, "num_points 3"], voxel_m: float
+) -> Float[np.ndarray, "num_voxels 3"]:
+    """Replace the points of each occupied voxel by their mean."""
+    if len(points) == 0:
+        return points
+    keys = np.floor(points / voxel_m).astype(np.int64)
+    keys -= keys.min(axis=0)
+    spans = keys.max(axis=0) + 1
+    flat = (keys[:, 0] * spans[1] + keys[:, 1]) * spans[2] + keys[:, 2]
+    _, index, count = np.unique(flat, return_inverse=True, return_counts=True)
+    sums = [np.bincount(index, weights=points[:, axis]) for axis in range(3)]
+    return np.stack(sums, axis=1) / count[:, None]
+
+
+def clusters(
+    points: Float[np.ndarray, "num_points 3"],
+    view_ids: Int[np.ndarray, " num_points"],
+    gap_m: float,
+) -> list[Cluster]:
+    """Connected groups seen from above, largest first."""
+    if len(points) == 0:
+        return []
+    cells = np.floor(points[:, :2] / (gap_m / 2)).astype(np.int64)
+    cells -= cells.min(axis=0)
+    grid = np.zeros(cells.max(axis=0) + 1, dtype=bool)
+    grid[cells[:, 0], cells[:, 1]] = True
+    near = ndimage.binary_dilation(grid, structure=np.ones((3, 3), dtype=bool))
+    labels, num = ndimage.label(near, structure=np.ones((3, 3), dtype=np.int64))
+    label_of_point = labels[cells[:, 0], cells[:, 1]]
+    groups = [
+        Cluster(p_base=points[label_of_point == label], view_ids=view_ids[label_of_point == label])
+        for label in range(1, num + 1)
+    ]
+    return sorted(groups, key=lambda group: -len(group))

@@ -1,0 +1,210 @@
+"""What localisation says of one object: its pose with how sure it is, or why there is none."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry import se3
+from bridge.task.record import check_record
+from bridge.task.task_file import ObjectModel
+from twin.scene.localise.fit import ShapeFit
+from twin.scene.localise.mesh import MeshFit
+from twin.scene.shape.known import (
+    pose_of,
+    rectangle_yaw_rad,
+    rest_height_m,
+    surface_distances,
+    yaw_period_rad,
+)
+
+SCHEMA_VERSION = 1
+METHOD = "colour_shape_fit"
+MESH_METHOD = "colour_mesh_icp"
+BOX_METHOD = "colour_box"
+BOXED_M = 0.01
+"""A point of a thing that is only boxed in lies this near to the box."""
+UPRIGHT = 0.98
+"""Cosine of the tilt up to which an object stands."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalisedObject:
+    """One object's pose, or the reason why there is none."""
+
+    object_id: str
+    found: bool
+    T_base_object: Float[np.ndarray, "4 4"] | None
+    covariance: Float[np.ndarray, "6 6"] | None
+    """Of (x, y, z, rotation about x, y, z), base frame [m^2, m rad, rad^2]."""
+    confidence: float
+    """0 to 1: the share of points and outline that the fitted shape explains."""
+    method: str
+    reason: str | None
+    stamp_ns: int
+    symmetry: str = "none"
+    detail: Mapping[str, Any] = field(default_factory=dict)
+    """Numbers behind the pose: points, residuals, what the table said of the cameras."""
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the gst localisation v1 record, checked against its schema."""
+        pose = None
+        if self.T_base_object is not None:
+            q, p = se3.split(self.T_base_object)
+            pose = {"p_m": p.tolist(), "q_wxyz": q.tolist()}
+        record = {
+            "schema_version": SCHEMA_VERSION,
+            "stamp_ns": self.stamp_ns,
+            "object": self.object_id,
+            "found": self.found,
+            "T_base_object": pose,
+            "covariance": None if self.covariance is None else self.covariance.ravel().tolist(),
+            "symmetry": self.symmetry,
+            "confidence": self.confidence,
+            "method": self.method,
+            "reason": self.reason,
+            **self.detail,
+        }
+        check_record(record, name="localisation")
+        return record
+
+
+def missing(
+    model: ObjectModel, stamp_ns: int, reason: str, detail: Mapping[str, Any]
+) -> LocalisedObject:
+    """Say why an object was not found."""
+    return LocalisedObject(
+        object_id=model.id,
+        found=False,
+        T_base_object=None,
+        covariance=None,
+        confidence=0.0,
+        method=METHOD if model.mesh is None else MESH_METHOD,
+        reason=reason,
+        stamp_ns=stamp_ns,
+        symmetry=model.symmetry,
+        detail=detail,
+    )
+
+
+def found_by_mesh(
+    model: ObjectModel,
+    fit: MeshFit,
+    stamp_ns: int,
+    rest_tolerance_m: float,
+    detail: dict[str, Any],
+) -> LocalisedObject:
+    """Turn a fitted mesh into a result; what nearly stands on the table stands on it."""
+    T = fit.T_base_object.copy()
+    lift_m = float(T[2, 3]) - rest_height_m(model)
+    detail |= {
+        "residual_m": fit.residual_m,
+        "seen_through_fraction": fit.seen_through,
+        "lift_m": lift_m,
+    }
+    reason = None
+    stands = bool(T[2, 2] > UPRIGHT) and abs(lift_m) <= rest_tolerance_m
+    if stands:
+        T[2, 3] = rest_height_m(model)
+    else:
+        tilt = np.degrees(np.arccos(np.clip(T[2, 2], -1, 1)))
+        reason = (
+            f"{model.id} is {lift_m * 1e3:+.0f} mm from standing on the table, "
+            f"tilted by {tilt:.0f} degrees"
+        )
+    if model.soft is None and stands:
+        T = reduce_by_symmetry(T, model)
+    return LocalisedObject(
+        object_id=model.id,
+        found=True,
+        T_base_object=T,
+        covariance=fit.covariance,
+        confidence=fit.explained * (1 - fit.seen_through),
+        method=MESH_METHOD,
+        reason=reason,
+        stamp_ns=stamp_ns,
+        symmetry=model.symmetry,
+        detail=detail,
+    )
+
+
+def found_by_shape(
+    model: ObjectModel,
+    fit: ShapeFit,
+    stamp_ns: int,
+    rest_tolerance_m: float,
+    detail: dict[str, Any],
+) -> LocalisedObject:
+    """Turn a fitted shape into a result; what nearly stands on the table stands on it."""
+    T = reduce_by_symmetry(fit.T_base_object, model)
+    lift_m = float(T[2, 3]) - rest_height_m(model)
+    detail["lift_m"] = lift_m
+    reason = None
+    if abs(lift_m) <= rest_tolerance_m:
+        T[2, 3] = rest_height_m(model)
+    else:
+        reason = f"{model.id} is {lift_m * 1e3:+.0f} mm from standing on the table"
+    return LocalisedObject(
+        object_id=model.id,
+        found=True,
+        T_base_object=T,
+        covariance=fit.covariance,
+        confidence=fit.explained,
+        method=METHOD,
+        reason=reason,
+        stamp_ns=stamp_ns,
+        symmetry=model.symmetry,
+        detail=detail,
+    )
+
+
+def found_by_box(
+    model: ObjectModel,
+    points: Float[np.ndarray, "num_points 3"],
+    stamp_ns: int,
+    detail: dict[str, Any],
+) -> LocalisedObject:
+    """Box in a thing whose shape nobody knows yet; it stands on the table.
+
+    The box of the stated size lies over the middle of the points, along the smallest rectangle
+    around them. Its frame is a name for the place, good enough to reconstruct the thing in: which
+    side is the front is whatever came out.
+    """
+    yaw = rectangle_yaw_rad(points[:, :2])
+    c, s = np.cos(yaw), np.sin(yaw)
+    local = points[:, :2] @ np.array([[c, -s], [s, c]])
+    low, high = np.percentile(local, [1, 99], axis=0)
+    if (high - low)[0] < (high - low)[1] and model.size_m[0] > model.size_m[1]:
+        yaw += np.pi / 2
+    u, v = (low + high) / 2
+    T = pose_of(np.array([c * u - s * v, s * u + c * v, rest_height_m(model), yaw]))
+    away, _ = surface_distances(points, model, T)
+    half = np.array([*(high - low) / 2, model.size_m[2] / 2])
+    spread = np.concatenate([half / 4, np.array([0.02, 0.02, 0.3])])
+    return LocalisedObject(
+        object_id=model.id,
+        found=True,
+        T_base_object=T,
+        covariance=np.diag(np.square(spread)),
+        confidence=float((away < BOXED_M).mean()),
+        method=BOX_METHOD,
+        reason=f"the shape of {model.id} is not known yet: only boxed in",
+        stamp_ns=stamp_ns,
+        symmetry=model.symmetry,
+        detail=detail,
+    )
+
+
+def reduce_by_symmetry(
+    T_base_object: Float[np.ndarray, "4 4"], model: ObjectModel
+) -> Float[np.ndarray, "4 4"]:
+    """Choose the yaw nearest zero among those that look the same."""
+    period = yaw_period_rad(model)
+    yaw = np.arctan2(T_base_object[1, 0], T_base_object[0, 0])
+    reduced = np.mod(yaw + period / 2, period) - period / 2
+    T = T_base_object.copy()
+    c, s = np.cos(reduced), np.sin(reduced)
+    T[:2, :2] = [[c, -s], [s, c]]
+    return T

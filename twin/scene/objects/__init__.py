@@ -1,0 +1,1 @@
+"""Objects as parts of a scene that can be moved."""

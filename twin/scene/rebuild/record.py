@@ -1,0 +1,192 @@
+"""What ``scene.json`` says: where the scene came from, how it was made, how good it is."""
+
+import resource
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from bridge.episode import provenance, streams
+from twin.scene.fit.run import FitResult
+from twin.scene.frames.camera_poses import SAYS
+from twin.scene.frames.choice import FrameChoice, Sources, root_frame
+from twin.scene.learn.read import Learnt
+from twin.scene.settings import FrameConfig, RebuildConfig
+from twin.scene.store.folder import BACKGROUND, SCENE_VERSION
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """What a rebuild took so far."""
+
+    seconds: float
+    """Wall time."""
+    cpu_seconds: float
+    """Of all threads."""
+    stages_s: Mapping[str, float] = field(default_factory=dict)
+    """Wall time of each stage."""
+
+    def to_record(self) -> dict[str, Any]:
+        """What ``scene.json`` says."""
+        return {
+            "seconds": round(self.seconds, 2),
+            "cpu_seconds": round(self.cpu_seconds, 2),
+            "peak_memory_mb": round(peak_memory_mb()),
+            "stages_s": {name: round(seconds, 2) for name, seconds in self.stages_s.items()},
+        }
+
+
+def peak_memory_mb() -> float:
+    """Most memory this process ever held resident, in 10^6 bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
+
+
+def make_record(
+    *,
+    key: str,
+    scene_hash: str,
+    sources: Sources,
+    learnt: Learnt,
+    config: RebuildConfig,
+    fitted: FitResult,
+    views: Mapping[str, Any],
+    num_background: int,
+    cost: Cost,
+) -> dict[str, Any]:
+    """Put together the content of ``scene.json``."""
+    settings = asdict(config)
+    settings.pop("force")
+    return {
+        "schema_version": SCENE_VERSION,
+        "key": key,
+        "scene_hash": scene_hash,
+        "frame": root_frame(learnt.choices[0]),
+        "units": {"length": "m", "colour": "sRGB", "quaternion": "wxyz"},
+        "remark": sources.remark,
+        "stand_in": any(episode.info.stand_in for episode in sources.episodes),
+        "sources": [
+            {"id": e.info.id, "kind": e.info.kind, "sha256": e.sha256()} for e in sources.episodes
+        ],
+        "cameras": [camera_record(choice) for choice in learnt.choices],
+        "scan": learnt.report.to_record(),
+        "settings": settings,
+        "background": {"file": BACKGROUND, "num_splats": num_background},
+        "fit": {
+            "num_splats": len(fitted.cloud),
+            "iterations": fitted.iterations,
+            "coarse_iterations": fitted.coarse_iterations,
+            "seconds": round(fitted.seconds, 2),
+            "cpu_seconds": round(fitted.cpu_seconds, 2),
+            "colour_steps": fitted.colour_steps,
+            "train_psnr_db": None
+            if fitted.train_psnr_db is None
+            else round(fitted.train_psnr_db, 3),
+        },
+        "views": dict(views),
+        "cost": cost.to_record(),
+        "seconds": round(cost.seconds, 2),
+        "software": provenance.software(),
+    }
+
+
+def protocol_of(
+    choices: Sequence[FrameChoice], fitted: FitResult, config: RebuildConfig, cost: Cost
+) -> dict[str, Any]:
+    """How the scene was made, as far as whoever rates its views must know."""
+    frames = config.frames
+    return {
+        "holdout": holdout_text(frames),
+        "training": training_text(frames),
+        "train_frames": sum(len(choice.train_ns) for choice in choices),
+        "cameras_from": sorted({SAYS[choice.poses.source] for choice in choices}),
+        "poses_refined": frames.align_poses or config.fit.refine_poses,
+        "num_splats": len(fitted.cloud),
+        "fit_seconds": round(fitted.seconds, 2),
+        "fit_cpu_seconds": round(fitted.cpu_seconds, 2),
+        "rebuild_seconds": round(cost.seconds, 2),
+        "rebuild_cpu_seconds": round(cost.cpu_seconds, 2),
+        "peak_memory_mb": round(peak_memory_mb()),
+    }
+
+
+def holdout_text(frames: FrameConfig) -> str:
+    """Which frames were held out, in words."""
+    return (
+        f"frame {frames.first_holdout} and every {frames.holdout_every}th after it of each camera, "
+        f"at most {frames.max_holdout_frames} in all"
+    )
+
+
+def training_text(frames: FrameConfig) -> str:
+    """Which frames were learnt from, in words."""
+    if frames.train_every:
+        return f"frame 0 and every {frames.train_every}th after it, but no held-out one"
+    return "of the others the stillest and sharpest of each stretch of the camera's path"
+
+
+def camera_record(choice: FrameChoice) -> dict[str, Any]:
+    """What ``scene.json`` says about one camera of one episode."""
+    camera = streams.camera_info(choice.episode, choice.camera_id).camera
+    return {
+        "episode": choice.episode.info.id,
+        "id": choice.camera_id,
+        "still": choice.still,
+        "poses_from": choice.poses.source,
+        "poses_quality": dict(choice.poses.quality),
+        "poses_corrected": len(choice.corrections),
+        "frames_without_pose": len(choice.poses.unposed_ns),
+        "train_frames": len(choice.train_ns),
+        "holdout_frames": len(choice.holdout_ns),
+        "color": asdict(camera),
+    }
+
+
+def describe_scene(record: Mapping[str, Any]) -> str:
+    """Say in a few lines what was rebuilt and how well."""
+    fitted, cost = record["fit"], record["cost"]
+    lines = [
+        f"scene {record['scene_hash']}: {record['background']['num_splats']} Gaussians"
+        + (" (stand-in)" if record["stand_in"] else ""),
+        f"fit: {fitted['iterations']} images in {fitted['seconds']:.1f} s"
+        + (
+            ""
+            if fitted["train_psnr_db"] is None
+            else f", training PSNR {fitted['train_psnr_db']:.2f} dB where nothing moved"
+        ),
+        f"took {cost['seconds']:.0f} s, {cost['cpu_seconds']:.0f} CPU seconds, "
+        f"{cost['peak_memory_mb']} MB at most",
+    ]
+    lines += [
+        f"camera {item['id']} of {item['episode']}: {item['train_frames']} frames learnt, "
+        f"{item['holdout_frames']} held out; poses from {SAYS[item['poses_from']]}"
+        for item in record["cameras"]
+    ]
+    lines += _view_lines(record["views"])
+    lines += record["scan"]["remarks"]
+    if record["remark"]:
+        lines.append(record["remark"])
+    return "\n".join(lines)
+
+
+def _view_lines(views: Mapping[str, Any]) -> list[str]:
+    lines = []
+    for ending, what in (
+        ("", "held-out views of moving cameras"),
+        ("_still_cameras", "held-out images of cameras that stand still (no new viewpoint)"),
+    ):
+        if views[f"psnr_db{ending}"] is None:
+            continue
+        count, raw, gain = (
+            views[f"{name}{ending}"] for name in ("num_images", "psnr_db", "gain_psnr_db")
+        )
+        line = f"{what} ({count}): PSNR {raw:.2f} dB raw, {gain:.2f} dB with a gain per channel"
+        if views[f"static_psnr_db{ending}"] is not None:
+            line += f", {views[f'static_psnr_db{ending}']:.2f} dB raw where nothing moved"
+        line += f"; SSIM {views[f'ssim{ending}']:.3f}"
+        if views[f"depth_mean_abs_m{ending}"] is not None:
+            line += f"; depth off by {1e3 * views[f'depth_mean_abs_m{ending}']:.1f} mm on average"
+        lines.append(line)
+    if not views["images"]:
+        lines.append("no frame could be held out: too few frames")
+    return lines

@@ -1,0 +1,273 @@
+"""Episodes in, scene out: choose frames, fuse, fit, render what was held out, store.
+
+The order of things is here; each stage lives in a module of its own. Nothing that is learnt from
+sees a held-out frame, and ``scene.json`` is written last: it vouches for all the rest.
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from bridge.episode import provenance
+from bridge.episode.run import RunFolder
+from bridge.errors import UsageError
+from bridge.task.task_file import Task, load_task
+from bridge.terminal import Output
+from twin.scene.fit.initialise import fuse
+from twin.scene.fit.run import FitResult, fit
+from twin.scene.fit.state import FIT_STATE, Checkpoint
+from twin.scene.foundation.complete import complete_shapes
+from twin.scene.foundation.stage import check_models
+from twin.scene.frames.choice import FrameChoice, Sources, choose_frames, find_sources
+from twin.scene.gaussians.cloud import GaussianCloud, as_float32, concatenate, with_harmonics
+from twin.scene.gaussians.moved import moved_cloud
+from twin.scene.learn.read import Learnt, learn, limits_of, with_fitted_poses
+from twin.scene.objects.parts import TakenApart, episode_of_task, take_apart
+from twin.scene.raster.rasteriser import RasterConfig, load_native
+from twin.scene.rebuild.record import Cost, make_record, protocol_of
+from twin.scene.rebuild.semantics import write_scene_semantics
+from twin.scene.rebuild.view_numbers import summarise_views
+from twin.scene.rebuild.views import ViewsJob, views_path, write_views
+from twin.scene.robot.stage import DrivenRobot, write_robot
+from twin.scene.settings import RebuildConfig
+from twin.scene.store.calibration import Calibration, read_calibration
+from twin.scene.store.folder import (
+    BACKGROUND,
+    SCENE_FILE,
+    background_hash,
+    read_record,
+    write_record,
+)
+from twin.scene.store.ply import write_ply
+
+METHOD_VERSION = 17
+"""Counts changes of method that make older scenes out of date."""
+
+
+class _Clock:
+    """What the rebuild took so far, stage by stage."""
+
+    def __init__(self) -> None:
+        self._wall = self._lap = time.monotonic()
+        self._cpu = time.process_time()
+        self._stages: dict[str, float] = {}
+
+    def end(self, stage: str) -> None:
+        """A stage is over; the next one begins."""
+        now = time.monotonic()
+        self._stages[stage] = now - self._lap
+        self._lap = now
+
+    def cost(self) -> Cost:
+        return Cost(
+            seconds=time.monotonic() - self._wall,
+            cpu_seconds=time.process_time() - self._cpu,
+            stages_s=dict(self._stages),
+        )
+
+
+def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, Any]:
+    """Rebuild the static scene of a run and return the content of ``scene.json``.
+
+    Work already done with the same inputs and settings is not repeated unless forced.
+
+    Raises:
+        NoFramesError: When the run has no RGB-D frames.
+        LostError: When a camera without poses cannot be followed.
+        NoDepthError: When the depth images hold nothing usable.
+        PoseConventionError: When poses fit the depth only if read in another convention.
+        SplatExtensionMissingError: When the native code is not built.
+        UsageError: When a model that was named cannot be used.
+        MissingDependencyError: When the extra ``foundation`` is needed and not installed.
+    """
+    load_native()
+    sources = find_sources(run)
+    if sources.remark:
+        output.say(sources.remark)
+    calibration = read_calibration(run)
+    key = _key(sources, config, calibration)
+    done = None if config.force else _already_done(run, key)
+    if done is not None:
+        output.say("the scene is up to date (same episodes, same settings); --force redoes it")
+        return done
+    clock = _Clock()
+    choices = choose_frames(sources, config.frames, output, calibration)
+    learnt = learn(choices, config, output)
+    clock.end("read")
+    run.scene_dir.mkdir(parents=True, exist_ok=True)
+    kept = Checkpoint(path=run.scene_dir / FIT_STATE, key=key)
+    if config.force:
+        kept.path.unlink(missing_ok=True)
+    fitted = _fit(learnt, config, kept, output)
+    clock.end("initialise_and_fit")
+    learnt = with_fitted_poses(learnt, fitted.Ts_base_color)
+    (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
+    complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
+    apart = take_apart(sources, fitted.cloud, learnt.choices, learnt.views, complete)
+    if apart.remark:
+        output.say(apart.remark)
+    write_ply(run.scene_dir / BACKGROUND, apart.background)
+    links = learnt.robot.frames.links(config.initialise)
+    clock.end("take_apart")
+    views = _hold_out(run, learnt, fitted, apart, links, config, clock, output)
+    clock.end("held_out_views")
+    extras = apart.write(run, learnt.views) | write_robot(run, learnt.robot, links)
+    extras |= write_scene_semantics(
+        run.scene_dir,
+        apart,
+        learnt.views,
+        config.fit.threads,
+        output,
+        models=config.models,
+        choices=learnt.choices,
+        task=_task(sources),
+    )
+    clock.end("objects_and_semantics")
+    record = make_record(
+        key=key,
+        scene_hash=background_hash(run),
+        sources=sources,
+        learnt=learnt,
+        config=config,
+        fitted=fitted,
+        views=views,
+        num_background=len(apart.background),
+        cost=clock.cost(),
+    )
+    record |= extras
+    write_record(run, record)
+    kept.path.unlink(missing_ok=True)
+    return record
+
+
+def _fit(learnt: Learnt, config: RebuildConfig, kept: Checkpoint, output: Output) -> FitResult:
+    began_s = time.monotonic()
+    first = fuse(learnt.points, config.initialise)
+    output.say(f"{len(first)} Gaussians from {len(learnt.views)} training frames")
+    with output.progress("fit", 100) as advance:
+        return fit(
+            first,
+            learnt.views,
+            config.fit,
+            advance,
+            max_splats=config.initialise.max_splats,
+            checkpoint=kept,
+            spent_s=time.monotonic() - began_s,
+        )
+
+
+def _hold_out(
+    run: RunFolder,
+    learnt: Learnt,
+    fitted: FitResult,
+    apart: TakenApart,
+    links: Mapping[str, GaussianCloud],
+    config: RebuildConfig,
+    clock: _Clock,
+    output: Output,
+) -> dict[str, Any]:
+    """Render what was held out, and say how well it came out."""
+    choices = learnt.choices
+    job = ViewsJob(
+        scene_hash=background_hash(run),
+        cloud=fitted.cloud,
+        witnesses=learnt.witnesses,
+        limits=limits_of(config),
+        raster=RasterConfig(threads=config.fit.threads),
+        protocol=protocol_of(choices, fitted, config, clock.cost()),
+        marked=_marked_objects(apart),
+        robot=DrivenRobot(frames=learnt.robot.frames, links=links),
+        carried={
+            (choices[index].episode.path, choices[index].camera_id): mask
+            for index, mask in learnt.carried.items()
+        },
+        align=config.frames.align_holdout,
+    )
+    total = sum(len(choice.holdout_ns) for choice in choices)
+    with output.progress("render held-out views", total) as advance:
+        numbers = write_views(run, choices, job, advance)
+    return summarise_views(numbers, _remove_stale_views(run, choices, job.scene_hash))
+
+
+def _marked_objects(apart: TakenApart) -> GaussianCloud | None:
+    """The scene with its objects white and all else black: where they show in a view."""
+    objects = {} if apart.parts is None else apart.parts.objects
+    if not objects:
+        return None
+    placed = [moved_cloud(item.cloud, item.T_base_object) for item in objects.values()]
+    cloud = with_harmonics(concatenate([apart.background, *placed]), 0)
+    colors = np.ones((len(cloud), 3))
+    colors[: len(apart.background)] = 0.0
+    return GaussianCloud(
+        means_m=cloud.means_m,
+        quats_wxyz=cloud.quats_wxyz,
+        scales_log=cloud.scales_log,
+        opacities_logit=cloud.opacities_logit,
+        colors=as_float32(colors),
+    )
+
+
+def _key(sources: Sources, config: RebuildConfig, calibration: Calibration | None) -> str:
+    settings = asdict(config)
+    settings.pop("force")
+    settings["fit"].pop("threads")
+    settings["models"].pop("device")
+    hashes = {str(e.path.name): e.sha256() for e in sources.episodes}
+    task = _task(sources)
+    return provenance.hash_settings(
+        {
+            "method": METHOD_VERSION,
+            "episodes": hashes,
+            "settings": settings,
+            "models": check_models(config.models, task),
+            "task": None if task is None else asdict(task),
+            "calibration": None if calibration is None else calibration.calibration_id,
+        }
+    )
+
+
+def _task(sources: Sources) -> Task | None:
+    """Shapes and colours decide the objects; a task that cannot be read gives none."""
+    episode = episode_of_task(sources)
+    try:
+        return None if episode is None else load_task(episode.info.task)
+    except UsageError:
+        return None
+
+
+def _already_done(run: RunFolder, key: str) -> dict[str, Any] | None:
+    record = read_record(run)
+    if record is None or record.get("key") != key:
+        return None
+    needed = [run.scene_dir / BACKGROUND]
+    needed += [run.derived_dir / name for name in record["views"]["files"]]
+    needed += [
+        run.scene_dir / item["folder"] / name
+        for item in record.get("objects", {}).values()
+        for name in item["files"]
+    ]
+    links = record.get("robot", {}).get("links", {})
+    needed += [run.scene_dir / item["file"] for item in links.values()]
+    if "semantics" in record:
+        about = record["semantics"]
+        named = [about, about.get("features") or {}, about.get("vectors") or {}]
+        needed += [run.scene_dir / item["file"] for item in named if "file" in item]
+    static = (record.get("sdf") or {}).get("file")
+    needed += [run.scene_dir / static] if static else []
+    whole = all(path.is_file() for path in needed)
+    return record if whole and background_hash(run) == record["scene_hash"] else None
+
+
+def _remove_stale_views(
+    run: RunFolder, choices: Sequence[FrameChoice], scene_hash: str
+) -> list[str]:
+    """Remove the views of earlier scenes, which are no longer stored; return the present ones."""
+    present = {views_path(run, c.episode, scene_hash).name for c in choices if c.holdout_ns}
+    for path in run.derived("*.views.*"):
+        if path.name not in present:
+            path.unlink()
+    return sorted(present)

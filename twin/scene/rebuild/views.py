@@ -1,0 +1,217 @@
+"""Render held-out frames and keep them, recorded beside rendered, as a derived episode.
+
+Topics, all with the stamp of the recorded frame and the frame id of its colour camera:
+``/<cell>/views/cam/<id>/{recorded,rendered}/image`` (PNG), ``.../rendered/depth`` (16UC1),
+``.../recorded/depth`` where depth and colour come from the same camera and
+``.../recorded/depth_in_color`` where it was carried over, ``.../mask/{static,objects}`` (PNG, white
+inside) where there is something to mask, ``.../pose_aligned/image`` (PNG) where pose and brightness
+were fitted to the recorded image, and ``.../color/info``.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from bridge.episode import schema, streams
+from bridge.episode.metadata import Derived
+from bridge.episode.reader import Episode
+from bridge.episode.records import CameraInfo, CompressedColor, DepthImage
+from bridge.episode.run import RunFolder
+from bridge.episode.streams import RgbdFrame
+from bridge.episode.writer import EpisodeWriter
+from bridge.media.color import encode_png
+from bridge.terminal import Advance
+from twin.scene.fit.camera_correction import align_view
+from twin.scene.frames.choice import FrameChoice, load
+from twin.scene.frames.points import DepthLimits, FrameSurface
+from twin.scene.frames.training_view import TrainingView, training_view
+from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.learn.carried import CarriedMask
+from twin.scene.learn.moving import Witness, find_moving
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
+from twin.scene.rebuild.view_numbers import ViewNumbers, rate_view
+from twin.scene.robot.stage import DrivenRobot
+
+OBJECT_SHARE = 0.5
+"""A pixel shows an object when this share of its light comes from it."""
+
+
+def views_path(run: RunFolder, episode: Episode, scene_hash: str) -> Path:
+    """Name of the derived episode that holds an episode's held-out views."""
+    return run.derived_dir / f"{episode.path.stem}.views.{scene_hash}.mcap"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewsJob:
+    """What to render held-out frames of, and what to say about it."""
+
+    scene_hash: str
+    cloud: GaussianCloud
+    witnesses: Sequence[Witness]
+    limits: DepthLimits
+    raster: RasterConfig
+    protocol: Mapping[str, Any]
+    """How the scene was made: kept with the images, for whoever rates them."""
+    marked: GaussianCloud | None = None
+    """The same scene with objects white and everything else black; None without objects."""
+    robot: DrivenRobot | None = None
+    """Drawn where it stood at each frame; the cloud holds only what is static."""
+    carried: Mapping[tuple[Path, str], CarriedMask] = field(default_factory=dict)
+    """By episode and camera: what moves with the camera and is not part of the scene."""
+    align: bool = False
+    """Also draw each view where it fits the recorded image best."""
+
+    def settings(self) -> dict[str, Any]:
+        """What the derived episode records about how its views were made."""
+        return {
+            **self.protocol,
+            "resolution": "native colour camera",
+            "masks": "as separate topics; none applied",
+            "alpha_cut": self.raster.alpha_cut,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldOut:
+    """One held-out frame with everything that is said about it."""
+
+    choice: FrameChoice
+    frame: RgbdFrame
+    recorded: TrainingView
+    """The frame with what moved masked; nothing is trained on it."""
+    view: View
+    masks: Mapping[str, Bool[np.ndarray, "height width"]] = field(default_factory=dict)
+    aligned_u8: np.ndarray | None = None
+
+
+def write_views(
+    run: RunFolder, choices: Sequence[FrameChoice], job: ViewsJob, advance: Advance
+) -> list[ViewNumbers]:
+    """Render every held-out frame; one derived episode per recorded one, replaced if present."""
+    rasteriser = Rasteriser(job.raster)
+    numbers: list[ViewNumbers] = []
+    episodes = {choice.episode.path: choice.episode for choice in choices if choice.holdout_ns}
+    for path, episode in episodes.items():
+        target = views_path(run, episode, job.scene_hash)
+        target.unlink(missing_ok=True)
+        own = [choice for choice in choices if choice.episode.path == path]
+        with EpisodeWriter(target) as writer:
+            writer.describe(
+                replace(episode.info, id=target.stem),
+                derived=Derived(
+                    kind="views",
+                    source_episode=episode.info.id,
+                    source_sha256=episode.sha256(),
+                    scene_hash=job.scene_hash,
+                    engine="robot-gst splat",
+                    settings=job.settings(),
+                ),
+            )
+            for choice in own:
+                for item in _rendered(choice, rasteriser, job):
+                    _write_view(writer, item)
+                    numbers.append(
+                        rate_view(
+                            item.frame,
+                            item.recorded,
+                            item.view,
+                            item.masks["static"],
+                            episode=choice.episode.info.id,
+                            still=choice.still,
+                        )
+                    )
+                    advance(len(numbers), f"{numbers[-1].psnr_db:.1f} dB")
+    return numbers
+
+
+def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Iterator[HeldOut]:
+    for frame in load(choice, choice.holdout_ns):
+        camera, T = frame.color_camera, frame.T_base_color
+        cloud = job.cloud
+        if job.robot is not None:
+            cloud = job.robot.joined(cloud, choice.episode, frame.stamp_ns)
+        recorded = _recorded(frame, job, job.carried.get((choice.episode.path, choice.camera_id)))
+        masks = {"static": recorded.full.static_mask}
+        if job.marked is not None:
+            planes = rasteriser.draw_planes(job.marked, camera, T)
+            masks["objects"] = planes[0] > OBJECT_SHARE
+        aligned = None
+        if job.align:
+            fitted = align_view(cloud, recorded.half, recorded.full, T, rasteriser)
+            aligned = _u8(np.moveaxis(fitted.image, 0, -1))
+        yield HeldOut(
+            choice=choice,
+            frame=frame,
+            recorded=recorded,
+            view=rasteriser.view(cloud, camera, T),
+            masks=masks,
+            aligned_u8=aligned,
+        )
+
+
+def _recorded(frame: RgbdFrame, job: ViewsJob, carried: CarriedMask | None) -> TrainingView:
+    """A held-out frame without what training frames look through or moves with the camera."""
+    surface = FrameSurface(frame, job.limits)
+    view, points = training_view(surface), surface.points()
+    if carried is not None:
+        view, points = carried.mask_in(view), carried.drop_from(points, view)
+    return find_moving([points], job.witnesses).mask_in(view)
+
+
+def one_camera(frame: RgbdFrame) -> bool:
+    """Say whether colour and depth have the same pixels."""
+    return frame.color_camera == frame.depth_camera and bool(
+        np.allclose(frame.T_base_color, frame.T_base_depth, atol=1e-6)
+    )
+
+
+def _write_view(writer: EpisodeWriter, item: HeldOut) -> None:
+    choice, frame = item.choice, item.frame
+    cell = choice.episode.info.cell or "cell"
+    topic = f"/{cell}/views/cam/{frame.camera_id}"
+    frame_id = streams.camera_info(choice.episode, frame.camera_id).frame_id
+    stamp = frame.stamp_ns
+
+    def put(tail: str, data: bytes, type_name: str) -> None:
+        writer.write(
+            f"{topic}/{tail}", data, type_name=type_name, log_time_ns=stamp, publish_time_ns=stamp
+        )
+
+    def png(tail: str, image_u8: np.ndarray) -> None:
+        color = CompressedColor(
+            stamp_ns=stamp, frame_id=frame_id, format="png", data=encode_png(image_u8)
+        )
+        put(tail, color.to_cdr(), schema.COMPRESSED_IMAGE)
+
+    def depth(tail: str, depth_m: np.ndarray) -> None:
+        millimetres = np.clip(np.rint(depth_m * 1e3), 0, 65535).astype(np.uint16)
+        image = DepthImage(stamp_ns=stamp, frame_id=frame_id, depth_mm=millimetres)
+        put(tail, image.to_cdr(), schema.IMAGE)
+
+    info = CameraInfo(stamp_ns=stamp, frame_id=frame_id, camera=frame.color_camera)
+    put("color/info", info.to_cdr(), schema.CAMERA_INFO)
+    png("recorded/image", frame.image_u8)
+    png("rendered/image", item.view.image_u8())
+    depth("rendered/depth", item.view.depth_m)
+    if one_camera(frame):
+        depth("recorded/depth", np.nan_to_num(frame.depth_m, posinf=0.0))
+    else:
+        depth("recorded/depth_in_color", training_depth(item))
+    for name, mask in item.masks.items():
+        if not mask.all():
+            png(f"mask/{name}", np.repeat(mask[..., None], 3, axis=2).astype(np.uint8) * 255)
+    if item.aligned_u8 is not None:
+        png("pose_aligned/image", item.aligned_u8)
+
+
+def training_depth(item: HeldOut) -> np.ndarray:
+    """Recorded depth as the colour camera sees it; 0 where unknown or where something moved."""
+    return item.recorded.full.depth_m
+
+
+def _u8(image: np.ndarray) -> np.ndarray:
+    return np.asarray(np.rint(np.clip(image, 0.0, 1.0) * 255.0), dtype=np.uint8)

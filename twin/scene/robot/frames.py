@@ -1,0 +1,198 @@
+"""The robot in a scan's frames: known from its joints, it is kept out of the background.
+
+Pixels that show it are masked, its points go to its links. What it hid in one frame is filled by
+the frames in which it stood elsewhere; nothing is invented.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+from scipy.ndimage import binary_dilation
+
+from bridge.episode.reader import Episode
+from bridge.episode.streams import RgbdFrame
+from bridge.errors import GstError
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from twin.robot.model import RobotModel, load_robot
+from twin.robot.posture import PostureTrack, posture_track
+from twin.robot.surface import PosedSurface, link_poses, link_surfaces
+from twin.scene.fit.initialise import NoSurfaceError, fuse
+from twin.scene.frames.points import PointSet
+from twin.scene.frames.training_view import TrainingView
+from twin.scene.gaussians.cloud import GaussianCloud, as_float32, concatenate
+from twin.scene.gaussians.moved import moved_cloud
+from twin.scene.robot.splats import posed, surface_owners
+from twin.scene.settings import InitialiseConfig
+
+IN_FRONT_M = 0.03
+"""A measurement this much nearer than the robot shows something in front of it."""
+GROW_PX = 2
+"""Masks grow by this much at half size: cameras and joints are never quite where they say."""
+MIN_POINTS = 60
+"""A link seen by fewer points is not kept."""
+ROBOT_SHARE = 0.25
+"""Of the budget of Gaussians, for the robot's links."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Tracked:
+    robot: RobotModel
+    track: PostureTrack
+
+
+class RobotFrames:
+    """Tells robot from background in the frames of some episodes, and collects its surface."""
+
+    def __init__(
+        self,
+        episodes: Sequence[Episode],
+        T_base_root: Float[np.ndarray, "4 4"] | None = None,
+    ) -> None:
+        """Read joints and descriptions; an episode without them is passed over, with a remark.
+
+        Args:
+            episodes: Whose frames will be given.
+            T_base_root: Where the frames' root lies in the robot's base; None: it is the base.
+        """
+        self.T_base_root = np.eye(4) if T_base_root is None else T_base_root
+        self._tracked: dict[str, _Tracked] = {}
+        remarks = []
+        for episode in episodes:
+            try:
+                track = posture_track(episode)
+                robot = load_robot(track.urdf)
+                link_surfaces(robot)
+            except GstError as error:
+                remarks.append(f"{episode.info.id}: {error}")
+                continue
+            self._tracked[str(episode.path)] = _Tracked(robot=robot, track=track)
+        self.remark = "; ".join(remarks)
+        """Why the robot is not told apart in some episodes; empty when it is in all."""
+        self._points: dict[str, list[PointSet]] = {}
+
+    def knows(self, episode: Episode) -> bool:
+        """Say whether joints tell where the robot is in the frames of an episode."""
+        return str(episode.path) in self._tracked
+
+    def take_out(
+        self, episode: Episode, frame: RgbdFrame, points: PointSet, view: TrainingView
+    ) -> tuple[PointSet, TrainingView]:
+        """Return a frame's points without the robot's, and its view with the robot masked.
+
+        The robot's points are kept for its links when it stood still.
+        """
+        surface = self._surface(episode, frame.stamp_ns)
+        if surface is None:
+            return points, view
+        owner = self._keep(episode, frame.stamp_ns, surface, points)
+        masked = _masked(view, surface, self.T_base_root @ view.T_base_color)
+        return points.take(owner < 0), masked
+
+    def collect(self, episode: Episode, stamp_ns: int, points: PointSet) -> None:
+        """Keep the robot's points of a frame that the background does not need."""
+        surface = self._surface(episode, stamp_ns)
+        if surface is not None:
+            self._keep(episode, stamp_ns, surface, points)
+
+    def still_postures(
+        self, episode: Episode, stamps_ns: Iterable[int]
+    ) -> dict[int, Float[np.ndarray, " num_joints"]]:
+        """Joints at those of some instants at which the robot of an episode stood still [rad]."""
+        tracked = self._tracked.get(str(episode.path))
+        if tracked is None:
+            return {}
+        track = tracked.track
+        return {t: track.at(t).joints_rad for t in sorted(stamps_ns) if track.is_still(t)}
+
+    def _surface(self, episode: Episode, stamp_ns: int) -> PosedSurface | None:
+        tracked = self._tracked.get(str(episode.path))
+        if tracked is None or not tracked.track.covers(stamp_ns):
+            return None
+        return PosedSurface(tracked.robot, tracked.track.at(stamp_ns))
+
+    def _keep(
+        self, episode: Episode, stamp_ns: int, surface: PosedSurface, points: PointSet
+    ) -> Int64[np.ndarray, " num_points"]:
+        """Keep the robot's points if it stood still; return which shape owns each point, or -1."""
+        tracked, T = self._tracked[str(episode.path)], self.T_base_root
+        owner = surface_owners(
+            tracked.robot,
+            surface,
+            se3.apply(T, points.p_m.astype(np.float64)),
+            points.normals.astype(np.float64) @ T[:3, :3].T,
+        )
+        if tracked.track.is_still(stamp_ns):
+            poses = link_poses(tracked.robot, tracked.track.at(stamp_ns))
+            for link in {surface.links[index] for index in np.unique(owner[owner >= 0])}:
+                mine = np.isin(owner, [i for i, name in enumerate(surface.links) if name == link])
+                moved = _moved(points.take(mine), se3.invert(poses[link]) @ T)
+                self._points.setdefault(link, []).append(moved)
+        return owner
+
+    def links(self, config: InitialiseConfig) -> dict[str, GaussianCloud]:
+        """Fuse what was collected of each link, in the link's frame."""
+        total = sum(len(item.p_m) for sets in self._points.values() for item in sets)
+        clouds = {}
+        for link, sets in sorted(self._points.items()):
+            count = sum(len(item.p_m) for item in sets)
+            if count < MIN_POINTS:
+                continue
+            budget = max(int(ROBOT_SHARE * config.max_splats * count / total), 1)
+            try:
+                clouds[link] = fuse(sets, replace(config, max_splats=budget))
+            except NoSurfaceError:
+                continue
+        return clouds
+
+    def joined(
+        self,
+        cloud: GaussianCloud,
+        links: Mapping[str, GaussianCloud],
+        episode: Episode,
+        stamp_ns: int,
+    ) -> GaussianCloud:
+        """Put the robot into a scene as it stood at an instant of an episode.
+
+        Args:
+            cloud: The scene, in the frames' root.
+            links: Per link its Gaussians, in the link's frame.
+            episode: Whose joints count.
+            stamp_ns: When.
+        """
+        tracked = self._tracked.get(str(episode.path))
+        if tracked is None or not links or not tracked.track.covers(stamp_ns):
+            return cloud
+        posture = tracked.track.at(stamp_ns)
+        robot = posed(links, posture.joints_rad, tracked.track.urdf, width_m=posture.width_m)
+        return concatenate([cloud, moved_cloud(robot, se3.invert(self.T_base_root))])
+
+
+def _moved(points: PointSet, T_link_base: Float[np.ndarray, "4 4"]) -> PointSet:
+    return replace(
+        points,
+        p_m=as_float32(se3.apply(T_link_base, points.p_m.astype(np.float64))),
+        normals=as_float32(points.normals @ T_link_base[:3, :3].T),
+    )
+
+
+def _masked(
+    view: TrainingView, surface: PosedSurface, T_base_camera: Float[np.ndarray, "4 4"]
+) -> TrainingView:
+    """Mark the pixels that show the robot as not static, at both sizes."""
+    return view.without(robot_mask(surface, view.half.camera, T_base_camera, view.half.depth_m))
+
+
+def robot_mask(
+    surface: PosedSurface,
+    camera: Camera,
+    T_base_camera: Float[np.ndarray, "4 4"],
+    depth_m: Float[np.ndarray, "height width"],
+) -> Bool[np.ndarray, "height width"]:
+    """Pixels that show the posed robot, grown by two; not those with something in front of it."""
+    expected = surface.depth_along(camera.rays(), T_base_camera)
+    hidden = (depth_m > 0) & (depth_m < expected - IN_FRONT_M)
+    around = np.ones((2 * GROW_PX + 1, 2 * GROW_PX + 1), dtype=bool)
+    return np.asarray(binary_dilation(np.isfinite(expected) & ~hidden, around))

@@ -1,0 +1,1 @@
+"""The scene folder and the files in it."""
