@@ -21,6 +21,7 @@ from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
 from twin.gate.moved import who_moved
+from twin.replay.failure import with_reasons
 
 ENGINE_NONE = "none"
 POLL_S = 0.05
@@ -186,9 +187,9 @@ class Gate:
 
     def _find_objects(self, frames: Any, ends_s: float) -> Mapping[str, Any]:
         found = self._localise(frames, self._task, ends_s)
-        missing = [f"{name}: {item.reason}" for name, item in found.items() if not item.found]
+        missing = {name: item.reason for name, item in found.items() if not item.found}
         if missing:
-            raise UndecidedError(f"not every object was found: {'; '.join(missing)}")
+            raise UndecidedError(f"not every object was found: {with_reasons(missing)}")
         return found
 
     def _wait_for_frames(self) -> Any:

@@ -1,6 +1,6 @@
 """One reason why a factor of I(tau) is false, and the earliest of many."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from bridge.task.verdict import Factor
@@ -43,3 +43,13 @@ def factor_from(failures: Sequence[Failure], *, undecided: str | None = None) ->
     if undecided is not None:
         return Factor(value=None, detail=undecided)
     return Factor(value=True)
+
+
+def with_reasons(reasons: Mapping[str, str | None]) -> str:
+    """Names with why, each reason once: ``cube, box (no frames at rest); duck``."""
+    names: dict[str | None, list[str]] = {}
+    for name, reason in reasons.items():
+        names.setdefault(reason, []).append(name)
+    return "; ".join(
+        ", ".join(sharing) + (f" ({reason})" if reason else "") for reason, sharing in names.items()
+    )

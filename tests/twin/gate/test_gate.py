@@ -158,7 +158,7 @@ def raising(error: Exception) -> Callable[..., Any]:
         (
             {"localise": lambda *_: found(cube="0 points")},
             PLAN,
-            "not every object was found: cube: 0 points",
+            "not every object was found: cube (0 points)",
         ),
         ({"replay": raising(TwinError("no waypoints"))}, PLAN, "no waypoints"),
         ({}, replace(PLAN, frame="world"), "is given in frame 'world'"),

@@ -146,7 +146,7 @@ def test_a_yes_needs_the_cell_to_be_as_it_was_judged() -> None:
                 seen(pose()),
                 {**seen(pose()), "cube": SimpleNamespace(found=False, reason="0 points")},
             ],
-            "not every object was found: cube: 0 points",
+            "not every object was found: cube (0 points)",
         ),
     ],
 )

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.task.task_file import Task
+from twin.replay.failure import with_reasons
 from twin.scene.shape.static import StaticSdf
 
 
@@ -45,10 +46,8 @@ class ReplayScene:
 
     def describe_missing(self) -> str:
         """Name the objects without a pose, with the reasons where they are known."""
-        return "; ".join(
-            f"{name} ({self.reasons[name]})" if name in self.reasons else name
-            for name in self.missing()
-        )
+        why = {name: self.reasons.get(name) for name in self.missing()}
+        return f"not localised: {with_reasons(why)}"
 
     def containers(self) -> dict[str, Float[np.ndarray, "4 4"]]:
         """Poses of the objects that stand still: containers and those declared fixed."""

@@ -1,5 +1,6 @@
 """The terminal factor of I(tau), what each predicate found, and the reason a verdict gives."""
 
+from collections.abc import Iterable
 from typing import Any
 
 from bridge.task.predicate import (
@@ -20,6 +21,8 @@ from twin.replay.place.scene import ReplayScene
 from twin.replay.verdict.result import ReplayResult
 
 HELD_BEFORE = "the goal held before anything moved"
+MANY = 8
+"""Of more findings than this, those that hold are not worth reading one by one."""
 
 
 def terminal_factor(
@@ -51,8 +54,10 @@ def terminal_factor(
         return factor_from([failure])
     findings = evaluate_success(scene.task, result.rollout())
     value = all_hold(findings)
-    if value is not False:
-        return Factor(value=value, detail=_told(findings, several=len(findings) > 8))
+    if value is True:
+        return Factor(value=True, detail=_why_true(findings))
+    if value is None:
+        return Factor(value=None, detail=_why_open(findings, scene))
     index = next(i for i, finding in enumerate(findings) if finding.value is False)
     spec = scene.task.success[index]
     return Factor(
@@ -60,14 +65,32 @@ def terminal_factor(
         first_t_ns=end_ns,
         cause=findings[index].kind,
         bodies=tuple(spec[key] for key in ("object", "container") if key in spec),
-        detail=_told(findings, several=len(findings) > 8),
+        detail=_once(finding.detail for finding in findings if finding.value is False),
     )
 
 
-def _told(findings: list[Finding], *, several: bool) -> str:
-    """All findings; of many, only what is wrong or open is worth reading."""
-    told = [finding for finding in findings if not several or finding.value is not True]
-    return "; ".join(finding.detail for finding in told) or "every object is where it belongs"
+def _why_true(findings: list[Finding]) -> str:
+    if len(findings) > MANY:
+        return "every object is where it belongs"
+    return _once(finding.detail for finding in findings)
+
+
+def _why_open(findings: list[Finding], scene: ReplayScene) -> str:
+    """What was not localised is said in the words of the clearance, which is open for it too."""
+    if not findings:
+        return "the task asks for nothing"
+    lost = scene.missing()
+    told = []
+    for spec, finding in zip(scene.task.success, findings, strict=True):
+        if spec.get("object") in lost or spec.get("container") in lost:
+            told.append(scene.describe_missing())
+        elif finding.value is None:
+            told.append(finding.detail)
+    return _once(told)
+
+
+def _once(sentences: Iterable[str]) -> str:
+    return "; ".join(dict.fromkeys(sentences))
 
 
 def findings_of(task: Task, rollout: Rollout, side: str, *, tolerance_m: float = 0.0) -> list[Any]:
@@ -111,10 +134,11 @@ def reason_of(verdict: Verdict) -> str | None:
         factor: Factor = getattr(verdict, name)
         return f"{name}: {factor.cause}: {factor.detail}"
     if verdict.accepted is None:
-        undecided = [
-            f"{name}: {getattr(verdict, name).detail}"
-            for name in ("ik", "clearance", "terminal")
-            if getattr(verdict, name).value is None
-        ]
+        names: dict[str | None, list[str]] = {}
+        for name in ("ik", "clearance", "terminal"):
+            factor = getattr(verdict, name)
+            if factor.value is None:
+                names.setdefault(factor.detail, []).append(name)
+        undecided = [f"{' and '.join(open_for)}: {why}" for why, open_for in names.items()]
         return "undecided: " + "; ".join(undecided)
     return verdict.warnings[0] if verdict.warnings else None

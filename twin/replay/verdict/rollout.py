@@ -184,5 +184,5 @@ def _clearance_undecided(
     if unreachable_ns is not None:
         return f"known only up to the unreachable pose at {unreachable_ns * 1e-9:.2f} s"
     if scene.missing():
-        return f"not localised: {scene.describe_missing()}"
+        return scene.describe_missing()
     return None
