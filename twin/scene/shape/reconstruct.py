@@ -37,7 +37,7 @@ class ShapeConfig:
 
     min_voxel_m: float = 0.0015
     """Finest voxel."""
-    voxels_along: int = 80
+    voxels_along: int = 100
     """Voxels along the longest side, unless that makes them too fine."""
     truncation_voxels: float = 4.0
     """Depth within this many voxels of a surface says how far the surface is."""
