@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 
 from bridge.episode import schema
 from bridge.episode.alike import joints_of, poses_of
+from bridge.episode.cdr import decode
 from bridge.episode.reader import Episode
 from bridge.episode.records import (
     CameraInfo,
@@ -19,6 +20,7 @@ from bridge.episode.records import (
     PoseSample,
     RawColor,
     color_from_message,
+    stamp_of,
     string_from_cdr,
     transforms_from_cdr,
 )
@@ -65,6 +67,28 @@ class JointTrack:
             for joint in range(len(self.names))
         ]
         return np.stack(columns, axis=1)
+
+
+def first_stamp_ns(episode: Episode) -> int | None:
+    """Return the source time of the first sample of robot, tool, objects, cameras or events.
+
+    Seconds into an episode count from here, wherever a person reads or gives them. None without
+    any. When messages arrived does not matter: that is another clock.
+    """
+    stamps = [int(event["stamp_ns"]) for event in events(episode)[:1]]
+    poses = episode.topics_of_type(schema.POSE_STAMPED)
+    joints = episode.topics_of_type(schema.JOINT_STATE)
+    images = (schema.COMPRESSED_IMAGE, schema.IMAGE)
+    topics = [
+        *(topic for topic in joints if topic.endswith("/joint_states")),
+        *(topic for topic in poses if topic.endswith("/tcp/pose") or "/object/" in topic),
+        *(t for name in images for t in episode.topics_of_type(name) if _COLOR_TOPIC.search(t)),
+    ]
+    for topic in topics:
+        for message in episode.messages([topic]):
+            stamps.append(stamp_of(decode(message.type_name, message.data)))
+            break
+    return min(stamps, default=None)
 
 
 def transform_tree(episode: Episode) -> TransformTree:

@@ -5,6 +5,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from bridge.episode import streams
+from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from dashboards.clock import PageClock
 from dashboards.recording import Recording, read_recording
@@ -21,6 +23,11 @@ def test_time_on_the_page_goes_there_and_back(recording: Recording, synthetic: M
     assert clock.stamp_ns(clock.seconds(synthetic.EXECUTION_NS)) == synthetic.EXECUTION_NS
     assert clock.clamp(-3) == 0
     assert clock.clamp(99) == clock.end_s
+
+
+def test_the_pages_zero_is_where_every_command_counts_from(recording: Recording) -> None:
+    zero_ns = streams.first_stamp_ns(Episode.open(recording.path))
+    assert PageClock.of(recording).zero_ns == zero_ns
 
 
 def test_a_replay_from_zero_is_laid_from_the_start_of_its_execution(

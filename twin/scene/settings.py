@@ -245,7 +245,8 @@ class RenderConfig:
     camera: str = ""
     """Camera id; empty: the episode's first."""
     at_s: float = 0.0
-    """Seconds after the episode's start."""
+    """Seconds after the episode's first sample, by the stamps of its source as on the dashboard;
+    when messages arrived does not count."""
     eye: tuple[float, float, float] | None = None
     """Stand here instead, in metres in the scene's frame; needs --target."""
     target: tuple[float, float, float] | None = None

@@ -35,9 +35,9 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     scene = read_scene(run)
     episode = _episode(run, scene, config.episode)
     camera_id = _camera_id(episode, config.camera)
-    stamp_ns = episode.start_ns + round(config.at_s * 1e9)
+    stamp_ns = _stamp_ns(episode, config.at_s)
     composed = compose(run, scene, episode, stamp_ns, config)
-    camera, T_base_camera = _view_of(episode, camera_id, config)
+    camera, T_base_camera = _view_of(episode, camera_id, stamp_ns, config)
     view = rasteriser.view(composed.cloud, camera, T_base_camera)
     path = config.out or run.results_dir / "render.png"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -66,6 +66,11 @@ def _episode(run: RunFolder, scene: Scene, wanted: str) -> Episode:
     return episodes[name]
 
 
+def _stamp_ns(episode: Episode, at_s: float) -> int:
+    first_ns = streams.first_stamp_ns(episode)
+    return (episode.start_ns if first_ns is None else first_ns) + round(at_s * 1e9)
+
+
 def _camera_id(episode: Episode, wanted: str) -> str:
     ids = streams.camera_ids(episode)
     if not ids or (wanted and wanted not in ids):
@@ -76,7 +81,7 @@ def _camera_id(episode: Episode, wanted: str) -> str:
 
 
 def _view_of(
-    episode: Episode, camera_id: str, config: RenderConfig
+    episode: Episode, camera_id: str, stamp_ns: int, config: RenderConfig
 ) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
     info = streams.camera_info(episode, camera_id)
     if (config.eye is None) != (config.target is None):
@@ -93,5 +98,4 @@ def _view_of(
         T_base_camera = carried_camera(episode, info.frame_id, np.array(config.joints))
         if T_base_camera is not None:
             return info.camera, T_base_camera
-    stamp_ns = episode.start_ns + round(config.at_s * 1e9)
     return info.camera, tree.T_root_frame(info.frame_id, stamp_ns)

@@ -122,6 +122,20 @@ def test_joints_for_a_scene_without_robot_are_refused_in_one_sentence(
         render(room, RenderConfig(out=tmp_path / "a.png", joints=HOME))
 
 
+def test_seconds_count_from_the_first_stamp_whenever_messages_arrived(
+    room: RunFolder, tmp_path: Path
+) -> None:
+    textured_room.write_episode(
+        room.episodes_dir / "late.mcap", num_frames=9, sent_late_ns=3_600_000_000_000
+    )
+    for name in ("scan", "late"):
+        out = tmp_path / f"{name}.png"
+        render(room, RenderConfig(episode=name, at_s=0.4, out=out))
+    assert (tmp_path / "late.png").read_bytes() == (tmp_path / "scan.png").read_bytes()
+    render(room, RenderConfig(episode="late", at_s=0.8, out=tmp_path / "end.png"))
+    assert (tmp_path / "end.png").read_bytes() != (tmp_path / "late.png").read_bytes()
+
+
 @pytest.fixture
 def with_robot(room: RunFolder, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
     scene = read_scene(room)
