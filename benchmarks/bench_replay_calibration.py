@@ -75,7 +75,7 @@ def measure_seed(seed: int, folder: Path, rounds: int, trials: int, workers: int
         "parameters": physics["parameters"],
         "held_out": physics["held_out"],
         "promoted": physics["promoted"],
-        "discrepancy_m": physics["discrepancy_m"],
+        "errors": physics["errors"],
         "command_delay_s": physics["command_delay_s"],
         "num_evaluations": physics["num_evaluations"],
         "recorded_s": recorded_s,

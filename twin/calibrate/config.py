@@ -36,7 +36,7 @@ class CalibrateConfig:
     seed: int = 0
     """Of the resampling behind the intervals; with --physics, of the search and of which episodes
     are held out."""
-    evaluations: int = 80
+    evaluations: int = 50
     """With --physics: points the search tries; the intervals take about 60 more."""
     budget_s: Annotated[float, Parameter(name="--budget", converter=convert_duration)] = 900.0
     """With --physics: wall time after which the search ends: 900s, 10min or plain seconds."""

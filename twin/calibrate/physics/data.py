@@ -28,7 +28,7 @@ KINDS = ("probe", "trial")
 NEAR_M = 0.085
 """The tool is at work while it is this near to the line from where an object lies before to where
 it lies afterwards."""
-BEFORE_S, AFTER_S = 0.1, 0.6
+BEFORE_S, AFTER_S = 0.1, 0.25
 GRID_S = 0.02
 LONGEST_GAP_S = 0.2
 HELD_M = 0.002
@@ -130,7 +130,8 @@ def read_case(run: RunFolder, episode: Episode) -> Case:
     inside = (times_s >= 0.0) & (arm.stamps_ns <= end_ns)
     commands = _commands(episode, plan, start_ns)
     widths = _widths(episode, start_ns)
-    stretches = _stretches(arm, urdf, (start_ns, end_ns), before, after, commands, widths)
+    moving = {key: before[key] for key in objects}
+    stretches = _stretches(arm, urdf, (start_ns, end_ns), moving, after, commands, widths)
     hold_times, held = _holds(commands, widths)
     kept = np.array([np.any((stretches[:, 0] < t) & (t < stretches[:, 1])) for t in hold_times])
     order = [arm.names.index(name) for name in ARM_JOINTS]

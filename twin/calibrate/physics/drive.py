@@ -21,7 +21,9 @@ from twin.physics.world import World
 from twin.robot.description import parse_description
 
 SETTLE_S = 0.6
-"""The robot stands still for this long before the final state is read."""
+"""The robot stands still for this long before the final state is read, or until all lies still."""
+REST_S, REST = 0.05, 2e-5
+"""Whatever moves or turns by less [m and quaternion] in this time lies still."""
 TAIL_HZ = 60
 SAMPLE_STREAM = 606
 
@@ -137,9 +139,15 @@ def _settle(
     poses: dict[str, list[Float[np.ndarray, "4 4"]]] = {key: [] for key in case.objects}
     touches: dict[str, list[bool]] = {key: [] for key in case.objects}
     still = np.zeros(len(joints_rad))
+    before: Float[np.ndarray, "num_objects 7"] | None = None
     for step in range(round(SETTLE_S * rate)):
         world.command(joints_rad, still, width_m)
         world.step()
+        if case.success is None and step % round(REST_S * rate) == 0:
+            now = np.array([world.object_pose(key) for key in case.objects])
+            if before is not None and np.abs(now - before).max() < REST:
+                break
+            before = now
         if case.success is not None and step % (rate // TAIL_HZ) == 0:
             stamps.append(round(step * 1e9 / rate))
             for key in case.objects:

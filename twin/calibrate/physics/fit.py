@@ -55,7 +55,7 @@ class Predictor(Protocol):
 class FitConfig:
     """How hard to look."""
 
-    evaluations: int = 80
+    evaluations: int = 50
     """Points of the search; the intervals take about 60 more."""
     budget_s: float = 900.0
     """Wall time after which the search ends; the intervals are still computed."""
@@ -256,7 +256,7 @@ def _held_out(
     return judge(
         [predictor.cases[index] for index in split.held_out],
         predictor.predict(x[None], split.held_out)[0],
-        (trained.pose_discrepancy_m, trained.width_discrepancy_m),
+        trained.beliefs,
         predictor.num_samples,
     )
 

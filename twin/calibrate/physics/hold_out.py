@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from twin.calibrate.physics.beliefs import Beliefs
 from twin.calibrate.physics.case import Case, Prediction
 from twin.calibrate.physics.likelihood import features_of, observations_of, score
 
@@ -58,7 +59,7 @@ class HeldOut:
 def judge(
     cases: Sequence[Case],
     predictions: Sequence[Prediction],
-    discrepancies_m: tuple[float, float],
+    beliefs: Beliefs,
     num_samples: int,
 ) -> HeldOut:
     """Compare predictions of held-out cases with what was seen.
@@ -66,13 +67,12 @@ def judge(
     Args:
         cases: The held-out ones.
         predictions: Theirs.
-        discrepancies_m: The twin's, of poses and widths, as the training episodes gave them for the
-            same parameters.
+        beliefs: In errors, as the training episodes left them for the same parameters.
         num_samples: Noisy starts behind each share of successes.
     """
     observed = observations_of(cases, num_samples)
     predicted = features_of(cases, predictions)
-    found = score(observed, predicted, discrepancies_m=discrepancies_m)
+    found = score(observed, predicted, beliefs=beliefs)
     off = np.linalg.norm((observed.settled - predicted.settled)[:, :2], axis=1)
     return HeldOut(
         log_likelihood=found.log_likelihood,

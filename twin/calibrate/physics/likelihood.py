@@ -2,10 +2,10 @@
 
 Settled poses and held widths follow Student's t with few degrees of freedom, because a twin that
 is otherwise right still misses a contact now and then; success is a coin. No model is exact: on top
-of what localisation says of its own error there is a discrepancy of the twin, of unknown size. Its
-size is chosen anew for every point, so that a point that explains little is not called impossible,
-and one that explains much is not held to be exact (Kennedy and O'Hagan, Bayesian calibration of
-computer models, 2001, in its simplest form).
+of localisation's noise there is a discrepancy of the twin, of unknown size, for each kind of
+episode one of its own: where pushed objects stop is nearly certain, how far they slide is not.
+Every size has its say by how likely it is (Kennedy and O'Hagan, Bayesian calibration of computer
+models, 2001, in its simplest form; sizes and beliefs are in ``beliefs``).
 """
 
 from collections.abc import Sequence
@@ -15,20 +15,33 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import gammaln
 
-from twin.calibrate.physics.case import Case, Prediction
+from twin.calibrate.physics.beliefs import (
+    NOISE_SHARE,
+    POSE_DISCREPANCY_M,
+    WIDTH_DISCREPANCY_M,
+    Beliefs,
+    log_total,
+)
+from twin.calibrate.physics.case import Case, Prediction, planar
 
 DEGREES = 4.0
-POSE_DISCREPANCY_M = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016)
-"""Sizes that are tried; the turn has the same at the edge of a 3 cm object."""
 LEVER_M = 0.03
-WIDTH_DISCREPANCY_M = (0.0003, 0.0006, 0.0012, 0.0024, 0.0048)
-EXPECTED_M = {"pose": 0.001, "width": 0.001}
-"""Discrepancies believed in beforehand; twice or half of it is one standard deviation away."""
+"""The discrepancy of a turn is that of the edge of an object this far from its axis."""
 WIDTH_SIGMA_M = 0.0002
 """Of the gripper's own measurement."""
+STAYED_M = 0.01
+SHARED_WAY = 0.5
+"""Part of the discrepancy of a kind that all its objects are off by alike along their way: at the
+same friction all slides end a little early in one engine, and no number of them makes up for it."""
 SHARED_WIDTH_M = 0.001
 """What all held widths of one kind of episode are off by alike: contact is not the twin's, and no
 number of repetitions makes it so. Two engines differ by about this much at the same friction."""
+SHARED_AT: Float[np.ndarray, " num_shared"] = np.linspace(-3.0, 3.0, 41)
+"""Standard normal errors at which what episodes share is tried. Evenly spaced: that sums a smooth
+peak to many digits as long as it is no narrower than half a step."""
+SHARED_LOG_WEIGHT: Float[np.ndarray, " num_shared"] = -0.5 * SHARED_AT**2 - np.log(
+    np.exp(-0.5 * SHARED_AT**2).sum()
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,9 +52,13 @@ class Observations:
     covariance: Float[np.ndarray, "num_poses 3 3"]
     """Of localisation before and after together."""
     period_rad: Float[np.ndarray, " num_poses"]
+    way: Float[np.ndarray, "num_poses 2"]
+    """Direction in which an object was moved; zero where it stayed."""
+    kinds: tuple[str, ...]
+    """Kinds of episodes; the numbers below count in them."""
+    pose_kind: Int[np.ndarray, " num_poses"]
     widths_m: Float[np.ndarray, " num_holds"]
     width_kind: Int[np.ndarray, " num_holds"]
-    """Holds of one kind of episode have the same number."""
     success: Float[np.ndarray, " num_judged"]
     """1 or 0."""
     num_samples: int
@@ -67,11 +84,10 @@ class Features:
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """What a point is worth, and the discrepancies that were chosen for it."""
+    """What a point is worth, and what is believed of errors if it is the right one."""
 
     log_likelihood: float
-    pose_discrepancy_m: float
-    width_discrepancy_m: float
+    beliefs: Beliefs
 
 
 def observations_of(cases: Sequence[Case], num_samples: int) -> Observations:
@@ -79,7 +95,7 @@ def observations_of(cases: Sequence[Case], num_samples: int) -> Observations:
     seen = [np.isfinite(case.settled).all(axis=1) for case in cases]
     rows = list(zip(cases, seen, strict=True))
     none = np.zeros(0)
-    kinds = sorted({case.kind for case in cases})
+    kinds = tuple(sorted({case.kind for case in cases}))
     return Observations(
         settled=np.concatenate([np.zeros((0, 3)), *(case.settled[ok] for case, ok in rows)]),
         covariance=np.concatenate(
@@ -89,6 +105,11 @@ def observations_of(cases: Sequence[Case], num_samples: int) -> Observations:
             ]
         ),
         period_rad=np.concatenate([none, *(case.turn_period_rad[ok] for case, ok in rows)]),
+        way=np.concatenate([np.zeros((0, 2)), *(_way(case)[ok] for case, ok in rows)]),
+        kinds=kinds,
+        pose_kind=np.array(
+            [kinds.index(case.kind) for case, ok in rows for _ in range(ok.sum())], dtype=np.int64
+        ),
         widths_m=np.concatenate([none, *(case.held_widths_m for case in cases)]),
         width_kind=np.array(
             [kinds.index(case.kind) for case in cases for _ in case.held_widths_m], dtype=np.int64
@@ -96,6 +117,13 @@ def observations_of(cases: Sequence[Case], num_samples: int) -> Observations:
         success=np.array([float(case.success) for case in cases if case.success is not None]),
         num_samples=num_samples,
     )
+
+
+def _way(case: Case) -> Float[np.ndarray, "num_objects 2"]:
+    start = np.array([planar(case.Ts_base_start[key])[:2] for key in case.objects])
+    moved = case.settled[:, :2] - start
+    distance = np.linalg.norm(moved, axis=1, keepdims=True)
+    return np.asarray(np.where(distance > STAYED_M, moved / np.maximum(distance, STAYED_M), 0.0))
 
 
 def features_of(cases: Sequence[Case], predictions: Sequence[Prediction]) -> Features:
@@ -131,81 +159,98 @@ def unflatten(row: Float[np.ndarray, " num_features"], like: Observations) -> Fe
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class Scales:
+    """How far observations may be off, for every size of the errors; the same at every point."""
+
+    inverse: Float[np.ndarray, "num_shares num_sizes num_poses 3 3"]
+    """Of the scale matrices of settled poses."""
+    log_det: Float[np.ndarray, "num_shares num_sizes num_poses"]
+    width_inverse: Float[np.ndarray, "num_width_sizes num_holds"]
+    """One over the variance of each width, what they share left aside."""
+
+
+def scales_of(
+    observed: Observations, extra: Float[np.ndarray, " num_features"] | None = None
+) -> Scales:
+    """Add localisation's noise and the twin's discrepancy.
+
+    Args:
+        observed: What was seen.
+        extra: Variance of each feature that the prediction has of its own (an emulator's).
+    """
+    poses = observed.settled.size
+    own = np.square(POSE_DISCREPANCY_M)[:, None, None, None] * np.diag([1.0, 1.0, LEVER_M**-2])
+    S = np.square(NOISE_SHARE)[:, None, None, None, None] * observed.covariance + own
+    holds = len(observed.widths_m)
+    variance = np.square(WIDTH_DISCREPANCY_M)[:, None] + np.full(holds, WIDTH_SIGMA_M**2)
+    if extra is not None:
+        S = S + np.eye(3) * extra[:poses].reshape(-1, 1, 3)
+        variance = variance + extra[poses : poses + holds]
+    return Scales(
+        inverse=np.linalg.inv(S), log_det=np.linalg.slogdet(S)[1], width_inverse=1.0 / variance
+    )
+
+
 def score(
     observed: Observations,
     predicted: Features,
     *,
-    discrepancies_m: tuple[float, float] | None = None,
-    extra: Float[np.ndarray, " num_features"] | None = None,
+    beliefs: Beliefs | None = None,
+    scales: Scales | None = None,
 ) -> Score:
-    """Log-likelihood of observations, maximised over the twin's discrepancy.
+    """Log-likelihood of observations, whatever the sizes of the errors are.
 
     Args:
         observed: What was seen.
         predicted: What a point says.
-        discrepancies_m: Of poses and widths where they are known, from other episodes.
-        extra: Variance of each feature that the prediction has of its own (an emulator's).
+        beliefs: In errors, from other episodes; None: those beforehand.
+        scales: Of the same observations; None: without any variance of the prediction's own.
     """
-    poses = _poses(observed, predicted, extra)
-    widths = _widths(observed, predicted, extra)
-    total = _coins(observed, predicted)
-    chosen = []
-    given = discrepancies_m or (None, None)
-    for table, sizes, name, known in zip(
-        (poses, widths),
-        (POSE_DISCREPANCY_M, WIDTH_DISCREPANCY_M),
-        ("pose", "width"),
-        given,
-        strict=True,
-    ):
-        belief = -0.5 * np.log2(np.array(sizes) / EXPECTED_M[name]) ** 2
-        best = int(np.argmax(table + belief)) if known is None else sizes.index(known)
-        total += float(table[best]) + (float(belief[best]) if known is None else 0.0)
-        chosen.append(sizes[best])
-    return Score(log_likelihood=total, pose_discrepancy_m=chosen[0], width_discrepancy_m=chosen[1])
+    known = scales_of(observed) if scales is None else scales
+    before = Beliefs() if beliefs is None else beliefs
+    after, total = before.after(
+        _poses(observed, predicted, known), _widths(observed, predicted, known)
+    )
+    return Score(log_likelihood=total + _coins(observed, predicted), beliefs=after)
 
 
 def _poses(
-    observed: Observations, predicted: Features, extra: Float[np.ndarray, " num_features"] | None
-) -> Float[np.ndarray, " num_sizes"]:
-    """Multivariate t, per size of the discrepancy."""
-    sizes = np.array(POSE_DISCREPANCY_M)
-    if len(observed.settled) == 0:
-        return np.zeros(len(sizes))
+    observed: Observations, predicted: Features, scales: Scales
+) -> dict[str, Float[np.ndarray, "num_shares num_sizes"]]:
+    """Multivariate t, per kind, share of localisation's error, and size of the discrepancy."""
     r = observed.settled - predicted.settled
     half = observed.period_rad / 2
     r[:, 2] = np.mod(r[:, 2] + half, observed.period_rad) - half
-    own = np.diag([1.0, 1.0, LEVER_M**-2])
-    S = observed.covariance[None] + (sizes**2)[:, None, None, None] * own
-    if extra is not None:
-        S = S + np.eye(3) * extra[: r.size].reshape(-1, 1, 3)
-    solved = np.linalg.solve(S, np.broadcast_to(r[..., None], (*S.shape[:2], 3, 1)))[..., 0]
-    distance = np.sum(solved * r, axis=-1)
-    _, log_det = np.linalg.slogdet(S)
-    return np.asarray(np.sum(_log_t(distance, 3) - 0.5 * log_det, axis=1))
+    way = np.pad(observed.way, ((0, 0), (0, 1)))
+    own, both, along = (
+        np.sum((scales.inverse @ right[..., None])[..., 0] * left, axis=-1)
+        for left, right in ((r, r), (way, r), (way, way))
+    )
+    size = (SHARED_WAY * np.outer(SHARED_AT, POSE_DISCREPANCY_M))[:, None, :, None]
+    squared = own - 2 * size * both + size**2 * along
+    each = _log_t(squared, 3) - 0.5 * scales.log_det
+    return {
+        observed.kinds[number]: _over_shared(each[..., observed.pose_kind == number].sum(axis=-1))
+        for number in np.unique(observed.pose_kind)
+    }
 
 
 def _widths(
-    observed: Observations, predicted: Features, extra: Float[np.ndarray, " num_features"] | None
-) -> Float[np.ndarray, " num_sizes"]:
-    sizes = np.array(WIDTH_DISCREPANCY_M)
-    if len(observed.widths_m) == 0:
-        return np.zeros(len(sizes))
-    variance = (sizes**2)[:, None] + WIDTH_SIGMA_M**2
-    if extra is not None:
-        first = 3 * len(observed.settled)
-        variance = variance + extra[first : first + len(observed.widths_m)]
-    total = np.zeros(len(sizes))
+    observed: Observations, predicted: Features, scales: Scales
+) -> Float[np.ndarray, " num_width_sizes"]:
+    r = observed.widths_m - predicted.widths_m
+    off = (r - SHARED_WIDTH_M * SHARED_AT[:, None])[:, None]
+    each = _log_t(scales.width_inverse * off**2, 1) + 0.5 * np.log(scales.width_inverse)
+    total = np.zeros(len(WIDTH_DISCREPANCY_M))
     for kind in np.unique(observed.width_kind):
-        mine = observed.width_kind == kind
-        inverse = 1.0 / np.broadcast_to(variance, (len(sizes), len(mine)))[:, mine]
-        r = (observed.widths_m - predicted.widths_m)[mine]
-        # Sherman and Morrison (1950): a diagonal with one error that all of the kind share.
-        share = 1.0 / (SHARED_WIDTH_M**-2 + inverse.sum(axis=1))
-        distance = inverse @ r**2 - share * (inverse @ r) ** 2
-        log_det = -np.log(inverse).sum(axis=1) + np.log1p(SHARED_WIDTH_M**2 * inverse.sum(axis=1))
-        total += _log_t(distance, len(r)) - 0.5 * log_det
+        total += _over_shared(each[..., observed.width_kind == kind].sum(axis=-1))
     return total
+
+
+def _over_shared(logs: Float[np.ndarray, "num_shared *rest"]) -> Float[np.ndarray, "*rest"]:
+    """Log-likelihood over all values of an error that the episodes of a kind have in common."""
+    return log_total(np.moveaxis(logs, 0, -1) + SHARED_LOG_WEIGHT)
 
 
 def _log_t(distance: Float[np.ndarray, "*shape"], dimensions: int) -> Float[np.ndarray, "*shape"]:

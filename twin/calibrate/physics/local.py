@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
-from twin.calibrate.physics.likelihood import Observations, score, unflatten
+from twin.calibrate.physics.likelihood import Observations, Scales, scales_of, score, unflatten
 
 LEVEL = 3.841
 """95 % of chi square with one degree of freedom: Wilks (1938)."""
@@ -38,15 +38,17 @@ class Emulator:
     """What the quadratics leave unexplained."""
     bounds: Float[np.ndarray, "num_parameters 2"]
     observed: Observations
+    scales: Scales
+    """Of the observations, with the variance above."""
 
     def features(self, x: Float[np.ndarray, " num_parameters"]) -> Float[np.ndarray, " n"]:
         """Predict."""
         return np.asarray(_basis((x - self.centre) / self.width)[0] @ self.coefficients)
 
     def log_posterior(self, x: Float[np.ndarray, " num_parameters"]) -> float:
-        """Of a point, the twin's discrepancy chosen for it."""
+        """Of a point, whatever the size of the twin's discrepancy."""
         predicted = unflatten(self.features(x), self.observed)
-        found = score(self.observed, predicted, extra=self.variance)
+        found = score(self.observed, predicted, scales=self.scales)
         return found.log_likelihood - 0.5 * float(x @ x)
 
     def trusted(self) -> Float[np.ndarray, "num_parameters 2"]:
@@ -100,13 +102,15 @@ def fit_emulator(
     """Lay quadratics without mixed terms through predicted numbers."""
     basis = _basis((points - centre) / width)
     rows = [_clear_terms(basis, column) for column in features.T]
+    variance = np.array([row[1] for row in rows]) + FLOOR
     return Emulator(
         centre=centre,
         width=width,
         coefficients=np.stack([row[0] for row in rows], axis=1),
-        variance=np.array([row[1] for row in rows]) + FLOOR,
+        variance=variance,
         bounds=bounds,
         observed=observed,
+        scales=scales_of(observed, variance),
     )
 
 

@@ -57,10 +57,7 @@ def physics_record(
             "nominal": found.nominal.to_record(),
             "calibrated": found.calibrated.to_record(),
         },
-        "discrepancy_m": {
-            "pose": found.calibrated_score.pose_discrepancy_m,
-            "width": found.calibrated_score.width_discrepancy_m,
-        },
+        "errors": found.calibrated_score.beliefs.most_likely(),
         "sources": {case.episode: {"kind": case.kind, "sha256": case.sha256} for case in cases},
         "skipped": dict(skipped),
         "num_evaluations": found.num_evaluations,

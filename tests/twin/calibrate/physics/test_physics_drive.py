@@ -10,6 +10,7 @@ from bridge.sources.standin.probes import plan_probe
 from bridge.task.plan import Plan
 from bridge.task.robot import MAX_WIDTH_M, ur5_with_gripper_urdf
 from bridge.task.task_file import load_task
+from twin.calibrate.physics import drive
 from twin.calibrate.physics.case import Case, Prediction, planar
 from twin.calibrate.physics.drive import gripper_only, predict
 from twin.calibrate.physics.evaluate import Evaluator
@@ -20,6 +21,7 @@ from twin.calibrate.physics.parameters import (
     rigid_parameters,
 )
 from twin.physics.config import PhysicsConfig
+from twin.physics.world import World
 
 TASK = load_task("cube_into_box")
 CONFIG = PhysicsConfig()
@@ -128,6 +130,24 @@ def test_a_slow_push_ends_where_the_fingers_stopped_and_shows_a_bias_of_localisa
 def test_every_run_and_every_process_gives_the_same_bits(slide: Case) -> None:
     first, again = told(slide), told(slide)
     np.testing.assert_array_equal(first.settled, again.settled)
+
+
+def test_what_lies_still_is_not_watched_longer_and_would_have_stayed(
+    slide: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = []
+
+    class Counted(World):
+        def step(self) -> None:
+            steps.append(None)
+            super().step()
+
+    monkeypatch.setattr(drive, "World", Counted)
+    soon, quick = told(slide), len(steps)
+    monkeypatch.setattr(drive, "REST", -1.0)
+    late = told(slide)
+    assert len(steps) - quick > quick + 0.3 * CONFIG.rate_hz
+    np.testing.assert_allclose(soon.settled, late.settled, atol=5e-5)
 
 
 @pytest.mark.slow

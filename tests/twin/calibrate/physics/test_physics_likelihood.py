@@ -1,23 +1,33 @@
 """The likelihood against SciPy, and what it makes of turns, outliers and coins."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import integrate, stats
 
+from bridge.geometry import se3
+from twin.calibrate.physics.beliefs import (
+    EXPECTED_M,
+    NOISE_SHARE,
+    POSE_DISCREPANCY_M,
+    WIDTH_DISCREPANCY_M,
+    Beliefs,
+)
 from twin.calibrate.physics.case import Case, Prediction, planar
 from twin.calibrate.physics.likelihood import (
     DEGREES,
     LEVER_M,
-    POSE_DISCREPANCY_M,
+    SHARED_WAY,
     SHARED_WIDTH_M,
-    WIDTH_DISCREPANCY_M,
     WIDTH_SIGMA_M,
     Features,
+    Score,
     features_of,
     observations_of,
+    scales_of,
     score,
     unflatten,
 )
@@ -25,7 +35,7 @@ from twin.calibrate.physics.likelihood import (
 sys.path.insert(0, str(Path(__file__).parent))
 import synthetic
 
-KNOWN = (POSE_DISCREPANCY_M[1], WIDTH_DISCREPANCY_M[1])
+GOOD = np.array([0.5, -0.1, 0.2])
 
 
 def seen(**changes: object) -> Case:
@@ -36,16 +46,133 @@ def predicted(pose: np.ndarray, width_m: float = 0.04, success: float = np.nan) 
     return Prediction(settled=pose[None], held_widths_m=np.array([width_m]), success=success)
 
 
-def test_poses_and_widths_follow_the_t_distributions_of_scipy() -> None:
-    case = seen(settled=np.array([[0.5, -0.1, 0.2]]), held_widths_m=np.array([0.0407]))
+def weights(sizes_m: tuple[float, ...]) -> np.ndarray:
+    """Log-normal, as believed beforehand."""
+    dense = stats.norm.pdf(np.log2(np.array(sizes_m) / EXPECTED_M))
+    return dense / dense.sum()
+
+
+@pytest.mark.parametrize("own_sigma", [0.0, 0.003])
+def test_poses_and_widths_follow_mixtures_of_the_t_distributions_of_scipy(own_sigma: float) -> None:
+    case = seen(settled=GOOD[None], held_widths_m=np.array([0.0407]))
     pose = np.array([0.502, -0.101, 0.23])
     observed = observations_of([case], 0)
-    found = score(observed, features_of([case], [predicted(pose)]), discrepancies_m=KNOWN)
-    scale = case.settled_covariance[0] + KNOWN[0] ** 2 * np.diag([1, 1, LEVER_M**-2])
-    expected = stats.multivariate_t.logpdf(case.settled[0], pose, scale, df=DEGREES)
-    sigma = np.sqrt(KNOWN[1] ** 2 + WIDTH_SIGMA_M**2 + SHARED_WIDTH_M**2)
-    expected += stats.t.logpdf(0.0407, DEGREES, 0.04, sigma)
-    assert found.log_likelihood == pytest.approx(expected)
+    scales = scales_of(observed, np.full(4, own_sigma**2))
+    found = score(observed, features_of([case], [predicted(pose)]), scales=scales)
+    way = np.array([*GOOD[:2], 0.0]) / np.linalg.norm(GOOD[:2])
+    likelihood = 0.0
+    for share in NOISE_SHARE:
+        for size, weight in zip(POSE_DISCREPANCY_M, weights(POSE_DISCREPANCY_M), strict=True):
+            scale = share**2 * case.settled_covariance[0] + own_sigma**2 * np.eye(3)
+            scale += size**2 * np.diag([1, 1, LEVER_M**-2])
+            t = stats.multivariate_t(pose, scale, df=DEGREES)
+            density = over_shared(lambda z, t=t, d=size: t.pdf(GOOD - SHARED_WAY * d * z * way))
+            likelihood += weight * density / len(NOISE_SHARE)
+    held = 0.0
+    for size, weight in zip(WIDTH_DISCREPANCY_M, weights(WIDTH_DISCREPANCY_M), strict=True):
+        t = stats.t(DEGREES, 0.04, np.sqrt(size**2 + WIDTH_SIGMA_M**2 + own_sigma**2))
+        held += weight * over_shared(lambda z, t=t: t.pdf(0.0407 - SHARED_WIDTH_M * z))
+    assert found.log_likelihood == pytest.approx(np.log(likelihood) + np.log(held), abs=2e-3)
+
+
+def over_shared(density: Callable[[float], float]) -> float:
+    """An integral over a standard normal error."""
+    return integrate.quad(lambda z: stats.norm.pdf(z) * density(z), -8, 8)[0]
+
+
+def test_what_slides_have_in_common_gets_no_surer_by_repetition() -> None:
+    def sigma_m(count: int) -> float:
+        cases = scattered(count, 0.002, 8, kind="slide", start=np.zeros(3))
+        steps = np.linspace(-0.004, 0.004, 41)
+        way = np.array([*GOOD[:2], 0.0]) / np.linalg.norm(GOOD[:2])
+        logs = np.array([worth(cases, GOOD + s * way).log_likelihood for s in steps])
+        dense = np.exp(logs - logs.max())
+        mean = np.average(steps, weights=dense)
+        return float(np.sqrt(np.average((steps - mean) ** 2, weights=dense)))
+
+    assert sigma_m(6) < 1.3 * 0.002
+    assert sigma_m(96) > 0.5 * SHARED_WAY * 0.002
+
+
+def test_one_jam_at_another_place_does_not_make_the_others_less_sure() -> None:
+    def drop(*extra_m: float) -> float:
+        widths = np.array([0.0470, 0.0472, 0.0468, 0.0471, *extra_m])
+        cases = [seen(hold_times_s=np.zeros(1), held_widths_m=np.array([w])) for w in widths]
+        observed = observations_of(cases, 0)
+        rows = [
+            score(observed, features_of(cases, [predicted(np.zeros(3), at)] * len(cases)))
+            for at in (0.0470, 0.0500)
+        ]
+        return rows[0].log_likelihood - rows[1].log_likelihood
+
+    assert drop() > 2.0
+    assert drop(0.0439) > 0.7 * drop()
+
+
+def scattered(
+    count: int, sigma_m: float, seed: int, kind: str = "push", start: np.ndarray = GOOD
+) -> list[Case]:
+    """Poses around one, of which localisation states 2.5 mm and 0.083 rad."""
+    rng = np.random.default_rng(seed)
+    stated = np.diag([0.0025, 0.0025, 0.0025 / LEVER_M])[None] ** 2
+    poses = GOOD + rng.standard_normal((count, 3)) * [sigma_m, sigma_m, sigma_m / LEVER_M]
+    return [
+        seen(
+            kind=kind,
+            Ts_base_start={"cube": se3.transform_from(np.array([1.0, 0, 0, 0]), start)},
+            settled=pose[None],
+            settled_covariance=stated,
+            hold_times_s=np.zeros(0),
+            held_widths_m=np.zeros(0),
+        )
+        for pose in poses
+    ]
+
+
+def worth(cases: list[Case], pose: np.ndarray, beliefs: Beliefs | None = None) -> Score:
+    said = Prediction(settled=pose[None], held_widths_m=np.zeros(0), success=np.nan)
+    return score(
+        observations_of(cases, 0), features_of(cases, [said] * len(cases)), beliefs=beliefs
+    )
+
+
+def test_what_some_episodes_teach_of_errors_is_taken_to_the_next_by_the_rule_of_bayes() -> None:
+    cases = [*scattered(6, 0.001, 1), *scattered(5, 0.004, 2, kind="slide")]
+    first = worth(cases[:8], GOOD)
+    second = worth(cases[8:], GOOD, first.beliefs)
+    together = worth(cases, GOOD)
+    assert first.log_likelihood + second.log_likelihood == pytest.approx(together.log_likelihood)
+    np.testing.assert_allclose(second.beliefs.share, together.beliefs.share)
+    for kind in ("push", "slide"):
+        np.testing.assert_allclose(second.beliefs.pose[kind], together.beliefs.pose[kind])
+
+
+def test_an_error_that_all_localisations_share_does_not_hide_a_better_point() -> None:
+    # 0.3 mm of scatter, of which 2.5 mm are stated: 1.5 mm are five standard deviations.
+    cases, off = scattered(14, 0.0003, 3), GOOD + np.array([0.0015, 0.0, 0.0])
+    right, wrong = worth(cases, GOOD), worth(cases, off)
+    assert right.beliefs.most_likely()["noise_share"] == NOISE_SHARE[-1]
+    assert right.log_likelihood - wrong.log_likelihood > 20.0
+    new = scattered(6, 0.0003, 4)
+    gain = worth(new, GOOD, right.beliefs).log_likelihood
+    assert gain - worth(new, off, wrong.beliefs).log_likelihood > 6.0
+
+
+def test_poses_that_scatter_as_stated_count_as_stated() -> None:
+    well = [
+        Case(**{**vars(case), "settled_covariance": case.settled_covariance / 100.0})
+        for case in scattered(10, 0.00025, 5)
+    ]
+    poorly = scattered(10, 0.0025, 6)
+    assert worth(well + poorly, GOOD).beliefs.most_likely()["noise_share"] in NOISE_SHARE[:2]
+
+
+def test_each_kind_of_episode_has_a_discrepancy_of_its_own() -> None:
+    cases = [*scattered(12, 0.0003, 6), *scattered(12, 0.008, 7, kind="slide")]
+    found = worth(cases, GOOD).beliefs.most_likely()["pose_m"]
+    assert isinstance(found, dict)
+    assert found["push"] <= 0.001
+    assert found["slide"] >= 0.004
 
 
 def test_turns_that_look_the_same_are_the_same() -> None:
