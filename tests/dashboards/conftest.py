@@ -26,6 +26,8 @@ from dashboards.library import Library
 from evaluator.compare import compare_run
 from evaluator.result import write_results
 
+sys.path.insert(0, str(Path(__file__).parent))
+
 START_NS = 1_760_000_000_000_000_000
 EXECUTION_NS = START_NS + 1_000_000_000
 END_S = 6.0

@@ -1,9 +1,11 @@
 """A small trial of a made-up cell: cameras, joints, gripper, plan, events, verdict, drops."""
 
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +27,8 @@ from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.verdict import Factor, Verdict
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 START_NS = 1_700_000_000_123_456_789
 WIDTH, HEIGHT = 32, 24
@@ -258,3 +262,11 @@ def make_trial(tmp_path: Path) -> Callable[..., Path]:
 def made_trial() -> type[MadeTrial]:
     """The record behind ``make_trial``, for expected values."""
     return MadeTrial
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Any:
+    """Return a LeRobot dataset of three episodes, not yet written."""
+    from lerobot_dataset import Dataset  # needs packages that not every test here needs
+
+    return Dataset(tmp_path / "ds")

@@ -126,3 +126,18 @@ def make_cell(cell_file: CellFile, task: Task, reserved_seed: int) -> Callable[.
         )
 
     return make
+
+
+@pytest.fixture(scope="session")
+def toys_cell() -> CellFile:
+    return load_cell("standin_toys")
+
+
+@pytest.fixture(scope="session")
+def sloth() -> Task:
+    return load_task("sloth_into_basket")
+
+
+@pytest.fixture(scope="session")
+def ducks() -> Task:
+    return load_task("five_ducks_into_basket")
