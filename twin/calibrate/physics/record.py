@@ -146,6 +146,12 @@ def describe_physics(record: Mapping[str, Any], calibration_id: str) -> str:
         else "         not identified"
     )
     lines.append(f"  {'command_delay_s':<22} {told}: {delay['why']}")
+    errors = record["errors"]
+    own = ", ".join(f"{kind} {size * 1e3:.2g} mm" for kind, size in errors["pose_m"].items())
+    lines.append(
+        f"  likeliest errors: {errors['noise_share']:.0%} of what localisation states changes from "
+        f"pose to pose; the twin's own: {own or 'no pose'}"
+    )
     held = record["held_out"]
     for label in ("nominal", "calibrated"):
         item = held[label]

@@ -120,6 +120,7 @@ def test_what_was_found_is_kept_in_the_scene_as_replays_read_it_and_told_in_a_ta
         assert parameter.name in text
     assert "not identified" in text
     assert "held out, calibrated: settled poses off by" in text
+    assert "of what localisation states changes from pose to pose; the twin's own: push" in text
 
 
 def physics_part(**changes: Any) -> dict[str, Any]:
