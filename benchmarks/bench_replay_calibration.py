@@ -17,6 +17,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -133,6 +134,17 @@ def targets_of(rows: list[dict[str, Any]]) -> list[Target]:
     return targets
 
 
+def print_kinds(poses: Sequence[dict[str, Any]]) -> None:
+    """What each kind of probe was off by: a slide cannot be foreseen as a push can."""
+    for kind in sorted({pose["kind"] for pose in poses}):
+        mine = [pose for pose in poses if pose["kind"] == kind]
+        before, after = (1e3 * np.median(each) for each in errors_m(mine, "shifted"))
+        print(
+            f"{kind}, {COMPARED['shifted']} [mm]: median {before:.2f} with the defaults, "
+            f"{after:.2f} calibrated, {len(mine)} poses"
+        )
+
+
 def main() -> None:
     """Every seed, then the table."""
     given = [int(text) for text in sys.argv[1:]]
@@ -161,6 +173,7 @@ def main() -> None:
         print(f"seed {seed}: {told}; {row['calibrated_s']:.0f} s", flush=True)
     if not rows:
         return
+    print_kinds([pose for row in rows for pose in row["settled"]])
     report_targets(
         "replay_calibration",
         targets_of(rows),
