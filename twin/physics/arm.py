@@ -103,7 +103,6 @@ class Arm:
                 self.id,
                 link,
                 lateralFriction=self._config.finger_friction,
-                spinningFriction=self._config.spinning_friction_m,
                 physicsClientId=self._client,
             )
         gear = pybullet.createConstraint(

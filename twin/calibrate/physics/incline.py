@@ -77,7 +77,9 @@ def _slide(
             pybullet.GEOM_BOX, halfExtents=half, physicsClientId=client
         )
         body = pybullet.createMultiBody(mass, shape, -1, [0, 0, height], physicsClientId=client)
-        pybullet.changeDynamics(body, -1, lateralFriction=mu, physicsClientId=client)
+        pybullet.changeDynamics(
+            body, -1, lateralFriction=mu, frictionAnchor=1, physicsClientId=client
+        )
         bodies.append(body)
     pybullet.setGravity(0, 0, -g, physicsClientId=client)
     for _ in range(round(REST_S * config.rate_hz)):

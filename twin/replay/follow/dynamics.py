@@ -6,6 +6,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from bridge.geometry import se3
 from twin.physics.attach import Attachment
 from twin.physics.soft import BURST_STRETCH, SoftHealth, SoftModel
 from twin.physics.world import World
@@ -102,7 +103,9 @@ class _Samples:
         self._stamps: list[int] = []
         self._joints: list[Float[np.ndarray, " num_joints"]] = []
         self._widths: list[float] = []
-        self._poses: dict[str, list[Float[np.ndarray, "4 4"]]] = {n: [] for n in self._objects}
+        self._rigid = [name for name in self._objects if name not in soft]
+        self._poses: dict[str, list[tuple[float, ...]]] = {name: [] for name in self._rigid}
+        self._fits: dict[str, list[Float[np.ndarray, "4 4"]]] = {name: [] for name in soft}
         self._touch: dict[str, list[bool]] = {name: [] for name in self._objects}
         self._nodes: dict[str, list[Float32[np.ndarray, "num_nodes 3"]]] = {n: [] for n in soft}
         self._extents: dict[str, list[np.ndarray]] = {name: [] for name in soft}
@@ -122,15 +125,17 @@ class _Samples:
         self._joints.append(joints)
         self._widths.append(width)
         for name in self._objects:
-            self._poses[name].append(world.T_base_object(name))
             self._touch[name].append(world.finger_touches(name))
+        for name in self._rigid:
+            self._poses[name].append(world.object_pose(name))
         for name in self._soft:
+            self._fits[name].append(world.T_base_object(name))
             self._nodes[name].append(world.soft_nodes_m(name).copy())
             self._extents[name].append(world.soft_extents_m(name))
         return True
 
     def states(self, world: World) -> States:
-        poses = {name: np.stack(items) for name, items in self._poses.items()}
+        poses = {name: self._Ts_base_object(name) for name in self._objects}
         poses |= {
             name: np.repeat(T[None], len(self._stamps), axis=0) for name, T in self._still.items()
         }
@@ -145,6 +150,12 @@ class _Samples:
             broken=self._broken(world),
             burst=self._burst,
         )
+
+    def _Ts_base_object(self, name: str) -> Float[np.ndarray, "num_steps 4 4"]:
+        if name in self._fits:
+            return np.stack(self._fits[name])
+        rows = np.array(self._poses[name])
+        return se3.transform_from(rows[:, 3:], rows[:, :3])
 
     def _broken(self, world: World) -> dict[str, str]:
         found = {}
