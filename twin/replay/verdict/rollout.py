@@ -20,6 +20,7 @@ from twin.replay.follow.furnish import soft_models
 from twin.replay.follow.overlap import free_start
 from twin.replay.follow.path import JointPath, check_path, path_of_plan
 from twin.replay.place.scene import ReplayScene
+from twin.replay.verdict.hold import holds_of, slips, unless_slipped
 from twin.replay.verdict.judge import findings_of, reason_of, terminal_factor, warnings_of
 from twin.replay.verdict.result import ReplayResult
 from twin.robot.collision import hulls_of
@@ -111,15 +112,18 @@ def _replay(
         extents_m=states.extents_m,
         broken=states.broken,
     )
+    # What was executed is judged by where things end: it is known whether they were dropped.
+    holds = holds_of(plan, path, result) if dynamic and trajectory == "planned" else []
+    terminal = terminal_factor(
+        result, scene, config, unreachable_ns=unreachable_ns, burst=states.burst
+    )
     verdict = replace(
         result.verdict,
         ik=factor_from(failures),
         clearance=factor_from(
             monitor.failures, undecided=_clearance_undecided(scene, unreachable_ns, states)
         ),
-        terminal=terminal_factor(
-            result, scene, config, unreachable_ns=unreachable_ns, burst=states.burst
-        ),
+        terminal=unless_slipped(terminal, slips(holds, config.max_slip_m)),
         warnings=warnings_of(scene, result),
         findings=tuple(findings_of(scene.task, result.rollout(), "replayed")) if dynamic else (),
     )
