@@ -21,10 +21,10 @@ from bridge.task.robot import BASE_FRAME
 from bridge.task.task_file import Task
 from twin.scene.frames.choice import rgbd_camera_ids
 from twin.scene.frames.still import same_pose
-from twin.scene.localise.mesh import Surface
 from twin.scene.localise.objects import LocaliseConfig, localise_objects
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.localise.scanned import scanned_surfaces
+from twin.scene.localise.surface import Surface
 
 NO_SCENE = "noscene"
 STILL_WINDOW_NS = 40_000_000

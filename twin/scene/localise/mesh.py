@@ -6,19 +6,17 @@ claim surface where a camera saw through.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from bridge.geometry import se3
-from bridge.task.meshes.catalogue import object_mesh
-from bridge.task.task_file import ObjectModel
 from twin.scene.localise.fit import FitConfig
 from twin.scene.localise.points import Cluster, View
+from twin.scene.localise.surface import Surface, facing, lengths, seen_through
 from twin.scene.shape.known import pose_of
 
 _POSE = 6
@@ -27,8 +25,6 @@ _SIDES = [
     Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     for angles in ((0, 0, 0), (90, 0, 0), (-90, 0, 0), (180, 0, 0), (0, 90, 0), (0, -90, 0))
 ]
-FACING = 0.15
-"""Cosine below which a camera hardly sees a surface."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,14 +47,6 @@ class MeshFitConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Surface:
-    """Points spread evenly over a mesh, in the object frame."""
-
-    p_m: Float[np.ndarray, "num_samples 3"]
-    normals: Float[np.ndarray, "num_samples 3"]
-
-
-@dataclass(frozen=True, kw_only=True)
 class MeshFit:
     """A mesh laid onto points."""
 
@@ -76,40 +64,12 @@ class MeshFit:
     """Of the best pose that is turned by more than 30 degrees; infinite without any."""
 
 
-def surface_of(
-    vertices_m: Float[np.ndarray, "num_vertices 3"],
-    triangles: Int[np.ndarray, "num_faces 3"],
-    num_samples: int,
-) -> Surface:
-    """Spread points over a mesh, each triangle by its area; the same each time.
-
-    Args:
-        vertices_m: Of the known or a reconstructed mesh, in the object frame.
-        triangles: Counter-clockwise seen from outside.
-        num_samples: How many.
-    """
-    a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
-    double_area = np.linalg.norm(cross, axis=1)
-    edges = np.cumsum(double_area) / double_area.sum()
-    chosen = np.searchsorted(edges, (np.arange(num_samples) + 0.5) / num_samples)
-    u, v = np.random.default_rng(0).random((2, num_samples, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    p = a[chosen] * (1 - u - v) + b[chosen] * u + c[chosen] * v
-    return Surface(p_m=p, normals=cross[chosen] / double_area[chosen, None])
-
-
-@cache
-def known_surface(model: ObjectModel, num_samples: int) -> Surface:
-    """Surface of the mesh that the task file names."""
-    mesh = object_mesh(model)
-    return surface_of(mesh.vertices_m, mesh.triangles, num_samples)
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Problem:
     surface: Surface
     cluster: Cluster
+    points: Sequence[Float[np.ndarray, "_ 3"]]
+    """Those of the cluster that each view saw."""
     views: Sequence[View]
     fit: FitConfig
     tilt_sigma_rad: float
@@ -150,21 +110,21 @@ def fit_mesh(
         distance = float(np.linalg.norm(view.T_base_depth[:3, 3] - centre))
         sigma = np.hypot(fit.camera_sigma_m, fit.camera_sigma_rad * distance)
         prior += [1 / sigma**2] * _PER_VIEW
+    few = cluster.thinned(config.coarse_points)
     problem = _Problem(
         surface=surface,
         cluster=cluster,
+        points=cluster.by_view(len(views)),
         views=views,
         fit=fit,
         tilt_sigma_rad=tilt_sigma_rad,
         prior=np.array(prior),
     )
-    coarse = _Problem(
+    coarse = replace(
+        problem,
         surface=Surface(p_m=surface.p_m[::3], normals=surface.normals[::3]),
-        cluster=cluster.thinned(config.coarse_points),
-        views=views,
-        fit=fit,
-        tilt_sigma_rad=tilt_sigma_rad,
-        prior=problem.prior,
+        cluster=few,
+        points=few.by_view(len(views)),
     )
     sides = _SIDES if lying else _SIDES[:1]
     first = [T for side in sides for T in _starts(problem, config.num_starts, side, yaw_period_rad)]
@@ -191,44 +151,44 @@ def _starts(
     ]
 
 
-def facing(
-    T: Float[np.ndarray, "4 4"], view: View, surface: Surface
-) -> Bool[np.ndarray, " num_samples"]:
-    """Tell which samples turn their outside to a view's camera."""
-    eye = se3.apply(se3.invert(T), view.T_base_depth[None, :3, 3])[0]
-    ray = eye - surface.p_m
-    along = np.einsum("ij,ij->i", ray, surface.normals)
-    return np.asarray(along > FACING * np.linalg.norm(ray, axis=1))
-
-
 def _residuals(
     T: Float[np.ndarray, "4 4"], shifts: Float[np.ndarray, "num_views 2"], problem: _Problem
 ) -> tuple[Float[np.ndarray, " num_points"], Float[np.ndarray, "num_points 8"], np.ndarray]:
     """Signed distances, derivatives by pose and by the own view's shift, and view ids."""
     rows, jacobians, ids = [], [], []
-    for view_id, view in enumerate(problem.views):
-        p = problem.cluster.p_base[problem.cluster.view_ids == view_id]
-        seen = facing(T, view, problem.surface)
+    T_object_base = se3.invert(T)
+    for view_id, (view, p) in enumerate(zip(problem.views, problem.points, strict=True)):
+        seen = facing(T_object_base, view, problem.surface)
         if len(p) == 0 or seen.sum() < 10:
             continue
         moved = T.copy()
         moved[:2, 3] += shifts[view_id]
         q, n = problem.surface.p_m[seen], problem.surface.normals[seen]
         local = se3.apply(se3.invert(moved), p)
-        _, nearest = cKDTree(q).query(local)
-        normal = n[nearest] @ T[:3, :3].T
+        # Each tree is asked once: one that is made quickly beats one that answers quickly.
+        _, nearest = cKDTree(q, balanced_tree=False, compact_nodes=False).query(local)
+        n = n[nearest]
         gap = local - q[nearest]
-        r = np.einsum("ij,ij->i", gap, n[nearest])
+        r = np.einsum("ij,ij->i", gap, n)
         # Beside the mesh the plane is no surface: the plain distance counts there.
-        far = np.linalg.norm(gap, axis=1)
+        far = lengths(gap)
         r = np.where(far > 2 * np.abs(r) + problem.fit.tukey_m, far, r)
-        arm = p - moved[:3, 3]
-        jacobians.append(np.column_stack([-normal, -np.cross(arm, normal), -normal[:, :2]]))
         rows.append(r)
+        jacobians.append(_derivatives(p - moved[:3, 3], n @ T[:3, :3].T))
         ids.append(np.full(len(r), view_id))
     if not rows:
         return np.zeros(0), np.zeros((0, _POSE + _PER_VIEW)), np.zeros(0, dtype=np.int64)
     return np.concatenate(rows), np.concatenate(jacobians), np.concatenate(ids)
+
+
+def _derivatives(
+    arm_m: Float[np.ndarray, "num_points 3"], normal: Float[np.ndarray, "num_points 3"]
+) -> Float[np.ndarray, "num_points 8"]:
+    """Of the distances along the normals, by the pose and by the own view's shift."""
+    x, y, z = arm_m.T
+    a, b, c = normal.T
+    columns = [a, b, c, y * c - z * b, z * a - x * c, x * b - y * a, a, b]
+    return np.asarray(-np.stack(columns, axis=1))
 
 
 def _normal_equations(
@@ -288,34 +248,6 @@ def _score(
     return misfit + through, through
 
 
-def seen_through(
-    T: Float[np.ndarray, "4 4"], surface: Surface, views: Sequence[View], margin_m: float
-) -> float:
-    """Share of the mesh's facing surface behind which cameras measured something.
-
-    Args:
-        T: ``T_base_object``.
-        surface: The mesh.
-        views: With their depth.
-        margin_m: How far behind.
-    """
-    through, looked = 0, 0
-    for view in views:
-        p = se3.apply(T, surface.p_m[facing(T, view, surface)])
-        p = se3.apply(se3.invert(view.T_base_depth), p)
-        p = p[p[:, 2] > 0.05]
-        if len(p) == 0:
-            continue
-        uv, _ = view.depth_camera.project(p)
-        size = (view.depth_camera.width, view.depth_camera.height)
-        inside = np.all((uv >= 0) & (uv < size), axis=1)
-        column, row = uv[inside].astype(np.int64).T
-        depth = view.depth_m[row, column]
-        looked += int((depth > 0).sum())
-        through += int((depth > p[inside, 2] + margin_m).sum())
-    return through / looked if looked else 0.0
-
-
 def _choose(
     ends: Sequence[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "num_views 2"]]],
     problem: _Problem,
@@ -351,22 +283,3 @@ def _turn(R: Float[np.ndarray, "3 3"], period_rad: float) -> float:
     turns = np.arange(0.0, 2 * np.pi - 1e-9, period_rad)
     spun = [R @ Rotation.from_euler("z", turn).as_matrix() for turn in turns]
     return min(float(se3.rotation_angle_rad(rotation)) for rotation in spun)
-
-
-def agreeing(
-    T: Float[np.ndarray, "4 4"], surface: Surface, views: Sequence[View], margin_m: float
-) -> float:
-    """Share of the mesh's facing surface that the camera which sees most of it measured there.
-
-    Args:
-        T: ``T_base_object``.
-        surface: The mesh.
-        views: With their depth.
-        margin_m: How far off a measurement may be.
-    """
-    share = 0.0
-    for view in views:
-        # Behind the nearer bound, but not behind the farther one.
-        behind = seen_through(T, surface, [view], -margin_m)
-        share = max(share, behind - seen_through(T, surface, [view], margin_m))
-    return share

@@ -18,7 +18,7 @@ from bridge.episode.streams import RgbdFrame
 from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.scene.localise.colour import ColourConfig
 from twin.scene.localise.fit import FitConfig, fit_shape
-from twin.scene.localise.mesh import MeshFitConfig, Surface, fit_mesh, known_surface
+from twin.scene.localise.mesh import MeshFitConfig, fit_mesh
 from twin.scene.localise.points import Cluster, PointConfig, View, fuse_stills, object_points
 from twin.scene.localise.result import (
     LocalisedObject,
@@ -27,7 +27,9 @@ from twin.scene.localise.result import (
     found_by_shape,
     missing,
 )
-from twin.scene.localise.soft import SoftConfig, SoftFit, fit_toys
+from twin.scene.localise.soft import SoftFit, fit_toys
+from twin.scene.localise.soft_config import SoftConfig
+from twin.scene.localise.surface import Surface, known_surface
 from twin.scene.localise.table import TableConfig, TableFit, correct_for_table
 from twin.scene.shape.known import rest_height_m, yaw_period_rad
 

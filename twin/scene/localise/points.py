@@ -172,6 +172,10 @@ class Cluster:
         step = -(-len(self) // max_points) if len(self) else 1
         return Cluster(p_base=self.p_base[::step], view_ids=self.view_ids[::step])
 
+    def by_view(self, num_views: int) -> list[Float[np.ndarray, "_ 3"]]:
+        """Return the points of each view."""
+        return [self.p_base[self.view_ids == view_id] for view_id in range(num_views)]
+
 
 def object_points(
     views: Sequence[View], model: ObjectModel, config: PointConfig, colour: ColourConfig

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from bridge.episode import provenance
 from bridge.episode.run import RunFolder
 from bridge.task.task_file import SCANNED, Task
-from twin.scene.localise.mesh import Surface, surface_of
+from twin.scene.localise.surface import Surface, surface_of
 from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.mesh import read_mesh
 from twin.scene.store.folder import UnreadableSceneError

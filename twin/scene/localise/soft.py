@@ -9,85 +9,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.cluster.vq import kmeans2
+from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
 
-from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
-from twin.scene.localise.colour import ColourConfig, likeness
+from twin.scene.localise.candidates import candidates
+from twin.scene.localise.colour import ColourConfig
 from twin.scene.localise.fit import FitConfig
-from twin.scene.localise.mesh import (
-    MeshFit,
-    MeshFitConfig,
-    Surface,
-    agreeing,
-    facing,
-    fit_mesh,
-    known_surface,
-)
-from twin.scene.localise.points import Cluster, PointConfig, View, clusters, voxel_mean
-from twin.scene.shape.known import surface_distances
-
-DENSE_SAMPLES = 20_000
-CELL_M = 0.004
-STANDS = 0.9
-"""Cosine of the tilt up to which the underside of a toy is taken to be level."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SoftConfig:
-    """How soft toys are found."""
-
-    min_height_m: float = 0.006
-    """Lower points may be table."""
-    clear_m: float = 0.009
-    """Points nearer than this to a rigid object that was found belong to it."""
-    growth: float = 1.2
-    """A cluster with a longer diagonal than the toy's times this holds more than one thing."""
-    shrink: float = 0.35
-    """One shorter than the toy's shortest extent times this is not the toy."""
-    fill: float = 0.7
-    """A toy covers this share of the rectangle around it, seen from above."""
-    stretch_m: float = 0.012
-    """Points nearer than this to the fitted surface show how the toy is deformed."""
-    tilt_sigma_rad: float = 0.1
-    """Prior of roll and pitch of a toy that stands."""
-    well_explained: float = 0.9
-    """With less it may lie on another side: more starts are tried."""
-    well_seen_through: float = 0.12
-    """So they are with more of its surface seen through."""
-    max_seen_through: float = 0.3
-    """With more of its surface seen through it is something else."""
-    min_agreeing: float = 0.35
-    """Some camera must measure this share of the surface that faces it where the toy is."""
-    moved_m: float = 0.05
-    """Equal toys farther from where they are expected were moved, no matter how far: those that
-    stayed keep their names."""
-    score_m: float = 0.2
-    """In the assignment, a point of score counts like this distance."""
-    min_margin_m: float = 0.02
-    """Equal toys whose exchange would cost less are reported as hardly told apart."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SoftShape:
-    """Coarse shape: a box with its middle, axes and extents."""
-
-    centroid_m: Float[np.ndarray, "3"]
-    R_base_axes: Float[np.ndarray, "3 3"]
-    extents_m: Float[np.ndarray, "3"]
-    extents_sigma_m: Float[np.ndarray, "3"]
-
-    def to_record(self) -> dict[str, list[float] | list[list[float]]]:
-        """Return the entry ``soft_shape`` of a localisation record."""
-        return {
-            "centroid_m": self.centroid_m.tolist(),
-            "axes": self.R_base_axes.T.tolist(),
-            "extents_m": self.extents_m.tolist(),
-            "extents_sigma_m": self.extents_sigma_m.tolist(),
-        }
+from twin.scene.localise.mesh import MeshFit, MeshFitConfig, fit_mesh
+from twin.scene.localise.points import Cluster, PointConfig, View
+from twin.scene.localise.soft_config import SoftConfig
+from twin.scene.localise.soft_shape import SoftShape, soft_shape
+from twin.scene.localise.surface import Surface, agreeing, known_surface
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +68,11 @@ def fit_toys(
     model = models[0]
     groups = candidates(model, len(models), views, blocked, points, colour, soft)
     surface = known_surface(model, mesh.num_samples)
-    fits = [fit_toy(group, views, surface, fit, mesh, soft) for group in groups]
+    enough = soft.turned_share * max((len(group) for group in groups), default=0)
+    fits = [
+        fit_toy(group, views, surface, fit, mesh, soft, turn=len(group) >= enough)
+        for group in groups
+    ]
     good = [
         index
         for index, item in enumerate(fits)
@@ -176,82 +113,6 @@ def fit_toys(
     return found
 
 
-def candidates(
-    model: ObjectModel,
-    count: int,
-    views: Sequence[View],
-    blocked: Mapping[ObjectModel, Float[np.ndarray, "4 4"]],
-    points: PointConfig,
-    colour: ColourConfig,
-    soft: SoftConfig,
-) -> list[Cluster]:
-    """Clusters that may be one toy each; what touches is cut apart.
-
-    Args:
-        model: The toy.
-        count: How many equal ones there are at most.
-        views: What the cameras saw.
-        blocked: Rigid objects with their poses; their points do not count.
-        points: Which points count.
-        colour: Which pixels have the toy's colour.
-        soft: Heights and sizes.
-    """
-    parts = []
-    for view in views:
-        p = view.p_base
-        alike = p[:, 2] > soft.min_height_m
-        alike[alike] = likeness(view.color_linear[alike], model.color_srgb, colour) >= (
-            points.min_likeness
-        )
-        p = voxel_mean(p[alike], points.voxel_m)
-        parts.append(p[~_on_others(p, blocked, soft.clear_m)])
-    ids = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    everything = np.concatenate(parts) if parts else np.zeros((0, 3))
-    single = []
-    for group in clusters(everything, ids, points.cluster_gap_m):
-        if len(group) < points.min_points:
-            continue
-        for piece in _cut(group, model, count, soft):
-            extent = np.ptp(np.percentile(piece.p_base, [2, 98], axis=0), axis=0).max()
-            if len(piece) >= points.min_points and extent > soft.shrink * min(model.size_m):
-                single.append(piece)
-    return single
-
-
-def _on_others(
-    p: Float[np.ndarray, "num_points 3"],
-    blocked: Mapping[ObjectModel, Float[np.ndarray, "4 4"]],
-    clear_m: float,
-) -> Bool[np.ndarray, " num_points"]:
-    mask = np.zeros(len(p), dtype=bool)
-    for model, T in blocked.items():
-        if model.mesh is None:
-            distance, _ = surface_distances(p, model, T)
-            mask |= np.abs(distance) < clear_m
-        elif len(p):
-            surface = se3.apply(T, known_surface(model, DENSE_SAMPLES).p_m)
-            distance, _ = cKDTree(surface).query(p, distance_upper_bound=clear_m)
-            mask |= np.isfinite(distance)
-    return mask
-
-
-def _cut(group: Cluster, model: ObjectModel, count: int, soft: SoftConfig) -> list[Cluster]:
-    """Cut a cluster that is too large for one toy into as many as would cover its area."""
-    low, high = np.percentile(group.p_base[:, :2], [1, 99], axis=0)
-    if float(np.linalg.norm(high - low)) <= soft.growth * float(np.linalg.norm(model.size_m[:2])):
-        return [group]
-    cells = np.unique(np.floor(group.p_base[:, :2] / CELL_M).astype(np.int64), axis=0)
-    one = soft.fill * model.size_m[0] * model.size_m[1]
-    number = round(len(cells) * CELL_M**2 / one)
-    if not 2 <= number <= count:
-        return []
-    _, labels = kmeans2(group.p_base, number, minit="++", seed=0)
-    return [
-        Cluster(p_base=group.p_base[labels == label], view_ids=group.view_ids[labels == label])
-        for label in range(number)
-    ]
-
-
 def fit_toy(
     group: Cluster,
     views: Sequence[View],
@@ -259,63 +120,28 @@ def fit_toy(
     fit: FitConfig,
     mesh: MeshFitConfig,
     soft: SoftConfig,
+    *,
+    turn: bool,
 ) -> MeshFit:
-    """Lay a toy's mesh onto points, standing first, on its other sides if that explains little."""
+    """Lay a toy's mesh onto points, standing first, on its other sides if that explains little.
+
+    Args:
+        group: The points.
+        views: What the cameras saw.
+        surface: The mesh at rest.
+        fit: Standard errors and bounds.
+        mesh: Starts and scores.
+        soft: What explains little.
+        turn: Whether to try the other sides at all.
+    """
     standing = fit_mesh(group, views, surface, fit, mesh, tilt_sigma_rad=soft.tilt_sigma_rad)
     doubtful = standing.seen_through > soft.well_seen_through
-    if standing.explained >= soft.well_explained and not doubtful:
+    doubtful |= standing.explained < soft.well_explained
+    if not turn or not doubtful or standing.explained < soft.hopeless:
         return standing
     few = replace(mesh, num_starts=max(mesh.num_starts // 2, 1))
     lying = fit_mesh(group, views, surface, fit, few, tilt_sigma_rad=10.0, lying=True)
     return min((standing, lying), key=lambda item: item.score)
-
-
-def soft_shape(
-    views: Sequence[View],
-    surface: Surface,
-    model: ObjectModel,
-    fit: MeshFit,
-    points: PointConfig,
-    soft: SoftConfig,
-) -> SoftShape:
-    """Extents along the axes of the fitted pose: those at rest, plus how far the seen ends moved.
-
-    All points near the fitted surface count, whatever their colour.
-
-    Args:
-        views: What the cameras saw.
-        surface: Its mesh at rest.
-        model: Its extents at rest.
-        fit: Where it was found.
-        points: Size of the voxels.
-        soft: How far the surface may be off.
-    """
-    T = fit.T_base_object
-    above = [view.p_base[view.p_base[:, 2] > soft.min_height_m] for view in views]
-    local = se3.apply(se3.invert(T), np.concatenate(above))
-    reach = np.array(model.size_m) / 2 + soft.stretch_m
-    local = voxel_mean(local[np.all(np.abs(local) < reach, axis=1)], points.voxel_m)
-    distance, _ = cKDTree(surface.p_m).query(local)
-    local = local[distance < soft.stretch_m]
-    # An end that every camera looks at from behind was not seen; it is taken as at rest.
-    eyes = se3.apply(se3.invert(T), np.array([view.T_base_depth[:3, 3] for view in views]))
-    towards = eyes / np.linalg.norm(eyes, axis=1, keepdims=True)
-    faced = np.any([facing(T, view, surface) for view in views], axis=0)
-    half, ends = np.array(model.size_m) / 2, np.zeros((2, 3))
-    for row, sign in enumerate((1.0, -1.0)):
-        seen = (sign * towards).max(axis=0) > -0.2
-        reached = np.percentile(sign * local, 98, axis=0)
-        rest = np.percentile(sign * surface.p_m[faced], 98, axis=0)
-        ends[row] = sign * np.maximum(half + np.where(seen, reached - rest, 0.0), 0.1 * half)
-    if T[2, 2] > STANDS and T[2, 3] + ends[1, 2] < 0:
-        ends[1, 2] = -T[2, 3]  # it cannot reach below the table
-    sigma = np.hypot(0.005, fit.residual_m) * np.ones(3)
-    return SoftShape(
-        centroid_m=se3.apply(T, ends.mean(axis=0)[None])[0],
-        R_base_axes=T[:3, :3].copy(),
-        extents_m=ends[0] - ends[1],
-        extents_sigma_m=sigma,
-    )
 
 
 def _displacement(

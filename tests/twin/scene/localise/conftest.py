@@ -1,6 +1,11 @@
-"""Ray-cast frames of a cube, an open box and a table; nothing of the stand-in cell."""
+"""Ray-cast frames of a cube, an open box and a table; nothing of the stand-in cell.
 
+Lets the tests of this folder import the module ``toy_frames`` that lies beside them.
+"""
+
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import open3d as o3d
@@ -11,6 +16,8 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import Task, load_task
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 WIDTH, HEIGHT = 320, 240
 DEPTH_CAMERA = Camera(width=WIDTH, height=HEIGHT, fx=300.0, fy=300.0, cx=160.0, cy=120.0)

@@ -14,10 +14,10 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.task.meshes.catalogue import ToyMesh, toy_mesh
 from bridge.task.task_file import SCANNED, ObjectModel, Task, load_task
-from twin.scene.localise.mesh import surface_of
 from twin.scene.localise.objects import localise_objects
 from twin.scene.localise.result import BOX_METHOD, MESH_METHOD
 from twin.scene.localise.scanned import scanned_surfaces
+from twin.scene.localise.surface import surface_of
 from twin.scene.shape.known import pose_of
 from twin.scene.shape.mesh import UnreadableMeshError, mesh_ply
 from twin.scene.store.folder import UnreadableSceneError

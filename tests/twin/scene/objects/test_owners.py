@@ -7,7 +7,7 @@ from bridge.geometry import se3
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import load_task
 from twin.scene.gaussians.cloud import GaussianCloud, as_float32
-from twin.scene.localise.mesh import surface_of
+from twin.scene.localise.surface import surface_of
 from twin.scene.objects.owners import owners
 from twin.scene.shape.from_mesh import shape_of_mesh
 from twin.scene.shape.known import pose_of

@@ -1,0 +1,55 @@
+"""Several equal toys: told apart, cut apart, and not mistaken for what is not there."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from toy_frames import DUCK, DUCKS, ducks_at, off, only, shoot, table_with
+
+from twin.scene.localise.objects import localise_objects
+
+PLACES = ducks_at((0.39, -0.27, 0.2), (0.55, -0.27, -0.8), (0.39, -0.13, 1.0))
+
+
+def test_equal_toys_are_told_apart_by_where_they_start(stage: Callable[..., Any]) -> None:
+    task = only(DUCKS, "duck_3", "duck_1", "duck_2")
+    found = localise_objects(shoot(table_with(stage, *[(DUCK, T) for T in PLACES])), task)
+    for name, T in zip(("duck_1", "duck_2", "duck_3"), PLACES, strict=True):
+        assert found[name].found, found[name].reason
+        distance_mm, angle_deg = off(found[name].T_base_object, T)
+        assert distance_mm < 2.5
+        assert angle_deg < 4.0
+        assert found[name].detail["equal_objects"] == 3
+        assert found[name].detail["assignment_margin_m"] > 0.02
+
+
+@pytest.mark.slow
+def test_toys_that_stayed_keep_their_names_when_another_one_was_moved(
+    stage: Callable[..., Any],
+) -> None:
+    task = only(DUCKS, "duck_1", "duck_2", "duck_3")
+    now = [PLACES[0], PLACES[2], *ducks_at((0.50, 0.0, 0.4))]
+    last = {f"duck_{index + 1}": T[:3, 3] for index, T in enumerate(PLACES)}
+    found = localise_objects(shoot(table_with(stage, *[(DUCK, T) for T in now])), task, None, last)
+    for name, T in (("duck_1", now[0]), ("duck_3", now[1]), ("duck_2", now[2])):
+        assert off(found[name].T_base_object, T)[0] < 2.5
+
+
+def test_a_toy_that_is_not_there_is_not_found_and_the_others_are(
+    stage: Callable[..., Any],
+) -> None:
+    task = only(DUCKS, "duck_1", "duck_2", "duck_3")
+    found = localise_objects(shoot(table_with(stage, *[(DUCK, T) for T in PLACES[:2]])), task)
+    assert [found[f"duck_{k}"].found for k in (1, 2, 3)] == [True, True, False]
+    assert found["duck_3"].reason == "2 of 3 objects that look like duck_3 were seen"
+    assert found["duck_3"].T_base_object is None
+
+
+@pytest.mark.slow
+def test_toys_that_touch_are_cut_apart(stage: Callable[..., Any]) -> None:
+    task = only(DUCKS, "duck_1", "duck_3")
+    places = ducks_at((0.45, -0.20, 0.0), (0.45, -0.148, 0.0))
+    found = localise_objects(shoot(table_with(stage, *[(DUCK, T) for T in places])), task)
+    for name, T in zip(("duck_1", "duck_3"), places, strict=True):
+        assert found[name].found, found[name].reason
+        assert off(found[name].T_base_object, T)[0] < 6.0
