@@ -86,18 +86,7 @@ def _replay(
     states = simulate(path, scene, hulls, config) if dynamic else follow(path, scene, config)
     monitor = ClearanceMonitor(scene, plan, hulls, config)
     _pre_grasp(monitor, path, config)
-    movable = scene.movable()
-    known = {name: Ts for name, Ts in states.Ts_base_object.items() if name in movable}
-    clearance = [
-        monitor.measure(
-            int(t_ns),
-            states.joints_rad[index],
-            float(states.width_m[index]),
-            {name: Ts[index] for name, Ts in known.items()},
-            {name: nodes[index] for name, nodes in states.nodes_m.items()},
-        )
-        for index, t_ns in enumerate(states.stamps_ns)
-    ]
+    clearance_m = _clearance_m(monitor, states, list(scene.movable()))
     result = ReplayResult(
         verdict=_undecided(plan, trajectory, config, scene),
         stamps_ns=states.stamps_ns,
@@ -106,7 +95,7 @@ def _replay(
         Ts_base_tcp=robot.Ts_base_tcp(states.joints_rad),
         Ts_base_object=states.Ts_base_object,
         finger_contact=states.finger_contact,
-        clearance_m=np.array(clearance),
+        clearance_m=clearance_m,
         contacts=monitor.contacts(),
         nodes_m=states.nodes_m,
         extents_m=states.extents_m,
@@ -128,6 +117,24 @@ def _replay(
         findings=tuple(findings_of(scene.task, result.rollout(), "replayed")) if dynamic else (),
     )
     return replace(result, verdict=replace(verdict, reason=reason_of(verdict)))
+
+
+def _clearance_m(
+    monitor: ClearanceMonitor, states: States, movable: list[str]
+) -> Float[np.ndarray, " num_steps"]:
+    known = {name: Ts for name, Ts in states.Ts_base_object.items() if name in movable}
+    return np.array(
+        [
+            monitor.measure(
+                int(t_ns),
+                states.joints_rad[index],
+                float(states.width_m[index]),
+                {name: Ts[index] for name, Ts in known.items()},
+                {name: nodes[index] for name, nodes in states.nodes_m.items()},
+            )
+            for index, t_ns in enumerate(states.stamps_ns)
+        ]
+    )
 
 
 def follow(path: JointPath, scene: ReplayScene, config: ReplayConfig) -> States:
