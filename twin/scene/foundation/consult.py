@@ -25,7 +25,13 @@ class Consulted:
     findings: ModelFindings
 
     def give_vectors(
-        self, folder: Path, rows: Mapping[str, int], cloud: GaussianCloud, *, threads: int = 0
+        self,
+        folder: Path,
+        rows: Mapping[str, int],
+        cloud: GaussianCloud,
+        output: Output,
+        *,
+        threads: int = 0,
     ) -> dict[str, Any]:
         """Write the CLIP vectors of the things that ``semantics.npz`` holds.
 
@@ -33,6 +39,7 @@ class Consulted:
             folder: The scene folder, its semantics written.
             rows: Gaussians of the background and of each object, as they were written.
             cloud: All of them, in that order.
+            output: Shows how far it is.
             threads: For drawing; 0: all cores.
 
         Returns:
@@ -42,9 +49,17 @@ class Consulted:
             return {}
         scene = read_semantics(folder, rows)
         features = self.findings.features
-        about = embed_things(
-            folder, scene, cloud, self.frames, features, self.config, threads=threads
-        )
+        with output.progress("give things vectors", len(scene.instances)) as advance:
+            about = embed_things(
+                folder,
+                scene,
+                cloud,
+                self.frames,
+                features,
+                self.config,
+                threads=threads,
+                advance=advance,
+            )
         return {"vectors": about}
 
 

@@ -171,6 +171,7 @@ def embed_things(
     config: ModelConfig,
     *,
     threads: int = 0,
+    advance: Advance = lambda done, note: None,
 ) -> dict[str, Any]:
     """Give every thing of a scene its CLIP vector and write ``features.npz``.
 
@@ -182,6 +183,7 @@ def embed_things(
         features: What ``ask_models`` found, written along; None: vectors only.
         config: Names the folder of CLIP.
         threads: For drawing; 0: all cores.
+        advance: Told how many things are done.
 
     Returns:
         What ``scene.json`` says about the vectors.
@@ -194,7 +196,7 @@ def embed_things(
         raise UsageError(message)
     embedder = open_clip(Path(config.clip), Placement(device=config.device))
     rasteriser = Rasteriser(RasterConfig(threads=threads))
-    vectors, shown = thing_vectors(embedder, scene, cloud, frames, rasteriser)
+    vectors, shown = thing_vectors(embedder, scene, cloud, frames, rasteriser, advance)
     held = features or _no_features(len(cloud))
     sources = [name for name in (held.source, embedder.source) if name]
     with_vectors = replace(
@@ -219,6 +221,7 @@ def thing_vectors(
     cloud: GaussianCloud,
     frames: Sequence[RgbdFrame],
     rasteriser: Rasteriser,
+    advance: Advance = lambda done, note: None,
 ) -> tuple[Float32[np.ndarray, "num_instances num_channels"], list[int]]:
     """One unit vector for each instance, the mean over the frames that show most of it.
 
@@ -243,6 +246,7 @@ def thing_vectors(
             images = [frames[index].image_u8 for _, index, _ in best]
             mean = embedder.embed_masked(images, [mask for _, _, mask in best]).mean(axis=0)
             vectors[row] = mean / max(float(np.linalg.norm(mean)), 1e-12)
+        advance(row + 1, item.label)
     return vectors, shown
 
 

@@ -80,16 +80,7 @@ def fit_toys(
         and item.seen_through <= soft.max_seen_through
         and agreeing(item.T_base_object, surface, views, mesh.see_through_m) >= soft.min_agreeing
     ]
-    cost = np.array(
-        [
-            [
-                _displacement(expected_m.get(item.id), fits[index], soft)
-                + soft.score_m * fits[index].score
-                for index in good
-            ]
-            for item in models
-        ]
-    ).reshape(len(models), len(good))
+    cost = _costs(models, [fits[index] for index in good], expected_m, soft)
     rows, columns = linear_sum_assignment(cost)
     taken = dict(zip(rows.tolist(), columns.tolist(), strict=True))
     margins = _margins(cost, taken)
@@ -142,6 +133,23 @@ def fit_toy(
     few = replace(mesh, num_starts=max(mesh.num_starts // 2, 1))
     lying = fit_mesh(group, views, surface, fit, few, tilt_sigma_rad=10.0, lying=True)
     return min((standing, lying), key=lambda item: item.score)
+
+
+def _costs(
+    models: Sequence[ObjectModel],
+    fits: Sequence[MeshFit],
+    expected_m: Mapping[str, Float[np.ndarray, "3"]],
+    soft: SoftConfig,
+) -> Float[np.ndarray, "num_models num_candidates"]:
+    """What it costs to say that a fit is a toy [m]."""
+    cost = [
+        [
+            _displacement(expected_m.get(item.id), fit, soft) + soft.score_m * fit.score
+            for fit in fits
+        ]
+        for item in models
+    ]
+    return np.array(cost).reshape(len(models), len(fits))
 
 
 def _displacement(

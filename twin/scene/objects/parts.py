@@ -14,6 +14,7 @@ from bridge.episode.run import RunFolder, check_episode_id
 from bridge.errors import BridgeError, UsageError
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task, load_task
+from bridge.terminal import Output
 from twin.scene.foundation.complete import Completed, Shapes
 from twin.scene.frames.choice import FrameChoice, Sources
 from twin.scene.frames.training_view import TrainingView
@@ -91,6 +92,7 @@ def take_apart(
     choices: Sequence[FrameChoice],
     views: Sequence[TrainingView] = (),
     complete: Complete | None = None,
+    output: Output | None = None,
 ) -> TakenApart:
     """Cut the task's objects out of the scene where the first episode of a task shows them.
 
@@ -100,12 +102,15 @@ def take_apart(
         choices: Which frames are held out: the objects are not looked for in them.
         views: What the scene was fitted to; objects are reconstructed from them.
         complete: Asks a shape generator about them; None: nobody is asked.
+        output: How to talk; None: say nothing.
     """
+    output = Output(quiet=True) if output is None else output
     episode = episode_of_task(sources)
     if episode is None:
         return TakenApart(background=cloud, remark="no episode names a task: objects not known")
     try:
         task = load_task(episode.info.task)
+        output.say(f"look for {', '.join(task.objects)} in {episode.info.id} and take them out")
         held_out = {
             choice.camera_id: choice.holdout_ns
             for choice in choices
@@ -115,7 +120,8 @@ def take_apart(
     except (BridgeError, UsageError) as error:
         return TakenApart(background=cloud, remark=f"objects not taken out: {error}")
     poses = object_poses(cloud, localised, task)
-    shapes = shapes_of(views, task.objects, poses)
+    with output.progress("reconstruct objects", len(poses)) as advance:
+        shapes = shapes_of(views, task.objects, poses, advance=advance)
     asked = Completed(shapes=shapes, record={})
     if complete is not None:
         asked = complete(views, task.objects, poses, shapes)

@@ -107,7 +107,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     learnt = with_fitted_poses(learnt, fitted.Ts_base_color)
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
-    apart = take_apart(sources, fitted.cloud, learnt.choices, learnt.views, complete)
+    apart = take_apart(sources, fitted.cloud, learnt.choices, learnt.views, complete, output)
     if apart.remark:
         output.say(apart.remark)
     write_ply(run.scene_dir / BACKGROUND, apart.background)
@@ -115,6 +115,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     clock.end("take_apart")
     views = _hold_out(run, learnt, fitted, apart, links, config, clock, output)
     clock.end("held_out_views")
+    output.say("write objects, robot links and the distances to what is static")
     extras = apart.write(run, learnt.views) | write_robot(run, learnt.robot, links)
     extras |= write_scene_semantics(
         run.scene_dir,

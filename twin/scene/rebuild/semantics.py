@@ -50,20 +50,23 @@ def write_scene_semantics(
     objects = {} if apart.parts is None else apart.parts.objects
     placed = {key: moved_cloud(item.cloud, item.T_base_object) for key, item in objects.items()}
     cloud = concatenate([apart.background, *placed.values()])
+    output.say(f"name what is in the scene: {len(cloud)} Gaussians, {len(objects)} objects known")
     asked = consult(models or ModelConfig(), choices, cloud, task, output, threads=threads)
-    record = add_semantics(
-        folder,
-        apart.background,
-        placed,
-        [Viewpoint(camera=v.half.camera, T_base_camera=v.T_base_color) for v in views],
-        masks=asked.findings.masks,
-        features=asked.findings.features,
-        surfaces_m=apart.surfaces_m(),
-        threads=threads,
-    )
+    with output.progress("name things", 100) as advance:
+        record = add_semantics(
+            folder,
+            apart.background,
+            placed,
+            [Viewpoint(camera=v.half.camera, T_base_camera=v.T_base_color) for v in views],
+            masks=asked.findings.masks,
+            features=asked.findings.features,
+            surfaces_m=apart.surfaces_m(),
+            threads=threads,
+            advance=advance,
+        )
     rows = {BACKGROUND_KEY: len(apart.background)}
     rows |= {key: len(part) for key, part in placed.items()}
-    record |= asked.give_vectors(folder, rows, cloud, threads=threads)
+    record |= asked.give_vectors(folder, rows, cloud, output, threads=threads)
     labels = ", ".join(item["label"] for item in record["instances"])
     output.say(
         f"{len(record['instances'])} things ({record['source']}): {labels}"

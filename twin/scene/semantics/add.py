@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from bridge.terminal import Advance
 from twin.scene.gaussians.cloud import GaussianCloud, concatenate
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default, scene_from_masks
@@ -31,6 +32,7 @@ def add_semantics(
     robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
     surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
     threads: int = 0,
+    advance: Advance = lambda done, note: None,
 ) -> dict[str, Any]:
     """Segment a scene and write ``semantics.npz`` (and ``features.npz``) into its folder.
 
@@ -48,6 +50,7 @@ def add_semantics(
         surfaces_m: Points of the objects' reconstructed surfaces where they stand: their parts are
             told apart on these.
         threads: For drawing; 0: all cores.
+        advance: Told the percentage done.
 
     Returns:
         What ``scene.json`` says under ``semantics``.
@@ -57,7 +60,7 @@ def add_semantics(
     rasteriser = Rasteriser(RasterConfig(threads=threads))
     try:
         if masks:
-            scene = scene_from_masks(cloud, masks, rasteriser)
+            scene = scene_from_masks(cloud, masks, rasteriser, advance=advance)
         else:
             step = -(-len(viewpoints) // MAX_VIEWPOINTS) or 1
             known = {key: _rows(rows, key) for key in objects}
@@ -68,6 +71,7 @@ def add_semantics(
                 robot_m=robot_m,
                 known=known,
                 surfaces_m=surfaces_m,
+                advance=advance,
             )
     except SemanticsError as error:
         nothing = np.zeros(len(cloud), dtype=np.uint16)

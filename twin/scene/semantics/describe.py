@@ -1,11 +1,13 @@
 """From sets of Gaussians to instances: colour, box, parts and keypoints."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt16
 from scipy.spatial import cKDTree
 
+from bridge.terminal import Advance
 from twin.scene.gaussians.cloud import GaussianCloud
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.semantics.associate import AssociateConfig, associate
@@ -30,6 +32,10 @@ CELL_M = 0.004
 """Gaussians of a scene lie about this far apart."""
 MIN_SHOWN_PX = 20.0
 """A frame shows a thing when its Gaussians give this many pixels of the image."""
+FOUND, SHOWN = 30, 70
+"""Percent of the work when things are found, and when the frames that show them are counted."""
+
+Item = TypeVar("Item")
 
 
 def scene_from_masks(
@@ -37,6 +43,7 @@ def scene_from_masks(
     frames: Iterable[tuple[Viewpoint, MaskSet]],
     rasteriser: Rasteriser,
     config: AssociateConfig | None = None,
+    advance: Advance = lambda done, note: None,
 ) -> SemanticScene:
     """Fuse the masks of a 2D segmenter into the Gaussians of a scene.
 
@@ -45,12 +52,13 @@ def scene_from_masks(
         frames: Masks with where their cameras stood.
         rasteriser: What to draw with.
         config: When masks mean the same thing.
+        advance: Told the percentage done.
 
     Raises:
         SemanticsError: When a mask does not fit its camera.
     """
     observations, sources = [], []
-    for viewpoint, masks in frames:
+    for viewpoint, masks in _told(frames, 0, SHOWN, advance, "masks lifted"):
         observations.append(observe(rasteriser, cloud, viewpoint, masks))
         sources.append(masks.source)
     source = ", ".join(dict.fromkeys(sources)) or "no masks"
@@ -73,7 +81,9 @@ def scene_from_masks(
             source=source,
             plane=plane,
         )
-        for number, track in enumerate(found.tracks, start=1)
+        for number, track in enumerate(
+            _told(found.tracks, SHOWN, 100, advance, "things measured"), start=1
+        )
     )
     num_masks = sum(len(item.labels) for item in observations)
     remark = (
@@ -95,6 +105,7 @@ def scene_by_default(
     robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
     known: Mapping[str, Bool[np.ndarray, " num_splats"]] | None = None,
     surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
+    advance: Advance = lambda done, note: None,
 ) -> SemanticScene:
     """Segment the fused Gaussians with the default segmenter.
 
@@ -111,6 +122,7 @@ def scene_by_default(
             their names.
         surfaces_m: Points of the reconstructed surfaces of some of them, where they stand: parts
             are told apart on these, which are thinner than any coat of Gaussians.
+        advance: Told the percentage done.
     """
     labels = np.zeros(len(cloud), dtype=np.uint16)
     ids = np.flatnonzero(solid_splats(cloud))
@@ -123,11 +135,14 @@ def scene_by_default(
     else:
         labels[ids] = found.labels.astype(np.uint16)
         things, plane, remark = found.things, found.plane, found.remark
+    advance(FOUND, f"{len(things)} things found")
     final = numbered(labels, known or {})
     total = len(final.keys) + len(final.others)
-    shown = _num_shown(cloud, final.labels, total, viewpoints, rasteriser)
+    looked = _told(viewpoints, FOUND, SHOWN, advance, "frames looked at")
+    shown = _num_shown(cloud, final.labels, total, looked, rasteriser)
     named = [(key, "", 1.0, NAMED) for key in final.keys]
     named += [("", things[n - 1].label, things[n - 1].score, SOURCE) for n in final.others]
+    telling = _told(named, SHOWN, 100, advance, "things measured")
     instances = tuple(
         describe(
             cloud,
@@ -142,9 +157,19 @@ def scene_by_default(
             plane=plane,
             surface_m=(surfaces_m or {}).get(key),
         )
-        for number, (key, label, score, source) in enumerate(named, start=1)
+        for number, (key, label, score, source) in enumerate(telling, start=1)
     )
     return SemanticScene(instances=instances, labels=final.labels, source=SOURCE, remark=remark)
+
+
+def _told(
+    items: Iterable[Item], first: int, last: int, advance: Advance, note: str
+) -> Iterator[Item]:
+    """Give one item after another, and tell the percentage after each."""
+    known = list(items)
+    for done, item in enumerate(known, start=1):
+        yield item
+        advance(first + (last - first) * done // len(known), note)
 
 
 def _num_shown(

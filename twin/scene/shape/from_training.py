@@ -18,6 +18,7 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import SCANNED, ObjectModel, Task
+from bridge.terminal import Advance
 from twin.errors import TwinError
 from twin.scene.frames.training_view import TrainingView
 from twin.scene.shape.from_mesh import shape_of_mesh
@@ -45,6 +46,7 @@ def shapes_of(
     models: Mapping[str, ObjectModel],
     Ts_base_object: Poses,
     config: ShapeConfig | None = None,
+    advance: Advance = lambda done, note: None,
 ) -> dict[str, ObjectShape | str]:
     """Reconstruct each object in its own frame, or say why not.
 
@@ -53,10 +55,12 @@ def shapes_of(
         models: Known shapes: they say which pixels are the object's, nothing more.
         Ts_base_object: Where the objects were; others are left out.
         config: Settings; the defaults, with eight rounds of view alignment, when None.
+        advance: Told how many objects are done, and what is next.
     """
     config = ShapeConfig(align_rounds=ALIGN_ROUNDS) if config is None else config
     found: dict[str, ObjectShape | str] = {}
-    for key, T in Ts_base_object.items():
+    for done, (key, T) in enumerate(Ts_base_object.items()):
+        advance(done, key)
         if T[2, 2] < LEANING_COSINE:
             found[key] = f"{key} does not stand upright, so its underside cannot be closed"
             continue

@@ -227,7 +227,7 @@ def test_without_any_model_nothing_is_read_or_asked() -> None:
     consulted = consult(ModelConfig(), [], heaps()[0], None, Output(quiet=True))
     assert (consulted.frames, consulted.findings.masks) == ([], [])
     assert consulted.findings.features is None
-    assert consulted.give_vectors(Path("nowhere"), {}, heaps()[0]) == {}
+    assert consulted.give_vectors(Path("nowhere"), {}, heaps()[0], Output(quiet=True)) == {}
 
 
 def test_training_frames_are_spread_over_what_is_learnt_from(tmp_path: Path) -> None:

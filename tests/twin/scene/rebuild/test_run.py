@@ -94,12 +94,18 @@ def test_the_views_episode_pairs_recorded_and_rendered_images(room: RunFolder) -
 
 
 def test_done_work_is_skipped_and_other_settings_redo_it(
-    room: RunFolder, monkeypatch: pytest.MonkeyPatch
+    room: RunFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = (room.scene_dir / "background.ply").stat().st_mtime_ns
     record = rebuild(room, CONFIG, QUIET)
     assert (room.scene_dir / "background.ply").stat().st_mtime_ns == before
-    forced = rebuild(room, replace(CONFIG, force=True), QUIET)
+    assert capsys.readouterr().err == ""
+    forced = rebuild(room, replace(CONFIG, force=True), Output())
+    said = capsys.readouterr().err
+    stages = ["training frames", "write objects", "name what is in the scene", "no things named"]
+    places = [said.find(stage) for stage in stages]
+    assert -1 not in places
+    assert places == sorted(places), said
     assert (room.scene_dir / "background.ply").stat().st_mtime_ns > before
     assert forced["scene_hash"] == record["scene_hash"]  # a number of images is reproducible
 

@@ -32,7 +32,11 @@ def rows_of(world: World) -> dict[str, int]:
 
 
 def test_what_is_written_comes_back(tabletop: World, tmp_path: Path) -> None:
-    record = added(tmp_path, tabletop)
+    told: list[tuple[int, str]] = []
+    record = added(tmp_path, tabletop, advance=lambda *step: told.append(step))
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    assert told[0] == (30, "4 things found")
+    assert told[-1][0] == 100
     scene = read_semantics(tmp_path, rows_of(tabletop))
     assert {item.label for item in scene.instances} == set(tabletop.names.values())
     assert record["source"] == scene.source == "default segmenter"
