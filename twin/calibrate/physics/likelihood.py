@@ -29,10 +29,11 @@ LEVER_M = 0.03
 """The discrepancy of a turn is that of the edge of an object this far from its axis."""
 WIDTH_SIGMA_M = 0.0002
 """Of the gripper's own measurement."""
-STAYED_M = 0.01
+STAYED_M = 0.002
 SHARED_WAY = 0.5
 """Part of the discrepancy of a kind that all its objects are off by alike along their way: at the
-same friction all slides end a little early in one engine, and no number of them makes up for it."""
+same friction all slides may end early in one engine, and all squeezed boxes be turned less before
+they jam; no number of them makes up for it."""
 SHARED_WIDTH_M = 0.001
 """What all held widths of one kind of episode are off by alike: contact is not the twin's, and no
 number of repetitions makes it so. Two engines differ by about this much at the same friction."""
@@ -52,8 +53,8 @@ class Observations:
     covariance: Float[np.ndarray, "num_poses 3 3"]
     """Of localisation before and after together."""
     period_rad: Float[np.ndarray, " num_poses"]
-    way: Float[np.ndarray, "num_poses 2"]
-    """Direction in which an object was moved; zero where it stayed."""
+    way: Float[np.ndarray, "num_poses 3"]
+    """How x, y and turn of an object changed, per metre of change; zero where it stayed."""
     kinds: tuple[str, ...]
     """Kinds of episodes; the numbers below count in them."""
     pose_kind: Int[np.ndarray, " num_poses"]
@@ -105,7 +106,7 @@ def observations_of(cases: Sequence[Case], num_samples: int) -> Observations:
             ]
         ),
         period_rad=np.concatenate([none, *(case.turn_period_rad[ok] for case, ok in rows)]),
-        way=np.concatenate([np.zeros((0, 2)), *(_way(case)[ok] for case, ok in rows)]),
+        way=np.concatenate([np.zeros((0, 3)), *(_way(case)[ok] for case, ok in rows)]),
         kinds=kinds,
         pose_kind=np.array(
             [kinds.index(case.kind) for case, ok in rows for _ in range(ok.sum())], dtype=np.int64
@@ -119,10 +120,10 @@ def observations_of(cases: Sequence[Case], num_samples: int) -> Observations:
     )
 
 
-def _way(case: Case) -> Float[np.ndarray, "num_objects 2"]:
-    start = np.array([planar(case.Ts_base_start[key])[:2] for key in case.objects])
-    moved = case.settled[:, :2] - start
-    distance = np.linalg.norm(moved, axis=1, keepdims=True)
+def _way(case: Case) -> Float[np.ndarray, "num_objects 3"]:
+    moved = case.settled - np.stack([planar(case.Ts_base_start[key]) for key in case.objects])
+    moved[:, 2] -= np.round(moved[:, 2] / case.turn_period_rad) * case.turn_period_rad
+    distance = np.linalg.norm(moved * [1.0, 1.0, LEVER_M], axis=1, keepdims=True)
     return np.asarray(np.where(distance > STAYED_M, moved / np.maximum(distance, STAYED_M), 0.0))
 
 
@@ -222,10 +223,9 @@ def _poses(
     r = observed.settled - predicted.settled
     half = observed.period_rad / 2
     r[:, 2] = np.mod(r[:, 2] + half, observed.period_rad) - half
-    way = np.pad(observed.way, ((0, 0), (0, 1)))
     own, both, along = (
         np.sum((scales.inverse @ right[..., None])[..., 0] * left, axis=-1)
-        for left, right in ((r, r), (way, r), (way, way))
+        for left, right in ((r, r), (observed.way, r), (observed.way, observed.way))
     )
     size = (SHARED_WAY * np.outer(SHARED_AT, POSE_DISCREPANCY_M))[:, None, :, None]
     squared = own - 2 * size * both + size**2 * along

@@ -59,7 +59,7 @@ def test_poses_and_widths_follow_mixtures_of_the_t_distributions_of_scipy(own_si
     observed = observations_of([case], 0)
     scales = scales_of(observed, np.full(4, own_sigma**2))
     found = score(observed, features_of([case], [predicted(pose)]), scales=scales)
-    way = np.array([*GOOD[:2], 0.0]) / np.linalg.norm(GOOD[:2])
+    way = GOOD / np.linalg.norm(GOOD * [1.0, 1.0, LEVER_M])
     likelihood = 0.0
     for share in NOISE_SHARE:
         for size, weight in zip(POSE_DISCREPANCY_M, weights(POSE_DISCREPANCY_M), strict=True):
@@ -82,9 +82,9 @@ def over_shared(density: Callable[[float], float]) -> float:
 
 def test_what_slides_have_in_common_gets_no_surer_by_repetition() -> None:
     def sigma_m(count: int) -> float:
-        cases = scattered(count, 0.002, 8, kind="slide", start=np.zeros(3))
+        cases = scattered(count, 0.002, 8, kind="slide", moved=True)
         steps = np.linspace(-0.004, 0.004, 41)
-        way = np.array([*GOOD[:2], 0.0]) / np.linalg.norm(GOOD[:2])
+        way = GOOD / np.linalg.norm(GOOD * [1.0, 1.0, LEVER_M])
         logs = np.array([worth(cases, GOOD + s * way).log_likelihood for s in steps])
         dense = np.exp(logs - logs.max())
         mean = np.average(steps, weights=dense)
@@ -109,8 +109,15 @@ def test_one_jam_at_another_place_does_not_make_the_others_less_sure() -> None:
     assert drop(0.0439) > 0.7 * drop()
 
 
+def standing(pose: np.ndarray) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, pose[2]]))
+    T[:2, 3] = pose[:2]
+    return T
+
+
 def scattered(
-    count: int, sigma_m: float, seed: int, kind: str = "push", start: np.ndarray = GOOD
+    count: int, sigma_m: float, seed: int, kind: str = "push", *, moved: bool = False
 ) -> list[Case]:
     """Poses around one, of which localisation states 2.5 mm and 0.083 rad."""
     rng = np.random.default_rng(seed)
@@ -119,7 +126,7 @@ def scattered(
     return [
         seen(
             kind=kind,
-            Ts_base_start={"cube": se3.transform_from(np.array([1.0, 0, 0, 0]), start)},
+            Ts_base_start={"cube": np.eye(4) if moved else standing(pose)},
             settled=pose[None],
             settled_covariance=stated,
             hold_times_s=np.zeros(0),
