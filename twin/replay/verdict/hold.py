@@ -1,8 +1,8 @@
 """Whether a plan's grasps hold: how far a carried object moves in the hand.
 
-What moves in the hand is held by a hair: a little less friction or force, or another finger's width
-beside it, and it is dropped. Measured on soft toys, of all margins of a grasp this one tells right
-yes from wrong yes best (docs/decisions/0047-what-moves-in-the-hand.md).
+What moves in the hand is held by a hair: a little less friction or force, and it is dropped. On
+soft toys this margin tells right yes from wrong yes about as well as swing and lever do, and better
+than forces and contacts (docs/decisions/0047-what-moves-in-the-hand.md).
 """
 
 from collections.abc import Sequence
