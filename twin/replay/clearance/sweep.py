@@ -6,6 +6,7 @@ of them. Two bodies that were d0 and d1 apart and travelled s together therefore
 """
 
 from dataclasses import dataclass, field
+from math import asin, hypot, sqrt
 from typing import Any
 
 import numpy as np
@@ -96,9 +97,10 @@ def object_travel_m(a: State, b: State, name: str, radius_m: float) -> float:
         return float(np.linalg.norm(b.nodes_m[name] - a.nodes_m[name], axis=1).max())
     if name not in a.Ts_base_object or name not in b.Ts_base_object:
         return float("inf")
-    T_a, T_b = a.Ts_base_object[name], b.Ts_base_object[name]
-    turned = float(se3.rotation_angle_rad(T_a[:3, :3].T @ T_b[:3, :3]))
-    return float(np.linalg.norm(T_b[:3, 3] - T_a[:3, 3])) + turned * radius_m
+    change = b.Ts_base_object[name] - a.Ts_base_object[name]
+    # Rotations an angle apart differ by a matrix of norm sqrt(8) sin(angle / 2).
+    turned = 2 * asin(min(1.0, hypot(*change[:3, :3].ravel().tolist()) / sqrt(8)))
+    return hypot(*change[:3, 3].tolist()) + turned * radius_m
 
 
 def _slide_m(model: Any, joint: int) -> float:
