@@ -5,10 +5,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import open3d as o3d
 
+from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.task_file import load_task
+from twin.scene.frames.training_view import Target, TrainingView
 from twin.scene.objects.split import shape_mesh
 from twin.scene.shape.isosurface import isosurface
+from twin.scene.shape.known import pose_of
 from twin.scene.shape.masked_view import MaskedView
 
 CAMERA = Camera(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
@@ -130,3 +133,39 @@ def mean_error_m(mesh: Mesh, reference: Mesh, *, num: int = 4000) -> tuple[float
     points = np.asarray(surface.sample_points_uniformly(num).points)
     away = ray_scene([mesh]).compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
     return float(away.mean()), float(np.percentile(away, 95))
+
+
+POSES = {
+    "cube": pose_of(np.array([0.50, -0.10, 0.02, 0.4])),
+    "box": pose_of(np.array([0.49, 0.12, 0.0, -0.12])),
+}
+"""Where they stand in ``training_views``."""
+
+
+def placed(key: str) -> Mesh:
+    vertices, faces = shape_mesh(TASK.objects[key])
+    return se3.apply(POSES[key], vertices), faces
+
+
+def training_views() -> list[TrainingView]:
+    """Cube and box on a table, seen from 24 places."""
+    poses = around([0.5, 0.0, 0.02], 24, 0.6)
+    meshes = [placed("cube"), placed("box"), table()]
+    training = []
+    for seen in cast(meshes, poses, noise=0.003):
+        target = Target(
+            camera=seen.camera,
+            planes_u8=np.zeros((3, *seen.depth_m.shape), dtype=np.uint8),
+            depth_m=seen.depth_m.astype(np.float32),
+            static_mask=np.ones(seen.depth_m.shape, dtype=bool),
+        )
+        training.append(
+            TrainingView(
+                camera_id="wrist",
+                stamp_ns=len(training),
+                T_base_color=seen.T_base_camera,
+                half=target,
+                full=target,
+            )
+        )
+    return training

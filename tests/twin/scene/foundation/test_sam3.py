@@ -1,0 +1,108 @@
+"""SAM 3 from a folder that holds a tiny network with random weights."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from model_inputs import ALL_QUERIES, CPU, picture
+
+from bridge.errors import UsageError
+from twin.scene.foundation.open import open_segmenter
+from twin.scene.foundation.sam3 import Sam3Config, Sam3Segmenter
+
+pytest.importorskip("transformers", reason="the extra [foundation] is not installed")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_network")]
+
+
+def test_sam3_gives_masks_of_the_image_s_size_with_scores_from_0_to_1(
+    saved: Callable[[str], Path],
+) -> None:
+    segmenter = open_segmenter(f"sam3:{saved('sam3')}", CPU, ALL_QUERIES)
+    found = segmenter.segment(picture(), ["red cube", "duck"], camera_id="wrist", stamp_ns=7)
+    assert (found.camera_id, found.stamp_ns, found.source) == ("wrist", 7, "SAM 3")
+    assert len(found.masks) == 20  # ten queries each
+    for mask in found.masks:
+        assert mask.image.shape == (60, 80)
+        assert mask.image.dtype == np.bool_
+        assert 0.0 <= mask.score <= 1.0
+    for label in ("red cube", "duck"):
+        scores = [mask.score for mask in found.masks if mask.label == label]
+        assert scores == sorted(scores, reverse=True)
+    assert any(mask.image.any() and not mask.image.all() for mask in found.masks)
+
+
+def test_sam3_says_the_same_twice_and_of_one_prompt_what_it_says_among_others(
+    saved: Callable[[str], Path],
+) -> None:
+    segmenter = Sam3Segmenter.load(saved("sam3"), CPU, ALL_QUERIES)
+    again = Sam3Segmenter.load(saved("sam3"), CPU, ALL_QUERIES)
+    where = {"camera_id": "c", "stamp_ns": 0}
+    both = segmenter.segment(picture(), ["red cube", "duck"], **where)
+    twice = again.segment(picture(), ["red cube", "duck"], **where)
+    alone = segmenter.segment(picture(), ["duck"], **where)
+    pairs = [*zip(both.masks, twice.masks, strict=True)]
+    pairs += zip(both.masks[10:], alone.masks, strict=True)
+    for one, other in pairs:
+        np.testing.assert_array_equal(one.image, other.image)
+        assert one.score == pytest.approx(other.score, abs=1e-6)
+    assert both.masks[0].score != pytest.approx(both.masks[10].score, abs=1e-9)  # words matter
+
+
+def test_sam3_drops_what_is_unlikely_or_small(saved: Callable[[str], Path]) -> None:
+    everything = Sam3Segmenter.load(saved("sam3"), CPU, ALL_QUERIES)
+    where = {"camera_id": "c", "stamp_ns": 0}
+    masks = everything.segment(picture(), ["duck"], **where).masks
+    cut, least = masks[4].score, sorted(int(mask.image.sum()) for mask in masks)[5]
+    likely = Sam3Segmenter.load(saved("sam3"), CPU, Sam3Config(min_score=cut, min_pixels=0))
+    assert len(likely.segment(picture(), ["duck"], **where).masks) == 5
+    large = Sam3Segmenter.load(saved("sam3"), CPU, Sam3Config(min_score=0.0, min_pixels=least))
+    kept = large.segment(picture(), ["duck"], **where).masks
+    assert 0 < len(kept) < 10
+    assert min(int(mask.image.sum()) for mask in kept) >= least
+
+
+@pytest.mark.parametrize(
+    ("prompts", "said"),
+    [
+        ([], "0 prompts"),
+        (["duck"] * 65, "65 prompts"),
+        (["  "], "is no prompt"),
+        (["duck\n"], "is no prompt"),
+        (["a red cube a red cube a"], "has 9 tokens, SAM 3 reads 8"),
+    ],
+)
+def test_sam3_refuses_prompts_it_cannot_read_whole(
+    saved: Callable[[str], Path], prompts: list[str], said: str
+) -> None:
+    segmenter = Sam3Segmenter.load(saved("sam3"), CPU)
+    with pytest.raises(UsageError, match=said):
+        segmenter.segment(picture(), prompts, camera_id="c", stamp_ns=0)
+
+
+def test_sam3_is_read_in_the_form_it_is_published_in(
+    saved: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """As the detector inside a model for videos, whose other parts are left out."""
+    import json
+
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    for path in saved("sam3").iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    inner = json.loads((tmp_path / "config.json").read_text())
+    outer = {"model_type": "sam3_video", "detector_config": inner}
+    (tmp_path / "config.json").write_text(json.dumps(outer))
+    tensors = load_file(tmp_path / "model.safetensors")
+    named = {f"detector_model.{name}": values for name, values in tensors.items()}
+    named |= {"tracker_model.a": torch.zeros(3), "tracker_neck.b": torch.zeros(2)}
+    save_file(named, tmp_path / "model.safetensors", metadata={"format": "pt"})
+    where = {"camera_id": "c", "stamp_ns": 0}
+    plain, video = (
+        Sam3Segmenter.load(folder, CPU, ALL_QUERIES).segment(picture(), ["duck"], **where)
+        for folder in (saved("sam3"), tmp_path)
+    )
+    for one, other in zip(plain.masks, video.masks, strict=True):
+        assert one.score == other.score
+        np.testing.assert_array_equal(one.image, other.image)

@@ -1,0 +1,112 @@
+"""The static scene's distances: from training views to the file in the scene folder."""
+
+from pathlib import Path
+
+import cast_views
+import numpy as np
+import pytest
+
+from bridge.geometry import se3
+from bridge.task.task_file import load_task
+from twin.scene.frames.training_view import TrainingView
+from twin.scene.shape.from_training import (
+    from_outside_m,
+    write_static,
+)
+from twin.scene.shape.known import pose_of, surface_distances
+from twin.scene.shape.masked_view import ShapeError
+from twin.scene.shape.sdf import SdfGrid
+from twin.scene.shape.static import FREE, SURFACE, UNSEEN, StaticConfig, StaticSdf, static_sdf
+
+TASK, POSES = cast_views.TASK, cast_views.POSES
+COARSE = StaticConfig(voxel_m=0.012, height_m=0.3)
+
+
+@pytest.fixture(scope="module")
+def static(views: list[TrainingView]) -> StaticSdf:
+    def cube(points: np.ndarray) -> np.ndarray:
+        return surface_distances(points, TASK.objects["cube"], POSES["cube"])[0]
+
+    return static_sdf(views, 0.0, [cube], COARSE)
+
+
+def test_distances_to_the_table_and_to_what_stands_on_it(static: StaticSdf) -> None:
+    above = np.array([[0.4, -0.25, z] for z in (0.05, 0.1)])
+    np.testing.assert_allclose(static.observed.distance(above), [0.05, 0.1], atol=0.012)
+    assert np.all(static.observed.distance(above - [0, 0, 0.12]) < 0)
+    wall = se3.apply(POSES["box"], np.array([[0.078, 0.0, 0.03]]))
+    assert static.observed.distance(wall)[0] < 0.006
+    inside = se3.apply(POSES["box"], np.array([[0.0, 0.0, 0.045]]))
+    assert static.observed.distance(inside)[0] > 0.01
+    assert static.conservative.distance(inside)[0] > 0.01
+
+
+def test_a_movable_object_is_not_part_of_the_static_scene(
+    static: StaticSdf, views: list[TrainingView]
+) -> None:
+    centre = POSES["cube"][:3, 3] + [0, 0, 0.005]
+    assert static.conservative.distance(centre) > 0
+    with_cube = static_sdf(views, 0.0, [], COARSE)
+    assert with_cube.conservative.distance(centre) < 0
+
+
+def test_unseen_is_solid_for_the_careful_and_free_for_the_bold(static: StaticSdf) -> None:
+    assert set(np.unique(static.state)) == {FREE, SURFACE, UNSEEN}
+    assert np.all(static.conservative.values_m <= static.observed.values_m + 1e-6)
+    unseen = static.state == UNSEEN
+    assert np.all(static.conservative.values_m[unseen] < 0)
+    assert np.all(static.observed.values_m[unseen] > 0)
+    beyond = np.array([0.5, 0.0, 3.0])
+    assert static.conservative.distance(beyond) < 0.7
+
+
+def test_the_static_scene_is_read_back_and_described(static: StaticSdf, tmp_path: Path) -> None:
+    path = tmp_path / "sdf.npz"
+    static.save(path)
+    again = StaticSdf.load(path)
+    np.testing.assert_array_equal(again.state, static.state)
+    np.testing.assert_array_equal(again.observed.values_m, static.observed.values_m)
+    assert again.table_z_m == 0.0
+    assert not SdfGrid.load(path).closed
+    about = static.to_record()
+    assert about["free"] + about["surface"] + about["unseen"] == pytest.approx(1.0, abs=1e-3)
+    assert about["truncation_m"] == pytest.approx(3 * about["voxel_m"])
+
+
+def test_a_budget_of_voxels_makes_them_larger(views: list[TrainingView]) -> None:
+    small = static_sdf(views, 0.0, [], StaticConfig(max_voxels=8000))
+    assert small.state.size <= 9000
+    assert small.conservative.voxel_m > 0.008
+
+
+def test_without_views_there_is_no_static_scene_but_a_reason(tmp_path: Path) -> None:
+    with pytest.raises(ShapeError, match="0 points"):
+        static_sdf([], 0.0)
+    (tmp_path / "sdf.npz").write_bytes(b"old")
+    about = write_static(tmp_path, [], None, {})
+    assert about["file"] is None
+    assert "0 points" in about["remark"]
+    assert not (tmp_path / "sdf.npz").exists()
+
+
+def test_the_scene_folder_gets_the_static_scene(views: list[TrainingView], tmp_path: Path) -> None:
+    about = write_static(tmp_path, views, TASK, POSES, COARSE)
+    assert about["file"] == "sdf.npz"
+    again = StaticSdf.load(tmp_path / "sdf.npz")
+    assert again.conservative.distance(POSES["cube"][:3, 3]) > 0
+    nameless = write_static(tmp_path, views, None, {}, COARSE)
+    assert nameless["table_z_m"] is None
+
+
+def test_a_basket_takes_its_handles_and_its_rim_out_of_the_scene() -> None:
+    """What stays in the grid is an obstacle that nobody may touch: a toy goes over the handles."""
+    basket = load_task("sloth_into_basket").objects["basket"]
+    T = pose_of(np.array([0.48, 0.2, 0.0, 0.3]))
+    angle = np.linspace(0.0, np.pi, 9)
+    x, _, top = (np.array(basket.inner_m) + basket.wall_m) / [2, 2, 1]
+    arch = np.stack([np.full(9, x), 0.03 * np.cos(angle), top + 0.03 * np.sin(angle)], axis=1)
+    rim = np.array([[0.0, basket.inner_m[1] / 2 + basket.wall_m / 2, top + 0.003]])
+    inside = np.array([[0.0, 0.0, 0.05]])
+    for points, is_taken in ((arch, True), (rim, True), (inside, False)):
+        away = from_outside_m(se3.apply(T, points), basket, T)
+        assert np.all(away < 0.001) if is_taken else np.all(away > 0.03)
