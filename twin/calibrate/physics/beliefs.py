@@ -40,25 +40,27 @@ def _beforehand(
     return _normalised(-0.5 * np.log2(np.array(sizes_m) / expected_m) ** 2)
 
 
+_SHARE = _normalised(np.zeros(len(NOISE_SHARE)))
+_WIDTH = _beforehand(WIDTH_DISCREPANCY_M)
+_POSE = np.tile(_beforehand(POSE_DISCREPANCY_M), (len(NOISE_SHARE), 1))
+_POSE_OF_KIND = {
+    kind: np.tile(_beforehand(POSE_DISCREPANCY_M, expected_m), (len(NOISE_SHARE), 1))
+    for kind, expected_m in EXPECTED_OF_KIND_M.items()
+}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Beliefs:
     """Log-probabilities; as built, those before any episode."""
 
-    share: Float[np.ndarray, " num_shares"] = field(
-        default_factory=lambda: _normalised(np.zeros(len(NOISE_SHARE)))
-    )
+    share: Float[np.ndarray, " num_shares"] = field(default_factory=lambda: _SHARE)
     pose: Mapping[str, Float[np.ndarray, "num_shares num_sizes"]] = field(default_factory=dict)
     """Of the twin's discrepancy per kind of episode, given the share."""
-    width: Float[np.ndarray, " num_width_sizes"] = field(
-        default_factory=lambda: _beforehand(WIDTH_DISCREPANCY_M)
-    )
+    width: Float[np.ndarray, " num_width_sizes"] = field(default_factory=lambda: _WIDTH)
 
     def of_kind(self, kind: str) -> Float[np.ndarray, "num_shares num_sizes"]:
         """Of a kind that no episode has shown yet, what is believed beforehand."""
-        if kind in self.pose:
-            return self.pose[kind]
-        expected_m = EXPECTED_OF_KIND_M.get(kind, EXPECTED_M)
-        return np.tile(_beforehand(POSE_DISCREPANCY_M, expected_m), (len(NOISE_SHARE), 1))
+        return self.pose.get(kind, _POSE_OF_KIND.get(kind, _POSE))
 
     def after(
         self,
@@ -74,15 +76,16 @@ class Beliefs:
         Returns:
             The belief afterwards, and the log-likelihood of everything under the one before.
         """
-        joint = {kind: table + self.of_kind(kind) for kind, table in poses.items()}
-        share = self.share + sum(log_total(table) for table in joint.values())
+        share, pose = self.share, dict(self.pose)
+        if poses:
+            joint = np.stack([table + self.of_kind(kind) for kind, table in poses.items()])
+            each = log_total(joint)
+            share = share + each.sum(axis=0)
+            pose.update(zip(poses, joint - each[..., None], strict=True))
         width = self.width + widths
-        after = Beliefs(
-            share=_normalised(share),
-            pose={**self.pose, **{kind: _normalised(table) for kind, table in joint.items()}},
-            width=_normalised(width),
-        )
-        return after, float(log_total(share) + log_total(width))
+        of_share, of_width = log_total(share), log_total(width)
+        after = Beliefs(share=share - of_share, pose=pose, width=width - of_width)
+        return after, float(of_share + of_width)
 
     def most_likely(self) -> dict[str, float | dict[str, float]]:
         """The likeliest share of the noise, and discrepancies [m] given it, as plain numbers."""

@@ -37,12 +37,10 @@ they jam; no number of them makes up for it."""
 SHARED_WIDTH_M = 0.001
 """What all held widths of one kind of episode are off by alike: contact is not the twin's, and no
 number of repetitions makes it so. Two engines differ by about this much at the same friction."""
-SHARED_AT: Float[np.ndarray, " num_shared"] = np.linspace(-3.0, 3.0, 41)
+SHARED_WIDTH_AT = np.linspace(-3.0, 3.0, 41)
+SHARED_WAY_AT = np.linspace(-3.0, 3.0, 21)
 """Standard normal errors at which what episodes share is tried. Evenly spaced: that sums a smooth
 peak to many digits as long as it is no narrower than half a step."""
-SHARED_LOG_WEIGHT: Float[np.ndarray, " num_shared"] = -0.5 * SHARED_AT**2 - np.log(
-    np.exp(-0.5 * SHARED_AT**2).sum()
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,30 +225,37 @@ def _poses(
         np.sum((scales.inverse @ right[..., None])[..., 0] * left, axis=-1)
         for left, right in ((r, r), (observed.way, r), (observed.way, observed.way))
     )
-    size = (SHARED_WAY * np.outer(SHARED_AT, POSE_DISCREPANCY_M))[:, None, :, None]
+    size = (SHARED_WAY * np.outer(SHARED_WAY_AT, POSE_DISCREPANCY_M))[:, None, :, None]
     squared = own - 2 * size * both + size**2 * along
     each = _log_t(squared, 3) - 0.5 * scales.log_det
-    return {
-        observed.kinds[number]: _over_shared(each[..., observed.pose_kind == number].sum(axis=-1))
-        for number in np.unique(observed.pose_kind)
-    }
+    tables = _over_shared(each @ _members(observed.pose_kind, observed), SHARED_WAY_AT)
+    tables = np.moveaxis(tables, -1, 0)
+    return {observed.kinds[number]: tables[number] for number in np.unique(observed.pose_kind)}
 
 
 def _widths(
     observed: Observations, predicted: Features, scales: Scales
 ) -> Float[np.ndarray, " num_width_sizes"]:
     r = observed.widths_m - predicted.widths_m
-    off = (r - SHARED_WIDTH_M * SHARED_AT[:, None])[:, None]
+    off = (r - SHARED_WIDTH_M * SHARED_WIDTH_AT[:, None])[:, None]
     each = _log_t(scales.width_inverse * off**2, 1) + 0.5 * np.log(scales.width_inverse)
-    total = np.zeros(len(WIDTH_DISCREPANCY_M))
-    for kind in np.unique(observed.width_kind):
-        total += _over_shared(each[..., observed.width_kind == kind].sum(axis=-1))
-    return total
+    tables = _over_shared(each @ _members(observed.width_kind, observed), SHARED_WIDTH_AT)
+    return np.asarray(tables.sum(axis=-1))
 
 
-def _over_shared(logs: Float[np.ndarray, "num_shared *rest"]) -> Float[np.ndarray, "*rest"]:
+def _members(
+    numbers: Int[np.ndarray, " num_rows"], observed: Observations
+) -> Float[np.ndarray, "num_rows num_kinds"]:
+    """1 where a row belongs to a kind of episode."""
+    return np.asarray(numbers[:, None] == np.arange(len(observed.kinds)), dtype=np.float64)
+
+
+def _over_shared(
+    logs: Float[np.ndarray, "num_shared *rest"], at: Float[np.ndarray, " num_shared"]
+) -> Float[np.ndarray, "*rest"]:
     """Log-likelihood over all values of an error that the episodes of a kind have in common."""
-    return log_total(np.moveaxis(logs, 0, -1) + SHARED_LOG_WEIGHT)
+    weight = -0.5 * at**2
+    return log_total(np.moveaxis(logs, 0, -1) + weight - np.log(np.exp(weight).sum()))
 
 
 def _log_t(distance: Float[np.ndarray, "*shape"], dimensions: int) -> Float[np.ndarray, "*shape"]:
