@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.special import gammaln
 
 from twin.calibrate.physics.beliefs import (
@@ -50,6 +50,9 @@ class Observations:
     settled: Float[np.ndarray, "num_poses 3"]
     covariance: Float[np.ndarray, "num_poses 3 3"]
     """Of localisation before and after together."""
+    held: Bool[np.ndarray, " num_poses"]
+    """Fingers held the object. How they jammed is seen in their opening and again in its turn; only
+    the opening counts, or one chance would be taken for two witnesses."""
     period_rad: Float[np.ndarray, " num_poses"]
     way: Float[np.ndarray, "num_poses 3"]
     """How x, y and turn of an object changed, per metre of change; zero where it stayed."""
@@ -102,6 +105,9 @@ def observations_of(cases: Sequence[Case], num_samples: int) -> Observations:
                 np.zeros((0, 3, 3)),
                 *((case.settled_covariance + case.start_covariance)[ok] for case, ok in rows),
             ]
+        ),
+        held=np.array(
+            [len(case.hold_times_s) > 0 for case, ok in rows for _ in range(ok.sum())], dtype=bool
         ),
         period_rad=np.concatenate([none, *(case.turn_period_rad[ok] for case, ok in rows)]),
         way=np.concatenate([np.zeros((0, 3)), *(_way(case)[ok] for case, ok in rows)]),
@@ -186,9 +192,12 @@ def scales_of(
     if extra is not None:
         S = S + np.eye(3) * extra[:poses].reshape(-1, 1, 3)
         variance = variance + extra[poses : poses + holds]
-    return Scales(
-        inverse=np.linalg.inv(S), log_det=np.linalg.slogdet(S)[1], width_inverse=1.0 / variance
-    )
+    held = observed.held
+    S[..., held, 2, :] = S[..., held, :, 2] = 0.0
+    S[..., held, 2, 2] = 1.0
+    inverse, log_det = np.linalg.inv(S), np.linalg.slogdet(S)[1]
+    inverse[..., held, 2, 2] = 0.0
+    return Scales(inverse=inverse, log_det=log_det, width_inverse=1.0 / variance)
 
 
 def score(
@@ -227,7 +236,7 @@ def _poses(
     )
     size = (SHARED_WAY * np.outer(SHARED_WAY_AT, POSE_DISCREPANCY_M))[:, None, :, None]
     squared = own - 2 * size * both + size**2 * along
-    each = _log_t(squared, 3) - 0.5 * scales.log_det
+    each = _log_t(squared, 3.0 - observed.held) - 0.5 * scales.log_det
     tables = _over_shared(each @ _members(observed.pose_kind, observed), SHARED_WAY_AT)
     tables = np.moveaxis(tables, -1, 0)
     return {observed.kinds[number]: tables[number] for number in np.unique(observed.pose_kind)}
@@ -238,7 +247,7 @@ def _widths(
 ) -> Float[np.ndarray, " num_width_sizes"]:
     r = observed.widths_m - predicted.widths_m
     off = (r - SHARED_WIDTH_M * SHARED_WIDTH_AT[:, None])[:, None]
-    each = _log_t(scales.width_inverse * off**2, 1) + 0.5 * np.log(scales.width_inverse)
+    each = _log_t(scales.width_inverse * off**2, np.ones(1)) + 0.5 * np.log(scales.width_inverse)
     tables = _over_shared(each @ _members(observed.width_kind, observed), SHARED_WIDTH_AT)
     return np.asarray(tables.sum(axis=-1))
 
@@ -258,7 +267,9 @@ def _over_shared(
     return log_total(np.moveaxis(logs, 0, -1) + weight - np.log(np.exp(weight).sum()))
 
 
-def _log_t(distance: Float[np.ndarray, "*shape"], dimensions: int) -> Float[np.ndarray, "*shape"]:
+def _log_t(
+    distance: Float[np.ndarray, "*shape num"], dimensions: Float[np.ndarray, " each"]
+) -> Float[np.ndarray, "*shape num"]:
     """Log-density of Student's t at a squared distance, but for the determinant of its scale."""
     half = (DEGREES + dimensions) / 2
     constant = gammaln(half) - gammaln(DEGREES / 2) - dimensions / 2 * np.log(DEGREES * np.pi)

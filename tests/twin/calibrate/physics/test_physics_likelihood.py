@@ -52,27 +52,35 @@ def weights(sizes_m: tuple[float, ...]) -> np.ndarray:
     return dense / dense.sum()
 
 
-@pytest.mark.parametrize("own_sigma", [0.0, 0.003])
-def test_poses_and_widths_follow_mixtures_of_the_t_distributions_of_scipy(own_sigma: float) -> None:
-    case = seen(settled=GOOD[None], held_widths_m=np.array([0.0407]))
+@pytest.mark.parametrize(("own_sigma", "axes"), [(0.0, 2), (0.003, 2), (0.003, 3)])
+def test_poses_and_widths_follow_mixtures_of_the_t_distributions_of_scipy(
+    own_sigma: float, axes: int
+) -> None:
+    # The turn of what was held, by two axes, does not count.
+    widths = np.full(3 - axes, 0.0407)
+    case = seen(settled=GOOD[None], hold_times_s=np.zeros(3 - axes), held_widths_m=widths)
     pose = np.array([0.502, -0.101, 0.23])
     observed = observations_of([case], 0)
-    scales = scales_of(observed, np.full(4, own_sigma**2))
-    found = score(observed, features_of([case], [predicted(pose)]), scales=scales)
+    scales = scales_of(observed, np.full(3 + len(widths), own_sigma**2))
+    said = Prediction(settled=pose[None], held_widths_m=0 * widths + 0.04, success=np.nan)
+    found = score(observed, features_of([case], [said]), scales=scales)
     way = GOOD / np.linalg.norm(GOOD * [1.0, 1.0, LEVER_M])
     likelihood = 0.0
     for share in NOISE_SHARE:
         for size, weight in zip(POSE_DISCREPANCY_M, weights(POSE_DISCREPANCY_M), strict=True):
             scale = share**2 * case.settled_covariance[0] + own_sigma**2 * np.eye(3)
             scale += size**2 * np.diag([1, 1, LEVER_M**-2])
-            t = stats.multivariate_t(pose, scale, df=DEGREES)
-            density = over_shared(lambda z, t=t, d=size: t.pdf(GOOD - SHARED_WAY * d * z * way))
+            t = stats.multivariate_t(pose[:axes], scale[:axes, :axes], df=DEGREES)
+            density = over_shared(
+                lambda z, t=t, d=size: t.pdf((GOOD - SHARED_WAY * d * z * way)[:axes])
+            )
             likelihood += weight * density / len(NOISE_SHARE)
     held = 0.0
     for size, weight in zip(WIDTH_DISCREPANCY_M, weights(WIDTH_DISCREPANCY_M), strict=True):
         t = stats.t(DEGREES, 0.04, np.sqrt(size**2 + WIDTH_SIGMA_M**2 + own_sigma**2))
         held += weight * over_shared(lambda z, t=t: t.pdf(0.0407 - SHARED_WIDTH_M * z))
-    assert found.log_likelihood == pytest.approx(np.log(likelihood) + np.log(held), abs=2e-3)
+    expected = np.log(likelihood) + len(widths) * np.log(held)
+    assert found.log_likelihood == pytest.approx(expected, abs=2e-3)
 
 
 def over_shared(density: Callable[[float], float]) -> float:
@@ -172,6 +180,25 @@ def test_poses_that_scatter_as_stated_count_as_stated() -> None:
     ]
     poorly = scattered(10, 0.0025, 6)
     assert worth(well + poorly, GOOD).beliefs.most_likely()["noise_share"] in NOISE_SHARE[:2]
+
+
+def test_how_fingers_jam_on_an_object_is_counted_once() -> None:
+    turned = GOOD + np.array([0.0, 0.0, 0.1])
+
+    def loss(case: Case) -> float:
+        observed = observations_of([case], 0)
+        width = np.full(len(case.hold_times_s), 0.04)
+        told = [
+            Prediction(settled=pose[None], held_widths_m=width, success=np.nan)
+            for pose in (GOOD, turned)
+        ]
+        good, off = (score(observed, features_of([case], [item])).log_likelihood for item in told)
+        return good - off
+
+    pushed = scattered(1, 0.0, 9)[0]
+    held = Case(**{**vars(pushed), "hold_times_s": np.zeros(1), "held_widths_m": np.full(1, 0.04)})
+    assert loss(pushed) > 1.0
+    assert loss(held) == pytest.approx(0.0, abs=0.05)
 
 
 def test_each_kind_of_episode_has_a_discrepancy_of_its_own() -> None:
