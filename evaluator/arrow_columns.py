@@ -6,6 +6,7 @@ and read out of them, in the layout that the Arrow columnar format, version 1, l
 Importing this module loads pyarrow.
 """
 
+from array import array
 from collections.abc import Sequence
 from itertools import accumulate, chain, pairwise
 from typing import Any
@@ -13,6 +14,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from jaxtyping import Int32
+
+from evaluator.packed import Packed, packed
 
 TEXT, WHOLE, NUMBER, ANSWER = pa.string(), pa.int64(), pa.float64(), pa.bool_()
 """Column types in which unknown is null, never "", 0, NaN or False."""
@@ -24,6 +27,7 @@ _TAKEN: dict[pa.DataType, tuple[type, ...]] = {
     NUMBER: (float, int, np.floating, np.integer),
     ANSWER: (bool, np.bool_),
 }
+_NONE = packed()
 _MOST_BYTES = 2**31 - 1
 """Of one column of texts, whose places have 32 bits."""
 
@@ -32,8 +36,8 @@ def column_of(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
     """Fill a column.
 
     Args:
-        values: Texts, whole numbers, numbers or answers, or for a list type sequences of them;
-            None is null.
+        values: Texts, whole numbers, numbers or answers, or for a list type sequences of them
+            (arrays of doubles are the quickest); None is null.
         kind: One of the types above, or a list of one of them.
 
     Raises:
@@ -44,8 +48,8 @@ def column_of(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
     there = [value is not None for value in values]
     buffers = [None if all(there) else _bits(there)]
     if pa.types.is_list(kind):
-        lists = [() if value is None else value for value in values]
-        inner = column_of(list(chain.from_iterable(lists)), kind.value_type)
+        lists = [_NONE if value is None else value for value in values]
+        inner = _inner(lists, kind.value_type)
         buffers.append(_buffer(_ends(map(len, lists))))
         return pa.Array.from_buffers(kind, len(values), buffers, children=[inner])
     _check(values, kind)
@@ -60,33 +64,69 @@ def column_of(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
     return pa.Array.from_buffers(kind, len(values), buffers)
 
 
+def _inner(lists: Sequence[Any], kind: pa.DataType) -> pa.Array:
+    if kind == NUMBER and all(isinstance(each, array) and each.typecode == "d" for each in lists):
+        data = b"".join(lists)
+        return pa.Array.from_buffers(kind, len(data) // 8, [None, pa.py_buffer(data)])
+    return column_of(list(chain.from_iterable(lists)), kind)
+
+
 def values_of(column: pa.ChunkedArray) -> list[Any]:
     """Read a column out, as what ``column_of`` was given; lists are tuples.
 
     Raises:
         ValueError: When a text is no Unicode.
     """
-    return [value for array in column.chunks for value in _values(array)]
+    return [value for piece in column.chunks for value in _values(piece)]
 
 
-def _values(array: pa.Array) -> list[Any]:
-    first, end = array.offset, array.offset + len(array)
-    mask, *buffers = array.buffers()
-    if pa.types.is_list(array.type):
-        flat, places = _values(array.values), _places(buffers[0], end)[first:]
+def arrays_of(column: pa.ChunkedArray) -> list[Packed | None]:
+    """Read a column of lists of numbers out as packed arrays: a fifth of the time of tuples.
+
+    Raises:
+        ValueError: When a number within a list is missing.
+    """
+    return [each for piece in column.chunks for each in _arrays(piece)]
+
+
+def _arrays(piece: pa.Array) -> list[Packed | None]:
+    if piece.values.null_count:
+        message = "a number is missing in a list"
+        raise ValueError(message)
+    first, end = piece.offset, piece.offset + len(piece)
+    mask, ends, *_ = piece.buffers()
+    places = _places(ends, end)[first:]
+    start, data = piece.values.offset, piece.values.buffers()[1]
+    numbers = memoryview(b"" if data is None else data).cast("B")
+    found: list[Packed | None] = [
+        packed(numbers[8 * (start + low) : 8 * (start + high)].tobytes())
+        for low, high in pairwise(places)
+    ]
+    return _without_missing(found, piece, mask)
+
+
+def _values(piece: pa.Array) -> list[Any]:
+    first, end = piece.offset, piece.offset + len(piece)
+    mask, *buffers = piece.buffers()
+    if pa.types.is_list(piece.type):
+        flat, places = _values(piece.values), _places(buffers[0], end)[first:]
         values: list[Any] = [tuple(flat[low:high]) for low, high in pairwise(places)]
-    elif array.type == TEXT:
+    elif piece.type == TEXT:
         values = _texts(buffers[1], _places(buffers[0], end)[first:])
-    elif array.type == ANSWER:
+    elif piece.type == ANSWER:
         values = _read_bits(buffers[0], end)[first:]
     elif end:
-        values = np.frombuffer(buffers[0], _NUMPY[array.type], end)[first:].tolist()
+        values = np.frombuffer(buffers[0], _NUMPY[piece.type], end)[first:].tolist()
     else:
         values = []
-    if array.null_count:
-        there = _read_bits(mask, end)[first:]
-        return [value if is_there else None for value, is_there in zip(values, there, strict=True)]
-    return values
+    return _without_missing(values, piece, mask)
+
+
+def _without_missing(values: list[Any], piece: pa.Array, mask: pa.Buffer | None) -> list[Any]:
+    if not piece.null_count:
+        return values
+    there = _read_bits(mask, piece.offset + len(piece))[piece.offset :]
+    return [value if is_there else None for value, is_there in zip(values, there, strict=True)]
 
 
 def _texts(buffer: pa.Buffer | None, places: list[int]) -> list[str]:
@@ -131,5 +171,5 @@ def _read_bits(buffer: pa.Buffer | None, end: int) -> list[bool]:
     return np.unpackbits(bits, count=end, bitorder="little").view(bool).tolist()
 
 
-def _buffer(array: np.ndarray) -> pa.Buffer:
-    return pa.py_buffer(array.tobytes())
+def _buffer(values: np.ndarray) -> pa.Buffer:
+    return pa.py_buffer(values.tobytes())

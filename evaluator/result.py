@@ -211,8 +211,7 @@ def _lines(value: Any, indent: int, deep: int) -> str:
         inner = [_lines(item, indent + 1, deep - 1) for item in value]
     else:
         inner = [
-            f"{_encode(name)}: {_lines(item, indent + 1, deep - 1)}"
-            for name, item in value.items()
+            f"{_encode(name)}: {_lines(item, indent + 1, deep - 1)}" for name, item in value.items()
         ]
     first, last = "[]" if isinstance(value, list) else "{}"
     return f"{first}{pad}{f',{pad}'.join(inner)}{pad[:-1]}{last}"

@@ -25,6 +25,7 @@ from evaluator.metrics.trajectory import (
 )
 from evaluator.metrics.trajectory_align import find_lag_s, without_rigid_motion
 from evaluator.metrics.trajectory_steps import joint_errors, relative_errors
+from evaluator.packed import Packed, packed
 
 MOTION_VERSION = 1
 """Raise it when the same files give another summary."""
@@ -75,9 +76,9 @@ class MotionSummary:
     joint_max_rad: float | None
     joint_worst: str | None
     """The joint that reaches it."""
-    curve_m: tuple[float, ...]
+    curve_m: Packed
     """Distance at 101 instants spread evenly over the duration."""
-    joint_curve_rad: tuple[float, ...]
+    joint_curve_rad: Packed
     """Root mean square over the joints at such instants; empty without joints."""
 
 
@@ -194,7 +195,7 @@ def _summary(aligned_by: str, errors: PoseErrors) -> MotionSummary:
         joint_max_rad=None,
         joint_worst=None,
         curve_m=_curve(errors.stamps_ns, position),
-        joint_curve_rad=(),
+        joint_curve_rad=packed(),
     )
 
 
@@ -255,9 +256,9 @@ def _with_joints(
 
 def _curve(
     stamps_ns: Int[np.ndarray, " num_samples"], values: Float[np.ndarray, " num_samples"]
-) -> tuple[float, ...]:
+) -> Packed:
     asked = np.linspace(stamps_ns[0], stamps_ns[-1], NORMALISED_SAMPLES)
-    return tuple(np.interp(asked, stamps_ns, values).tolist())
+    return packed(np.interp(asked, stamps_ns, values).tobytes())
 
 
 def _or_none(compute: Callable[[], float]) -> float | None:

@@ -1,13 +1,13 @@
 """One Parquet file of summaries: frozen dataclasses in columns, read back as they were.
 
-Text, numbers and answers are columns of their own, tuples of them are lists, and what is nested is
-JSON text. Importing this module loads pyarrow; ``cache`` does so only when a cache is asked for.
+Text, numbers and answers are columns of their own, tuples and arrays of them are lists, and what is
+nested is JSON text. Importing this module loads pyarrow; ``cache`` does so only when a cache is
+asked for.
 """
 
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
@@ -15,9 +15,18 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bridge.whole_file import write_whole
-from evaluator.arrow_columns import ANSWER, NUMBER, TEXT, WHOLE, column_of, values_of
+from evaluator.arrow_columns import (
+    ANSWER,
+    NUMBER,
+    TEXT,
+    WHOLE,
+    arrays_of,
+    column_of,
+    values_of,
+)
 from evaluator.collecting import without_collecting
 from evaluator.compare.typed_json import Reader, as_it_is, reader, to_text, without_none
+from evaluator.packed import Packed
 
 Summary = TypeVar("Summary")
 Rows = Mapping[str, tuple[Any, ...]]
@@ -125,12 +134,12 @@ def _unpacked(kind: type[Summary], table: pa.Table) -> dict[str, tuple[Summary, 
         if not is_optional and column.null_count != nothing:
             message = f"{name} is missing"
             raise UnusableFileError(message)
-        values = values_of(column)
-        if unpack is as_it_is:
-            columns.append(values)
+        if unpack is Packed:
+            columns.append(arrays_of(column))
+        elif unpack is as_it_is:
+            columns.append(values_of(column))
         else:
-            known = {text: unpack(text) for text in set(values) - {None}}  # many are the same
-            columns.append([None if text is None else known[text] for text in values])
+            columns.append(_from_texts(values_of(column), unpack))
     names = [column.name for column in _columns(kind)]
     make = _maker(kind)
     rows: dict[str, tuple[Summary, ...]] = {}
@@ -175,10 +184,16 @@ def _column(name: str, hint: Any) -> _Column:
     if inner in _SCALARS:
         return _Column(name, _SCALARS[inner], is_optional, as_it_is, as_it_is)
     args = get_args(inner)
+    if inner is Packed:
+        return _Column(name, pa.list_(NUMBER), is_optional, as_it_is, Packed)
     if get_origin(inner) is tuple and args[1:] == (Ellipsis,) and args[0] in _SCALARS:
         return _Column(name, pa.list_(_SCALARS[args[0]]), is_optional, list, as_it_is)
-    return _Column(name, pa.string(), is_optional, to_text, partial(_from_text, reader(inner)))
+    return _Column(name, TEXT, is_optional, to_text, reader(inner))
 
 
-def _from_text(read: Reader, text: str) -> Any:
-    return read(json.loads(text))
+def _from_texts(texts: list[str | None], read: Reader) -> list[Any]:
+    """Parse JSON texts: each of the different ones once, all of them together."""
+    different = [text for text in dict.fromkeys(texts) if text is not None]
+    values = json.loads(f"[{','.join(different)}]")
+    known = {text: read(value) for text, value in zip(different, values, strict=True)}
+    return [None if text is None else known[text] for text in texts]

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from array import array
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluator.arrow_columns import ANSWER, NUMBER, TEXT, WHOLE, column_of, values_of
+from evaluator.arrow_columns import ANSWER, NUMBER, TEXT, WHOLE, arrays_of, column_of, values_of
 
 ROOT = Path(__file__).resolve().parents[2]
 _SCALARS = {
@@ -44,6 +45,23 @@ def test_a_column_is_what_pyarrow_makes_and_comes_back_whole_and_in_pieces(
     pieces = pa.chunked_array([array[:first], array[first:last], array[last:]], kind)
     assert values_of(pieces) == values
     assert values_of(pa.chunked_array([pa.array(values, kind)])) == values
+
+
+@given(
+    st.lists(st.none() | st.lists(st.floats(allow_nan=False), max_size=4), max_size=9),
+    st.integers(0, 9),
+)
+def test_arrays_of_numbers_come_back_packed(lists: list[list[float] | None], cut: int) -> None:
+    packed = [None if values is None else array("d", values) for values in lists]
+    column = column_of(packed, pa.list_(NUMBER))
+    assert column.equals(column_of(lists, pa.list_(NUMBER)))
+    assert arrays_of(pa.chunked_array([column[:cut], column[cut:]])) == packed
+
+
+def test_a_hole_in_an_array_is_refused() -> None:
+    column = column_of([(1.0, None)], pa.list_(NUMBER))
+    with pytest.raises(ValueError, match="missing"):
+        arrays_of(pa.chunked_array([column]))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Motions against each other: laws of the errors, and what is left without delay or offset."""
 
+from array import array
 from pathlib import Path
 
 import numpy as np
@@ -95,7 +96,7 @@ def test_a_rigid_motion_of_one_side_is_taken_out(seed: int) -> None:
     )
     assert found.without_offset_mean_m == pytest.approx(0.0, abs=1e-9)
     assert found.joint_rms_rad is None
-    assert found.joint_curve_rad == ()
+    assert not found.joint_curve_rad
 
 
 @settings(max_examples=15)
@@ -296,7 +297,7 @@ def summaries(*mean_m: float) -> list[MotionSummary]:
                 "against": "planned",
                 "position_mean_m": value,
                 "position_max_m": 2 * value,
-                "curve_m": (value,) * 101,
+                "curve_m": array("d", [value]) * 101,
             }
         )
         for index, value in enumerate(mean_m)

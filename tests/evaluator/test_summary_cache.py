@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,7 @@ from hypothesis import strategies as st
 from evaluator.compare import cache_folder
 from evaluator.compare.cache import MOST_FILES, SummaryCache
 from evaluator.compare.summary_file import UnusableFileError, read_summaries, write_summaries
+from evaluator.packed import Packed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +40,7 @@ class Everything:
     maybe: float | None = None
     unknown: bool | None = None
     curve_m: tuple[float, ...] = ()
+    packed_m: Packed = field(default_factory=lambda: array("d"))
     names: tuple[str, ...] | None = None
     inner: Inner | None = None
     places: dict[str, tuple[float, float, float]] = field(default_factory=dict)
@@ -58,6 +61,7 @@ FULL = Everything(
     maybe=1e-300,
     unknown=False,
     curve_m=(0.0, -0.0, 1.5),
+    packed_m=array("d", (0.0, -0.0, 0.1)),
     names=("x", ""),
     inner=Inner(name="i", pairs=(("grasp", True), ("place", None))),
     places={"cube": (0.1, 0.2, 0.3)},
@@ -76,6 +80,7 @@ everything = st.builds(
     maybe=st.none() | numbers,
     unknown=st.none() | st.booleans(),
     curve_m=st.lists(numbers, max_size=4).map(tuple),
+    packed_m=st.lists(numbers, max_size=4).map(lambda values: array("d", values)),
     names=st.none() | st.lists(names, max_size=3).map(tuple),
     inner=st.none() | st.builds(Inner, name=names),
     places=st.dictionaries(names, st.tuples(numbers, numbers, numbers), max_size=2),

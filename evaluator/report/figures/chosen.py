@@ -7,6 +7,7 @@ from evaluator.compare.band_measurements import BandCurve
 from evaluator.compare.drawn import CurveBand, DrawnBin, curve_bands, drawn_bins
 from evaluator.compare.motion import MotionSummary
 from evaluator.compare.rows import Comparison, RateCell
+from evaluator.packed import Packed
 from evaluator.report.figures.agreement import scatter, success
 from evaluator.report.figures.bands import bands
 from evaluator.report.figures.drawing import Drawing, NotDrawn
@@ -94,9 +95,9 @@ def _alone(measurement: Measurement) -> Measurement:
     return replace(measurement, episodes=())
 
 
-def _curves(summaries: Iterable[MotionSummary]) -> dict[str, Sequence[tuple[float, ...]]]:
+def _curves(summaries: Iterable[MotionSummary]) -> dict[str, Sequence[Packed]]:
     """Gather curves by what was compared with what; planned comes before executed."""
-    found: dict[str, list[tuple[float, ...]]] = {}
+    found: dict[str, list[Packed]] = {}
     for summary in summaries:
         name = f"{summary.side} to {summary.against}"
         found.setdefault(name, []).append(summary.curve_m)

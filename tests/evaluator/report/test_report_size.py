@@ -1,5 +1,6 @@
 """Large runs: the page stays small and says where the rest is; the results are complete."""
 
+from array import array
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,8 +76,8 @@ def motion(rng: np.random.Generator, row: TrialRow, against: str) -> MotionSumma
         joint_rms_rad=None,
         joint_max_rad=None,
         joint_worst=None,
-        curve_m=tuple(curve),
-        joint_curve_rad=(),
+        curve_m=array("d", curve),
+        joint_curve_rad=array("d"),
     )
 
 
