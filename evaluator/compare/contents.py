@@ -53,7 +53,7 @@ def read_contents(run: RunFolder, cache: SummaryCache, output: Output) -> RunCon
     recorded, left_out = _read(
         inventory.recorded,
         RecordedFacts,
-        lambda file: f"{file.name} {file.sha256} {labels.get(file.path.stem, '')}",
+        lambda file: f"{file.name} {file.sha256} {labels.get(file.stem, '')}",
         lambda file: read_recorded(run, Episode.open(file.path)),
         cache,
         output,
@@ -73,9 +73,7 @@ def read_contents(run: RunFolder, cache: SummaryCache, output: Output) -> RunCon
             if file.name in recorded
         ),
         derived=tuple(
-            DerivedFile(
-                path=file.path, name=file.name, sha256=file.sha256, facts=derived[file.name]
-            )
+            DerivedFile(file=file, facts=derived[file.name])
             for file in inventory.derived
             if file.name in derived
         ),

@@ -30,12 +30,22 @@ MEGABYTE = 1_000_000
 class RunFile:
     """One episode of a run, recorded or derived, as it lies on the disk."""
 
-    path: Path
-    """Its first part."""
+    folder: Path
+    """That ``name`` is relative to: the run's."""
     name: str
-    """Relative to the run folder, with forward slashes."""
+    """Of its first part, with forward slashes."""
     sha256: str
     """Of the bytes of all parts, one after the other."""
+
+    @property
+    def path(self) -> Path:
+        """Its first part; made when asked for, most files of a large run are not opened again."""
+        return self.folder / self.name
+
+    @property
+    def stem(self) -> str:
+        """The name of the file without folder and ending."""
+        return self.name.rpartition("/")[2].rpartition(".")[0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +91,7 @@ def take_inventory(run: RunFolder, cache: SummaryCache, output: Output) -> Inven
     files: dict[bool, list[RunFile]] = {False: [], True: []}
     for each in seen:
         if each.name in hashes:
-            file = RunFile(path=each.path, name=each.name, sha256=hashes[each.name])
+            file = RunFile(folder=run.path, name=each.name, sha256=hashes[each.name])
             files[each.is_derived].append(file)
     return Inventory(
         recorded=tuple(files[False]), derived=tuple(files[True]), left_out=tuple(left_out)

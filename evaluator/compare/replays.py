@@ -9,6 +9,7 @@ from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.streams import verdicts
 from bridge.errors import GstError
+from evaluator.compare.inventory import RunFile
 from evaluator.compare.recorded import Place, places_in
 from evaluator.compare.said import Said, said_by
 from evaluator.errors import EvaluatorError
@@ -32,11 +33,23 @@ class DerivedFacts:
 class DerivedFile:
     """One derived episode and what it was made from."""
 
-    path: Path
-    name: str
-    """Relative to the run folder."""
-    sha256: str
+    file: RunFile
     facts: DerivedFacts
+
+    @property
+    def path(self) -> Path:
+        """Of its first part."""
+        return self.file.path
+
+    @property
+    def name(self) -> str:
+        """Relative to the run folder."""
+        return self.file.name
+
+    @property
+    def sha256(self) -> str:
+        """Of its bytes."""
+        return self.file.sha256
 
     @property
     def info(self) -> EpisodeInfo:

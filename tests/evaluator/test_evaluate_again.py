@@ -20,6 +20,7 @@ from bridge.terminal import Output
 from evaluator.cli import evaluate
 from evaluator.compare import Comparison, compare_run, inventory
 from evaluator.compare.cache import FOLDER, SummaryCache
+from evaluator.compare.inventory import RunFile
 from evaluator.compare.replays import DerivedFacts, DerivedFile, DerivedIndex
 from evaluator.result import write_results
 
@@ -320,7 +321,9 @@ def test_the_index_finds_what_looking_at_every_file_finds(
         path.touch()
         os.utime(path, ns=(number % 5, number % 5))
         facts = DerivedFacts(info=EpisodeInfo(id="x", kind="trial"), derived=derived)
-        files.append(DerivedFile(path=path, name=path.name, sha256="", facts=facts))
+        files.append(
+            DerivedFile(file=RunFile(folder=path.parent, name=path.name, sha256=""), facts=facts)
+        )
     index = DerivedIndex(files)
     for source in "ab":
         for plan_id in "pq":

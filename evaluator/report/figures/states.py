@@ -1,7 +1,7 @@
 """Predicted against localised and replayed final states, as distributions of errors."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from evaluator.compare.drawn import Shares, shares_of
 from evaluator.compare.states import StateSummary
@@ -27,7 +27,10 @@ SUBJECT = Subject(
 
 def state_panels(states: Sequence[StateSummary]) -> tuple[Subject, list[Panel]]:
     """Return one panel for each kind of error that any state has."""
-    final = [state for state in states if state.is_last]
+    final: dict[tuple[str, str], list[StateSummary]] = {}
+    for state in states:
+        if state.is_last:
+            final.setdefault((state.predicted_by, state.against), []).append(state)
     panels = [
         Panel(label=label, groups=_groups(final, value), log=True)
         for label, value in (
@@ -44,16 +47,13 @@ def _scaled(value: float | None, factor: float) -> float | None:
 
 
 def _groups(
-    states: Sequence[StateSummary], value: Callable[[StateSummary], float | None]
+    states: Mapping[tuple[str, str], Sequence[StateSummary]],
+    value: Callable[[StateSummary], float | None],
 ) -> tuple[Shares, ...]:
     found = []
     for predicted_by, against, name in PAIRS:
-        values = [
-            error
-            for state in states
-            if (state.predicted_by, state.against) == (predicted_by, against)
-            and (error := value(state)) is not None
-        ]
+        errors = map(value, states.get((predicted_by, against), ()))
+        values = [error for error in errors if error is not None]
         shares = shares_of(name, values)
         if shares is not None:
             found.append(shares)
