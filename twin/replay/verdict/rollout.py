@@ -102,7 +102,9 @@ def _replay(
         broken=states.broken,
     )
     # What was executed is judged by where things end: it is known whether they were dropped.
-    holds = holds_of(plan, path, result) if dynamic and trajectory == "planned" else []
+    slipped: list[Failure] = []
+    if dynamic and trajectory == "planned" and config.max_slip_m is not None:
+        slipped = slips(holds_of(plan, path, result), config.max_slip_m)
     terminal = terminal_factor(
         result, scene, config, unreachable_ns=unreachable_ns, burst=states.burst
     )
@@ -112,7 +114,7 @@ def _replay(
         clearance=factor_from(
             monitor.failures, undecided=_clearance_undecided(scene, unreachable_ns, states)
         ),
-        terminal=unless_slipped(terminal, slips(holds, config.max_slip_m)),
+        terminal=unless_slipped(terminal, slipped),
         warnings=warnings_of(scene, result),
         findings=tuple(findings_of(scene.task, result.rollout(), "replayed")) if dynamic else (),
     )
