@@ -28,11 +28,11 @@ _TAKEN: dict[pa.DataType, tuple[type, ...]] = {
     ANSWER: (bool, np.bool_),
 }
 _NONE = packed()
-_MOST_BYTES = 2**31 - 1
-"""Of one column of texts, whose places have 32 bits."""
+_MOST = 2**31 - 1
+"""Bytes of one column of texts, or values of one of lists: their places have 32 bits."""
 
 
-def column_of(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
+def column_of(values: Sequence[Any], kind: pa.DataType) -> pa.Array | pa.ChunkedArray:
     """Fill a column.
 
     Args:
@@ -42,7 +42,7 @@ def column_of(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
 
     Raises:
         TypeError: When a value is of another type.
-        OverflowError: When a number needs more than 64 bits, or all texts have over 2 GB.
+        OverflowError: When a number needs more than 64 bits, or a list column has over 2^31 values.
         ValueError: When a text is no Unicode.
     """
     there = [value is not None for value in values]
@@ -55,6 +55,8 @@ def column_of(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
     _check(values, kind)
     if kind == TEXT:
         texts = [b"" if value is None else value.encode() for value in values]
+        if sum(map(len, texts)) > _MOST:
+            return pa.array(values, kind)  # which cuts it into pieces
         buffers += [_buffer(_ends(map(len, texts))), pa.py_buffer(b"".join(texts))]
     elif kind == ANSWER:
         buffers.append(_bits([bool(value) for value in values]))
@@ -149,8 +151,8 @@ def _check(values: Sequence[Any], kind: pa.DataType) -> None:
 
 def _ends(lengths: "map[int]") -> Int32[np.ndarray, " places"]:
     places = list(accumulate(lengths, initial=0))
-    if places[-1] > _MOST_BYTES:
-        message = f"{places[-1]} bytes do not fit one column"
+    if places[-1] > _MOST:
+        message = f"{places[-1]} values do not fit one column of lists"
         raise OverflowError(message)
     return np.array(places, dtype=np.int32)
 

@@ -1,7 +1,5 @@
 """Columns hold what was put in, agree with pyarrow's own ways, and never load pandas."""
 
-import subprocess
-import sys
 from array import array
 from pathlib import Path
 from typing import Any
@@ -10,6 +8,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from own_process import printed
 
 from evaluator.arrow_columns import ANSWER, NUMBER, TEXT, WHOLE, arrays_of, column_of, values_of
 
@@ -92,7 +91,4 @@ def test_neither_direction_loads_pandas() -> None:
         "(([1.0, None], NUMBER), (['a', None], TEXT), ([(1.0,), None], pa.list_(NUMBER)))]; "
         "print('pandas' in sys.modules, len(found))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
-    )
-    assert done.stdout.strip() == "False 3"
+    assert printed(code) == "False 3"

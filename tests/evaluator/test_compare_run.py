@@ -1,12 +1,12 @@
 """``compare_run``: pairing, headline sim, and everything that must be left out with a reason."""
 
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from own_process import printed
 
 from bridge.episode import schema
 from bridge.episode.catalogue import label_episode
@@ -314,15 +314,12 @@ def test_kinova_runs_lie_near_their_simulators(tmp_path: Path) -> None:
 
 
 def test_the_evaluator_loads_nothing_heavy() -> None:
-    import subprocess
-
     code = (
         "import sys, evaluator.compare, evaluator.report.write;"
         "print([n for n in ('torch','zenoh','mujoco','pybullet','open3d','pandas','twin')"
         " if n in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert printed(code) == "[]"
 
 
 def test_rows_can_be_turned_into_plain_records(six_trials: Any) -> None:

@@ -3,13 +3,11 @@
 ``lint-imports`` does not look into a parent package's ``__init__`` (style page, trap 3).
 """
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from own_process import ROOT, printed
 
-ROOT = Path(__file__).parents[2]
 HEAVY = ("pyrealsense2", "zenoh", "torch", "open3d", "mujoco", "pybullet", "rerun", "pandas")
 LIGHT_ROOMS = (
     "bridge",
@@ -36,10 +34,7 @@ LIGHT_ROOMS = (
 @pytest.mark.parametrize("room", LIGHT_ROOMS)
 def test_a_light_room_loads_nothing_heavy(room: str) -> None:
     code = f"import sys; import {room}; print([name for name in {HEAVY!r} if name in sys.modules])"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
-    )
-    assert done.stdout.strip() == "[]"
+    assert printed(code) == "[]"
 
 
 def test_hugging_face_datasets_would_not_be_hidden() -> None:
@@ -53,10 +48,7 @@ def test_tests_and_datasets_are_not_importable_from_elsewhere(tmp_path: Path) ->
         "print([n for n in ('datasets.tasks', 'tests.shape') if n.split('.')[0] in "
         "('datasets', 'tests') and u.find_spec(n.split('.')[0])])"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True
-    )
-    assert done.stdout.strip() == "[]"
+    assert printed(code, folder=tmp_path) == "[]"
 
 
 def test_only_the_wire_imports_zenoh() -> None:

@@ -40,10 +40,10 @@ def state(number: int) -> dict[str, object]:
         "target_q": [number * 1e-3 + joint + 0.5 for joint in range(6)],
         "actual_TCP_pose": [0.1, 0.2, 0.3, 0.0, 0.0, number * 1e-3],
         "actual_TCP_force": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
-        "speed_scaling": 1.0 if number < 150 else 0.25,
+        "speed_scaling": 1.0 if number < 250 else 0.25,
         "robot_mode": 7,
-        "safety_mode": 1 if number < 150 else 3,
-        "actual_digital_output_bits": int(number >= 150),
+        "safety_mode": 1 if number < 250 else 3,
+        "actual_digital_output_bits": int(number >= 250),
     }
 
 
@@ -104,11 +104,11 @@ def samples_of(path: Path, topic: str) -> list[tuple[int, int, JointSample]]:
 
 @pytest.mark.slow
 def test_an_arm_is_recorded_whole_and_checks_clean(joined: Joined, server: RtdeServer) -> None:
-    server.last = 400
+    server.last = 550
     config = UrConfig(cell="lab", rate_hz=250.0, port=server.port, gripper="digital_out:0")
     joined.control.start("t1", {"kind": "trial", "cell": "lab"})
     running = Running(joined, config)
-    result = running.end_after(400)
+    result = running.end_after(550)
     joined.control.stop({"result": "success"})
     path = joined.episode_path("t1")
     assert check_episode(path).faults == []
@@ -116,8 +116,8 @@ def test_an_arm_is_recorded_whole_and_checks_clean(joined: Joined, server: RtdeS
 
     joints = samples_of(path, "/lab/joint_states")
     numbers = [round(sample.position[0] * 1e3) for _, _, sample in joints]
-    assert numbers == list(range(numbers[0], 401))  # every package, in order
-    assert 100 < numbers[0] < 200  # half a second finds the offset between the clocks
+    assert numbers == list(range(numbers[0], 551))  # every package, in order
+    assert 100 < numbers[0] < 250  # half a second finds the offset between the clocks
     assert result["samples"] == len(joints)
     assert (result["lost"], result["connections"]) == (0, 1)
     stamps = np.array([stamp_ns for _, stamp_ns, _ in joints])
@@ -131,7 +131,7 @@ def test_an_arm_is_recorded_whole_and_checks_clean(joined: Joined, server: RtdeS
     assert widths.names == ("gripper_width",)
     assert widths.position[:, 0].min() == 0.0
     closed = widths.position[:, 0] == 0.0
-    assert closed.sum() == pytest.approx(251 / 2, abs=2)  # 125 Hz of 250, from sample 150 on
+    assert closed.sum() == pytest.approx(301 / 2, abs=2)  # 125 Hz of 250, from sample 250 on
     pose = streams.pose_track(episode, "/lab/tcp/pose")
     assert len(pose.stamps_ns) == len(joints)
     np.testing.assert_allclose(pose.p_m[0], [-0.1, -0.2, 0.3])
@@ -148,7 +148,11 @@ def test_an_arm_is_recorded_whole_and_checks_clean(joined: Joined, server: RtdeS
         "robot mode RUNNING, safety mode PROTECTIVE_STOP",
     ]
     speeds = [sample.position[0] for _, _, sample in samples_of(path, "/lab/speed_scaling")]
-    assert (speeds[0], speeds[-1], len(speeds)) == (1.0, 0.25, 3)  # once, changed, a second later
+    assert (speeds[0], speeds[-1], len(speeds)) == (
+        1.0,
+        0.25,
+        3,
+    )  # once, changed, a second (250 samples) later
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """Parquet says what CSV and JSON say, with types; without a package the report is still written."""
 
-import subprocess
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
+from own_process import printed
 
 from bridge.episode.run import RunFolder
 from bridge.exchange.trials_csv import TrialRecord, read_trials
@@ -126,10 +126,7 @@ def test_nothing_heavy_is_loaded_before_something_is_written() -> None:
         "import sys, evaluator.report.write, evaluator.compare; "
         "print([n for n in ('pandas', 'pyarrow', 'matplotlib', 'torch') if n in sys.modules])"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
-    )
-    assert done.stdout.strip() == "[]"
+    assert printed(code) == "[]"
 
 
 @pytest.mark.slow
@@ -141,14 +138,7 @@ def test_a_whole_evaluation_loads_neither_the_twin_nor_torch(
         "heavy = ('twin', 'torch', 'open3d', 'mujoco', 'pybullet', 'zenoh'); "
         "print(code, [n for n in heavy if n in sys.modules])"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(evaluation_run.path)],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        check=True,
-    )
-    assert done.stdout.strip().endswith("0 []")
+    assert printed(code, str(evaluation_run.path)).endswith("0 []")
 
 
 def test_parquet_is_written_without_pandas_and_numbers_keep_their_last_bit(tmp_path: Path) -> None:
@@ -161,9 +151,7 @@ def test_parquet_is_written_without_pandas_and_numbers_keep_their_last_bit(tmp_p
         "print('pandas' in sys.modules)"
     )
     path = tmp_path / "t.parquet"
-    command = [sys.executable, "-c", code, str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
-    assert done.stdout.strip() == "False"
+    assert printed(code, str(path)) == "False"
     assert pd.read_parquet(path)["p_success"].tolist() == [0.1 + 0.2]
 
 

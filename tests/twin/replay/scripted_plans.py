@@ -31,6 +31,15 @@ def scene_of_test(missing: tuple[str, ...] = ()) -> ReplayScene:
     )
 
 
+def joints_over(scene: ReplayScene, x: float, y: float, z: float) -> np.ndarray:
+    """Tool at this place of the base frame, pointing straight down."""
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    T[:3, 3] = (x, y, z)
+    solution = solve_ik(load_robot(scene.urdf), T, IkConfig())
+    assert solution.reached
+    return solution.joints_rad
+
+
 def downward(yaw_rad: float) -> tuple[float, float, float, float]:
     """The tool looks down; its fingers open along the direction of the yaw."""
     R = np.array(

@@ -16,6 +16,7 @@ from bridge.task.plan import Plan
 from bridge.task.verdict import Factor
 from twin.replay.failure import Failure, factor_from
 from twin.replay.follow.path import JointPath
+from twin.replay.stretches import stretches
 from twin.replay.verdict.result import ReplayResult
 
 LEAVES_M = 0.002
@@ -70,8 +71,7 @@ def _closed(
     told: Bool[np.ndarray, " num_waypoints"] = np.array([w.g == 1 for w in plan.tau])
     index = np.searchsorted(path.width_times_ns, stamps, side="right") - 1
     closed = (index >= 0) & told[np.clip(index, 0, len(told) - 1)]
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], closed, [False]]).astype(np.int8)))
-    return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
+    return stretches(closed)
 
 
 def _grasped(plan: Plan, t_ns: int) -> str | None:

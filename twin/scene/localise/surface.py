@@ -80,22 +80,10 @@ def seen_through(
         views: With their depth.
         margin_m: How far behind.
     """
-    through, looked = 0, 0
     T_object_base = se3.invert(T)
-    for view in views:
-        p = se3.apply(T, surface.p_m[facing(T_object_base, view, surface)])
-        p = se3.apply(se3.invert(view.T_base_depth), p)
-        p = p[p[:, 2] > 0.05]
-        if len(p) == 0:
-            continue
-        uv, _ = view.depth_camera.project(p)
-        size = (view.depth_camera.width, view.depth_camera.height)
-        inside = np.all((uv >= 0) & (uv < size), axis=1)
-        column, row = uv[inside].astype(np.int64).T
-        depth = view.depth_m[row, column]
-        looked += int((depth > 0).sum())
-        through += int((depth > p[inside, 2] + margin_m).sum())
-    return through / looked if looked else 0.0
+    looked = [_looked_at(T, T_object_base, surface, view) for view in views]
+    through = sum(int((measured > z + margin_m).sum()) for measured, z in looked)
+    return _share(through, sum(int((measured > 0).sum()) for measured, _ in looked))
 
 
 def agreeing(
@@ -109,9 +97,33 @@ def agreeing(
         views: With their depth.
         margin_m: How far off a measurement may be.
     """
+    T_object_base = se3.invert(T)
     share = 0.0
     for view in views:
+        measured, z = _looked_at(T, T_object_base, surface, view)
+        looked = int((measured > 0).sum())
         # Behind the nearer bound, but not behind the farther one.
-        behind = seen_through(T, surface, [view], -margin_m)
-        share = max(share, behind - seen_through(T, surface, [view], margin_m))
+        near, far = (int((measured > z + bound).sum()) for bound in (-margin_m, margin_m))
+        share = max(share, _share(near, looked) - _share(far, looked))
     return share
+
+
+def _looked_at(
+    T: Float[np.ndarray, "4 4"],
+    T_object_base: Float[np.ndarray, "4 4"],
+    surface: Surface,
+    view: View,
+) -> tuple[Float[np.ndarray, " num_seen"], Float[np.ndarray, " num_seen"]]:
+    """Depth that a camera measured (0: none) and has, where it looks at the facing surface [m]."""
+    p = se3.apply(T, surface.p_m[facing(T_object_base, view, surface)])
+    p = se3.apply(se3.invert(view.T_base_depth), p)
+    p = p[p[:, 2] > 0.05]
+    uv, _ = view.depth_camera.project(p)
+    size = (view.depth_camera.width, view.depth_camera.height)
+    inside = np.all((uv >= 0) & (uv < size), axis=1)
+    column, row = uv[inside].astype(np.int64).T
+    return view.depth_m[row, column], p[inside, 2]
+
+
+def _share(part: int, whole: int) -> float:
+    return part / whole if whole else 0.0

@@ -3,28 +3,16 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
+from scripted_plans import joints_over
 
 from twin.replay.clearance import ClearanceMonitor, active_stage
 from twin.replay.config import ReplayConfig
 from twin.replay.place.scene import ReplayScene
 from twin.robot.collision import hulls_of
-from twin.robot.inverse import solve_ik
 from twin.robot.model import load_robot
 
 WIDTH_M = 0.08
-
-
-def joints_over(scene: ReplayScene, x: float, y: float, z: float) -> np.ndarray:
-    """Tool pointing straight down."""
-    from twin.robot.config import IkConfig
-
-    T = np.diag([1.0, -1.0, -1.0, 1.0])
-    T[:3, 3] = (x, y, z)
-    solution = solve_ik(load_robot(scene.urdf), T, IkConfig())
-    assert solution.reached
-    return solution.joints_rad
 
 
 def monitor_of(script: SimpleNamespace, scene: ReplayScene, **stage: object) -> ClearanceMonitor:

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scripted_plans import joints_over
 
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
@@ -60,14 +61,6 @@ def static_of(*boxes: Box, table_m: float | None = 0.0, left_m: float = 0.3) -> 
 
 
 POST: Box = ((0.62, -0.3, 0.16), (0.048, 0.048, 0.32))
-
-
-def joints_over(scene: ReplayScene, x: float, y: float, z: float) -> np.ndarray:
-    T = np.diag([1.0, -1.0, -1.0, 1.0])
-    T[:3, 3] = (x, y, z)
-    solution = solve_ik(load_robot(scene.urdf), T, IkConfig())
-    assert solution.reached
-    return solution.joints_rad
 
 
 def monitor_of(script: SimpleNamespace, scene: ReplayScene, **stage: object) -> ClearanceMonitor:

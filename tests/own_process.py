@@ -1,0 +1,20 @@
+"""Code in a Python process of its own, in which nothing is loaded yet."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def printed(code: str, *arguments: str, folder: Path = ROOT) -> str:
+    """Run code and return what it printed, without blanks around it; it must end well."""
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
