@@ -191,9 +191,7 @@ def clearance_rows(num_states: int) -> list[Target]:
             found = []
             for joints in postures:
                 hulls.place(joints, 0.08)
-                distances, _ = around.measure(
-                    around.links, [], {}, near_m=0.012, counts=lambda body, other: True
-                )
+                distances, _ = around.measure({}, [], near_m=0.012, counts=lambda body, other: True)
                 found.append(min(distances.values()))
             return found
 

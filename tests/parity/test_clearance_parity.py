@@ -1,12 +1,20 @@
-"""The tree of points in C++ against looking at every point with the grid's own lookup."""
+"""The tree of points in C++ against looking at every point, and bounds of pairs against coal."""
 
+from itertools import combinations
+
+import coal
 import numpy as np
 import pytest
 from scipy import ndimage
 
+from bridge.geometry.box import box_corners
 from twin.replay import _clearance
+from twin.replay.clearance.bodies import half_space_solid, solid_of
 from twin.replay.clearance.grid import GridLookup
+from twin.replay.clearance.near import NearPairs
 from twin.replay.clearance.shells import FINE_M, Shells, shell_of
+from twin.robot.collision import signed_distance
+from twin.robot.hulls import convex_hull
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid
 
 pytestmark = pytest.mark.parity
@@ -66,3 +74,60 @@ def test_what_does_not_fit_together_is_refused(grid: SdfGrid) -> None:
         _clearance.nearest(*fixed, R, t, points, np.zeros(3), fine, roots, answers)
     with pytest.raises(ValueError, match="differ in number"):
         _clearance.nearest(*fixed, R, t, points, radius, fine, roots, np.zeros(2))
+
+
+def bound_in_numpy(near: NearPairs, solids: list, one: int, other: int) -> float:
+    """What boxes and spheres leave between two bodies, seen from either body."""
+    found = []
+    c = [near.R[i] @ solids[i].centre + near.t[i] for i in (one, other)]
+    found.append(np.linalg.norm(c[1] - c[0]) - solids[one].radius_m - solids[other].radius_m)
+    for a, b, way in ((one, other, c[1] - c[0]), (other, one, c[0] - c[1])):
+        ball = np.abs(near.R[a].T @ way) - solids[a].half_m
+        box = ball - np.abs(near.R[a].T @ near.R[b]) @ solids[b].half_m
+        for gap, radius in ((ball, solids[b].radius_m), (box, 0.0)):
+            outside = np.linalg.norm(np.maximum(gap, 0.0)) if gap.max() > 0 else gap.max()
+            found.append(outside - radius)
+    return max(found) - 1e-6
+
+
+def test_bounds_are_those_of_numpy_and_never_above_what_coal_measures() -> None:
+    rng = np.random.default_rng(5)
+    points = [rng.normal(size=(30, 3)) * rng.uniform(0.01, 0.1, 3) for _ in range(6)]
+    points += [box_corners(rng.uniform(0.02, 0.1, 3)) for _ in range(4)]
+    solids = [solid_of("body", convex_hull(p), p) for p in points]
+    pairs = list(combinations(range(10), 2))
+    solids.append(half_space_solid("table"))
+    pairs += [(index, 10) for index in range(10)]
+    near = NearPairs(solids, pairs)
+    exact = apart = 0
+    for seed in range(20):
+        near.R[:10], near.t[:10] = poses(10, seed)
+        placed = [coal.Transform3s(R, t) for R, t in zip(near.R, near.t, strict=True)]
+        bounds = list(near.nearest_first())
+        assert bounds == sorted(bounds)
+        assert sorted(index for _, index in bounds) == list(range(len(pairs)))
+        for bound, index in bounds:
+            one, other = pairs[index]
+            assert bound == pytest.approx(bound_in_numpy(near, solids, one, other), abs=1e-12)
+            distance = signed_distance(
+                solids[one].shape, placed[one], solids[other].shape, placed[other]
+            )
+            assert bound <= distance
+            apart += bound > 0
+            exact += bound > 0 and distance - bound < 0.01
+    assert apart > 700
+    assert exact > 0.2 * apart  # boxes about random hulls are loose
+
+
+def test_bounds_refuse_what_does_not_fit_together() -> None:
+    one, three = np.ones(1), np.zeros((1, 3))
+    with pytest.raises(ValueError, match="differ in number"):
+        _clearance.Bounds(three, np.zeros((2, 3)), one, np.zeros((1, 2), dtype=np.int32))
+    with pytest.raises(IndexError, match="not there"):
+        _clearance.Bounds(three, three, one, np.array([[0, 1]], dtype=np.int32))
+    bounds = _clearance.Bounds(three, three, one, np.zeros((1, 2), dtype=np.int32))
+    order = np.zeros(1, dtype=np.int32)
+    with pytest.raises(ValueError, match="differ in number"):
+        bounds.nearest_first(np.eye(3)[None], np.zeros((2, 3)), np.zeros(1), order)
+    with pytest.raises(ValueError, match="differ in number"):
+        bounds.nearest_first(np.eye(3)[None], three, np.zeros(2), order)

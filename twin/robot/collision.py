@@ -56,9 +56,15 @@ class RobotHulls:
         self.robot = robot
         self.hulls: list[LinkHull] = link_hulls(robot)
         self._frame_ids = [robot.model.getFrameId(hull.link) for hull in self.hulls]
-        self.placements: list[coal.Transform3s] = [coal.Transform3s() for _ in self.hulls]
+        # Views of pinocchio's own memory: to ask for them costs more than the kinematics.
+        frames = [robot.data.oMf[frame_id] for frame_id in self._frame_ids]
+        self._rotation_views = [frame.rotation for frame in frames]
+        self._translation_views = [frame.translation for frame in frames]
         self.rotations: Float[np.ndarray, "num_hulls 3 3"] = np.zeros((len(self.hulls), 3, 3))
         self.translations: Float[np.ndarray, "num_hulls 3"] = np.zeros((len(self.hulls), 3))
+        self._rotation_rows = self.rotations.reshape(-1, 3)
+        self._translation_row = self.translations.reshape(-1)
+        self._placements: dict[int, coal.Transform3s] = {}
         points = [hull.points_m for hull in self.hulls]
         self._centres = np.array([(p.min(axis=0) + p.max(axis=0)) / 2 for p in points])
         self._radii = np.array(
@@ -75,11 +81,22 @@ class RobotHulls:
         pin.framesForwardKinematics(
             robot.model, robot.data, robot.configuration(joints_rad, width_m)
         )
-        for index, frame_id in enumerate(self._frame_ids):
-            T = robot.data.oMf[frame_id]
-            R, t = T.rotation, T.translation
-            self.rotations[index], self.translations[index] = R, t
-            self.placements[index] = coal.Transform3s(R, t)
+        np.concatenate(self._rotation_views, out=self._rotation_rows)
+        np.concatenate(self._translation_views, out=self._translation_row)
+        self._placements.clear()
+
+    def placement(self, index: int) -> coal.Transform3s:
+        """Where a hull is, as coal wants it; few are asked for in most postures."""
+        placed = self._placements.get(index)
+        if placed is None:
+            placed = coal.Transform3s(self.rotations[index], self.translations[index])
+            self._placements[index] = placed
+        return placed
+
+    @property
+    def placements(self) -> list[coal.Transform3s]:
+        """Where all hulls are."""
+        return [self.placement(index) for index in range(len(self.hulls))]
 
     def self_distance(self) -> SelfDistance:
         """Closest pair at the placed posture; infinite when there is no pair to check."""
@@ -95,17 +112,21 @@ class RobotHulls:
             if gaps[index] > best:
                 break
             first, second = self.pairs[index]
-            distance = self._pair_distance(first, second)
+            distance = self.pair_distance_m(index)
             if distance < best:
                 best, links = distance, (self.hulls[first].link, self.hulls[second].link)
         return SelfDistance(distance_m=float(best), links=links)
 
-    def _pair_distance(self, first: int, second: int) -> float:
+    def pair_distance_m(self, index: int) -> float:
+        """Signed distance of one of ``pairs`` [m]."""
+        return self._distance_m(*self.pairs[index])
+
+    def _distance_m(self, first: int, second: int) -> float:
         return signed_distance(
             self.hulls[first].shape,
-            self.placements[first],
+            self.placement(first),
             self.hulls[second].shape,
-            self.placements[second],
+            self.placement(second),
         )
 
     def _pairs(self) -> list[tuple[int, int]]:
@@ -122,7 +143,7 @@ class RobotHulls:
         overlaps = np.zeros(len(candidates))
         for _ in range(_SAMPLES):
             self.place(rng.uniform(-np.pi, np.pi, len(self.robot.arm_ids)), 0.04)
-            overlaps += [self._pair_distance(*pair) <= 0 for pair in candidates]
+            overlaps += [self._distance_m(*pair) <= 0 for pair in candidates]
         return [
             pair
             for pair, count in zip(candidates, overlaps, strict=True)

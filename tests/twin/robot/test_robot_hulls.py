@@ -53,6 +53,24 @@ def test_every_mesh_vertex_lies_in_its_hull(hulls: RobotHulls) -> None:
             assert signed_distance(hull.shape, coal.Transform3s(), point, T) < 1e-5, hull.link
 
 
+def test_hulls_are_placed_where_the_kinematics_of_their_links_says(hulls: RobotHulls) -> None:
+    """Two postures: what was read once must follow the arm."""
+    rng = np.random.default_rng(3)
+    for _ in range(2):
+        joints, width = rng.uniform(-3.0, 3.0, 6), float(rng.uniform(0.0, 0.08))
+        hulls.place(joints, width)
+        placed = zip(
+            hulls.hulls, hulls.rotations, hulls.translations, hulls.placements, strict=True
+        )
+        for hull, R, t, placement in placed:
+            T = hulls.robot.T_base_link(hull.link, joints, width)
+            np.testing.assert_array_equal(R, T[:3, :3])
+            np.testing.assert_array_equal(t, T[:3, 3])
+            np.testing.assert_array_equal(placement.getRotation(), T[:3, :3])
+            np.testing.assert_array_equal(placement.getTranslation(), T[:3, 3])
+            hulls.place(joints, width)
+
+
 def test_the_home_posture_is_free_of_self_collision(hulls: RobotHulls) -> None:
     hulls.place(HOME, 0.08)
     assert hulls.self_distance().distance_m > 0.005

@@ -1,4 +1,4 @@
-"""Convex pieces with bounding spheres, and the names bodies have in contacts and failures."""
+"""Convex pieces with what holds them, and the names bodies have in contacts and failures."""
 
 from dataclasses import dataclass
 
@@ -16,40 +16,43 @@ GRIPPER = "gripper"
 SCENE = "scene"
 """What stands still and has no name of its own."""
 
+_FAR_M = 1e3
+
 
 @dataclass(frozen=True)
 class Solid:
-    """One convex piece with a bounding sphere, to skip pairs that are far apart."""
+    """One convex piece with a box and a sphere that hold it, to skip pairs that are far apart."""
 
     body: str
     shape: coal.CollisionGeometry
     centre: Float[np.ndarray, "3"]
+    """Of both, in the piece's frame."""
     radius_m: float
-
-
-@dataclass(frozen=True)
-class Placed:
-    """One piece where it is."""
-
-    body: str
-    shape: coal.CollisionGeometry
-    placement: coal.Transform3s
-    piece: int = 0
+    half_m: Float[np.ndarray, "3"]
+    """Half the extents of the box, along the axes of the piece's frame."""
 
 
 def solid_of(
     body: str, shape: coal.CollisionGeometry, points_m: Float[np.ndarray, "num_points 3"]
 ) -> Solid:
-    """Put a sphere around a piece."""
-    centre = (points_m.min(axis=0) + points_m.max(axis=0)) / 2
+    """Put a box and a sphere around a piece."""
+    low, high = points_m.min(axis=0), points_m.max(axis=0)
+    centre = (low + high) / 2
     radius = float(np.linalg.norm(points_m - centre, axis=1).max())
-    return Solid(body, shape, centre, radius)
+    return Solid(body, shape, centre, radius, (high - low) / 2)
 
 
 def box_solid(body: str, size_m: Float[np.ndarray, "3"]) -> Solid:
     """A box around the origin."""
     corners = box_corners(size_m)
     return solid_of(body, convex_hull(corners), corners)
+
+
+def half_space_solid(body: str) -> Solid:
+    """Everything below its frame; the box is as large as any cell and far beyond."""
+    half = np.full(3, _FAR_M)
+    shape = coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
+    return Solid(body, shape, np.array([0.0, 0.0, -_FAR_M]), float("inf"), half)
 
 
 def group_of(body: str) -> str:

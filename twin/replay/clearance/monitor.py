@@ -10,6 +10,7 @@ soft bodies their nodes, and distances are on the safe side.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from math import hypot
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +19,7 @@ from bridge.geometry import se3
 from bridge.task.contact import Contact
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan, Stage
-from twin.replay.clearance.bodies import GRIPPER, Solid, box_solid, group_of, placement_of
+from twin.replay.clearance.bodies import GRIPPER, group_of, placement_of
 from twin.replay.clearance.nodes import planes_of
 from twin.replay.clearance.surroundings import Pair, Surroundings
 from twin.replay.clearance.sweep import MAX_LEAP_M, Reach, State, half_way, object_travel_m
@@ -67,10 +68,10 @@ class ClearanceMonitor:
         self._scene = scene
         self._around = Surroundings(scene, hulls, config.eps_col_m)
         self._links = self._around.links
-        self._objects = {
-            name: box_solid(name, np.array(scene.task.objects[name].size_m))
-            for name in scene.movable()
-        }
+        self._objects = self._around.objects
+        self._centres = np.stack([link.centre for link in self._links])[:, :, None]
+        self._radii = np.array([link.radius_m for link in self._links])
+        self._allowed: dict[int, Allowed] = {}
         self._reach = Reach(hulls)
         self._contacts: dict[tuple[str, str, bool], list[Contact]] = {}
         self._last: _Look | None = None
@@ -122,11 +123,10 @@ class ClearanceMonitor:
         self.hulls.place(state.joints_rad, state.width_m)
         moved = [name for name, T in state.Ts_base_object.items() if self._has_moved(name, T)]
         soft = {n: p for n, p in state.nodes_m.items() if self._nodes_have_moved(n, p)}
-        allowed = allowed_pairs(self.stages, state.t_ns)
+        allowed = self._allowed_at(state.t_ns)
         distances, cut = self._around.measure(
-            self._links + [self._objects[name] for name in moved],
-            [state.Ts_base_object[name] for name in moved],
-            {name: (self._objects[name], T) for name, T in state.Ts_base_object.items()},
+            state.Ts_base_object,
+            moved,
             near_m=self.config.eps_col_m + _LOOK_AHEAD_M,
             counts=lambda body, other: not _may_touch(body, other, allowed),
         )
@@ -192,22 +192,24 @@ class ClearanceMonitor:
         Physics would push the object aside and hide that a finger comes down on it.
         """
         self.hulls.place(joints_rad, width_m)
+        R, t = self.hulls.rotations, self.hulls.translations
+        centres = np.matmul(R, self._centres)[:, :, 0] + t
         for name, T in self._scene.movable().items():
             model = self._scene.task.objects[name]
             solid = self._objects[name]
             limit_m = self.config.pre_grasp_depth_m
             if model.soft is not None:  # it gives way, and is localised less exactly
                 limit_m = self.config.pre_grasp_soft_depth_m
-            points = None if model.mesh is None else se3.apply(T, object_mesh(model).vertices_m)
-            for index, link in enumerate(self._links):
-                R, t = self.hulls.rotations[index], self.hulls.translations[index]
-                if _sphere_gap(R @ link.centre + t, link, se3.apply(T, solid.centre), solid) > 0:
-                    continue
+            away = np.linalg.norm(centres - se3.apply(T, solid.centre), axis=1)
+            for index in np.flatnonzero(away <= self._radii + solid.radius_m).tolist():
+                link = self._links[index]
                 distance = (
-                    planes_of(self.hulls)[index].distance_m(points, R, t)
-                    if points is not None
+                    planes_of(self.hulls)[index].distance_m(
+                        se3.apply(T, object_mesh(model).vertices_m), R[index], t[index]
+                    )
+                    if model.mesh is not None
                     else signed_distance(
-                        link.shape, self.hulls.placements[index], solid.shape, placement_of(T)
+                        link.shape, self.hulls.placement(index), solid.shape, placement_of(T)
                     )
                 )
                 if distance < -limit_m:
@@ -220,13 +222,20 @@ class ClearanceMonitor:
 
     def _has_moved(self, name: str, T: Float[np.ndarray, "4 4"]) -> bool:
         start = self._scene.Ts_base_object[name]
-        return bool(np.linalg.norm(T[:3, 3] - start[:3, 3]) > self.config.moved_m)
+        return hypot(*(T[:3, 3] - start[:3, 3]).tolist()) > self.config.moved_m
 
     def _nodes_have_moved(self, name: str, nodes: Float[np.ndarray, "num_nodes 3"]) -> bool:
         """Against where the body had come to rest, because it sags when it is put down."""
         centre = nodes.mean(axis=0)
         start = self._first_centre.setdefault(name, centre)
         return bool(np.linalg.norm(centre - start) > self.config.moved_m)
+
+    def _allowed_at(self, t_ns: int) -> Allowed:
+        """As ``allowed_pairs``, worked out once for each stage."""
+        stage = id(active_stage(self.stages, t_ns))
+        if stage not in self._allowed:
+            self._allowed[stage] = allowed_pairs(self.stages, t_ns)
+        return self._allowed[stage]
 
     def _judge(self, t_ns: int, body: str, other: str, distance: float, allowed: Allowed) -> float:
         """Note a pair that is too close; returns its distance if the pair may not touch."""
@@ -302,10 +311,3 @@ def allowed_pairs(stages: tuple[Stage, ...], t_ns: int) -> Allowed:
 @lru_cache(maxsize=4096)
 def _may_touch(body: str, other: str, allowed: Allowed) -> bool:
     return frozenset((group_of(body), other)) in allowed or frozenset((body, other)) in allowed
-
-
-def _sphere_gap(
-    centre: Float[np.ndarray, "3"], link: Solid, other: Float[np.ndarray, "3"], solid: Solid
-) -> float:
-    """Lower bound of the distance of two pieces, from their bounding spheres."""
-    return float(np.linalg.norm(centre - other)) - link.radius_m - solid.radius_m

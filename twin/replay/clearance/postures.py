@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.task.robot import GRIPPER_LINKS, MAX_WIDTH_M
+from twin.replay.clearance.near import own_links
 from twin.replay.clearance.surroundings import Surroundings
 from twin.replay.config import ReplayConfig
 from twin.replay.place.scene import ReplayScene
@@ -21,6 +22,7 @@ def posture_clearance(
     is where the path says, whatever the arm does, so it is left out; so are objects.
     """
     around = Surroundings(scene, hulls, config.eps_col_m)
+    links = own_links(hulls)
 
     def room_m(
         joints_rad: Float[np.ndarray, "num_postures num_joints"],
@@ -29,13 +31,11 @@ def posture_clearance(
 
     def one(joints_rad: Float[np.ndarray, " num_joints"]) -> float:
         hulls.place(joints_rad, MAX_WIDTH_M)
-        apart = hulls.self_distance().distance_m
-        if apart <= 0:
-            return apart
+        if links.touch():
+            return hulls.self_distance().distance_m
         distances, _ = around.measure(
-            around.links,
-            [],
             {},
+            [],
             near_m=config.eps_col_m,
             counts=lambda body, other: body not in GRIPPER_LINKS,
         )

@@ -1,6 +1,7 @@
 """What stands still around the robot, and how far placed pieces are from it and from objects."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import coal
@@ -12,24 +13,35 @@ from bridge.geometry.box import box_corners
 from twin.replay.clearance.bodies import (
     SCENE,
     TABLE,
-    Placed,
     Solid,
+    box_solid,
     placed_panels,
     placement_of,
     solid_of,
 )
 from twin.replay.clearance.grid import GridLookup
+from twin.replay.clearance.near import NearPairs
 from twin.replay.clearance.nodes import distances_to_boxes_m, planes_of
 from twin.replay.clearance.shells import Shells, shell_of, shells_of_robot
-from twin.replay.clearance.unnamed import Foot, unnamed_scene
+from twin.replay.clearance.standing import standing_bodies, standing_links
+from twin.replay.clearance.unnamed import unnamed_scene
 from twin.replay.place.scene import ReplayScene
 from twin.robot.collision import RobotHulls, signed_distance
 
 Pair = tuple[str, int, str, int]
 """A body and which of the robot's hulls it is (-1: an object), the other body and its piece."""
 
-_STILL_M = 1e-9
-_SAMPLES = 4
+Poses = Mapping[str, Float[np.ndarray, "4 4"]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pairing:
+    """The pairs that are measured while the same objects are known and have moved."""
+
+    near: NearPairs
+    names: list[Pair]
+    bodies: list[tuple[int, int]]
+    """Two of the links, the objects and what stands, in this order."""
 
 
 class Surroundings:
@@ -46,16 +58,10 @@ class Surroundings:
         self._hulls = hulls
         self._eps_m = eps_m
         self._table_height_m = scene.table_height_m
-        half_space = coal.Halfspace(np.array([0.0, 0.0, 1.0]), scene.table_height_m)
-        self._table = Placed(TABLE, half_space, coal.Transform3s())
         self._panels = [
             (name, piece, panel)
             for name, T in scene.containers().items()
             for piece, panel in enumerate(placed_panels(scene.task.objects[name], T))
-        ]
-        self._placed = [
-            Placed(name, coal.Box(*extents), placement_of(T), piece)
-            for name, piece, (T, extents) in self._panels
         ]
         if self._panels:
             Ts_panel_base = np.stack([se3.invert(T) for _, _, (T, _) in self._panels])
@@ -64,12 +70,16 @@ class Surroundings:
                 Ts_panel_base[:, :3, 3],
             )
             self._half_m = np.stack([extents / 2 for _, _, (_, extents) in self._panels])
+        self.standing = standing_bodies(self._panels, scene.table_height_m)
+        self._placements = [placement_of(item.T) for item in self.standing]
+        self._pairings: dict[tuple[tuple[str, ...], tuple[str, ...]], _Pairing] = {}
         standing, foot = standing_links(hulls)
         self._mobile = [i for i, hull in enumerate(hulls.hulls) if hull.link not in standing]
-        solids = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
-        self._centres = np.stack([solid.centre for solid in solids])
-        self._radii = np.array([solid.radius_m for solid in solids])
-        self.links = solids
+        self.links = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
+        self.objects = {
+            name: box_solid(name, np.array(scene.task.objects[name].size_m))
+            for name in scene.movable()
+        }
         self.lookup: GridLookup | None = None
         if scene.static_sdf is not None:
             panels = [panel for _, _, panel in self._panels]
@@ -87,46 +97,90 @@ class Surroundings:
 
     def measure(
         self,
-        solids: list[Solid],
-        Ts_base_moved: list[Float[np.ndarray, "4 4"]],
-        objects: Mapping[str, tuple[Solid, Float[np.ndarray, "4 4"]]],
+        Ts_base_object: Poses,
+        moved: Sequence[str],
         *,
         near_m: float,
         counts: Callable[[str, str], bool],
     ) -> tuple[dict[Pair, float], float]:
-        """Measure the nearest pairs.
+        """Measure the nearest pairs of the robot, which ``RobotHulls.place`` has placed.
 
         Args:
-            solids: The robot's hulls, placed by ``RobotHulls.place``, then moved objects.
-            Ts_base_moved: Poses of the moved objects.
-            objects: What the robot is measured against.
+            Ts_base_object: The objects that the robot is measured against.
+            moved: Those of them that are measured against what stands still.
             near_m: Pairs closer than this are all measured.
             counts: Whether a pair's distance counts for the smallest one.
 
         Returns:
             Distances [m], and one that all other pairs keep.
         """
-        num_links = len(self._hulls.hulls)
-        placements = self._hulls.placements + [placement_of(T) for T in Ts_base_moved]
-        R, t = self._hulls.rotations, self._hulls.translations
-        if Ts_base_moved:
-            Ts = np.stack(Ts_base_moved)
-            R, t = np.concatenate([R, Ts[:, :3, :3]]), np.concatenate([t, Ts[:, :3, 3]])
-        found = self._to_scene(solids[num_links:], R, t)
+        pairing = self._pairing(tuple(Ts_base_object), tuple(moved))
+        links, near = self._hulls, pairing.near
+        num_links = len(self.links)
+        near.R[:num_links], near.t[:num_links] = links.rotations, links.translations
+        for index, T in enumerate(Ts_base_object.values(), start=num_links):
+            near.R[index], near.t[index] = T[:3, :3], T[:3, 3]
+        found = self._to_scene(moved, Ts_base_object)
         best = min(
             (d for (body, _, other, _), d in found.items() if counts(body, other)), default=np.inf
         )
+        objects = list(Ts_base_object.items())
+        placements: dict[int, coal.Transform3s] = {}
+
+        def placed(index: int) -> tuple[coal.CollisionGeometry, coal.Transform3s]:
+            if index < num_links:
+                return self.links[index].shape, links.placement(index)
+            index -= num_links
+            if index >= len(objects):
+                index -= len(objects)
+                return self.standing[index].solid.shape, self._placements[index]
+            name, T = objects[index]
+            if index not in placements:
+                placements[index] = placement_of(T)
+            return self.objects[name].shape, placements[index]
+
         # Nearest bounds first: most pairs are then skipped, and the minimum stays exact.
-        for bound, index, other in self._candidates(solids, R, t, objects):
+        for bound, number in near.nearest_first():
             if bound > max(best, near_m):
                 return found, max(best, near_m)
-            solid = solids[index]
-            distance = signed_distance(solid.shape, placements[index], other.shape, other.placement)
-            piece = index if index < num_links else -1
-            found[solid.body, piece, other.body, other.piece] = distance
-            if counts(solid.body, other.body):
-                best = min(best, distance)
+            one, other = pairing.bodies[number]
+            pair = pairing.names[number]
+            distance = signed_distance(*placed(one), *placed(other))
+            found[pair] = distance
+            if distance < best and counts(pair[0], pair[2]):
+                best = distance
         return found, np.inf
+
+    def _pairing(self, known: tuple[str, ...], moved: tuple[str, ...]) -> _Pairing:
+        """Links and moved objects against what stands, then links against objects."""
+        pairing = self._pairings.get((known, moved))
+        if pairing is not None:
+            return pairing
+        num_links = len(self.links)
+        first = num_links + len(known)  # what stands comes behind the objects
+        movers = [num_links + known.index(name) for name in moved]
+        solids = [
+            *self.links,
+            *(self.objects[name] for name in known),
+            *(item.solid for item in self.standing),
+        ]
+        names: list[Pair] = []
+        bodies: list[tuple[int, int]] = []
+        for other, item in enumerate(self.standing, start=first):
+            links = self._mobile if item.body == TABLE else range(num_links)
+            for index in (*links, *movers):
+                piece = index if index < num_links else -1
+                names.append((solids[index].body, piece, item.body, item.piece))
+                bodies.append((index, other))
+        for other, name in enumerate(known, start=num_links):
+            names += [(link.body, index, name, 0) for index, link in enumerate(self.links)]
+            bodies += [(index, other) for index in range(num_links)]
+        near = NearPairs(solids, bodies)
+        for index, item in enumerate(self.standing, start=first):
+            near.R[index], near.t[index] = item.T[:3, :3], item.T[:3, 3]
+        pairing = _Pairing(near=near, names=names, bodies=bodies)
+        self._pairings[known, moved] = pairing
+        return pairing
 
     def measure_nodes(
         self,
@@ -158,92 +212,25 @@ class Surroundings:
                 found[name, -1, SCENE, 0] = float(self.lookup.distance(nodes).min())
         return found
 
-    def _to_scene(
-        self,
-        moved: list[Solid],
-        R: Float[np.ndarray, "num_solids 3 3"],
-        t: Float[np.ndarray, "num_solids 3"],
-    ) -> dict[Pair, float]:
+    def _to_scene(self, moved: Sequence[str], Ts_base_object: Poses) -> dict[Pair, float]:
         """Distances to the unnamed scene: of every link that moves, and of moved objects."""
         if self.lookup is None or self._shells is None:
             return {}
+        R, t = self._hulls.rotations, self._hulls.translations
         links = self._shells.distances_m(self.lookup, R[self._mobile], t[self._mobile])
         found: dict[Pair, float] = {
             (self.links[index].body, index, SCENE, 0): distance
             for index, distance in zip(self._mobile, links.tolist(), strict=True)
         }
-        start = len(self.links)
-        for index, solid in enumerate(moved, start=start):
-            shell = self._object_shells.get(solid.body)
+        for name in moved:
+            shell = self._object_shells.get(name)
             if shell is not None:
-                one = slice(index, index + 1)
-                distance = shell.distances_m(self.lookup, R[one], t[one])[0]
-                found[solid.body, -1, SCENE, 0] = float(distance)
+                T = Ts_base_object[name][None]
+                R, t = np.ascontiguousarray(T[:, :3, :3]), np.ascontiguousarray(T[:, :3, 3])
+                found[name, -1, SCENE, 0] = float(shell.distances_m(self.lookup, R, t)[0])
         return found
-
-    def _candidates(
-        self,
-        solids: list[Solid],
-        R: Float[np.ndarray, "num_solids 3 3"],
-        t: Float[np.ndarray, "num_solids 3"],
-        objects: Mapping[str, tuple[Solid, Float[np.ndarray, "4 4"]]],
-    ) -> list[tuple[float, int, Placed]]:
-        """Pairs with a lower bound of their distance, nearest first."""
-        num_links = len(self._hulls.hulls)
-        own, radii = self._centres, self._radii
-        if len(solids) > num_links:
-            own = np.concatenate([own, [solid.centre for solid in solids[num_links:]]])
-            radii = np.concatenate([radii, [solid.radius_m for solid in solids[num_links:]]])
-        centres = np.matmul(R, own[:, :, None])[:, :, 0] + t
-        pairs: list[tuple[float, int, Placed]] = []
-        mobile = [*self._mobile, *range(num_links, len(solids))]
-        heights = (centres[:, 2] - radii - self._table_height_m).tolist()
-        pairs += [(heights[index], index, self._table) for index in mobile]
-        if self._panels:
-            local = np.einsum("pij,sj->psi", self._R_panel_base, centres)
-            outside = np.abs(local + self._p_panel_base[:, None]) - self._half_m[:, None]
-            gaps = np.linalg.norm(np.maximum(outside, 0.0), axis=-1) - radii
-            pairs += [
-                (gap, index, panel)
-                for row, panel in zip(gaps.tolist(), self._placed, strict=True)
-                for index, gap in enumerate(row)
-            ]
-        for name, (solid, T) in objects.items():
-            placed = Placed(name, solid.shape, placement_of(T))
-            offsets = centres[:num_links] - se3.apply(T, solid.centre)
-            gaps = np.linalg.norm(offsets, axis=1) - radii[:num_links] - solid.radius_m
-            pairs += [(gap, index, placed) for index, gap in enumerate(gaps.tolist())]
-        return sorted(pairs, key=lambda pair: pair[0])
 
 
 @lru_cache(maxsize=32)
 def _box_shell(size_m: tuple[float, float, float]) -> Shells:
     return Shells([shell_of(box_corners(np.array(size_m)))])
-
-
-@lru_cache(maxsize=4)
-def standing_links(hulls: RobotHulls) -> tuple[frozenset[str], Foot | None]:
-    """Links whose height no motion changes: the base, and a shoulder that turns about vertical.
-
-    The robot stands on the table with them, so their distance to it says nothing of a plan. With
-    them the cylinder about the base's z axis that holds them.
-    """
-    rng = np.random.default_rng(0)
-    corners = []
-    for _ in range(_SAMPLES):
-        hulls.place(rng.uniform(-1.0, 1.0, len(hulls.robot.arm_ids)), 0.0)
-        corners.append(
-            [
-                hull.points_m @ R.T + t
-                for hull, R, t in zip(hulls.hulls, hulls.rotations, hulls.translations, strict=True)
-            ]
-        )
-    lowest = np.array([[points[:, 2].min() for points in posture] for posture in corners])
-    still = np.flatnonzero(np.ptp(lowest, axis=0) < _STILL_M)
-    if not len(still):
-        return frozenset(), None
-    held = np.concatenate([posture[index] for posture in corners for index in still])
-    foot = Foot(
-        radius_m=float(np.hypot(held[:, 0], held[:, 1]).max()), top_m=float(held[:, 2].max())
-    )
-    return frozenset(hulls.hulls[index].link for index in still), foot

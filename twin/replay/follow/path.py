@@ -15,6 +15,7 @@ from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan, Waypoint
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M
 from twin.errors import TwinError
+from twin.replay.clearance.near import own_links
 from twin.replay.config import ReplayConfig
 from twin.replay.failure import Failure
 from twin.replay.follow.joint_checks import jumps, limit_failure, outside_limits
@@ -341,10 +342,11 @@ def check_path(
     joints = path.joints_at(times)
     failures += jumps(times, joints, robot, config)
     widths = path.width_at(times)
+    links = own_links(hulls)
     for t_ns, row, width in zip(times, joints, widths, strict=True):
         hulls.place(row, float(width))
-        closest = hulls.self_distance()
-        if closest.distance_m <= 0:
+        if links.touch():
+            closest = hulls.self_distance()
             failures.append(
                 Failure(
                     t_ns=int(t_ns),

@@ -4,27 +4,11 @@
 // point at distance d cannot lead to less than d - radius, and most of the tree is never looked at
 // (branch and bound; the children of the nearest point first). Plain double arithmetic in a fixed
 // order: the same bits on every run. tests/parity/test_clearance_parity.py looks at every point.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
-#include <limits>
-#include <stdexcept>
-#include <vector>
-
-namespace nb = nanobind;
-using namespace nb::literals;
+#include "bounds.hpp"
 
 namespace {
 
 using Values = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
-using Vector = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-using Turns = nb::ndarray<const double, nb::shape<-1, 3, 3>, nb::c_contig, nb::device::cpu>;
-using Ranges = nb::ndarray<const std::int32_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
-using Answers = nb::ndarray<double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 constexpr double kShare = 0.02;
 
@@ -74,11 +58,6 @@ private:
     double voxel_;
     std::int64_t count_[3];
     double origin_[3];
-};
-
-struct Visit {
-    double distance;
-    std::int32_t index;
 };
 
 class Search {
@@ -157,7 +136,13 @@ void nearest(const Values& values, const Vector& origin, double voxel, const Tur
 }  // namespace
 
 NB_MODULE(_clearance, module) {
-    module.doc() = "Distances of surfaces to a grid.";
+    module.doc() = "Distances of surfaces to a grid, and which pairs of bodies may be near.";
+    nb::class_<Bounds>(module, "Bounds")
+        .def(nb::init<const Points&, const Points&, const Vector&, const Ranges&>(), "centres"_a,
+             "halves"_a, "radii"_a, "pairs"_a,
+             "Bodies by their boxes and spheres about their centres, and the pairs of them.")
+        .def("nearest_first", &Bounds::nearest_first, "R"_a, "t"_a, "bounds"_a.noconvert(),
+             "order"_a.noconvert(), "Lower bounds of the pairs' distances, and their order.");
     module.def("nearest", &nearest, "values"_a, "origin"_a, "voxel"_a, "R"_a, "t"_a, "points"_a,
                "radius"_a, "children"_a, "roots"_a, "answers"_a.noconvert(),
                "Smallest distance of each placed body's points, into answers.");

@@ -15,7 +15,7 @@ from twin.replay.clearance.candidates import candidate_clearance
 from twin.replay.clearance.grid import GridLookup
 from twin.replay.clearance.nodes import distances_to_boxes_m, planes_of
 from twin.replay.clearance.shells import shell_of
-from twin.replay.clearance.surroundings import standing_links
+from twin.replay.clearance.standing import standing_links
 from twin.replay.clearance.sweep import Reach, State
 from twin.replay.clearance.unnamed import unnamed_scene
 from twin.replay.config import ReplayConfig
