@@ -42,7 +42,7 @@ test: $(READY)
 	@$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not gpu and not hardware and not network" $(TEST)
 
 soak: $(READY)
-	@GST_KILLS=100 GST_RECORDER_KILLS=12 GST_KILL_NUMBERS=1,2,3,5 GST_EPISODES=1000 \
+	@GST_KILLS=100 GST_RECORDER_KILLS=12 GST_KILL_NUMBERS=1,2,3,5 GST_EPISODES=1000 GST_WARM_UP_S=15 \
 		GST_SOAK_S=60 GST_LISTED=10000 GST_CUT_MESSAGES=12 GST_FUZZ_S=30 \
 		$(BIN)/python -m pytest -q -rA -m slow \
 		tests/bridge/episode/test_writer_killed.py tests/bridge/episode/test_catalogue_at_scale.py \

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,13 @@ LONG_FILES = (
 )
 """Files of half a minute or more. Workers take whole files in this order: one that came last would
 leave the other worker idle."""
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Leave the checks of shapes in calls out of a long test."""
+    with lean_checks.unchecked():
+        yield
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,6 +1,19 @@
-"""Chromium without a window, for tests of pages: where it is, and how it is started."""
+"""Chromium without a window, for tests of pages, driven over its DevTools pipe.
 
+No driver and no open port are needed.
+"""
+
+import base64
+import json
+import os
 import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from io import BufferedReader
+from pathlib import Path
+from typing import IO, Any
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 NO_CHROMIUM = "no chromium on this machine (Debian: chromium)"
@@ -13,5 +26,132 @@ FLAGS = (
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
+    "--hide-scrollbars",
+    "--remote-debugging-pipe",
 )
 """It draws on the processor, asks nobody for anything, and may be run as root."""
+
+
+KEYS: dict[str, dict[str, Any]] = {
+    "Tab": {"windowsVirtualKeyCode": 9},
+    "Enter": {"windowsVirtualKeyCode": 13, "text": "\r"},
+}
+
+
+@dataclass
+class Browser:
+    """One tab. What the page asks for and complains of is kept."""
+
+    commands: IO[bytes]
+    answers: BufferedReader
+    session: str | None = None
+    asked: list[str] = field(default_factory=list)
+    """Every address that was requested since the page was opened."""
+    complaints: list[str] = field(default_factory=list)
+    _number: int = 0
+    _seen: list[str] = field(default_factory=list)
+
+    def call(self, method: str, **params: Any) -> dict[str, Any]:
+        """Give one command and wait for its answer."""
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": params}
+        if self.session is not None:
+            message["sessionId"] = self.session
+        self.commands.write(json.dumps(message).encode() + b"\0")
+        self.commands.flush()
+        while True:
+            answer = self._read()
+            if answer.get("id") == self._number:
+                assert "error" not in answer, answer
+                return dict(answer["result"])
+
+    def _read(self) -> dict[str, Any]:
+        data = bytearray()
+        while not data.endswith(b"\0"):
+            waiting = self.answers.peek()
+            assert waiting, "the browser ended"
+            data += self.answers.read(waiting.find(b"\0") + 1 or len(waiting))
+        answer = dict(json.loads(data[:-1]))
+        self._note(answer.get("method", ""), answer.get("params", {}))
+        return answer
+
+    def _note(self, method: str, params: dict[str, Any]) -> None:
+        self._seen.append(method)
+        if method == "Network.requestWillBeSent":
+            self.asked.append(params["request"]["url"])
+        elif method == "Runtime.consoleAPICalled":
+            self.complaints.append(str(params["args"]))
+        elif method == "Runtime.exceptionThrown":
+            self.complaints.append(str(params["exceptionDetails"]))
+        elif method == "Log.entryAdded":
+            self.complaints.append(f"{params['entry']['source']}: {params['entry']['text']}")
+        elif method == "Audits.issueAdded":
+            self.complaints.append(str(params["issue"]["code"]))
+
+    def show(self, address: str, *, width: int, dark: bool, media: str = "screen") -> None:
+        """Open an address at this width [px] and wait until it is there."""
+        self.asked.clear()
+        self.complaints.clear()
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=900,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.call("Emulation.setEmulatedMedia", media=media, features=[scheme])
+        self._seen.clear()
+        self.call("Page.navigate", url=address)
+        while "Page.loadEventFired" not in self._seen:
+            self._read()
+
+    def ask(self, expression: str) -> Any:
+        """Return the value of a JavaScript expression; the page's own policy does not bind it."""
+        found = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
+        assert "exceptionDetails" not in found, found["exceptionDetails"]
+        return found["result"].get("value")
+
+    def press(self, key: str) -> None:
+        """Press a key as a person would."""
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, **KEYS[key])
+
+    def picture(self) -> bytes:
+        """Take a PNG of the whole page."""
+        size = self.call("Page.getLayoutMetrics")["cssContentSize"]
+        clip = {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1}
+        found = self.call("Page.captureScreenshot", captureBeyondViewport=True, clip=clip)
+        return base64.b64decode(found["data"])
+
+
+@contextmanager
+def chromium(home: Path) -> Iterator[Browser]:
+    """Start Chromium with its own home folder; end it with the block."""
+    assert CHROMIUM is not None
+    to_read, commands = os.pipe()
+    answers, to_write = os.pipe()
+    # Chromium reads commands from 3 and answers on 4.
+    shell = f'exec "$@" 3<&{to_read} 4>&{to_write}'
+    process = subprocess.Popen(
+        ["bash", "-c", shell, "bash", CHROMIUM, *FLAGS, f"--user-data-dir={home / 'profile'}"],
+        pass_fds=(to_read, to_write),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "HOME": str(home)},
+    )
+    os.close(to_read)
+    os.close(to_write)
+    try:  # it ends with its pipe, at the latest
+        with os.fdopen(commands, "wb") as into, os.fdopen(answers, "rb") as out:
+            tab = Browser(into, out)
+            target = tab.call("Target.createTarget", url="about:blank")["targetId"]
+            attached = tab.call("Target.attachToTarget", targetId=target, flatten=True)
+            tab.session = attached["sessionId"]
+            for domain in ("Page", "Network", "Runtime", "Log", "Audits"):
+                tab.call(f"{domain}.enable")
+            yield tab
+            tab.session = None
+            tab.call("Browser.close")
+    finally:
+        process.wait(timeout=20)

@@ -9,7 +9,8 @@ scope of axis names where a hint has any, and a checking function is made at the
 import functools
 import inspect
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import is_dataclass
 from typing import Any, get_args, get_type_hints
 
@@ -25,6 +26,20 @@ CONF = BeartypeConf(violation_type=jaxtyping.TypeCheckError)
 def install() -> None:
     """Take the place of the decorator that jaxtyping's import hook writes into each module."""
     jaxtyping.jaxtyped = lambda *, typechecker: checked  # type: ignore[assignment]
+
+
+@contextmanager
+def unchecked() -> Iterator[None]:
+    """Leave the checks out of a long run: in a whole trial they cost four times the physics.
+
+    Only where short tests make the same calls with the checks.
+    """
+    before = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)
+    try:
+        yield
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", before)
 
 
 def checked(thing: Any) -> Any:

@@ -11,14 +11,31 @@ from mcap.reader import make_reader
 
 from bridge.episode.reader import Episode
 
+ROOT = Path(__file__).parents[2]
+SHORT = """
+import sys
+import robot_gst
+from dashboards.demo import DemoConfig
+DemoConfig.trials, DemoConfig.budget = 1, "5s"
+sys.exit(robot_gst.run(["demo", sys.argv[1], "--quick", "--no-serve"]))
+"""
+"""The command with half the trials and a third of the rebuild of ``--quick``."""
+
 pytestmark = pytest.mark.slow
 Gst = Callable[..., subprocess.CompletedProcess[str]]
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory, gst: Gst) -> Path:
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = tmp_path_factory.mktemp("demo") / "run"
-    done = gst("demo", str(run), "--quick", "--no-serve", timeout_s=500)
+    done = subprocess.run(
+        [sys.executable, "-c", SHORT, str(run)],
+        capture_output=True,
+        text=True,
+        timeout=500,
+        cwd=ROOT,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     assert "stand-in" in done.stdout
     return run
@@ -32,7 +49,7 @@ def test_the_demo_leaves_a_scan_trials_of_both_conditions_and_replays(demo: Path
     infos = [Episode.open(path).info for path in sorted((demo / "episodes").glob("*.mcap"))]
     assert [info.kind for info in infos].count("scan") == 1
     conditions = [info.condition for info in infos if info.kind == "trial"]
-    assert conditions.count("without_replanning") == conditions.count("with_replanning") == 2
+    assert conditions.count("without_replanning") == conditions.count("with_replanning") == 1
     assert all(info.stand_in for info in infos)
     assert list((demo / "derived").glob("*.replay.planned.dynamic.*.mcap"))
     assert list((demo / "derived").glob("*.replay.executed.*.mcap"))

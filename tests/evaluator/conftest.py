@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
+import lean_checks
 import numpy as np
 import pytest
 
@@ -19,6 +20,7 @@ from bridge.episode.run import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.verdict import Factor, Verdict
+from evaluator.compare import Comparison, compare_run
 
 START_NS = 10_000_000_000
 STEP_NS = 100_000_000
@@ -289,9 +291,18 @@ def golden_script(name: str) -> ModuleType:
 def evaluation_run_once(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """An invented run with data for every part of an evaluation. Read it only."""
     folder = tmp_path_factory.mktemp("golden") / "everything"
-    run = golden_script("make_evaluation_run").make_evaluation_run(folder)
+    few = {"cube_into_box": 4, "sloth_into_basket": 3, "five_ducks_into_basket": 3}
+    with lean_checks.unchecked():
+        run = golden_script("make_evaluation_run").make_evaluation_run(folder, trials=few)
     assert isinstance(run, RunFolder)
     return run
+
+
+@pytest.fixture(scope="session")
+def everything(evaluation_run_once: RunFolder) -> Comparison:
+    """The evaluation of that run."""
+    with lean_checks.unchecked():
+        return compare_run(evaluation_run_once)
 
 
 @pytest.fixture

@@ -88,6 +88,7 @@ def test_simulated_coverage_of_fisher_is_the_stored_one() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
 def test_simulated_coverage_of_every_statistic_is_the_stored_one() -> None:
     """A few draws at one size; the shipped map has many at eight."""
     rng = np.random.default_rng(2)

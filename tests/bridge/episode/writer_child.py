@@ -1,7 +1,7 @@
 """Write at a live rate until killed, telling the parent what was written; or recover in a loop.
 
-Usage: writer_child.py write PATH KIND | recover PATH. ``write`` prints one line for each message
-after the writer took it: topic, sequence, monotonic time. After SECONDS it closes the file.
+Usage: writer_child.py write PATH KIND SECONDS | recover PATH. ``write`` prints one line for each
+message after the writer took it: topic, sequence, monotonic time. After SECONDS it closes the file.
 """
 
 import sys
@@ -12,17 +12,15 @@ from bridge.episode import metadata, schema
 from bridge.episode.recover import recover
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 
-SECONDS = 3.0
 
-
-def write(path: Path, kind: str) -> None:
+def write(path: Path, kind: str, seconds: float) -> None:
     """Joints at 500 Hz, with pictures at 30 Hz when ``kind`` is mixed."""
     config = WriterConfig(flush_s=0.25, sync_s=0.5)
     with EpisodeWriter(path, config=config) as writer:
         writer.describe(metadata.EpisodeInfo(id=path.stem, kind="trial"))
         start = time.monotonic()
         sequence = 0
-        while (now := time.monotonic()) - start < SECONDS:
+        while (now := time.monotonic()) - start < seconds:
             put(writer, "/joint_states", schema.JOINT_STATE, sequence, bytes(300))
             if kind == "mixed" and sequence % 16 == 0:
                 put(writer, "/cam/a/color/image", schema.COMPRESSED_IMAGE, sequence, bytes(50_000))
@@ -46,7 +44,7 @@ def put(writer: EpisodeWriter, topic: str, type_name: str, sequence: int, data: 
 def main() -> None:
     """Do what the command line says."""
     if sys.argv[1] == "write":
-        write(Path(sys.argv[2]), sys.argv[3])
+        write(Path(sys.argv[2]), sys.argv[3], float(sys.argv[4]))
     else:
         sys.stdout.write("recovering\n")
         sys.stdout.flush()

@@ -23,6 +23,8 @@ from bridge.episode.check import check_episode  # noqa: E402
 from bridge.episode.reader import Episode  # noqa: E402
 from bridge.episode.records import CompressedColor, DepthImage  # noqa: E402
 from bridge.media.color import decode_color  # noqa: E402
+from bridge.sources import announcer  # noqa: E402
+from bridge.sources.realsense import publish  # noqa: E402
 from bridge.sources.realsense.config import RealSenseConfig  # noqa: E402
 from bridge.sources.realsense.device import CameraDevice  # noqa: E402
 from bridge.sources.realsense.errors import (  # noqa: E402
@@ -306,8 +308,10 @@ def test_frames_the_camera_dropped_are_declared_lost(joined: Joined) -> None:
 
 @pytest.mark.slow
 def test_a_camera_that_was_unplugged_is_taken_up_again(
-    joined: Joined, capsys: pytest.CaptureFixture[str]
+    joined: Joined, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(publish, "STALL_S", 2.0)
+    monkeypatch.setattr(publish, "RETRY_S", 0.2)
     before, after = SoftwareCamera(serial="7"), SoftwareCamera(serial="7")
     attached = [before.device]
     running = Running(
@@ -317,7 +321,7 @@ def test_a_camera_that_was_unplugged_is_taken_up_again(
     before.send(900, 1.7e12, color=color_image(1))
     running.wait("/lab/cam/eye/color/image", 1)
     attached.clear()
-    time.sleep(4.5)  # silent for three seconds, then looked for
+    time.sleep(2.8)  # silent for two seconds, then looked for
     attached.append(after.device)
     running.wait("/lab/cam/eye/depth/info", 2)
     time.sleep(0.3)
@@ -326,21 +330,27 @@ def test_a_camera_that_was_unplugged_is_taken_up_again(
     result = running.end()["eye"]
     assert (result["connections"], result["color_frames"], result["color_lost"]) == (2, 2, 0)
     said = capsys.readouterr().err
-    assert said.count("no frames for 3 s, unplugged? Waiting for it to come back.") == 1
+    assert said.count("no frames for 2 s, unplugged? Waiting for it to come back.") == 1
     assert said.count("streaming") == 2
 
 
 @pytest.mark.slow
-def test_a_recorder_that_comes_late_gets_the_calibration(joined: Joined) -> None:
+def test_a_recorder_that_comes_late_gets_the_calibration(
+    joined: Joined, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(announcer, "REPEAT_S", 1.0)
     camera = SoftwareCamera()
     running = Running(joined, RealSenseConfig(cell="lab"), lambda: [camera.device])
     running.wait("/lab/cam/camera/depth/info", 2)  # said again by itself
     heard: list[str] = []
     late = joined.client.subscribe("**", lambda sample: heard.append(sample.topic))
-    time.sleep(5.5)
+    said = {"/tf_static", "/lab/cam/camera/color/info", "/lab/cam/camera/depth/info"}
+    end_s = time.monotonic() + ANSWER_S
+    while not said <= set(heard):
+        assert time.monotonic() < end_s, heard
+        time.sleep(0.05)
     late.close()
     running.end()
-    assert {"/tf_static", "/lab/cam/camera/color/info", "/lab/cam/camera/depth/info"} <= set(heard)
 
 
 def test_a_failure_at_the_start_ends_the_command(joined: Joined) -> None:

@@ -117,7 +117,7 @@ def test_from_an_arm_to_a_checked_episode_and_through_a_crash(start: Run, tmp_pa
         )
         wait_for_status("/lab/joint_states")
         assert ask("ctl", "start", "--id", "trial_0001", "--cell", "lab", *here)[0] == 0
-        time.sleep(1.0)
+        time.sleep(0.5)
         assert ask("ctl", "mark", "grasped", *here)[0] == 0
         assert ask("ctl", "stop", "--result", "success", *here)[0] == 0
         code, said = ask("check", run)
@@ -126,7 +126,7 @@ def test_from_an_arm_to_a_checked_episode_and_through_a_crash(start: Run, tmp_pa
         assert "failure" in ask("ls", run)[1]
 
         assert ask("ctl", "start", "--id", "trial_0002", *here)[0] == 0
-        time.sleep(1.5)
+        time.sleep(1.0)
         recorder.kill()
         recorder.communicate()
         code, said = ask("recover", run)

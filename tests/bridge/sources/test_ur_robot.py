@@ -21,6 +21,7 @@ from bridge.episode import schema, streams
 from bridge.episode.check import check_episode
 from bridge.episode.reader import Episode
 from bridge.episode.records import JointSample, transforms_from_cdr
+from bridge.sources.ur import link
 from bridge.sources.ur.client import RtdeClient, Wish
 from bridge.sources.ur.config import UrConfig
 from bridge.sources.ur.errors import ControllerError, NotRtdeError
@@ -301,7 +302,11 @@ def test_a_peer_that_is_no_controller_is_one_sentence(data: bytes, words: str) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pause_s", [0.0, 0.4])
-def test_a_peer_that_never_finishes_is_left_in_time(pause_s: float) -> None:
+def test_a_peer_that_never_finishes_is_left_in_time(
+    pause_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert link.AGREE_S <= 5.0
+    monkeypatch.setattr(link, "AGREE_S", 2.5)
     text = b"\x00\x09M\x02hi\x01x\x00"  # words without end are no agreement either
     peer = Peer(text * 40 if pause_s else b"", pause_s=pause_s, stay=True)
     try:
@@ -360,7 +365,7 @@ def test_the_command_says_what_is_wrong(
 def test_the_command_publishes_and_counts(
     joined: Joined, server: RtdeServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["publish", "ur", "127.0.0.1", "--port", str(server.port), "--duration", "0.9"]
+    arguments = ["publish", "ur", "127.0.0.1", "--port", str(server.port), "--duration", "1.2"]
     assert robot_gst.run([*arguments, "--connect", joined.endpoint, "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["samples"] > 50

@@ -91,6 +91,7 @@ def test_fingers_close_slowly_in_a_squeeze_and_at_once_elsewhere(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
 def test_a_slide_leaves_the_fingers_behind(
     make_session: Callable[..., Any], make_cell: Callable[..., StandinCell], nominal: Any
 ) -> None:
@@ -126,6 +127,7 @@ def settings(**more: Any) -> SessionConfig:
     return SessionConfig(**{**values, "conditions": ("without_replanning",), **more})
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_probes_come_after_the_trials_and_change_nothing_of_them(
     make_session: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

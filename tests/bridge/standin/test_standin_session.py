@@ -175,6 +175,7 @@ def test_an_undecided_verdict_is_no_permission(make_session: Callable[..., Any])
     assert len(session.asked) == 1
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_without_replanning_the_gate_may_be_asked_but_is_not_obeyed(
     make_session: Callable[..., Any],
 ) -> None:
@@ -222,6 +223,7 @@ def test_a_stopped_session_finishes_its_episode(make_session: Callable[..., Any]
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
 def test_a_whole_session_records_scan_and_trials_and_labels_by_the_predicate(
     make_session: Callable[..., Any], task: Task
 ) -> None:

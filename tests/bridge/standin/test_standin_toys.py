@@ -1,11 +1,10 @@
 """Soft toys in the stand-in cell: physics, plans, pictures and truth."""
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import jaxtyping
 import numpy as np
 import pytest
 
@@ -70,17 +69,6 @@ def plan_of(task: Task, Ts: dict[str, np.ndarray], error: Any = NO_ERROR) -> Pla
         condition="without_replanning",
         start_id=f"{task.name}/{SEED}",
     )
-
-
-@pytest.fixture
-def unchecked() -> Iterator[None]:
-    """Without the checks of shapes in calls: in a whole trial they cost four times the physics.
-
-    The short tests of this file make the same calls with the checks.
-    """
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def trial(task: Task, file: CellFile, session: Any) -> tuple[Outcome, StandinCell]:

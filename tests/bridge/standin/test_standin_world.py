@@ -53,6 +53,7 @@ def attempt(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
 def test_a_good_grasp_puts_the_cube_into_the_box(
     attempt: Callable[..., tuple[Outcome, Any]],
 ) -> None:
@@ -63,6 +64,7 @@ def test_a_good_grasp_puts_the_cube_into_the_box(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", ["along_m", "across_m"])
+@pytest.mark.usefixtures("unchecked")
 def test_a_grasp_six_centimetres_off_fails(
     attempt: Callable[..., tuple[Outcome, Any]], axis: str
 ) -> None:
@@ -72,6 +74,7 @@ def test_a_grasp_six_centimetres_off_fails(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
 def test_a_release_beside_the_box_fails_although_the_grasp_held(
     attempt: Callable[..., tuple[Outcome, Any]],
 ) -> None:

@@ -318,11 +318,13 @@ def test_previews_leave_at_five_a_second(
     end_s = time.monotonic() + 5.0
     while not preview.has_subscribers():
         assert time.monotonic() < end_s
+    begin_s = time.monotonic()
     for number in range(60):
         preview.put(b"jpeg", source_ns=number)
         time.sleep(0.01)
+    took_s = time.monotonic() - begin_s
     time.sleep(0.1)
-    assert 2 <= len(seen) <= 10
+    assert 2 <= len(seen) <= max(10, 5 * took_s + 2)
 
 
 @pytest.mark.slow

@@ -22,7 +22,11 @@
     level = mine;
   }
   const ids = all("[id]").map((element) => element.id);
-  for (const id of ids.filter((id, place) => ids.indexOf(id) !== place)) found.push(`twice: ${id}`);
+  const known = new Set();
+  for (const id of ids) {
+    if (known.has(id)) found.push(`twice: ${id}`);
+    known.add(id);
+  }
   for (const element of all("[aria-labelledby],[aria-describedby]")) {
     const names = `${element.getAttribute("aria-labelledby") || ""} ${element.getAttribute("aria-describedby") || ""}`;
     for (const id of names.split(" ").filter(Boolean)) if (!document.getElementById(id)) say(`no ${id}`, element);
@@ -62,14 +66,14 @@
     const [r, g, b] = rgb.map((v) => v / 255).map((v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));
     return 0.2126 * r + 0.7152 * g + 0.0722 * b;
   };
+  const backs = new Map();
   const behind = (element) => {
-    const layers = [];
-    for (let at = element; at; at = at.parentElement) {
-      const colour = getComputedStyle(at).backgroundColor;
-      if (colour) layers.push(parts(colour));
-      if (parts(colour)[3] === 1) break;
+    if (!element) return [255, 255, 255];
+    if (!backs.has(element)) {
+      const colour = parts(getComputedStyle(element).backgroundColor);
+      backs.set(element, colour[3] === 1 ? colour.slice(0, 3) : over(colour, behind(element.parentElement)));
     }
-    return layers.reverse().reduce((back, layer) => over(layer, back), [255, 255, 255]);
+    return backs.get(element);
   };
   let texts = 0;
   const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);

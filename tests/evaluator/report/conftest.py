@@ -1,109 +1,9 @@
-"""A real browser without a window, driven over its DevTools pipe: no driver, no open port."""
+"""One browser for all tests of reports."""
 
-import json
-import os
-import subprocess
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import IO, Any
 
 import pytest
-from headless import CHROMIUM, FLAGS, NO_CHROMIUM
-
-
-@dataclass
-class Browser:
-    """One tab. What the page asks for and complains of is kept."""
-
-    commands: IO[bytes]
-    answers: IO[bytes]
-    session: str | None = None
-    asked: list[str] = field(default_factory=list)
-    """Every address that was requested since the page was opened."""
-    complaints: list[str] = field(default_factory=list)
-    _number: int = 0
-    _seen: list[str] = field(default_factory=list)
-
-    def call(self, method: str, **params: Any) -> dict[str, Any]:
-        """Give one command and wait for its answer."""
-        self._number += 1
-        message = {"id": self._number, "method": method, "params": params}
-        if self.session is not None:
-            message["sessionId"] = self.session
-        self.commands.write(json.dumps(message).encode() + b"\0")
-        self.commands.flush()
-        while True:
-            answer = self._read()
-            if answer.get("id") == self._number:
-                assert "error" not in answer, answer
-                return dict(answer["result"])
-
-    def _read(self) -> dict[str, Any]:
-        data = bytearray()
-        while (byte := self.answers.read(1)) != b"\0":
-            assert byte, "the browser ended"
-            data += byte
-        answer = dict(json.loads(data))
-        self._note(answer.get("method", ""), answer.get("params", {}))
-        return answer
-
-    def _note(self, method: str, params: dict[str, Any]) -> None:
-        self._seen.append(method)
-        if method == "Network.requestWillBeSent":
-            self.asked.append(params["request"]["url"])
-        elif method == "Runtime.consoleAPICalled":
-            self.complaints.append(str(params["args"]))
-        elif method == "Runtime.exceptionThrown":
-            self.complaints.append(str(params["exceptionDetails"]))
-        elif method == "Log.entryAdded":
-            self.complaints.append(f"{params['entry']['source']}: {params['entry']['text']}")
-        elif method == "Audits.issueAdded":
-            self.complaints.append(str(params["issue"]["code"]))
-
-    def show(self, page: Path, *, width: int, dark: bool, media: str = "screen") -> None:
-        """Open a file at this width [px] and wait until it is there."""
-        self.asked.clear()
-        self.complaints.clear()
-        self.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=900,
-            deviceScaleFactor=1,
-            mobile=False,
-        )
-        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-        self.call("Emulation.setEmulatedMedia", media=media, features=[scheme])
-        self._seen.clear()
-        self.call("Page.navigate", url=page.as_uri())
-        while "Page.loadEventFired" not in self._seen:
-            self._read()
-
-    def ask(self, expression: str) -> Any:
-        """Return the value of a JavaScript expression; the page's own policy does not bind it."""
-        found = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
-        assert "exceptionDetails" not in found, found["exceptionDetails"]
-        return found["result"].get("value")
-
-    def press(self, key: str) -> None:
-        """Press a key as a person would."""
-        for kind in ("keyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, **KEYS[key])
-
-    def picture(self) -> bytes:
-        """Take a PNG of the whole page."""
-        import base64
-
-        size = self.call("Page.getLayoutMetrics")["cssContentSize"]
-        clip = {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1}
-        found = self.call("Page.captureScreenshot", captureBeyondViewport=True, clip=clip)
-        return base64.b64decode(found["data"])
-
-
-KEYS: dict[str, dict[str, Any]] = {
-    "Tab": {"windowsVirtualKeyCode": 9},
-    "Enter": {"windowsVirtualKeyCode": 13, "text": "\r"},
-}
+from headless import CHROMIUM, NO_CHROMIUM, Browser, chromium
 
 
 @pytest.fixture(scope="session")
@@ -111,28 +11,5 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     """Start Chromium once for all tests of a session."""
     if CHROMIUM is None:
         pytest.skip(NO_CHROMIUM)
-    home = tmp_path_factory.mktemp("browser")
-    to_read, commands = os.pipe()
-    answers, to_write = os.pipe()
-    # Chromium reads commands from 3 and answers on 4.
-    shell = f'exec "$@" 3<&{to_read} 4>&{to_write}'
-    flags = (*FLAGS, "--hide-scrollbars", "--remote-debugging-pipe")
-    process = subprocess.Popen(
-        ["bash", "-c", shell, "bash", CHROMIUM, *flags, f"--user-data-dir={home / 'profile'}"],
-        pass_fds=(to_read, to_write),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "HOME": str(home)},
-    )
-    os.close(to_read)
-    os.close(to_write)
-    with os.fdopen(commands, "wb") as into, os.fdopen(answers, "rb") as out:
-        tab = Browser(into, out)
-        target = tab.call("Target.createTarget", url="about:blank")["targetId"]
-        tab.session = tab.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
-        for domain in ("Page", "Network", "Runtime", "Log", "Audits"):
-            tab.call(f"{domain}.enable")
+    with chromium(tmp_path_factory.mktemp("browser")) as tab:
         yield tab
-        tab.session = None
-        tab.call("Browser.close")
-    process.wait(timeout=20)

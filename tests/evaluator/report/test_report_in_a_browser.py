@@ -2,23 +2,49 @@
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
+from own_process import printed
 
 from bridge.episode.run import RunFolder
-from evaluator.compare import compare_run
 from evaluator.report.page import POLICY
-from evaluator.report.write import write_report
 
 CHECKS = Path(__file__).with_name("checks.js").read_text()
 pytestmark = pytest.mark.slow
 
 
+WHOLE = """
+import sys, robot_gst
+code = robot_gst.run(["evaluate", sys.argv[1], "--out", sys.argv[2], "--quiet"])
+heavy = ("twin", "torch", "open3d", "mujoco", "pybullet", "zenoh")
+print(code, [name for name in heavy if name in sys.modules])
+"""
+
+
+class Evaluated(NamedTuple):
+    """The command in a process of its own: what it said in the end, and its page."""
+
+    said: str
+    report: Path
+
+
 @pytest.fixture(scope="module")
-def report(evaluation_run_once: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def evaluated(
+    evaluation_run_once: RunFolder, tmp_path_factory: pytest.TempPathFactory
+) -> Evaluated:
     folder = tmp_path_factory.mktemp("report")
-    return write_report(compare_run(evaluation_run_once), folder).report
+    said = printed(WHOLE, str(evaluation_run_once.path), str(folder))
+    return Evaluated(said, folder / "report.html")
+
+
+@pytest.fixture(scope="module")
+def report(evaluated: Evaluated) -> Path:
+    return evaluated.report
+
+
+def test_a_whole_evaluation_loads_neither_the_twin_nor_torch(evaluated: Evaluated) -> None:
+    assert evaluated.said.endswith("0 []")
 
 
 def keep(browser: Any, name: str) -> None:
@@ -32,7 +58,7 @@ def keep(browser: Any, name: str) -> None:
 def test_the_report_asks_for_nothing_complains_of_nothing_and_can_be_read(
     browser: Any, report: Path, width: int, dark: bool
 ) -> None:
-    browser.show(report, width=width, dark=dark)
+    browser.show(report.as_uri(), width=width, dark=dark)
     keep(browser, f"report_{width}_{'dark' if dark else 'light'}")
     asked = [url for url in browser.asked if not url.startswith("data:image/png;base64,")]
     assert asked == [report.as_uri()]
@@ -47,7 +73,7 @@ def test_the_report_asks_for_nothing_complains_of_nothing_and_can_be_read(
 def test_light_and_dark_are_two_looks_of_the_same_page(browser: Any, report: Path) -> None:
     looks = []
     for dark in (False, True):
-        browser.show(report, width=1280, dark=dark)
+        browser.show(report.as_uri(), width=1280, dark=dark)
         colours = "[document.body, document.querySelector('figure svg text')].map((e) => "
         colours += "getComputedStyle(e)).map((s) => s.backgroundColor + s.fill)"
         looks.append(browser.ask(colours))
@@ -56,7 +82,7 @@ def test_light_and_dark_are_two_looks_of_the_same_page(browser: Any, report: Pat
 
 
 def test_the_keyboard_reaches_what_there_is_to_do(browser: Any, report: Path) -> None:
-    browser.show(report, width=1280, dark=False)
+    browser.show(report.as_uri(), width=1280, dark=False)
     reached = []
     for _ in range(400):
         browser.press("Tab")
@@ -75,7 +101,7 @@ def test_the_keyboard_reaches_what_there_is_to_do(browser: Any, report: Path) ->
 
 
 def test_a_printed_report_is_dark_on_white_without_its_contents(browser: Any, report: Path) -> None:
-    browser.show(report, width=1280, dark=True, media="print")
+    browser.show(report.as_uri(), width=1280, dark=True, media="print")
     style = "getComputedStyle(document.querySelector('{}')).{}"
     assert browser.ask(style.format("body", "backgroundColor")) == "rgb(255, 255, 255)"
     assert browser.ask(style.format("nav", "display")) == "none"
@@ -86,7 +112,7 @@ def test_a_page_that_wants_to_load_something_is_noticed(browser: Any, report: Pa
     spoiled = report.with_name("spoiled.html")
     text = report.read_text().replace("<main", '<img src="other.png" alt=""><h4>x</h4><main', 1)
     spoiled.write_text(text)
-    browser.show(spoiled, width=1280, dark=False)
+    browser.show(spoiled.as_uri(), width=1280, dark=False)
     assert POLICY in text
     assert any("Content Security Policy" in text or "Csp" in text for text in browser.complaints)
     found = browser.ask(CHECKS)

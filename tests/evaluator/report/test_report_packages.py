@@ -18,7 +18,7 @@ from evaluator.report.parquet import (
     write_measurements,
     write_trials,
 )
-from evaluator.report.write import summary_text, write_report
+from evaluator.report.write import Written, summary_text, write_report
 from evaluator.result import load_results
 
 ROOT = Path(__file__).parents[3]
@@ -30,9 +30,14 @@ def plain(frame: pd.DataFrame) -> list[dict[str, Any]]:
     return [{str(name): value for name, value in row.items()} for row in rows]
 
 
-def test_trials_read_back_are_the_trials_of_the_csv(six_trials: Any) -> None:
-    folder = six_trials.run.results_dir
-    written = write_report(compare_run(six_trials.run), folder)
+@pytest.fixture(scope="module")
+def written(six_trials_once: Path, tmp_path_factory: pytest.TempPathFactory) -> Written:
+    folder = tmp_path_factory.mktemp("written") / "results"
+    return write_report(compare_run(RunFolder(six_trials_once)), folder)
+
+
+def test_trials_read_back_are_the_trials_of_the_csv(written: Written) -> None:
+    folder = written.report.parent
     assert folder / "trials.parquet" in written.files
     frame = pd.read_parquet(folder / "trials.parquet", dtype_backend="numpy_nullable")
     assert [TrialRecord(**row) for row in plain(frame)] == read_trials(folder / "trials.csv")
@@ -53,11 +58,10 @@ def test_an_unknown_answer_stays_unknown(tmp_path: Path) -> None:
     assert frame["recorded"].isna().tolist() == [False, False, True]
 
 
-def test_measurements_read_back_are_those_of_the_results_file(six_trials: Any) -> None:
-    folder = six_trials.run.results_dir
-    write_report(compare_run(six_trials.run), folder)
+def test_measurements_read_back_are_those_of_the_results_file(written: Written) -> None:
+    folder = written.report.parent
     rows = plain(pd.read_parquet(folder / "measurements.parquet", dtype_backend="numpy_nullable"))
-    expected = load_results(six_trials.run.path).measurements
+    expected = load_results(written.results).measurements
     assert len(rows) == len(expected) > 5
     for row, measurement in zip(rows, expected, strict=True):
         interval = measurement.interval
@@ -127,18 +131,6 @@ def test_nothing_heavy_is_loaded_before_something_is_written() -> None:
         "print([n for n in ('pandas', 'pyarrow', 'matplotlib', 'torch') if n in sys.modules])"
     )
     assert printed(code) == "[]"
-
-
-@pytest.mark.slow
-def test_a_whole_evaluation_loads_neither_the_twin_nor_torch(
-    evaluation_run: RunFolder,
-) -> None:
-    code = (
-        "import sys, robot_gst; code = robot_gst.run(['evaluate', sys.argv[1], '--quiet']); "
-        "heavy = ('twin', 'torch', 'open3d', 'mujoco', 'pybullet', 'zenoh'); "
-        "print(code, [n for n in heavy if n in sys.modules])"
-    )
-    assert printed(code, str(evaluation_run.path)).endswith("0 []")
 
 
 def test_parquet_is_written_without_pandas_and_numbers_keep_their_last_bit(tmp_path: Path) -> None:

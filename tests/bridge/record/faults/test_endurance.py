@@ -15,9 +15,10 @@ from fault_messages import MIX
 
 pytestmark = pytest.mark.slow
 
-EPISODES = int(os.environ.get("GST_EPISODES", "150"))
-SOAK_S = float(os.environ.get("GST_SOAK_S", "30"))
-WARM_UP_S = 15.0
+EPISODES = int(os.environ.get("GST_EPISODES", "60"))
+WARM_UP_EPISODES = 30
+SOAK_S = float(os.environ.get("GST_SOAK_S", "15"))
+WARM_UP_S = float(os.environ.get("GST_WARM_UP_S", "8"))
 MAX_MB_PER_MIN = 3.0
 MAX_GROWTH_MB = 20.0
 
@@ -34,7 +35,7 @@ def test_many_episodes_leave_no_files_threads_or_memory(cell: FaultCell) -> None
         answer = publisher.ask("stop")["ok"]
         assert (answer["messages"], answer["lost"]) == (4, 0)
 
-    for number in range(50):
+    for number in range(WARM_UP_EPISODES):
         record(f"warm_{number}")
     before = recorder.open_files(), recorder.number("Threads")
     before_mb = recorder.memory_mb()
@@ -52,7 +53,7 @@ def test_many_episodes_leave_no_files_threads_or_memory(cell: FaultCell) -> None
     assert after[0] <= before[0] + 2
     assert after[1] <= before[1] + 2
     assert after_mb - before_mb < MAX_GROWTH_MB
-    assert len(list((cell.run / "episodes").iterdir())) == EPISODES + 50
+    assert len(list((cell.run / "episodes").iterdir())) == EPISODES + WARM_UP_EPISODES
     for name in ("e0000", f"e{EPISODES - 1:04d}"):
         assert len(read(cell.path(name))) == 4
         assert check_code(cell.path(name)) == 0

@@ -17,11 +17,15 @@ from fault_account import check_code, metadata, nothing_invented, read
 from fault_cell import Child, FaultCell, PublisherChild, Sent
 from fault_messages import MIX
 
+from bridge.wire.config import WireConfig
+from bridge.wire.recorder_client import RecorderClient
+from bridge.wire.session import open_session
+
 TAIL_S = 0.5
 AFTER_STOP_S = 0.5
 """A recorder answers a stop when all is written; no call of its end comes so long after."""
 MIXES = {"joints": ("joints",), "mix": MIX}
-KILLS = int(os.environ.get("GST_RECORDER_KILLS", "6"))
+KILLS = int(os.environ.get("GST_RECORDER_KILLS", "3"))
 NUMBERS = [int(word) for word in os.environ.get("GST_KILL_NUMBERS", "1,2").split(",")]
 """At which call of a kind an episode's end is cut off; `make soak` goes on to the fifth."""
 KILLER = str(Path(__file__).with_name("killing_recorder.py"))
@@ -44,8 +48,8 @@ def assert_only_the_tail_is_missing(path: Path, sent: list[Sent], killed_ns: int
 def listed_by_the_next_start(cell: FaultCell, path: Path) -> Child:
     """Start another recorder, which says what it recovered; it goes on as if nothing had been."""
     recorder = cell.record()
-    publisher = cell.publisher()
-    status = publisher.ask("status")["ok"]
+    with open_session(WireConfig(connect=(cell.endpoint,), connect_timeout_s=30.0)) as session:
+        status = RecorderClient(session).status()
     (report,) = status["recovered"]
     assert report["file"] == path.name + ".part"
     assert report["output"] == path.name
@@ -54,7 +58,6 @@ def listed_by_the_next_start(cell: FaultCell, path: Path) -> Child:
     if report["reason"]:  # else it was whole, and only its name was missing
         assert metadata(path, "recovered")["messages"] == report["messages"]
     assert status["state"] == "idle"
-    publisher.kill()
     return recorder
 
 

@@ -5,6 +5,7 @@ Every pixel knows its instance and its part, because each primitive is a body of
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -74,22 +75,24 @@ class World:
             source="truth",
         )
 
+    @cached_property
+    def _nearest(self) -> np.ndarray:
+        return nearest_piece(self.pieces, self.cloud.means_m)
+
     def true_pieces(self) -> np.ndarray:
         """The primitive whose surface each Gaussian is nearest to."""
-        return nearest_piece(self.pieces, self.cloud.means_m)
+        return self._nearest
 
     def true_instances(self) -> np.ndarray:
         """The instance each Gaussian belongs to."""
-        return np.array([piece.instance for piece in self.pieces])[self.true_pieces()]
+        return np.array([piece.instance for piece in self.pieces])[self._nearest]
 
 
 def nearest_piece(pieces: Sequence[Piece], p_m: np.ndarray) -> np.ndarray:
     """Index of the primitive whose surface is nearest to each point."""
     distances = []
     for piece in pieces:
-        scene = open3d.t.geometry.RaycastingScene()
-        scene.add_triangles(piece.vertices.astype(np.float32), piece.faces.astype(np.uint32))
-        distances.append(scene.compute_distance(p_m.astype(np.float32)).numpy())
+        distances.append(ray_scene([piece]).compute_distance(p_m.astype(np.float32)).numpy())
     return np.argmin(distances, axis=0)
 
 
@@ -235,13 +238,22 @@ def look(angle: float, height_m: float, radius_m: float = 0.42) -> np.ndarray:
     return se3.look_at(eye, np.array([0.0, 0.0, 0.02]), np.array([0.0, 0.0, 1.0]))
 
 
-def shoot(
-    pieces: Sequence[Piece], T_base_camera: np.ndarray, index: int, noise_m: float, seed: int = 0
-) -> Shot:
-    """Cast a ray through every pixel centre; shading is diffuse."""
+def ray_scene(pieces: Sequence[Piece]) -> open3d.t.geometry.RaycastingScene:
     scene = open3d.t.geometry.RaycastingScene()
     for piece in pieces:
         scene.add_triangles(piece.vertices.astype(np.float32), piece.faces.astype(np.uint32))
+    return scene
+
+
+def shoot(
+    scene: open3d.t.geometry.RaycastingScene,
+    pieces: Sequence[Piece],
+    T_base_camera: np.ndarray,
+    index: int,
+    noise_m: float,
+    seed: int = 0,
+) -> Shot:
+    """Cast a ray through every pixel centre; shading is diffuse."""
     directions = CAMERA.rays() @ T_base_camera[:3, :3].T
     origins = np.broadcast_to(T_base_camera[:3, 3], directions.shape)
     hit = scene.cast_rays(np.concatenate([origins, directions], axis=-1).astype(np.float32))
@@ -281,8 +293,10 @@ def make_world(
 ) -> World:
     """Look from a ring at two heights, and fuse what the training frames saw."""
     total = num_train + num_held_out
+    scene = ray_scene(pieces)
     shots = [
         shoot(
+            scene,
             pieces,
             look(2 * np.pi * index * 0.381966, 0.26 + 0.16 * ((index * 7) % 3) / 2),
             index,

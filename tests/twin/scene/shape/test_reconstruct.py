@@ -1,6 +1,7 @@
 """Views in, closed shape out: size, place, openings, and what is said when it cannot be done."""
 
 from dataclasses import replace
+from functools import cache
 
 import cast_views
 import numpy as np
@@ -23,14 +24,24 @@ def views_of(mesh: cast_views.Mesh, *, num: int = 20, noise: float = NOISE) -> l
     return cast_views.cast([mesh, cast_views.table()], poses, noise=noise)
 
 
+@cache
+def cube_views(num: int = 20) -> list[MaskedView]:
+    return views_of(cast_views.cube_mesh(), num=num)
+
+
+@cache
+def box_views() -> list[MaskedView]:
+    return views_of(cast_views.open_box_mesh())
+
+
 @pytest.fixture(scope="module")
 def cube() -> ObjectShape:
-    return reconstruct(views_of(cast_views.cube_mesh()), 0.0, QUICK)
+    return reconstruct(cube_views(), 0.0, QUICK)
 
 
 @pytest.fixture(scope="module")
 def box() -> ObjectShape:
-    return reconstruct(views_of(cast_views.open_box_mesh()), 0.0)
+    return reconstruct(box_views(), 0.0)
 
 
 def check(shape: ObjectShape, reference: cast_views.Mesh, volume: float) -> None:
@@ -95,7 +106,7 @@ def test_without_noise_a_sphere_in_the_air_is_closed_by_itself() -> None:
 
 def test_moving_cameras_and_object_together_moves_the_result(cube: ObjectShape) -> None:
     T = se3.transform_from(np.array([0.92, 0.0, 0.0, 0.39]), np.array([0.4, -0.2, 0.1]))
-    views = moved_views(views_of(cast_views.cube_mesh()), T)
+    views = moved_views(cube_views(), T)
     moved = reconstruct(views, 0.1, QUICK)
     assert moved.volume_m3 == pytest.approx(cube.volume_m3, rel=0.05)
     back = se3.apply(se3.invert(T), moved.vertices_m)
@@ -107,10 +118,9 @@ def test_moving_cameras_and_object_together_moves_the_result(cube: ObjectShape) 
 
 
 def test_views_that_are_shifted_against_each_other_are_laid_together() -> None:
-    mesh = cast_views.cube_mesh()
     rng = np.random.default_rng(3)
     shifted = []
-    for view in views_of(mesh):
+    for view in cube_views():
         T = view.T_base_camera.copy()
         T[:3, 3] += rng.normal(scale=0.003, size=3)
         shifted.append(replace(view, T_base_camera=T))
@@ -128,7 +138,7 @@ def test_views_that_all_stand_too_far_out_do_not_thin_a_wall() -> None:
     model = cast_views.TASK.objects["box"]
     solid = float(np.prod(model.size_m)) - float(np.prod(model.inner_m))
     outward = []
-    for view in views_of(cast_views.open_box_mesh()):
+    for view in box_views():
         T = view.T_base_camera.copy()
         away = T[:2, 3] / np.linalg.norm(T[:2, 3])
         T[:2, 3] -= 0.0015 * away  # towards the middle: outer faces move in, inner faces out
@@ -141,7 +151,7 @@ def test_views_that_all_stand_too_far_out_do_not_thin_a_wall() -> None:
 
 
 def test_views_that_agree_are_left_where_they_are() -> None:
-    views = views_of(cast_views.cube_mesh())
+    views = cube_views()
     moved, shift = laid_together(views, 0.0, 6)
     assert shift < 0.0015  # the noise is 1 mm, and a cube of 4 cm has few points
     turns = [
@@ -154,7 +164,7 @@ def test_views_that_agree_are_left_where_they_are() -> None:
 
 
 def test_a_flying_pixel_and_a_hole_in_the_depth_change_nothing(cube: ObjectShape) -> None:
-    views = views_of(cast_views.cube_mesh())
+    views = cube_views()
     rng = np.random.default_rng(0)
     broken = []
     for view in views:
@@ -193,19 +203,19 @@ def test_an_opening_nobody_looked_into_is_reported() -> None:
     ],
 )
 def test_too_little_is_refused_in_one_sentence(num: int, change: dict, says: str) -> None:
-    views = views_of(cast_views.cube_mesh(), num=max(num, 1))[:num]
+    views = cube_views(max(num, 1))[:num]
     with pytest.raises(ShapeError, match=says):
         reconstruct([replace(view, **change) for view in views], 0.0, QUICK)
 
 
 def test_views_from_one_side_only_are_refused() -> None:
-    views = views_of(cast_views.cube_mesh(), num=2)
+    views = cube_views(2)
     with pytest.raises(ShapeError, match="within 0 degrees"):
         reconstruct([views[0]] * 5, 0.0, QUICK)
 
 
 def test_poses_that_contradict_each_other_are_refused() -> None:
-    views = views_of(cast_views.cube_mesh(), num=4)
+    views = cube_views(4)
     apart = [
         replace(view, T_base_camera=view.T_base_camera + np.pad([[k * 1.0]], ((0, 3), (3, 0))))
         for k, view in enumerate(views)
@@ -216,11 +226,11 @@ def test_poses_that_contradict_each_other_are_refused() -> None:
 
 def test_a_plane_above_the_object_is_refused() -> None:
     with pytest.raises(ShapeError, match="below the plane"):
-        reconstruct(views_of(cast_views.cube_mesh(), num=4), 1.0, QUICK)
+        reconstruct(cube_views(4), 1.0, QUICK)
 
 
 def test_sizes_that_differ_and_a_pose_that_is_no_number_are_refused() -> None:
-    (view,) = views_of(cast_views.cube_mesh(), num=1)
+    (view,) = cube_views(1)
     with pytest.raises(ShapeError, match="320 x 240"):
         replace(view, mask=np.zeros((10, 10), dtype=bool))
     with pytest.raises(ShapeError, match="not finite"):
