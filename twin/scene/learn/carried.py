@@ -43,6 +43,10 @@ MIN_SHARE, MAX_SHARE = 0.002, 0.5
 """Of the image: smaller is chance, larger is a camera that hardly moved."""
 EDGE_SHARE = 0.2
 """Of a piece must be edges that stay: an even surface alone could be anything."""
+STEADY_VIEWS, STEADY_FRACTION = 3, 0.05
+"""A depth that so many views or more measure, and that varies by less, stays."""
+REACH_PERCENTILE = 95.0
+"""Of the depths that stay in what was found: as far as that it may have more."""
 GROW_PX = 3
 """Masks grow by this much at half size: what is so near is out of focus and shadows its edge."""
 
@@ -90,7 +94,8 @@ def find_carried(views: Sequence[TrainingView]) -> CarriedMask | None:
     mask = _solid(found, stays)
     if not MIN_SHARE <= mask.mean() <= MAX_SHARE:
         return None
-    return CarriedMask(half=mask)
+    mask = mask | _more_of_it(mask, np.stack([view.half.depth_m for view in chosen]))
+    return CarriedMask(half=mask) if mask.mean() <= MAX_SHARE else None
 
 
 def _apart(views: Sequence[TrainingView]) -> list[TrainingView]:
@@ -160,6 +165,27 @@ def _stands_in_scene(views: Sequence[TrainingView]) -> Bool[np.ndarray, "height 
     return np.asarray(
         ndimage.uniform_filter(confirmed, window) > ndimage.uniform_filter(through, window) + 1e-3
     )
+
+
+def _more_of_it(
+    mask: Bool[np.ndarray, "height width"], depth_m: Float32[np.ndarray, "num_views height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """What wobbles has no edge that stays, but a depth: that of what is carried, or less.
+
+    The scene does not come so near, and where it does, not by the same depth in every view.
+    """
+    known = depth_m > 0
+    measured = np.where(known | ~known.any(axis=0), depth_m, np.nan)
+    middle = np.nanmedian(measured, axis=0)
+    spread = np.nanmedian(np.abs(measured - middle), axis=0)
+    steady = (known.sum(axis=0) >= STEADY_VIEWS) & (spread < STEADY_FRACTION * middle)
+    if not (steady & mask).any():
+        return np.zeros_like(mask)
+    farthest_m = np.percentile(middle[steady & mask], REACH_PERCENTILE)
+    like_it = ndimage.binary_closing(mask | (steady & (middle <= farthest_m)), iterations=2)
+    pieces, _ = ndimage.label(like_it | mask)
+    more = np.isin(pieces, np.unique(pieces[mask])) & ~mask
+    return np.asarray(ndimage.binary_dilation(more, iterations=GROW_PX), dtype=bool)
 
 
 def _solid(

@@ -44,7 +44,7 @@ from twin.scene.store.folder import (
 )
 from twin.scene.store.ply import write_ply
 
-METHOD_VERSION = 18
+METHOD_VERSION = 19
 """Counts changes of method that make older scenes out of date."""
 
 
