@@ -143,6 +143,8 @@ def _find_head(
             for core in find_cores(smooth)
             if float(smooth[core.region].max()) > MIN_CORE * most
         ]
+        if not cores:  # above what is thick only a tail or an antenna is left
+            break
         owner = _nearest_core(cores, thick)
         touches = [_touched(piece, owner, len(cores)) for piece in pieces]
         if len(cores) < 2 and not found:

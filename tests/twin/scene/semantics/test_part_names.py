@@ -3,6 +3,7 @@ import pytest
 import table_scene
 from table_scene import Piece, iou, make_world, table
 
+from twin.scene.semantics.limbs import MARGIN_CELLS, _label_cells, thickness_of
 from twin.scene.semantics.part_names import Parts, PartsConfig, find_parts
 from twin.scene.semantics.solid import fill_solid
 
@@ -61,6 +62,23 @@ def test_a_solid_box_called_container_gets_no_invented_cavity() -> None:
     _, _, parts = parts_of([block], "open container")
     assert parts.masks == {}
     assert set(parts.keypoints) == {"centre", "top", "bottom"}
+
+
+def test_every_cell_of_any_shape_belongs_to_a_part() -> None:
+    """Balls with masts on them: high up nothing is thick, and there is no head to be found."""
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        solid = np.zeros((40, 40, 28), dtype=bool)
+        grid = np.moveaxis(np.indices(solid.shape), 0, -1)
+        for _ in range(rng.integers(1, 5)):
+            centre = [*rng.uniform(10, 30, 2), MARGIN_CELLS + rng.uniform(0, 8)]
+            solid |= np.linalg.norm(grid - centre, axis=-1) < rng.uniform(2, 9)
+        for _ in range(rng.integers(1, 4)):
+            x, y = rng.choice(np.argwhere(solid.any(axis=2)))
+            solid[x : x + 2, y : y + 2, MARGIN_CELLS : rng.integers(10, 27)] = True
+        solid[:, :, :MARGIN_CELLS] = False
+        parts, _ = _label_cells(solid, thickness_of(solid), PartsConfig().limb_ratio)
+        np.testing.assert_array_equal(parts > 0, solid)
 
 
 def test_parts_move_with_the_thing() -> None:
