@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,10 +16,14 @@ from evaluator.compare.cache import SummaryCache
 from evaluator.compare.inventory import RunFile, take_inventory
 from evaluator.compare.recorded import RecordedFacts, read_recorded
 from evaluator.compare.replays import DerivedFacts, DerivedFile, read_derived
+from evaluator.compare.workers import ALONE, Workers
 from evaluator.result import Exclusion
 
 ODD = (GstError, OSError, TypeError, ValueError, KeyError, RecursionError)
 """What one file of another program, or a failing disk, may raise; it costs that file only."""
+
+READ_S = 0.0015
+"""About what reading one file takes [s]."""
 
 Facts = TypeVar("Facts", RecordedFacts, DerivedFacts)
 
@@ -46,7 +51,9 @@ class RunContents:
         return {each.facts.info.id: (each.file.path, each.file.sha256) for each in self.recorded}
 
 
-def read_contents(run: RunFolder, cache: SummaryCache, output: Output) -> RunContents:
+def read_contents(
+    run: RunFolder, cache: SummaryCache, output: Output, workers: Workers = ALONE
+) -> RunContents:
     """Read what is new or has changed in a run; a broken file is left out and named."""
     inventory = take_inventory(run, cache, output)
     labels = _labels(run)
@@ -54,17 +61,19 @@ def read_contents(run: RunFolder, cache: SummaryCache, output: Output) -> RunCon
         inventory.recorded,
         RecordedFacts,
         lambda file: f"{file.name} {file.sha256} {labels.get(file.stem, '')}",
-        lambda file: read_recorded(run, Episode.open(file.path)),
+        partial(_recorded, run),
         cache,
         output,
+        workers,
     )
     derived, broken = _read(
         inventory.derived,
         DerivedFacts,
         lambda file: f"{file.name} {file.sha256}",
-        lambda file: read_derived(file.path),
+        _derived,
         cache,
         output,
+        workers,
     )
     return RunContents(
         recorded=tuple(
@@ -92,13 +101,28 @@ def _labels(run: RunFolder) -> dict[str, str]:
     return found
 
 
+def _recorded(run: RunFolder, file: RunFile) -> RecordedFacts | Exclusion:
+    try:
+        return read_recorded(run, Episode.open(file.path))
+    except ODD as error:
+        return broken(file.path.name, error)
+
+
+def _derived(file: RunFile) -> DerivedFacts | Exclusion:
+    try:
+        return read_derived(file.path)
+    except ODD as error:
+        return broken(file.path.name, error)
+
+
 def _read(
     files: Sequence[RunFile],
     kind: type[Facts],
     key: Callable[[RunFile], str],
-    read: Callable[[RunFile], Facts],
+    read: Callable[[RunFile], Facts | Exclusion],
     cache: SummaryCache,
     output: Output,
+    workers: Workers,
 ) -> tuple[dict[str, Facts], list[Exclusion]]:
     """Return what the files say of themselves, by name, and the files left out."""
     facts: dict[str, Facts] = {}
@@ -113,11 +137,10 @@ def _read(
     if not unknown:
         return facts, left_out
     with output.progress("read episodes", len(unknown)) as advance:
-        for done, file in enumerate(unknown, start=1):
-            try:
-                made = read(file)
-            except ODD as error:
-                left_out.append(broken(file.path.name, error))
+        all_made = zip(unknown, workers.map(read, unknown, each_s=READ_S), strict=True)
+        for done, (file, made) in enumerate(all_made, start=1):
+            if isinstance(made, Exclusion):
+                left_out.append(made)
             else:
                 facts[file.name] = made
                 if not made.broken:  # a message names the folder, which may move

@@ -1,4 +1,7 @@
-"""Work on many items with a few threads; NumPy and the image decoders let go of the interpreter."""
+"""Work on many images with a few threads; NumPy and the image decoders let go of the interpreter.
+
+Episodes are read and compared by processes: ``workers``.
+"""
 
 import os
 from collections.abc import Callable, Iterable

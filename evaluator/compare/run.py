@@ -25,6 +25,7 @@ from evaluator.compare.summaries import sum_up
 from evaluator.compare.tracking import motion_results
 from evaluator.compare.trial import Trial, lay_out
 from evaluator.compare.views import ViewReport, compare_views
+from evaluator.compare.workers import Workers
 from evaluator.metrics.lpips import open_nets
 from evaluator.metrics.options import ImageOptions
 from evaluator.result import Exclusion
@@ -61,12 +62,13 @@ def compare_run(
     """
     run = RunFolder.open(run.path)
     cache = SummaryCache(None) if cache is None else cache
-    contents = read_contents(run, cache, output)
-    trials, left_out = trials_of(contents)
+    with Workers() as workers:
+        contents = read_contents(run, cache, output, workers)
+        trials, left_out = trials_of(contents)
+        summaries = sum_up(trials, cache, output, workers)
     recorded_ids = {recorded.facts.info.id for recorded in contents.recorded}
     imported, doubled = imported_rows(run, recorded_ids)
     rows = [*(trial.row for trial in trials), *imported]
-    summaries = sum_up(trials, cache, output)
     nets = open_nets(images.backbones)
     views = compare_views(contents.derived, contents.sources, nets=nets, cache=cache)
     methods = compare_renders(images, contents.derived, contents.sources, nets=nets)

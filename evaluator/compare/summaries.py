@@ -5,9 +5,10 @@ content in the key. Only summaries stay in memory, no series.
 """
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from bridge.episode.provenance import hash_file
@@ -21,7 +22,11 @@ from evaluator.compare.label import Witness, summarise_witness
 from evaluator.compare.motion import MotionSummary, summarise_motions
 from evaluator.compare.states import StateSummary, summarise_states
 from evaluator.compare.trial import TRAJECTORIES, Trial
+from evaluator.compare.workers import ALONE, Workers
 from evaluator.result import Exclusion
+
+COMPARE_S = 0.03
+"""About what comparing one trial takes [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,24 +40,37 @@ class Summaries:
     """Trials of which something could not be read."""
 
 
+@dataclass(frozen=True, kw_only=True)
 class _Files:
     """The episodes of one trial, each opened at most once, and only if somebody asks."""
 
-    def __init__(self, trial: Trial, plan_id: str) -> None:
-        self._trial = trial
-        self.plan_id = plan_id
+    episode: str
+    plan_id: str
+    recorded_path: Path
+    replay_paths: Mapping[str, Path]
+    localised_path: Path | None
 
     @cached_property
     def recorded(self) -> Episode:
-        return Episode.open(self._trial.file.path)
+        return Episode.open(self.recorded_path)
 
     @cached_property
     def replays(self) -> dict[str, Episode]:
-        return {name: replay.episode for name, replay in self._trial.replays.items()}
+        return {name: Episode.open(path) for name, path in self.replay_paths.items()}
 
     @cached_property
     def localised(self) -> Episode | None:
-        return None if self._trial.localised is None else self._trial.localised.episode
+        return None if self.localised_path is None else Episode.open(self.localised_path)
+
+
+def _files_of(trial: Trial, plan_id: str) -> _Files:
+    return _Files(
+        episode=trial.row.episode,
+        plan_id=plan_id,
+        recorded_path=trial.file.path,
+        replay_paths={name: replay.path for name, replay in trial.replays.items()},
+        localised_path=None if trial.localised is None else trial.localised.path,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,24 +81,36 @@ class _Part:
     key: Callable[[Trial], str]
 
 
-def sum_up(trials: Sequence[Trial], cache: SummaryCache, output: Output) -> Summaries:
+_Job = tuple[_Files, tuple[_Part, ...]]
+
+
+def sum_up(
+    trials: Sequence[Trial], cache: SummaryCache, output: Output, workers: Workers = ALONE
+) -> Summaries:
     """Summarise motions, final states and localised success of every trial with a plan sent."""
     found: dict[type[Any], list[Any]] = {part.kind: [] for part in PARTS}
-    unknown: list[tuple[Trial, list[_Part]]] = []
+    unknown: list[tuple[Trial, _Job]] = []
     for trial in trials:
         if trial.row.plan_id is None:
             continue
         kept = {part.kind: cache.find(part.kind, part.key(trial)) for part in PARTS}
-        parts = [part for part in PARTS if kept[part.kind] is None]
+        parts = tuple(part for part in PARTS if kept[part.kind] is None)
         if parts:
-            unknown.append((trial, parts))
+            unknown.append((trial, (_files_of(trial, trial.row.plan_id), parts)))
         for kind, known in kept.items():
             found[kind] += known or ()
-    left_out = []
+    left_out: list[Exclusion] = []
     if unknown:
+        jobs = [job for _, job in unknown]
         with output.progress("compare motions", len(unknown)) as advance:
-            for done, (trial, parts) in enumerate(unknown, start=1):
-                left_out += _make(trial, parts, cache, found)
+            all_made = zip(unknown, workers.map(_make, jobs, each_s=COMPARE_S), strict=True)
+            for done, ((trial, (_, parts)), made) in enumerate(all_made, start=1):
+                for part, summaries in zip(parts, made, strict=True):
+                    if isinstance(summaries, Exclusion):
+                        left_out.append(summaries)
+                    else:
+                        cache.keep(part.kind, part.key(trial), summaries)
+                        found[part.kind] += summaries
                 advance(done, trial.row.episode)
     return Summaries(
         motions=_in_order(found[MotionSummary], trials),
@@ -90,23 +120,16 @@ def sum_up(trials: Sequence[Trial], cache: SummaryCache, output: Output) -> Summ
     )
 
 
-def _make(
-    trial: Trial,
-    parts: Iterable[_Part],
-    cache: SummaryCache,
-    found: dict[type[Any], list[Any]],
-) -> list[Exclusion]:
-    files = _Files(trial, trial.row.plan_id or "")
-    left_out = []
+def _make(job: _Job) -> list[tuple[Any, ...] | Exclusion]:
+    """Return the summaries of each part asked for, or why there are none."""
+    files, parts = job
+    made: list[tuple[Any, ...] | Exclusion] = []
     for part in parts:
         try:
-            made = part.make(files)
+            made.append(part.make(files))
         except ODD as error:
-            left_out.append(broken(trial.row.episode, error, scope=part.scope))
-            continue
-        cache.keep(part.kind, part.key(trial), made)
-        found[part.kind] += made
-    return left_out
+            made.append(broken(files.episode, error, scope=part.scope))
+    return made
 
 
 def _in_order(found: Iterable[Any], trials: Iterable[Trial]) -> tuple[Any, ...]:

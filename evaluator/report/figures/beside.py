@@ -1,22 +1,17 @@
 """Draw the figures of a large run in a second process, while the first compares and writes.
 
-Loading matplotlib and drawing take three seconds that nothing else of an evaluation waits for. The
-process speaks over its standard streams alone, so it ends when the command that started it ends,
-however that ends; and whatever becomes of it, the same figures can be drawn without it.
+Loading matplotlib and drawing take three seconds that nothing else of an evaluation waits for.
+Whatever becomes of the process, the same figures can be drawn without it.
 """
 
 import os
 import pickle
-import queue
-import subprocess
-import sys
 import threading
-import weakref
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
+from evaluator.child_process import ChildProcess
 from evaluator.report.figures.drawing import Drawing, Rendered
 
 if TYPE_CHECKING:
@@ -34,7 +29,7 @@ Forms = tuple[bytes, bytes, str]
 """SVG, PDF and the SVG for the page."""
 
 
-class Beside:
+class Beside(ChildProcess):
     """A second process that draws; it ends with this object, or with the program."""
 
     def __init__(self) -> None:
@@ -43,23 +38,7 @@ class Beside:
         Raises:
             OSError: When the system gives no further process.
         """
-        places = os.pathsep.join(place or os.getcwd() for place in sys.path)  # noqa: PTH109
-        self.process = subprocess.Popen(
-            [sys.executable, "-P", "-m", __name__],  # the program's own main module stays unloaded
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": places},
-        )
-        self.end = weakref.finalize(self, _end, self.process)
-        """End the process and wait for it; does nothing the second time."""
-
-    def send(self, data: "Drawable") -> None:
-        """Hand over what is to be drawn, and go on."""
-        assert self.process.stdin is not None  # noqa: S101  # for the type checker
-        with suppress(OSError):  # it has ended, and ``take`` says so
-            self.process.stdin.write(pickle.dumps(data))
-            self.process.stdin.flush()
+        super().__init__(__name__)
 
     def take(self, drawn: Sequence[Drawing]) -> list[Rendered] | None:
         """Wait for the figures and end the process.
@@ -99,47 +78,20 @@ def _rendered(drawing: Drawing, forms: Forms) -> Rendered:
     return Rendered(drawing=drawing, svg=svg, pdf=pdf, inline=inline)
 
 
-def _end(process: "subprocess.Popen[bytes]") -> None:
-    process.kill()
-    with suppress(OSError), process:  # closes the pipes, one perhaps half written, and waits
-        pass
-
-
-def serve(inbox: BinaryIO, outbox: BinaryIO) -> None:
-    """Load what drawing needs, then draw what arrives; end as soon as nobody is left to draw for.
+def serve(receive: Callable[[], "Drawable"], outbox: BinaryIO) -> None:
+    """Load what drawing needs, then draw what arrives.
 
     Args:
-        inbox: Brings one pickled ``Drawable``, then nothing until whoever sent it has ended.
+        receive: Brings what the figures show.
         outbox: Takes a pickled dictionary: the forms of each figure by its id.
     """
-    arrived: queue.SimpleQueue[Drawable] = queue.SimpleQueue()
-    threading.Thread(target=_listen, args=(inbox, arrived), daemon=True).start()
     from evaluator.report.figures.chosen import drawings_of  # noqa: PLC0415  # loads the numbers
     from evaluator.report.figures.render import render, warm_up  # noqa: PLC0415  # and matplotlib
 
     warm_up()
     found: dict[str, Forms] = {}
-    for drawing in drawings_of(arrived.get())[0]:
+    for drawing in drawings_of(receive())[0]:
         item = render(drawing)
         found[drawing.id] = (item.svg, item.pdf, item.inline)
     outbox.write(pickle.dumps(found))
     outbox.flush()
-
-
-def _listen(inbox: BinaryIO, arrived: "queue.SimpleQueue[Drawable]") -> None:
-    with suppress(EOFError, OSError):
-        arrived.put(pickle.load(inbox))
-        inbox.read(1)
-    os._exit(0)  # in the middle of a figure too: nobody waits for it
-
-
-def _main() -> None:
-    to_parent = os.dup(1)
-    with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
-        os.dup2(nowhere.fileno(), 1)  # a library that prints must not speak to the parent
-    with open(0, "rb", closefd=False) as inbox, open(to_parent, "wb") as outbox:  # noqa: PTH123
-        serve(inbox, outbox)
-
-
-if __name__ == "__main__":
-    _main()

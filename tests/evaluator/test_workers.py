@@ -1,0 +1,234 @@
+"""Other processes read and compare too, and nothing in the results tells."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from functools import partial
+from multiprocessing.connection import wait
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from bridge.terminal import Output
+from evaluator.compare import compare_run, run, workers
+from evaluator.compare.cache import FOLDER, SummaryCache
+from evaluator.compare.contents import READ_S
+from evaluator.compare.workers import Workers
+from evaluator.result import write_results
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def begun(pool: Workers, number: int) -> Workers:
+    """Start processes, and wait until they can work."""
+    pool._start(number)
+    for worker in pool.started:
+        assert worker.is_ready or wait([worker.outlet], 30)
+    return pool
+
+
+def is_running(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+def ended_within(pid: int, seconds: float) -> bool:
+    limit = time.monotonic() + seconds
+    while is_running(pid) and time.monotonic() < limit:
+        time.sleep(0.02)
+    return not is_running(pid)
+
+
+@pytest.fixture(scope="module")
+def jobs() -> Iterator[ModuleType]:
+    sys.path.insert(0, str(Path(__file__).parent))
+    import worker_jobs
+
+    yield worker_jobs
+    sys.path.remove(str(Path(__file__).parent))
+
+
+@pytest.fixture(scope="module")
+def pool(jobs: ModuleType) -> Iterator[Workers]:
+    with Workers(2) as pool:
+        yield pool
+
+
+@pytest.fixture
+def two(pool: Workers) -> Workers:
+    """This process and one beside it."""
+    return begun(pool, 1)
+
+
+@pytest.fixture
+def nobody(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Count processes instead of starting them."""
+    started: list[bool] = []
+
+    def refuse() -> None:
+        started.append(True)
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(workers, "_Worker", refuse)
+    return started
+
+
+@pytest.mark.slow
+def test_two_processes_share_a_list_and_keep_its_order(two: Workers, jobs: ModuleType) -> None:
+    found = list(two.map(jobs.where, range(100), each_s=0.002))
+    assert [number for number, _ in found] == list(range(100))
+    assert {pid for _, pid in found} == {os.getpid(), two.started[0].process.pid}
+    again = list(two.map(jobs.surroundings, range(100), each_s=0.002))
+    (beside,) = {about for about in again if about[0] != os.getpid()}
+    assert beside == (two.started[0].process.pid, False, "1")
+
+
+@pytest.mark.slow
+def test_an_exception_nobody_expected_is_raised_here(two: Workers, jobs: ModuleType) -> None:
+    found = []
+    with pytest.raises(LookupError, match="item 37") as caught:
+        found.extend(two.map(jobs.fail, range(100), each_s=0.002))
+    assert any(entry.name == "fail" for entry in caught.traceback)
+    assert found == list(range(len(found)))
+    assert all(not worker.asked for worker in two.started)
+
+
+@pytest.mark.slow
+def test_what_would_be_printed_is_told_here(two: Workers, jobs: ModuleType) -> None:
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        assert list(two.map(jobs.warn, range(30), each_s=0.002)) == list(range(30))
+    assert sorted(int(str(each.message).split()[1]) for each in said) == list(range(30))
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_or_hangs_costs_nothing(
+    jobs: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers, "MAX_WAIT_S", 0.3)
+    with begun(Workers(4), 3) as pool:
+        processes = [worker.process for worker in pool.started]
+        processes[0].kill()  # before it is given anything
+        processes[1].send_signal(signal.SIGSTOP)
+        work = partial(jobs.signal_elsewhere, os.getpid(), signal.SIGKILL)  # the third, at work
+        assert list(pool.map(work, range(60), each_s=0.002)) == list(range(60))
+        assert pool.started == []
+    assert [process.returncode for process in processes] == [-signal.SIGKILL] * 3
+
+
+def spoil(folder: Path, derived: Path) -> None:
+    """Break one recorded and one derived episode, each in its own way."""
+    path = folder / "a1.mcap"
+    path.write_bytes(path.read_bytes()[:-40])
+    derived.write_bytes(b"\x89MCAP0\r\n" * 50)
+
+
+@pytest.mark.slow
+def test_results_are_the_same_bytes_with_and_without_processes(
+    six_trials: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoil(six_trials.run.episodes_dir, six_trials.run.derived("b1.replay.planned*")[0])
+    taken: list[int] = []
+    after: list[Callable[[], object]] = []
+    take = workers._List.take
+
+    def noting(self: Any, answer: Any) -> None:
+        take(self, answer)
+        if answer is not None and answer[1] is not None:
+            taken.append(len(answer[1]))
+            for act in after:
+                act()
+
+    def results(name: str) -> bytes:
+        with SummaryCache(tmp_path / name / FOLDER) as cache:
+            comparison = compare_run(six_trials.run, cache=cache)
+        named = {each.episode for each in comparison.exclusions if each.scope == "everything"}
+        assert "a1.mcap" in named
+        return write_results(comparison.results(), tmp_path / name / "results.json").read_bytes()
+
+    monkeypatch.setattr(workers._List, "take", noting)
+    alone = results("alone")
+    assert taken == []
+    with begun(Workers(2), 1) as pool:
+        monkeypatch.setattr(run, "Workers", lambda: nullcontext(pool))
+        assert results("two") == alone
+        assert sum(taken) > 2
+        taken.clear()
+        after.append(pool.started[0].process.kill)
+        assert results("killed") == alone
+        assert len(taken) <= workers.AHEAD
+        assert pool.started == []
+
+
+INTERRUPTED = """
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in a background
+import robot_gst
+from multiprocessing.connection import wait
+from evaluator.compare import contents, workers
+
+def read_recorded(*_):
+    (worker,) = told
+    wait([worker.outlet], 30)
+    print("reading", flush=True)
+    time.sleep(20)
+
+told = []
+class Told(workers._Worker):
+    def __init__(self):
+        super().__init__()
+        told.append(self)
+        print(self.process.pid, flush=True)
+
+workers.WORTH_S, workers._Worker, contents.read_recorded = 1e-3, Told, read_recorded
+workers._cores = lambda: 2
+sys.exit(robot_gst.run(["evaluate", sys.argv[1]]))
+"""
+
+
+@pytest.mark.slow
+def test_an_interrupt_ends_all_processes(six_trials: Any) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTED, str(six_trials.run.path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        pid = int(process.stdout.readline())
+        assert process.stdout.readline() == "reading\n"
+        os.killpg(process.pid, signal.SIGINT)
+        out, said = process.communicate(timeout=20)
+    assert (process.returncode, out, said) == (130, "", "")
+    assert ended_within(pid, 10.0)
+
+
+def test_few_files_start_nothing(six_trials: Any, nobody: list[bool]) -> None:
+    with SummaryCache(six_trials.run.results_dir / FOLDER) as cache:
+        compare_run(six_trials.run, cache=cache, output=Output(quiet=True))
+    assert nobody == []
+    enough = round(workers.WORTH_S / READ_S)
+    assert list(Workers(2).map(abs, range(enough - 1), each_s=READ_S)) == list(range(enough - 1))
+    assert nobody == []
+    assert list(Workers(1).map(abs, range(enough), each_s=READ_S)) == list(range(enough))
+    assert nobody == []
+
+
+def test_without_a_further_process_all_is_done_here(nobody: list[bool]) -> None:
+    pool = Workers(2)
+    assert list(pool.map(abs, range(9), each_s=workers.WORTH_S)) == list(range(9))
+    assert nobody == [True]
+    assert list(pool.map(abs, range(9), each_s=workers.WORTH_S)) == list(range(9))
+    assert nobody == [True]  # it is not asked for again
