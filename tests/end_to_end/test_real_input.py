@@ -25,7 +25,10 @@ def test_a_real_kitchen_is_published_recorded_and_rebuilt(
         )
     assert sent.returncode == 0, sent.stderr
     assert json.loads(sent.stdout)["recorded"]["lost"] == 0
-    rebuilt = gst("rebuild", str(run), "--budget", "20s", "--json")
+    rebuilt = gst(
+        *("rebuild", str(run), "--iterations", "60", "--max-splats", "25000"),
+        *("--max-train-frames", "40", "--max-holdout-frames", "6", "--json"),
+    )
     assert rebuilt.returncode == 0, rebuilt.stderr[-3000:]
     evaluated = gst("evaluate", str(run), "--json")
     assert evaluated.returncode == 0, evaluated.stderr[-3000:]
