@@ -1,5 +1,7 @@
 """Convex parts: they hold the solid, leave the cavity free, and engines can load them."""
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from twin.scene.shape.cavity import find_cavity
-from twin.scene.shape.collision import CollisionConfig, collision_parts
+from twin.scene.shape.collision import CollisionConfig, CollisionParts, collision_parts
 from twin.scene.shape.convex import hull_of_points, thinned, voxel_corners
 from twin.scene.shape.files import read_parts, write_shape
 from twin.scene.shape.isosurface import isosurface
@@ -43,11 +45,13 @@ def grid(num: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.meshgrid(axis, axis, axis, indexing="ij")
 
 
+@cache
 def ball_shape() -> ObjectShape:
     x, y, z = grid(40)
     return shape_of(np.sqrt(x * x + y * y + z * z) < 15, 0.002)
 
 
+@cache
 def box_shape() -> ObjectShape:
     x, y, z = grid(50)
     outer = (np.abs(x) < 20) & (np.abs(y) < 16) & (z > -12) & (z < 10)
@@ -55,16 +59,24 @@ def box_shape() -> ObjectShape:
     return shape_of(outer & ~inner, 0.0025)
 
 
+@cache
 def basket_shape() -> ObjectShape:
     x, y, z = grid(60)
     r = np.hypot(x, y)
     return shape_of((r < 26) & (z > -12) & (z < 10) & ~((r < 22) & (z > -8)), 0.0025)
 
 
+@cache
 def ell_shape() -> ObjectShape:
     x, y, z = grid(40)
     ell = (np.abs(z) < 5) & (np.abs(x) < 15) & (np.abs(y) < 15) & ((x < -5) | (y < -5))
     return shape_of(ell, 0.002)
+
+
+@cache
+def parts_of(make: Callable[[], ObjectShape]) -> CollisionParts:
+    """Found with the default settings."""
+    return collision_parts(make())
 
 
 def held(shape: ObjectShape, parts: tuple, margin_m: float) -> np.ndarray:
@@ -77,8 +89,7 @@ def held(shape: ObjectShape, parts: tuple, margin_m: float) -> np.ndarray:
 
 
 def test_a_convex_shape_is_one_hull() -> None:
-    shape = ball_shape()
-    found = collision_parts(shape)
+    shape, found = ball_shape(), parts_of(ball_shape)
     assert len(found.parts) == 1
     assert found.hull_ratio < 1.05
     assert found.cavity_blocked is None
@@ -87,10 +98,9 @@ def test_a_convex_shape_is_one_hull() -> None:
 
 
 @pytest.mark.parametrize("make", [box_shape, basket_shape])
-def test_a_container_keeps_its_cavity_and_its_walls(make: object) -> None:
-    shape = make()  # type: ignore[operator]
+def test_a_container_keeps_its_cavity_and_its_walls(make: Callable[[], ObjectShape]) -> None:
+    shape, found = make(), parts_of(make)
     assert shape.cavity is not None
-    found = collision_parts(shape)
     assert found.hull_ratio > 1.5
     assert found.cavity_blocked == 0.0
     assert 5 <= len(found.parts) <= 16
@@ -106,7 +116,7 @@ def held_points(points: np.ndarray, parts: tuple) -> np.ndarray:
 
 
 def test_a_box_falls_apart_into_floor_and_four_walls() -> None:
-    found = collision_parts(box_shape())
+    found = parts_of(box_shape)
     assert len(found.parts) == 5
     assert found.volume_ratio == pytest.approx(1.0, abs=0.1)
 
@@ -127,7 +137,7 @@ def test_a_concave_shape_is_cut_until_little_is_added() -> None:
 
 
 def test_parts_are_closed_and_as_large_as_qhull_says() -> None:
-    for part in collision_parts(basket_shape()).parts:
+    for part in parts_of(basket_shape).parts:
         assert is_watertight(part.faces)
         assert volume_m3(part.vertices_m, part.faces) == pytest.approx(part.volume_m3, rel=1e-6)
         assert part.volume_m3 == pytest.approx(ConvexHull(part.vertices_m).volume)
@@ -165,7 +175,7 @@ def test_the_parts_are_read_back_and_pybullet_takes_their_vertices(tmp_path: Pat
 
     shape = box_shape()
     names, about = write_shape(tmp_path, shape, "box", soft=False)
-    found = collision_parts(shape).parts
+    found = parts_of(box_shape).parts
     parts = read_parts(tmp_path)
     assert len(parts) == len(found) == about["collision"]["num_parts"]
     assert sorted(n for n in names if n.startswith("collision/"))[0] == "collision/00.ply"
