@@ -24,6 +24,8 @@ from evaluator.compare.inventory import RunFile
 from evaluator.compare.replays import DerivedFacts, DerivedFile, DerivedIndex
 from evaluator.result import write_results
 
+pytestmark = pytest.mark.usefixtures("unchecked")  # a first evaluation is checked elsewhere
+
 
 def again(run: RunFolder, **asked: Any) -> Comparison:
     """Evaluate as the command does, with the run's own cache."""

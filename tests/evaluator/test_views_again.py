@@ -41,6 +41,7 @@ def again(run: RunFolder) -> Comparison:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
 def test_views_are_scored_once_and_again_when_they_change(
     run: RunFolder, scored: list[int], load_golden_script: Callable[[str], ModuleType]
 ) -> None:

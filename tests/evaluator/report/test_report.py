@@ -139,6 +139,7 @@ def test_evaluate_writes_everything_and_says_where(evaluated: Evaluated) -> None
     assert not list(run.results_dir.rglob("*.part"))
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_evaluate_prints_json_that_is_the_results_file(
     six_trials: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -147,6 +148,7 @@ def test_evaluate_prints_json_that_is_the_results_file(
     assert record == json.loads((six_trials.run.results_dir / "results.json").read_text())
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_agreement_below_the_threshold_ends_with_three(
     evaluated: Evaluated, six_trials: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -173,6 +175,7 @@ def test_an_empty_run_still_gets_a_report(maker: Any, capsys: pytest.CaptureFixt
     assert "no recorded trial" in (maker.run.results_dir / "report.html").read_text()
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_writing_twice_replaces_the_first(six_trials: Any) -> None:
     comparison = compare_run(six_trials.run)
     folder = six_trials.run.results_dir

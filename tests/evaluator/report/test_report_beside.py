@@ -64,6 +64,7 @@ def ended_within(pid: int, seconds: float) -> bool:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
 def test_a_report_is_the_same_with_a_second_process(
     comparison: Comparison,
     in_process: Path,
@@ -81,6 +82,7 @@ def test_a_report_is_the_same_with_a_second_process(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("after_sending", [False, True])
+@pytest.mark.usefixtures("unchecked")
 def test_a_killed_process_takes_nothing_of_the_report_with_it(
     comparison: Comparison, in_process: Path, second: Beside, tmp_path: Path, after_sending: bool
 ) -> None:

@@ -82,6 +82,7 @@ def motion(rng: np.random.Generator, row: TrialRow, against: str) -> MotionSumma
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
 def test_a_report_about_thousands_of_trials_stays_small_and_complete(tmp_path: Path) -> None:
     comparison = many(3000)
     written = write_report(comparison, tmp_path)
@@ -98,6 +99,7 @@ def test_a_report_about_thousands_of_trials_stays_small_and_complete(tmp_path: P
     assert written.results.stat().st_size < 3_000_000
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_what_is_cut_depends_on_the_number_of_rows_alone(tmp_path: Path) -> None:
     written = write_report(many(SHOWN_ROWS), tmp_path)
     assert "The first 200" not in written.report.read_text()
