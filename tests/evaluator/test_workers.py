@@ -94,36 +94,11 @@ def test_two_processes_share_a_list_and_keep_its_order(two: Workers, jobs: Modul
 
 
 @pytest.mark.slow
-def test_an_exception_nobody_expected_is_raised_here(two: Workers, jobs: ModuleType) -> None:
-    found = []
-    with pytest.raises(LookupError, match="item 37") as caught:
-        found.extend(two.map(jobs.fail, range(100), each_s=0.002))
-    assert any(entry.name == "fail" for entry in caught.traceback)
-    assert found == list(range(len(found)))
-    assert all(not worker.asked for worker in two.started)
-
-
-@pytest.mark.slow
 def test_what_would_be_printed_is_told_here(two: Workers, jobs: ModuleType) -> None:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         assert list(two.map(jobs.warn, range(30), each_s=0.002)) == list(range(30))
     assert sorted(int(str(each.message).split()[1]) for each in said) == list(range(30))
-
-
-@pytest.mark.slow
-def test_a_process_that_dies_or_hangs_costs_nothing(
-    jobs: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(workers, "MAX_WAIT_S", 0.3)
-    with begun(Workers(4), 3) as pool:
-        processes = [worker.process for worker in pool.started]
-        processes[0].kill()  # before it is given anything
-        processes[1].send_signal(signal.SIGSTOP)
-        work = partial(jobs.signal_elsewhere, os.getpid(), signal.SIGKILL)  # the third, at work
-        assert list(pool.map(work, range(60), each_s=0.002)) == list(range(60))
-        assert pool.started == []
-    assert [process.returncode for process in processes] == [-signal.SIGKILL] * 3
 
 
 def spoil(folder: Path, derived: Path) -> None:
@@ -135,7 +110,7 @@ def spoil(folder: Path, derived: Path) -> None:
 
 @pytest.mark.slow
 def test_results_are_the_same_bytes_with_and_without_processes(
-    six_trials: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    two: Workers, six_trials: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spoil(six_trials.run.episodes_dir, six_trials.run.derived("b1.replay.planned*")[0])
     taken: list[int] = []
@@ -159,15 +134,38 @@ def test_results_are_the_same_bytes_with_and_without_processes(
     monkeypatch.setattr(workers._List, "take", noting)
     alone = results("alone")
     assert taken == []
-    with begun(Workers(2), 1) as pool:
-        monkeypatch.setattr(run, "Workers", lambda: nullcontext(pool))
-        assert results("two") == alone
-        assert sum(taken) > 2
-        taken.clear()
-        after.append(pool.started[0].process.kill)
-        assert results("killed") == alone
-        assert len(taken) <= workers.AHEAD
+    monkeypatch.setattr(run, "Workers", lambda: nullcontext(two))
+    assert results("two") == alone
+    assert sum(taken) > 2
+    taken.clear()
+    after.append(two.started[0].process.kill)
+    assert results("killed") == alone
+    assert len(taken) <= workers.AHEAD
+    assert two.started == []
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_or_hangs_costs_nothing(
+    jobs: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers, "MAX_WAIT_S", 0.3)
+    with begun(Workers(3), 2) as pool:
+        processes = [worker.process for worker in pool.started]
+        processes[0].send_signal(signal.SIGSTOP)
+        work = partial(jobs.signal_elsewhere, os.getpid(), signal.SIGKILL)  # the other one
+        assert list(pool.map(work, range(60), each_s=0.002)) == list(range(60))
         assert pool.started == []
+    assert [process.returncode for process in processes] == [-signal.SIGKILL] * 2
+
+
+@pytest.mark.slow
+def test_an_exception_nobody_expected_is_raised_here(two: Workers, jobs: ModuleType) -> None:
+    found = []
+    with pytest.raises(LookupError, match="item 37") as caught:
+        found.extend(two.map(jobs.fail, range(100), each_s=0.002))
+    assert any(entry.name == "fail" for entry in caught.traceback)
+    assert found == list(range(len(found)))
+    assert all(not worker.asked for worker in two.started)
 
 
 INTERRUPTED = """
