@@ -11,7 +11,7 @@ from math import cos
 
 from twin.physics.engine import pybullet
 
-TURN_RAD = 0.02
+TURN_RAD = 0.03
 """A body that has turned by this much takes hold anew."""
 EVERY_STEPS = 4
 """How often bodies are asked; the fastest joint turns by 0.05 rad meanwhile."""
@@ -37,11 +37,15 @@ class FrictionAnchors:
         self._held[body] = self._orientation(body)
         pybullet.changeDynamics(body, -1, frictionAnchor=1, physicsClientId=self._client)
 
-    def refresh(self) -> None:
-        """Let bodies that have turned take hold anew in the next step. Call once per step."""
+    def refresh(self) -> bool:
+        """Let bodies that have turned take hold anew in the next step; whether any does.
+
+        Call once per step.
+        """
         self._steps += 1
         if self._steps % EVERY_STEPS:
-            return
+            return False
+        anew = False
         for body, (x0, y0, z0, w0) in self._held.items():
             x, y, z, w = now = self._orientation(body)
             if abs(x * x0 + y * y0 + z * z0 + w * w0) < cos(TURN_RAD / 2):
@@ -50,6 +54,8 @@ class FrictionAnchors:
                 pybullet.setCollisionFilterGroupMask(
                     body, -1, _DYNAMIC, _ALL, physicsClientId=self._client
                 )
+                anew = True
+        return anew
 
     def _orientation(self, body: int) -> tuple[float, ...]:
         _, q = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)

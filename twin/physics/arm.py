@@ -16,6 +16,12 @@ from twin.physics.engine import pybullet
 
 SLOWEST_M_S = 1e-4
 """Stalled fingers still creep this fast: PyBullet takes a speed of 0 for no limit."""
+_GAIN, _PRESS_GAIN = 0.1, 1.0
+"""Share of the way to the target that fingers would go in one step, if they were fast enough:
+PyBullet's own, and one with which fingers that press ask for their whole speed."""
+
+Joints = list[float] | Float[np.ndarray, " num_joints"]
+"""One value per joint of the arm; a list costs less than an array."""
 
 LinkPose = tuple[tuple[float, ...], tuple[float, ...]]
 """Position [m] and quaternion xyzw of a link's frame, as PyBullet has them."""
@@ -47,7 +53,10 @@ class Arm:
         self._couple_fingers()
         self._target_m = MAX_WIDTH_M / 2
         self._arm_order: tuple[list[float], list[float]] | None = None
-        self._finger_order: tuple[float, float] | None = None
+        self._finger_order: tuple[float, float, float] | None = None
+        self._press_m_s: float | None = None
+        self.closing = False
+        """Whether the fingers were told to be narrower than before, and not wider since."""
 
     def _load(self, urdf: str, mesh_hulls_m: Hulls) -> int:
         with tempfile.TemporaryDirectory(prefix="robot-gst-physics-") as folder:
@@ -135,17 +144,12 @@ class Arm:
                 self.id, index, float(width_m) / 2, 0.0, physicsClientId=self._client
             )
 
-    def command(
-        self,
-        joints_rad: Float[np.ndarray, " num_joints"],
-        velocity_rad_s: Float[np.ndarray, " num_joints"],
-        width_m: float,
-    ) -> None:
+    def command(self, joints_rad: Joints, velocity_rad_s: Joints, width_m: float) -> None:
         """Set the position targets that the motors follow from the next step on.
 
         Motors keep their orders: one that is already followed is not given again.
         """
-        order = (joints_rad.tolist(), velocity_rad_s.tolist())
+        order = (_numbers(joints_rad), _numbers(velocity_rad_s))
         if order != self._arm_order:
             pybullet.setJointMotorControlArray(
                 self.id,
@@ -157,13 +161,36 @@ class Arm:
                 physicsClientId=self._client,
             )
             self._arm_order = order
-        self._target_m = min(max(width_m, 0.0), MAX_WIDTH_M) / 2
-        self._drive_fingers(self._target_m, self._config.finger_speed_m_s)
+        target_m = min(max(width_m, 0.0), MAX_WIDTH_M) / 2
+        if target_m > self._target_m:
+            self.closing, self._press_m_s = False, None
+        elif target_m < self._target_m:
+            self.closing = True
+        self._target_m = target_m
+        self._close_fingers()
 
-    def _drive_fingers(self, target_m: float, speed_m_s: float) -> None:
-        if self._finger_order == (target_m, speed_m_s):
+    def _close_fingers(self) -> None:
+        if self._press_m_s is None:
+            self._drive_fingers(self._target_m, self._config.finger_speed_m_s)
+        else:
+            self._drive_fingers(self._target_m, self._press_m_s, _PRESS_GAIN)
+
+    def press(self, speed_m_s: float | None) -> None:
+        """Drive the fingers to their target with another speed; None: with the usual one."""
+        if speed_m_s != self._press_m_s:
+            self._press_m_s = speed_m_s
+            self._close_fingers()
+
+    def fingers(self) -> list[tuple[float, float]]:
+        """How far each finger is from being as closed as it was told [m], and its speed [m/s]."""
+        states = pybullet.getJointStates(self.id, self._fingers, physicsClientId=self._client)
+        return [(state[0] - self._target_m, state[1]) for state in states]
+
+    def _drive_fingers(self, target_m: float, speed_m_s: float, gain: float = _GAIN) -> None:
+        order = (target_m, speed_m_s, gain)
+        if self._finger_order == order:
             return
-        self._finger_order = (target_m, speed_m_s)
+        self._finger_order = order
         for index in self._fingers:
             pybullet.setJointMotorControl2(
                 self.id,
@@ -172,6 +199,7 @@ class Arm:
                 targetPosition=target_m,
                 force=self._config.grip_force_N,
                 maxVelocity=speed_m_s,
+                positionGain=gain,
                 physicsClientId=self._client,
             )
 
@@ -246,3 +274,7 @@ class Arm:
             pybullet.WORLD_FRAME,
             physicsClientId=self._client,
         )
+
+
+def _numbers(joints: Joints) -> list[float]:
+    return joints if isinstance(joints, list) else joints.tolist()

@@ -16,10 +16,11 @@ from jaxtyping import Float, Float32
 from bridge.geometry import se3
 from bridge.task.robot import BASE_FRAME
 from twin.physics.anchors import FrictionAnchors
-from twin.physics.arm import Arm, PhysicsError
+from twin.physics.arm import Arm, Joints, PhysicsError
 from twin.physics.config import PhysicsConfig
 from twin.physics.description import Hulls
 from twin.physics.engine import pybullet
+from twin.physics.press import Press
 from twin.physics.soft import SoftHealth, SoftModel
 from twin.physics.soft_world import SoftWorld
 
@@ -60,6 +61,7 @@ class World:
         except PhysicsError:
             self.close()
             raise
+        self._press = Press(self._arm)
         self._soft = SoftWorld(self._client, self._arm, urdf, mesh_hulls_m, config)
 
     def add_static(self, boxes: Sequence[Box], T_base_owner: Float[np.ndarray, "4 4"]) -> list[int]:
@@ -148,19 +150,16 @@ class World:
         self._arm.reset(joints_rad, width_m)
         self._soft.place_links()
 
-    def command(
-        self,
-        joints_rad: Float[np.ndarray, " num_joints"],
-        velocity_rad_s: Float[np.ndarray, " num_joints"],
-        width_m: float,
-    ) -> None:
+    def command(self, joints_rad: Joints, velocity_rad_s: Joints, width_m: float) -> None:
         """Set the position targets that the motors follow from the next step on."""
         self._arm.command(joints_rad, velocity_rad_s, width_m)
 
     def step(self) -> None:
         """Advance rigid and soft bodies by one fixed step."""
         self._soft.push_rigid()
-        self._anchors.refresh()
+        anew = self._anchors.refresh()
+        if not self._soft.names:  # soft bodies slow the fingers down themselves
+            self._press.update(anew=anew)
         pybullet.stepSimulation(physicsClientId=self._client)
         self._soft.step()
 
@@ -203,11 +202,12 @@ class World:
         """Whether a finger is in contact with an object that moves."""
         if object_id in self._soft.names:
             return self._soft.finger_touches(object_id)
-        fingers = self._arm.finger_links
+        body = self._free(object_id)
         return any(
-            point[8] <= 0.0 and point[3] in fingers
+            point[8] <= 0.0
+            for link in self._arm.finger_links
             for point in pybullet.getContactPoints(
-                self._arm.id, self._free(object_id), physicsClientId=self._client
+                self._arm.id, body, linkIndexA=link, physicsClientId=self._client
             )
         )
 

@@ -60,16 +60,17 @@ def simulate(
     # Whole samples, so that the last one lies at the end of settling.
     total = -(-(moving_steps + round(config.settle_after_s * rate)) // stride) * stride
     times_ns = (np.arange(total + 1) * (1e9 / rate)).round().astype(np.int64)
-    targets = path.joints_at(times_ns)
-    velocities = np.diff(targets, axis=0) * rate
+    postures = path.joints_at(times_ns)
+    targets = postures.tolist()
+    velocities = (np.diff(postures, axis=0) * rate).tolist()
     widths = path.width_at(times_ns).tolist()
     stamps = times_ns.tolist()
     soft = soft_models(scene)
     samples = _Samples(scene, soft)
     with World(hulls.robot.urdf, _mesh_hulls(hulls), config.physics) as world:
         furnish(world, scene, soft)
-        world.reset_robot(targets[0], widths[0])
-        world.command(targets[0], np.zeros(targets.shape[1]), widths[0])
+        world.reset_robot(postures[0], widths[0])
+        world.command(targets[0], [0.0] * len(targets[0]), widths[0])
         for _ in range(round(config.settle_before_s * rate)):
             world.step()
         samples.take(world, 0)

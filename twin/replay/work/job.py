@@ -19,7 +19,7 @@ from twin.replay.failure import NOT_EVALUATED
 from twin.replay.place.starts import StartState
 from twin.replay.verdict.rollout import KINEMATIC_ENGINE, engine_of
 
-REPLAY_VERSION = 17
+REPLAY_VERSION = 18
 """Raise it when the same inputs give another replay, so that old files are redone."""
 
 MAY_STAY_OPEN = ("settled", "shape")

@@ -1,0 +1,106 @@
+"""Stalled fingers: their whole force, and the usual speed as soon as they are free."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bridge.task.robot import FINGER_JOINTS, ur5_with_gripper_urdf
+from twin.physics import press
+from twin.physics.config import PhysicsConfig
+from twin.physics.engine import pybullet
+from twin.physics.world import World
+from twin.robot.description import with_absolute_meshes
+
+HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
+SIZE = np.array([0.04, 0.04, 0.04])
+STILL = np.zeros(6)
+STRONG = PhysicsConfig(grip_force_N=30.0)
+OPEN_M, CLOSED_M = 0.06, 0.0
+
+
+@pytest.fixture(scope="module")
+def urdf() -> str:
+    return with_absolute_meshes(ur5_with_gripper_urdf())
+
+
+def fingers(world: World) -> np.ndarray:
+    """Speed [m/s] and force [N] of each finger."""
+    names = {
+        pybullet.getJointInfo(world.robot_id, index, physicsClientId=world.client)[1].decode(): (
+            index
+        )
+        for index in range(pybullet.getNumJoints(world.robot_id, physicsClientId=world.client))
+    }
+    states = pybullet.getJointStates(
+        world.robot_id, [names[name] for name in FINGER_JOINTS], physicsClientId=world.client
+    )
+    return np.array([[state[1], state[3]] for state in states])
+
+
+def run(world: World, steps: int, width_m: float) -> np.ndarray:
+    """Step, and return the speeds and forces on the way."""
+    rows = []
+    for _ in range(steps):
+        world.command(HOME, STILL, width_m)
+        world.step()
+        rows.append(fingers(world))
+    return np.array(rows)
+
+
+def holding(world: World) -> np.ndarray:
+    """Close on a cube that floats between the fingers."""
+    pybullet.setGravity(0, 0, 0, physicsClientId=world.client)
+    world.reset_robot(HOME, OPEN_M)
+    world.add_free("cube", SIZE, 0.05, world.T_base_link("tcp"))
+    run(world, 10, OPEN_M)
+    return run(world, 120, CLOSED_M)
+
+
+def test_the_whole_force_is_there_after_a_few_iterations(
+    urdf: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = replace(STRONG, solver_iterations=20)
+    with World(urdf, {}, few) as world:
+        np.testing.assert_allclose(np.abs(holding(world)[-20:, :, 1]), 30.0, rtol=1e-6)
+    monkeypatch.setattr(press, "PATIENCE", 10**9)
+    with World(urdf, {}, few) as world:
+        assert np.abs(holding(world)[-20:, :, 1]).max() < 20.0, "at the usual speed it is not"
+
+
+def test_fingers_that_hold_something_stand_still(urdf: str) -> None:
+    with World(urdf, {}, STRONG) as world:
+        assert np.abs(holding(world)[-20:, :, 0]).max() < 1e-3
+        assert world.width_m() == pytest.approx(0.04, abs=3e-4)
+
+
+def test_fingers_keep_their_speed_until_they_meet_something(urdf: str) -> None:
+    with World(urdf, {}, STRONG) as world:
+        world.reset_robot(HOME, OPEN_M)
+        run(world, 10, OPEN_M)
+        speeds = np.abs(run(world, 60, CLOSED_M)[:, :, 0])
+        assert speeds.max() < 1.05 * STRONG.finger_speed_m_s
+        assert speeds[:40].max() > 0.95 * STRONG.finger_speed_m_s
+
+
+def test_fingers_whose_cube_is_gone_are_slow_again_after_a_few_steps(urdf: str) -> None:
+    with World(urdf, {}, STRONG) as world:
+        holding(world)
+        width_m = world.width_m()
+        pybullet.resetBasePositionAndOrientation(
+            world.free_ids["cube"], [2.0, 0.0, 1.0], [0, 0, 0, 1], physicsClientId=world.client
+        )
+        speeds = np.abs(run(world, 12, CLOSED_M)[:, :, 0])
+        free_m_s = 1.05 * STRONG.finger_speed_m_s
+        assert (speeds.max(axis=1) > free_m_s).sum() <= press.EVERY_STEPS
+        usual_m = 2 * STRONG.finger_speed_m_s * 12 / STRONG.rate_hz
+        farthest_m = 2 * press.EVERY_STEPS * press.PRESS_M_S / STRONG.rate_hz
+        assert world.width_m() > width_m - usual_m - farthest_m - 1e-3
+
+
+def test_fingers_that_open_are_as_fast_as_ever(urdf: str) -> None:
+    with World(urdf, {}, STRONG) as world:
+        holding(world)
+        speeds = np.abs(run(world, 30, OPEN_M)[:, :, 0])
+        assert speeds.max() < 1.05 * STRONG.finger_speed_m_s
+        assert world.width_m() > 0.05
