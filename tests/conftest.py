@@ -25,14 +25,17 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 LONG_FILES = (
     "test_demo.py",
     "test_real_input.py",
-    "test_endurance.py",
     "test_killed_recorders.py",
-    "test_standin_session.py",
-    "test_stalled_recorder.py",
+    "test_endurance.py",
+    "test_reconstruct.py",
+    "test_report_in_a_browser.py",
+    "test_stopped_and_shared.py",
+    "test_harnesses.py",
     "test_writer_killed.py",
+    "test_standin_session.py",
 )
-"""Files of half a minute or more. Workers take whole files in this order: one that came last would
-leave the other worker idle."""
+"""Files of about twenty seconds or more. Workers take whole files in this order: one that came
+last would leave the other worker idle."""
 
 
 @pytest.fixture

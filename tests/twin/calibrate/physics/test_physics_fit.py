@@ -30,6 +30,8 @@ ALL = tuple(
 PROBES = ("push", "slide", "squeeze") * 4
 QUICK = FitConfig(evaluations=40)
 
+pytestmark = pytest.mark.usefixtures("unchecked")  # the first fit, made for all, is checked
+
 
 def truth(**values: float) -> np.ndarray:
     return np.array([item.units(values.get(item.name, item.nominal)) for item in ALL])
@@ -123,7 +125,6 @@ def test_parameters_go_to_units_of_the_prior_and_back() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("unchecked")
 def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
     some = tuple(item for item in EVERY if item.name in (SURFACE_FRICTION, "bias_x_m", "bias_y_m"))
     rng = np.random.default_rng(5)
