@@ -53,11 +53,15 @@ def quickest_ls(run: RunFolder, *arguments: str) -> tuple[float, list[str]]:
 def test_thousands_of_episodes_are_listed_in_under_a_second(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path / "run")
     fill(run, NUM_EPISODES)
-    time.sleep(2.1)  # younger files are not trusted to stay as they are
+    long_ago_ns = time.time_ns() - 10**11  # young files are not trusted to stay as they are
+    for path in run.episodes():
+        os.utime(path, ns=(long_ago_ns, long_ago_ns))
     assert len(list_episodes(run)) == NUM_EPISODES
     wall_s, lines = quickest_ls(run, "--task", "cube", "--sort", "start", "--reverse", "--limit=9")
     assert (len(lines), lines[0].split()[0]) == (9, f"t{NUM_EPISODES - 1:05}")
-    assert wall_s < 1.0
+    empty_s, _ = quickest_ls(RunFolder.create(tmp_path / "empty"))
+    print(f"{NUM_EPISODES} episodes listed in {wall_s:.2f} s, none in {empty_s:.2f} s")
+    assert wall_s - empty_s < 0.7  # starting takes 0.3 s here, and far longer on a busy machine
     (run.episodes_dir / "t00500.mcap").unlink()
     wall_s, lines = quickest_ls(run)
     assert len(lines) == NUM_EPISODES - 1

@@ -238,11 +238,18 @@ def test_rerun_reads_the_dataset_as_lerobots(dataset: Path, tmp_path: Path) -> N
     import time
 
     pytest.importorskip("rerun")
-    script = (
-        "import rerun as rr, sys, time\n"
-        "rr.init('x'); rr.save(sys.argv[2]); rr.log_file_from_path(sys.argv[1]); time.sleep(4)\n"
-        "rr.disconnect()\n"
-    )
+    script = """
+import os, sys, time
+import rerun as rr
+rr.init("x")
+rr.save(sys.argv[2])
+rr.log_file_from_path(sys.argv[1])  # reads on a thread of its own, and does not say when it is done
+sizes, end_s = [], time.monotonic() + 60
+while time.monotonic() < end_s and (len(sizes) < 20 or sizes[-20] < sizes[-1] or sizes[-1] < 2000):
+    time.sleep(0.1)
+    sizes.append(os.path.getsize(sys.argv[2]))
+rr.disconnect()
+"""
     out = tmp_path / "x.rrd"
     command = [sys.executable, "-c", script, str(dataset), str(out)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
