@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import lean_checks
 import numpy as np
 import pytest
 
@@ -92,7 +93,7 @@ def with_formulas(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("with_formulas")
+@pytest.mark.usefixtures("with_formulas", "unchecked")
 def test_what_was_found_is_kept_in_the_scene_as_replays_read_it_and_told_in_a_table(
     run: RunFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -168,7 +169,7 @@ def probed(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
     run = RunFolder.create(tmp_path_factory.mktemp("probed"))
     config = SessionConfig(seed=9001, trials=0, probes=1, rate_hz=0.0, scan=False)
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, lean_checks.unchecked():
         patch.setattr(operator, "PROBES", ("squeeze",))
         run_session(FileSession(run.episodes_dir), config, Output(quiet=True), start_ns=START_NS)
     return run

@@ -82,6 +82,7 @@ def test_a_depth_scale_error_moves_the_cube_by_less_than_3_mm(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
 def test_the_covariance_covers_errors_of_the_cameras(stage: Callable[..., Any], task: Task) -> None:
     """Over drawn camera errors, squared errors are on average what the covariance says."""
     scene, ratios = stage(POSES), []
