@@ -151,7 +151,9 @@ class ClearanceMonitor:
             (travel for travel in objects_m.values() if travel <= MAX_LEAP_M), default=0.0
         )
         eps = self.config.eps_col_m
-        if farthest > _FINE_TRAVEL_M and a.cut_m + b.cut_m - farthest < 2 * eps:
+        if farthest <= _FINE_TRAVEL_M:
+            return False  # objects that leapt are nobody's way
+        if a.cut_m + b.cut_m - farthest < 2 * eps:
             return True
         for pair in a.distances.keys() | b.distances.keys():
             body, piece, other, _ = pair

@@ -42,6 +42,9 @@ class _Pairing:
     names: list[Pair]
     bodies: list[tuple[int, int]]
     """Two of the links, the objects and what stands, in this order."""
+    shapes: list[coal.CollisionGeometry]
+    placements: list[coal.Transform3s | None]
+    """Of what stands; None where something may move."""
 
 
 class Surroundings:
@@ -71,7 +74,6 @@ class Surroundings:
             )
             self._half_m = np.stack([extents / 2 for _, _, (_, extents) in self._panels])
         self.standing = standing_bodies(self._panels, scene.table_height_m)
-        self._placements = [placement_of(item.T) for item in self.standing]
         self._pairings: dict[tuple[tuple[str, ...], tuple[str, ...]], _Pairing] = {}
         standing, foot = standing_links(hulls)
         self._mobile = [i for i, hull in enumerate(hulls.hulls) if hull.link not in standing]
@@ -124,20 +126,15 @@ class Surroundings:
         best = min(
             (d for (body, _, other, _), d in found.items() if counts(body, other)), default=np.inf
         )
-        objects = list(Ts_base_object.items())
-        placements: dict[int, coal.Transform3s] = {}
+        first = num_links + len(Ts_base_object)
+        shapes, placements = pairing.shapes, list(pairing.placements)
 
-        def placed(index: int) -> tuple[coal.CollisionGeometry, coal.Transform3s]:
+        def placed(index: int) -> coal.Transform3s:
             if index < num_links:
-                return self.links[index].shape, links.placement(index)
-            index -= num_links
-            if index >= len(objects):
-                index -= len(objects)
-                return self.standing[index].solid.shape, self._placements[index]
-            name, T = objects[index]
-            if index not in placements:
-                placements[index] = placement_of(T)
-            return self.objects[name].shape, placements[index]
+                return links.placement(index)
+            if index < first and placements[index] is None:
+                placements[index] = coal.Transform3s(near.R[index], near.t[index])
+            return placements[index]
 
         # Nearest bounds first: most pairs are then skipped, and the minimum stays exact.
         for bound, number in near.nearest_first():
@@ -145,7 +142,7 @@ class Surroundings:
                 return found, max(best, near_m)
             one, other = pairing.bodies[number]
             pair = pairing.names[number]
-            distance = signed_distance(*placed(one), *placed(other))
+            distance = signed_distance(shapes[one], placed(one), shapes[other], placed(other))
             found[pair] = distance
             if distance < best and counts(pair[0], pair[2]):
                 best = distance
@@ -178,7 +175,13 @@ class Surroundings:
         near = NearPairs(solids, bodies)
         for index, item in enumerate(self.standing, start=first):
             near.R[index], near.t[index] = item.T[:3, :3], item.T[:3, 3]
-        pairing = _Pairing(near=near, names=names, bodies=bodies)
+        pairing = _Pairing(
+            near=near,
+            names=names,
+            bodies=bodies,
+            shapes=[solid.shape for solid in solids],
+            placements=[None] * first + [placement_of(item.T) for item in self.standing],
+        )
         self._pairings[known, moved] = pairing
         return pairing
 

@@ -3,8 +3,9 @@
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Int
@@ -26,8 +27,7 @@ NODES_PERIOD_NS = 33_000_000
 """Nodes of soft bodies are written at most this often: 30 Hz, about a camera's rate."""
 
 
-@dataclass(frozen=True)
-class _Message:
+class _Message(NamedTuple):
     stamp_ns: int
     topic: str
     type_name: str
@@ -66,7 +66,7 @@ def write_replay(path: Path, result: ReplayResult, plan: Plan, origin: ReplayOri
     messages = [*_messages(result, plan, origin), *_events(result, plan, origin)]
     with EpisodeWriter(path) as writer:
         writer.describe(origin.info, derived=origin.derived)
-        for message in sorted(messages, key=lambda message: message.stamp_ns):
+        for message in sorted(messages, key=itemgetter(0)):
             writer.write(
                 message.topic,
                 message.data,
