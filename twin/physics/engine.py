@@ -19,5 +19,27 @@ def _import_quietly() -> ModuleType:
 
 pybullet = _import_quietly()
 
+_IDLE: list[int] = []
+"""Clients that no world uses. To make one costs 4 to 15 ms, to empty one 2, and the bits are the
+same (a test)."""
+
+
+def take_client() -> int:
+    """Return the number of a client without anything in it, with the engine's own settings."""
+    if not _IDLE:
+        return int(pybullet.connect(pybullet.DIRECT))
+    client = _IDLE.pop()
+    pybullet.resetSimulation(physicsClientId=client)
+    return client
+
+
+def give_client_back(client: int) -> None:
+    """Let another world have a client; of several that nobody uses, one is kept."""
+    if _IDLE:
+        pybullet.disconnect(physicsClientId=client)
+    else:
+        _IDLE.append(client)
+
+
 ENGINE = "pybullet"
 ENGINE_VERSION = f"{ENGINE}-{pybullet.getAPIVersion()}"

@@ -1,7 +1,7 @@
 """One simulated cell: the robot and boxes in PyBullet, soft bodies beside them on one clock.
 
 Measured choices (design page on physics): ``deterministicOverlappingPairs`` always on, 240 Hz with
-75 solver iterations and anchored friction (slip p90 0.7 mm, 24 of 24 grasps held), a gear of ratio
+75 solver iterations and anchored friction (slip p90 0.5 mm, 24 of 24 grasps held), a gear of ratio
 -1 between the fingers, whose axes point outward (+1 lets them shear and the grasp fails). No
 spinning friction: a patch is its corner points, which resist turning more than a patch does. The
 same bits on every run.
@@ -19,7 +19,7 @@ from twin.physics.anchors import FrictionAnchors
 from twin.physics.arm import Arm, Joints, PhysicsError
 from twin.physics.config import PhysicsConfig
 from twin.physics.description import Hulls
-from twin.physics.engine import pybullet
+from twin.physics.engine import give_client_back, pybullet, take_client
 from twin.physics.press import Press
 from twin.physics.soft import SoftHealth, SoftModel
 from twin.physics.soft_world import SoftWorld
@@ -43,7 +43,7 @@ class World:
             PhysicsError: When PyBullet does not load the description or joints are missing.
         """
         self.config = config
-        self._client = int(pybullet.connect(pybullet.DIRECT))
+        self._client = take_client()
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=1.0 / config.rate_hz,
             numSolverIterations=config.solver_iterations,
@@ -250,7 +250,7 @@ class World:
     def close(self) -> None:
         """Give the client back; a second call does nothing."""
         if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
+            give_client_back(self._client)
             self._client = -1
 
     def __enter__(self) -> "World":

@@ -7,8 +7,10 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.task.robot import ur5_with_gripper_urdf
+from twin.physics import engine
 from twin.physics.arm import Arm
 from twin.physics.config import PhysicsConfig
+from twin.physics.engine import pybullet
 from twin.physics.world import PhysicsError, World
 from twin.robot.description import with_absolute_meshes
 
@@ -49,6 +51,42 @@ def test_a_dropped_cube_comes_to_rest_on_the_table(urdf: str) -> None:
 
 def test_every_run_gives_the_same_bits(urdf: str) -> None:
     assert dropped(urdf, 60)[1] == dropped(urdf, 60)[1]
+
+
+def test_what_a_world_before_was_told_changes_nothing(urdf: str) -> None:
+    """Clients are used again: settings, bodies and constraints of one world end with it.
+
+    But for the contact breaking threshold, which PyBullet keeps for the whole process.
+    """
+    while engine._IDLE:
+        pybullet.disconnect(physicsClientId=engine._IDLE.pop())
+    first = dropped(urdf, 60)[1]
+    odd = PhysicsConfig(rate_hz=480, solver_iterations=7, solver_residual=1e-2, gravity_m_s2=1.0)
+    with World(urdf, {}, odd) as world:
+        client = world.client
+        pybullet.setPhysicsEngineParameter(
+            enableConeFriction=0,
+            erp=0.9,
+            contactERP=0.9,
+            frictionERP=0.9,
+            numSubSteps=3,
+            reportSolverAnalytics=1,
+            physicsClientId=client,
+        )
+        world.add_free("left", SIZE, 0.05, at(0.5, 0.0, 0.3))
+        for _ in range(20):
+            world.step()
+    with World(urdf, {}, PhysicsConfig()) as world:
+        assert world.client == client, "this is about one client"
+    assert dropped(urdf, 60)[1] == first
+
+
+def test_two_worlds_at_once_are_apart(urdf: str) -> None:
+    with World(urdf, {}, PhysicsConfig()) as one, World(urdf, {}, PhysicsConfig()) as other:
+        assert one.client != other.client
+        one.add_free("cube", SIZE, 0.05, at(0.5, 0.0, 0.3))
+        assert not other.free_ids
+    assert len(engine._IDLE) == 1
 
 
 def test_orders_given_once_do_what_repeated_ones_do(
