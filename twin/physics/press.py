@@ -4,7 +4,7 @@ The solver begins each step with fingers that press by nothing, and each of its 
 stops a finger at the speed it is driven with. At the usual speed 20 N take 45 iterations; all else
 takes 10. Fingers that stand still although they are told to close are therefore driven faster.
 Their force is the same. What they hold may give way: then they are at the usual speed again before
-they have gone far. docs/decisions/0048-stalled-fingers.md.
+they have gone far. docs/decisions/0049-stalled-fingers.md.
 """
 
 from twin.physics.arm import Arm
