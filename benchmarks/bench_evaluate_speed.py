@@ -1,7 +1,7 @@
 """``robot-gst evaluate`` over 10,000 episodes with two replays each: cold, warm, and ten new ones.
 
-The run is written once under ``build/`` and kept. Files are read before they are timed, so "cold" is
-about the evaluator's own cache, not the disk's.
+The run is written once under ``build/`` and kept. Files are read before they are timed, so "cold"
+is about the evaluator's own cache, not the disk's.
 """
 
 import json
