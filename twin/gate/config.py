@@ -54,15 +54,20 @@ class GateConfig:
 
     def __post_init__(self) -> None:
         """Refuse numbers with which no gate can work."""
-        most = float("inf")
+        day_s = 86_400
         refuse_outside(
             self,
             {
-                "deadline_s": (0, most),
+                "deadline_s": (0, day_s),
                 "waiting": (0, 1000),
                 "samples": (0, 100_000),
                 "min_p_success": (0, 1),
                 "frames": (1, 100),
+                "frame_wait_s": (0, day_s),
+                "max_frame_age_s": (0, day_s),
+                "max_silence_s": (0, day_s),
+                "moved_m": (0, 10),
+                "moved_rad": (0, 10),
             },
         )
         if self.min_p_success > 0 and self.samples == 0:

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from bridge.errors import refuse_outside
+
 
 @dataclass(frozen=True, kw_only=True)
 class PhysicsConfig:
@@ -31,3 +33,23 @@ class PhysicsConfig:
     """Substeps of soft bodies within each physics step; 10 are 2400 a second."""
     soft_stiffness_scale: float = 1.0
     """Factor on Young's modulus of all soft bodies."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no physics; samples draw from wide priors, so the limits are wide too."""
+        least, most = 1e-6, 1e6
+        refuse_outside(
+            self,
+            {
+                "rate_hz": (1, 100_000),
+                "solver_iterations": (1, 100_000),
+                "solver_residual": (0, 1),
+                "grip_force_N": (least, most),
+                "finger_speed_m_s": (least, 100),
+                "object_friction": (0, most),
+                "finger_friction": (0, most),
+                "surface_friction": (0, most),
+                "gravity_m_s2": (0, 1000),
+                "soft_substeps": (1, 10_000),
+                "soft_stiffness_scale": (least, most),
+            },
+        )

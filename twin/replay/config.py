@@ -1,5 +1,6 @@
 """Settings of a replay; imports nothing heavy."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -12,6 +13,24 @@ from twin.robot.config import IkConfig
 
 Mode = Literal["kinematic", "dynamic"]
 Grasp = Literal["friction", "attach"]
+
+RANGES: Mapping[str, tuple[float, float]] = {
+    "start_overlap_m": (0, 1),
+    "eps_col_m": (0, 1),
+    "max_contact_depth_m": (0, 1),
+    "pre_grasp_depth_m": (0, 1),
+    "pre_grasp_soft_depth_m": (0, 1),
+    "max_slip_m": (0, 10),
+    "moved_m": (0, 1),
+    "path_step_s": (1e-3, 10),
+    "max_joint_step_rad": (0, 10),
+    "settle_before_s": (0, 60),
+    "settle_after_s": (0, 60),
+    "squeeze_m": (0, 0.1),
+    "grip_delay_s": (0, 60),
+    "samples": (0, 100_000),
+}
+"""Of the numbers of a replay, ends included."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +47,11 @@ class PartingConfig:
     """Position of an object; the recorded one is localised to a few millimetres [m]."""
     contact_s: float = 0.25
     """When fingers begin or cease to touch an object [s]."""
+
+    def __post_init__(self) -> None:
+        """Refuse limits that are none."""
+        names = ("tool_m", "tool_rad", "width_m", "object_m", "contact_s")
+        refuse_outside(self, dict.fromkeys(names, (0, 1000)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +110,8 @@ class ReplayConfig:
     """Nominal physics."""
 
     def __post_init__(self) -> None:
-        """Refuse rates that do not fit together."""
+        """Refuse numbers beyond which no comparison would fail, and rates that do not fit."""
+        refuse_outside(self, RANGES)
         if self.sample_rate_hz < 1 or self.physics.rate_hz % self.sample_rate_hz:
             message = (
                 f"sample_rate_hz {self.sample_rate_hz} does not divide the physics rate "

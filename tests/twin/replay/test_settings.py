@@ -1,0 +1,52 @@
+"""Settings of replays, gate and physics: no number may make every comparison come out well."""
+
+import math
+from dataclasses import fields
+from typing import Any
+
+import pytest
+
+from bridge.errors import OptionError
+from twin.gate.config import GateConfig
+from twin.physics.config import PhysicsConfig
+from twin.replay.config import PartingConfig, ReplayConfig
+from twin.replay.variation import VariationConfig
+from twin.robot.config import IkConfig
+
+CONFIGS = (GateConfig, ReplayConfig, PartingConfig, VariationConfig, PhysicsConfig, IkConfig)
+NUMBERS = [
+    (config, item.name)
+    for config in CONFIGS
+    for item in fields(config)
+    if item.type in (float, float | None) or isinstance(item.default, float)
+]
+
+
+def made(config: Any, name: str, value: float) -> Any:
+    return config(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("config", "name"), NUMBERS, ids=lambda item: getattr(item, "__name__", item)
+)
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1.0])
+def test_what_is_no_number_or_less_than_nothing_is_refused_by_its_name(
+    config: Any, name: str, value: float
+) -> None:
+    """A distance is never below NaN: with it as a limit everything would be accepted."""
+    with pytest.raises(OptionError, match=f"--{name.replace('_', '-')} "):
+        made(config, name, value)
+
+
+def test_there_are_numbers_to_try_in_every_settings_record() -> None:
+    assert {config for config, _ in NUMBERS} == set(CONFIGS)
+    assert len(NUMBERS) > 40
+
+
+def test_a_rate_or_a_force_of_nothing_is_refused() -> None:
+    for name in ("rate_hz", "solver_iterations"):
+        with pytest.raises(OptionError, match="makes no sense"):
+            made(PhysicsConfig, name, 0)
+    for name in ("grip_force_N", "finger_speed_m_s"):
+        with pytest.raises(OptionError, match="makes no sense"):
+            made(PhysicsConfig, name, 0.0)
