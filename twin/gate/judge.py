@@ -29,6 +29,20 @@ ANSWER_S = 0.1
 """Kept back from the deadline for answering."""
 LOOK_AGAIN = 1.5
 """Times the first localisation, kept back for looking again before a yes."""
+MAX_PLAN_BYTES = 32_000_000
+"""Ten minutes of waypoints with joints at 125 Hz take less."""
+
+
+class PlanTooLargeError(TwinError):
+    """A payload is too large to be read before the deadline."""
+
+    def __init__(self, *, num_bytes: int) -> None:
+        """Remember the size."""
+        self.num_bytes = num_bytes
+        super().__init__(
+            f"a payload of {num_bytes / 1e6:.0f} MB is not read as a plan; at most "
+            f"{MAX_PLAN_BYTES / 1e6:.0f} MB are. Send fewer waypoints, or split the plan."
+        )
 
 
 class UndecidedError(TwinError):
@@ -87,27 +101,33 @@ class Gate:
         self._contact_ns = 0
 
     def judge(self, payload: bytes) -> Verdict:
-        """Judge one plan.
+        """Judge one plan; the deadline counts from here, reading it included.
 
         Raises:
-            InvalidRecordError: When the payload is no gst plan; nothing else is an error.
+            InvalidRecordError: When the payload is no gst plan.
+            PlanTooLargeError: When it is too large to be looked at; nothing else is an error.
         """
+        ends_s = time.monotonic() + self._config.deadline_s
+        if len(payload) > MAX_PLAN_BYTES:
+            raise PlanTooLargeError(num_bytes=len(payload))
         plan = Plan.from_json(payload)
         with self._counting:
             if self._inside > self._config.waiting:
                 return no_verdict(plan, f"{self._inside} plans are being judged already; ask later")
             self._inside += 1
         try:
-            return self._before_deadline(plan)
+            return self._before_deadline(plan, ends_s)
         finally:
             with self._counting:
                 self._inside -= 1
 
-    def _before_deadline(self, plan: Plan) -> Verdict:
-        ends_s = time.monotonic() + self._config.deadline_s
+    def _before_deadline(self, plan: Plan, ends_s: float) -> Verdict:
         limit = f"the deadline of {self._config.deadline_s:g} s"
-        if not self._turn.acquire(timeout=self._config.deadline_s):
+        if not self._turn.acquire(timeout=max(0.0, ends_s - time.monotonic())):
             return no_verdict(plan, f"an earlier plan was still being judged at {limit}")
+        if time.monotonic() >= ends_s:
+            self._turn.release()
+            return no_verdict(plan, f"it had only just been read at {limit}")
         answers: queue.SimpleQueue[Verdict] = queue.SimpleQueue()
 
         def work() -> None:

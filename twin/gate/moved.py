@@ -36,9 +36,8 @@ def who_moved(
         shift_m = float(np.linalg.norm(new.T_base_object[:3, 3] - old.T_base_object[:3, 3]))
         turn_rad = turn_between(old.T_base_object, new.T_base_object, task.objects[name])
         sigma_m, sigma_rad = _sigmas(old)
-        if shift_m > max(moved_m, SIGMAS * sigma_m) or turn_rad > max(
-            moved_rad, SIGMAS * sigma_rad
-        ):
+        near = shift_m <= max(moved_m, SIGMAS * sigma_m)
+        if not (near and turn_rad <= max(moved_rad, SIGMAS * sigma_rad)):  # also what is no number
             told.append(f"{name} by {shift_m * 1e3:.0f} mm and {np.degrees(turn_rad):.0f} degrees")
     return told
 

@@ -10,7 +10,7 @@ from typing import Any
 from bridge.episode import schema
 from bridge.episode.run import RunFolder
 from bridge.task.task_file import load_task
-from bridge.terminal import Output, stop_signals
+from bridge.terminal import Output, printable, stop_signals
 from bridge.wire.config import WireConfig
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
@@ -56,7 +56,7 @@ def serve_gate(session: Any, gate: Gate, eyes: Eyes, config: GateConfig, output:
         p = verdict.p_success
         share = f" {p['k']:g} of {p['n']:g} samples succeed." if p else ""
         text = f"{verdict.plan_id}: {SAID[verdict.accepted]} in {seconds:.1f} s.{share}"
-        output.say(f"{text} {verdict.reason or ''}".rstrip())
+        output.say(printable(f"{text} {verdict.reason or ''}".rstrip()))
         return data
 
     # One is judged, some wait, and one more is told at once that it may not: all heard at once,
@@ -74,6 +74,24 @@ def watch_cell(session: Any, cell: str, take: Callable[[str, bytes, int, str], N
         session.subscribe(key, on_sample)
 
 
+def be_the_only_one(session: Any, cell: str) -> None:
+    """Let other gates of this cell see that there is one.
+
+    Whoever asks takes the first answer that comes, and of two gates one may know another task or
+    an older scene.
+
+    Raises:
+        GateError: When there is one already.
+    """
+    key = f"{cell}/gate/alive"
+    if session.query_alive(key):
+        raise GateError(
+            f"a gate answers on {cell}/gate/verdict already, and of two only one would be heard. "
+            "Stop it first; one whose machine is gone is forgotten after ten seconds."
+        )
+    session.declare_alive(key)
+
+
 def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     """Judge plans until SIGINT or SIGTERM; both end with exit code 0."""
     from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
@@ -89,6 +107,7 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
         open_session(wire) as session,
         TwinProcess(run.path, task, config, output) as twin,
     ):
+        be_the_only_one(session, config.cell)
         watch_cell(session, config.cell, eyes.take)
         gate = make_gate(config, eyes, session.now_ns, twin)
         serve_gate(session, gate, eyes, config, output)

@@ -22,7 +22,7 @@ from bridge.terminal import Output, stop_signals
 from bridge.wire.errors import WireConfigError
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
-from twin.gate.judge import Gate, no_verdict, robot_name
+from twin.gate.judge import Gate, PlanTooLargeError, no_verdict, robot_name
 from twin.gate.service import GateError, run_gate, serve_gate, watch_cell
 
 TASK = load_task("cube_into_box")
@@ -213,6 +213,26 @@ def test_a_plan_of_a_newer_version_is_an_error() -> None:
         gate_with().judge(json.dumps(record).encode())
 
 
+def test_a_payload_that_is_too_large_is_not_even_read() -> None:
+    """A hundred megabytes of JSON would keep all other answers waiting while they are parsed."""
+    payload = b" " * (100 * 10**6)
+    started = time.monotonic()
+    with pytest.raises(PlanTooLargeError, match=r"100 MB is not read as a plan; at most 32 MB are"):
+        gate_with().judge(payload)
+    assert time.monotonic() - started < 0.5
+
+
+def test_reading_a_plan_counts_towards_its_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slowly(payload: bytes) -> Plan:
+        time.sleep(0.3)
+        return PLAN
+
+    monkeypatch.setattr(Plan, "from_json", staticmethod(slowly))
+    verdict = gate_with(deadline_s=0.2).judge(b"a plan")
+    assert verdict.accepted is None
+    assert "at the deadline of 0.2 s" in str(verdict.reason)
+
+
 def test_a_replay_past_the_deadline_is_null_and_the_next_plan_waits_for_its_turn() -> None:
     go_on = threading.Event()
 
@@ -327,6 +347,17 @@ def test_the_service_answers_and_publishes_with_the_cells_own_time() -> None:
     answer = session.services["standin/gate/verdict"](PLAN.to_json())
     assert Verdict.from_json(answer).accepted is True
     assert session.published == [("/standin/verdict", answer, 42)]
+
+
+def test_an_id_from_the_network_does_not_move_the_cursor(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    session, plan = FakeSession(), replace(PLAN, id="plan\x1b[2J\x1b[31m")
+    serve_gate(session, gate_with(), FakeEyes(), GateConfig(), Output())
+    session.services["standin/gate/verdict"](plan.to_json())
+    said = capsys.readouterr().err
+    assert "\x1b" not in said
+    assert "plan?[2J?[31m: accepted" in said
 
 
 def test_a_malformed_plan_is_not_published() -> None:

@@ -177,6 +177,14 @@ def test_what_localisation_is_not_sure_of_is_no_motion() -> None:
     assert who_moved(before, after, TASK, moved_m=0.01, moved_rad=0.3) == []
 
 
+def test_a_place_that_is_no_number_is_not_where_it_was() -> None:
+    before, after = seen(pose()), seen(pose(np.nan))
+    assert who_moved(before, after, TASK, moved_m=0.01, moved_rad=0.3)
+    turned = pose()
+    turned[0, 0] = np.nan
+    assert who_moved(before, seen(turned), TASK, moved_m=0.01, moved_rad=0.3)
+
+
 def test_a_cube_turned_by_a_quarter_did_not_turn() -> None:
     cube = TASK.objects["cube"]
     assert turn_between(pose(), pose(yaw_rad=np.pi / 2), cube) == pytest.approx(0.0, abs=1e-9)

@@ -4,7 +4,7 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -31,7 +31,7 @@ from bridge.wire.errors import RemoteError
 from bridge.wire.session import WireSession, open_session
 from twin.gate.config import GateConfig
 from twin.gate.judge import Gate
-from twin.gate.service import serve_gate, watch_cell
+from twin.gate.service import GateError, be_the_only_one, serve_gate, watch_cell
 from twin.scene.localise.live import LiveView
 
 CAMERA = Camera(width=8, height=6, fx=10.0, fy=10.0, cx=4.0, cy=3.0)
@@ -315,3 +315,24 @@ def test_a_plan_with_numbers_that_are_none_is_refused(
     assert payload != plan_for("arm")
     with pytest.raises(RemoteError, match="plan is invalid"):
         cell.query("lab/gate/verdict", payload, timeout_s=10.0)
+
+
+def test_a_second_gate_in_a_cell_is_refused_until_the_first_is_gone(
+    sessions: tuple[WireSession, WireSession],
+) -> None:
+    """Of two answers the first one counts, and one of them may come from an older scene."""
+    router, cell = sessions
+    be_the_only_one(cell, "lab")
+    _until(lambda: bool(router.query_alive("lab/gate/alive")))
+    with pytest.raises(GateError, match=r"a gate answers on lab/gate/verdict already"):
+        be_the_only_one(router, "lab")
+    be_the_only_one(router, "another_lab")
+    cell.close()
+    _until(lambda: not router.query_alive("lab/gate/alive"))
+    be_the_only_one(router, "lab")
+
+
+def _until(holds: Callable[[], bool]) -> None:
+    ends = time.monotonic() + 10
+    while not holds() and time.monotonic() < ends:
+        time.sleep(0.02)
