@@ -1,7 +1,7 @@
 """What the gate's own process does: finding objects and replaying plans."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -89,4 +89,12 @@ def answer(question: Question) -> Verdict:
         ends_s=started_s + SAMPLING * question.left_s,
         expected_s=time.monotonic() - started_s,
     )
-    return with_probability(verdict, samples)
+    return _with_remarks(with_probability(verdict, samples), place.remarks)
+
+
+def _with_remarks(verdict: Verdict, remarks: tuple[str, ...]) -> Verdict:
+    """Say what the scene could not tell; a yes that knows less than it might says so first."""
+    if not remarks:
+        return verdict
+    warnings = (*verdict.warnings, *remarks)
+    return replace(verdict, warnings=warnings, reason=verdict.reason or warnings[0])

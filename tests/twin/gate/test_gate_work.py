@@ -1,6 +1,8 @@
 """What the gate's process replays with: the run's calibration, and the force of the task."""
 
+import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from bridge.geometry import se3
 from bridge.task.plan import Plan
 from bridge.task.robot import ROBOT_NAME, ur5_with_gripper_urdf
 from bridge.task.task_file import load_task
+from bridge.task.verdict import Factor, Verdict
 from twin.gate.work import Question, answer
 from twin.replay.config import ReplayConfig
 from twin.replay.place.scene import ReplayScene
@@ -31,13 +34,20 @@ def asked(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> tuple[ReplayScene,
         raise SeenError
 
     monkeypatch.setattr(rollout, "replay_plan", replay_plan)
+    with pytest.raises(SeenError):
+        answer(question_of(run))
+    return seen[0]
+
+
+def question_of(run: RunFolder) -> Question:
+    """A plan for the sloth, which lies somewhere."""
     task = load_task("sloth_into_basket")
     lying = se3.transform_from(np.array([1.0, 0, 0, 0]), np.array([0.5, -0.1, 0.03]))
     plan = Plan(
         id="p", planner="", policy="", condition="without_replanning", robot=ROBOT_NAME,
         frame="base_link", instruction="", stages=(), tau=(),
     )  # fmt: skip
-    question = Question(
+    return Question(
         run_path=run.path,
         plan=plan,
         task=task,
@@ -47,9 +57,6 @@ def asked(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> tuple[ReplayScene,
         config=ReplayConfig(),
         left_s=1.0,
     )
-    with pytest.raises(SeenError):
-        answer(question)
-    return seen[0]
 
 
 def test_a_gate_without_a_calibration_presses_as_the_task_says(
@@ -72,3 +79,27 @@ def test_a_gate_starts_objects_where_the_calibration_says(
     assert scene.Ts_base_object["sloth"][:3, 3] == pytest.approx([0.5, -0.092, 0.03])
     assert scene.Ts_base_object["basket"][:3, 3] == pytest.approx([0.0, 0.008, 0.0])
     assert scene.calibration_id is not None
+
+
+def test_a_yes_that_knows_less_than_a_scene_could_tell_says_what_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A rebuilt scene without distances and without the toy: the task file stands in for both."""
+    run = RunFolder.create(tmp_path / "run")
+    run.scene_dir.mkdir(exist_ok=True)
+    record = {"schema_version": 1, "key": "k", "scene_hash": "abc", "background": {},
+              "sources": [], "views": []}  # fmt: skip
+    (run.scene_dir / "scene.json").write_text(json.dumps(record))
+    yes = Factor(value=True)
+    verdict = Verdict(
+        plan_id="p", trajectory="planned", mode="dynamic", ik=yes, clearance=yes, terminal=yes,
+        engine="fake", seed=0,
+    )  # fmt: skip
+    monkeypatch.setattr(rollout, "replay_plan", lambda *_: SimpleNamespace(verdict=verdict))
+    said = answer(question_of(run))
+    assert said.accepted is True
+    assert said.warnings == (
+        "sloth: shape of the task file (the scene has no lattice of it)",
+        "the scene has no sdf.npz: only the table and the containers are in the way",
+    )
+    assert said.reason == said.warnings[0]

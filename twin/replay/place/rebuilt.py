@@ -1,7 +1,8 @@
 """What a rebuilt scene adds to a task: shapes of soft bodies, distances, calibrated physics.
 
-Nothing here is needed: what the scene does not have, or has in a state that cannot be trusted, the
-task file stands in for, and the place says so in a sentence.
+Nothing here is needed: for what the scene does not have, and for lattices that cannot be trusted,
+the task file stands in, and the place says so in a sentence. Distances that are there and cannot be
+read are an error: somebody saw what stands in the way, and a yes without it would be no answer.
 """
 
 import json
@@ -27,6 +28,7 @@ from twin.scene.store.folder import read_record
 TASK_SHAPE = "shape of the task file"
 MOST_OFF = 0.25
 """A lattice of which an extent differs by more from the task's size is some other body."""
+NO_DISTANCES = "the scene has no sdf.npz: only the table and the containers are in the way"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +47,7 @@ class Place:
     correction: Correction = field(default_factory=Correction)
     """What a calibration says of localised poses and of masses; ``static_sdf`` is moved already."""
     remarks: tuple[str, ...] = ()
-    """What was there and could not be used."""
+    """What the scene does not have, or has in a state in which it is not used."""
 
     def scene(
         self,
@@ -85,6 +87,7 @@ def read_place(run: RunFolder, task: Task) -> Place:
     Raises:
         UnreadableSceneError: When ``scene.json`` cannot be understood.
         UnreadableCalibrationError: When ``calibration.json`` cannot be understood.
+        UnreadableArraysError: When ``sdf.npz`` is there and cannot be read.
     """
     sources = dict.fromkeys(task.objects, TASK_SHAPE)
     calibration = read_calibration(run)
@@ -99,10 +102,13 @@ def read_place(run: RunFolder, task: Task) -> Place:
     lattices, remarks = {}, []
     for key in task.soft_objects:
         arrays, sources[key] = _lattice(run.scene_dir / "objects" / key, task.objects[key])
-        if arrays is not None:
+        if arrays is None:
+            remarks.append(f"{key}: {sources[key]}")
+        else:
             lattices[key] = arrays
-    static, remark = _static(run.scene_dir / "sdf.npz", place.correction)
-    remarks += [remark] if remark else []
+    static = _static(run.scene_dir / "sdf.npz", place.correction)
+    if static is None:
+        remarks.append(NO_DISTANCES)
     return replace(
         place,
         scene_hash=str(record["scene_hash"]),
@@ -162,16 +168,14 @@ def _watertight(path: Path) -> bool:
     return isinstance(geometry, dict) and geometry.get("watertight") is True
 
 
-def _static(path: Path, correction: Correction) -> tuple[StaticSdf | None, str]:
-    if not path.is_file():
-        return None, "the scene has no sdf.npz: only the table and the containers are in the way"
-    try:
-        return _load_static(path, path.stat().st_mtime_ns, correction), ""
-    except UnreadableArraysError as error:
-        return None, str(error)
+def _static(path: Path, correction: Correction) -> StaticSdf | None:
+    return _load_static(path, path.stat().st_mtime_ns, correction) if path.is_file() else None
 
 
 @lru_cache(maxsize=2)
 def _load_static(path: Path, mtime_ns: int, correction: Correction) -> StaticSdf:
     """One and the same grid each time: what is derived from it is remembered by its identity."""
-    return correction.static(StaticSdf.load(path))
+    found = StaticSdf.load(path)
+    if not np.isfinite(found.observed.values_m).all():
+        raise UnreadableArraysError(path=path, found="a distance is no number")
+    return correction.static(found)

@@ -1,6 +1,6 @@
 """Replay every trajectory of a run: each plan as planned, each execution as recorded."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -8,14 +8,14 @@ from typing import Any
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
-from bridge.errors import PathNotFoundError, UsageError
+from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.task.task_file import load_task
 from bridge.terminal import Advance, Output
 from twin.replay.config import ReplayRunConfig
 from twin.replay.crew.pool import Alone, Crew, Runner
 from twin.replay.crew.worker import Failed, do
 from twin.replay.place.calibrated import calibrated, for_task
-from twin.replay.place.rebuilt import shape_hashes
+from twin.replay.place.rebuilt import read_place, shape_hashes
 from twin.replay.place.starts import localised_starts
 from twin.replay.run.prepare import Preparation, prepare, replayed_task
 from twin.replay.run.table import against_recorded, count_verdicts, executions_of, recorded_labels
@@ -40,6 +40,7 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
     scene_hash = _scene_hash(run, config, output)
     with runner_for(config) as runner:
         jobs, skipped = _all_jobs(run, scene_hash, config, runner, output)
+        _say_what_is_missing(run, jobs, output)
         if config.render:
             tasks = sorted({job.task for job in jobs})
             for remark in describe_undrawn(read_record(run) or {}, tasks):
@@ -99,11 +100,14 @@ def _all_jobs(
     jobs: list[ReplayJob] = []
     ahead = not isinstance(runner, Alone)
     relocalise = config.relocalise and not ahead
+    shapes = shape_hashes(run)
     with output.progress("localise", len(names)) as advance:
         skipped = _prepare(run, names, scene_hash, config, runner, advance) if ahead else {}
         for index, episode_id in enumerate(name for name in names if name not in skipped):
             answer = do(
-                lambda name: _jobs_of(run, name, scene_hash, config, output, relocalise=relocalise),
+                lambda name: _jobs_of(
+                    run, name, scene_hash, shapes, config, output, relocalise=relocalise
+                ),
                 episode_id,
             )
             if isinstance(answer, Failed):
@@ -158,6 +162,17 @@ def _scene_hash(run: RunFolder, config: ReplayRunConfig, output: Output) -> str 
     return scene_hash
 
 
+def _say_what_is_missing(run: RunFolder, jobs: list[ReplayJob], output: Output) -> None:
+    """Tell what the task file stands in for, once for all replays of a task."""
+    for task in sorted({job.task for job in jobs}):
+        try:
+            remarks = read_place(run, load_task(task)).remarks
+        except GstError:  # which each of its replays will say
+            continue
+        for remark in remarks:
+            output.say(f"{task}: {remark}")
+
+
 def _chosen(run: RunFolder, config: ReplayRunConfig) -> list[str]:
     there = [path.stem for path in run.episodes()]
     unknown = [name for name in config.episode if name not in there]
@@ -167,13 +182,14 @@ def _chosen(run: RunFolder, config: ReplayRunConfig) -> list[str]:
             f"There are: {', '.join(there) or 'none'}."
         )
         raise UsageError(message)
-    return list(config.episode) or there
+    return list(dict.fromkeys(config.episode)) or there
 
 
 def _jobs_of(
     run: RunFolder,
     episode_id: str,
     scene_hash: str | None,
+    shapes: Mapping[str, str],
     config: ReplayRunConfig,
     output: Output,
     *,
@@ -210,7 +226,7 @@ def _jobs_of(
             folder=run.derived_dir.resolve(),
             duration_s=plan.tau[-1].t_ns * 1e-9 if plan.tau else 0.0,
             run_path=run.path.resolve(),
-            shapes=shape_hashes(run),
+            shapes=shapes,
             calibration_id=None if calibration is None else calibration.calibration_id,
             render=config.render,
         )

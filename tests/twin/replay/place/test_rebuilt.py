@@ -14,6 +14,9 @@ from twin.physics.soft import SoftModel
 from twin.replay.place.calibrated import physics_for
 from twin.replay.place.rebuilt import TASK_SHAPE, read_place, shape_hashes
 from twin.scene.shape.lattice import Lattice
+from twin.scene.shape.npz import UnreadableArraysError
+from twin.scene.shape.sdf import SdfGrid
+from twin.scene.shape.static import StaticSdf
 from twin.scene.store.calibration import Calibration
 
 TASK = load_task("sloth_into_basket")
@@ -83,14 +86,39 @@ def test_a_lattice_of_another_size_is_another_body(run: RunFolder) -> None:
     assert "% off)" in place.shape_sources["sloth"]
 
 
-def test_damaged_files_are_passed_over_with_the_reason(run: RunFolder) -> None:
+def test_a_damaged_lattice_is_passed_over_with_the_reason(run: RunFolder) -> None:
     (run.scene_dir / "objects" / "sloth" / "soft.npz").write_bytes(b"no arrays")
-    (run.scene_dir / "sdf.npz").write_bytes(b"none either")
     place = read_place(run, TASK)
     assert not place.lattices
     assert "soft.npz" in place.shape_sources["sloth"]
-    assert any("sdf.npz" in remark for remark in place.remarks)
-    assert place.static_sdf is None
+    assert any("sloth: shape of the task file" in remark for remark in place.remarks)
+
+
+def write_distances(run: RunFolder, observed_m: float) -> None:
+    values = np.full((4, 4, 4), 0.1, dtype=np.float32)
+    grid = SdfGrid(values_m=values, origin_m=np.zeros(3), voxel_m=0.1, closed=False)
+    observed = values.copy()
+    observed[1, 1, 1] = observed_m
+    StaticSdf(
+        conservative=grid,
+        observed=replace(grid, values_m=observed),
+        state=np.zeros(values.shape, dtype=np.uint8),
+        truncation_m=0.1,
+        table_z_m=None,
+    ).save(run.scene_dir / "sdf.npz")
+
+
+def test_distances_that_cannot_be_read_are_no_free_way(run: RunFolder) -> None:
+    """Somebody saw what stands there: without it nothing may be accepted."""
+    path = run.scene_dir / "sdf.npz"
+    path.write_bytes(b"no arrays")
+    with pytest.raises(UnreadableArraysError, match=r"sdf\.npz: .*robot-gst rebuild RUN --force"):
+        read_place(run, TASK)
+    write_distances(run, np.nan)
+    with pytest.raises(UnreadableArraysError, match=r"sdf\.npz: a distance is no number"):
+        read_place(run, TASK)
+    write_distances(run, -0.1)
+    assert read_place(run, TASK).static_sdf is not None
 
 
 def test_other_shapes_are_other_replays(run: RunFolder) -> None:

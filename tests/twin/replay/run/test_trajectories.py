@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from twin.replay.run.table import count_verdicts
 from twin.replay.run.text import describe_run
 from twin.replay.run.trajectories import replay_run
 from twin.replay.verdict.result import ReplayResult
-from twin.replay.work.job import ReplayJob, divergence_of
+from twin.replay.work.job import ReplayJob, divergence_of, row_of_failure
 from twin.scene.localise.episode import Phase
 
 T0 = 1_700_000_000_000_000_000
@@ -187,6 +188,51 @@ def _messages(path: Path) -> list[tuple[str, int, bytes]]:
 def test_an_unknown_episode_lists_those_that_exist(run: RunFolder) -> None:
     with pytest.raises(UsageError, match="trial_0001"):
         replay_run(run, ReplayRunConfig(episode=("trial_9",)), QUIET)
+
+
+def test_an_episode_named_twice_is_replayed_once(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two processes must not write one file."""
+    done: list[ReplayJob] = []
+
+    def note(job: ReplayJob) -> dict[str, Any]:
+        done.append(job)
+        return row_of_failure(job, "only looked at")
+
+    monkeypatch.setattr(trajectories, "run_job", note)
+    replay_run(run, ReplayRunConfig(episode=("trial_0001", "trial_0001")), QUIET)
+    assert len(done) == len({job.path() for job in done}) == 4
+
+
+def write_scene(run: RunFolder) -> None:
+    """A rebuilt scene that holds nothing."""
+    run.scene_dir.mkdir(exist_ok=True)
+    record = {"schema_version": 1, "key": "k", "scene_hash": "abc", "background": {},
+              "sources": [], "views": []}  # fmt: skip
+    (run.scene_dir / "scene.json").write_text(json.dumps(record))
+
+
+def test_what_the_scene_lacks_is_said_once_for_all_replays(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_scene(run)
+    monkeypatch.setattr(trajectories, "run_job", lambda job: row_of_failure(job, "looked at"))
+    replay_run(run, ReplayRunConfig(), Output())
+    said = capsys.readouterr().err
+    assert said.count("cube_into_box: the scene has no sdf.npz: only the table") == 1
+
+
+def test_distances_that_cannot_be_read_leave_everything_not_evaluated(
+    run: RunFolder,
+) -> None:
+    write_scene(run)
+    (run.scene_dir / "sdf.npz").write_bytes(b"no arrays")
+    summary = replay_run(run, ReplayRunConfig(replay=QUICK), QUIET)
+    assert len(summary["rows"]) == 4
+    for row in summary["rows"]:
+        assert row["accepted"] is None
+        assert "sdf.npz: not a file of arrays" in row["error"]
 
 
 def test_a_run_without_plans_says_so(tmp_path: Path) -> None:
