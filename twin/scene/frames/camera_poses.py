@@ -1,7 +1,7 @@
 """Where a camera was at each of its images: from ``/tf``, or from the images themselves."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,9 +13,12 @@ from bridge.episode.records import FrameTransform
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
 from bridge.terminal import Output
+from twin.scene.frames.base import base_tree
 from twin.scene.frames.odometry import CameraPath, TrackConfig, follow_camera
+from twin.scene.frames.stated import FAR_NS, apart_s, unknown_mask
+from twin.scene.frames.usable import UnusableCameraError, name_of
 from twin.scene.settings import FrameConfig
-from twin.scene.store.calibration import Calibration, calibrated_tree
+from twin.scene.store.calibration import Calibration, CameraPlace, calibrated_tree, without_joints
 
 ODOMETRY_FRAME = "odometry"
 """Begin of the name of the root frame of a scan without poses: the depth camera at the first frame
@@ -59,28 +62,22 @@ def find_poses(
 
     Raises:
         FrameNotFoundError: When ``/tf`` is asked for and does not know the camera.
+        UnusableCameraError: When no image was taken while ``/tf`` or the joints said where the
+            camera is.
         LostError: When the odometry cannot follow the camera.
     """
     place = None if calibration is None else calibration.cameras.get(camera_id)
     if config.poses == "auto" and calibration is not None and place is not None:
-        return CameraPoses(
-            tree=calibrated_tree(episode, camera_id, place, stamps_ns),
-            source="hand-eye",
-            depth_scale=place.depth_scale,
-            quality={"calibration_id": calibration.calibration_id},
-        )
-    tree = streams.transform_tree(episode)
+        poses = calibrated_poses(episode, camera_id, place, stamps_ns)
+        _say_unposed(poses, episode, camera_id, stamps_ns, output)
+        return replace(poses, quality={"calibration_id": calibration.calibration_id})
+    tree = base_tree(episode)
     if config.poses == "tf" or (config.poses == "auto" and places_camera(tree, episode, camera_id)):
-        frame = streams.camera_info(episode, camera_id).frame_id
-        with np.errstate(invalid="ignore"):
-            broken = ~np.isfinite(tree.Ts_root_frame(frame, stamps_ns)).all(axis=(1, 2))
-        unposed = frozenset(stamps_ns[broken].tolist())
-        if unposed:
-            output.say(
-                f"{len(unposed)} of {len(stamps_ns)} frames of camera {camera_id} have a pose "
-                "that is not finite and are left out"
-            )
-        return CameraPoses(tree=tree, source="tf", unposed_ns=unposed)
+        unknown = unknown_mask(tree, _frame_ids(episode, camera_id), stamps_ns)
+        unposed = frozenset(stamps_ns[unknown].tolist())
+        poses = CameraPoses(tree=tree, source="tf", unposed_ns=unposed)
+        _say_unposed(poses, episode, camera_id, stamps_ns, output)
+        return poses
     bare = _bare_tree(tree, episode, camera_id)
     with output.progress(f"follow camera {camera_id}", len(stamps_ns)) as advance:
         path = follow_camera(
@@ -88,6 +85,7 @@ def find_poses(
             held_out_ns,
             TrackConfig(max_depth_m=config.max_depth_m),
             advance,
+            name=name_of(episode, camera_id),
         )
     lost = frozenset(set(stamps_ns.tolist()) - path.Ts_first_depth.keys())
     output.say(f"camera {camera_id} of {episode.info.id}: {_describe(path, len(lost))}")
@@ -97,6 +95,54 @@ def find_poses(
         unposed_ns=lost,
         quality=path.quality,
     )
+
+
+def calibrated_poses(
+    episode: Episode,
+    camera_id: str,
+    place: CameraPlace,
+    stamps_ns: Int[np.ndarray, " num_frames"],
+) -> CameraPoses:
+    """Pose a camera's images as ``robot-gst calibrate`` says it is mounted.
+
+    Raises:
+        EpisodeError: A camera in the hand, and no joint states.
+        RobotDescriptionError: A camera in the hand, and no usable robot description.
+    """
+    return CameraPoses(
+        tree=calibrated_tree(episode, camera_id, place, stamps_ns),
+        source="hand-eye",
+        unposed_ns=without_joints(episode, place, stamps_ns),
+        depth_scale=place.depth_scale,
+    )
+
+
+def _say_unposed(
+    poses: CameraPoses,
+    episode: Episode,
+    camera_id: str,
+    stamps_ns: Int[np.ndarray, " num_frames"],
+    output: Output,
+) -> None:
+    """Count the images without a pose; refuse the camera when they are all of them."""
+    if not poses.unposed_ns:
+        return
+    witness = "/tf" if poses.source == "tf" else "joints"
+    if len(poses.unposed_ns) < len(stamps_ns):
+        output.say(
+            f"{len(poses.unposed_ns)} of {len(stamps_ns)} frames of camera {camera_id} are left "
+            f"out: {witness} says nothing within {FAR_NS * 1e-9:g} s of them, or a pose that is "
+            "not finite"
+        )
+        return
+    gap_s = apart_s(poses.tree, _frame_ids(episode, camera_id)[0], stamps_ns)
+    least = f", {gap_s:.1f} s away at least" if gap_s and poses.source == "tf" else ""
+    message = (
+        f"no image of {name_of(episode, camera_id)} was taken while {witness} said where it "
+        f"is{least}: clocks that differ, or recordings of different times. Record images and "
+        f"{witness} by one clock, or rebuild with --poses odometry."
+    )
+    raise UnusableCameraError(message)
 
 
 def places_camera(tree: TransformTree, episode: Episode, camera_id: str) -> bool:

@@ -8,21 +8,20 @@ from jaxtyping import Float, Int
 
 from bridge.episode import schema, streams
 from bridge.episode.reader import Episode
-from bridge.episode.records import DepthImage, color_from_message
 from bridge.episode.run import RunFolder
 from bridge.episode.streams import RgbdFrame
+from bridge.errors import BridgeError
 from bridge.terminal import Output
 from twin.errors import TwinError
 from twin.scene.frames import select
 from twin.scene.frames.camera_poses import CameraPoses, find_poses
-from twin.scene.frames.odometry import LostError
+from twin.scene.frames.pairs import frames_at, paired_stamps_ns
+from twin.scene.frames.stated import STILL_M, STILL_RAD
 from twin.scene.frames.still import same_pose
+from twin.scene.frames.usable import UnusableCameraError, check_camera, name_of
 from twin.scene.settings import FrameConfig
 from twin.scene.store.calibration import Calibration
 
-STILL_M = 0.002
-STILL_RAD = 0.0035
-"""A camera whose pose varies less than these stands still."""
 STILL_TRAIN_FRAMES = 4
 STILL_HOLDOUT_FRAMES = 2
 """A camera that stands still shows the same again and again; this many frames are enough."""
@@ -56,19 +55,33 @@ class Sources:
 
     episodes: tuple[Episode, ...]
     remark: str
-    """Empty when there are scans."""
+    """That there is no scan, and what could not be read; empty when there is nothing to say."""
 
 
 def find_sources(run: RunFolder) -> Sources:
     """Take all scans; without a scan, every episode that has posed RGB-D frames.
 
+    An episode that cannot be read is passed over, with a remark.
+
     Raises:
         NoFramesError: When no episode has a camera with colour, depth and intrinsics.
+        EpisodeError: When there is none that can be read, but one that cannot.
     """
-    usable = [e for path in run.episodes() if rgbd_camera_ids(e := Episode.open(path))]
+    usable: list[Episode] = []
+    broken: list[BridgeError] = []
+    for path in run.episodes():
+        try:
+            episode = Episode.open(path)
+            if rgbd_camera_ids(episode):
+                usable.append(episode)
+        except BridgeError as error:
+            broken.append(error)
+    remarks = [f"passed over: {error}" for error in broken]
     scans = [episode for episode in usable if episode.info.kind == "scan"]
     if scans:
-        return Sources(episodes=tuple(scans), remark="")
+        return Sources(episodes=tuple(scans), remark="; ".join(remarks))
+    if broken and not usable:
+        raise broken[0]
     if not usable:
         message = (
             f"no episode in {run.episodes_dir} has colour and depth images with intrinsics. "
@@ -76,8 +89,10 @@ def find_sources(run: RunFolder) -> Sources:
         )
         raise NoFramesError(message)
     kinds = sorted({episode.info.kind for episode in usable})
-    remark = f"no scan in this run: using {len(usable)} episode(s) of kind {', '.join(kinds)}"
-    return Sources(episodes=tuple(usable), remark=remark)
+    remarks.insert(
+        0, f"no scan in this run: using {len(usable)} episode(s) of kind {', '.join(kinds)}"
+    )
+    return Sources(episodes=tuple(usable), remark="; ".join(remarks))
 
 
 def rgbd_camera_ids(episode: Episode) -> list[str]:
@@ -102,7 +117,7 @@ def choose_frames(
 
     Raises:
         NoFramesError: When nothing is left to learn from.
-        LostError: When a camera without poses cannot be followed.
+        UnusableCameraError: When no camera can be used: the first one's reason.
     """
     found = [
         (episode, camera_id)
@@ -117,10 +132,11 @@ def choose_frames(
     choices, lost = [], []
     for episode, camera_id in found:
         try:
+            check_camera(episode, camera_id)
             choices.append(_choose(episode, camera_id, shared, output, calibration))
-        except LostError as error:
+        except UnusableCameraError as error:
             lost.append(error)
-            output.say(f"camera {camera_id} of {episode.info.id} is left out: {error}")
+            output.say(f"left out: {error}")
     if lost and not choices:
         raise lost[0]
     choices = _in_one_frame(choices, output)
@@ -162,7 +178,14 @@ def _choose(
     output: Output,
     calibration: Calibration | None,
 ) -> FrameChoice:
-    stamps = np.array(list(_paired_stamps(episode, camera_id)), dtype=np.int64)
+    stamps = paired_stamps_ns(episode, camera_id)
+    if len(stamps) == 0:
+        message = (
+            f"no colour image of {name_of(episode, camera_id)} has a depth image within "
+            f"{streams.PAIRING_TOLERANCE_NS * 1e-6:g} ms: clocks that differ, or one of the two "
+            "was not recorded. Record them synchronised."
+        )
+        raise UnusableCameraError(message)
     held = stamps[config.first_holdout :: config.holdout_every]
     poses = find_poses(
         episode, camera_id, stamps, frozenset(held.tolist()), config, output, calibration
@@ -233,36 +256,10 @@ def _stands_still(
     return still and len(stamps) > 1
 
 
-def _paired_stamps(episode: Episode, camera_id: str) -> Iterator[int]:
-    """Header stamps of colour images with a depth image nearby, as ``load`` will see them."""
-    ending = f"/cam/{camera_id}/"
-    colors, depths = (
-        np.array(
-            [
-                read(message.type_name, message.data).stamp_ns
-                for topic in episode.topics()
-                if topic.endswith(f"{ending}{stream}/image") and not schema.is_truth(topic)
-                for message in episode.messages([topic])
-            ],
-            dtype=np.int64,
-        )
-        for stream, read in (("color", color_from_message), ("depth", DepthImage.from_message))
-    )
-    for stamp in np.unique(colors).tolist() if len(depths) else ():
-        if np.abs(depths - stamp).min() <= streams.PAIRING_TOLERANCE_NS:
-            yield stamp
-
-
 def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:
     """Yield the frames of a choice that carry one of the stamps, with the poses it chose."""
-    if not stamps_ns:
-        return
-    last = max(stamps_ns)
-    for frame in streams.rgbd_frames(choice.episode, choice.camera_id, choice.poses.tree):
-        if frame.stamp_ns in stamps_ns:
-            yield _corrected(frame, choice)
-        if frame.stamp_ns >= last:
-            return
+    for frame in frames_at(choice.episode, choice.camera_id, choice.poses.tree, stamps_ns):
+        yield _corrected(frame, choice)
 
 
 def _corrected(frame: RgbdFrame, choice: FrameChoice) -> RgbdFrame:

@@ -17,14 +17,14 @@ from bridge.errors import MissingDependencyError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.terminal import Advance
-from twin.errors import TwinError
 from twin.scene.frames.thumb import Thumb, colors_in_depth, meet, thumb_of
+from twin.scene.frames.usable import UnusableCameraError
 
 SURE = 0.9
 """A frame that fits this nearly as well as the one before needs no second guess."""
 
 
-class LostError(TwinError):
+class LostError(UnusableCameraError):
     """The camera cannot be followed by its images."""
 
 
@@ -240,6 +240,8 @@ def follow_camera(
     held_out_ns: frozenset[int],
     config: TrackConfig,
     advance: Advance,
+    *,
+    name: str = "this camera",
 ) -> CameraPath:
     """Follow a camera through its frames.
 
@@ -248,6 +250,7 @@ def follow_camera(
         held_out_ns: Stamps of frames that are placed, but do not help to place others.
         config: Settings.
         advance: Told how many frames are done.
+        name: The camera, for what is said when it is lost.
 
     Raises:
         LostError: When most frames cannot be placed.
@@ -261,7 +264,7 @@ def follow_camera(
         advance(total, f"{len(follower.keys)} keyframes")
     if not follower.keys or len(follower.places) < max(2, config.min_placed * total):
         message = (
-            f"/tf has no poses for this camera, and RGB-D odometry could place only "
+            f"/tf has no poses for {name}, and RGB-D odometry could place only "
             f"{len(follower.places)} of its {total} frames. Record the camera's poses on /tf, or "
             "scan again slowly with textured surfaces near the camera."
         )

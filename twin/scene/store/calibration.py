@@ -60,6 +60,15 @@ class CameraPlace:
         """Whether the camera stands still."""
         return self.link == BASE_FRAME
 
+    def to_record(self) -> dict[str, Any]:
+        """Plain numbers: all that poses made with it depend on."""
+        return {
+            "link": self.link,
+            "stream": self.stream,
+            "T_link_camera": self.T_link_camera.tolist(),
+            "depth_scale": self.depth_scale,
+        }
+
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
@@ -212,6 +221,25 @@ def _links(
     track = posture_track(episode)
     robot = load_robot(track.urdf)
     return [robot.T_base_link(place.link, track.at(int(stamp)).joints_rad) for stamp in stamps_ns]
+
+
+def without_joints(
+    episode: Episode, place: CameraPlace, stamps_ns: Int[np.ndarray, " num_frames"]
+) -> frozenset[int]:
+    """Those of some instants at which nobody recorded where the hand that carries a camera was.
+
+    Raises:
+        EpisodeError: A camera in the hand, and no joint states.
+        RobotDescriptionError: A camera in the hand, and no usable robot description.
+    """
+    if place.fixed:
+        return frozenset()
+    track = posture_track(episode)
+    return frozenset(
+        stamp
+        for stamp in stamps_ns.tolist()
+        if not track.covers(stamp) or not np.isfinite(track.at(stamp).joints_rad).all()
+    )
 
 
 def _edge(child: str, T: np.ndarray, stamp_ns: int) -> FrameTransform:

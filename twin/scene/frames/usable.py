@@ -1,0 +1,61 @@
+"""Whether a camera's images can be used at all, before anything is made of them."""
+
+import numpy as np
+
+from bridge.episode import streams
+from bridge.episode.reader import Episode
+from bridge.episode.records import DepthImage, color_from_message
+from bridge.errors import BridgeError
+from twin.errors import TwinError
+
+
+class UnusableCameraError(TwinError):
+    """Nothing can be learnt from one camera; others may do."""
+
+
+def name_of(episode: Episode, camera_id: str) -> str:
+    """The camera, as a sentence begins with it."""
+    return f"camera {camera_id} of episode {episode.info.id}"
+
+
+def check_camera(episode: Episode, camera_id: str) -> None:
+    """Look at the first intrinsics and the first image of colour and depth.
+
+    Raises:
+        UnusableCameraError: The lens distorts, intrinsics are missing or of another image size, or
+            an image cannot be read.
+    """
+    for stream in ("color", "depth"):
+        try:
+            camera = streams.camera_info(episode, camera_id, stream).camera
+            size = _first_size(episode, camera_id, stream)
+        except BridgeError as error:
+            message = f"{name_of(episode, camera_id)} cannot be used: {error}"
+            raise UnusableCameraError(message) from error
+        numbers = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        if not np.isfinite(numbers).all() or min(camera.fx, camera.fy) <= 0:
+            message = (
+                f"{name_of(episode, camera_id)} states focal lengths of {camera.fx:g} and "
+                f"{camera.fy:g} pixels on {stream}/info: it was not calibrated. Record it again "
+                "with its intrinsics."
+            )
+            raise UnusableCameraError(message)
+        if size is not None and size != (camera.width, camera.height):
+            message = (
+                f"{name_of(episode, camera_id)} sends {stream} images of {size[0]} x {size[1]} "
+                f"pixels, and {stream}/info is for {camera.width} x {camera.height}. Record it "
+                "again with the intrinsics of the images that are sent."
+            )
+            raise UnusableCameraError(message)
+
+
+def _first_size(episode: Episode, camera_id: str, stream: str) -> tuple[int, int] | None:
+    """Width and height of the first image; None without any."""
+    topic = streams.find_camera_topic(episode, camera_id, f"{stream}/image")
+    for message in episode.messages([topic] if topic else []):
+        if stream == "color":
+            height, width = color_from_message(message.type_name, message.data).image_u8().shape[:2]
+        else:
+            height, width = DepthImage.from_message(message.type_name, message.data).depth_mm.shape
+        return width, height
+    return None
