@@ -26,6 +26,7 @@ from twin.replay.place.calibrated import Correction
 from twin.replay.place.scene import ReplayScene
 from twin.replay.verdict.result import ReplayResult
 from twin.scene.draw.compose import carried_camera
+from twin.scene.frames.base import base_tree
 from twin.scene.gaussians.cloud import GaussianCloud, concatenate
 from twin.scene.gaussians.moved import moved_cloud
 from twin.scene.gaussians.skin import Binding, bind, pose_cloud
@@ -104,7 +105,7 @@ def render_replay(
     """
     stage = _set_up(run, scene, result, correction)
     rasteriser = open_rasteriser()
-    tree = streams.transform_tree(episode)
+    tree = base_tree(episode)
     for camera_id in streams.camera_ids(episode):
         info = streams.camera_info(episode, camera_id)
         T_tcp_camera = _mounting(episode, tree, info.frame_id, result) if planned else None

@@ -9,12 +9,14 @@ from jaxtyping import Float
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
+from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
 from bridge.task.robot import ARM_JOINTS
 from twin.robot.description import RobotDescriptionError
 from twin.robot.model import load_robot
 from twin.robot.posture import Posture, posture_track
+from twin.scene.frames.base import base_tree
 from twin.scene.gaussians.cloud import GaussianCloud, concatenate
 from twin.scene.gaussians.moved import moved_cloud
 from twin.scene.objects.parts import put_together, read_objects, read_pose
@@ -149,7 +151,10 @@ def _pose_from(text: str, listed: str) -> Float[np.ndarray, "4 4"]:
 
 
 def carried_camera(
-    episode: Episode, frame_id: str, joints_rad: Float[np.ndarray, " num_joints"]
+    episode: Episode,
+    frame_id: str,
+    joints_rad: Float[np.ndarray, " num_joints"],
+    tree: TransformTree | None = None,
 ) -> Float[np.ndarray, "4 4"] | None:
     """Where a camera in the robot's hand would be in a posture, ``T_base_camera``.
 
@@ -157,6 +162,7 @@ def carried_camera(
         episode: Shows whether the camera moves with the hand.
         frame_id: The camera's frame.
         joints_rad: The posture.
+        tree: Says where the camera was; None: ``/tf`` does.
 
     Returns:
         None when the camera is not seen to move with the hand.
@@ -165,7 +171,7 @@ def carried_camera(
         track = posture_track(episode)
     except GstError:
         return None
-    tree = streams.transform_tree(episode)
+    tree = base_tree(episode) if tree is None else tree
     robot = load_robot(track.urdf)
     # By the source's clock, which may have little to do with when messages arrived; and where the
     # camera's pose was stated, because in a fast motion what lies between may be off by much.

@@ -1,12 +1,12 @@
 """Localise the objects of a recorded episode, and keep the answer as a derived episode."""
 
-from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from bridge.episode import provenance, schema, streams
 from bridge.episode.metadata import Derived
@@ -16,15 +16,20 @@ from bridge.episode.run import RunFolder
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.transforms import TransformTree
 from bridge.episode.writer import EpisodeWriter
-from bridge.errors import EpisodeError
+from bridge.errors import EpisodeError, GstError
 from bridge.task.robot import BASE_FRAME
 from bridge.task.task_file import Task
-from twin.scene.frames.choice import rgbd_camera_ids
+from twin.scene.frames.base import base_tree
+from twin.scene.frames.camera_poses import CameraPoses, calibrated_poses
+from twin.scene.frames.choice import rgbd_camera_ids, spread
+from twin.scene.frames.pairs import frames_at, paired_stamps_ns
 from twin.scene.frames.still import same_pose
+from twin.scene.frames.usable import check_camera
 from twin.scene.localise.objects import LocaliseConfig, localise_objects
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.localise.scanned import scanned_surfaces
 from twin.scene.localise.surface import Surface
+from twin.scene.store.calibration import Calibration, read_calibration
 
 NO_SCENE = "noscene"
 STILL_WINDOW_NS = 40_000_000
@@ -34,6 +39,8 @@ STILL_ANGLE_RAD = 3e-3
 
 HeldOut = Mapping[str, Collection[int]]
 """Stamps of frames to leave out, by camera id."""
+Poses = Mapping[str, CameraPoses]
+"""Of cameras that were calibrated, by id; all others are where ``/tf`` says."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +64,7 @@ def localise_episode(
     held_out_ns: HeldOut | None = None,
     last_seen_m: Mapping[str, Float[np.ndarray, "3"]] | None = None,
     surfaces: Mapping[str, Surface] | None = None,
+    poses: Poses | None = None,
 ) -> dict[str, LocalisedObject]:
     """Localise from the last still frames before the first execution started.
 
@@ -72,15 +80,21 @@ def localise_episode(
         held_out_ns: Frames that must not be looked at.
         last_seen_m: Where objects were seen before; tells equal ones apart.
         surfaces: Of scanned objects, from the scene.
+        poses: Where calibrated cameras are.
+
+    Raises:
+        GstError: When no camera can be used; what is wrong with the first.
     """
     config = LocaliseConfig() if config is None else config
     if after_ns is None and before_ns is None:
         before_ns = first_execution_ns(episode)
     if after_ns is None and before_ns is None:
-        frames = still_frames(episode, config.max_views, spread=True, held_out_ns=held_out_ns)
+        frames = still_frames(
+            episode, config.max_views, evenly=True, held_out_ns=held_out_ns, poses=poses
+        )
     else:
         frames = still_frames(
-            episode, config.max_frames, after_ns, before_ns, held_out_ns=held_out_ns
+            episode, config.max_frames, after_ns, before_ns, held_out_ns=held_out_ns, poses=poses
         )
     return localise_objects(frames, task, config, last_seen_m, surfaces)
 
@@ -122,45 +136,103 @@ def still_frames(
     after_ns: int | None = None,
     before_ns: int | None = None,
     *,
-    spread: bool = False,
+    evenly: bool = False,
     held_out_ns: HeldOut | None = None,
+    poses: Poses | None = None,
 ) -> list[RgbdFrame]:
     """Frames of each camera taken in an interval while that camera did not move.
+
+    Only the frames that are returned are ever in memory. A camera that cannot be used, or whose
+    place in the robot's base nobody knows, is passed over as long as another one can.
 
     Args:
         episode: Recorded, with posed colour and depth.
         max_per_camera: At most so many.
         after_ns: Only frames later than this source time.
         before_ns: Only frames earlier than this source time.
-        spread: Spread them evenly over the interval instead of taking the last ones.
+        evenly: Spread them evenly over the interval instead of taking the last ones.
         held_out_ns: Frames that must not be looked at.
+        poses: Where calibrated cameras are.
+
+    Raises:
+        GstError: When no camera can be used; what is wrong with the first.
     """
-    hidden = held_out_ns or {}
-    tree = streams.transform_tree(episode)
+    tree = base_tree(episode)
+    failed: list[GstError] = []
+    usable: dict[str, _Still] = {}
+    camera_ids = rgbd_camera_ids(episode)
+    for camera_id in camera_ids:
+        known = (poses or {}).get(camera_id) or CameraPoses(tree=tree, source="tf")
+        hidden = known.unposed_ns.union((held_out_ns or {}).get(camera_id, ()))
+        try:
+            usable[camera_id] = _still(
+                episode, camera_id, replace(known, unposed_ns=hidden), after_ns, before_ns
+            )
+        except GstError as error:
+            failed.append(error)
+    if failed and not usable:
+        raise failed[0]
+    roots = [item.root for item in usable.values()]
     frames: list[RgbdFrame] = []
-    for camera_id in rgbd_camera_ids(episode):
-        frame_id = streams.camera_info(episode, camera_id, "color").frame_id
-        kept: deque[RgbdFrame] = deque(maxlen=None if spread else max_per_camera)
-        for frame in _between(streams.rgbd_frames(episode, camera_id, tree), after_ns, before_ns):
-            seen = frame.stamp_ns not in hidden.get(camera_id, ())
-            if seen and is_still(tree, frame_id, frame.stamp_ns, before_ns):
-                kept.append(frame)
-        if spread and len(kept) > max_per_camera:
-            ids = np.linspace(0, len(kept) - 1, max_per_camera).round().astype(int)
-            frames.extend(kept[index] for index in ids)
-        else:
-            frames.extend(kept)
+    for camera_id, item in usable.items():
+        if item.root != (BASE_FRAME if BASE_FRAME in roots else roots[0]):
+            continue
+        stamps = np.array(item.stamps_ns, dtype=np.int64)
+        chosen = spread(stamps, max_per_camera) if evenly else stamps[-max_per_camera:]
+        frames.extend(_frames_at(episode, camera_id, item.poses, chosen.tolist()))
     return frames
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Still:
+    """When one camera stood still, and where."""
+
+    poses: CameraPoses
+    root: str
+    """Frame that the poses are in."""
+    stamps_ns: list[int]
+
+
+def _still(
+    episode: Episode,
+    camera_id: str,
+    poses: CameraPoses,
+    after_ns: int | None,
+    before_ns: int | None,
+) -> _Still:
+    check_camera(episode, camera_id)
+    frame_id = streams.camera_info(episode, camera_id, "color").frame_id
+    stamps = _between(paired_stamps_ns(episode, camera_id), after_ns, before_ns)
+    return _Still(
+        poses=poses,
+        root=poses.tree.root_of(frame_id),
+        stamps_ns=[
+            stamp
+            for stamp in stamps
+            if stamp not in poses.unposed_ns and is_still(poses.tree, frame_id, stamp, before_ns)
+        ],
+    )
+
+
 def _between(
-    frames: Iterable[RgbdFrame], after_ns: int | None, before_ns: int | None
+    stamps_ns: Int[np.ndarray, " num_frames"], after_ns: int | None, before_ns: int | None
+) -> list[int]:
+    wanted = np.ones(len(stamps_ns), dtype=bool)
+    if after_ns is not None:
+        wanted &= stamps_ns > after_ns
+    if before_ns is not None:
+        wanted &= stamps_ns < before_ns
+    return [int(stamp) for stamp in stamps_ns[wanted]]
+
+
+def _frames_at(
+    episode: Episode, camera_id: str, poses: CameraPoses, stamps_ns: Collection[int]
 ) -> Iterator[RgbdFrame]:
-    for frame in frames:
-        if before_ns is not None and frame.stamp_ns >= before_ns:
-            return
-        if after_ns is None or frame.stamp_ns > after_ns:
+    for frame in frames_at(episode, camera_id, poses.tree, stamps_ns):
+        if poses.depth_scale == 1.0:
             yield frame
+        else:
+            yield replace(frame, depth_m=frame.depth_m * np.float32(poses.depth_scale))
 
 
 def is_still(
@@ -190,8 +262,8 @@ def write_localised(
 
     Holds one gst localisation record per object for the start and after every execution, and a
     PoseStamped per object that was found. Objects whose shape only a scan knows are laid out by the
-    meshes of the run's scene. A file made from the same bytes with the same settings
-    is kept unless ``force``.
+    meshes of the run's scene, and calibrated cameras are where the run's calibration says. A file
+    made from the same bytes with the same settings is kept unless ``force``.
 
     Args:
         run: Where derived episodes go.
@@ -200,8 +272,13 @@ def write_localised(
         config: Settings; the defaults when None.
         scene_hash: The scene the poses are meant for; its first twelve digits name the file.
         force: Write again even when it is there.
+
+    Raises:
+        GstError: When no camera can be used; what is wrong with the first.
+        UnreadableCalibrationError: When ``calibration.json`` cannot be understood.
     """
     config = LocaliseConfig() if config is None else config
+    calibration = read_calibration(run)
     scanned = scanned_surfaces(run, task, config.mesh.num_samples)
     scene = scene_hash[:12] if scene_hash else NO_SCENE
     path = run.derived_dir / f"{episode.path.stem}.localised.{scene}.mcap"
@@ -212,10 +289,12 @@ def write_localised(
         scene_hash=scene_hash,
         engine="colour_shape_fit",
         settings={"task": asdict(task), **asdict(config)}
-        | ({"meshes": scanned.hashes} if scanned.hashes else {}),
+        | ({"meshes": scanned.hashes} if scanned.hashes else {})
+        | _mounts(calibration, rgbd_camera_ids(episode)),
     )
     if path.exists() and not force and _made_from(path, derived):
         return path
+    poses = calibrated_cameras(episode, calibration)
     phases: list[tuple[Phase, dict[str, LocalisedObject]]] = []
     last_seen_m: dict[str, np.ndarray] = {}
     for phase in quiet_phases(episode):
@@ -227,6 +306,7 @@ def write_localised(
             before_ns=phase.before_ns,
             last_seen_m=last_seen_m,
             surfaces=scanned.surfaces,
+            poses=poses,
         )
         phases.append((phase, found))
         last_seen_m |= {
@@ -240,6 +320,30 @@ def write_localised(
         for phase, objects in phases:
             _write_phase(writer, _cell_of(episode), phase, objects)
     return path
+
+
+def calibrated_cameras(episode: Episode, calibration: Calibration | None) -> Poses:
+    """Where the cameras of an episode are, as far as they were calibrated.
+
+    Raises:
+        EpisodeError: A camera in the hand, and no joint states.
+        RobotDescriptionError: A camera in the hand, and no usable robot description.
+    """
+    places = {} if calibration is None else calibration.cameras
+    return {
+        camera_id: calibrated_poses(
+            episode, camera_id, places[camera_id], paired_stamps_ns(episode, camera_id)
+        )
+        for camera_id in rgbd_camera_ids(episode)
+        if camera_id in places
+    }
+
+
+def _mounts(calibration: Calibration | None, camera_ids: Collection[str]) -> dict[str, Any]:
+    """What a localisation depends on beside the episode; nothing without calibrated cameras."""
+    places = {} if calibration is None else calibration.cameras
+    mounts = {key: places[key].to_record() for key in camera_ids if key in places}
+    return {"cameras": mounts} if mounts else {}
 
 
 def _made_from(path: Path, derived: Derived) -> bool:

@@ -24,6 +24,7 @@ from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
 from bridge.task.record import parse_record
 from twin.errors import TwinError
+from twin.scene.frames.base import rooted_in_base
 from twin.scene.localise.episode import STILL_WINDOW_NS, is_still
 
 KEPT_IMAGES = 6
@@ -171,7 +172,7 @@ class LiveView:
             quiet_since_ns, newest_ns = self._quiet_since_ns, self._newest_ns
         if not cameras:
             return LiveFrames(frames=[], reasons=[f"no images on /{self._cell}/cam/**"])
-        tree = TransformTree(transforms)
+        tree = TransformTree(rooted_in_base(transforms))
         frames: list[RgbdFrame] = []
         reasons: list[str] = []
         for camera_id, camera in cameras.items():

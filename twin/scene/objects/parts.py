@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder, check_episode_id
-from bridge.errors import BridgeError, UsageError
+from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task, load_task
 from bridge.terminal import Output
@@ -116,8 +116,13 @@ def take_apart(
             for choice in choices
             if choice.episode.path == episode.path
         }
-        localised = localise_episode(episode, task, held_out_ns=held_out)
-    except (BridgeError, UsageError) as error:
+        mounted = {
+            choice.camera_id: choice.poses
+            for choice in choices
+            if choice.episode.path == episode.path and choice.poses.source == "hand-eye"
+        }
+        localised = localise_episode(episode, task, held_out_ns=held_out, poses=mounted)
+    except GstError as error:
         return TakenApart(background=cloud, remark=f"objects not taken out: {error}")
     poses = object_poses(cloud, localised, task)
     with output.progress("reconstruct objects", len(poses)) as advance:
