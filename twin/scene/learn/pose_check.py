@@ -6,7 +6,7 @@ the same surface the depths must be equal; with a pose read in the wrong convent
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 from jaxtyping import Float
@@ -52,6 +52,10 @@ SCALES = (1.0, 0.1, 10.0, 0.2, 5.0, 0.001, 1000.0)
 
 class PoseConventionError(TwinError):
     """Poses fit the depth only when they are read in another way."""
+
+
+class MovedCameraError(TwinError):
+    """A camera moved while its poses say that it stood still."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,6 +153,20 @@ def check_poses(thumbs: Sequence[Thumb]) -> PoseReport:
         better=best,
         better_agreement=score,
     )
+
+
+def still_agreement(thumbs: Sequence[Thumb]) -> float | None:
+    """Share of the depth that stays the same in the images of a camera said to stand still.
+
+    The median over all pairs: a robot that passes by once does not count. None when no two images
+    measured the same place.
+    """
+    found = []
+    for first, second in combinations(thumbs, 2):
+        met = meet(first, second, se3.invert(second.T_base_depth) @ first.T_base_depth)
+        if met.overlap >= MIN_OVERLAP:
+            found.append(met.agreement)
+    return float(np.median(found)) if found else None
 
 
 def _best(pairs: list[tuple[Thumb, Thumb]]) -> tuple[Convention, float]:

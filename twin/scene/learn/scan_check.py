@@ -10,7 +10,14 @@ from twin.errors import TwinError
 from twin.scene.frames.choice import FrameChoice
 from twin.scene.frames.points import NEAR_M
 from twin.scene.frames.thumb import Thumb
-from twin.scene.learn.pose_check import PoseConventionError, PoseReport, check_poses
+from twin.scene.learn.pose_check import (
+    GOOD,
+    MovedCameraError,
+    PoseConventionError,
+    PoseReport,
+    check_poses,
+    still_agreement,
+)
 from twin.scene.settings import FrameConfig
 
 FEW_FRAMES = 5
@@ -86,13 +93,14 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
     """Look for what makes a scan useless, or worth less than it seems.
 
     Raises:
-        NoDepthError: When no depth image of any camera holds a trusted pixel.
+        NoDepthError: When no camera has depth images that can be used.
         PoseConventionError: When a camera's poses fit only if read in another convention.
+        MovedCameraError: When a camera moved that is said to stand still.
     """
     seen = [camera for camera in cameras if camera.thumbs]
     blind = [camera for camera in seen if max(camera.trusted) < SPARSE]
     usable = [camera for camera in seen if max(camera.trusted) >= SPARSE]
-    if blind and not any(max(camera.trusted) > 0 for camera in seen):
+    if blind and not usable:
         raise NoDepthError(_no_depth(blind[0], config))
     poses = {
         camera.name: check_poses(camera.thumbs) for camera in usable if not camera.choice.still
@@ -104,7 +112,10 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
                 "rebuild with --no-check-poses."
             )
             raise PoseConventionError(message)
-    found = [_no_depth(camera, config) for camera in blind]
+    moved = [text for camera in usable if camera.choice.still and (text := _moved(camera))]
+    if moved and config.check_poses:
+        raise MovedCameraError(moved[0])
+    found = [_no_depth(camera, config) for camera in blind] + moved
     found += [f"{name}: {report.remark()}" for name, report in poses.items() if report.remark()]
     total = sum(len(camera.thumbs) for camera in seen)
     if total < FEW_FRAMES:
@@ -113,6 +124,18 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
             "and is likely to be wrong from elsewhere; scan longer"
         )
     return ScanReport(poses=poses, found=tuple(found))
+
+
+def _moved(camera: CameraCheck) -> str:
+    """Say that a camera moved although its poses do not; empty when it did not."""
+    agreement = still_agreement(camera.thumbs)
+    if agreement is None or agreement >= GOOD:
+        return ""
+    return (
+        f"{camera.name} stands still by its poses, but only {100 * agreement:.0f} % of its depth "
+        "is the same from image to image: it was moved, or nobody recorded how it moves. Rebuild "
+        "with --poses odometry, record its poses, or insist with --no-check-poses"
+    )
 
 
 def _no_depth(camera: CameraCheck, config: FrameConfig) -> str:

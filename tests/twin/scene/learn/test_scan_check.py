@@ -15,7 +15,7 @@ from bridge.terminal import Output
 from twin.scene.frames.choice import FrameChoice, choose_frames, find_sources, root_frame
 from twin.scene.frames.points import without_seams
 from twin.scene.frames.thumb import Thumb, thumb_of
-from twin.scene.learn.pose_check import PoseConventionError
+from twin.scene.learn.pose_check import MovedCameraError, PoseConventionError
 from twin.scene.learn.scan_check import CameraCheck, NoDepthError, ScanReport, check_scan
 from twin.scene.settings import FrameConfig
 
@@ -79,6 +79,31 @@ def test_poses_in_a_wrong_convention_are_refused_unless_told_not_to(choice: Fram
     assert "world-to-camera" in remark
 
 
+def test_cameras_with_next_to_no_usable_depth_are_refused_when_no_other_is_there(
+    choice: FrameChoice,
+) -> None:
+    """Depth ten times too large leaves a few pixels below the limit: no scene comes of these."""
+    wrong_unit = replace(camera(choice, depth_times=10.0), trusted=[0.01] * 8)
+    with pytest.raises(NoDepthError, match="check the unit of depth"):
+        check_scan([wrong_unit], CONFIG)
+    (remark,) = check_scan([camera(choice), wrong_unit], CONFIG).remarks()
+    assert "check the unit of depth" in remark
+
+
+def test_a_camera_in_motion_that_is_said_to_stand_still_is_refused(choice: FrameChoice) -> None:
+    """As when /tf ends at the camera's own link: all images get one pose, no pose moves."""
+    right = camera(choice)
+    first = right.thumbs[0]
+    thumbs = [replace(first, depth_m=first.depth_m * np.float32(1 - 0.08 * k)) for k in range(8)]
+    wrong = replace(right, choice=replace(choice, still=True), thumbs=thumbs)
+    with pytest.raises(MovedCameraError, match=r"stands still by its poses.*--poses odometry"):
+        check_scan([wrong], CONFIG)
+    (remark,) = check_scan([wrong], FrameConfig(check_poses=False)).remarks()
+    assert "it was moved" in remark
+    truly = replace(wrong, thumbs=[thumbs[0]] * 4)
+    assert "moved" not in " ".join(check_scan([truly], CONFIG).remarks())
+
+
 def test_much_motion_is_said() -> None:
     report = ScanReport(poses={}, found=(), moving_fraction=0.4)
     assert "40 % of the measured surface moved" in report.remarks()[0]
@@ -116,7 +141,8 @@ def test_frames_whose_pose_is_not_a_number_are_left_out(
     assert len(choice.train_ns) >= 7
     said = " ".join(capsys.readouterr().err.split())
     # Between two poses the camera is interpolated, so the frame after a broken one has none either.
-    assert "3 of 12 frames of camera wrist have a pose that is not finite" in said
+    assert "3 of 12 frames of camera wrist are left out" in said
+    assert "a pose that is not finite" in said
 
 
 @pytest.mark.slow
