@@ -92,7 +92,7 @@ class Arm:
             self._axes[item[12].decode()] = tuple(item[13])
             parents[item[12].decode()] = item[16]
         missing = [name for name in (*ARM_JOINTS, *FINGER_JOINTS) if name not in self._joints] + [
-            name for name in (TCP_FRAME,) if name not in self.links
+            name for name in (TCP_FRAME, *FINGER_LINKS) if name not in self.links
         ]
         if missing:
             message = (

@@ -32,15 +32,14 @@ def write_description(urdf: str, mesh_hulls_m: Hulls, folder: Path) -> Path:
         The path of the URDF file.
     """
     root = ET.fromstring(urdf)
-    for link in root.findall("link"):
+    for number, link in enumerate(root.findall("link")):
         for visual in link.findall("visual"):
             link.remove(visual)
         if link.find("inertial") is None:
             link.append(_tiny_inertial())
-        name = link.get("name", "")
-        hulls = mesh_hulls_m.get(name, ())
-        if hulls:
-            _replace_meshes(link, hulls, folder, name)
+        hulls = mesh_hulls_m.get(link.get("name", ""), ())
+        if hulls:  # by number: a name may hold a slash
+            _replace_meshes(link, hulls, folder, f"link_{number}")
     path = folder / "robot.urdf"
     path.write_text(ET.tostring(root, encoding="unicode"))
     return path
@@ -59,13 +58,13 @@ def _replace_meshes(
     link: ET.Element,
     hulls: Sequence[Float[np.ndarray, "num_points 3"]],
     folder: Path,
-    name: str,
+    stem: str,
 ) -> None:
     for collision in link.findall("collision"):
         if collision.find("geometry/mesh") is not None:
             link.remove(collision)
     for index, points in enumerate(hulls):
-        path = folder / f"{name}_{index}.obj"
+        path = folder / f"{stem}_{index}.obj"
         path.write_text(_obj(points))
         collision = ET.SubElement(link, "collision")
         geometry = ET.SubElement(collision, "geometry")

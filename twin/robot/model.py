@@ -5,13 +5,16 @@ half of the gripper width each. A model keeps scratch memory: use it from one th
 """
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
-from bridge.task.robot import ARM_JOINTS, FINGER_JOINTS, TCP_FRAME
-from twin.robot.description import RobotDescriptionError, mimicked, with_absolute_meshes
+from bridge.task.robot import ARM_JOINTS, BASE_FRAME, FINGER_JOINTS, TCP_FRAME
+from twin.robot.description import Mimic, RobotDescriptionError, mimicked, with_absolute_meshes
+
+_SAME_FRAME = 1e-6
 
 
 class RobotModel:
@@ -21,7 +24,8 @@ class RobotModel:
         """Build from a URDF text; use ``load_robot``, which remembers.
 
         Raises:
-            RobotDescriptionError: When joints or the frame ``tcp`` are missing.
+            RobotDescriptionError: When joints or the frame ``tcp`` are missing, joints are of
+                another kind than is needed, or the base link is not where the root is.
         """
         self.urdf = with_absolute_meshes(urdf)
         mimics = mimicked(urdf)
@@ -34,6 +38,7 @@ class RobotModel:
         self.name = str(self.model.name)
         self._check_names()
         self._check_joints()
+        self._check_base()
         self.data = self.model.createData()
         self._neutral: Float[np.ndarray, " num_values"] = pin.neutral(self.model)
         self.arm_ids = np.array([self._q_id(name) for name in ARM_JOINTS])
@@ -45,6 +50,7 @@ class RobotModel:
             dtype=np.int64,
         )
         followers = [m for m in mimics if self.model.existJointName(m.joint)]
+        self._check_followers(followers)
         self._follower_ids = np.array([self._q_id(m.joint) for m in followers], dtype=np.int64)
         self._leader_ids = np.array([self._q_id(m.leader) for m in followers], dtype=np.int64)
         self._ratios = np.array([m.multiplier for m in followers])
@@ -71,11 +77,53 @@ class RobotModel:
 
     def _check_joints(self) -> None:
         for name in ARM_JOINTS:
-            if self.model.joints[self.model.getJointId(name)].nq != 1:
+            if self._joint(name).nq != 1:
                 raise RobotDescriptionError(
                     found=f"has the joint {name!r}, which turns without end",
                     hint="Make it revolute and give it limits.",
                 )
+            if self._slides(name):
+                raise RobotDescriptionError(
+                    found=f"has the joint {name!r}, which slides",
+                    hint="An arm of six joints that turn is needed.",
+                )
+        for name in FINGER_JOINTS:
+            if self.model.existJointName(name) and not self._slides(name):
+                raise RobotDescriptionError(
+                    found=f"has the finger joint {name!r}, which does not slide",
+                    hint="Two prismatic fingers are needed, each open by half of the width.",
+                )
+
+    def _check_followers(self, followers: list[Mimic]) -> None:
+        for item in followers:
+            for name in (item.joint, item.leader):
+                if not self.model.existJointName(name) or self._joint(name).nq != 1:
+                    raise RobotDescriptionError(
+                        found=f"lets the joint {item.joint!r} mimic {item.leader!r}, and {name!r} "
+                        "is fixed or turns without end",
+                        hint="Make both revolute or prismatic, with limits.",
+                    )
+
+    def _check_base(self) -> None:
+        """Plans and objects are given in the base link, kinematics in the root."""
+        if not self.model.existFrame(BASE_FRAME):
+            return
+        frame = self.model.frames[self.model.getFrameId(BASE_FRAME)]
+        T_root_base = np.array(frame.placement.homogeneous)
+        if frame.parentJoint != 0 or np.abs(T_root_base - np.eye(4)).max() > _SAME_FRAME:
+            x, y, z = T_root_base[:3, 3]
+            raise RobotDescriptionError(
+                found=f"puts {BASE_FRAME!r} elsewhere than its root {self.model.frames[1].name!r}: "
+                f"at ({x:.3f}, {y:.3f}, {z:.3f}) m, or turned",
+                hint=f"Plans and objects are given in {BASE_FRAME!r}: let it be the root.",
+            )
+
+    def _joint(self, name: str) -> Any:
+        return self.model.joints[self.model.getJointId(name)]
+
+    def _slides(self, name: str) -> bool:
+        joint = self._joint(name)
+        return bool(joint.nq == 1 and joint.shortname().startswith("JointModelP"))
 
     def _q_id(self, name: str) -> int:
         return int(self.model.joints[self.model.getJointId(name)].idx_q)

@@ -1,15 +1,18 @@
 """The physics world: things fall, rest, are gripped, and do the same on every run."""
 
 import hashlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bridge.geometry import se3
+from bridge.geometry.box import box_corners
 from bridge.task.robot import ur5_with_gripper_urdf
 from twin.physics import engine
 from twin.physics.arm import Arm
 from twin.physics.config import PhysicsConfig
+from twin.physics.description import write_description
 from twin.physics.engine import pybullet
 from twin.physics.world import PhysicsError, World
 from twin.robot.description import with_absolute_meshes
@@ -156,3 +159,17 @@ def test_open_fingers_hold_nothing(urdf: str) -> None:
 def test_a_description_without_fingers_is_refused_by_name(urdf: str) -> None:
     with pytest.raises(PhysicsError, match="gripper_left_finger_joint"):
         World(urdf.replace("gripper_left_finger_joint", "thumb_joint"), {}, PhysicsConfig())
+
+
+def test_a_description_without_the_links_of_the_fingers_is_refused_by_name(urdf: str) -> None:
+    other = urdf.replace('"gripper_left_finger"', '"thumb"')
+    with pytest.raises(PhysicsError, match="lacks gripper_left_finger;"):
+        World(other, {}, PhysicsConfig())
+
+
+def test_a_link_may_be_called_what_no_file_can_be(urdf: str, tmp_path: Path) -> None:
+    other = urdf.replace('"forearm_link"', '"left/forearm_link"')
+    assert other != urdf
+    path = write_description(other, {"left/forearm_link": [box_corners(SIZE)]}, tmp_path)
+    assert "left/forearm_link" in path.read_text()
+    assert len(list(tmp_path.glob("*.obj"))) == 1

@@ -104,6 +104,66 @@ def test_an_endless_joint_is_refused_by_name() -> None:
         RobotModel(urdf)
 
 
+def changed(joint: str, before: str, after: str) -> str:
+    """The usual description with one thing about one joint changed."""
+    urdf = re.sub(
+        rf'(<joint name="{joint}"(?:(?!</joint>).)*?){before}',
+        rf"\g<1>{after}",
+        ur5_with_gripper_urdf(),
+        flags=re.DOTALL,
+    )
+    assert urdf != ur5_with_gripper_urdf()
+    return urdf
+
+
+@pytest.mark.parametrize(
+    ("joint", "before", "after", "found"),
+    [
+        ("elbow_joint", 'type="revolute"', 'type="prismatic"', r"'elbow_joint', which slides"),
+        (
+            "gripper_left_finger_joint",
+            'type="prismatic"',
+            'type="revolute"',
+            r"finger joint 'gripper_left_finger_joint', which does not slide",
+        ),
+        (
+            "gripper_left_finger_joint",
+            'type="prismatic"',
+            'type="continuous"',
+            r"finger joint 'gripper_left_finger_joint', which does not slide",
+        ),
+    ],
+)
+def test_joints_of_another_kind_are_refused_by_name(
+    joint: str, before: str, after: str, found: str
+) -> None:
+    """Radians for metres, or metres for radians, would be replayed without a word."""
+    with pytest.raises(RobotDescriptionError, match=found):
+        RobotModel(changed(joint, before, after))
+
+
+@pytest.mark.parametrize("origin", ['xyz="0 0 0.8" rpy="0 0 0"', 'xyz="0 0 0" rpy="0 0 3.14159"'])
+def test_a_base_that_is_not_the_root_is_refused_with_where_it_is(origin: str) -> None:
+    """On a pedestal, say: plans are given in the base, kinematics would be those of the floor."""
+    urdf = changed("world_joint", r"<origin[^>]*/>", f"<origin {origin}/>")
+    with pytest.raises(RobotDescriptionError, match=r"'base_link' elsewhere than its root 'world'"):
+        RobotModel(urdf)
+
+
+@pytest.mark.parametrize("leader", ["world_joint", "endless"])
+def test_a_joint_that_mimics_one_without_a_position_is_refused(leader: str) -> None:
+    more = (
+        '<link name="wheel"/><joint name="endless" type="continuous"><parent link="tool0"/>'
+        '<child link="wheel"/><axis xyz="0 0 1"/></joint>'
+        '<link name="flap"/><joint name="flap_joint" type="revolute"><parent link="tool0"/>'
+        f'<child link="flap"/><axis xyz="0 0 1"/><mimic joint="{leader}"/>'
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
+    )
+    urdf = ur5_with_gripper_urdf().replace("</robot>", more)
+    with pytest.raises(RobotDescriptionError, match=rf"'flap_joint' mimic '{leader}'.*is fixed or"):
+        RobotModel(urdf)
+
+
 def test_a_pose_that_is_not_a_number_is_refused(script: SimpleNamespace) -> None:
     scene = script.scene()
     plan = script.plan(scene)
