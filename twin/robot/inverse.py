@@ -115,6 +115,7 @@ def _descend(
         joints_rad=accepted,
         position_error_m=position,
         rotation_error_rad=rotation,
-        reached=position <= config.position_tolerance_m
+        reached=last < math.inf  # nothing was tried of a pose that is no number
+        and position <= config.position_tolerance_m
         and rotation <= config.rotation_tolerance_rad,
     )

@@ -18,10 +18,10 @@ from bridge.episode.repeated import joint_messages, pose_messages
 from bridge.episode.writer import EpisodeWriter
 from bridge.task.plan import Plan, Stage
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME, GRIPPER
+from twin.replay.follow.track_checks import GRIPPER_WIDTH
 from twin.replay.stretches import stretches_ns
 from twin.replay.verdict.result import ReplayResult
 
-GRIPPER_WIDTH = "gripper_width"
 MIN_CLEARANCE = "min_clearance_m"
 NODES_PERIOD_NS = 33_000_000
 """Nodes of soft bodies are written at most this often: 30 Hz, about a camera's rate."""

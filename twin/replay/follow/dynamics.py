@@ -156,6 +156,8 @@ class _Samples:
         if name in self._fits:
             return np.stack(self._fits[name])
         rows = np.array(self._poses[name])
+        if not np.isfinite(rows).all():
+            raise NotEvaluatedError(f"physics lost {name}: its place is no number any more")
         return se3.transform_from(rows[:, 3:], rows[:, :3])
 
     def _broken(self, world: World) -> dict[str, str]:

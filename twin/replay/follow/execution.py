@@ -11,7 +11,9 @@ from bridge.episode.streams import JointTrack
 from bridge.task.plan import Plan, Stage
 from bridge.task.robot import ARM_JOINTS
 from twin.replay.config import ReplayConfig
-from twin.replay.follow.path import JointPath, UnusablePlanError
+from twin.replay.follow.path import JointPath
+from twin.replay.follow.track_checks import check_track, gripper_widths
+from twin.replay.follow.usable import UnusablePlanError
 
 _PLATEAU_M = 0.002
 """A finger distance this close to the smallest one of a grasp belongs to the grasp."""
@@ -19,8 +21,6 @@ _AHEAD_NS, _CREEP_M = 100_000_000, 0.003
 """Fingers that close by less than this within a tenth of a second are stopped by something."""
 _LATENESS_NS = 2_000_000_000
 """An execution may lag behind its plan by up to this long."""
-_LARGEST_GAP_NS = 500_000_000
-"""Joints that were not recorded for longer than this are not made up."""
 
 
 def path_of_execution(
@@ -34,7 +34,8 @@ def path_of_execution(
     recorded width.
 
     Raises:
-        UnusablePlanError: When a track is empty, has gaps or names other joints.
+        UnusablePlanError: When a track is empty, has gaps, names other joints, or holds what is no
+            posture or no width.
     """
     if len(track.stamps_ns) == 0 or len(widths.stamps_ns) == 0:
         raise UnusablePlanError(
@@ -42,9 +43,8 @@ def path_of_execution(
             found="was executed without recorded joints or gripper",
             hint="Record /joint_states and /gripper/state over the whole execution.",
         )
-    _check_finite(track, "joints", plan)
-    _check_finite(widths, "gripper widths", plan)
-    _check_gaps(track, plan)
+    check_track(track, "joints", plan)
+    check_track(widths, "gripper widths", plan)
     missing = [name for name in ARM_JOINTS if name not in track.names]
     if missing:
         raise UnusablePlanError(
@@ -56,7 +56,7 @@ def path_of_execution(
     first_ns = int(track.stamps_ns[0])
     times, keep = np.unique(track.stamps_ns - first_ns, return_index=True)
     width_times, width_keep = np.unique(widths.stamps_ns - first_ns, return_index=True)
-    width = widths.position[width_keep, 0].astype(np.float64)
+    width = gripper_widths(widths, plan)[width_keep]
     closed = closed_mask(width_times, width, plan)
     squeeze_m = config.squeeze_m if config.mode == "dynamic" else 0.0
     return JointPath(
@@ -78,43 +78,6 @@ def cut_track(track: JointTrack, start_ns: int, end_ns: int) -> JointTrack:
         names=track.names,
         stamps_ns=np.concatenate([[start_ns], track.stamps_ns[inside]]),
         position=np.concatenate([track.at(np.array([start_ns])), track.position[inside]]),
-    )
-
-
-def check_covers(track: JointTrack, end_ns: int, plan: Plan) -> None:
-    """Refuse a track that stops well before the execution ended.
-
-    Raises:
-        UnusablePlanError: Saying how much is missing.
-    """
-    missing_ns = end_ns - int(track.stamps_ns[-1])
-    if missing_ns > _LARGEST_GAP_NS:
-        raise _not_recorded(plan, missing_ns, "at its end")
-
-
-def _check_finite(track: JointTrack, what: str, plan: Plan) -> None:
-    wrong = ~np.isfinite(track.position).all(axis=1)
-    if wrong.any():
-        at_s = int(track.stamps_ns[int(np.argmax(wrong))] - track.stamps_ns[0]) * 1e-9
-        raise UnusablePlanError(
-            plan_id=plan.id,
-            found=f"was executed with {what} that are no numbers at {at_s:.2f} s",
-            hint=f"{int(wrong.sum())} of {len(wrong)} samples are concerned; look at their source.",
-        )
-
-
-def _check_gaps(track: JointTrack, plan: Plan) -> None:
-    gaps_ns = np.diff(track.stamps_ns)
-    if len(gaps_ns) and int(gaps_ns.max()) > _LARGEST_GAP_NS:
-        at_s = int(track.stamps_ns[int(gaps_ns.argmax())] - track.stamps_ns[0]) * 1e-9
-        raise _not_recorded(plan, int(gaps_ns.max()), f"from {at_s:.1f} s on")
-
-
-def _not_recorded(plan: Plan, missing_ns: int, where: str) -> UnusablePlanError:
-    return UnusablePlanError(
-        plan_id=plan.id,
-        found=f"was executed while no joints were recorded for {missing_ns * 1e-9:.1f} s {where}",
-        hint="Record /joint_states without gaps over the whole execution.",
     )
 
 

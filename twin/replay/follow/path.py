@@ -13,28 +13,16 @@ from jaxtyping import Float, Int
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan, Waypoint
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M
-from twin.errors import TwinError
+from bridge.task.robot import ARM_JOINTS, MAX_WIDTH_M
 from twin.replay.clearance.near import own_links
 from twin.replay.config import ReplayConfig
 from twin.replay.failure import Failure
 from twin.replay.follow.joint_checks import jumps, limit_failure, outside_limits
+from twin.replay.follow.usable import UnusablePlanError, check_usable
 from twin.robot.collision import RobotHulls
 from twin.robot.follow import Clearance, follow_poses
 from twin.robot.inverse import pose_error, solve_ik
 from twin.robot.model import RobotModel
-
-MAX_DURATION_S = 600.0
-"""Longest trajectory that is replayed [s]."""
-
-
-class UnusablePlanError(TwinError):
-    """A plan cannot be replayed at all."""
-
-    def __init__(self, *, plan_id: str, found: str, hint: str) -> None:
-        """Remember the plan."""
-        self.plan_id = plan_id
-        super().__init__(f"plan {plan_id!r} {found}. {hint}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,10 +92,9 @@ def path_of_plan(
         unreachable pose (None when all were reached).
 
     Raises:
-        UnusablePlanError: No waypoints, times that do not increase, another frame, joint order or
-            robot.
+        UnusablePlanError: What ``check_usable`` refuses, or another number of joints.
     """
-    _check_usable(plan, robot)
+    check_usable(plan, robot)
     knots = _Knots()
     for is_open, group in groupby(_targets(plan, config), key=lambda target: target.given is None):
         run = list(group)
@@ -197,56 +184,6 @@ def _take_given(knots: _Knots, run: list[_Target], robot: RobotModel, config: Re
                 return
             knots.failures.append(failure)
         knots.add(target.t_ns, given)
-
-
-def _check_usable(plan: Plan, robot: RobotModel) -> None:
-    times = plan.times_ns()
-    if len(times) == 0:
-        raise UnusablePlanError(plan_id=plan.id, found="has no waypoints", hint="Send tau.")
-    if times[0] < 0 or np.any(np.diff(times) <= 0):
-        raise UnusablePlanError(
-            plan_id=plan.id,
-            found="has waypoint times that do not increase from 0",
-            hint="t_ns counts from the start of the trajectory.",
-        )
-    if times[-1] > MAX_DURATION_S * 1e9:
-        raise UnusablePlanError(
-            plan_id=plan.id,
-            found=f"lasts {times[-1] * 1e-9:.0f} s",
-            hint=f"At most {MAX_DURATION_S:.0f} s are replayed; split it.",
-        )
-    numbers = np.concatenate([plan.positions_m(), plan.quaternions_wxyz()], axis=1)
-    if not np.all(np.isfinite(numbers)) or np.any(np.abs(numbers[:, 3:]).max(axis=1) < 1e-6):
-        raise UnusablePlanError(
-            plan_id=plan.id,
-            found="has poses that are not finite, or quaternions that are zero",
-            hint="Send p_m in metres and q_wxyz of unit length.",
-        )
-    commands = [value for w in plan.tau for value in (w.width_m, *(w.joints_rad or ()))]
-    if not np.all(np.isfinite([value for value in commands if value is not None])):
-        raise UnusablePlanError(
-            plan_id=plan.id,
-            found="has joints or gripper widths that are not finite",
-            hint="Send joints_rad and width_m as numbers, or leave them out.",
-        )
-    if plan.frame != BASE_FRAME:
-        raise UnusablePlanError(
-            plan_id=plan.id,
-            found=f"is in the frame {plan.frame!r}",
-            hint=f"Transform it to {BASE_FRAME!r}.",
-        )
-    if plan.robot != robot.name:
-        raise UnusablePlanError(
-            plan_id=plan.id,
-            found=f"is for the robot {plan.robot!r}",
-            hint=f"The robot that was described is {robot.name!r}.",
-        )
-    if plan.joint_names and set(plan.joint_names) != set(ARM_JOINTS):
-        raise UnusablePlanError(
-            plan_id=plan.id,
-            found=f"names the joints {', '.join(plan.joint_names)}",
-            hint=f"The robot has {', '.join(ARM_JOINTS)}.",
-        )
 
 
 def _targets(plan: Plan, config: ReplayConfig) -> list[_Target]:

@@ -15,12 +15,8 @@ from bridge.task.verdict import Verdict
 from twin.replay.chance.samples import replay_samples, with_probability
 from twin.replay.episode.file import ReplayOrigin, write_replay
 from twin.replay.follow.clock import check_clock
-from twin.replay.follow.execution import (
-    check_covers,
-    cut_track,
-    path_of_execution,
-    stages_as_executed,
-)
+from twin.replay.follow.execution import cut_track, path_of_execution, stages_as_executed
+from twin.replay.follow.track_checks import check_covers, check_length
 from twin.replay.parting.recorded import Recording
 from twin.replay.place.calibrated import Correction
 from twin.replay.place.rebuilt import Place, read_place
@@ -128,9 +124,11 @@ def _tracks(source: _Source) -> tuple[streams.JointTrack, streams.JointTrack]:
     job, episode = source.job, source.episode
     end_ns = job.start_ns + job.length_ns()
     check_clock(episode, (JOINTS, GRIPPER_STATE), job.start_ns, end_ns, source.plan.id)
+    check_length(job.length_ns(), source.plan)
     arm = cut_track(streams.joint_track(episode, JOINTS), job.start_ns, end_ns)
-    check_covers(arm, end_ns, source.plan)
+    check_covers(arm, "joints", end_ns, source.plan)
     widths = cut_track(streams.joint_track(episode, GRIPPER_STATE), job.start_ns, end_ns)
+    check_covers(widths, "gripper widths", end_ns, source.plan)
     return arm, widths
 
 

@@ -9,13 +9,14 @@ from bridge.episode.streams import JointTrack
 from bridge.task.robot import ARM_JOINTS
 from twin.replay.config import ReplayConfig
 from twin.replay.follow.execution import (
-    check_covers,
     closed_mask,
     cut_track,
     path_of_execution,
     stages_as_executed,
 )
-from twin.replay.follow.path import UnusablePlanError
+from twin.replay.follow.path import JointPath
+from twin.replay.follow.track_checks import check_covers, check_length
+from twin.replay.follow.usable import UnusablePlanError
 
 OPEN_M, HELD_M = 0.085, 0.040
 
@@ -105,12 +106,71 @@ def test_a_recording_that_stops_early_or_starts_late_is_refused(script: SimpleNa
     track = JointTrack(names=ARM_JOINTS, stamps_ns=stamps, position=np.zeros((len(stamps), 6)))
     plan = script.plan(script.scene())
     cut = cut_track(track, 2_000_000_000, 5_000_000_000)
-    check_covers(cut, 4_400_000_000, plan)
-    with pytest.raises(UnusablePlanError, match=r"for 1\.0 s at its end"):
-        check_covers(cut, 5_000_000_000, plan)
+    check_covers(cut, "joints", 4_400_000_000, plan)
+    with pytest.raises(UnusablePlanError, match=r"no joints were recorded for 1\.0 s at its end"):
+        check_covers(cut, "joints", 5_000_000_000, plan)
     late = cut_track(track, 1_000_000_000, 3_000_000_000)
     with pytest.raises(UnusablePlanError, match=r"for 1\.0 s from 0\.0 s on"):
         path_of_execution(late, late, plan, ReplayConfig())
+
+
+def still_arm(times: np.ndarray) -> JointTrack:
+    return JointTrack(names=ARM_JOINTS, stamps_ns=times, position=np.zeros((len(times), 6)))
+
+
+@pytest.mark.parametrize(
+    ("what", "factor", "shift"),
+    [("radians, 0 when open", -9.4, 0.8), ("millimetres", 1000.0, 0.0), ("per cent", 1176.0, 0.0)],
+)
+def test_widths_that_are_no_distances_in_metres_are_refused(
+    script: SimpleNamespace, what: str, factor: float, shift: float
+) -> None:
+    """They would be cut off at the fingers' limits and replayed as a gripper that does nothing."""
+    times, width = recorded_grasp(0.0)
+    widths = JointTrack(
+        names=("finger_joint",), stamps_ns=times, position=factor * width[:, None] + shift
+    )
+    plan = script.plan(script.scene())
+    with pytest.raises(
+        UnusablePlanError, match=r"gripper widths from -?\d.* in metres, 0 to 0\.085"
+    ):
+        path_of_execution(still_arm(times), widths, plan, ReplayConfig())
+
+
+def test_of_several_joints_of_a_gripper_the_one_with_the_name_counts(
+    script: SimpleNamespace,
+) -> None:
+    times, width = recorded_grasp(0.0)
+    both = np.stack([np.zeros(len(width)), width], axis=1)
+    plan = script.plan(script.scene())
+
+    def path(*names: str) -> JointPath:
+        widths = JointTrack(names=names, stamps_ns=times, position=both)
+        return path_of_execution(still_arm(times), widths, plan, ReplayConfig(mode="kinematic"))
+
+    assert np.array_equal(path("current", "gripper_width").width_m, width)
+    with pytest.raises(UnusablePlanError, match=r"several joints of the gripper: left, right"):
+        path("left", "right")
+
+
+def test_widths_that_were_not_recorded_are_not_made_up(script: SimpleNamespace) -> None:
+    times, width = recorded_grasp(0.0)
+    plan = script.plan(script.scene())
+    there = (times < 1_000_000_000) | (times > 4_000_000_000)
+    widths = JointTrack(
+        names=("gripper_width",), stamps_ns=times[there], position=width[there, None]
+    )
+    with pytest.raises(UnusablePlanError, match=r"no gripper widths were recorded for 3\.0 s from"):
+        path_of_execution(still_arm(times), widths, plan, ReplayConfig())
+    with pytest.raises(UnusablePlanError, match=r"no gripper widths were recorded for 2\.0 s at"):
+        check_covers(widths, "gripper widths", int(times[-1]) + 2_000_000_000, plan)
+
+
+def test_an_execution_of_hours_is_refused_before_it_takes_hours(script: SimpleNamespace) -> None:
+    plan = script.plan(script.scene())
+    check_length(600_000_000_000, plan)
+    with pytest.raises(UnusablePlanError, match=r"was executed for 7200 s\. At most 600 s"):
+        check_length(7_200_000_000_000, plan)
 
 
 def test_a_grasp_of_something_soft_begins_where_the_fingers_stop_though_they_creep_on(

@@ -12,10 +12,13 @@ from bridge.geometry import se3
 from bridge.task.plan import Plan, Waypoint
 from bridge.task.robot import ROBOT_NAME, ur5_with_gripper_urdf
 from twin.replay.config import ReplayConfig
-from twin.replay.follow.path import UnusablePlanError, check_path, path_of_plan
+from twin.replay.follow.path import check_path, path_of_plan
+from twin.replay.follow.usable import MAX_WAYPOINTS, UnusablePlanError, check_usable
 from twin.replay.verdict.rollout import replay_plan
 from twin.robot.collision import hulls_of
+from twin.robot.config import IkConfig
 from twin.robot.description import RobotDescriptionError
+from twin.robot.inverse import solve_ik
 from twin.robot.model import RobotModel, load_robot
 
 KINEMATIC = ReplayConfig(mode="kinematic")
@@ -170,6 +173,33 @@ def test_a_pose_that_is_not_a_number_is_refused(script: SimpleNamespace) -> None
     tau = (plan.tau[0], replace(plan.tau[1], p_m=(float("nan"), 0.0, 0.2)), *plan.tau[2:])
     with pytest.raises(UnusablePlanError, match="not finite"):
         replay_plan(replace(plan, tau=tau), scene, KINEMATIC)
+
+
+def test_numbers_no_plan_can_mean_are_refused_in_a_sentence() -> None:
+    """JSON has no largest integer, and a quaternion too long to be squared has no direction."""
+    robot = load_robot(ur5_with_gripper_urdf())
+    plan = plan_through(robot.Ts_base_tcp(np.stack([HOME, HOME + 0.1])))
+    first, second = plan.tau
+    check_usable(plan, robot)
+    for changes, found in (
+        ({"t_ns": 10**30}, r"lasts 1\d* s"),
+        ({"width_m": 85.0}, r"gripper widths from 0\.080 to 85\.000.*in metres"),
+        ({"width_m": -0.04}, r"gripper widths from -0\.040 to"),
+        ({"q_wxyz": (1e200, 0.0, 0.0, 0.0)}, "quaternions that are none"),
+        ({"p_m": (1e300, 0.0, 0.2)}, "out of this world"),
+    ):
+        with pytest.raises(UnusablePlanError, match=found):
+            check_usable(replace(plan, tau=(first, replace(second, **changes))), robot)
+    many = tuple(replace(first, t_ns=k) for k in range(MAX_WAYPOINTS + 1))
+    with pytest.raises(UnusablePlanError, match="has 100001 waypoints"):
+        check_usable(replace(plan, tau=many), robot)
+
+
+def test_a_pose_that_is_no_number_is_not_reached() -> None:
+    robot = load_robot(ur5_with_gripper_urdf())
+    T = np.eye(4)
+    T[:3, :3] = np.nan
+    assert not solve_ik(robot, T, IkConfig(restarts=1)).reached
 
 
 def test_straight_motion_through_a_wrist_singularity_is_a_named_jump() -> None:

@@ -8,8 +8,10 @@ import pytest
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
+from twin.physics.world import World
 from twin.replay.config import Mode, ReplayConfig
-from twin.replay.follow.path import UnusablePlanError
+from twin.replay.failure import NotEvaluatedError
+from twin.replay.follow.usable import UnusablePlanError
 from twin.replay.verdict.result import ReplayResult
 from twin.replay.verdict.rollout import replay_joints, replay_plan
 
@@ -302,6 +304,17 @@ def test_a_plan_of_one_waypoint_stands_still(script: SimpleNamespace) -> None:
     assert result.verdict.ik.value is True
     assert result.verdict.terminal.value is not True
     assert result.verdict.accepted is not True
+
+
+def test_a_rigid_body_that_physics_lost_is_not_judged(
+    script: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No distance to it is ever below a limit, so it would touch nothing and lie well."""
+    monkeypatch.setattr(World, "object_pose", lambda *_: (np.nan,) * 7)
+    scene = script.scene()
+    plan = script.plan(scene)
+    with pytest.raises(NotEvaluatedError, match="not evaluated: physics lost cube: its place is no"):
+        replay_plan(replace(plan, tau=plan.tau[:1]), scene, ReplayConfig(settle_after_s=0.1))
 
 
 def test_quaternions_of_another_length_mean_the_same_path(script: SimpleNamespace) -> None:

@@ -16,7 +16,7 @@ from twin.replay.config import ReplayConfig
 from twin.replay.failure import NotEvaluatedError
 from twin.replay.follow.clock import check_clock
 from twin.replay.follow.execution import path_of_execution
-from twin.replay.follow.path import UnusablePlanError
+from twin.replay.follow.usable import UnusablePlanError
 from twin.replay.place.starts import StartState
 from twin.replay.verdict.result import ReplayResult
 from twin.replay.work.job import ReplayJob, row_of_failure
