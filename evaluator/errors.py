@@ -15,3 +15,17 @@ class UndefinedStatisticError(EvaluatorError):
         self.statistic = statistic
         self.reason = reason
         super().__init__(f"{statistic} is undefined: {reason}.")
+
+
+class AlikeNamesError(EvaluatorError):
+    """Two names differ only in what the ids of measurements do not keep."""
+
+    def __init__(self, *, kind: str, names: tuple[str, str], places: tuple[str, str]) -> None:
+        """Remember both names and where they stand."""
+        self.kind = kind
+        self.names = names
+        self.places = places
+        super().__init__(
+            f"{kind} {names[0]!r} ({places[0]}) and {names[1]!r} ({places[1]}) cannot be told "
+            "apart in the ids of results. Spell them alike if they are one, else further apart."
+        )

@@ -98,7 +98,7 @@ class Results:
     source: str
     """run, trials, rates or images."""
     stand_in: bool | None
-    """None when the input does not say, as a rates CSV."""
+    """None when the input does not say, as rates of the twin alone."""
     measurements: tuple[Measurement, ...]
     tables: tuple[Table, ...] = ()
     exclusions: tuple[Exclusion, ...] = ()

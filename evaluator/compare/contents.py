@@ -75,19 +75,50 @@ def read_contents(
         output,
         workers,
     )
-    return RunContents(
-        recorded=tuple(
+    found, doubled = _each_once(
+        [
             RecordedFile(file=file, facts=recorded[file.name])
             for file in inventory.recorded
             if file.name in recorded
-        ),
+        ]
+    )
+    return RunContents(
+        recorded=tuple(found),
         derived=tuple(
             DerivedFile(file=file, facts=derived[file.name])
             for file in inventory.derived
             if file.name in derived
         ),
-        left_out=(*inventory.left_out, *left_out, *broken),
+        left_out=(*inventory.left_out, *left_out, *doubled, *broken),
     )
+
+
+def _each_once(files: Sequence[RecordedFile]) -> tuple[list[RecordedFile], list[Exclusion]]:
+    """Keep one file of each episode; what a backup or a sync left beside it counts no trial twice.
+
+    One that can be judged goes before a broken one, one named as its episode before a copy.
+    """
+    best: dict[str, RecordedFile] = {}
+    for each in files:
+        name = each.facts.info.id
+        if name not in best or _rank(each) < _rank(best[name]):
+            best[name] = each
+    kept = [each for each in files if best[each.facts.info.id] is each]
+    doubled = [
+        Exclusion(
+            episode=each.file.path.name,
+            scope="everything",
+            reason=f"it is episode {each.facts.info.id} once more, which "
+            f"{best[each.facts.info.id].file.path.name} is; an episode counts once",
+        )
+        for each in files
+        if best[each.facts.info.id] is not each
+    ]
+    return kept, doubled
+
+
+def _rank(each: RecordedFile) -> tuple[bool, bool]:
+    return bool(each.facts.broken), each.file.stem != each.facts.info.id
 
 
 def _labels(run: RunFolder) -> dict[str, str]:

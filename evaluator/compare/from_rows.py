@@ -6,6 +6,7 @@ from evaluator.compare.cells import agreement_intervals, cell_agreement
 from evaluator.compare.decisions import decisions
 from evaluator.compare.fewer import assisted_rates, sequences, stopping_table
 from evaluator.compare.gains import gain_tests, replanning_gains
+from evaluator.compare.measure import refuse_alike
 from evaluator.compare.pairing import pair_starts, paired_gain, start_distances
 from evaluator.compare.remarks import remarks, remarks_table
 from evaluator.compare.rows import Comparison, TrialRow
@@ -48,9 +49,14 @@ def compare_rows(
         stand_in: Whether the recorded side is a simulated laboratory.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
         goal: Success rate to stop or continue for.
+
+    Raises:
+        AlikeNamesError: When ids cannot tell two tasks, conditions or policies apart.
     """
     if not rows:
         return Comparison(run=run, source=source, stand_in=stand_in)
+    for kind in ("task", "condition", "policy"):
+        refuse_alike(kind, ((getattr(row, kind), row.episode or "streamed") for row in rows))
     word = Comparison(run=run, source=source, stand_in=stand_in).recorded_word
     rates = side_rates(rows, method=method)
     cells = rate_cells(rows, rates, method=method)

@@ -20,6 +20,7 @@ from evaluator.statistics.proportion import relative_gain
 from evaluator.statistics.unpaired import boschloo, guaranteed_difference, newcombe_difference
 
 SIDES = ("recorded", "sim")
+A_RATIO = "a ratio of two rates; the interval is that of the gain in percentage points"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,24 +101,29 @@ def _gain(change: Change, method: str) -> list[Measurement]:
         )
         return gain, interval
 
-    episodes = (*before.episodes, *after.episodes)
+    arms = None if change.counts is None else (change.counts[1], change.counts[3])
+    make = partial(
+        measured,
+        n=None if arms is None else sum(arms),
+        counted=before.counted,
+        episodes=(*before.episodes, *after.episodes),
+    )
     return [
-        measured(
+        make(
             f"gain.pp.{change.side}.{change.name}",
             points,
             unit="pp",
             definition=f"gain with replanning in percentage points ({change.side}): {change.words}",
             reason_without_interval="no n",
-            episodes=episodes,
-            interval_n=None if change.counts is None else min(change.counts[1], change.counts[3]),
+            interval_n=None if arms is None else min(arms),
         ),
-        measured(
+        make(
             f"gain.relative.{change.side}.{change.name}",
             lambda: relative_gain(_value(before), _value(after)),
             unit="1",
             definition=f"relative gain with replanning ({change.side}), (with - without) / "
             f"without: {change.words}; not percentage points",
-            episodes=episodes,
+            reason_without_interval=A_RATIO,
         ),
     ]
 
@@ -148,6 +154,7 @@ def _average_gains(pairs: Sequence[Change]) -> list[Measurement]:
                 definition=f"relative gain with replanning {what}; not percentage points",
                 n=len(mine),
                 counted="task",
+                reason_without_interval="a ratio of two means over these tasks",
             ),
         ]
     return measurements

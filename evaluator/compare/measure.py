@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Callable, Iterable
 
-from evaluator.errors import UndefinedStatisticError
+from evaluator.errors import AlikeNamesError, UndefinedStatisticError
 from evaluator.result import Interval, Measurement
 from evaluator.statistics.coverage.stored import vouch
 from evaluator.statistics.proportion import RATE_INTERVALS
@@ -13,8 +13,37 @@ Statistic = Callable[[], float | tuple[float, Interval | None]]
 
 
 def slug(text: str) -> str:
-    """Return text usable as one part of a measurement id."""
-    return re.sub(r"[^A-Za-z0-9_+-]+", "_", text) or "-"
+    """Return text usable as one part of a measurement id.
+
+    Letters beyond ASCII are written as their code points, so that names in any script stay apart.
+    Blanks and signs become ``_``, so that names may still share one: ``refuse_alike``.
+    """
+    plain = text if text.isascii() else "".join(c if c.isascii() else _code(c) for c in text)
+    return re.sub(r"[^A-Za-z0-9_+-]+", "_", plain) or "-"
+
+
+def _code(letter: str) -> str:
+    return f"+{ord(letter):04x}"
+
+
+def refuse_alike(kind: str, named: Iterable[tuple[str, str]]) -> None:
+    """Refuse two names that would share an id: the number of one would stand for both.
+
+    Args:
+        kind: What is named: task, condition, policy.
+        named: Each name with where it stands: an episode, or a row of a table.
+
+    Raises:
+        AlikeNamesError: Naming both, and where they first stand.
+    """
+    places: dict[str, str] = {}
+    for name, where in named:
+        places.setdefault(name, where)
+    owners: dict[str, str] = {}
+    for name, where in places.items():
+        owner = owners.setdefault(slug(name), name)
+        if owner != name:
+            raise AlikeNamesError(kind=kind, names=(owner, name), places=(places[owner], where))
 
 
 def measured(

@@ -138,6 +138,7 @@ def paired_gain(pairs: Sequence[StartPair]) -> list[Measurement]:
                     f"{'-p' if kind == 'mid' else ' binomial'}: {words}",
                     n=len(known),
                     counted="pair",
+                    reason_without_interval="a p-value",
                     episodes=[r.episode for pair in known for r in (pair.before, pair.after)],
                 )
             )

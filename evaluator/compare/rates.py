@@ -9,7 +9,7 @@ from bridge.exchange.trials_rates import RateRecord, read_rates
 from evaluator.compare.cells import agreement_intervals, cell_agreement
 from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import gain_tests, replanning_gains
-from evaluator.compare.measure import slug, vouched_rate
+from evaluator.compare.measure import refuse_alike, slug, vouched_rate
 from evaluator.compare.remarks import remarks, remarks_table
 from evaluator.compare.rows import Comparison, RateCell
 from evaluator.compare.success import WITH, averages
@@ -29,10 +29,18 @@ def compare_rates(path: Path, *, method: str = "wilson") -> Comparison:
 def compare_records(
     records: Sequence[RateRecord], path: Path, *, method: str = "wilson"
 ) -> Comparison:
-    """Compare rates that were read already; ``path`` is where they come from."""
-    stand_in = any(record.side == "stand-in" for record in records)
+    """Compare rates that were read already; ``path`` is where they come from.
+
+    Raises:
+        AlikeNamesError: When ids cannot tell two tasks or conditions apart.
+    """
+    for kind in ("task", "condition"):
+        refuse_alike(kind, ((getattr(r, kind), f"row {r.row}") for r in records))
+    sides = {record.side for record in records}
+    # Rates of the twin alone say nothing of where the others would come from.
+    stand_in = True if "stand-in" in sides else (False if "real" in sides else None)
     cells, left_out = _rate_cells(records, method)
-    word = "stand-in" if stand_in else "real"
+    word = Comparison(run=path.stem, source="rates", stand_in=stand_in).recorded_word
     gains = replanning_gains(cells, method=method)
     chosen, decision_tables = decisions(cells)
     measurements = (

@@ -38,6 +38,8 @@ class RecordedFacts:
     """What one recorded episode says of itself, with the label given to it afterwards."""
 
     info: EpisodeInfo
+    began_ns: int = 0
+    """When its recording began; 0 without messages."""
     outcome: Outcome | None = None
     """As the operator labelled it; a label given after the fact wins."""
     num_plans: int = 0
@@ -93,6 +95,7 @@ def _read_trial(run: RunFolder, episode: Episode, info: EpisodeInfo) -> Recorded
     verdict = None if plan_id is None else log.verdicts.get(plan_id)
     return RecordedFacts(
         info=info,
+        began_ns=episode.start_ns,
         outcome=outcome_of(run, episode) or log.label,
         num_plans=len(log.plan_ids),
         num_plans_sent=len(set(log.sent)),

@@ -73,6 +73,8 @@ class TrialRow:
     """The same of the verdict before motion."""
     count: int = 1
     """Trials this row stands for; above 1 only in a streamed table, where ``episode`` is empty."""
+    began_ns: int = 0
+    """When its recording began; 0 where nobody knows, as in a table, whose rows are in order."""
     path: Path | None = None
     start_positions_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     """Where the objects were localised at the start, to judge pairs of starts."""

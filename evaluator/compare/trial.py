@@ -33,15 +33,21 @@ class Trial:
     row: TrialRow
     lacking: tuple[str, ...] = ()
     """Why parts of the row are unknown."""
+    impossible_count: str = ""
+    """What is wrong with the label's count of objects or sub-tasks, which is then unknown."""
     replays: dict[str, DerivedFile] = field(default_factory=dict)
     """The dynamic replays of the plan sent, planned and executed, as far as there are any."""
     localised: DerivedFile | None = None
 
     @property
     def exclusions(self) -> list[Exclusion]:
-        """What is left out of the agreement."""
+        """What is left out of the agreement, and of rates in other units."""
         name = self.row.episode
-        return [Exclusion(episode=name, scope="agreement", reason=why) for why in self.lacking]
+        found = [Exclusion(episode=name, scope="agreement", reason=why) for why in self.lacking]
+        if self.impossible_count:
+            scope = f"rates counted in {self.row.unit}s"
+            found.append(Exclusion(episode=name, scope=scope, reason=self.impossible_count))
+        return found
 
 
 def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
@@ -67,6 +73,7 @@ def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
         file=file,
         row=_row(file, facts, found, localised, replays),
         lacking=tuple(lacking),
+        impossible_count=_impossible_count(facts.outcome),
         replays=replays,
         localised=localised,
     )
@@ -81,6 +88,13 @@ def _unlabelled(outcome: Outcome | None) -> list[str]:
     return []
 
 
+def _impossible_count(outcome: Outcome | None) -> str:
+    """Say what is wrong with a count of objects or sub-tasks; nothing where it can be."""
+    if outcome is None or outcome.unit == "trial" or 0 <= outcome.k <= outcome.n > 0:
+        return ""
+    return f"the label counts {outcome.k} of {outcome.n} {outcome.unit}s, which cannot be"
+
+
 def _row(
     file: RunFile,
     facts: RecordedFacts,
@@ -91,7 +105,7 @@ def _row(
     info, outcome, verdict = facts.info, facts.outcome, facts.verdict
     planned = found["planned"]
     failing = planned.verdict if planned.verdict is not None else verdict
-    counted = outcome is not None and outcome.unit != "trial"
+    counted = outcome is not None and outcome.unit != "trial" and not _impossible_count(outcome)
     probabilities = [s.p_success for s in (planned.verdict, verdict) if s is not None]
     places = () if localised is None else localised.facts.places
     return TrialRow(
@@ -121,6 +135,7 @@ def _row(
         stages=_stages(outcome),
         planned_replay=replays["planned"].path.name if "planned" in replays else None,
         executed_replay=replays["executed"].path.name if "executed" in replays else None,
+        began_ns=facts.began_ns,
         path=file.path,
         start_positions_m=facts.start_positions_m | positions_at_start(places, facts.started_ns),
         read_tcp_errors=partial(

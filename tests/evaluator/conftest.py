@@ -90,6 +90,8 @@ class RunMaker:
         tags: tuple[str, ...] = (),
         localised_m: float | None = None,
         num_poses: int = NUM_POSES,
+        start_ns: int = START_NS,
+        outcome: Outcome | None = None,
     ) -> str:
         """Write one recorded trial; the plan is named after it. Returns the plan's id."""
         info = EpisodeInfo(
@@ -103,7 +105,8 @@ class RunMaker:
             stand_in=stand_in,
             tags=tags,
         )
-        outcome = None if recorded is None else Outcome(result=recorded, k=recorded == "success")
+        if outcome is None and recorded is not None:
+            outcome = Outcome(result=recorded, k=recorded == "success")
         plan_id = f"plan_{name}"
         with EpisodeWriter(self.run.episodes_dir / f"{name}.mcap") as writer:
             writer.describe(info, outcome=outcome)
@@ -111,15 +114,15 @@ class RunMaker:
             if localised_m is not None:
                 log.localised(localised_m)
             plan = plan_of(plan_id)
-            log.raw("/standin/plan", schema.PLAN, plan.to_json(), START_NS - 2 * STEP_NS)
+            log.raw("/standin/plan", schema.PLAN, plan.to_json(), start_ns - 2 * STEP_NS)
             never_sent = plan_of(f"{plan_id}_unsent")
-            log.raw("/standin/plan", schema.PLAN, never_sent.to_json(), START_NS - 2 * STEP_NS)
+            log.raw("/standin/plan", schema.PLAN, never_sent.to_json(), start_ns - 2 * STEP_NS)
             if gate != "none":
                 assert not isinstance(gate, str)
                 said = verdict_of(gate, plan_id=plan_id).to_json()
-                log.raw("/standin/verdict", schema.VERDICT, said, START_NS - STEP_NS)
+                log.raw("/standin/verdict", schema.VERDICT, said, start_ns - STEP_NS)
             if sent:
-                log.event("execution_started", plan_id, START_NS)
+                log.event("execution_started", plan_id, start_ns)
             if late_gate != "none":
                 assert not isinstance(late_gate, str)
                 said = verdict_of(late_gate, plan_id=plan_id).to_json()
@@ -127,12 +130,12 @@ class RunMaker:
                     "/standin/verdict",
                     said,
                     type_name=schema.VERDICT,
-                    log_time_ns=START_NS + STEP_NS,
-                    publish_time_ns=late_gate_made_ns or START_NS + STEP_NS,
+                    log_time_ns=start_ns + STEP_NS,
+                    publish_time_ns=late_gate_made_ns or start_ns + STEP_NS,
                 )
-            log.poses("/standin/tcp/pose", START_NS, offset_m, num_poses)
+            log.poses("/standin/tcp/pose", start_ns, offset_m, num_poses)
             if sent:
-                log.event("execution_ended", plan_id, START_NS + num_poses * STEP_NS)
+                log.event("execution_ended", plan_id, start_ns + num_poses * STEP_NS)
         return plan_id
 
     def localised(self, name: str, x_m: float, *, source_sha256: str | None = None) -> Path:
