@@ -67,6 +67,9 @@ def _parse(part: str) -> Threshold:
     if "." not in name and name not in SHORT:
         message = f"--fail-under knows no {name!r}; there are: {', '.join(SHORT)}, and every id."
         raise UsageError(message)
+    if name in SHORT and name != "psnr" and abs(limit) > 1:
+        message = f"--fail-under {part!r} can never be reached: {name} is at most 1."
+        raise UsageError(message)
     return Threshold(name=name, id=SHORT.get(name, name), limit=limit)
 
 

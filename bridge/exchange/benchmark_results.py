@@ -6,6 +6,7 @@ the recorded side stays unknown.
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -90,12 +91,13 @@ def read_polaris(path: Path) -> list[TrialRecord]:
         text = row.text("success").lower().removesuffix(".0")
         if text not in YES and text not in NO:
             raise row.refuse(f"success is {text!r}", "PolaRiS writes True or False")
-        trial_id = f"{path.parent.name}/{episode}"
+        task = path.resolve().parent.name
+        trial_id = f"{task}/{episode}"
         if trial_id in trials:
             raise row.refuse(f"episode {episode} is there twice", "Remove the copy")
         trials[trial_id] = TrialRecord(
             trial_id=trial_id,
-            task=path.resolve().parent.name,
+            task=task,
             start_id=str(episode),
             sim_planned=text in YES,
         )
@@ -125,6 +127,10 @@ def read_lerobot_eval(path: Path) -> list[TrialRecord]:
         raise TableError(path=path, row=None, found=found, hint=_LEROBOT_HINT) from error
     if not trials:
         raise TableError(path=path, row=None, found="no outcomes", hint=_LEROBOT_HINT)
+    name, times = Counter(trial.trial_id for trial in trials).most_common(1)[0]
+    if times > 1:
+        found = f"{name} is there {times} times"
+        raise TableError(path=path, row=None, found=found, hint="Remove the copies")
     return trials
 
 

@@ -3,15 +3,27 @@
 Columns: task, condition, side, unit, k, n, and rate (0..1) or rate_percent (0..100).
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from pathlib import Path
 
-from bridge.exchange.trials_csv import UNITS, SourceRow, read_rows
+from bridge.exchange.trials_csv import UNITS, SourceRow, TableError, read_rows
 
 COLUMNS = ("task", "condition", "side", "unit", "k", "n", "rate", "rate_percent")
 SIDES = ("sim", "real", "stand-in")
+MOST_DIGITS = 30
+"""Before or behind the point of a printed figure; more would take forever to compare."""
+
+
+class ImpossibleRateError(TableError):
+    """A printed rate that no count of n rounds to, or another than the one beside it."""
+
+
+class AmbiguousRateError(TableError):
+    """A printed rate that several counts of n round to."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,21 +52,30 @@ def read_rates(path: Path) -> list[RateRecord]:
     records: list[RateRecord] = []
     for row in read_rows(path, ("task", "side"), COLUMNS):
         record = read_rate(row)
-        for other in records:
-            if other.task == record.task and other.unit != record.unit:
-                raise row.refuse(
-                    f"unit {record.unit!r} in task {record.task!r}, but row {other.row} says "
-                    f"{other.unit!r}",
-                    "One task is counted in one unit; mixing them changes what a rate means",
-                )
-            if _key(other) == _key(record):
-                raise row.refuse(
-                    f"{record.side} of {record.task!r} {record.condition!r} stands in row "
-                    f"{other.row} already",
-                    "Give each cell once",
-                )
+        check_beside(row, record, records)
         records.append(record)
     return records
+
+
+def check_beside(row: SourceRow, record: RateRecord, earlier: Sequence[RateRecord]) -> None:
+    """Refuse a cell that is there already, and a second unit in one task.
+
+    Raises:
+        TableError: Naming both rows.
+    """
+    for other in earlier:
+        if other.task == record.task and other.unit != record.unit:
+            raise row.refuse(
+                f"unit {record.unit!r} in task {record.task!r}, but row {other.row} says "
+                f"{other.unit!r}",
+                "One task is counted in one unit; mixing them changes what a rate means",
+            )
+        if _key(other) == _key(record):
+            raise row.refuse(
+                f"{record.side} of {record.task!r} {record.condition!r} stands in row "
+                f"{other.row} already",
+                "Give each cell once",
+            )
 
 
 def _key(record: RateRecord) -> tuple[str, str, str]:
@@ -65,7 +86,9 @@ def read_rate(row: SourceRow) -> RateRecord:
     """Read one row of a rates CSV; other columns than ours are not looked at.
 
     Raises:
-        TableError: For a rate that is no count of n.
+        ImpossibleRateError: For a rate that is no count of n.
+        AmbiguousRateError: For a rate that is several counts of n.
+        TableError: For everything else that no rate can be.
     """
     if not row.text("task"):
         raise row.refuse("task is empty", "Every rate needs its task")
@@ -118,35 +141,54 @@ def printed_rate(row: SourceRow) -> tuple[Fraction, Fraction] | None:
         number = Decimal(text.removesuffix("%"))
     except InvalidOperation:
         number = Decimal("NaN")
-    if not number.is_finite() or not 0 <= number <= scale:
+    if not is_figure(number) or not 0 <= number <= scale:
         hint = f"{name} lies in 0..{scale}; percent go into the column rate_percent"
         raise row.refuse(f"{name} is {text!r}", hint)
+    return Fraction(number) / scale, half_digit(number) / scale
+
+
+def is_figure(number: Decimal) -> bool:
+    """Say whether somebody may have printed this: finite, and not endlessly many digits."""
     exponent = number.as_tuple().exponent
-    digits = -exponent if isinstance(exponent, int) and exponent < 0 else 0
-    half = Fraction(1, 2 * 10**digits) / scale
-    return Fraction(number) / scale, half
+    return isinstance(exponent, int) and max(abs(exponent), abs(number.adjusted())) <= MOST_DIGITS
+
+
+def half_digit(number: Decimal) -> Fraction:
+    """Return half a unit of the last printed digit."""
+    exponent = number.as_tuple().exponent
+    return Fraction(1, 2 * 10 ** max(0, -exponent if isinstance(exponent, int) else 0))
 
 
 def _count(row: SourceRow, printed: tuple[Fraction, Fraction], n: int, k: int | None) -> int:
     """Return the count behind a printed rate, refusing what no count of n rounds to."""
     rate, half = printed
     nearest = int(rate * n + Fraction(1, 2))
-    fitting = [count for count in range(n + 1) if abs(Fraction(count, n) - rate) <= half]
+    fewest, most = max(0, math.ceil((rate - half) * n)), min(n, math.floor((rate + half) * n))
     if k is not None:
-        if k not in fitting:
-            raise row.refuse(
-                f"the rate {float(rate):.6g} is not {k}/{n} = {k / n:.6g}", "Correct one of them"
+        if not fewest <= k <= most:
+            raise ImpossibleRateError(
+                path=row.path,
+                row=row.row,
+                found=f"the rate {float(rate):.6g} is not {k}/{n} = {k / n:.6g}",
+                hint="Correct one of them",
             )
         return k
-    if not fitting:
+    if fewest > most:
         below = int(rate * n)
-        raise row.refuse(
-            f"{float(rate):.6g} x {n} = {float(rate * n):.6g} is no whole number of successes",
-            f"{below}/{n} = {below / n:.6g} and {below + 1}/{n} = {(below + 1) / n:.6g} are the "
-            "possible rates. Was another unit counted? 0.46 fits 23 of 50 objects, not 10 trials",
+        raise ImpossibleRateError(
+            path=row.path,
+            row=row.row,
+            found=f"{float(rate):.6g} x {n} = {float(rate * n):.6g} is no whole number of "
+            "successes",
+            hint=f"{below}/{n} = {below / n:.6g} and {below + 1}/{n} = {(below + 1) / n:.6g} are "
+            "the possible rates. Was another unit counted? 0.46 fits 23 of 50 objects, not 10 "
+            "trials",
         )
-    if len(fitting) > 1 and Fraction(nearest, n) != rate:
-        raise row.refuse(
-            f"{len(fitting)} counts of {n} round to {float(rate):.6g}", "Give k as well"
+    if fewest < most and Fraction(nearest, n) != rate:
+        raise AmbiguousRateError(
+            path=row.path,
+            row=row.row,
+            found=f"{most - fewest + 1} counts of {n} round to {float(rate):.6g}",
+            hint="Give k as well",
         )
     return nearest

@@ -11,7 +11,18 @@ from fractions import Fraction
 from pathlib import Path
 
 from bridge.exchange.trials_csv import SourceRow, TableError, read_rows
-from bridge.exchange.trials_rates import COLUMNS, RateRecord, printed_rate, read_rate
+from bridge.exchange.trials_rates import (
+    COLUMNS,
+    SIDES,
+    AmbiguousRateError,
+    ImpossibleRateError,
+    RateRecord,
+    check_beside,
+    half_digit,
+    is_figure,
+    printed_rate,
+    read_rate,
+)
 from evaluator.compare.cell_intervals import sides, usable_cells
 from evaluator.compare.rates import compare_records
 from evaluator.compare.remarks import remarks_table
@@ -33,9 +44,12 @@ STATISTICS = (
     "bias_pp",
     "mmrv",
 )
+OF_ONE_SIDE = ("average_percent", "gain_pp", "gain_relative_percent")
+"""Statistics that must say whose rates they are about."""
 AS_PRINTED, ROUNDED, DIFFERS = "as printed", "only from rounded figures", "differs"
 IMPOSSIBLE, UNDEFINED, NOT_PRINTED = "impossible", "undefined", "not in the table"
-FAILED = (ROUNDED, DIFFERS, IMPOSSIBLE)
+AMBIGUOUS = "ambiguous"
+FAILED = (ROUNDED, DIFFERS, IMPOSSIBLE, UNDEFINED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,11 +91,15 @@ class PublishedCheck:
         return tuple(finding for finding in self.findings if finding.verdict in FAILED)
 
 
-def check_published(path: Path) -> PublishedCheck:
+def check_published(path: Path, *, method: str = "wilson") -> PublishedCheck:
     """Recompute every printed figure of a table.
 
+    Args:
+        path: The table.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+
     Raises:
-        TableError: Naming the row that cannot be read at all.
+        TableError: Naming the row that cannot be read at all, or that is there twice.
     """
     records: list[RateRecord] = []
     claims: list[_Claim] = []
@@ -90,12 +108,11 @@ def check_published(path: Path) -> PublishedCheck:
         if row.text("statistic"):
             claims.append(_claim(row))
             continue
-        try:
-            records.append(read_rate(row))
-        except TableError as error:
-            records.append(_as_printed(row, error))
-            findings.append(_impossible(row, error))
-    comparison = compare_records(records, path)
+        record, finding = _read(row)
+        check_beside(row, record, records)
+        records.append(record)
+        findings += [] if finding is None else [finding]
+    comparison = compare_records(records, path, method=method)
     cells = usable_cells(comparison.cells)
     findings += [_judge(claim, cells, claims) for claim in claims]
     findings += _not_printed(cells, claims)
@@ -113,27 +130,51 @@ def _claim(row: SourceRow) -> _Claim:
         raise row.refuse(f"statistic is {statistic!r}", f"Statistics: {', '.join(STATISTICS)}")
     try:
         value = Decimal(row.text("printed").removesuffix("%"))
-    except InvalidOperation as error:
-        raise row.refuse(f"printed is {row.text('printed')!r}", "Give a number") from error
-    exponent = value.as_tuple().exponent
-    digits = -exponent if isinstance(exponent, int) and exponent < 0 else 0
-    side = "sim" if row.text("side") == "sim" else "recorded"
+    except InvalidOperation:
+        value = Decimal("NaN")
+    if not is_figure(value):
+        raise row.refuse(f"printed is {row.text('printed')!r}", "Give a number")
+    said = row.text("side")
+    if said not in SIDES and (said or statistic in OF_ONE_SIDE):
+        raise row.refuse(f"side of {statistic} is {said!r}", f"Sides: {', '.join(SIDES)}")
     return _Claim(
         row=row,
         statistic=statistic,
         task=row.text("task"),
-        side=side,
+        side="sim" if said == "sim" else "recorded",
         condition=row.text("condition"),
         value=value,
-        half=Fraction(1, 2 * 10**digits),
+        half=half_digit(value),
     )
 
 
-def _as_printed(row: SourceRow, error: TableError) -> RateRecord:
-    """Keep a rate that no count gives, without its n, so that the rest can be recomputed."""
+def _read(row: SourceRow) -> tuple[RateRecord, Finding | None]:
+    """Read a rate; one that no count gives, or several, is kept without n, and said."""
+    k, n = row.text("k"), row.text("n")
+    refusal: TableError
+    try:
+        return read_rate(row), None
+    except ImpossibleRateError as error:
+        refusal, recomputed, verdict = error, f"{k}/{n}" if k else f"no count of {n}", IMPOSSIBLE
+    except AmbiguousRateError as error:
+        refusal, recomputed, verdict = error, f"several counts of {n}", AMBIGUOUS
     printed = printed_rate(row)
     if printed is None:
-        raise error
+        raise refusal
+    names = (row.text("task"), row.text("condition"), row.text("side"))
+    finding = Finding(
+        row=row.row,
+        what=" ".join(name for name in names if name),
+        printed=row.text("rate_percent") or row.text("rate"),
+        recomputed=recomputed,
+        verdict=verdict,
+        remark=str(refusal).partition(f" row {row.row}: ")[2],
+    )
+    return _as_printed(row, printed[0]), finding
+
+
+def _as_printed(row: SourceRow, rate: Fraction) -> RateRecord:
+    """Keep a rate without its n, so that the rest can be recomputed."""
     return RateRecord(
         task=row.text("task"),
         condition=row.text("condition"),
@@ -141,21 +182,8 @@ def _as_printed(row: SourceRow, error: TableError) -> RateRecord:
         unit=row.text("unit") or "trial",
         k=None,
         n=None,
-        rate=printed[0],
+        rate=rate,
         row=row.row,
-    )
-
-
-def _impossible(row: SourceRow, error: TableError) -> Finding:
-    where = " ".join(p for p in (row.text("task"), row.text("condition"), row.text("side")) if p)
-    text = str(error).partition(": ")[2]
-    return Finding(
-        row=row.row,
-        what=where,
-        printed=row.text("rate_percent") or row.text("rate"),
-        recomputed=f"no count of {row.text('n')}",
-        verdict=IMPOSSIBLE,
-        remark=text,
     )
 
 
@@ -173,6 +201,7 @@ def _judge(claim: _Claim, cells: Sequence[RateCell], claims: Sequence[_Claim]) -
             printed=printed,
             recomputed=f"undefined: {error.reason}",
             verdict=UNDEFINED,
+            remark=f"printed {printed}, but the rows do not give it: {error.reason}",
         )
     shown = f"{value:.4g}" if abs(value) < 1 else f"{value:.2f}"
     if _fits(value, claim):
@@ -267,5 +296,6 @@ def _table(findings: Sequence[Finding]) -> Table:
             (f.row, f.what, f.printed or None, f.recomputed, f.verdict, f.remark or None)
             for f in findings
         ),
-        note="A figure fits when it rounds to what is printed. Row numbers as in the CSV.",
+        note="A figure fits when it rounds to what is printed. Ambiguous: several counts round to "
+        "the rate, so it has no interval here. Row numbers as in the CSV.",
     )

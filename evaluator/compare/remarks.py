@@ -96,10 +96,11 @@ def _power(by_id: dict[str, Measurement]) -> list[Remark]:
         cell = name.removeprefix("unpaired.boschloo_p.recorded.")
         needed = by_id.get(f"power.trials_needed.recorded.{cell}")
         gain = by_id.get(f"gain.pp.recorded.{cell}")
-        if p.value is None or p.value < SIGNIFICANT or gain is None or gain.value is None:
-            continue
+        if p.value is None or p.value < SIGNIFICANT or gain is None or not gain.value:
+            continue  # no gain at all is nothing that more trials would show
+        change = "a gain" if gain.value > 0 else "a loss"
         text = (
-            f"{p.n} {p.counted}s per condition do not show a gain of {gain.value:+.0f} pp "
+            f"{p.n} {p.counted}s per condition do not show {change} of {gain.value:+.0f} pp "
             f"(Boschloo p = {p.value:.2f})"
         )
         if needed is not None and needed.value is not None:

@@ -37,6 +37,14 @@ def compare_csv(path: Path, *, method: str = "wilson", goal: float | None = None
         TableError: Naming the row that cannot be believed.
         UsageError: When it is none of these.
     """
+    found = _compare(path, method, goal)
+    if goal is None or any(table.id == "stopping" and table.rows for table in found.tables):
+        return found
+    missing = "stop or continue: --goal needs recorded outcomes of single trials, one after another"
+    return replace(found, missing=(*found.missing, missing))
+
+
+def _compare(path: Path, method: str, goal: float | None) -> Comparison:
     if path.is_dir():
         return _from_benchmark(path, read_simpler(path), "SIMPLER", method)
     if path.suffix.lower() == ".json":
@@ -45,7 +53,7 @@ def compare_csv(path: Path, *, method: str = "wilson", goal: float | None = None
     if "trial_id" in header:
         return compare_trials(path, method=method, goal=goal)
     if "statistic" in header:
-        return check_published(path).comparison
+        return check_published(path, method=method).comparison
     if "side" in header:
         return compare_rates(path, method=method)
     if set(POLARIS_COLUMNS) <= set(header):

@@ -31,8 +31,28 @@ SIM_NOTE = (
 )
 
 
+METHOD_NAMES = {
+    "wilson": "Wilson",
+    "clopper-pearson": "Clopper-Pearson",
+    "jeffreys": "Jeffreys",
+    "newcombe-10, unpaired": "Newcombe",
+    "clopper-pearson-difference, unpaired": "Clopper-Pearson (difference)",
+}
+
+
+def _brackets(shown: Sequence[Measurement]) -> str:
+    """Name the intervals that stand in brackets, and say that some are left out if they are."""
+    found = [m.interval.method for m in shown if m.interval is not None]
+    names = " and ".join(METHOD_NAMES.get(name, name) for name in dict.fromkeys(found))
+    said = f"Brackets: 95 % {names} intervals." if found else "There are no intervals."
+    if any(m.value is not None and m.interval is None and m.n is not None for m in shown):
+        said += " One that would cover too little is left out; measurements say which to use."
+    return said
+
+
 def success_table(cells: Sequence[RateCell], word: str, sim_note: str = SIM_NOTE) -> Table:
     """Success without and with replanning, in the twin and recorded."""
+    shown = [side for cell in cells for side in (cell.sim, cell.recorded)]
     rows = tuple(
         (
             cell.task,
@@ -50,8 +70,8 @@ def success_table(cells: Sequence[RateCell], word: str, sim_note: str = SIM_NOTE
         title="Success",
         columns=("task", "condition", "policy", "unit", "sim", word, f"sim - {word} (pp)"),
         rows=rows,
-        note=f"{sim_note} Brackets: 95 % Wilson intervals in percent. The difference is over "
-        "trials where both sides are known.",
+        note=f"{sim_note} {_brackets(shown)} The difference is over trials where both sides are "
+        "known.",
     )
 
 
@@ -85,9 +105,8 @@ def gains_table(gains: Sequence[Measurement], word: str) -> tuple[Table, ...]:
         title="Gain with replanning",
         columns=("task", "side", "percentage points", "relative gain"),
         rows=tuple(rows),
-        note="Two different numbers. Brackets: 95 % Newcombe intervals of unpaired groups; one "
-        "that reaches below 0 does not show a gain. An interval that would cover too little with "
-        "so few trials is left out; measurements say which to use.",
+        note=f"Two different numbers. {_brackets(points)} Groups count as unpaired; an interval "
+        "that reaches below 0 does not show a gain.",
     )
     return (table,)
 

@@ -8,6 +8,7 @@ import pytest
 
 from bridge.errors import UsageError
 from bridge.exchange.trials_csv import TableError
+from bridge.exchange.trials_rates import read_rates
 from evaluator.cli import evaluate
 from evaluator.compare import compare_csv
 from evaluator.compare.published import check_published
@@ -191,3 +192,104 @@ def test_every_file_is_there_before_a_missed_threshold_ends_the_command(tmp_path
     assert evaluate(RATES, out=tmp_path / "out", fail_under="r=0.99, agreement.bias_pp=0") == 3
     for name in ("report.html", "results.json", "tables/success.csv", "figures/scatter.pdf"):
         assert (tmp_path / "out" / name).is_file()
+
+
+HEAD = "task,condition,side,unit,n,rate_percent,statistic,printed\n"
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ("a,c,sim,trial,10,50,,\na,c,sim,trial,10,90,,\n", r"row 3: sim of 'a'.*row 2 already"),
+        ("a,c,sim,trial,10,50,,\na,c,real,object,50,46,,\n", r"row 3: unit 'object'.*row 2 says"),
+        ("a,c,simulation,trial,10,50,,\n", r"row 2: side is 'simulation'"),
+        ("a,c,sim,trial,10,50,,\n,,,,,,average_percent,50\n", r"row 3: side of average_percent"),
+        ("a,c,sim,trial,10,50,,\n,,rael,,,,pearson_r,1\n", r"row 3: side of pearson_r is 'rael'"),
+        ("a,c,sim,trial,10,50,,\n,,sim,,,,average_percent,nan\n", r"row 3: printed is 'nan'"),
+        ("a,c,sim,trial,10,50,,\n,,sim,,,,gain_pp,1e-999999999\n", r"row 3: printed is '1e-9"),
+        ("a,c,sim,trial,10,1e-999999999,,\n", r"row 2: rate_percent is '1e-9"),
+    ],
+)
+def test_a_published_table_that_says_a_cell_twice_or_a_side_wrongly_is_refused(
+    write_table: Callable[[str], Path], lines: str, message: str
+) -> None:
+    with pytest.raises(TableError, match=message):
+        check_published(write_table(HEAD + lines))
+
+
+def test_a_rate_that_several_counts_give_accuses_nobody(
+    write_table: Callable[[str], Path],
+) -> None:
+    path = write_table(f"{HEAD}a,c,sim,trial,150,67,,\na,c,real,trial,10,46,,\n")
+    check = check_published(path)
+    found = {finding.row: finding for finding in check.findings}
+    assert found[2].verdict == "ambiguous"
+    assert "2 counts of 150 round to 0.67" in found[2].remark
+    assert [finding.row for finding in check.failed] == [3]
+    assert check.comparison.cells[0].sim.value == 0.67
+    assert check.comparison.cells[0].sim.n is None
+
+
+def test_a_printed_figure_that_the_rows_do_not_give_does_not_pass(
+    write_table: Callable[[str], Path],
+) -> None:
+    rows = "a,c,sim,trial,10,50,,\na,c,real,trial,10,40,,\n"
+    check = check_published(write_table(f"{HEAD}{rows},,,,,,pearson_r,0.95\n"))
+    assert [finding.verdict for finding in check.failed] == ["undefined"]
+    assert "printed 0.95, but the rows do not give it: 1 cell" in check.failed[0].remark
+
+
+def test_the_count_behind_a_rate_of_a_billion_trials_is_not_searched_for(
+    write_table: Callable[[str], Path],
+) -> None:
+    path = write_table("task,side,n,rate\na,sim,1000000000,0.5\nb,sim,1000000000,0.123456789\n")
+    records = read_rates(path)  # it went through every count once
+    assert [record.k for record in records] == [500_000_000, 123_456_789]
+
+
+@pytest.mark.parametrize("text", ["r=80", "ppv=1.5", "ssim=-2"])
+def test_a_limit_beyond_what_a_number_can_be_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="at most 1"):
+        parse_thresholds(text)
+    assert parse_thresholds("psnr=25, agreement.mae_pp=5")[0].limit == 25
+
+
+@pytest.mark.parametrize(
+    ("method", "rates", "gains"),
+    [
+        ("wilson", "95 % Wilson intervals", "95 % Newcombe intervals"),
+        ("clopper-pearson", "95 % Clopper-Pearson intervals", "Clopper-Pearson (difference)"),
+    ],
+)
+def test_a_table_names_the_intervals_that_it_prints(method: str, rates: str, gains: str) -> None:
+    for source in (RATES, PUBLISHED):
+        results = compare_csv(source, method=method).results()
+        assert rates in table_of(results, "success").note
+        assert gains in table_of(results, "gains").note
+    assert "Wilson" not in table_of(compare_csv(RATES, method="jeffreys").results(), "success").note
+
+
+def test_a_goal_that_nothing_can_answer_is_said(write_table: Callable[[str], Path]) -> None:
+    assert "--goal needs" in compare_csv(RATES, goal=0.8).missing[-1]
+    assert not any("--goal" in text for text in compare_csv(RATES).missing)
+    trials = "trial_id,task,recorded\na,cube,success\nb,cube,failure\n"
+    assert not any("--goal" in m for m in compare_csv(write_table(trials), goal=0.8).missing)
+
+
+def test_rates_of_the_twin_alone_are_called_neither_real_nor_stand_in(
+    write_table: Callable[[str], Path],
+) -> None:
+    comparison = compare_csv(write_table("task,side,rate\na,sim,0.5\n"))
+    assert comparison.stand_in is None
+    assert comparison.recorded_word == "recorded"
+
+
+def test_no_gain_at_all_is_not_called_underpowered(write_table: Callable[[str], Path]) -> None:
+    lines = [
+        f"a,{condition}_replanning,{side},trial,10,50,,"
+        for condition in ("without", "with")
+        for side in ("sim", "real")
+    ]
+    comparison = check_published(write_table(HEAD + "\n".join(lines) + "\n")).comparison
+    remarks = [t for t in comparison.tables if t.id == "remarks"]
+    assert not any("underpowered" in str(row) for table in remarks for row in table.rows)

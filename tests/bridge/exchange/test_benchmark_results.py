@@ -122,6 +122,7 @@ def test_lerobot_results_of_one_task_and_of_several_are_read(tmp_path: Path) -> 
         ({"per_episode": [{"episode_ix": 0}]}, "not as lerobot-eval writes it"),
         ({"per_episode": [{"episode_ix": 0, "success": 0.5}]}, "is not true or false"),
         ({"per_task": [{"task_group": "a"}]}, "not as lerobot-eval writes it"),
+        ({"per_episode": [{"episode_ix": 4, "success": True}] * 2}, "episode_4 is there 2 times"),
     ],
 )
 def test_lerobot_results_that_cannot_be_are_refused(
