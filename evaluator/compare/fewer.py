@@ -25,6 +25,9 @@ from evaluator.statistics.sequential_pairs import pairs_sequence
 ALPHA = 0.05
 GOAL = 0.5
 """Under no effect an improved and a worsened pair are equally likely."""
+MOST = 1e300
+"""A thousand pairs that all improved are evidence beyond what a float holds."""
+MOST_LOG = math.log(MOST)
 
 
 def assisted_rates(rows: Sequence[TrialRow]) -> list[Measurement]:
@@ -127,12 +130,26 @@ def sequences(rows: Sequence[TrialRow], pairs: Sequence[StartPair]) -> list[Meas
     """Say what holds however often somebody looked: each cell's rate, and the paired gain."""
     measurements = []
     for key, members in group_rows(rows).items():
-        known = [row for row in members if row.recorded is not None]
+        known = _in_order([row for row in members if row.recorded is not None])
         if known and all(row.count == 1 for row in known):
             measurements.append(_sequence(key, known))
     if pairs:
-        measurements += [_evidence(pairs), _gain_sequence(pairs)]
+        measurements += [_evidence(pairs), _gain_sequence(_pairs_in_order(pairs))]
     return measurements
+
+
+def _in_order(rows: Sequence[TrialRow]) -> list[TrialRow]:
+    """Sort trials as they were recorded: names need not tell, trial_10 comes before trial_2."""
+    known = all(row.began_ns for row in rows)
+    return sorted(rows, key=lambda row: row.began_ns) if known else list(rows)
+
+
+def _pairs_in_order(pairs: Sequence[StartPair]) -> list[StartPair]:
+    """Sort pairs by when they became complete."""
+    known = all(pair.before.began_ns and pair.after.began_ns for pair in pairs)
+    if not known:
+        return list(pairs)
+    return sorted(pairs, key=lambda pair: max(pair.before.began_ns, pair.after.began_ns))
 
 
 def _sequence(key: Key, known: Sequence[TrialRow]) -> Measurement:
@@ -145,7 +162,8 @@ def _sequence(key: Key, known: Sequence[TrialRow]) -> Measurement:
         compute,
         unit="1",
         definition="successes / trials as labelled, with a betting confidence sequence in the "
-        "order of the trials: it may be looked at after every one, to stop or to continue",
+        "order in which they were recorded (of a table: its rows): it may be looked at after every "
+        "one, to stop or to continue",
         n=len(known),
         counted="trial",
         episodes=names_of(known),
@@ -158,7 +176,7 @@ def stopping_table(rows: Sequence[TrialRow], goal: float | None) -> tuple[Table,
         return ()
     lines: list[tuple[Cell, ...]] = []
     for (task, condition, policy), members in group_rows(rows).items():
-        known = [row for row in members if row.recorded is not None]
+        known = _in_order([row for row in members if row.recorded is not None])
         if not known or any(row.count > 1 for row in known):
             continue
         try:
@@ -211,7 +229,7 @@ def _gain_sequence(pairs: Sequence[StartPair]) -> Measurement:
         compute,
         unit="pp",
         definition="recorded gain with replanning over paired starts, with a betting confidence "
-        "sequence in the order of the pairs: it may be looked at after every one",
+        "sequence in the order in which pairs became complete: it may be looked at after every one",
         n=len(changes),
         counted="pair",
         episodes=[row.episode for pair in pairs for row in (pair.before, pair.after)],
@@ -223,11 +241,11 @@ def _evidence(pairs: Sequence[StartPair]) -> Measurement:
     improved, worsened = answers.count(1), answers.count(-1)
     return measured(
         "sequence.replanning_evidence.recorded",
-        lambda: math.exp(capital_log(improved, improved + worsened, GOAL)),
+        lambda: math.exp(min(MOST_LOG, capital_log(improved, improved + worsened, GOAL))),
         unit="1",
         definition=f"what a bettor against 'replanning changes nothing' made of 1, over {improved} "
         f"improved and {worsened} worsened pairs; {1 / ALPHA:.0f} or more: stop, it is shown at "
-        f"{ALPHA:g}, however often one looked",
+        f"{ALPHA:g}, however often one looked; {MOST:g} stands for all that is more",
         n=len(answers),
         counted="pair",
         reason_without_interval="evidence, not an estimate",

@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 
-from bridge.errors import GstError
-from bridge.task.task_file import load_task
+from evaluator.compare.known_task import known_task
 from evaluator.compare.measure import proportion, slug
 from evaluator.compare.rows import TrialRow
 from evaluator.result import Exclusion, Measurement, Table
@@ -105,20 +104,24 @@ def _objects(
 ) -> tuple[tuple[str, list[CurvePoint]], ...]:
     """Objects that were released where they belong, by control step, for tasks with several.
 
-    The task file says which stages release something; of a task without one nothing is known.
+    The task file says which stages release something; of a task without one nothing is known. An
+    object whose stage came and has no known ending is neither; one whose stage was not reached,
+    because an earlier one failed, is not where it belongs.
     """
-    if slug(task) != task:
-        return ()  # a name from a table is never read as a path
-    try:
-        stages = load_task(task).stages
-    except GstError:
-        return ()
-    releasing = {str(stage["id"]) for stage in stages if stage.get("release")}
+    known = known_task(task)
+    releasing = (
+        {str(stage["id"]) for stage in known.stages if stage.get("release")} if known else ()
+    )
     places = [place for place, name in enumerate(names, start=1) if name in releasing]
     if len(places) < 2:
         return ()
-    done_at = [place if trial[place - 1] else None for trial in ended for place in places]
-    return (("objects", success_curve(done_at, len(names))),)
+    done_at = [
+        place if trial[place - 1] else None
+        for trial in ended
+        for place in places
+        if trial[place - 1] is not None or False in trial[: place - 1]
+    ]
+    return (("objects", success_curve(done_at, len(names))),) if done_at else ()
 
 
 def _band(point: CurvePoint) -> str:
@@ -150,7 +153,8 @@ def _tables(
             columns=("task", "condition", "counted", "control step", "succeeded", "of", "rate"),
             rows=tuple(curve_rows),
             note="Trials so far: every control step up to this one succeeded. Objects: released "
-            "where they belong up to this step, whatever happened to the others. Brackets: 95 % "
+            "where they belong up to this step, whatever happened to the others; those of which "
+            "nobody said it are left out. Brackets: 95 % "
             "Wilson intervals in percent; neighbouring steps share their trials.",
         ),
     )

@@ -1,6 +1,7 @@
 """The parts of an evaluation on trials: what they say with data, and without."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,13 @@ from bridge.errors import UsageError
 from bridge.task.record import check_record
 from evaluator.cli import evaluate
 from evaluator.compare import Comparison, compare_csv, compare_run
+from evaluator.compare.known_task import known_task
+from evaluator.compare.rows import TrialRow
 from evaluator.compare.spreadsheet import compare_trials
+from evaluator.compare.stages import stage_results
+from evaluator.report.wording import measurement_text
 from evaluator.result import load_results
+from evaluator.statistics.sequential import sequence_of
 
 HEADER = "trial_id,task,condition,policy,start_id,recorded,sim_planned,verdict,p_success\n"
 
@@ -321,3 +327,58 @@ def test_whatever_the_trials_say_the_results_fit_the_schema(
         for m in results.measurements:
             if m.interval is not None:
                 assert m.interval.low < m.interval.high or m.unit == "count", m.id
+
+
+def test_a_thousand_improved_pairs_are_evidence_and_no_overflow(
+    write_table: Callable[[str], Path],
+) -> None:
+    header = "trial_id,task,condition,start_id,recorded\n"
+    lines = [f"a{i},cube,without_replanning,s{i},failure" for i in range(1100)]
+    lines += [f"b{i},cube,with_replanning,s{i},success" for i in range(1100)]
+    comparison = compare_csv(write_table(header + "\n".join(lines) + "\n"))
+    evidence = comparison.results().get("sequence.replanning_evidence.recorded")
+    assert evidence.value == pytest.approx(1e300)
+    assert measurement_text(evidence).startswith("1e+300 (n = 1100 pairs)")
+    comparison.results().to_record()
+
+
+def test_a_sequence_goes_by_when_trials_were_recorded_and_not_by_their_names(maker: Any) -> None:
+    second = 1_000_000_000
+    outcomes = ["success"] * 9 + ["failure"] * 6
+    for number, outcome in enumerate(outcomes, start=1):
+        start_ns = 10 * second + 100 * number * second
+        maker.trial(f"trial_{number}", recorded=outcome, start_id=f"s{number}", start_ns=start_ns)
+    results = compare_run(maker.run).results()
+    rate = results.get("sequence.recorded.cube_into_box.without_replanning.scripted")
+    expected = sequence_of([outcome == "success" for outcome in outcomes])
+    assert rate.interval is not None
+    assert (rate.interval.low, rate.interval.high) == (expected.low, expected.high)
+    by_name = sorted(range(15), key=lambda i: f"trial_{i + 1}")
+    other = sequence_of([outcomes[i] == "success" for i in by_name])
+    assert (other.low, other.high) != (expected.low, expected.high)  # else this shows nothing
+
+
+def test_an_object_of_which_nobody_said_it_is_neither_here_nor_there() -> None:
+    stages = ["success", None, "failure", None]
+    row = TrialRow(
+        episode="t",
+        task="five_ducks_into_basket",
+        condition="c",
+        policy="p",
+        start_id=None,
+        cell="x",
+        stand_in=True,
+        recorded=False,
+    )
+    task = known_task(row.task)
+    assert task is not None
+    names = [str(stage["id"]) for stage in task.stages]
+    releasing = [place for place, stage in enumerate(task.stages) if stage.get("release")]
+    answers: dict[str, bool | None] = dict.fromkeys(names, True)
+    for place, said in zip(releasing, stages, strict=False):
+        answers[names[place]] = {"success": True, "failure": False, None: None}[said]
+    _, tables, _ = stage_results([replace(row, stages=tuple(answers.items()))])
+    curve = next(table for table in tables if table.id == "success_curve")
+    last = [line for line in curve.rows if line[2] == "objects"][-1]
+    # Of five: one there, one unsaid, one dropped, one not reached for that, the last there.
+    assert last[4:6] == (2, 4)

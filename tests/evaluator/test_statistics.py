@@ -1,5 +1,6 @@
 """Laws and known answers of the statistics; undefined is raised with its reason."""
 
+from collections.abc import Callable
 from fractions import Fraction
 
 import numpy as np
@@ -8,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluator.errors import UndefinedStatisticError
+from evaluator.result import Interval
 from evaluator.statistics import agreement, correlation
 from evaluator.statistics.gate import Confusion, phi
 from evaluator.statistics.paired import mcnemar
@@ -174,3 +176,31 @@ def test_newcombe_covers_about_ninety_five_percent() -> None:
         interval = newcombe_difference(int(first), 15, int(second), 15)
         hits.append(interval.low <= 0.4 <= interval.high)
     assert 0.93 < np.mean(hits) < 0.98
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.integers(0, 13), min_size=4, max_size=7, unique=True),
+    st.fractions(-1, 1, max_denominator=9),
+)
+def test_rates_on_a_line_correlate_exactly_and_get_no_interval(
+    counts: list[int], slope: Fraction
+) -> None:
+    recorded = [Fraction(k, 13) for k in counts]
+    sim = [slope * rate + Fraction(1, 3) for rate in recorded]
+    if slope == 0:
+        with pytest.raises(UndefinedStatisticError, match="twin side is constant"):
+            correlation.pearson(recorded, sim)
+        return
+    r = correlation.pearson(recorded, sim)
+    assert r == (1 if slope > 0 else -1)  # 0.9999999999999998 had an interval of no width
+    with pytest.raises(UndefinedStatisticError, match="exactly"):
+        correlation.fisher_interval(r, len(counts))
+
+
+@pytest.mark.parametrize("method", [wilson, clopper_pearson])
+def test_a_single_trial_leaves_the_rate_all_but_open(method: Callable[..., Interval]) -> None:
+    for k in (0, 1):
+        interval = method(k, 1)
+        assert (interval.low, interval.high)[k] == k
+        assert interval.high - interval.low > 0.75
