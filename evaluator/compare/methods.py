@@ -30,6 +30,7 @@ from evaluator.result import Exclusion
 
 SCOPE = "images"
 """What exclusions are from."""
+EMPTY_MASK = "no pixel of the mask is above 127: write what is inside as 255; scored without it"
 Scored = dict[Variant, ImageScore]
 
 
@@ -40,6 +41,9 @@ class Reference:
     images: ImageSet
     masks: Mapping[str, ImageSet] = field(default_factory=dict)
     """Boolean images by the name of the mask."""
+    asked: frozenset[str] = frozenset()
+    """Masks that somebody gave for these views: a view without one is named. An object that is not
+    seen has no mask in a run's own views, and that is no lack."""
     split: str
     """Which images were held out, as far as anyone said."""
 
@@ -64,6 +68,8 @@ class _View:
     scores: Mapping[str, Scored]
     reasons: Mapping[str, str]
     """Why a method has no score, by method; by "" where the recorded image is unusable."""
+    unmasked: Mapping[str, str] = field(default_factory=dict)
+    """Why a mask that somebody gave does not count here, by its name."""
 
 
 def compare_methods(
@@ -95,6 +101,11 @@ def compare_methods(
         for method, reason in seen.reasons.items()
     ]
     scored = [method for method in methods if any(method.name in v.scores for v in views.values())]
+    left_out += [
+        Exclusion(episode=f"mask {name}: {view}", scope=SCOPE, reason=reason)
+        for view, seen in views.items()
+        for name, reason in seen.unmasked.items()
+    ]
     left_out += _without_scores(methods, scored, left_out)
     common = [v for v, seen in views.items() if all(m.name in seen.scores for m in scored)]
     if not scored or not common:
@@ -147,7 +158,7 @@ def _score_view(
         if view in reference.images.refused:
             raise EvaluatorError(reference.images.refused[view])
         recorded = reference.images.load[view]()
-        masks = _masks(reference, view, recorded)
+        masks, unmasked = _masks(reference, view, recorded)
     except GstError as error:
         return _View(size=(0, 0), scores={}, reasons={"": f"recorded image: {error}"})
     for method in methods:
@@ -159,14 +170,18 @@ def _score_view(
             scores[method.name] = score_variants(recorded, rendered, masks, nets=nets)
         except GstError as error:
             reasons[method.name] = str(error)
-    return _View(size=(recorded.shape[0], recorded.shape[1]), scores=scores, reasons=reasons)
+    size = (recorded.shape[0], recorded.shape[1])
+    return _View(size=size, scores=scores, reasons=reasons, unmasked=unmasked)
 
 
-def _masks(reference: Reference, view: str, recorded: np.ndarray) -> dict[str, np.ndarray]:
-    """Load the masks of one view; a view without one is scored without."""
-    found = {}
+def _masks(
+    reference: Reference, view: str, recorded: np.ndarray
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Load the masks of one view, and say which were asked for and lack; it is scored without."""
+    found, lacking = {}, {}
     for name, masks in reference.masks.items():
         if view not in masks.load:
+            lacking[name] = f"no mask of this name in {masks.where}; scored without it"
             continue
         mask = masks.load[view]()
         if mask.shape != recorded.shape[:2]:
@@ -175,7 +190,9 @@ def _masks(reference: Reference, view: str, recorded: np.ndarray) -> dict[str, n
             )
         if mask.any():
             found[name] = mask
-    return found
+        else:
+            lacking[name] = EMPTY_MASK
+    return found, {name: why for name, why in lacking.items() if name in reference.asked}
 
 
 def _without_scores(

@@ -99,10 +99,11 @@ def compare_renders(
         )
         raise EvaluatorError(message)
     split = agreed_setting([file.derived.settings for file in found], "holdout") or options.split
-    if options.masks is not None:
-        masks = {**masks, slug(options.masks.name): _masks(options.masks)}
-    reference = Reference(images=recorded, masks=masks, split=split)
     names = _other_names(recorded.load)
+    given = {name: _renamed(mask, names) for name, mask in _given_masks(options).items()}
+    reference = Reference(
+        images=recorded, masks={**masks, **given}, asked=frozenset(given), split=split
+    )
     others = [_renamed(method, names) for method in _methods(options, taken=(TWIN,))]
     return _report(reference, [twin, *others], nets)
 
@@ -111,8 +112,8 @@ def _beside_folder(
     options: ImageOptions, folder: Path, nets: Sequence[PerceptualNet]
 ) -> ViewReport:
     images = folder_set(folder.resolve().name, folder)
-    masks = {} if options.masks is None else {slug(options.masks.name): _masks(options.masks)}
-    reference = Reference(images=images, masks=masks, split=options.split)
+    masks = _given_masks(options)
+    reference = Reference(images=images, masks=masks, asked=frozenset(masks), split=options.split)
     return _report(reference, _methods(options, taken=()), nets)
 
 
@@ -150,15 +151,20 @@ def _methods(options: ImageOptions, *, taken: Sequence[str]) -> list[ImageSet]:
     return found
 
 
-def _masks(folder: Path) -> ImageSet:
+def _given_masks(options: ImageOptions) -> dict[str, ImageSet]:
+    """Return the folder of masks under the name that ids give it; nothing without one."""
+    folder = options.masks
+    if folder is None:
+        return {}
     if not folder.is_dir():
         raise PathNotFoundError(path=folder, what="folder of masks", hint="Name a folder.")
-    return ImageSet(
+    masks = ImageSet(
         name=folder.name,
         where=str(folder),
         load={view: partial(read_mask, paths[0]) for view, paths in list_files(folder).items()},
         stored="masks",
     )
+    return {slug(folder.resolve().name): masks}
 
 
 def _other_names(views: Iterable[str]) -> dict[str, str]:

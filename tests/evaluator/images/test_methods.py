@@ -296,3 +296,18 @@ def test_views_of_a_run_may_be_called_as_export_tum_calls_them() -> None:
     assert names["side/rgb/1.500000000"] == "side/1500000000"
     assert names["rgb/2.000000001"] == "side/2000000001"
     assert "1.500000000" not in names  # two cameras have it
+
+
+def test_a_mask_that_lacks_or_holds_nothing_is_named_with_its_view(folders: Path) -> None:
+    inside = np.zeros(SIZE, dtype=np.uint8)
+    inside[16:40, 16:48] = 255
+    save(inside, folders / "cup" / "0000.png")
+    save(inside // 255, folders / "cup" / "0001.png")  # 0 and 1, as many programs write masks
+    comparison = compared(folders, masks=folders / "cup")
+    left_out = reasons(comparison)
+    assert "write what is inside as 255" in left_out["mask cup: 0001"]
+    assert "no mask of this name in" in left_out["mask cup: 0002"]
+    assert "mask cup: 0000" not in left_out
+    results = comparison.results()
+    assert results.get("image.good.psnr_cup_db").n == 1
+    assert results.get("image.good.psnr_db").n == 3
