@@ -40,6 +40,8 @@ _COMMANDS = {
     "…": r"\ldots{}",
     "’": "'",
     "‘": "`",
+    "«": r"$\ll$",
+    "»": r"$\gg$",
     "“": "``",
     "”": "''",
     "τ": r"$\tau$",
@@ -49,21 +51,27 @@ _COMMANDS = {
     "µ": r"$\mu$",
     "✓": "yes",
     "✗": "no",
+    "\u2060": "{}",
 }
 _TRANSLATION = str.maketrans(_COMMANDS)
-_NOT_SET = re.compile("[^\x20-\x7e\xa1-\u017f]")
-"""Letters up to U+017F are known to every LaTeX since 2018; others are written as U+XXXX."""
+_NOT_SET = re.compile("[^\x20-\x7e\xa1-\u017f]|[ÐÞðþĄąĘęĮįŲųĐđĦħĸĿŀŉŊŋŦŧſ]")
+"""What LaTeX since 2020 does not set in its default font encoding is written as U+XXXX; of the
+letters up to U+017F that are those named here."""
 _NAME = re.compile(r"[^A-Za-z0-9:.-]+")
+_MINUS = re.compile(r"(?<![\w.-])-(?=\.?\d)")
+_HYPHENS = re.compile("-(?=-)")
+"""Two would become a dash: ``--goal``."""
 
 
 def as_latex(table: Table) -> str:
     r"""Write a booktabs table: numbers to the right, no empty columns, the note below.
 
     The document needs ``\usepackage{booktabs}``; a table wider than the page also ``graphicx``,
-    which shrinks it to the width of the text, and one longer than a page ``longtable``.
+    which shrinks it to the width of the text, and one longer than a page ``longtable``, which is
+    set in a smaller size where it is wide. Sentences are broken over lines.
     """
     used = used_columns(table)
-    align = "".join("r" if is_number(table, index) else "l" for index in used)
+    align, characters = _columns(table, used)
     head = " & ".join(latex(table.columns[index]) for index in used)
     written = lru_cache(maxsize=None, typed=True)(_cell)  # tables say the same again and again
     body = [" & ".join([written(row[i]) for i in used]) + r" \\" for row in table.rows]
@@ -73,7 +81,7 @@ def as_latex(table: Table) -> str:
     note = [rf"\par\smallskip\footnotesize {latex(table.note)}"] if table.note else []
     if len(body) > LONG_ROWS:
         lines = [
-            r"{\small",
+            rf"{{{_fitting(characters)}",
             rf"\begin{{longtable}}{{{columns}}}",
             rf"{caption}{label} \\",
             *(r"\toprule", rf"{head} \\", r"\midrule", r"\endhead", r"\bottomrule", r"\endfoot"),
@@ -89,7 +97,7 @@ def as_latex(table: Table) -> str:
         *body,
         *(r"\bottomrule", r"\end{tabular}"),
     ]
-    if _is_wide(table, used):
+    if characters > WIDE_CHARACTERS:
         tabular = [r"\resizebox{\textwidth}{!}{%", *tabular, "}"]
     lines = [
         *(r"\begin{table}[t]", r"\centering", caption, label, r"\small"),
@@ -108,10 +116,41 @@ WIDE_CHARACTERS = 84
 """A line of text in a usual article, in the small size of tables."""
 
 
-def _is_wide(table: Table, used: list[int]) -> bool:
-    """Say whether the longest cells of all columns would not fit beside each other."""
+SENTENCE = 45
+"""Text longer than this is broken over lines, where it can be."""
+SENTENCES = 0.6
+"""Share of the width of the text that such columns have together."""
+LONGEST_WORD = 20
+
+
+def _columns(table: Table, used: list[int]) -> tuple[str, float]:
+    """Return how columns are set, and how many characters lie beside each other."""
     lines = [table.columns, *(texts(row) for row in table.rows)]
-    return sum(max(len(line[index]) for line in lines) + 2 for index in used) > WIDE_CHARACTERS
+    longest = {index: max(len(line[index]) for line in lines) for index in used}
+    sentences = {
+        index
+        for index in used
+        if longest[index] > SENTENCE
+        and all(len(word) <= LONGEST_WORD for line in lines for word in line[index].split())
+    }
+    share = SENTENCES / max(1, len(sentences))
+    align, characters = "", 0.0
+    for index in used:
+        if index in sentences:
+            align += rf"p{{{share:.2f}\textwidth}}"
+            characters += share * WIDE_CHARACTERS + 2
+        else:
+            align += "r" if is_number(table, index) else "l"
+            characters += longest[index] + 2
+    return align, characters
+
+
+def _fitting(characters: float) -> str:
+    """Return the size in which a table of several pages, which cannot be shrunk, is as wide."""
+    if characters <= WIDE_CHARACTERS:
+        return r"\small"
+    size = "scriptsize" if characters <= 1.2 * WIDE_CHARACTERS else "tiny"
+    return rf"\{size}\setlength{{\tabcolsep}}{{2pt}}"
 
 
 def _cell(cell: Cell) -> str:
@@ -119,6 +158,10 @@ def _cell(cell: Cell) -> str:
 
 
 def latex(text: str) -> str:
-    """Escape what LaTeX would read as a command, and write what it cannot set as U+XXXX."""
-    plain = " ".join(text.split()).translate(_TRANSLATION)
+    """Escape what LaTeX would read as a command, and write what it cannot set as U+XXXX.
+
+    A minus before a number is set as one; hyphens in a row stay hyphens, where LaTeX makes dashes.
+    """
+    plain = _MINUS.sub("−", " ".join(text.split()))
+    plain = _HYPHENS.sub("-\u2060", plain).translate(_TRANSLATION)
     return _NOT_SET.sub(lambda found: f"U+{ord(found[0]):04X}", plain)

@@ -42,17 +42,18 @@ def as_csv(table: Table) -> str:
 
 def as_markdown(table: Table) -> str:
     """Write a Markdown table with its title and note."""
-    lines = [f"**{table.title}**", "", _bar(table.columns), _bar(["---"] * len(table.columns))]
     written = lru_cache(maxsize=None, typed=True)(_markdown_cell)
+    heads = [written(name) for name in table.columns]
+    lines = [f"**{table.title}**", "", _bar(heads), _bar(["---"] * len(heads))]
     lines += [_bar([written(cell) for cell in row]) for row in table.rows]
     return "\n".join(lines) + (f"\n\n{table.note}\n" if table.note else "\n")
 
 
 def _markdown_cell(cell: Cell) -> str:
-    return cell_text(cell).replace("|", r"\|")
+    return " ".join(cell_text(cell).split()).replace("|", r"\|")  # a row is one line
 
 
-def _bar(cells: tuple[str, ...] | list[str]) -> str:
+def _bar(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 

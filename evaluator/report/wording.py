@@ -51,6 +51,8 @@ UNSIGNED = (
 )
 """Sizes in percentage points that are never below 0: a plus would look like a direction."""
 PLURALS = {"pair of runs": "pairs of runs", "policy": "policies"}
+HUGE = 1e7
+"""Nobody reads more digits before the point; evidence may have hundreds."""
 
 
 def number(value: float, unit: str) -> str:
@@ -61,6 +63,8 @@ def number(value: float, unit: str) -> str:
 
 def _figure(value: float, unit: str) -> str:
     factor, _, digits = SHOWN_UNITS.get(unit, PLAIN)
+    if abs(value) >= HUGE and unit != "count":
+        return f"{factor * value:.4g}"
     text = f"{factor * value:{digits}}"
     small = value != 0 and float(text) == 0
     return f"{factor * value:.1g}" if small else text  # small is not nothing
@@ -98,13 +102,15 @@ def count_text(measurement: Measurement) -> str:
 
 
 def ends_text(measurement: Measurement) -> str:
-    """Write the ends of the interval in the unit of the value, or nothing."""
+    """Write the ends of the interval in the unit that stands at the value, or nothing."""
     interval = measurement.interval
     if interval is None:
         return ""
     if is_share(measurement):
         return f"[{100 * interval.low:.1f}, {100 * interval.high:.1f}]"
     low, high = (_figure(end, measurement.unit) for end in (interval.low, interval.high))
+    if measurement.id in UNSIGNED:
+        low, high = low.lstrip("+"), high.lstrip("+")
     return f"[{low}, {high}]"
 
 
@@ -123,22 +129,15 @@ def measurement_text(measurement: Measurement) -> str:
     if measurement.value is None:
         return f"undefined: {measurement.reason_if_undefined}"
     text = value_text(measurement)
+    if measurement.id.startswith("gain.relative."):
+        text += " relative"
     if measurement.k is not None and measurement.n is not None:
         text = f"{measurement.k}/{measurement.n} = {text}"
-    elif measurement.id.startswith("gain.relative."):
-        text += " relative"
     elif measurement.n is not None and measurement.counted:
         text += f" (n = {count_text(measurement)})"
-    return text + interval_text(measurement)
-
-
-def interval_text(measurement: Measurement) -> str:
-    """Write the interval with its level, method and least coverage at this n, or nothing."""
     if measurement.interval is None:
-        return ""
-    _, unit, _ = SHOWN_UNITS.get(measurement.unit, PLAIN)
-    unit = " %" if is_share(measurement) else unit
-    return f" {ends_text(measurement)}{unit} ({method_text(measurement)})"
+        return text
+    return f"{text} {ends_text(measurement)} ({method_text(measurement)})"
 
 
 def headlines(results: Results) -> list[tuple[str, str, Measurement]]:

@@ -1,5 +1,6 @@
 """Put one comparison on disk: results.json, tables, figures, report.html, trials.csv, Parquet."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from evaluator.report.figures.drawing import Drawing, NotDrawn, Rendered
 from evaluator.report.figures.views import worst_pairs
 from evaluator.report.latex import as_latex
 from evaluator.report.page import page
+from evaluator.report.sections import TRIALS
 from evaluator.report.tables import as_csv, as_markdown, as_text
 from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
@@ -59,10 +61,11 @@ def write_report(comparison: Comparison, folder: Path, beside: Beside | None = N
         words = "; ".join(f"{item.id} ({item.reason})" for item in not_drawn)
         missing = f"figures without data, not drawn: {words}"
         results = replace(results, missing=(*results.missing, missing))
+    old = _old_files(folder, results)
     path = write_results(results, folder / "results.json")
     try:
         tables = _write(_table_files(folder / "tables", results))
-        _remove_old(folder, not_drawn)
+        _remove_old(folder, not_drawn, old)
         trials = [record_from_row(row) for row in comparison.rows]
         extra = [write_trials(folder / "trials.csv", trials)] if trials else []
         parquet, no_parquet = _write_parquet(folder, trials, results)
@@ -130,8 +133,30 @@ def _figure_files(
     return files
 
 
-def _remove_old(folder: Path, not_drawn: Sequence[NotDrawn]) -> None:
-    """Remove the figures of an earlier evaluation that this one has no data for."""
+def _old_files(folder: Path, results: Results) -> list[Path]:
+    """List what the earlier evaluation wrote and this one will not; only what it says is its own.
+
+    A paper that includes a table would else go on to print the numbers of another evaluation.
+    """
+    now = {table.id for table in results.tables}
+    try:
+        named = {path.stem for path in (folder / "tables").iterdir()} - now
+        if not named:
+            return []
+        tables = json.loads((folder / "results.json").read_bytes())["tables"]
+        gone = sorted(named & {str(table["id"]) for table in tables})
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return []  # nothing of ours
+    files = [folder / "tables" / f"{name}.{end}" for name in gone for end in ("csv", "md", "tex")]
+    if TRIALS in gone:
+        files += [folder / "trials.csv", folder / "trials.parquet"]
+    return files
+
+
+def _remove_old(folder: Path, not_drawn: Sequence[NotDrawn], old: Sequence[Path]) -> None:
+    """Remove what an earlier evaluation wrote and this one has no data for."""
+    for path in old:
+        path.unlink(missing_ok=True)
     for item in not_drawn:
         for ending in ("csv", "svg", "pdf"):
             (folder / "figures" / f"{item.id}.{ending}").unlink(missing_ok=True)

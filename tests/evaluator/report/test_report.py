@@ -183,3 +183,29 @@ def test_writing_twice_replaces_the_first(six_trials: Any) -> None:
     before = {path: path.read_bytes() for path in first.files}
     second = write_report(compare_run(six_trials.run), folder)
     assert {path: path.read_bytes() for path in second.files} == before
+
+
+def test_what_an_earlier_evaluation_wrote_and_this_one_does_not_is_removed(
+    six_trials: Any, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    write_report(compare_run(six_trials.run), out)
+    mine = out / "tables" / "mine.tex"
+    mine.write_text("not ours")
+    assert (out / "trials.csv").is_file()
+    assert (out / "tables" / "confusion.tex").is_file()
+    write_report(compare_csv(PAPER), out)
+    assert mine.read_text() == "not ours"
+    left = {path.stem for path in (out / "tables").iterdir()} - {"mine"}
+    assert left == {table.id for table in load_results(out / "results.json").tables}
+    assert not (out / "trials.csv").exists()
+    assert not (out / "trials.parquet").exists()
+
+
+def test_a_markdown_row_stays_one_line() -> None:
+    odd = Table(id="t", title="t", columns=("a|b",), rows=(("first\nsecond | third",),))
+    assert as_markdown(odd).splitlines()[2:] == [
+        r"| a\|b |",
+        "| --- |",
+        r"| first second \| third |",
+    ]

@@ -9,9 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evaluator.compare import compare_csv
 from evaluator.report.latex import LONG_ROWS, as_latex, latex
 from evaluator.result import Table
 
+PAPER = Path(__file__).resolve().parents[3] / "docs" / "examples" / "paper_table_rates.csv"
 TEX = shutil.which("pdflatex") or shutil.which("lualatex") or shutil.which("tectonic")
 NASTY = (
     "[x]",
@@ -114,6 +116,8 @@ def test_tex_sets_the_tables(tmp_path: Path) -> None:
         table([(text, "1") for text in NASTY], note="100 % [sic]"),
         table([("a", str(i)) for i in range(60)]),
         table([("a" * 60, "b" * 60)]),
+        table([(chr(code), "1") for code in range(0xA1, 0x180)]),
+        *compare_csv(PAPER).tables,
     ]
     packages = r"\usepackage{booktabs,graphicx,longtable}"
     body = "\n".join(as_latex(item) for item in tables)
@@ -124,3 +128,25 @@ def test_tex_sets_the_tables(tmp_path: Path) -> None:
         [TEX, *options, "all.tex"], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout[-2000:]
+
+
+def test_hyphens_stay_hyphens_and_a_minus_is_one() -> None:
+    assert latex("--goal 0.8") == r"-{}-goal 0.8"
+    assert latex("a---b") == "a-{}-{}-b"
+    assert latex("-33.3") == "$-$33.3"
+    assert latex("+75 pp [-50.5, +98.3]") == "+75 pp {[}$-$50.5, +98.3{]}"
+    assert latex("2026-11-22, f-5, clopper-pearson") == "2026-11-22, f-5, clopper-pearson"
+    made = as_latex(Table(id="t", title="t", columns=("a",), rows=((-1.5,), (2,))))
+    check(made, columns=1, rows=2)
+    assert r"$-$1.5 \\" in made
+
+
+def test_a_sentence_is_broken_over_lines_and_a_long_wide_table_is_set_smaller() -> None:
+    sentence = "few points that rise together give a high r, whatever the twin is like"
+    made = as_latex(table([("r", sentence), ("gain", "a short one")]))
+    check(made, columns=2, rows=2)
+    assert r"\begin{tabular}{@{}lp{0.60\textwidth}@{}}" in made
+    assert r"\resizebox" not in made  # it was shrunk until nobody could read it
+    long = as_latex(table([("a" * 60, "b" * 60)] * (LONG_ROWS + 1)))
+    check(long, columns=2, rows=LONG_ROWS + 1)
+    assert r"{\tiny\setlength{\tabcolsep}{2pt}" in long
