@@ -35,7 +35,7 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
         UndeterminedCameraError: The one camera that was asked for is not determined.
         RobotNotAlignedError: The same, from the robot it sees.
     """
-    episodes = [Episode.open(path) for path in run.episodes()]
+    episodes = _readable(run, output)
     where = {} if config.pairs is not None else placement(episodes)
     found: dict[str, Any] = {}
     reasons: dict[str, str] = {}
@@ -50,6 +50,17 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
     if not found:
         raise NothingToCalibrateError(_nothing(run, reasons))
     return write_calibration(run, found, reasons)
+
+
+def _readable(run: RunFolder, output: Output) -> list[Episode]:
+    """All episodes but those that cannot be opened, which are named."""
+    episodes = []
+    for path in run.episodes():
+        try:
+            episodes.append(Episode.open(path))
+        except GstError as error:
+            output.say(f"{path.stem}: {error}")
+    return episodes
 
 
 def _wanted(

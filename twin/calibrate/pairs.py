@@ -114,6 +114,8 @@ def target_cameras(episodes: Sequence[Episode]) -> list[str]:
 def recorded_pairs(episodes: Sequence[Episode], camera_id: str, link: str) -> PosePairs:
     """Pair recorded target poses of one camera with the robot's link, robot standing still.
 
+    Poses that are no numbers, as some detectors send when they see nothing, are left out.
+
     Raises:
         EpisodeError: An episode with targets has no joint states.
         RobotDescriptionError: No usable robot description, or it lacks the link.
@@ -128,6 +130,7 @@ def recorded_pairs(episodes: Sequence[Episode], camera_id: str, link: str) -> Po
             if topic.endswith(f"/cam/{camera_id}{TARGET_ENDING}")
         ]
         samples = [PoseSample.from_cdr(message.data) for message in episode.messages(topics)]
+        samples = [sample for sample in samples if np.isfinite(sample.T_frame_body).all()]
         if not samples:
             continue
         used.append(episode.info.id)

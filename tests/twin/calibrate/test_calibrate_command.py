@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -109,8 +110,11 @@ def some_postures(count: int) -> np.ndarray:
     return np.array(cell_views.POSTURES[0]) + rng.uniform(-0.5, 0.5, (count, 6))
 
 
-def record_targets(run: RunFolder, count: int = 12) -> None:
-    """A camera in the hand sees a target from several stops, and once on the move."""
+def record_targets(run: RunFolder, count: int = 12, more: Sequence[np.ndarray] = ()) -> Path:
+    """A camera in the hand sees a target from several stops, and once on the move.
+
+    At the first stop also at ``more`` places.
+    """
     robot, rng = load_robot(URDF), np.random.default_rng(1)
     recording = Recording(run.episodes_dir / "probe_1.mcap", some_postures(count))
     for index, joints in enumerate(recording.postures):
@@ -120,8 +124,13 @@ def record_targets(run: RunFolder, count: int = 12) -> None:
             noise[:3, 3] = rng.normal(size=3) * 5e-4
             seen = se3.invert(T_base_camera) @ T_BASE_TARGET @ noise
             recording.target("wrist", seen, recording.stamp(index) + late)
+    for p_m in more:
+        T = np.eye(4)
+        T[:3, 3] = p_m
+        recording.target("wrist", T, recording.stamp(0) + 10_000_000)
     recording.target("wrist", np.eye(4), recording.stamp(0) + SECOND)
     recording.writer.close()
+    return recording.path
 
 
 @pytest.fixture
@@ -149,6 +158,26 @@ def test_a_target_seen_from_the_hand_gives_the_camera(
     assert item["num_pairs"] == 12
     assert item["sources"] == ["probe_1"]
     assert item["residual_m"]["low"] <= item["residual_m"]["value"] <= item["residual_m"]["high"]
+
+
+def test_a_file_that_is_no_episode_costs_itself_only(
+    run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record_targets(run)
+    (run.episodes_dir / "cut_off.mcap").write_bytes(b"no episode")
+    assert calibrate(run, "--cameras") == 0
+    assert "cut_off: " in capsys.readouterr().err
+    found = read_calibration(run)
+    assert found is not None
+    assert set(found.cameras) == {"wrist"}
+
+
+def test_a_detection_that_is_no_number_is_left_out(run: RunFolder) -> None:
+    """One would spoil the mean of its stop, and with it everything."""
+    path = record_targets(run, count=5, more=[np.array([np.nan, 0.0, 1.0])])
+    pairs = recorded_pairs([Episode.open(path)], "wrist", "tool0")
+    assert len(pairs) == 5
+    assert np.isfinite(pairs.Ts_camera_target).all()
 
 
 def test_detections_of_one_stop_are_averaged_and_those_on_the_move_left_out(

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import streams
+from bridge.episode.catalogue.labels import outcome_of
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.errors import GstError, UsageError
@@ -136,7 +137,7 @@ def read_case(run: RunFolder, episode: Episode) -> Case:
     kept = np.array([np.any((stretches[:, 0] < t) & (t < stretches[:, 1])) for t in hold_times])
     order = [arm.names.index(name) for name in ARM_JOINTS]
     nowhere, unknown = np.full(3, np.nan), np.diag(np.square(UNKNOWN_SIGMA))
-    outcome = episode.outcome
+    outcome = outcome_of(run, episode)
     judged = episode.info.kind == "trial" and outcome is not None and outcome.result != "unknown"
     return Case(
         episode=episode.info.id,
@@ -201,9 +202,12 @@ def _check_joints(arm: streams.JointTrack, start_ns: int, end_ns: int) -> None:
     if missing:
         message = f"joints without a recording: {', '.join(missing)}."
         raise UnusableCaseError(message)
-    stamps = arm.stamps_ns[(arm.stamps_ns >= start_ns) & (arm.stamps_ns <= end_ns)]
+    during = (arm.stamps_ns >= start_ns) & (arm.stamps_ns <= end_ns)
+    stamps = arm.stamps_ns[during]
     if len(stamps) < 2 or np.diff(stamps).max() > LONGEST_GAP_S * 1e9:
         raise UnusableCaseError("joint states have gaps while the plan was executed.")
+    if not np.isfinite(arm.position[during]).all():
+        raise UnusableCaseError("joint states hold what is no number while the plan was executed.")
 
 
 def _stretches(
@@ -279,6 +283,8 @@ def _widths(episode: Episode, start_ns: int) -> _Series:
         track = streams.joint_track(episode, "/gripper/state")
     except GstError:
         return np.zeros(0), np.zeros(0)
+    if not np.isfinite(track.position).all():
+        raise UnusableCaseError("gripper widths hold what is no number.")
     return (track.stamps_ns - start_ns) * 1e-9, track.position[:, 0].astype(np.float64)
 
 

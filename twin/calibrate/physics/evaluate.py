@@ -3,6 +3,7 @@
 import multiprocessing
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from types import TracebackType
 
 import numpy as np
@@ -11,11 +12,16 @@ from jaxtyping import Float
 from twin.calibrate.physics.case import Case, Prediction
 from twin.calibrate.physics.drive import predict
 from twin.calibrate.physics.parameters import PhysicsParameter, values_of
+from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 
 _State = tuple[Sequence[Case], Sequence[PhysicsParameter], PhysicsConfig, int]
 _state: list[_State] = []
 """What this process of the pool works on; set once, because cases are large."""
+
+
+class LostProcessError(TwinError):
+    """A process of the pool is gone, and with it what it was doing."""
 
 
 class Evaluator:
@@ -55,12 +61,16 @@ class Evaluator:
     def predict(
         self, points: Float[np.ndarray, "num_points num_parameters"], chosen: Sequence[int]
     ) -> list[list[Prediction]]:
-        """Predict the chosen cases, by their numbers, at every point."""
+        """Predict the chosen cases, by their numbers, at every point.
+
+        Raises:
+            LostProcessError: When a process was killed.
+        """
         jobs = [(index, points[k]) for k in range(len(points)) for index in chosen]
         if self._pool is None:
             flat = [_predict(self._args, index, x) for index, x in jobs]
         else:
-            flat = list(self._pool.map(_work, *zip(*jobs, strict=True))) if jobs else []
+            flat = _mapped(self._pool, jobs)
         size = len(chosen)
         return [flat[k * size : (k + 1) * size] for k in range(len(points))]
 
@@ -77,6 +87,20 @@ class Evaluator:
         """End the processes; what waits is not begun."""
         if self._pool is not None:
             self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _mapped(
+    pool: ProcessPoolExecutor, jobs: Sequence[tuple[int, Float[np.ndarray, " num_parameters"]]]
+) -> list[Prediction]:
+    if not jobs:
+        return []
+    try:
+        return list(pool.map(_work, *zip(*jobs, strict=True)))
+    except BrokenProcessPool as error:
+        raise LostProcessError(
+            "a process that simulated was ended from outside, perhaps by a machine short of "
+            "memory, and nothing was written. Try again, with fewer --workers."
+        ) from error
 
 
 def _begin(state: _State) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +12,19 @@ import pytest
 
 import robot_gst
 from bridge.episode import schema
-from bridge.episode.metadata import Derived, EpisodeInfo
+from bridge.episode.catalogue.labels import write_label
+from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
+from bridge.episode.streams import JointTrack
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
+from bridge.task.robot import ARM_JOINTS
 from bridge.task.task_file import Task
 from twin.calibrate.physics import data
 from twin.calibrate.physics import run as physics_run
 from twin.calibrate.physics.case import Case
-from twin.calibrate.physics.data import NothingToCalibrateError, read_cases
+from twin.calibrate.physics.data import NothingToCalibrateError, UnusableCaseError, read_cases
 from twin.calibrate.physics.delay import best_shift_s, delay_of, mean_delay
 from twin.calibrate.physics.parameters import SURFACE_FRICTION, rigid_parameters
 from twin.calibrate.physics.record import describe_physics
@@ -240,3 +244,51 @@ def test_recorded_probes_become_cases(probed: RunFolder, monkeypatch: pytest.Mon
     )
     with pytest.raises(NothingToCalibrateError, match="never localised after the plan: cube"):
         read_cases(probed, Output(quiet=True))
+
+
+@pytest.mark.slow
+def test_a_label_given_afterwards_is_what_calibration_believes(
+    probed: RunFolder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(data, "write_localised", with_localisations)
+    monkeypatch.setattr(data, "NEAR_M", 0.5)
+    (path,) = probed.episodes()
+    episode, trials = Episode.open(path), RunFolder.create(tmp_path / "trials")
+    with EpisodeWriter(trials.episodes_dir / path.name) as writer:
+        writer.describe(replace(episode.info, kind="trial"), outcome=Outcome(result="success"))
+        for message in episode.messages():
+            writer.write(
+                message.topic,
+                message.data,
+                type_name=message.type_name,
+                log_time_ns=message.log_time_ns,
+                publish_time_ns=message.publish_time_ns,
+            )
+    trial = Episode.open(trials.episodes()[0])
+    assert data.read_case(trials, trial).success is True
+    write_label(trials, trial.path.stem, Outcome(result="failure"))
+    assert data.read_case(trials, trial).success is False
+    write_label(trials, trial.path.stem, Outcome(result="unknown"))
+    assert data.read_case(trials, trial).success is None
+
+
+def test_joints_that_are_no_numbers_teach_nothing() -> None:
+    stamps = np.arange(0, 1_000_000_000, 8_000_000)
+    position = np.zeros((len(stamps), 6))
+    position[3] = np.nan
+    arm = JointTrack(names=ARM_JOINTS, stamps_ns=stamps, position=position)
+    data._check_joints(arm, int(stamps[10]), int(stamps[-1]))
+    with pytest.raises(UnusableCaseError, match="no number while the plan was executed"):
+        data._check_joints(arm, 0, int(stamps[-1]))
+
+
+def test_widths_that_are_no_numbers_teach_nothing(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_episode(run, "probe_1", "probe")
+    track = JointTrack(
+        names=("gripper_width",), stamps_ns=np.arange(3), position=np.array([[0.0], [np.nan], [0]])
+    )
+    monkeypatch.setattr(data.streams, "joint_track", lambda *_: track)
+    with pytest.raises(UnusableCaseError, match="gripper widths hold what is no number"):
+        data._widths(Episode.open(run.episodes()[0]), 0)

@@ -1,5 +1,8 @@
 """Probes lived through in the replays' own physics: laws of friction, and parameters recovered."""
 
+import os
+import signal
+
 import numpy as np
 import pytest
 
@@ -13,7 +16,7 @@ from bridge.task.task_file import load_task
 from twin.calibrate.physics import drive
 from twin.calibrate.physics.case import Case, Prediction, planar
 from twin.calibrate.physics.drive import gripper_only, predict
-from twin.calibrate.physics.evaluate import Evaluator
+from twin.calibrate.physics.evaluate import Evaluator, LostProcessError
 from twin.calibrate.physics.fit import FitConfig, fit
 from twin.calibrate.physics.parameters import (
     FINGER_FRICTION,
@@ -176,3 +179,17 @@ def test_only_the_gripper_collides() -> None:
     text = gripper_only(ur5_with_gripper_urdf())
     assert text.count("<collision") == 3
     assert "<visual" not in text
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_ends_a_calibration_with_a_sentence(slide: Case) -> None:
+    """Memory ran out, say: Python's own word for it is a broken pool."""
+    with Evaluator(
+        [slide], rigid_parameters(CONFIG), CONFIG, num_samples=0, workers=2
+    ) as evaluator:
+        assert evaluator._pool is not None
+        os.kill(evaluator._pool.submit(os.getpid).result(), signal.SIGKILL)
+        # Enough that some of it is still to be done when the death is noticed.
+        points = np.zeros((100, 7))
+        with pytest.raises(LostProcessError, match=r"ended from outside.*fewer --workers"):
+            evaluator.predict(points, [0])
