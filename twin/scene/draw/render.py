@@ -3,20 +3,26 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32, UInt16
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
-from bridge.errors import UsageError
+from bridge.episode.transforms import TransformTree
+from bridge.errors import BridgeError, UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_png
 from bridge.task.robot import BASE_FRAME
 from twin.scene.draw.compose import carried_camera, compose
+from twin.scene.frames.base import base_tree
+from twin.scene.frames.pairs import paired_stamps_ns
+from twin.scene.frames.stated import unknown_mask
+from twin.scene.frames.usable import name_of
 from twin.scene.raster.backend import open_rasteriser
 from twin.scene.raster.rasteriser import RasterConfig
 from twin.scene.settings import RenderConfig
+from twin.scene.store.calibration import calibrated_tree, read_calibration, without_joints
 from twin.scene.store.folder import Scene, read_scene
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -28,7 +34,8 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
 
     Raises:
         UsageError: When the episode, the camera or an object is unknown (lists those that exist),
-            or joints are given for a robot that the scene does not have.
+            joints are given for a robot that the scene does not have, or nothing says where the
+            camera was in the scene at that time.
         MissingDependencyError: When the backend cuda was asked for and cannot run here.
     """
     rasteriser = open_rasteriser(RasterConfig(backend=config.backend))
@@ -37,7 +44,7 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     camera_id = _camera_id(episode, config.camera)
     stamp_ns = _stamp_ns(episode, config.at_s)
     composed = compose(run, scene, episode, stamp_ns, config)
-    camera, T_base_camera = _view_of(episode, camera_id, stamp_ns, config)
+    camera, T_base_camera = _view_of(run, scene, episode, camera_id, stamp_ns, config)
     view = rasteriser.view(composed.cloud, camera, T_base_camera)
     path = config.out or run.results_dir / "render.png"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -45,7 +52,7 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     written = [str(path)]
     if config.depth:
         depth_path = path.with_name(f"{path.stem}_depth{path.suffix}")
-        depth_path.write_bytes(encode_png(np.rint(view.depth_m * 1e3).astype(np.uint16)))
+        depth_path.write_bytes(encode_png(_millimetres(view.depth_m)))
         written.append(str(depth_path))
     return {
         "files": written,
@@ -57,9 +64,23 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     }
 
 
+def _millimetres(depth_m: Float32[np.ndarray, "height width"]) -> UInt16[np.ndarray, "_ _"]:
+    """Whole millimetres; what is farther away than they can say is as far as they can."""
+    largest = np.iinfo(np.uint16).max
+    return np.clip(np.rint(depth_m * 1e3), 0, largest).astype(np.uint16)
+
+
 def _episode(run: RunFolder, scene: Scene, wanted: str) -> Episode:
     name = wanted or scene.record["sources"][0]["id"]
-    episodes = {episode.info.id: episode for episode in map(Episode.open, run.episodes())}
+    episodes: dict[str, Episode] = {}
+    for path in run.episodes():
+        try:
+            episode = Episode.open(path)
+        except BridgeError:
+            if path.stem == name:
+                raise
+        else:
+            episodes[episode.info.id] = episode
     if name not in episodes:
         message = f"no episode {name!r} in {run.path}. There are: {', '.join(episodes) or 'none'}."
         raise UsageError(message)
@@ -81,7 +102,12 @@ def _camera_id(episode: Episode, wanted: str) -> str:
 
 
 def _view_of(
-    episode: Episode, camera_id: str, stamp_ns: int, config: RenderConfig
+    run: RunFolder,
+    scene: Scene,
+    episode: Episode,
+    camera_id: str,
+    stamp_ns: int,
+    config: RenderConfig,
 ) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
     info = streams.camera_info(episode, camera_id)
     if (config.eye is None) != (config.target is None):
@@ -93,9 +119,41 @@ def _view_of(
             message = "--eye is straight above or below --target; move it a little sideways."
             raise UsageError(message)
         return info.camera, se3.look_at(eye, target, UP)
-    tree = streams.transform_tree(episode)
-    if config.joints is not None and tree.root_of(info.frame_id) == BASE_FRAME:
-        T_base_camera = carried_camera(episode, info.frame_id, np.array(config.joints))
+    tree = _tree_of(run, scene, episode, camera_id, stamp_ns)
+    is_known = info.frame_id in tree.frames()
+    root = tree.root_of(info.frame_id) if is_known else None
+    if root != scene.record.get("frame", root) or root is None:
+        message = (
+            f"nothing says where {name_of(episode, camera_id)} was in the scene's frame "
+            f"{scene.record.get('frame')!r}: say where to stand with --eye and --target."
+        )
+        raise UsageError(message)
+    if config.joints is not None and root == BASE_FRAME:
+        T_base_camera = carried_camera(episode, info.frame_id, np.array(config.joints), tree)
         if T_base_camera is not None:
             return info.camera, T_base_camera
+    if unknown_mask(tree, [info.frame_id], np.array([stamp_ns]))[0]:
+        message = (
+            f"nobody recorded where {name_of(episode, camera_id)} was at --at-s {config.at_s:g}: "
+            "choose another time, or say where to stand with --eye and --target."
+        )
+        raise UsageError(message)
     return info.camera, tree.T_root_frame(info.frame_id, stamp_ns)
+
+
+def _tree_of(
+    run: RunFolder, scene: Scene, episode: Episode, camera_id: str, stamp_ns: int
+) -> TransformTree:
+    """Poses of a camera, from where the scene has its own."""
+    known = scene.record.get("cameras", [])
+    if not any((item["id"], item["poses_from"]) == (camera_id, "hand-eye") for item in known):
+        return base_tree(episode)
+    calibration = read_calibration(run)
+    place = None if calibration is None else calibration.cameras.get(camera_id)
+    if place is None:
+        return base_tree(episode)
+    stamps = np.unique(np.append(paired_stamps_ns(episode, camera_id), stamp_ns))
+    lost = without_joints(episode, place, stamps)
+    return calibrated_tree(
+        episode, camera_id, place, np.array([t for t in stamps.tolist() if t not in lost])
+    )
