@@ -4,12 +4,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bridge.episode import provenance
 from bridge.episode.run import RunFolder, check_episode_id
 from bridge.errors import PathNotFoundError, UsageError
+from twin.scene.gaussians.cloud import GaussianCloud
 from twin.scene.store.folder import (
     BACKGROUND,
-    HASH_DIGITS,
     SCENE_FILE,
     background_hash,
     read_record,
@@ -18,6 +20,7 @@ from twin.scene.store.folder import (
 from twin.scene.store.ply import UnreadablePlyError, read_ply, write_ply
 
 SPLATS = "gaussians.ply"
+EDITED = "splats were edited: what was said of each Gaussian no longer fits; rebuild to say it anew"
 
 
 def take_back(run: RunFolder, file: Path, object_id: str = "") -> dict[str, Any]:
@@ -27,6 +30,8 @@ def take_back(run: RunFolder, file: Path, object_id: str = "") -> dict[str, Any]
     more or fewer, lack normals and harmonics, or have harmonics of degree 1 to 3, of which degree
     1 is kept. Its frame must be the one the file had when it left. A new background is a new
     scene: it has another hash. The views held out of the fit still show, and name, the old one.
+    What was said of each Gaussian (names, parts, features) is dropped unless all of them are where
+    they were, in the same order: it would be said of others.
 
     Args:
         run: Run folder with a rebuilt scene.
@@ -61,21 +66,46 @@ def take_back(run: RunFolder, file: Path, object_id: str = "") -> dict[str, Any]
         "num_splats": len(cloud),
         "from_scene": record["scene_hash"],
     }
-    if not object_id and digest[:HASH_DIGITS] == record["scene_hash"]:
+    own = record["objects"][object_id]["files"].get(SPLATS) if object_id else record["scene_hash"]
+    if digest[: len(own)] == own and own:
         return about | {"scene_hash": record["scene_hash"]}  # the scene's own file, not edited
+    place = run.scene_dir
     if object_id:
-        place = run.scene_dir / "objects" / check_episode_id(object_id)
+        place = place / "objects" / check_episode_id(object_id)
+    if not _same_places(place / (SPLATS if object_id else BACKGROUND), cloud, digest):
+        _drop_semantics(run, record)
+    if object_id:
         write_ply(place / SPLATS, cloud)
         item = record["objects"][object_id]
         item["num_splats"] = len(cloud)
         item["files"][SPLATS] = provenance.hash_file(place / SPLATS)
     else:
-        write_ply(run.scene_dir / BACKGROUND, cloud)
+        write_ply(place / BACKGROUND, cloud)
         record["scene_hash"] = background_hash(run)
         record["background"] = {"file": BACKGROUND, "num_splats": len(cloud)}
     record["edited"] = [*record.get("edited", []), about]
     write_record(run, record)
     return about | {"scene_hash": record["scene_hash"]}
+
+
+def _same_places(before: Path, cloud: GaussianCloud, digest: str) -> bool:
+    """Whether a cloud has the Gaussians of a file where they were; unknown if edited in place."""
+    if not before.is_file() or provenance.hash_file(before) == digest:
+        return False
+    try:
+        old = read_ply(before)
+    except UnreadablePlyError:
+        return False
+    return len(old) == len(cloud) and np.allclose(old.means_m, cloud.means_m, atol=1e-6)
+
+
+def _drop_semantics(run: RunFolder, record: dict[str, Any]) -> None:
+    about = record.get("semantics") or {}
+    named = [about, about.get("features") or {}, about.get("vectors") or {}]
+    for name in {str(item["file"]) for item in named if "file" in item}:
+        (run.scene_dir / Path(name).name).unlink(missing_ok=True)
+    if about:
+        record["semantics"] = {"source": about.get("source"), "remark": EDITED, "instances": []}
 
 
 def describe_edit(about: Mapping[str, Any]) -> str:

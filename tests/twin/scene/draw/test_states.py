@@ -202,6 +202,20 @@ def test_an_edited_background_makes_a_new_scene(
     assert rebuild(room, CONFIG, QUIET)["scene_hash"] == after.scene_hash  # the edit is kept
 
 
+def test_names_of_gaussians_go_when_others_take_their_rows(room: RunFolder, tmp_path: Path) -> None:
+    """An editor may sort them on saving: as many as before, but not the same in each row."""
+    cloud = read_scene(room).background
+    write_ply(tmp_path / "grey.ply", replace(cloud, colors=np.full_like(cloud.colors, 0.5)))
+    take_back(room, tmp_path / "grey.ply")
+    assert (room.scene_dir / "semantics.npz").is_file()
+    assert "file" in read_scene(room).record["semantics"]
+    write_ply(tmp_path / "sorted.ply", cloud.take(np.argsort(cloud.means_m[:, 0])))
+    take_back(room, tmp_path / "sorted.ply")
+    assert not (room.scene_dir / "semantics.npz").exists()
+    assert "edited" in read_scene(room).record["semantics"]["remark"]
+    assert rebuild(room, CONFIG, QUIET)["scene_hash"] == read_scene(room).scene_hash
+
+
 def test_a_background_edited_in_place_is_taken_after_being_refused(room: RunFolder) -> None:
     path = room.scene_dir / "background.ply"
     write_ply(path, read_ply(path).take(np.arange(50)))
