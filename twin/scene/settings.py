@@ -1,5 +1,6 @@
 """Settings of ``rebuild`` and ``render``; imports nothing heavy, so that --help is quick."""
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,11 +9,13 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from bridge.errors import UsageError
+from bridge.errors import UsageError, refuse_outside
 
 _DURATION = re.compile(r"^\s*(\d+(?:\.\d+)?)\s*(s|sec|min|m|h)?\s*$")
 _SECONDS = {None: 1.0, "s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 MAX_APPEARANCE_STEPS = 6
+MOST_S = 1e6
+"""Eleven days: longer is a number gone wrong."""
 
 
 def parse_duration_s(text: str) -> float:
@@ -80,6 +83,7 @@ class FrameConfig:
         _refuse_below(0, train_every=self.train_every, holdout_offset=self.first_holdout)
         _refuse_below(1, max_train_frames=self.max_train_frames)
         _refuse_below(1, max_holdout_frames=self.max_holdout_frames)
+        refuse_outside(self, {"max_depth_m": (0.1, 1000.0)})
         if self.first_holdout >= self.holdout_every:
             message = (
                 f"--holdout-offset {self.first_holdout} lies beyond the first "
@@ -113,8 +117,16 @@ class InitialiseConfig:
     """A pixel whose depth differs from a neighbour's by more than this share is dropped."""
 
     def __post_init__(self) -> None:
-        """Refuse an empty budget, a growth of everything, and an opacity without a logit."""
+        """Refuse an empty budget, a growth of everything, Gaussians without a size or a logit."""
         _refuse_below(1, max_splats=self.max_splats)
+        refuse_outside(
+            self,
+            {
+                "footprint_factor": (0.1, 100.0),
+                "flatness": (1e-3, 1.0),
+                "flying_fraction": (1e-3, 10.0),
+            },
+        )
         if not 0 <= self.growth < 1:
             message = f"--growth {self.growth:g} is no share: 0 up to, not including, 1."
             raise UsageError(message)
@@ -160,18 +172,19 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         """Refuse a fit that never ends, or never begins."""
-        _refuse_below(0, iterations=self.iterations)
+        _refuse_below(0, iterations=self.iterations, seed=self.seed, threads=self.threads)
+        refuse_outside(self, {"depth_weight": (0.0, 1000.0), "coarse_fraction": (0.0, 1.0)})
         if not 0 <= self.appearance_steps <= MAX_APPEARANCE_STEPS:
             message = (
                 f"--appearance-steps {self.appearance_steps} lies outside 0 to "
                 f"{MAX_APPEARANCE_STEPS}: more steps follow the noise."
             )
             raise UsageError(message)
-        if not self.slab >= 0:
+        if not 0 <= self.slab < math.inf:
             message = f"--slab {self.slab:g} is no thickness: 0 or more."
             raise UsageError(message)
-        if self.iterations == 0 and not self.budget_s > 0:
-            message = f"--budget {self.budget_s:g} s leaves no time to fit; give more than 0."
+        if self.iterations == 0 and not 0 < self.budget_s <= MOST_S:
+            message = f"--budget {self.budget_s:g} s is no time to fit in; give more than 0."
             raise UsageError(message)
 
 
@@ -265,3 +278,11 @@ class RenderConfig:
     """What draws: our own code, or gsplat on a CUDA device; auto takes a GPU if there is one."""
     out: Path | None = None
     """File to write; default: RUN/results/render.png."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that are none."""
+        refuse_outside(self, {"at_s": (0.0, MOST_S), "width_m": (0.0, 1.0)})
+        for name, place in (("eye", self.eye), ("target", self.target)):
+            if place is not None and not all(math.isfinite(value) for value in place):
+                message = f"--{name} {place} is no place: three numbers in metres."
+                raise UsageError(message)

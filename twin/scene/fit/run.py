@@ -94,7 +94,7 @@ def fit(
     learner = _Learner(views, config)
     events = Events(views, config, max_splats or len(cloud), learner.rasteriser)
     state = None if checkpoint is None else load_state(checkpoint, learner.session)
-    if state is None:
+    if state is None or len(state.gains) != len(views):
         harmonics = NUM_FIRST if config.harmonics else cloud.num_harmonics
         state = first_state(learner.session(with_harmonics(cloud, harmonics)), len(views))
         state.seconds = min(spent_s, SPENT_AT_MOST * config.budget_s)

@@ -11,6 +11,7 @@ from twin.scene.fit.run import FitResult
 from twin.scene.frames.camera_poses import SAYS
 from twin.scene.frames.choice import FrameChoice, Sources, root_frame
 from twin.scene.learn.read import Learnt
+from twin.scene.rebuild.view_numbers import MOST_DB
 from twin.scene.settings import FrameConfig, RebuildConfig
 from twin.scene.store.folder import BACKGROUND, SCENE_VERSION
 
@@ -81,7 +82,7 @@ def make_record(
             "colour_steps": fitted.colour_steps,
             "train_psnr_db": None
             if fitted.train_psnr_db is None
-            else round(fitted.train_psnr_db, 3),
+            else round(min(fitted.train_psnr_db, MOST_DB), 3),
         },
         "views": dict(views),
         "cost": cost.to_record(),

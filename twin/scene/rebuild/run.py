@@ -8,13 +8,15 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bridge.episode import provenance
+from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
-from bridge.errors import UsageError
+from bridge.errors import BridgeError, UsageError
 from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output
 from twin.scene.fit.initialise import fuse
@@ -31,7 +33,7 @@ from twin.scene.raster.rasteriser import RasterConfig, load_native
 from twin.scene.rebuild.record import Cost, make_record, protocol_of
 from twin.scene.rebuild.semantics import write_scene_semantics
 from twin.scene.rebuild.view_numbers import summarise_views
-from twin.scene.rebuild.views import ViewsJob, views_path, write_views
+from twin.scene.rebuild.views import ENGINE, ViewsJob, views_path, write_views
 from twin.scene.robot.stage import DrivenRobot, write_robot
 from twin.scene.settings import RebuildConfig
 from twin.scene.store.calibration import Calibration, read_calibration
@@ -77,9 +79,10 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
 
     Raises:
         NoFramesError: When the run has no RGB-D frames.
-        LostError: When a camera without poses cannot be followed.
+        UnusableCameraError: When no camera can be used or followed.
         NoDepthError: When the depth images hold nothing usable.
         PoseConventionError: When poses fit the depth only if read in another convention.
+        MovedCameraError: When a camera moved that is said to stand still.
         SplatExtensionMissingError: When the native code is not built.
         UsageError: When a model that was named cannot be used.
         MissingDependencyError: When the extra ``foundation`` is needed and not installed.
@@ -226,9 +229,16 @@ def _key(sources: Sources, config: RebuildConfig, calibration: Calibration | Non
             "settings": settings,
             "models": check_models(config.models, task),
             "task": None if task is None else asdict(task),
-            "calibration": None if calibration is None else calibration.calibration_id,
+            "calibration": _mounts(config, calibration),
         }
     )
+
+
+def _mounts(config: RebuildConfig, calibration: Calibration | None) -> dict[str, Any] | None:
+    """Where calibrated cameras sit, if that counts; what else was calibrated changes no scene."""
+    if calibration is None or not calibration.cameras or config.frames.poses != "auto":
+        return None
+    return {key: place.to_record() for key, place in sorted(calibration.cameras.items())}
 
 
 def _task(sources: Sources) -> Task | None:
@@ -266,9 +276,20 @@ def _already_done(run: RunFolder, key: str) -> dict[str, Any] | None:
 def _remove_stale_views(
     run: RunFolder, choices: Sequence[FrameChoice], scene_hash: str
 ) -> list[str]:
-    """Remove the views of earlier scenes, which are no longer stored; return the present ones."""
+    """Remove our views of earlier scenes, which are no longer stored; return the present ones.
+
+    Views that another program drew stay: they are compared with ours.
+    """
     present = {views_path(run, c.episode, scene_hash).name for c in choices if c.holdout_ns}
     for path in run.derived("*.views.*"):
-        if path.name not in present:
+        if path.name not in present and _is_ours(path):
             path.unlink()
     return sorted(present)
+
+
+def _is_ours(path: Path) -> bool:
+    try:
+        derived = Episode.open(path).derived
+    except BridgeError:
+        return False
+    return derived is not None and derived.engine == ENGINE

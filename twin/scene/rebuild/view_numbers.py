@@ -18,6 +18,7 @@ VIEWS_NOTE = (
     "to the recorded image; static_: without pixels that show something that moved; the "
     "evaluator computes the official numbers from the views episode"
 )
+MOST_DB = 100.0
 AVERAGED = ("psnr_db", "static_psnr_db", "gain_psnr_db", "ssim", "depth_mean_abs_m")
 
 
@@ -66,14 +67,21 @@ def rate_view(
         camera_id=frame.camera_id,
         stamp_ns=frame.stamp_ns,
         still_camera=still,
-        psnr_db=psnr_db(float(squared.mean())),
-        static_psnr_db=psnr_db(float(squared[static_mask].mean())) if static_mask.any() else None,
+        psnr_db=finite_psnr_db(float(squared.mean())),
+        static_psnr_db=finite_psnr_db(float(squared[static_mask].mean()))
+        if static_mask.any()
+        else None,
         static_fraction=float(static_mask.mean()),
-        gain_psnr_db=psnr_db(float(np.square(brightened(rendered, wanted) - wanted).mean())),
+        gain_psnr_db=finite_psnr_db(float(np.square(brightened(rendered, wanted) - wanted).mean())),
         ssim=_similarity(rendered, wanted),
         depth_mean_abs_m=float(difference.mean()) if both.any() else None,
         coverage_fraction=float(view.alpha.mean()),
     )
+
+
+def finite_psnr_db(mse: float) -> float:
+    """Peak signal-to-noise ratio, at most 100 dB: JSON has no word for identical images."""
+    return min(psnr_db(mse), MOST_DB)
 
 
 def brightened(

@@ -36,6 +36,8 @@ from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
 from twin.scene.rebuild.view_numbers import ViewNumbers, rate_view
 from twin.scene.robot.stage import DrivenRobot
 
+ENGINE = "robot-gst splat"
+"""Who drew the views, as their episode says."""
 OBJECT_SHARE = 0.5
 """A pixel shows an object when this share of its light comes from it."""
 
@@ -107,7 +109,7 @@ def write_views(
                     source_episode=episode.info.id,
                     source_sha256=episode.sha256(),
                     scene_hash=job.scene_hash,
-                    engine="robot-gst splat",
+                    engine=ENGINE,
                     settings=job.settings(),
                 ),
             )

@@ -7,12 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import textured_room
 
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
+from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
@@ -24,7 +26,14 @@ from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects import parts as parts_module
 from twin.scene.objects.parts import read_objects, take_apart
 from twin.scene.rebuild.run import rebuild
-from twin.scene.settings import FitConfig, FrameConfig, InitialiseConfig, RebuildConfig
+from twin.scene.settings import (
+    FitConfig,
+    FrameConfig,
+    InitialiseConfig,
+    RebuildConfig,
+    RenderConfig,
+)
+from twin.scene.store.calibration import write_physics
 from twin.scene.store.folder import UnreadableSceneError, read_record, read_scene, scene_hash_of
 
 QUIET = Output(quiet=True)
@@ -107,6 +116,44 @@ def test_a_damaged_object_file_is_refused(room: RunFolder, text: str) -> None:
         read_objects(room, {"objects": {"cube": {}}})
 
 
+def test_views_of_another_program_are_kept_and_our_own_old_ones_are_not(room: RunFolder) -> None:
+    (own,) = room.derived("*.views.*")
+    foreign = room.derived_dir / "scan.views.otherone.mcap"
+    with EpisodeWriter(foreign) as writer:
+        about = Episode.open(own).derived
+        assert about is not None
+        theirs = replace(about, engine="another program")
+        writer.describe(EpisodeInfo(id="scan.views.otherone", kind="scan"), derived=theirs)
+    config = replace(CONFIG, fit=replace(CONFIG.fit, iterations=7))
+    scene_hash = rebuild(room, config, QUIET)["scene_hash"]
+    assert not own.exists()
+    assert room.derived("*.views.*") == sorted(
+        [foreign, room.derived_dir / f"scan.views.{scene_hash}.mcap"]
+    )
+
+
+def test_what_was_found_out_about_physics_does_not_make_a_scene_out_of_date(
+    room: RunFolder,
+) -> None:
+    """A scene made again has another name where time counts, and replays of the old one go."""
+    write_physics(room, {"promoted": True, "identified": {}, "id": "a"})
+    before = (room.scene_dir / "background.ply").stat().st_mtime_ns
+    rebuild(room, CONFIG, QUIET)
+    assert (room.scene_dir / "background.ply").stat().st_mtime_ns == before
+
+
+def test_the_scene_of_black_images_is_described_in_plain_json(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Black drawn as black is no error at all, and JSON does not know infinity."""
+    monkeypatch.setattr(textured_room, "texture", np.zeros_like)
+    run = RunFolder.create(tmp_path / "run")
+    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9)
+    record = rebuild(run, CONFIG, QUIET)
+    assert record["views"]["psnr_db"] == 100.0
+    json.dumps(record, allow_nan=False)
+
+
 def test_objects_are_not_looked_for_in_held_out_frames(
     room: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -149,6 +196,19 @@ def test_frames_are_known_by_their_own_stamp_and_not_by_when_they_were_sent(
         (lambda: InitialiseConfig(opacity=1.0), "--opacity"),
         (lambda: FitConfig(budget_s=0.0), "--budget"),
         (lambda: FitConfig(iterations=-1), "--iterations"),
+        (lambda: FitConfig(budget_s=float("inf")), "--budget"),
+        (lambda: FitConfig(seed=-1), "--seed"),
+        (lambda: FitConfig(threads=-2), "--threads"),
+        (lambda: FitConfig(depth_weight=-0.1), "--depth-weight"),
+        (lambda: FitConfig(coarse_fraction=float("nan")), "--coarse-fraction"),
+        (lambda: FrameConfig(max_depth_m=float("nan")), "--max-depth-m"),
+        (lambda: FrameConfig(max_depth_m=-1.0), "--max-depth-m"),
+        (lambda: InitialiseConfig(flatness=0.0), "--flatness"),
+        (lambda: InitialiseConfig(footprint_factor=0.0), "--footprint-factor"),
+        (lambda: InitialiseConfig(flying_fraction=float("nan")), "--flying-fraction"),
+        (lambda: RenderConfig(at_s=float("nan")), "--at-s"),
+        (lambda: RenderConfig(width_m=-0.1), "--width-m"),
+        (lambda: RenderConfig(eye=(0.0, 0.0, float("nan"))), "--eye"),
     ],
 )
 def test_settings_that_nothing_can_be_made_with_are_refused(
