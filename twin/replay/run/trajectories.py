@@ -17,6 +17,7 @@ from twin.replay.crew.worker import Failed, do
 from twin.replay.place.calibrated import calibrated, for_task
 from twin.replay.place.rebuilt import read_place, shape_hashes
 from twin.replay.place.starts import localised_starts
+from twin.replay.run.executions import execution_of
 from twin.replay.run.prepare import Preparation, prepare, replayed_task
 from twin.replay.run.table import against_recorded, count_verdicts, executions_of, recorded_labels
 from twin.replay.run.undrawn import describe_undrawn
@@ -207,9 +208,10 @@ def _jobs_of(
     digest = episode.sha256()
     calibration = read_calibration(run)
     replay = for_task(calibrated(config.replay, calibration), task)
-    jobs = []
+    jobs, events = [], streams.events(episode)
     for index, (stamp_ns, plan) in enumerate(plans):
-        interval = streams.executed_interval_ns(episode, plan.id)
+        execution = execution_of(events, plan.id)
+        interval = execution.interval_ns
         start_ns = stamp_ns if interval is None else interval[0]
         common = ReplayJob(
             episode_path=path,
@@ -229,9 +231,10 @@ def _jobs_of(
             shapes=shapes,
             calibration_id=None if calibration is None else calibration.calibration_id,
             render=config.render,
+            problem=execution.problem,
         )
         jobs.append(common)
-        if interval is not None:
+        if common.was_executed:
             executed = replace(common, trajectory="executed", end=starts.after(plan.id))
             jobs.append(executed)
             jobs.append(replace(executed, config=replace(replay, mode="kinematic")))

@@ -55,6 +55,13 @@ class ReplayJob:
     calibration_id: str | None = None
     render: bool = False
     """Also draw what the recorded cameras would have seen."""
+    problem: str = ""
+    """Why the plan's execution, of which there was one, cannot be replayed."""
+
+    @property
+    def was_executed(self) -> bool:
+        """Whether the recording says so, also of one that cannot be replayed."""
+        return self.end_ns is not None or bool(self.problem)
 
     @property
     def needs_planned(self) -> bool:
@@ -167,7 +174,7 @@ def _row(job: ReplayJob) -> dict[str, Any]:
         "task": job.task,
         "trajectory": job.trajectory,
         "mode": job.config.mode,
-        "executed": job.end_ns is not None,
+        "executed": job.was_executed,
         "file": job.path().name,
         "skipped": False,
         "accepted": None,

@@ -31,6 +31,8 @@ JOINTS, GRIPPER_STATE = "/joint_states", "/gripper/state"
 
 def run_job(job: ReplayJob) -> dict[str, Any]:
     """Replay and write; a failure the user can act on becomes a row, not an exception."""
+    if job.problem and job.trajectory == "executed":
+        return row_of_failure(job, job.problem)
     try:
         return judged(job, *_replay(job))
     except GstError as error:

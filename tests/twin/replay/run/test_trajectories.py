@@ -17,20 +17,27 @@ from bridge.episode.records import JointSample, string_to_cdr
 from bridge.episode.run import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
+from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
 from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.place.starts import StartState, StartStates
 from twin.replay.run import trajectories
+from twin.replay.run.executions import Execution, execution_of
 from twin.replay.run.table import count_verdicts
 from twin.replay.run.text import describe_run
 from twin.replay.run.trajectories import replay_run
 from twin.replay.verdict.result import ReplayResult
+from twin.replay.work import relive
 from twin.replay.work.job import ReplayJob, divergence_of, row_of_failure
 from twin.scene.localise.episode import Phase
 
 T0 = 1_700_000_000_000_000_000
 START = T0 + 2_000_000_000
 QUIET = Output(quiet=True)
+VERDICT = Verdict(
+    plan_id="round-1", trajectory="planned", mode="dynamic", ik=Factor(value=True),
+    clearance=Factor(value=True), terminal=Factor(value=True), engine="fake", seed=0,
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -239,6 +246,55 @@ def test_a_run_without_plans_says_so(tmp_path: Path) -> None:
     summary = replay_run(RunFolder.create(tmp_path / "empty"), ReplayRunConfig(), QUIET)
     assert describe_run(summary) == "No trial with a plan to replay."
     json.dumps(summary)
+
+
+def marks(*said: str) -> list[dict[str, Any]]:
+    """Events of plan a, one second apart: > it starts, < it ends."""
+    kinds = {">": "execution_started", "<": "execution_ended", ".": "note"}
+    return [
+        {"type": kinds[sign], "plan_id": "a", "stamp_ns": stamp}
+        for stamp, sign in enumerate("".join(said))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("said", "interval", "problem"),
+    [
+        ("..", None, ""),
+        ("<", None, ""),
+        (".>.<.", (1, 3), ""),
+        (".>..", None, "began, and nobody recorded that it ended"),
+        (">.<>.<", (0, 2), "was executed 2 times, and which end"),
+        (">.<>", (0, 2), "was executed 2 times"),
+    ],
+)
+def test_an_execution_without_an_end_of_its_own_is_no_plan_that_was_never_executed(
+    said: str, interval: tuple[int, int] | None, problem: str
+) -> None:
+    found = execution_of(marks(said), "a")
+    assert found.interval_ns == interval
+    assert problem in found.problem
+    assert bool(found.problem) is bool(problem)
+    assert execution_of(marks(said), "b") == Execution(interval_ns=None)
+
+
+def test_a_recording_that_ends_while_the_robot_moves_says_so(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events = marks(".>.")
+    for event in events:
+        event["plan_id"] = "round-1"
+    monkeypatch.setattr(trajectories.streams, "events", lambda _: events)
+    monkeypatch.setattr(relive, "_replay", lambda job: (VERDICT, None))
+    summary = replay_run(run, ReplayRunConfig(replay=QUICK), QUIET)
+    said = {(r["plan"], r["trajectory"], r["mode"]): r for r in summary["rows"]}
+    assert len(said) == 4
+    for mode in ("dynamic", "kinematic"):
+        row = said["round-1", "executed", mode]
+        assert row["error"].startswith("not evaluated: the execution of plan 'round-1' began, and")
+        assert row["accepted"] is None
+    assert summary["counts"]["planned dynamic"]["n"] == 1
+    assert summary["counts"]["planned dynamic, never executed"]["n"] == 1
 
 
 def test_counts_keep_never_executed_plans_apart() -> None:
