@@ -129,16 +129,18 @@ def choose_frames(
         max_train_frames=max(1, config.max_train_frames // max(len(found), 1)),
         max_holdout_frames=max(1, config.max_holdout_frames // max(len(found), 1)),
     )
-    choices, lost = [], []
+    choices: list[FrameChoice] = []
+    lost: list[UnusableCameraError] = []
     for episode, camera_id in found:
         try:
             check_camera(episode, camera_id)
             choices.append(_choose(episode, camera_id, shared, output, calibration))
         except UnusableCameraError as error:
             lost.append(error)
-            output.say(f"left out: {error}")
     if lost and not choices:
         raise lost[0]
+    for reason in lost:
+        output.say(f"left out: {reason}")
     choices = _in_one_frame(choices, output)
     if not any(choice.train_ns for choice in choices):
         message = "the cameras of this run have no frames to learn from. Record a longer scan."

@@ -1,46 +1,31 @@
 """Localise the objects of a recorded episode, and keep the answer as a derived episode."""
 
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from bridge.episode import provenance, schema, streams
 from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
 from bridge.episode.records import PoseSample
 from bridge.episode.run import RunFolder
-from bridge.episode.streams import RgbdFrame
-from bridge.episode.transforms import TransformTree
 from bridge.episode.writer import EpisodeWriter
-from bridge.errors import EpisodeError, GstError
+from bridge.errors import EpisodeError
 from bridge.task.robot import BASE_FRAME
 from bridge.task.task_file import Task
-from twin.scene.frames.base import base_tree
-from twin.scene.frames.camera_poses import CameraPoses, calibrated_poses
-from twin.scene.frames.choice import rgbd_camera_ids, spread
-from twin.scene.frames.pairs import frames_at, paired_stamps_ns
-from twin.scene.frames.still import same_pose
-from twin.scene.frames.usable import check_camera
+from twin.scene.frames.choice import rgbd_camera_ids
 from twin.scene.localise.objects import LocaliseConfig, localise_objects
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.localise.scanned import scanned_surfaces
+from twin.scene.localise.scanned import ScannedSurfaces, scanned_surfaces
+from twin.scene.localise.still_frames import HeldOut, Poses, calibrated_cameras, still_frames
 from twin.scene.localise.surface import Surface
 from twin.scene.store.calibration import Calibration, read_calibration
 
 NO_SCENE = "noscene"
-STILL_WINDOW_NS = 40_000_000
-"""A camera is still when its pose is the same this long before and after an image."""
-STILL_DISTANCE_M = 1e-3
-STILL_ANGLE_RAD = 3e-3
-
-HeldOut = Mapping[str, Collection[int]]
-"""Stamps of frames to leave out, by camera id."""
-Poses = Mapping[str, CameraPoses]
-"""Of cameras that were calibrated, by id; all others are where ``/tf`` says."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,125 +115,6 @@ def quiet_phases(episode: Episode) -> list[Phase]:
     return phases
 
 
-def still_frames(
-    episode: Episode,
-    max_per_camera: int,
-    after_ns: int | None = None,
-    before_ns: int | None = None,
-    *,
-    evenly: bool = False,
-    held_out_ns: HeldOut | None = None,
-    poses: Poses | None = None,
-) -> list[RgbdFrame]:
-    """Frames of each camera taken in an interval while that camera did not move.
-
-    Only the frames that are returned are ever in memory. A camera that cannot be used, or whose
-    place in the robot's base nobody knows, is passed over as long as another one can.
-
-    Args:
-        episode: Recorded, with posed colour and depth.
-        max_per_camera: At most so many.
-        after_ns: Only frames later than this source time.
-        before_ns: Only frames earlier than this source time.
-        evenly: Spread them evenly over the interval instead of taking the last ones.
-        held_out_ns: Frames that must not be looked at.
-        poses: Where calibrated cameras are.
-
-    Raises:
-        GstError: When no camera can be used; what is wrong with the first.
-    """
-    tree = base_tree(episode)
-    failed: list[GstError] = []
-    usable: dict[str, _Still] = {}
-    camera_ids = rgbd_camera_ids(episode)
-    for camera_id in camera_ids:
-        known = (poses or {}).get(camera_id) or CameraPoses(tree=tree, source="tf")
-        hidden = known.unposed_ns.union((held_out_ns or {}).get(camera_id, ()))
-        try:
-            usable[camera_id] = _still(
-                episode, camera_id, replace(known, unposed_ns=hidden), after_ns, before_ns
-            )
-        except GstError as error:
-            failed.append(error)
-    if failed and not usable:
-        raise failed[0]
-    roots = [item.root for item in usable.values()]
-    frames: list[RgbdFrame] = []
-    for camera_id, item in usable.items():
-        if item.root != (BASE_FRAME if BASE_FRAME in roots else roots[0]):
-            continue
-        stamps = np.array(item.stamps_ns, dtype=np.int64)
-        chosen = spread(stamps, max_per_camera) if evenly else stamps[-max_per_camera:]
-        frames.extend(_frames_at(episode, camera_id, item.poses, chosen.tolist()))
-    return frames
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Still:
-    """When one camera stood still, and where."""
-
-    poses: CameraPoses
-    root: str
-    """Frame that the poses are in."""
-    stamps_ns: list[int]
-
-
-def _still(
-    episode: Episode,
-    camera_id: str,
-    poses: CameraPoses,
-    after_ns: int | None,
-    before_ns: int | None,
-) -> _Still:
-    check_camera(episode, camera_id)
-    frame_id = streams.camera_info(episode, camera_id, "color").frame_id
-    stamps = _between(paired_stamps_ns(episode, camera_id), after_ns, before_ns)
-    return _Still(
-        poses=poses,
-        root=poses.tree.root_of(frame_id),
-        stamps_ns=[
-            stamp
-            for stamp in stamps
-            if stamp not in poses.unposed_ns and is_still(poses.tree, frame_id, stamp, before_ns)
-        ],
-    )
-
-
-def _between(
-    stamps_ns: Int[np.ndarray, " num_frames"], after_ns: int | None, before_ns: int | None
-) -> list[int]:
-    wanted = np.ones(len(stamps_ns), dtype=bool)
-    if after_ns is not None:
-        wanted &= stamps_ns > after_ns
-    if before_ns is not None:
-        wanted &= stamps_ns < before_ns
-    return [int(stamp) for stamp in stamps_ns[wanted]]
-
-
-def _frames_at(
-    episode: Episode, camera_id: str, poses: CameraPoses, stamps_ns: Collection[int]
-) -> Iterator[RgbdFrame]:
-    for frame in frames_at(episode, camera_id, poses.tree, stamps_ns):
-        if poses.depth_scale == 1.0:
-            yield frame
-        else:
-            yield replace(frame, depth_m=frame.depth_m * np.float32(poses.depth_scale))
-
-
-def is_still(
-    tree: TransformTree, frame_id: str, stamp_ns: int, until_ns: int | None = None
-) -> bool:
-    """Say whether a frame's pose is the same shortly before and after an instant."""
-    last_ns = (
-        stamp_ns + STILL_WINDOW_NS
-        if until_ns is None
-        else min(stamp_ns + STILL_WINDOW_NS, until_ns)
-    )
-    before = tree.T_root_frame(frame_id, stamp_ns - STILL_WINDOW_NS)
-    after = tree.T_root_frame(frame_id, last_ns)
-    return same_pose(before, after, distance_m=STILL_DISTANCE_M, angle_rad=STILL_ANGLE_RAD)
-
-
 def write_localised(
     run: RunFolder,
     episode: Episode,
@@ -295,6 +161,23 @@ def write_localised(
     if path.exists() and not force and _made_from(path, derived):
         return path
     poses = calibrated_cameras(episode, calibration)
+    phases = _localised_phases(episode, task, config, scanned, poses)
+    path.unlink(missing_ok=True)
+    with EpisodeWriter(path) as writer:
+        writer.describe(episode.info, derived=derived)
+        for phase, objects in phases:
+            _write_phase(writer, _cell_of(episode), phase, objects)
+    return path
+
+
+def _localised_phases(
+    episode: Episode,
+    task: Task,
+    config: LocaliseConfig,
+    scanned: ScannedSurfaces,
+    poses: Poses,
+) -> list[tuple[Phase, dict[str, LocalisedObject]]]:
+    """Localise in one quiet stretch after the other; each tells the next where objects were."""
     phases: list[tuple[Phase, dict[str, LocalisedObject]]] = []
     last_seen_m: dict[str, np.ndarray] = {}
     for phase in quiet_phases(episode):
@@ -314,29 +197,7 @@ def write_localised(
             for key, item in found.items()
             if item.T_base_object is not None
         }
-    path.unlink(missing_ok=True)
-    with EpisodeWriter(path) as writer:
-        writer.describe(episode.info, derived=derived)
-        for phase, objects in phases:
-            _write_phase(writer, _cell_of(episode), phase, objects)
-    return path
-
-
-def calibrated_cameras(episode: Episode, calibration: Calibration | None) -> Poses:
-    """Where the cameras of an episode are, as far as they were calibrated.
-
-    Raises:
-        EpisodeError: A camera in the hand, and no joint states.
-        RobotDescriptionError: A camera in the hand, and no usable robot description.
-    """
-    places = {} if calibration is None else calibration.cameras
-    return {
-        camera_id: calibrated_poses(
-            episode, camera_id, places[camera_id], paired_stamps_ns(episode, camera_id)
-        )
-        for camera_id in rgbd_camera_ids(episode)
-        if camera_id in places
-    }
+    return phases
 
 
 def _mounts(calibration: Calibration | None, camera_ids: Collection[str]) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from bridge.errors import GstError
 from bridge.task.record import parse_record
 from twin.errors import TwinError
 from twin.scene.frames.base import rooted_in_base
-from twin.scene.localise.episode import STILL_WINDOW_NS, is_still
+from twin.scene.localise.still_frames import STILL_WINDOW_NS, is_still
 
 KEPT_IMAGES = 6
 KEPT_TRANSFORMS = 1000

@@ -69,18 +69,17 @@ def take_back(run: RunFolder, file: Path, object_id: str = "") -> dict[str, Any]
     own = record["objects"][object_id]["files"].get(SPLATS) if object_id else record["scene_hash"]
     if digest[: len(own)] == own and own:
         return about | {"scene_hash": record["scene_hash"]}  # the scene's own file, not edited
-    place = run.scene_dir
+    place = run.scene_dir / BACKGROUND
     if object_id:
-        place = place / "objects" / check_episode_id(object_id)
-    if not _same_places(place / (SPLATS if object_id else BACKGROUND), cloud, digest):
+        place = run.scene_dir / "objects" / check_episode_id(object_id) / SPLATS
+    if not _same_places(place, cloud, digest):
         _drop_semantics(run, record)
+    write_ply(place, cloud)
     if object_id:
-        write_ply(place / SPLATS, cloud)
         item = record["objects"][object_id]
         item["num_splats"] = len(cloud)
-        item["files"][SPLATS] = provenance.hash_file(place / SPLATS)
+        item["files"][SPLATS] = provenance.hash_file(place)
     else:
-        write_ply(place / BACKGROUND, cloud)
         record["scene_hash"] = background_hash(run)
         record["background"] = {"file": BACKGROUND, "num_splats": len(cloud)}
     record["edited"] = [*record.get("edited", []), about]

@@ -25,7 +25,8 @@ from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.media.color import encode_jpeg
 from bridge.task.task_file import Task
-from twin.scene.localise.episode import localise_episode, still_frames, write_localised
+from twin.scene.localise.episode import localise_episode, write_localised
+from twin.scene.localise.still_frames import still_frames
 from twin.scene.shape.known import pose_of
 from twin.scene.store.calibration import write_calibration
 

@@ -29,9 +29,9 @@ from twin.scene.frames.choice import rgbd_camera_ids
 from twin.scene.localise.episode import (
     localise_episode,
     quiet_phases,
-    still_frames,
     write_localised,
 )
+from twin.scene.localise.still_frames import still_frames
 from twin.scene.shape.known import pose_of
 
 S = 1_000_000_000
