@@ -17,6 +17,10 @@ UNITS = ("trial", "object", "subtask")
 YES = ("success", "true", "yes", "1", "accepted")
 NO = ("failure", "false", "no", "0", "refused", "rejected")
 UNKNOWN = ("", "unknown", "undecided", "none")
+MOST = 10**12
+"""Counted in one field; beyond it a count is a slip, and soon no number that a float holds."""
+MOST_IN_TRIAL = 10_000
+"""Objects or sub-tasks of one trial."""
 
 
 class TableError(BridgeError):
@@ -49,7 +53,7 @@ class TrialRecord:
     verdict: bool | None = None
     p_success: float | None = None
     cell: str = ""
-    stand_in: bool = False
+    stand_in: bool | None = None
 
 
 COLUMNS = tuple(field.name for field in fields(TrialRecord))
@@ -72,12 +76,12 @@ class SourceRow:
         return TableError(path=self.path, row=self.row, found=found, hint=hint)
 
     def whole(self, name: str) -> int | None:
-        """Read a whole number of at least 0."""
+        """Read a whole number from 0 to ``MOST``."""
         number = self._number(name)
         if number is None:
             return None
-        if not (number >= 0 and number.is_integer()):
-            hint = f"{name} counts something: a whole number of at least 0"
+        if not (0 <= number <= MOST and number.is_integer()):
+            hint = f"{name} counts something: a whole number from 0 to {MOST:,}"
             raise self.refuse(f"{name} is {self.text(name)!r}", hint)
         return int(number)
 
@@ -238,6 +242,8 @@ def read_trial(row: SourceRow) -> TrialRecord:
     if k is not None and n is not None:
         if n < 1 or k > n:
             raise row.refuse(f"{k} of {n} is not a possible count", "Check k and n")
+        if n > MOST_IN_TRIAL:
+            raise row.refuse(f"one trial counts {n} {unit}s", f"At most {MOST_IN_TRIAL:,}")
         if unit == "trial" and n != 1:
             raise row.refuse(
                 f"one trial counts {n} trials", "A row is one trial; for ducks use unit object"
@@ -264,7 +270,7 @@ def read_trial(row: SourceRow) -> TrialRecord:
         verdict=row.answer("verdict"),
         p_success=row.fraction("p_success"),
         cell=row.text("cell"),
-        stand_in=bool(row.answer("stand_in")),
+        stand_in=row.answer("stand_in"),
     )
 
 

@@ -1,6 +1,6 @@
 """What a comparison is made of: one row per recorded trial, with what the twin said of it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -14,6 +14,17 @@ from evaluator.compare.motion import MotionSummary
 from evaluator.compare.states import StateSummary
 from evaluator.compare.view_quality import ViewQuality
 from evaluator.result import Exclusion, Measurement, Results, Table
+
+RECORDED_WORDS = {True: "stand-in", False: "real", None: "recorded"}
+"""What the recorded side is called."""
+
+
+def stand_in_of(marks: Iterable[bool | None]) -> bool | None:
+    """True as soon as one is a stand-in's: mixed results are not called real, nor unmarked ones."""
+    found = set(marks)
+    if True in found:
+        return True
+    return False if found == {False} else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +50,8 @@ class TrialRow:
     policy: str
     start_id: str | None
     cell: str
-    stand_in: bool
+    stand_in: bool | None
+    """Whether a simulated laboratory recorded it; None where a table does not say."""
     recorded: bool | None
     """Task-level outcome as the operator labelled it."""
     unit: str = "trial"
@@ -90,8 +102,8 @@ class TrialRow:
 
     @property
     def recorded_word(self) -> str:
-        """``stand-in`` or ``real``: what the recorded side of this row is."""
-        return "stand-in" if self.stand_in else "real"
+        """``stand-in``, ``real`` or ``recorded``: what the recorded side of this row is."""
+        return RECORDED_WORDS[self.stand_in]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +170,7 @@ class Comparison:
     @property
     def recorded_word(self) -> str:
         """``stand-in``, ``real``, or ``recorded`` when the input does not say."""
-        return {True: "stand-in", False: "real", None: "recorded"}[self.stand_in]
+        return RECORDED_WORDS[self.stand_in]
 
     def results(self) -> Results:
         """Return what goes into ``results.json``."""

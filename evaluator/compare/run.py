@@ -20,7 +20,7 @@ from evaluator.compare.pairing import START_LIMIT_M
 from evaluator.compare.part import Part
 from evaluator.compare.renders import compare_renders
 from evaluator.compare.replays import DerivedIndex
-from evaluator.compare.rows import Comparison, TrialRow
+from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.summaries import sum_up
 from evaluator.compare.tracking import motion_results
 from evaluator.compare.trial import Trial, lay_out
@@ -154,11 +154,10 @@ def _bands(contents: RunContents) -> BandReport:
 
 
 def _stand_in(contents: RunContents, imported: Sequence[TrialRow]) -> bool | None:
-    """True as soon as one episode is a stand-in's: mixed results are not called real."""
-    marks = [each.facts.info.stand_in for each in contents.recorded]
+    marks: list[bool | None] = [each.facts.info.stand_in for each in contents.recorded]
     marks += [file.info.stand_in for file in contents.derived]
     marks += [row.stand_in for row in imported]
-    return any(marks) if marks else None
+    return stand_in_of(marks)
 
 
 def _provenance(contents: RunContents, imported_sha256: str | None) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from evaluator.compare.imported import row_from_record
 from evaluator.compare.published import check_published
 from evaluator.compare.rates import compare_rates
 from evaluator.compare.remarks import remarks_table
-from evaluator.compare.rows import Comparison, TrialRow
+from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.success import trials_in
 from evaluator.result import Exclusion
 
@@ -82,7 +82,7 @@ def compare_trials(
         return _compare_streamed(path, method)
     records = read_trials(path)
     rows = [row_from_record(record) for record in records]
-    stand_in = any(record.stand_in for record in records)
+    stand_in = stand_in_of(record.stand_in for record in records)
     base = compare_rows(
         rows, run=path.stem, source="trials", stand_in=stand_in, method=method, goal=goal
     )
@@ -92,7 +92,7 @@ def compare_trials(
 def _compare_streamed(path: Path, method: str) -> Comparison:
     counted = count_trials(path)
     rows = [replace(row_from_record(record), episode="", count=count) for record, count in counted]
-    stand_in = any(record.stand_in for record, _ in counted)
+    stand_in = stand_in_of(record.stand_in for record, _ in counted)
     base = compare_rows(rows, run=path.stem, source="trials", stand_in=stand_in, method=method)
     left_out = [
         Exclusion(episode=f"{trials_in(lacking)} trials", scope="agreement", reason=reason)

@@ -45,7 +45,7 @@ def _brackets(shown: Sequence[Measurement]) -> str:
     found = [m.interval.method for m in shown if m.interval is not None]
     names = " and ".join(METHOD_NAMES.get(name, name) for name in dict.fromkeys(found))
     said = f"Brackets: 95 % {names} intervals." if found else "There are no intervals."
-    if any(m.value is not None and m.interval is None and m.n is not None for m in shown):
+    if any("; use " in (m.reason_without_interval or "") for m in shown):
         said += " One that would cover too little is left out; measurements say which to use."
     return said
 

@@ -11,6 +11,7 @@ from bridge.episode.metadata import Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.streams import pose_track
 from bridge.errors import BridgeError
+from bridge.exchange.trials_csv import MOST_IN_TRIAL
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.compare.inventory import RunFile
 from evaluator.compare.motion import SAME_CLOCK_NS
@@ -90,7 +91,9 @@ def _unlabelled(outcome: Outcome | None) -> list[str]:
 
 def _impossible_count(outcome: Outcome | None) -> str:
     """Say what is wrong with a count of objects or sub-tasks; nothing where it can be."""
-    if outcome is None or outcome.unit == "trial" or 0 <= outcome.k <= outcome.n > 0:
+    if outcome is None or outcome.unit == "trial":
+        return ""
+    if 0 <= outcome.k <= outcome.n and 0 < outcome.n <= MOST_IN_TRIAL:
         return ""
     return f"the label counts {outcome.k} of {outcome.n} {outcome.unit}s, which cannot be"
 

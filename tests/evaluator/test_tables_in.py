@@ -14,7 +14,7 @@ from bridge.exchange.trials_csv import TableError, TrialRecord, read_trials, wri
 from bridge.exchange.trials_rates import read_rates
 from evaluator.compare import compare_csv, compare_run
 from evaluator.compare.imported import row_from_record
-from evaluator.compare.spreadsheet import record_from_row
+from evaluator.compare.spreadsheet import compare_trials, record_from_row
 
 PAPER = Path(__file__).resolve().parents[2] / "docs" / "examples" / "paper_table_rates.csv"
 
@@ -42,7 +42,7 @@ def trial_records(draw: st.DrawFn) -> list[TrialRecord]:
                 sim_executed=draw(answers),
                 verdict=draw(answers),
                 p_success=draw(st.none() | st.floats(0, 1)),
-                stand_in=draw(st.booleans()),
+                stand_in=draw(answers),
             )
         )
     return records
@@ -201,3 +201,37 @@ def test_a_table_that_is_neither_is_refused(
     binary.write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(TableError, match="not a CSV"):
         compare_csv(binary)
+
+
+@pytest.mark.parametrize(
+    ("marks", "word"),
+    [
+        (("", ""), "recorded"),
+        (("false", ""), "recorded"),
+        (("false", "false"), "real"),
+        (("true", ""), "stand-in"),
+    ],
+)
+def test_trials_of_which_nobody_says_where_they_come_from_are_not_called_real(
+    write_table: Callable[[str], Path], marks: tuple[str, str], word: str
+) -> None:
+    path = write_table(
+        f"trial_id,task,recorded,stand_in\na,t,success,{marks[0]}\nb,t,failure,{marks[1]}\n"
+    )
+    assert compare_csv(path).recorded_word == word
+    assert compare_trials(path, stream_above=0).recorded_word == word
+    assert compare_csv(write_table("trial_id,task\na,t\n")).stand_in is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("trial_id,task,unit,k,n\na,t,object,1e30,1e30\n", "row 2: k is '1e30'"),
+        ("trial_id,task,unit,k,n\na,t,subtask,3,100000\n", "one trial counts 100000 subtasks"),
+    ],
+)
+def test_counts_that_nobody_counted_are_refused(
+    write_table: Callable[[str], Path], text: str, message: str
+) -> None:
+    with pytest.raises(TableError, match=message):
+        compare_csv(write_table(text))
