@@ -2,6 +2,7 @@
 
 import tomllib
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +150,21 @@ def load_task(name: str) -> Task:
         UsageError: Unknown name (lists those that exist), or a file that is no task.
     """
     path = dataset_file("tasks", name)
+    try:
+        status = path.stat()
+    except OSError:
+        return _load(path)  # which says why
+    return _load_once(path.absolute(), status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=64)
+def _load_once(path: Path, mtime_ns: int, size: int) -> Task:
+    """Parse a task file again only when it has changed: every replay job asks for its task."""
+    del mtime_ns, size  # only tell one version from another
+    return _load(path)
+
+
+def _load(path: Path) -> Task:
     table = read_tables(path)
     try:
         return _task_from(table)

@@ -1,29 +1,22 @@
 """Replay every trajectory of a run: each plan as planned, each execution as recorded."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
-from bridge.episode import streams
-from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.task.task_file import load_task
-from bridge.terminal import Advance, Output
+from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
 from twin.replay.crew.pool import Alone, Crew, Runner
-from twin.replay.crew.worker import Failed, do
-from twin.replay.place.calibrated import calibrated, for_task
+from twin.replay.crew.worker import Failed
 from twin.replay.place.rebuilt import read_place, shape_hashes
-from twin.replay.place.starts import localised_starts
-from twin.replay.run.executions import execution_of
-from twin.replay.run.prepare import Preparation, prepare, replayed_task
+from twin.replay.run.prepare import Preparation, jobs_of
 from twin.replay.run.table import against_recorded, count_verdicts, executions_of, recorded_labels
 from twin.replay.run.undrawn import describe_undrawn
 from twin.replay.work.job import ReplayJob, row_of_existing, row_of_failure
 from twin.replay.work.relive import run_job
-from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import SCENE_FILE, read_record, scene_hash_of
 
 
@@ -98,56 +91,33 @@ def _all_jobs(
 ) -> tuple[list[ReplayJob], dict[str, str]]:
     """List what is to be replayed, and the episodes that cannot be, with the reason."""
     names = _chosen(run, config)
-    jobs: list[ReplayJob] = []
-    ahead = not isinstance(runner, Alone)
-    relocalise = config.relocalise and not ahead
     shapes = shape_hashes(run)
-    with output.progress("localise", len(names)) as advance:
-        skipped = _prepare(run, names, scene_hash, config, runner, advance) if ahead else {}
-        for index, episode_id in enumerate(name for name in names if name not in skipped):
-            answer = do(
-                lambda name: _jobs_of(
-                    run, name, scene_hash, shapes, config, output, relocalise=relocalise
-                ),
-                episode_id,
-            )
-            if isinstance(answer, Failed):
-                skipped[episode_id] = answer.message
-                output.detail(answer.trace)
-            else:
-                jobs += answer
-            if not ahead:
-                advance(index + 1, episode_id)
-    for episode_id, reason in sorted(skipped.items()):
-        output.say(f"{episode_id}: {reason}")
-    return jobs, skipped
-
-
-def _prepare(
-    run: RunFolder,
-    names: list[str],
-    scene_hash: str | None,
-    config: ReplayRunConfig,
-    runner: Runner,
-    advance: Advance,
-) -> dict[str, str]:
-    """Localise many episodes side by side; returns those that failed, with the reason."""
     items = [
         Preparation(
             run_path=run.path.resolve(),
             episode_id=name,
             scene_hash=scene_hash,
-            force=config.relocalise,
+            shapes=shapes,
+            config=config,
         )
         for name in names
     ]
-    failed = {}
-    answers = runner.run(prepare, items, lambda item: item.episode_path().stat().st_size)
-    for done, (item, answer) in enumerate(answers, start=1):
-        if isinstance(answer, Failed):
-            failed[item.episode_id] = answer.message
-        advance(done, item.episode_id)
-    return failed
+    jobs: dict[str, list[ReplayJob]] = {}
+    skipped: dict[str, str] = {}
+    with output.progress("localise", len(names)) as advance:
+        answers = runner.run(jobs_of, items, Preparation.cost)
+        for done, (item, answer) in enumerate(answers, start=1):
+            if isinstance(answer, Failed):
+                skipped[item.episode_id] = answer.message
+                output.detail(answer.trace)
+            elif answer:
+                jobs[item.episode_id] = answer
+            else:
+                output.detail(f"{item.episode_id}: no trial with a plan, not replayed")
+            advance(done, item.episode_id)
+    for episode_id, reason in sorted(skipped.items()):
+        output.say(f"{episode_id}: {reason}")
+    return [job for name in names for job in jobs.get(name, ())], skipped
 
 
 def _scene_hash(run: RunFolder, config: ReplayRunConfig, output: Output) -> str | None:
@@ -184,61 +154,6 @@ def _chosen(run: RunFolder, config: ReplayRunConfig) -> list[str]:
         )
         raise UsageError(message)
     return list(dict.fromkeys(config.episode)) or there
-
-
-def _jobs_of(
-    run: RunFolder,
-    episode_id: str,
-    scene_hash: str | None,
-    shapes: Mapping[str, str],
-    config: ReplayRunConfig,
-    output: Output,
-    *,
-    relocalise: bool,
-) -> list[ReplayJob]:
-    path = run.episodes_dir.resolve() / f"{episode_id}.mcap"  # for processes elsewhere
-    episode = Episode.open(path)
-    plans = streams.plans(episode)
-    task_name = replayed_task(episode, plans)
-    if task_name is None:
-        output.detail(f"{episode_id}: {episode.info.kind} with {len(plans)} plan(s), not replayed")
-        return []
-    task = load_task(task_name)
-    starts = localised_starts(run, episode, task, scene_hash=scene_hash, force=relocalise)
-    digest = episode.sha256()
-    calibration = read_calibration(run)
-    replay = for_task(calibrated(config.replay, calibration), task)
-    jobs, events = [], streams.events(episode)
-    for index, (stamp_ns, plan) in enumerate(plans):
-        execution = execution_of(events, plan.id)
-        interval = execution.interval_ns
-        start_ns = stamp_ns if interval is None else interval[0]
-        common = ReplayJob(
-            episode_path=path,
-            episode_sha256=digest,
-            plan_id=plan.id,
-            plan_index=index,
-            trajectory="planned",
-            start_ns=start_ns,
-            end_ns=None if interval is None else interval[1],
-            task=task_name,
-            start=starts.at(start_ns),
-            scene_hash=scene_hash,
-            config=replace(replay, mode="dynamic", samples=config.samples),
-            folder=run.derived_dir.resolve(),
-            duration_s=plan.tau[-1].t_ns * 1e-9 if plan.tau else 0.0,
-            run_path=run.path.resolve(),
-            shapes=shapes,
-            calibration_id=None if calibration is None else calibration.calibration_id,
-            render=config.render,
-            problem=execution.problem,
-        )
-        jobs.append(common)
-        if common.was_executed:
-            executed = replace(common, trajectory="executed", end=starts.after(plan.id))
-            jobs.append(executed)
-            jobs.append(replace(executed, config=replace(replay, mode="kinematic")))
-    return jobs
 
 
 def _there_already(

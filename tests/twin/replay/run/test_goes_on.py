@@ -22,7 +22,7 @@ from bridge.task.robot import ARM_JOINTS
 from bridge.terminal import Output
 from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.place.starts import StartState, StartStates
-from twin.replay.run import trajectories
+from twin.replay.run import prepare
 from twin.replay.run.text import describe_run
 from twin.replay.run.trajectories import replay_run
 from twin.scene.localise.episode import Phase
@@ -129,7 +129,7 @@ def run(tmp_path: Path, script: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
         phase = Phase(name="start", plan_id=None, after_ns=None, before_ns=None)
         return StartStates(task, [phase], [StartState(Ts_base_object=poses, reasons=reasons)])
 
-    monkeypatch.setattr(trajectories, "localised_starts", starts)
+    monkeypatch.setattr(prepare, "localised_starts", starts)
     return folder
 
 

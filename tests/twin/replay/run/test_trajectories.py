@@ -21,7 +21,7 @@ from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
 from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.place.starts import StartState, StartStates
-from twin.replay.run import trajectories
+from twin.replay.run import prepare, trajectories
 from twin.replay.run.executions import Execution, execution_of
 from twin.replay.run.table import count_verdicts
 from twin.replay.run.text import describe_run
@@ -92,7 +92,7 @@ def run(
         phase = Phase(name="start", plan_id=None, after_ns=None, before_ns=START)
         return StartStates(scene.task, [phase], [StartState(Ts_base_object=scene.Ts_base_object)])
 
-    monkeypatch.setattr(trajectories, "localised_starts", starts)
+    monkeypatch.setattr(prepare, "localised_starts", starts)
     return folder
 
 
@@ -284,7 +284,7 @@ def test_a_recording_that_ends_while_the_robot_moves_says_so(
     events = marks(".>.")
     for event in events:
         event["plan_id"] = "round-1"
-    monkeypatch.setattr(trajectories.streams, "events", lambda _: events)
+    monkeypatch.setattr(prepare.streams, "events", lambda _: events)
     monkeypatch.setattr(relive, "_replay", lambda job: (VERDICT, None))
     summary = replay_run(run, ReplayRunConfig(replay=QUICK), QUIET)
     said = {(r["plan"], r["trajectory"], r["mode"]): r for r in summary["rows"]}
