@@ -41,7 +41,7 @@ class Preparation:
 
     def cost(self) -> float:
         """How long it takes, compared with others."""
-        return self.episode_path().stat().st_size
+        return float(self.episode_path().stat().st_size)
 
 
 def jobs_of(item: Preparation) -> list[ReplayJob]:
