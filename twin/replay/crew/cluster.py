@@ -30,6 +30,8 @@ MODE, TOKEN, TOKEN_PATH = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PAT
 NICENESS = "RAY_worker_niceness"
 """Ray gives way to everything else on a machine (15) unless told otherwise."""
 ENVIRONMENT = (MODE, TOKEN, TOKEN_PATH, NICENESS)
+ANSWER_S = 5.0
+"""How long the head of a cluster may take to accept a connection."""
 TOKEN_FILE = Path(".ray") / "auth_token"
 """Below the home folder; where Ray itself looks last."""
 
@@ -66,7 +68,7 @@ class RayRunner:
 
         Raises:
             MissingDependencyError: Without ray.
-            UsageError: Without a token.
+            UsageError: Without a token, or with an address that is none.
             RayClusterError: When nobody answers there, or not to our token.
         """
         self._before = {name: os.environ.get(name) for name in ENVIRONMENT}
@@ -133,6 +135,7 @@ def _connect(address: str, workers: int, folder: str | None) -> Any:
         settings |= {"num_cpus": workers, "include_dashboard": False, "_temp_dir": folder}
     else:
         _check_token()
+        _check_somebody_listens(address)
     if address == LOCAL or is_loopback(address):
         # Otherwise Ray replaces the loopback address by the machine's own, where nobody answers.
         settings["_node_ip_address"] = LOOPBACK
@@ -171,6 +174,28 @@ def _check_token() -> None:
             f"(or put it at ~/{TOKEN_FILE}). docs/scale.md says how to make one."
         )
         raise UsageError(message)
+
+
+def _check_somebody_listens(address: str) -> None:
+    """Ray itself tries for minutes, and tells its tries to the terminal.
+
+    Raises:
+        UsageError: When it is no HOST:PORT.
+        RayClusterError: When nothing can be reached there.
+    """
+    host, _, port = address.rpartition(":")
+    host = host.strip("[]")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        message = f"--ray {address!r} is no address: give HOST:PORT of the head, or {LOCAL}."
+        raise UsageError(message)
+    try:
+        socket.create_connection((host, int(port)), timeout=ANSWER_S).close()
+    except OSError as error:
+        message = (
+            f"no Ray cluster to use at {address}: {_first_line(error)}. Start its head there: "
+            "ray start --head, with a token; see docs/scale.md."
+        )
+        raise RayClusterError(message) from error
 
 
 def is_loopback(address: str) -> bool:

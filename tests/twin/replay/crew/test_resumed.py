@@ -1,8 +1,10 @@
 """A long replay that is killed goes on where it was; Ray gives the same bytes."""
 
 import os
+import socket
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -221,5 +223,14 @@ def test_nobody_at_an_address_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setitem(sys.modules, "ray", Ray)
     monkeypatch.setenv(cluster.TOKEN, "x" * 32)
     monkeypatch.delenv(cluster.MODE, raising=False)
-    with pytest.raises(RayClusterError, match=r"no Ray cluster to use at h:1: Failed to connect\."):
-        RayRunner("h:1", 1).__enter__()
+    with socket.create_server(("127.0.0.1", 0)) as somebody_else:
+        there = f"127.0.0.1:{somebody_else.getsockname()[1]}"
+        with pytest.raises(RayClusterError, match=rf"no Ray cluster to use at {there}: Failed to"):
+            RayRunner(there, 1).__enter__()
+    started = time.monotonic()
+    with pytest.raises(RayClusterError, match=rf"at {there}: .*refused\. Start its head there"):
+        RayRunner(there, 1).__enter__()
+    assert time.monotonic() - started < 2, "Ray would try for minutes"
+    for wrong in ("auto", "head.lab", "ray://head.lab", "head.lab:port", "head.lab:0"):
+        with pytest.raises(UsageError, match="is no address: give HOST:PORT"):
+            RayRunner(wrong, 1).__enter__()
