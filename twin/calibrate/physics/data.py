@@ -206,7 +206,8 @@ def _check_joints(arm: streams.JointTrack, start_ns: int, end_ns: int) -> None:
     stamps = arm.stamps_ns[during]
     if len(stamps) < 2 or np.diff(stamps).max() > LONGEST_GAP_S * 1e9:
         raise UnusableCaseError("joint states have gaps while the plan was executed.")
-    if not np.isfinite(arm.position[during]).all():
+    order = [arm.names.index(name) for name in ARM_JOINTS]
+    if not np.isfinite(arm.position[during][:, order]).all():
         raise UnusableCaseError("joint states hold what is no number while the plan was executed.")
 
 

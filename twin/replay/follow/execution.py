@@ -43,8 +43,6 @@ def path_of_execution(
             found="was executed without recorded joints or gripper",
             hint="Record /joint_states and /gripper/state over the whole execution.",
         )
-    check_track(track, "joints", plan)
-    check_track(widths, "gripper widths", plan)
     missing = [name for name in ARM_JOINTS if name not in track.names]
     if missing:
         raise UnusablePlanError(
@@ -53,15 +51,18 @@ def path_of_execution(
             hint=f"The recording has {', '.join(track.names)}.",
         )
     order = [track.names.index(name) for name in ARM_JOINTS]
+    arm = JointTrack(names=ARM_JOINTS, stamps_ns=track.stamps_ns, position=track.position[:, order])
+    check_track(arm, "joints", plan)
+    widths = gripper_widths(widths, plan)
     first_ns = int(track.stamps_ns[0])
     times, keep = np.unique(track.stamps_ns - first_ns, return_index=True)
     width_times, width_keep = np.unique(widths.stamps_ns - first_ns, return_index=True)
-    width = gripper_widths(widths, plan)[width_keep]
+    width = widths.position[width_keep, 0].astype(np.float64)
     closed = closed_mask(width_times, width, plan)
     squeeze_m = config.squeeze_m if config.mode == "dynamic" else 0.0
     return JointPath(
         times_ns=times,
-        joints_rad=track.position[keep][:, order].astype(np.float64),
+        joints_rad=arm.position[keep].astype(np.float64),
         width_times_ns=width_times,
         width_m=np.where(closed, np.maximum(width - squeeze_m, 0.0), width),
         first_close_ns=_first_close(width_times, width),

@@ -1,7 +1,6 @@
 """What recorded joints and gripper widths must be, so that an execution can be replayed."""
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.episode.streams import JointTrack
 from bridge.task.plan import Plan
@@ -70,12 +69,13 @@ def check_track(track: JointTrack, what: str, plan: Plan) -> None:
         raise _not_recorded(plan, what, int(gaps_ns.max()), f"from {at_s:.1f} s on")
 
 
-def gripper_widths(widths: JointTrack, plan: Plan) -> Float[np.ndarray, " num_samples"]:
-    """The recorded distances between the finger pads [m], if that is what they are.
+def gripper_widths(widths: JointTrack, plan: Plan) -> JointTrack:
+    """The recorded distances between the finger pads [m] alone, if that is what they are.
 
     Raises:
-        UnusablePlanError: For several joints of which none has the name, and for numbers that no
-            distance between these pads can be: radians, millimetres, percent.
+        UnusablePlanError: For several joints of which none has the name, for what ``check_track``
+            refuses, and for numbers that no distance between these pads can be: radians,
+            millimetres, percent.
     """
     names = widths.names
     if len(names) > 1 and GRIPPER_WIDTH not in names:
@@ -85,8 +85,13 @@ def gripper_widths(widths: JointTrack, plan: Plan) -> Float[np.ndarray, " num_sa
             hint=f"Record one, {GRIPPER_WIDTH}: the distance between its pads in metres.",
         )
     column = names.index(GRIPPER_WIDTH) if GRIPPER_WIDTH in names else 0
-    found: Float[np.ndarray, " num_samples"] = widths.position[:, column].astype(np.float64)
-    low, high = float(found.min()), float(found.max())
+    found = JointTrack(
+        names=(GRIPPER_WIDTH,),
+        stamps_ns=widths.stamps_ns,
+        position=widths.position[:, column : column + 1],
+    )
+    check_track(found, "gripper widths", plan)
+    low, high = float(found.position.min()), float(found.position.max())
     if low < -WIDTH_SLACK_M or high > MAX_WIDTH_M + WIDTH_SLACK_M:
         raise UnusablePlanError(
             plan_id=plan.id,

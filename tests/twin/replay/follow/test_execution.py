@@ -153,6 +153,18 @@ def test_of_several_joints_of_a_gripper_the_one_with_the_name_counts(
         path("left", "right")
 
 
+def test_a_joint_that_is_not_the_arms_may_say_nothing(script: SimpleNamespace) -> None:
+    """Drivers send NaN for joints without an encoder, in whatever order they like."""
+    times, width = recorded_grasp(0.0)
+    names = ("wheel", *reversed(ARM_JOINTS))
+    position = np.tile(np.arange(7.0), (len(times), 1)) / 10
+    position[:, 0] = np.nan
+    track = JointTrack(names=names, stamps_ns=times, position=position)
+    widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
+    path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig())
+    assert path.joints_rad[0] == pytest.approx([0.6, 0.5, 0.4, 0.3, 0.2, 0.1])
+
+
 def test_widths_that_were_not_recorded_are_not_made_up(script: SimpleNamespace) -> None:
     times, width = recorded_grasp(0.0)
     plan = script.plan(script.scene())

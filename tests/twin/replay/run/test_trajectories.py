@@ -20,6 +20,7 @@ from bridge.errors import UsageError
 from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
 from twin.replay.config import ReplayConfig, ReplayRunConfig
+from twin.replay.crew.pool import Alone, Crew
 from twin.replay.place.starts import StartState, StartStates
 from twin.replay.run import prepare, trajectories
 from twin.replay.run.executions import Execution, execution_of
@@ -177,12 +178,23 @@ def _check_file(run: RunFolder, pattern: str) -> None:
     assert np.linalg.norm(cube.p_m[-1] - cube.p_m[0]) > 0.2
 
 
+class CrewForReplays(Crew):
+    """Lists jobs in this process, where the fixture localises; replays in the others."""
+
+    def run(self, function: Any, items: Any, cost: Any) -> Any:
+        """See ``Crew``."""
+        runner = Alone() if function is prepare.jobs_of else super()
+        return runner.run(function, items, cost)
+
+
 @pytest.mark.slow
-def test_two_processes_say_what_one_process_says(run: RunFolder) -> None:
-    """Only replays are compared: the processes also localise, which the fixture does here."""
+def test_two_processes_say_what_one_process_says(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = ReplayRunConfig(replay=QUICK)
     replay_run(run, config, QUIET)
     before = {path.name: _messages(path) for path in run.derived("*.replay.*")}
+    monkeypatch.setattr(trajectories, "Crew", CrewForReplays)
     summary = replay_run(run, replace(config, workers=2, force=True), QUIET)
     assert not any(row["skipped"] or row["error"] for row in summary["rows"])
     assert {path.name: _messages(path) for path in run.derived("*.replay.*")} == before
