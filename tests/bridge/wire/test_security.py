@@ -228,6 +228,18 @@ def test_the_gate_judges_for_the_cell_only(
         join("camera").query("lab/gate/verdict", b"plan", timeout_s=REFUSED_S)
 
 
+def test_a_gate_sees_another_gate_of_its_cell_and_nobody_else_plays_one(
+    guarded: WireSession, join: Callable[[str], WireSession]
+) -> None:
+    join("cell").declare_alive("lab/gate/alive")
+    first, second = join("gate"), join("gate")
+    assert second.query_alive("lab/gate/alive", timeout_s=REFUSED_S) == []
+    first.declare_alive("lab/gate/alive")
+    end_s = time.monotonic() + 5.0
+    while second.query_alive("lab/gate/alive") != ["lab/gate/alive"]:
+        assert time.monotonic() < end_s
+
+
 ROS_KEY = "0/chatter/std_msgs::msg::dds_::String_/RIHS01_" + "d" * 64
 ROS_TOKEN = f"@ros2_lv/0/zid/0/1/MP/%/%/talker/%chatter/{ROS_KEY.split('/', 2)[2]}/:1:,1"
 
