@@ -115,7 +115,7 @@ def _gain(change: Change, method: str) -> list[Measurement]:
             unit="pp",
             definition=f"gain with replanning in percentage points ({change.side}): {change.words}",
             reason_without_interval="no n",
-            interval_n=None if arms is None else min(arms),
+            interval_n=arms,
         ),
         make(
             f"gain.relative.{change.side}.{change.name}",

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 
 from evaluator.errors import AlikeNamesError, UndefinedStatisticError
 from evaluator.result import Interval, Measurement
-from evaluator.statistics.coverage.stored import vouch
+from evaluator.statistics.coverage.stored import Size, vouch
 from evaluator.statistics.proportion import RATE_INTERVALS
 
 Statistic = Callable[[], float | tuple[float, Interval | None]]
@@ -56,7 +56,7 @@ def measured(
     counted: str | None = None,
     reason_without_interval: str | None = None,
     episodes: Iterable[str] = (),
-    interval_n: int | None = None,
+    interval_n: Size | None = None,
     coverage_key: str = "",
     instead: str = "",
 ) -> Measurement:

@@ -1,7 +1,10 @@
 """Intervals hold what they promise, the shipped map says so, and what does not is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from evaluator.compare.measure import measured, proportion
 from evaluator.result import Interval
@@ -10,6 +13,7 @@ from evaluator.statistics.coverage import exact, simulate, stored
 from evaluator.statistics.coverage.chosen import choose_method, holds_from
 from evaluator.statistics.coverage.population import POPULATIONS, Population
 from evaluator.statistics.coverage.simulate_cells import of_agreement, of_remeasurements, truth
+from evaluator.statistics.coverage.unequal import newcombe_coverage
 from evaluator.statistics.paired import tango_difference
 from evaluator.statistics.proportion import clopper_pearson, jeffreys, wilson
 from evaluator.statistics.sequential import betting_interval
@@ -234,3 +238,42 @@ def test_a_statistic_that_is_not_in_the_map_is_refused() -> None:
     assert kept is None
     assert "coverage of jackknife-points for this statistic is not known" in why
     assert holds_from("jackknife-points:regret") is None
+
+
+@pytest.mark.parametrize("sizes", [(6, 6), (3, 6), (7, 4)])
+def test_coverage_of_unequal_groups_is_counted_out_with_the_interval_itself(
+    sizes: tuple[int, int],
+) -> None:
+    n_first, n_second = sizes
+    found = newcombe_coverage(n_first, n_second)
+    if n_first == n_second:
+        of_map = stored.coverage_of("newcombe-10", n_first)
+        assert of_map is not None
+        assert (found.worst, found.mean) == pytest.approx((of_map.worst, of_map.mean), abs=1e-6)
+        return
+    shares = []
+    for p_first in exact.PAIR_RATES:
+        for p_second in exact.PAIR_RATES:
+            held = 0.0
+            for first in range(n_first + 1):
+                for second in range(n_second + 1):
+                    interval = newcombe_difference(first, n_first, second, n_second)
+                    if interval.low - 1e-12 <= p_second - p_first <= interval.high + 1e-12:
+                        chance = binom.pmf(first, n_first, p_first)
+                        held += chance * binom.pmf(second, n_second, p_second)
+            shares.append(held)
+    assert found.worst == pytest.approx(min(shares), abs=1e-9)
+    assert found.mean == pytest.approx(np.mean(shares), abs=1e-9)
+
+
+def test_groups_of_different_size_are_not_judged_by_the_smaller_one() -> None:
+    # Ten and ten trials cover enough, ten and sixteen do not.
+    made = replace(newcombe_difference(4, 10, 9, 16), method="newcombe-10, unpaired")
+    kept, _ = stored.vouch(made, (10, 10))
+    assert kept is not None
+    refused, why = stored.vouch(made, (10, 16))
+    assert refused is None
+    assert "newcombe-10 at 10 and 16 trials per group covers as little as 88.3 %" in why
+    assert "use clopper-pearson-difference" in why
+    both = stored.vouch(an_interval("clopper-pearson-difference"), (10, 16))[0]
+    assert both is not None

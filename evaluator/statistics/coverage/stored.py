@@ -8,6 +8,7 @@ from importlib import resources
 
 from evaluator.result import Interval
 from evaluator.statistics.coverage.exact import Coverage
+from evaluator.statistics.coverage.unequal import newcombe_coverage
 
 FLOOR = 0.90
 """An interval that claims 95 % and covers less than this somewhere is not printed."""
@@ -31,6 +32,8 @@ INSTEAD = {
     "remeasurement": "the coefficient with its n",
 }
 MAP = "coverage_map.json"
+NEWCOMBE = "newcombe-10"
+Size = int | tuple[int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +83,7 @@ def coverage_of(method: str, n: int) -> Coverage | None:
 
 
 def vouch(
-    interval: Interval, n: int | None, *, key: str = "", instead: str = ""
+    interval: Interval, n: Size | None, *, key: str = "", instead: str = ""
 ) -> tuple[Interval | None, str]:
     """Return the interval with its worst coverage, or None and why it is not printed.
 
@@ -89,7 +92,8 @@ def vouch(
 
     Args:
         interval: What a method gave.
-        n: What the method's coverage depends on: trials, pairs, cells, policies.
+        n: What the method's coverage depends on: trials, pairs, cells, policies; of a difference
+            the trials of both groups.
         key: Name in the map, where one method serves several statistics; its own without.
         instead: What to use where it is refused; what the method's own entry says without.
     """
@@ -100,14 +104,17 @@ def vouch(
     key = key or method
     if key not in load_map():
         return None, f"the coverage of {method} for this statistic is not known; use {instead}"
-    known = coverage_of(key, n)
-    axis = load_map()[key].axis
+    sizes = n if isinstance(n, tuple) else (n,)
+    if key == NEWCOMBE and len(set(sizes)) == 2:
+        known: Coverage | None = newcombe_coverage(*sizes)
+    else:
+        known = coverage_of(key, min(sizes))
+    at = f"{' and '.join(map(str, dict.fromkeys(sizes)))} {load_map()[key].axis}"
     if known is None:
-        reason = f"the coverage of {method} at {n} {axis} is not known"
-        return None, f"{reason}; use {instead}"
+        return None, f"the coverage of {method} at {at} is not known; use {instead}"
     if method not in JUDGED_BY_MEAN and known.worst < FLOOR:
         return None, (
-            f"{method} at {n} {axis} covers as little as {100 * known.worst:.1f} % where 95 % are "
+            f"{method} at {at} covers as little as {100 * known.worst:.1f} % where 95 % are "
             f"claimed ({known.worst_at}); use {instead}"
         )
     return replace(interval, worst_coverage=round(known.worst, 4)), ""
