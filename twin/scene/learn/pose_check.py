@@ -105,6 +105,11 @@ class PoseReport:
         """Whether the recorded poses can be believed as far as the depth tells."""
         return self.agreement is None or self.agreement >= GOOD
 
+    @property
+    def is_sure(self) -> bool:
+        """Whether depth was there to judge them by, and they fit."""
+        return self.agreement is not None and self.fits
+
     def remark(self) -> str:
         """One sentence about what is wrong; empty when nothing is."""
         if self.better is not None and self.better_agreement is not None:

@@ -10,6 +10,7 @@ from twin.errors import TwinError
 from twin.scene.frames.choice import FrameChoice
 from twin.scene.frames.points import NEAR_M
 from twin.scene.frames.thumb import Thumb
+from twin.scene.learn.between_cameras import check_between
 from twin.scene.learn.pose_check import (
     GOOD,
     MovedCameraError,
@@ -52,7 +53,7 @@ class ScanReport:
     """What is to be said about a scan; ``scene.json`` keeps it."""
 
     poses: Mapping[str, PoseReport]
-    """By camera; cameras that stand still are not in it."""
+    """By camera; one that stands still is compared with those that move, where there are any."""
     found: tuple[str, ...]
     """Sentences about what is wrong."""
     moving_fraction: float = 0.0
@@ -102,9 +103,7 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
     usable = [camera for camera in seen if max(camera.trusted) >= SPARSE]
     if blind and not usable:
         raise NoDepthError(_no_depth(blind[0], config))
-    poses = {
-        camera.name: check_poses(camera.thumbs) for camera in usable if not camera.choice.still
-    }
+    poses = _pose_reports(usable)
     for name, report in poses.items():
         if report.better is not None and config.check_poses:
             message = (
@@ -117,6 +116,9 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
         raise MovedCameraError(moved[0])
     found = [_no_depth(camera, config) for camera in blind] + moved
     found += [f"{name}: {report.remark()}" for name, report in poses.items() if report.remark()]
+    still = [camera.name for camera in usable if camera.choice.still]
+    if any(name in poses and not poses[name].fits for name in still):
+        found.append("robot-gst calibrate RUN --cameras finds where cameras are that stand still")
     total = sum(len(camera.thumbs) for camera in seen)
     if total < FEW_FRAMES:
         found.append(
@@ -124,6 +126,21 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
             "and is likely to be wrong from elsewhere; scan longer"
         )
     return ScanReport(poses=poses, found=tuple(found))
+
+
+def _pose_reports(usable: Sequence[CameraCheck]) -> dict[str, PoseReport]:
+    """Judge moving cameras by themselves, and the others by moving ones that can be believed."""
+    poses = {
+        camera.name: check_poses(camera.thumbs) for camera in usable if not camera.choice.still
+    }
+    sure = [camera for camera in usable if camera.name in poses and poses[camera.name].is_sure]
+    others = [thumb for camera in sure for thumb in camera.thumbs]
+    for camera in usable:
+        if camera.choice.still:
+            report = check_between(camera.thumbs, others)
+            if report.agreement is not None:  # else it looks at another place
+                poses[camera.name] = report
+    return poses
 
 
 def _moved(camera: CameraCheck) -> str:
