@@ -108,6 +108,11 @@ def take_apart(
     episode = episode_of_task(sources)
     if episode is None:
         return TakenApart(background=cloud, remark="no episode names a task: objects not known")
+    if any(choice.poses.source == "odometry" for choice in choices):
+        remark = (
+            "objects not taken out: nothing says where the table is in a scene whose camera was "
+        )
+        return TakenApart(background=cloud, remark=f"{remark}followed by its images")
     try:
         task = load_task(episode.info.task)
         output.say(f"look for {', '.join(task.objects)} in {episode.info.id} and take them out")

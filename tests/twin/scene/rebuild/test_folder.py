@@ -175,6 +175,23 @@ def test_objects_are_not_looked_for_in_held_out_frames(
     assert asked["held_out_ns"] == {"wrist": choices[0].holdout_ns}
 
 
+def test_objects_are_not_cut_out_of_a_scene_in_a_frame_of_its_own(
+    room: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are localised in the robot's base; a camera followed by its images knows no base."""
+    monkeypatch.setattr(parts_module, "localise_episode", lambda *a, **k: pytest.fail("localised"))
+    monkeypatch.setattr(Episode, "info", EpisodeInfo(id="s", kind="scan", task="cube_into_box"))
+    sources = find_sources(room)
+    (choice,) = choose_frames(sources, FrameConfig())
+    followed = replace(choice, poses=replace(choice.poses, source="odometry"))
+    cloud = fuse(
+        [FrameSurface(textured_room.frame(0, 9), LIMITS).points()], InitialiseConfig(max_splats=50)
+    )
+    apart = take_apart(sources, cloud, [followed])
+    assert "followed by its images" in apart.remark
+    assert apart.background is cloud
+
+
 def test_frames_are_known_by_their_own_stamp_and_not_by_when_they_were_sent(
     tmp_path: Path,
 ) -> None:
