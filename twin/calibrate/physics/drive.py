@@ -11,11 +11,10 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
-from bridge.geometry import se3
 from bridge.task.predicate import Rollout, all_hold, evaluate_success
 from bridge.task.robot import GRIPPER_LINKS
 from twin.calibrate.physics.case import Case, Prediction, planar
-from twin.calibrate.physics.parameters import BIAS, MASS_SCALE, apply_values
+from twin.calibrate.physics.parameters import BIAS, MASS_SCALE, apply_values, shifted
 from twin.physics.config import PhysicsConfig
 from twin.physics.world import World
 from twin.robot.description import parse_description
@@ -114,16 +113,6 @@ def _furnish(
         world.add_free(
             key, np.array(model.size_m), mass_kg, shifted(case.Ts_base_start[key], shift)
         )
-
-
-def shifted(
-    T_base_object: Float[np.ndarray, "4 4"], shift: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
-    """Move a pose along x and y [m] and turn it about its own vertical axis [rad]."""
-    T = T_base_object.copy()
-    T[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, shift[2]])) @ T[:3, :3]
-    T[:2, 3] += shift[:2]
-    return T
 
 
 def _settle(

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from bridge.geometry import se3
 from twin.physics.config import PhysicsConfig
 
 FINGER_FRICTION = "finger_pair_friction"
@@ -119,3 +120,13 @@ def apply_values(values: Mapping[str, float], config: PhysicsConfig) -> PhysicsC
     if GRIP_FORCE in values:
         changes["grip_force_N"] = values[GRIP_FORCE]
     return replace(config, **changes)  # type: ignore[arg-type]  # floats into float fields only
+
+
+def shifted(
+    T_base_object: Float[np.ndarray, "4 4"], shift: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
+    """Move a pose by a ``BIAS``: along x and y [m], turned about its own vertical axis [rad]."""
+    T = T_base_object.copy()
+    T[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, shift[2]])) @ T[:3, :3]
+    T[:2, 3] += shift[:2]
+    return T

@@ -5,8 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from scipy.stats import binomtest
-
 from bridge.errors import GstError, UsageError
 from bridge.task.record import check_record
 from bridge.task.verdict import Verdict
@@ -120,6 +118,8 @@ def with_probability(verdict: Verdict, samples: Sequence[Sample]) -> Verdict:
     """
     if not samples:
         return verdict
+    from scipy.stats import binomtest  # noqa: PLC0415  # half a second, and only with samples
+
     k, n = sum(sample.accepted is True for sample in samples), len(samples)
     interval = binomtest(k, n).proportion_ci(LEVEL, method="wilson")
     low, high = float(interval.low), float(interval.high)

@@ -9,8 +9,7 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.task.task_file import Task
-from twin.calibrate.physics.drive import shifted
-from twin.calibrate.physics.parameters import BIAS, MASS_SCALE
+from twin.calibrate.physics.parameters import BIAS, MASS_SCALE, shifted
 from twin.physics.config import PhysicsConfig
 from twin.replay.config import ReplayConfig
 from twin.replay.place.starts import StartState
