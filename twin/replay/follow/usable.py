@@ -1,8 +1,10 @@
 """Whether a plan can be replayed at all, before anything is computed from it."""
 
+from collections.abc import Iterable
 from itertools import pairwise
 
 import numpy as np
+from jaxtyping import Float
 
 from bridge.task.plan import Plan
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M
@@ -62,21 +64,28 @@ def _about_times(plan: Plan) -> _Wrong | None:
 
 
 def _about_numbers(plan: Plan) -> _Wrong | None:
-    p, q = np.abs(plan.positions_m()), np.abs(plan.quaternions_wxyz()).max(axis=1)
+    try:
+        p, q = np.abs(plan.positions_m()), np.abs(plan.quaternions_wxyz()).max(axis=1)
+        widths = _floats(w.width_m for w in plan.tau if w.width_m is not None)
+        joints = _floats(value for w in plan.tau for value in w.joints_rad or ())
+    except OverflowError:  # an integer of hundreds of digits
+        return "has numbers that are too large", "Send metres, radians and unit quaternions."
     # Comparisons that what is no number fails.
     if not (np.all(p < _FARTHEST_M) and np.all((q > _SHORTEST) & (q < _LONGEST))):
         found = "has poses that are not finite or out of this world, or quaternions that are none"
         return found, "Send p_m in metres and q_wxyz of unit length."
-    widths = [w.width_m for w in plan.tau if w.width_m is not None]
-    joints = [value for w in plan.tau for value in w.joints_rad or ()]
-    if not np.all(np.isfinite([*widths, *joints])):
+    if not (np.isfinite(widths).all() and np.isfinite(joints).all()):
         found = "has joints or gripper widths that are not finite"
         return found, "Send joints_rad and width_m as numbers, or leave them out."
-    low, high = min(widths, default=0.0), max(widths, default=0.0)
+    low, high = (float(f(widths)) if len(widths) else 0.0 for f in (np.min, np.max))
     if low < -WIDTH_SLACK_M or high > MAX_WIDTH_M + WIDTH_SLACK_M:
         found = f"has gripper widths from {low:.3f} to {high:.3f}"
         return found, f"width_m is the distance between the pads in metres, 0 to {MAX_WIDTH_M}."
     return None
+
+
+def _floats(values: Iterable[float]) -> Float[np.ndarray, " num_values"]:
+    return np.array(list(values), dtype=np.float64)
 
 
 def _about_whose(plan: Plan, robot: RobotModel) -> _Wrong | None:

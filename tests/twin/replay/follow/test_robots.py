@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -180,6 +181,13 @@ def test_numbers_no_plan_can_mean_are_refused_in_a_sentence() -> None:
     robot = load_robot(ur5_with_gripper_urdf())
     plan = plan_through(robot.Ts_base_tcp(np.stack([HOME, HOME + 0.1])))
     first, second = plan.tau
+
+    def with_second(**changes: Any) -> Plan:
+        waypoint = Waypoint.__new__(Waypoint)  # as JSON makes it: integers where floats belong
+        for name, value in {**vars(second), **changes}.items():
+            object.__setattr__(waypoint, name, value)
+        return replace(plan, tau=(first, waypoint))
+
     check_usable(plan, robot)
     for changes, found in (
         ({"t_ns": 10**30}, r"lasts 1\d* s"),
@@ -187,9 +195,14 @@ def test_numbers_no_plan_can_mean_are_refused_in_a_sentence() -> None:
         ({"width_m": -0.04}, r"gripper widths from -0\.040 to"),
         ({"q_wxyz": (1e200, 0.0, 0.0, 0.0)}, "quaternions that are none"),
         ({"p_m": (1e300, 0.0, 0.2)}, "out of this world"),
+        ({"p_m": (10**400, 0.0, 0.2)}, "numbers that are too large"),
+        ({"width_m": 10**400}, "numbers that are too large"),
+        ({"width_m": 10**25}, r"gripper widths from 0\.080 to 1\d*\.0"),
+        ({"joints_rad": (0.0, 0.0, 0.0, 0.0, 0.0, 10**400)}, "numbers that are too large"),
     ):
         with pytest.raises(UnusablePlanError, match=found):
-            check_usable(replace(plan, tau=(first, replace(second, **changes))), robot)
+            check_usable(with_second(**changes), robot)
+    check_usable(with_second(joints_rad=(0.0, 0.0, 0.0, 0.0, 0.0, 10**25)), robot)
     many = tuple(replace(first, t_ns=k) for k in range(MAX_WAYPOINTS + 1))
     with pytest.raises(UnusablePlanError, match="has 100001 waypoints"):
         check_usable(replace(plan, tau=many), robot)
