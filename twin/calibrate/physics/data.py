@@ -20,6 +20,7 @@ from bridge.task.task_file import load_task
 from bridge.terminal import Output
 from twin.calibrate.physics.case import PLANAR, Case, planar
 from twin.errors import TwinError
+from twin.robot.clock import check_clock
 from twin.robot.model import load_robot
 from twin.scene.localise.episode import write_localised
 from twin.scene.shape.known import yaw_period_rad
@@ -104,8 +105,10 @@ def read_case(run: RunFolder, episode: Episode) -> Case:
 
     Raises:
         UnusableCaseError: Nothing executed, objects not found, soft objects, gaps.
+        BackwardTimeError: Its clock went back meanwhile.
     """
     plan, start_ns, end_ns = _executed(episode)
+    check_clock(episode, ("/joint_states", "/gripper/state"), start_ns, end_ns, plan.id)
     task = load_task(plan.task or episode.info.task)
     if task.soft_objects:
         message = f"task {task.name} has soft objects, and only rigid ones are calibrated."

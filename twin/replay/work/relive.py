@@ -14,7 +14,6 @@ from bridge.task.task_file import load_task
 from bridge.task.verdict import Verdict
 from twin.replay.chance.samples import replay_samples, with_probability
 from twin.replay.episode.file import ReplayOrigin, write_replay
-from twin.replay.follow.clock import check_clock
 from twin.replay.follow.execution import cut_track, path_of_execution, stages_as_executed
 from twin.replay.follow.track_checks import check_covers, check_length
 from twin.replay.parting.recorded import Recording
@@ -25,6 +24,7 @@ from twin.replay.verdict.result import ReplayResult
 from twin.replay.verdict.rollout import replay_joints, replay_plan
 from twin.replay.work.compare import compare, recorded_findings
 from twin.replay.work.job import ReplayJob, judged, row_of_failure
+from twin.robot.clock import check_clock
 
 JOINTS, GRIPPER_STATE = "/joint_states", "/gripper/state"
 

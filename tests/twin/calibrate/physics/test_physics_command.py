@@ -15,10 +15,12 @@ from bridge.episode import schema
 from bridge.episode.catalogue.labels import write_label
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
+from bridge.episode.records import JointSample
 from bridge.episode.run import RunFolder
 from bridge.episode.streams import JointTrack
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
+from bridge.task.plan import Plan, Waypoint
 from bridge.task.robot import ARM_JOINTS
 from bridge.task.task_file import Task
 from twin.calibrate.physics import data
@@ -30,6 +32,7 @@ from twin.calibrate.physics.parameters import SURFACE_FRICTION, rigid_parameters
 from twin.calibrate.physics.record import describe_physics
 from twin.physics.config import PhysicsConfig
 from twin.replay.place.calibrated import physics_of
+from twin.robot.clock import BackwardTimeError
 from twin.scene.store.calibration import read_calibration, write_calibration, write_physics
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -270,6 +273,39 @@ def test_a_label_given_afterwards_is_what_calibration_believes(
     assert data.read_case(trials, trial).success is False
     write_label(trials, trial.path.stem, Outcome(result="unknown"))
     assert data.read_case(trials, trial).success is None
+
+
+def test_a_clock_that_goes_back_while_a_probe_is_executed_teaches_nothing(
+    run: RunFolder,
+) -> None:
+    """Sorted by their stamps the joints would be those of an execution nobody saw."""
+    path, second = run.episodes_dir / "probe_1.mcap", 1_000_000_000
+    plan = Plan(
+        id="p", planner="", policy="", condition="without_replanning", robot="arm",
+        frame="base_link", instruction="", task="cube_into_box", stages=(),
+        tau=(Waypoint(t_ns=0, p_m=(0.4, 0.0, 0.3), q_wxyz=(1.0, 0.0, 0.0, 0.0), g=0),),
+    )  # fmt: skip
+    with EpisodeWriter(path) as writer:
+        writer.describe(EpisodeInfo(id="probe_1", kind="probe", task="cube_into_box"))
+        writer.write("/c/plan", plan.to_json(), type_name=schema.PLAN, log_time_ns=1)
+        for kind, stamp in (("execution_started", second), ("execution_ended", 3 * second)):
+            event = {"schema_version": 1, "stamp_ns": stamp, "type": kind, "plan_id": "p"}
+            writer.write_json("/c/event", event, type_name=schema.EVENT, log_time_ns=stamp)
+        stamps = [*range(second, 2 * second, 10_000_000), *range(second, 3 * second, 10_000_000)]
+        for index, stamp in enumerate(stamps):
+            none = np.zeros(0)
+            sample = JointSample(
+                stamp_ns=stamp, names=ARM_JOINTS, position=np.zeros(6), velocity=none, effort=none
+            )
+            writer.write(
+                "/c/joint_states",
+                sample.to_cdr(),
+                type_name=schema.JOINT_STATE,
+                log_time_ns=second + index * 10_000_000,
+                publish_time_ns=stamp,
+            )
+    with pytest.raises(BackwardTimeError, match=r"goes back by 0\.99 s at 0\.99 s of plan 'p'"):
+        data.read_case(run, Episode.open(path))
 
 
 def test_joints_that_are_no_numbers_teach_nothing() -> None:

@@ -14,12 +14,12 @@ from bridge.episode.records import JointSample
 from bridge.episode.writer import EpisodeWriter
 from twin.replay.config import ReplayConfig
 from twin.replay.failure import NotEvaluatedError
-from twin.replay.follow.clock import check_clock
 from twin.replay.follow.execution import path_of_execution
 from twin.replay.follow.usable import UnusablePlanError
 from twin.replay.place.starts import StartState
 from twin.replay.verdict.result import ReplayResult
 from twin.replay.work.job import ReplayJob, row_of_failure
+from twin.robot.clock import BackwardTimeError, check_clock
 
 T0 = 1_700_000_000_000_000_000
 
@@ -65,7 +65,7 @@ def checked(episode: Episode, start_s: float, end_s: float) -> None:
 
 def test_time_that_goes_backwards_during_an_execution_is_refused(tmp_path: Path) -> None:
     episode = episode_with(tmp_path / "a.mcap", [0.0, 0.1, 0.2, 0.3, 0.05, 0.15])
-    with pytest.raises(NotEvaluatedError, match=r"goes back by 0\.25 s at 0\.20 s of plan 'p'"):
+    with pytest.raises(BackwardTimeError, match=r"goes back by 0\.25 s at 0\.20 s of plan 'p'"):
         checked(episode, 0.1, 0.4)
 
 
@@ -79,7 +79,7 @@ def test_a_jump_before_the_execution_is_none_of_its_business(tmp_path: Path) -> 
 
 def test_an_execution_that_took_no_time_is_refused(tmp_path: Path) -> None:
     episode = episode_with(tmp_path / "a.mcap", [0.0, 0.1])
-    with pytest.raises(NotEvaluatedError, match=r"ended 0\.10 s before it started"):
+    with pytest.raises(BackwardTimeError, match=r"ended 0\.10 s before it started"):
         checked(episode, 0.2, 0.1)
 
 

@@ -4,10 +4,14 @@ from collections.abc import Sequence
 
 from bridge.episode import schema
 from bridge.episode.reader import Episode
-from twin.replay.failure import NotEvaluatedError
+from twin.errors import TwinError
 
 BACK_NS = 20_000_000
 """Messages of several publishers may overtake each other by this much."""
+
+
+class BackwardTimeError(TwinError):
+    """Nobody knows in which order an execution happened."""
 
 
 def check_clock(
@@ -23,11 +27,11 @@ def check_clock(
         plan_id: Whose execution it is.
 
     Raises:
-        NotEvaluatedError: Naming the topic, the instant and by how much; or an execution that took
+        BackwardTimeError: Naming the topic, the instant and by how much; or an execution that took
             no time.
     """
     if end_ns <= start_ns:
-        raise NotEvaluatedError(
+        raise BackwardTimeError(
             f"the execution of plan {plan_id!r} ended {(start_ns - end_ns) * 1e-9:.2f} s before it "
             "started; look at the clock of the events"
         )
@@ -43,7 +47,7 @@ def check_clock(
         before_ns = latest.get(message.topic, stamp_ns)
         jumped = before_ns - stamp_ns > BACK_NS
         if jumped and message.topic in inside and stamp_ns <= end_ns:
-            raise NotEvaluatedError(
+            raise BackwardTimeError(
                 f"the time of {message.topic} goes back by {(before_ns - stamp_ns) * 1e-9:.2f} s "
                 f"at {max(0, before_ns - start_ns) * 1e-9:.2f} s of plan {plan_id!r}; the "
                 "execution is not known in its right order"
