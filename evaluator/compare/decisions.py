@@ -1,6 +1,7 @@
 """Over cells: what the twin would have chosen, and what hangs on one task alone."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from fractions import Fraction
 
 from evaluator.compare.cell_intervals import sides, usable_cells
@@ -10,6 +11,8 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Measurement, Table
 from evaluator.statistics import agreement, correlation
 from evaluator.statistics.decision import Decision, choose, over_tasks, without_each
+
+NO_SAMPLE = "the tasks are these, not a sample of others"
 
 
 def decisions(cells: Sequence[RateCell]) -> tuple[list[Measurement], tuple[Table, ...]]:
@@ -27,14 +30,16 @@ def decisions(cells: Sequence[RateCell]) -> tuple[list[Measurement], tuple[Table
             continue
     why = "no task has two conditions or policies to choose from"
     measurements = [
-        proportion(
-            f"decision.{name}",
-            sum(getattr(decision, name) for decision in found.values()),
-            len(found),
-            definition=f"tasks in which {words} (best: highest rate, ties together) / tasks with a "
-            "choice of condition or policy",
-            counted="task",
-            reason_if_undefined=why,
+        _of_these_tasks(
+            proportion(
+                f"decision.{name}",
+                sum(getattr(decision, name) for decision in found.values()),
+                len(found),
+                definition=f"tasks in which {words} (best: highest rate, ties together) / tasks "
+                "with a choice of condition or policy",
+                counted="task",
+                reason_if_undefined=why,
+            )
         )
         for name, words in (
             ("surely_right", "every choice that is best in the twin is among the recorded best"),
@@ -50,10 +55,17 @@ def decisions(cells: Sequence[RateCell]) -> tuple[list[Measurement], tuple[Table
             "a tie, mean over tasks with a choice",
             n=len(found),
             counted="task",
-            reason_without_interval="the tasks are these, not a sample of others",
+            reason_without_interval=NO_SAMPLE,
         )
     )
     return measurements, _decision_tables({**found, **_over_all(usable)}, usable)
+
+
+def _of_these_tasks(share: Measurement) -> Measurement:
+    """Leave out the interval of a share of tasks: it would be one of tasks drawn at random."""
+    if share.value is None:
+        return share
+    return replace(share, interval=None, reason_without_interval=NO_SAMPLE)
 
 
 def _mean_regret(found: dict[str, Decision], why: str) -> float:

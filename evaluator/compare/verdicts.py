@@ -18,6 +18,10 @@ from evaluator.statistics.reliability import (
 )
 
 CLAUSES = ("ik", "clearance", "terminal")
+WHOSE = (
+    "the probability is the planned replay's, where it has none the verdict's before motion; with "
+    "replanning the twin selected these plans"
+)
 REFUSAL_PRICES = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)
 """What refusing a good plan costs, in bad executions."""
 
@@ -204,7 +208,7 @@ def reliability(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Tabl
         make(
             "reliability.brier",
             lambda: brier(said, happened),
-            definition="Brier score: mean of (sampled success probability - outcome)^2",
+            definition=f"Brier score: mean of (sampled success probability - outcome)^2; {WHOSE}",
         ),
         make(
             "reliability.brier_of_base_rate",
@@ -216,7 +220,8 @@ def reliability(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Tabl
             "reliability.ece",
             lambda: expected_calibration_error(said, happened),
             definition=f"expected calibration error: {NUM_BINS} bins of equal width, sum of "
-            "n_bin / n x |mean probability - success rate|; biased upwards for few trials",
+            "n_bin / n x |mean probability - success rate|; biased upwards for few trials; "
+            f"{WHOSE}",
         ),
     ]
     bins = reliability_bins(said, happened)

@@ -208,6 +208,8 @@ def test_a_choice_among_conditions_is_judged(six_trials: Any) -> None:
     right = comparison.results().get("decision.surely_right")
     assert (right.k, right.n) == (0, 1)
     assert comparison.results().get("decision.possibly_right").k == 1
+    assert right.interval is None
+    assert "not a sample" in str(right.reason_without_interval)
 
 
 def test_a_sequence_may_be_looked_at_after_every_trial(six_trials: Any) -> None:
