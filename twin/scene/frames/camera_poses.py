@@ -63,7 +63,7 @@ def find_poses(
     Raises:
         FrameNotFoundError: When ``/tf`` is asked for and does not know the camera.
         UnusableCameraError: When no image was taken while ``/tf`` or the joints said where the
-            camera is.
+            camera is, or ``/tf`` does not connect its colour and depth frames.
         LostError: When the odometry cannot follow the camera.
     """
     place = None if calibration is None else calibration.cameras.get(camera_id)
@@ -73,6 +73,7 @@ def find_poses(
         return replace(poses, quality={"calibration_id": calibration.calibration_id})
     tree = base_tree(episode)
     if config.poses == "tf" or (config.poses == "auto" and places_camera(tree, episode, camera_id)):
+        check_connected(tree, episode, camera_id)
         unknown = unknown_mask(tree, _frame_ids(episode, camera_id), stamps_ns)
         unposed = frozenset(stamps_ns[unknown].tolist())
         poses = CameraPoses(tree=tree, source="tf", unposed_ns=unposed)
@@ -95,6 +96,24 @@ def find_poses(
         unposed_ns=lost,
         quality=path.quality,
     )
+
+
+def check_connected(tree: TransformTree, episode: Episode, camera_id: str) -> None:
+    """See that colour and depth are posed in one frame.
+
+    Raises:
+        FrameNotFoundError: When the tree does not know the colour frame.
+        UnusableCameraError: When nothing says how the depth frame lies to it.
+    """
+    color, depth = _frame_ids(episode, camera_id)
+    root = tree.root_of(color)
+    if depth not in tree.frames() or tree.root_of(depth) != root:
+        message = (
+            f"{name_of(episode, camera_id)}: /tf does not say how its depth frame {depth!r} lies "
+            f"to its colour frame {color!r}. Record the transform between them, or give both "
+            "streams one frame where depth is registered to colour."
+        )
+        raise UnusableCameraError(message)
 
 
 def calibrated_poses(

@@ -13,7 +13,7 @@ from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
 from bridge.task.robot import BASE_FRAME
 from twin.scene.frames.base import base_tree
-from twin.scene.frames.camera_poses import CameraPoses, calibrated_poses
+from twin.scene.frames.camera_poses import CameraPoses, calibrated_poses, check_connected
 from twin.scene.frames.choice import rgbd_camera_ids, spread
 from twin.scene.frames.pairs import frames_at, paired_stamps_ns
 from twin.scene.frames.still import same_pose
@@ -103,6 +103,7 @@ def _still(
 ) -> _Still:
     check_camera(episode, camera_id)
     frame_id = streams.camera_info(episode, camera_id, "color").frame_id
+    check_connected(poses.tree, episode, camera_id)
     stamps = _between(paired_stamps_ns(episode, camera_id), after_ns, before_ns)
     return _Still(
         poses=poses,

@@ -200,7 +200,8 @@ def calibrated_tree(
     color, depth = (streams.camera_info(episode, camera_id, s).frame_id for s in ("color", "depth"))
     tree = streams.transform_tree(episode)
     T_color_depth = np.eye(4)
-    if color != depth and {color, depth} <= set(tree.frames()):
+    known = color != depth and {color, depth} <= set(tree.frames())
+    if known and tree.root_of(color) == tree.root_of(depth):
         at = int(stamps_ns[0]) if len(stamps_ns) else episode.start_ns
         T_color_depth = se3.invert(tree.T_root_frame(color, at)) @ tree.T_root_frame(depth, at)
     T_camera_color = np.eye(4) if place.stream == "color" else se3.invert(T_color_depth)

@@ -90,6 +90,21 @@ def test_a_camera_that_stands_still_may_say_so_once(
     assert not choice.poses.unposed_ns
 
 
+@pytest.mark.parametrize("parent", [None, "elsewhere"])
+def test_depth_that_hangs_on_nothing_or_elsewhere_is_refused(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch, parent: str | None
+) -> None:
+    """Its pose in another tree is no pose in this one, however good it looks."""
+
+    def cut(items: list[FrameTransform]) -> list[FrameTransform]:
+        color, depth = items
+        return [color] if parent is None else [color, replace(depth, parent=parent)]
+
+    write(run, monkeypatch, cut)
+    with pytest.raises(GstError, match="how its depth frame 'wrist_depth_optical' lies"):
+        choose_frames(find_sources(run), FrameConfig(), QUIET)
+
+
 def other_info(
     monkeypatch: pytest.MonkeyPatch, run: RunFolder, change: Callable[[Camera], Camera]
 ) -> None:
