@@ -16,7 +16,7 @@ from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
 from bridge.task.plan import Plan
 from bridge.task.robot import ARM_JOINTS, MAX_WIDTH_M
-from bridge.task.task_file import load_task
+from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output
 from twin.calibrate.physics.case import PLANAR, Case, planar
 from twin.errors import TwinError
@@ -118,16 +118,7 @@ def read_case(run: RunFolder, episode: Episode) -> Case:
         raise UnusableCaseError("no robot description was recorded (/robot_description).")
     path = write_localised(run, episode, task, scene_hash=scene_hash_of(run))
     before, after = _localised(path, plan.id)
-    missing = [key for key in task.objects if key not in before]
-    if missing:
-        message = f"not localised before the plan: {', '.join(missing)}."
-        raise UnusableCaseError(message)
-    objects = tuple(
-        key for key, model in task.objects.items() if not model.fixed and key not in task.containers
-    )
-    if not any(key in after for key in objects):
-        message = f"never localised after the plan: {', '.join(objects)}."
-        raise UnusableCaseError(message)
+    objects = _moving(task, before, after)
     arm = streams.joint_track(episode)
     _check_joints(arm, start_ns, end_ns)
     times_s = (arm.stamps_ns - start_ns) * 1e-9
@@ -140,8 +131,6 @@ def read_case(run: RunFolder, episode: Episode) -> Case:
     kept = np.array([np.any((stretches[:, 0] < t) & (t < stretches[:, 1])) for t in hold_times])
     order = [arm.names.index(name) for name in ARM_JOINTS]
     nowhere, unknown = np.full(3, np.nan), np.diag(np.square(UNKNOWN_SIGMA))
-    outcome = outcome_of(run, episode)
-    judged = episode.info.kind == "trial" and outcome is not None and outcome.result != "unknown"
     return Case(
         episode=episode.info.id,
         sha256=episode.sha256(),
@@ -165,8 +154,31 @@ def read_case(run: RunFolder, episode: Episode) -> Case:
         turn_period_rad=np.array([yaw_period_rad(task.objects[key]) for key in objects]),
         hold_times_s=hold_times[kept.astype(bool)],
         held_widths_m=held[kept.astype(bool)],
-        success=outcome.result == "success" if judged and outcome is not None else None,
+        success=_success(run, episode),
     )
+
+
+def _moving(task: Task, before: Mapping[str, Found], after: Mapping[str, Found]) -> tuple[str, ...]:
+    """The objects that a plan may move, of which one at least was found again."""
+    missing = [key for key in task.objects if key not in before]
+    if missing:
+        message = f"not localised before the plan: {', '.join(missing)}."
+        raise UnusableCaseError(message)
+    objects = tuple(
+        key for key, model in task.objects.items() if not model.fixed and key not in task.containers
+    )
+    if not any(key in after for key in objects):
+        message = f"never localised after the plan: {', '.join(objects)}."
+        raise UnusableCaseError(message)
+    return objects
+
+
+def _success(run: RunFolder, episode: Episode) -> bool | None:
+    """What was said last of a trial; None of a probe, and where nobody knows."""
+    outcome = outcome_of(run, episode)
+    if episode.info.kind != "trial" or outcome is None or outcome.result == "unknown":
+        return None
+    return outcome.result == "success"
 
 
 def _executed(episode: Episode) -> tuple[Plan, int, int]:
