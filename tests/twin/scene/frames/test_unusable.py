@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import textured_room
 
-from bridge.episode import streams
+from bridge.episode import cdr, schema, streams
 from bridge.episode.reader import Episode
 from bridge.episode.records import CameraInfo, FrameTransform
 from bridge.episode.run import RunFolder
@@ -135,6 +135,32 @@ def test_intrinsics_that_are_not_the_images_are_refused(
     other_info(monkeypatch, run, change)
     with pytest.raises(GstError, match=found):
         choose_frames(find_sources(run), FrameConfig(), QUIET)
+
+
+def test_a_lens_that_distorts_is_refused_by_the_name_of_its_camera(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encode = CameraInfo.to_cdr
+
+    def distorted(self: CameraInfo) -> bytes:
+        message = cdr.decode(schema.CAMERA_INFO, encode(self))
+        return cdr.encode(schema.CAMERA_INFO, {**message, "d": np.array([0.1, 0, 0, 0, 0])})
+
+    with monkeypatch.context() as spoilt:
+        spoilt.setattr(CameraInfo, "to_cdr", distorted)
+        textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=6)
+    with pytest.raises(GstError, match=r"camera wrist of episode scan .*lens distortion"):
+        choose_frames(find_sources(run), FrameConfig(), QUIET)
+
+
+def test_one_camera_that_cannot_be_used_is_named_and_the_others_are_kept(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other_info(monkeypatch, run, lambda c: replace(c, width=128, height=96))
+    textured_room.write_episode(run.episodes_dir / "scan_2.mcap", num_frames=6)
+    (choice,) = choose_frames(find_sources(run), FrameConfig(), Output())
+    assert choice.episode.info.id == "scan_2"
+    assert "left out: camera wrist of episode scan " in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_camera_whose_images_never_come_in_pairs_is_named(
