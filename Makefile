@@ -39,6 +39,7 @@ demo: $(READY)
 	@$(BIN)/robot-gst demo $(RUN) $(DEMO)
 
 test: $(READY)
+	@.ci/browser
 	@$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not gpu and not hardware and not network" $(TEST)
 
 soak: $(READY)
