@@ -70,7 +70,8 @@ class FrameConfig:
     """Where cameras are. tf: /tf; odometry: from the images themselves; auto: what calibrate found,
     else /tf, else odometry."""
     check_poses: bool = True
-    """Refuse poses that fit the depth only when read in another convention."""
+    """Refuse poses that fit the depth only when read in another convention, and cameras that move
+    while their poses stand still."""
     align_poses: bool = False
     """Lay the depth of each training frame onto all others before the fit, for rough poses."""
     align_holdout: bool = False

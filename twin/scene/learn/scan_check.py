@@ -103,6 +103,9 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
     usable = [camera for camera in seen if max(camera.trusted) >= SPARSE]
     if blind and not usable:
         raise NoDepthError(_no_depth(blind[0], config))
+    moved = [text for camera in usable if camera.choice.still and (text := _moved(camera))]
+    if moved and config.check_poses:
+        raise MovedCameraError(moved[0])
     poses = _pose_reports(usable)
     for name, report in poses.items():
         if report.better is not None and config.check_poses:
@@ -111,9 +114,6 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
                 "rebuild with --no-check-poses."
             )
             raise PoseConventionError(message)
-    moved = [text for camera in usable if camera.choice.still and (text := _moved(camera))]
-    if moved and config.check_poses:
-        raise MovedCameraError(moved[0])
     found = [_no_depth(camera, config) for camera in blind] + moved
     found += [f"{name}: {report.remark()}" for name, report in poses.items() if report.remark()]
     still = [camera.name for camera in usable if camera.choice.still]
@@ -122,8 +122,9 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
     total = sum(len(camera.thumbs) for camera in seen)
     if total < FEW_FRAMES:
         found.append(
-            f"only {total} training frame{'s' if total > 1 else ''}: the scene holds what they saw "
-            "and is likely to be wrong from elsewhere; scan longer"
+            f"only {total} training frame{'s' if total > 1 else ''}: the scene holds what "
+            f"{'they' if total > 1 else 'it'} saw and is likely to be wrong from elsewhere; scan "
+            "longer"
         )
     return ScanReport(poses=poses, found=tuple(found))
 
