@@ -13,6 +13,7 @@ from twin.scene.frames.thumb import Thumb
 from twin.scene.learn.between_cameras import check_between
 from twin.scene.learn.pose_check import (
     GOOD,
+    STILL_AGREEMENT,
     MovedCameraError,
     PoseConventionError,
     PoseReport,
@@ -103,9 +104,7 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
     usable = [camera for camera in seen if max(camera.trusted) >= SPARSE]
     if blind and not usable:
         raise NoDepthError(_no_depth(blind[0], config))
-    moved = [text for camera in usable if camera.choice.still and (text := _moved(camera))]
-    if moved and config.check_poses:
-        raise MovedCameraError(moved[0])
+    moved = _still_cameras(usable, refuse=config.check_poses)
     poses = _pose_reports(usable)
     for name, report in poses.items():
         if report.better is not None and config.check_poses:
@@ -144,16 +143,32 @@ def _pose_reports(usable: Sequence[CameraCheck]) -> dict[str, PoseReport]:
     return poses
 
 
-def _moved(camera: CameraCheck) -> str:
-    """Say that a camera moved although its poses do not; empty when it did not."""
-    agreement = still_agreement(camera.thumbs)
-    if agreement is None or agreement >= GOOD:
-        return ""
-    return (
-        f"{camera.name} stands still by its poses, but only {100 * agreement:.0f} % of its depth "
-        "is the same from image to image: it was moved, or nobody recorded how it moves. Rebuild "
-        "with --poses odometry, record its poses, or insist with --no-check-poses"
-    )
+def _still_cameras(usable: Sequence[CameraCheck], *, refuse: bool) -> list[str]:
+    """Say which cameras moved although their poses do not.
+
+    Raises:
+        MovedCameraError: When one did beyond doubt, and that is to be refused.
+    """
+    found = []
+    for camera in usable:
+        agreement = still_agreement(camera.thumbs) if camera.choice.still else None
+        if agreement is None or agreement >= STILL_AGREEMENT:
+            continue
+        about = (
+            f"{camera.name} stands still by its poses, but only {100 * agreement:.0f} % of its "
+            "depth is the same from image to image: "
+        )
+        if agreement >= GOOD:
+            about += "much moved before it, or it moved itself and nobody recorded how"
+        else:
+            about += (
+                "it was moved, or nobody recorded how it moves. Rebuild with --poses odometry, "
+                "record its poses, or insist with --no-check-poses"
+            )
+            if refuse:
+                raise MovedCameraError(f"{about}.")
+        found.append(about)
+    return found
 
 
 def _no_depth(camera: CameraCheck, config: FrameConfig) -> str:

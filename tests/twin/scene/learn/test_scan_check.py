@@ -100,6 +100,9 @@ def test_a_camera_in_motion_that_is_said_to_stand_still_is_refused(choice: Frame
         check_scan([wrong], CONFIG)
     (remark,) = check_scan([wrong], FrameConfig(check_poses=False)).remarks()
     assert "it was moved" in remark
+    orbit = [replace(t, T_base_depth=first.T_base_depth) for t in right.thumbs]
+    (doubt,) = check_scan([replace(wrong, thumbs=orbit)], CONFIG).remarks()
+    assert "much moved before it, or it moved itself" in doubt
     truly = replace(wrong, thumbs=[thumbs[0]] * 4)
     assert "moved" not in " ".join(check_scan([truly], CONFIG).remarks())
 
