@@ -86,7 +86,7 @@ def with_absolute_meshes(urdf: str, *, keep_visuals: bool = False) -> str:
 
 
 def parse_description(urdf: str) -> ET.Element:
-    """Parse a URDF text. Raises ``RobotDescriptionError`` when it is none."""
+    """Parse a URDF text. Raises ``RobotDescriptionError`` when it is none or parts lack names."""
     try:
         root = ET.fromstring(urdf)
     except ET.ParseError as error:
@@ -99,4 +99,21 @@ def parse_description(urdf: str) -> ET.Element:
             found=f"has the root element <{root.tag}>, not <robot>",
             hint="Expand xacro files before publishing them.",
         )
+    _check_names(root)
     return root
+
+
+def _check_names(root: ET.Element) -> None:
+    """Readers of URDF that meet a part without a name may take the process with them."""
+    for tag in ("link", "joint"):
+        names = [element.get("name", "").strip() for element in root.findall(tag)]
+        if "" in names:
+            raise RobotDescriptionError(
+                found=f"has a {tag} without a name", hint="Name every link and joint."
+            )
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise RobotDescriptionError(
+                found=f"has more than one {tag} named {', '.join(twice)}",
+                hint="Give each a name of its own.",
+            )

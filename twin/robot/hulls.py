@@ -17,6 +17,7 @@ from twin.robot.description import RobotDescriptionError
 from twin.robot.model import RobotModel
 
 _CYLINDER_SIDES = 24
+_THINNEST_M = 1e-7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +58,8 @@ def link_hulls(robot: RobotModel) -> list[LinkHull]:
     """Return one hull for each collision element of the description.
 
     Raises:
-        RobotDescriptionError: When a mesh cannot be read, or a shape is of an unknown kind.
+        RobotDescriptionError: When a mesh cannot be read, or a shape is of an unknown kind or has
+            no volume.
     """
     geometry = collision_geometry(robot)
     hulls = []
@@ -65,11 +67,24 @@ def link_hulls(robot: RobotModel) -> list[LinkHull]:
         frame = robot.model.frames[item.parentFrame]
         T_link_shape = frame.placement.inverse() * item.placement
         points = _points(item) @ T_link_shape.rotation.T + T_link_shape.translation
+        if not _has_volume(points):
+            raise RobotDescriptionError(
+                found=f"has a collision shape without volume at {item.name}",
+                hint="Give it three extents above zero, or leave it out.",
+            )
         shape = convex_hull(points)
         corners = np.array(shape.points())
         from_mesh = isinstance(item.geometry, coal.BVHModelBase)
         hulls.append(LinkHull(link=frame.name, points_m=corners, shape=shape, from_mesh=from_mesh))
     return hulls
+
+
+def _has_volume(points_m: Float[np.ndarray, "num_points 3"]) -> bool:
+    """Whether points span a body; of others coal ends the process."""
+    if len(points_m) < 4 or not np.isfinite(points_m).all():
+        return False
+    spread = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)
+    return bool(spread[2] > _THINNEST_M)
 
 
 def _points(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:

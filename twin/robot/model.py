@@ -61,6 +61,7 @@ class RobotModel:
         self.velocity_limit_rad_s: Float[np.ndarray, " num_joints"] = self._arm(
             self.model.velocityLimit
         )
+        self._check_limits()
 
     def _check_names(self) -> None:
         missing = [name for name in ARM_JOINTS if not self.model.existJointName(name)]
@@ -92,6 +93,19 @@ class RobotModel:
                 raise RobotDescriptionError(
                     found=f"has the finger joint {name!r}, which does not slide",
                     hint="Two prismatic fingers are needed, each open by half of the width.",
+                )
+
+    def _check_limits(self) -> None:
+        """Nothing is ever beyond a limit that is no number."""
+        rows = zip(
+            ARM_JOINTS, self.lower_rad, self.upper_rad, self.velocity_limit_rad_s, strict=True
+        )
+        for name, low, high, speed in rows:
+            if not (low < high and speed >= 0):
+                raise RobotDescriptionError(
+                    found=f"limits the joint {name!r} to {low:.3f} to {high:.3f} rad and "
+                    f"{speed:.3f} rad/s",
+                    hint="Give lower, upper and velocity as numbers, lower below upper.",
                 )
 
     def _check_followers(self, followers: list[Mimic]) -> None:

@@ -16,7 +16,7 @@ from twin.replay.config import ReplayConfig
 from twin.replay.follow.path import check_path, path_of_plan
 from twin.replay.follow.usable import MAX_WAYPOINTS, UnusablePlanError, check_usable
 from twin.replay.verdict.rollout import replay_plan
-from twin.robot.collision import hulls_of
+from twin.robot.collision import RobotHulls, hulls_of
 from twin.robot.config import IkConfig
 from twin.robot.description import RobotDescriptionError
 from twin.robot.inverse import solve_ik
@@ -146,6 +146,13 @@ def test_joints_of_another_kind_are_refused_by_name(
         RobotModel(changed(joint, before, after))
 
 
+@pytest.mark.parametrize(("which", "value"), [("lower", "7"), ("upper", "-7")])
+def test_limits_between_which_nothing_lies_are_refused_by_name(which: str, value: str) -> None:
+    urdf = changed("elbow_joint", rf'{which}="[^"]*"', f'{which}="{value}"')
+    with pytest.raises(RobotDescriptionError, match=r"limits the joint 'elbow_joint' to"):
+        RobotModel(urdf)
+
+
 @pytest.mark.parametrize("origin", ['xyz="0 0 0.8" rpy="0 0 0"', 'xyz="0 0 0" rpy="0 0 3.14159"'])
 def test_a_base_that_is_not_the_root_is_refused_with_where_it_is(origin: str) -> None:
     """On a pedestal, say: plans are given in the base, kinematics would be those of the floor."""
@@ -206,6 +213,26 @@ def test_numbers_no_plan_can_mean_are_refused_in_a_sentence() -> None:
     many = tuple(replace(first, t_ns=k) for k in range(MAX_WAYPOINTS + 1))
     with pytest.raises(UnusablePlanError, match="has 100001 waypoints"):
         check_usable(replace(plan, tau=many), robot)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "found"),
+    [
+        ('<box size="0.01 0.01 0.01"/>', '<box size="0 0 0"/>', "without volume at ee_link"),
+        ('<box size="0.01 0.01 0.01"/>', '<box size="0.01 0 0.01"/>', "without volume at ee_link"),
+        ('<joint name="ee_fixed_joint"', '<joint name=""', "has a joint without a name"),
+        ('<link name="ee_link">', "<link>", "has a link without a name"),
+        ('<link name="ee_link">', '<link name="tool0">', "more than one link named tool0"),
+    ],
+)
+def test_descriptions_that_would_end_the_process_are_refused(
+    before: str, after: str, found: str
+) -> None:
+    """PyBullet and coal do not raise: they take every other replay with them."""
+    urdf = re.sub(r" +/>", "/>", ur5_with_gripper_urdf())
+    assert before in urdf
+    with pytest.raises(RobotDescriptionError, match=found):
+        RobotHulls(RobotModel(urdf.replace(before, after)))
 
 
 def test_a_pose_that_is_no_number_is_not_reached() -> None:
