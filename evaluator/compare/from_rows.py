@@ -27,6 +27,7 @@ from evaluator.compare.tables import (
     success_table,
     trials_table,
 )
+from evaluator.compare.varied import varied_sim
 from evaluator.compare.verdicts import agreement, gate_worth, reliability
 from evaluator.result import Measurement, Table
 
@@ -64,6 +65,7 @@ def compare_rows(
     pairs, unpaired = pair_starts(rows)
     worth, worth_tables = gate_worth(rows)
     kept, kept_tables = reliability(rows)
+    again, again_tables = varied_sim(rows)
     stages, stage_tables, other_stages = stage_results(rows)
     chosen, decision_tables = decisions(cells)
     measurements: list[Measurement] = [
@@ -74,6 +76,7 @@ def compare_rows(
         *cell_agreement(cells),
         *gains,
         *gain_tests(cells),
+        *again,
         *paired_gain(pairs),
         *start_distances(pairs),
         *never_sent(rows),
@@ -89,6 +92,7 @@ def compare_rows(
         success_table(cells, word),
         *layout_table(cells, measurements, word),
         *gains_table(gains, word),
+        *again_tables,
         *remarks_table(remarks(cells, measurements)),
         *agreement_intervals(cells),
         confusion_table(rows, word),
@@ -115,6 +119,11 @@ def compare_rows(
 
 NO_DATA = (
     ("reliability.", "reliability of the success probability", "no trial has p_success"),
+    (
+        "rate.sim_varied.",
+        "sim estimated again with fresh seeds",
+        "no planned replay has varied ones; robot-gst replay RUN --samples 16 makes them",
+    ),
     ("stage.", "stage funnel", "no trial has labelled stages or counts sub-tasks"),
     (
         "proxy.",

@@ -69,6 +69,9 @@ class TrialRow:
     verdict: bool | None = None
     """The gate's verdict on the sent plan, made before its execution started."""
     p_success: float | None = None
+    """Share of varied replays that succeed: of the planned replay, else of the gate."""
+    sim_varied: float | None = None
+    """The same of the planned replay alone, whose draws the gate did not use."""
     first_failing: str | None = None
     """ik, clearance or terminal of the planned replay, or of the verdict where there is none."""
     failing_detail: str | None = None

@@ -26,8 +26,8 @@ SIM_NOTE = (
     "sim: planned-in-twin, dynamic, of the plan actually sent, replayed from the start localised "
     "again in the recording. With replanning the twin selected the accepted plans, so their sim is "
     "optimistic by that selection: the replay has the gate's engine and nominal physics and draws "
-    "nothing new; an estimate with fresh seeds is not made yet. A trial in which no plan was sent "
-    "has an outcome and no sim."
+    "nothing new. Replays with --samples estimate it again with fresh seeds, in its own table. "
+    "A trial in which no plan was sent has an outcome and no sim."
 )
 
 

@@ -4,7 +4,7 @@ import importlib.util
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 
@@ -166,8 +166,9 @@ class RunMaker:
         tag: str = "a",
         num_poses: int = NUM_POSES,
         astray: int | None = None,
+        varied: tuple[int, int] | None = None,
     ) -> Path:
-        """Write one derived replay of a trial."""
+        """Write one derived replay of a trial; ``varied``: successes and number of its samples."""
         source = self.run.episodes_dir / f"{name}.mcap"
         plan_id = plan_id or f"plan_{name}"
         derived = Derived(
@@ -187,6 +188,9 @@ class RunMaker:
             writer.describe(info, derived=derived)
             log = _Log(writer)
             said = verdict_of(accepted, plan_id=plan_id, trajectory=trajectory)
+            if varied is not None:
+                k, n = varied
+                said = replace(said, p_success={"value": k / n, "k": k, "n": n})
             log.raw("/standin/verdict", schema.VERDICT, said.to_json(), start_ns)
             log.poses("/standin/tcp/pose", start_ns, offset_m, num_poses, astray)
         return path

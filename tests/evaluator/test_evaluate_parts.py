@@ -49,6 +49,7 @@ def test_a_run_without_data_for_a_part_says_no_data(six_trials: Any) -> None:
     missing = " | ".join(compare_run(six_trials.run).missing)
     parts = (
         "reliability of the success probability",
+        "sim estimated again with fresh seeds",
         "stage funnel",
         "recorded rate with",
         "final states",
