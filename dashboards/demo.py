@@ -20,6 +20,7 @@ from cyclopts import Parameter
 
 from bridge.episode.run import RunFolder
 from bridge.errors import GstError
+from bridge.task.task_file import load_task
 from bridge.terminal import Output
 from dashboards.errors import DashboardError
 
@@ -54,6 +55,11 @@ class DemoConfig:
     def budget(self) -> str:
         """Time the rebuild may take."""
         return "90s" if self.full else "15s" if self.quick else "40s"
+
+    @property
+    def samples(self) -> int:
+        """Varied replays behind each verdict; toys take seconds for each, and have none."""
+        return 0 if self.quick or load_task(self.task).soft_objects else 8
 
 
 class StepFailedError(DashboardError):
@@ -114,7 +120,7 @@ def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
         with _ending_on_sigterm():
             _record(run, config, output)
     workers = str(min(4, os.cpu_count() or 1))
-    replay = ["replay", str(path), "--workers", workers]
+    replay = ["replay", str(path), "--workers", workers, "--samples", str(config.samples)]
     _step(output, "5/6 replaying every plan and execution in PyBullet", replay)
     _step(output, "6/6 evaluating", ["evaluate", str(path)], show_result=True)
     seconds = time.monotonic() - started
