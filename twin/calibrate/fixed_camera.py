@@ -9,13 +9,13 @@ from jaxtyping import Float
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.records import DepthImage
-from bridge.episode.transforms import TransformTree
 from bridge.errors import BridgeError, GstError
 from bridge.task.robot import BASE_FRAME
 from twin.robot.model import load_robot
 from twin.robot.posture import Posture, PostureTrack, far_apart, posture_track
 from twin.scene.align.align import AlignConfig, Alignment, RobotNotAlignedError, align_robot
 from twin.scene.align.view import RobotView
+from twin.scene.frames.base import base_tree
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +129,7 @@ def _load(episode: Episode, camera_id: str, chosen: Sequence[_Seen]) -> Iterator
 
 def _believed(seen: _Seen, camera_id: str) -> Float[np.ndarray, "4 4"] | None:
     """The pose of the depth camera in the robot's base as the recording has it, if it has one."""
-    tree: TransformTree = streams.transform_tree(seen.episode)
+    tree = base_tree(seen.episode)
     frame = streams.camera_info(seen.episode, camera_id, "depth").frame_id
     try:
         T = tree.T_root_frame(frame, seen.stamp_ns)

@@ -26,9 +26,11 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
+from twin.calibrate import fixed_camera
 from twin.calibrate.pairs import recorded_pairs
 from twin.calibrate.placement import placement
 from twin.robot.model import load_robot
+from twin.scene.align.align import RobotNotAlignedError
 from twin.scene.store.calibration import (
     UnreadableCalibrationError,
     calibrated_tree,
@@ -233,6 +235,37 @@ def test_the_robot_seen_by_a_fixed_camera_gives_the_camera(run: RunFolder, belie
     item = found.record["cameras"]["side"]
     assert (item["yaw_margin"] is None) == believed
     assert ("correction_m" in item) == believed
+
+
+def test_the_search_begins_where_tf_believes_the_camera_also_below_a_world(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the driver of a UR publishes it; without the belief the whole table is searched."""
+    believed = se3.transform_from(np.array([0.9, 0.1, 0.0, 0.4]), np.array([0.7, -0.8, 0.6]))
+    recording = Recording(run.episodes_dir / "scan.mcap", np.array(cell_views.POSTURES[:1]))
+    recording.intrinsics("side")
+    recording.depth("side", np.ones((240, 320)), recording.stamp(0))
+    world = FrameTransform(
+        stamp_ns=1, parent="world", child="base_link", T_parent_child=T_BASE_TARGET
+    )
+    recording.put("/tf_static", transforms_to_cdr([world]), schema.TF_MESSAGE, 1)
+    recording.transform("side", believed, 1)
+    recording.writer.close()
+    begun: list[np.ndarray | None] = []
+
+    def look(*_: object, start: np.ndarray | None = None, **__: object) -> None:
+        begun.append(start)
+        raise RobotNotAlignedError(found="nothing", hint="Look elsewhere.")
+
+    monkeypatch.setattr(fixed_camera, "align_robot", look)
+    with pytest.raises(RobotNotAlignedError):
+        fixed_camera.find_fixed_camera(
+            [Episode.open(path) for path in run.episodes()], "side", max_postures=2, seed=0
+        )
+    first, whole_table = begun
+    assert whole_table is None
+    assert first is not None
+    np.testing.assert_allclose(first, believed, atol=1e-9)
 
 
 def test_a_run_without_data_says_what_is_missing(
