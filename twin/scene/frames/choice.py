@@ -50,6 +50,15 @@ class FrameChoice:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Chosen:
+    """What is used of a run's cameras, and why others are not."""
+
+    choices: list[FrameChoice]
+    left_out: tuple[str, ...]
+    """A sentence about each camera that is not used."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Sources:
     """The episodes a scene is made from."""
 
@@ -111,6 +120,13 @@ def choose_frames(
     output: Output = QUIET,
     calibration: Calibration | None = None,
 ) -> list[FrameChoice]:
+    """The choices of ``choose_with_reasons``; raises as it does."""
+    return choose_with_reasons(sources, config, output, calibration).choices
+
+
+def choose_with_reasons(
+    sources: Sources, config: FrameConfig, output: Output, calibration: Calibration | None
+) -> Chosen:
     """Hold out every n-th frame of each camera, then choose training frames from the others.
 
     Which frames are held out depends on their number alone, never on what they show.
@@ -139,29 +155,33 @@ def choose_frames(
             lost.append(error)
     if lost and not choices:
         raise lost[0]
-    for reason in lost:
-        output.say(f"left out: {reason}")
-    choices = _in_one_frame(choices, output)
-    if not any(choice.train_ns for choice in choices):
+    kept, apart = _in_one_frame(choices)
+    left_out = (*(f"left out: {reason}" for reason in lost), *apart)
+    for sentence in left_out:
+        output.say(sentence)
+    if not any(choice.train_ns for choice in kept):
         message = "the cameras of this run have no frames to learn from. Record a longer scan."
         raise NoFramesError(message)
-    return choices
+    return Chosen(choices=kept, left_out=left_out)
 
 
-def _in_one_frame(choices: list[FrameChoice], output: Output) -> list[FrameChoice]:
-    """Keep the cameras whose poses share a root frame with the first, recorded poses first."""
+def _in_one_frame(choices: list[FrameChoice]) -> tuple[list[FrameChoice], list[str]]:
+    """Keep the cameras whose poses share a root frame with the first, recorded poses first.
+
+    And say of each of the others where it is.
+    """
     ordered = sorted(choices, key=lambda choice: choice.poses.source == "odometry")
     if not ordered:
-        return choices
-    kept = [choice for choice in choices if root_frame(choice) == root_frame(ordered[0])]
-    for choice in choices:
-        if root_frame(choice) != root_frame(ordered[0]):
-            output.say(
-                f"camera {choice.camera_id} of {choice.episode.info.id} is left out: its poses are "
-                f"in frame {root_frame(choice)!r}, and nothing says where that is in "
-                f"{root_frame(ordered[0])!r}"
-            )
-    return kept
+        return choices, []
+    root = root_frame(ordered[0])
+    kept = [choice for choice in choices if root_frame(choice) == root]
+    apart = [
+        f"camera {choice.camera_id} of {choice.episode.info.id} is left out: its poses are in "
+        f"frame {root_frame(choice)!r}, and nothing says where that is in {root!r}"
+        for choice in choices
+        if root_frame(choice) != root
+    ]
+    return kept, apart
 
 
 def root_frame(choice: FrameChoice) -> str:

@@ -48,6 +48,7 @@ def make_record(
     key: str,
     scene_hash: str,
     sources: Sources,
+    left_out: Sequence[str],
     learnt: Learnt,
     config: RebuildConfig,
     fitted: FitResult,
@@ -58,6 +59,7 @@ def make_record(
     """Put together the content of ``scene.json``."""
     settings = asdict(config)
     settings.pop("force")
+    scan = learnt.report.to_record()
     return {
         "schema_version": SCENE_VERSION,
         "key": key,
@@ -70,7 +72,7 @@ def make_record(
             {"id": e.info.id, "kind": e.info.kind, "sha256": e.sha256()} for e in sources.episodes
         ],
         "cameras": [camera_record(choice) for choice in learnt.choices],
-        "scan": learnt.report.to_record(),
+        "scan": scan | {"remarks": [*left_out, *scan["remarks"]]},
         "settings": settings,
         "background": {"file": BACKGROUND, "num_splats": num_background},
         "fit": {

@@ -24,7 +24,7 @@ from twin.scene.fit.run import FitResult, fit
 from twin.scene.fit.state import FIT_STATE, Checkpoint
 from twin.scene.foundation.complete import complete_shapes
 from twin.scene.foundation.stage import check_models
-from twin.scene.frames.choice import FrameChoice, Sources, choose_frames, find_sources
+from twin.scene.frames.choice import FrameChoice, Sources, choose_with_reasons, find_sources
 from twin.scene.gaussians.cloud import GaussianCloud, as_float32, concatenate, with_harmonics
 from twin.scene.gaussians.moved import moved_cloud
 from twin.scene.learn.read import Learnt, learn, limits_of, with_fitted_poses
@@ -98,8 +98,8 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         output.say("the scene is up to date (same episodes, same settings); --force redoes it")
         return done
     clock = _Clock()
-    choices = choose_frames(sources, config.frames, output, calibration)
-    learnt = learn(choices, config, output)
+    chosen = choose_with_reasons(sources, config.frames, output, calibration)
+    learnt = learn(chosen.choices, config, output)
     clock.end("read")
     run.scene_dir.mkdir(parents=True, exist_ok=True)
     kept = Checkpoint(path=run.scene_dir / FIT_STATE, key=key)
@@ -135,6 +135,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         key=key,
         scene_hash=background_hash(run),
         sources=sources,
+        left_out=chosen.left_out,
         learnt=learnt,
         config=config,
         fitted=fitted,

@@ -25,6 +25,7 @@ from twin.scene.frames.points import DepthLimits, FrameSurface
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects import parts as parts_module
 from twin.scene.objects.parts import read_objects, take_apart
+from twin.scene.rebuild.record import describe_scene
 from twin.scene.rebuild.run import rebuild
 from twin.scene.settings import (
     FitConfig,
@@ -152,6 +153,26 @@ def test_the_scene_of_black_images_is_described_in_plain_json(
     record = rebuild(run, CONFIG, QUIET)
     assert record["views"]["psnr_db"] == 100.0
     json.dumps(record, allow_nan=False)
+
+
+def test_a_camera_that_was_left_out_stands_in_the_scene_with_its_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9)
+    encode = textured_room.transforms_to_cdr
+    monkeypatch.setattr(
+        textured_room,
+        "transforms_to_cdr",
+        lambda items: encode([replace(item, parent="elsewhere") for item in items]),
+    )
+    textured_room.write_episode(run.episodes_dir / "scan_2.mcap", num_frames=9)
+    rebuild(run, CONFIG, QUIET)
+    record = read_record(run)
+    assert record is not None
+    (remark,) = (text for text in record["scan"]["remarks"] if "left out" in text)
+    assert "camera wrist of scan_2 is left out: its poses are in frame 'elsewhere'" in remark
+    assert remark in describe_scene(record)
 
 
 def test_objects_are_not_looked_for_in_held_out_frames(
