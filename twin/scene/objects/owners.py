@@ -12,6 +12,7 @@ from twin.scene.gaussians.cloud import GaussianCloud
 from twin.scene.localise.colour import ColourConfig, likeness, linear_from_srgb
 from twin.scene.localise.fit import FitConfig, refine_on_points
 from twin.scene.localise.result import LocalisedObject
+from twin.scene.objects.remains import Poses, with_halo
 from twin.scene.shape.known import surface_distances
 from twin.scene.shape.reconstruct import ObjectShape
 
@@ -32,9 +33,6 @@ class SplitConfig:
     """Near the table a Gaussian must also have the object's colour, see ``likeness``."""
     max_scale_m: float = 0.05
     """Larger Gaussians are background that happens to pass through."""
-
-
-Poses = Mapping[str, Float[np.ndarray, "4 4"]]
 
 
 def object_poses(
@@ -97,7 +95,7 @@ def owners(
         wins = mine & (distance < nearest[ids])
         owner[ids[wins]] = index
         nearest[ids[wins]] = distance[wins]
-    return owner
+    return with_halo(cloud, owner, poses, shapes)
 
 
 def _alike(

@@ -22,7 +22,8 @@ from twin.scene.gaussians.cloud import GaussianCloud, concatenate
 from twin.scene.gaussians.moved import moved_cloud
 from twin.scene.localise.episode import localise_episode
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.objects.owners import Poses, object_poses
+from twin.scene.objects.owners import object_poses
+from twin.scene.objects.remains import Poses
 from twin.scene.objects.split import ObjectSplats, SceneParts, split_objects, write_objects
 from twin.scene.shape.from_training import shapes_of, write_static
 from twin.scene.shape.reconstruct import ObjectShape

@@ -25,6 +25,7 @@ from twin.scene.gaussians.moved import moved_cloud
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.fill import fill_footprint
 from twin.scene.objects.owners import SplitConfig, object_poses, owners
+from twin.scene.objects.remains import hidden_table
 from twin.scene.shape.files import MESH, TASK_SHAPE, remove_shape, write_shape
 from twin.scene.shape.mesh import mesh_ply
 from twin.scene.shape.reconstruct import ObjectShape
@@ -63,7 +64,8 @@ def split_objects(
 
     A Gaussian goes to the object whose surface is nearest, if it is near enough and nearer than the
     table; close to the table only if it has the object's colour. Every Gaussian ends up in exactly
-    one part, the filling comes on top. Objects that were not found stay in the background.
+    one part, but those of the table under an object, which nobody saw: the filling takes their
+    place. Objects that were not found stay in the background.
 
     Args:
         cloud: The whole scene in ``base_link``.
@@ -80,7 +82,8 @@ def split_objects(
     for index, (key, T) in enumerate(poses.items()):
         part = moved_cloud(cloud.take(owner == index), se3.invert(T))
         objects[key] = ObjectSplats(cloud=part, T_base_object=T)
-    background = cloud.take(owner < 0)
+    hidden = hidden_table(cloud, owner, poses, known)
+    background = cloud.take((owner < 0) & ~hidden)
     nothing = cloud.take(np.zeros(0, dtype=np.int64))
     filling = [fill_footprint(background, task.objects[key], T) for key, T in poses.items()]
     return SceneParts(

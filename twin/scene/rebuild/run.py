@@ -46,7 +46,7 @@ from twin.scene.store.folder import (
 )
 from twin.scene.store.ply import write_ply
 
-METHOD_VERSION = 19
+METHOD_VERSION = 20
 """Counts changes of method that make older scenes out of date."""
 
 
