@@ -78,38 +78,42 @@ def judge_task(task_name: str, options: argparse.Namespace) -> list[Judged]:
         paths = record_ungated(run, task_name, seed, PER_SESSION)
         todo = options.trials - len(judged)
         with TwinProcess(run.path, load_task(task_name), config, Output(quiet=True)) as twin:
-            judged += [judge_trial(path, config, twin) for path in paths[:todo]]
+            judged += [judge_trial(run, path, config, twin) for path in paths[:todo]]
     return judged
 
 
-def judge_trial(path: Path, config: Any, twin: Any) -> Judged:
+def judge_trial(run: Any, path: Path, config: Any, twin: Any) -> Judged:
     """Ask the gate about one recorded trial, or read what it said before."""
     from bridge.episode.provenance import hash_settings
     from bridge.episode.reader import Episode
     from twin.replay.work.job import REPLAY_VERSION
+    from twin.scene.store.calibration import read_calibration
 
     settings = {"config": repr(config), "replay_version": REPLAY_VERSION}
+    calibration = read_calibration(run)
+    if calibration is not None:
+        settings["calibration_id"] = calibration.calibration_id
     kept = path.with_suffix(f".{hash_settings(settings)}.json")
     if not kept.is_file():
-        verdict, seconds = ask(Episode.open(path), config, twin)
+        verdict, seconds = ask(Episode.open(path), config, twin, calibration)
         kept.write_text(json.dumps({"verdict": json.loads(verdict.to_json()), "seconds": seconds}))
     said = json.loads(kept.read_text())
     return compare(Episode.open(path), said["verdict"], config.task, said["seconds"])
 
 
-def ask(episode: Any, config: Any, twin: Any) -> tuple[Any, float]:
+def ask(episode: Any, config: Any, twin: Any, calibration: Any = None) -> tuple[Any, float]:
     """Let the gate see what came before the plan, and judge it."""
     from bridge.episode import schema, streams
     from twin.gate.service import make_gate
     from twin.scene.localise.live import LiveView
 
     ((stamp_ns, plan),) = streams.plans(episode)
-    eyes = LiveView(config.cell)
+    eyes = LiveView(config.cell, calibration)
     for message in episode.messages():
         if message.log_time_ns >= stamp_ns:  # the execution begins with the same stamp
             break
         watched = message.topic in CAMERAS_AND_FRAMES or message.topic.startswith(
-            (f"/{config.cell}/cam/", f"/{config.cell}/event")
+            (f"/{config.cell}/cam/", f"/{config.cell}/event", f"/{config.cell}/joint_states")
         )
         if watched and not schema.is_truth(message.topic):
             eyes.take(message.topic, message.data, message.log_time_ns, message.type_name)

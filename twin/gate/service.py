@@ -64,13 +64,20 @@ def serve_gate(session: Any, gate: Gate, eyes: Eyes, config: GateConfig, output:
     session.serve(f"{config.cell}/gate/verdict", answer, side_by_side=config.waiting + 2)
 
 
-def watch_cell(session: Any, cell: str, take: Callable[[str, bytes, int, str], None]) -> None:
-    """Hand the cell's images, transforms, description and events to ``take``."""
+def watch_cell(
+    session: Any,
+    cell: str,
+    take: Callable[[str, bytes, int, str], None],
+    *,
+    joints: bool = False,
+) -> None:
+    """Hand the cell's images, transforms, description and events to ``take``; joints if asked."""
 
     def on_sample(sample: Any) -> None:
         take(sample.topic, sample.data, sample.received_ns, sample.type_name)
 
-    for key in (f"{cell}/cam/**", f"{cell}/event", "tf", "tf_static", "robot_description"):
+    keys = [f"{cell}/cam/**", f"{cell}/event", "tf", "tf_static", "robot_description"]
+    for key in [*keys, f"{cell}/joint_states"] if joints else keys:
         session.subscribe(key, on_sample)
 
 
@@ -96,11 +103,12 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     """Judge plans until SIGINT or SIGTERM; both end with exit code 0."""
     from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
     from twin.scene.localise.live import LiveView  # noqa: PLC0415
+    from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
 
     if not CELL_NAME.match(config.cell):
         raise GateError(f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'.")
     run, task = RunFolder.open(path), load_task(config.task)
-    eyes = LiveView(config.cell)
+    eyes = LiveView(config.cell, read_calibration(run))
     wire = WireConfig(connect=config.connect, config=config.zenoh_config)
     with (
         stop_signals() as stopped,
@@ -108,12 +116,12 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
         TwinProcess(run.path, task, config, output) as twin,
     ):
         be_the_only_one(session, config.cell)
-        watch_cell(session, config.cell, eyes.take)
+        watch_cell(session, config.cell, eyes.take, joints=eyes.needs_joints)
         gate = make_gate(config, eyes, session.now_ns, twin)
         serve_gate(session, gate, eyes, config, output)
         output.say(
-            f"gate ready: {config.task} of cell {config.cell}, service {config.cell}/gate/verdict. "
-            "Stop with Ctrl-C."
+            f"gate ready: {config.task} of cell {config.cell}, service {config.cell}/gate/verdict, "
+            f"{eyes.cameras_from()}. Stop with Ctrl-C."
         )
         while not stopped.wait(0.2):
             pass

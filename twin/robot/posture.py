@@ -85,14 +85,23 @@ def posture_track(episode: Episode) -> PostureTrack:
             hint="Record /robot_description, or attach the URDF as robot.urdf.",
         )
     arm = joint_track(episode)
-    missing = [name for name in ARM_JOINTS if name not in arm.names]
-    if missing:
-        raise RobotDescriptionError(
-            found=f"does not fit episode {episode.info.id}, which lacks {', '.join(missing)}",
-            hint=f"Its joint states have: {', '.join(arm.names)}.",
-        )
+    check_joints(arm, f"episode {episode.info.id}")
     try:
         widths = joint_track(episode, "/gripper/state")
     except EpisodeError:
         widths = None
     return PostureTrack(urdf=urdf, arm=arm, widths=widths)
+
+
+def check_joints(arm: JointTrack, source: str) -> None:
+    """See that joint states are of the robots that are known here.
+
+    Raises:
+        RobotDescriptionError: A joint of the arm is missing in what a source sent.
+    """
+    missing = [name for name in ARM_JOINTS if name not in arm.names]
+    if missing:
+        raise RobotDescriptionError(
+            found=f"does not fit {source}, which lacks {', '.join(missing)}",
+            hint=f"Its joint states have: {', '.join(arm.names)}.",
+        )

@@ -6,7 +6,12 @@ there are none. Knows nothing of the network: whoever is connected hands the mes
 
 import threading
 from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Int
 
 from bridge.episode import cdr, schema
 from bridge.episode.records import (
@@ -14,21 +19,37 @@ from bridge.episode.records import (
     CompressedColor,
     DepthImage,
     FrameTransform,
+    JointSample,
     RawColor,
     color_from_message,
     string_from_cdr,
     transforms_from_cdr,
 )
-from bridge.episode.streams import PAIRING_TOLERANCE_NS, RgbdFrame
+from bridge.episode.streams import PAIRING_TOLERANCE_NS, RgbdFrame, joint_track_of
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
 from bridge.task.record import parse_record
 from twin.errors import TwinError
+from twin.robot.posture import PostureTrack, check_joints
 from twin.scene.frames.base import rooted_in_base
-from twin.scene.localise.still_frames import STILL_WINDOW_NS, is_still
+from twin.scene.frames.camera_poses import CameraPoses
+from twin.scene.localise.still_frames import (
+    STILL_WINDOW_NS,
+    common_root,
+    is_still,
+    with_true_depth,
+)
+from twin.scene.store.calibration import (
+    Calibration,
+    CameraPlace,
+    mounted_tree,
+    unknown_postures,
+)
 
 KEPT_IMAGES = 6
 KEPT_TRANSFORMS = 1000
+KEPT_JOINTS = 2000
+"""Four seconds of a robot that sends at 500 Hz."""
 MAX_CAMERAS = 16
 MAX_FRAMES = 1000
 """Static frames; a flood of names must not fill the memory."""
@@ -58,9 +79,18 @@ class LiveFrames:
 class LiveView:
     """Remembers images, transforms and the robot description of one cell; thread safe."""
 
-    def __init__(self, cell: str) -> None:
-        """Listen for ``/<cell>/cam/...``, ``/<cell>/event``, transforms and the URDF."""
+    def __init__(self, cell: str, calibration: Calibration | None = None) -> None:
+        """Listen for ``/<cell>/cam/...``, ``/<cell>/event``, transforms and the URDF.
+
+        Args:
+            cell: Its name.
+            calibration: Of the run. Cameras in it are where it says, and never where ``/tf`` does;
+                for those in the hand ``/<cell>/joint_states`` is listened for, too.
+        """
         self._cell = cell
+        self._calibration = calibration
+        self._places = {} if calibration is None else dict(calibration.cameras)
+        self._joints: deque[bytes] = deque(maxlen=KEPT_JOINTS)
         self._lock = threading.Lock()
         self._cameras: dict[str, _Camera] = {}
         self._static: dict[str, FrameTransform] = {}
@@ -81,7 +111,7 @@ class LiveView:
             received_ns: On the receiver's clock.
             type_name: Of an image: raw or compressed; "" is what the topic's name promises.
         """
-        if schema.is_truth(topic):
+        if schema.is_truth(topic) or (topic == self._joint_topic and not self.needs_joints):
             return
         try:
             with self._lock:
@@ -101,6 +131,10 @@ class LiveView:
                     self._static[item.child] = item
         elif topic == "/robot_description":
             self._urdf = string_from_cdr(data)
+        elif topic == self._joint_topic:
+            sample = JointSample.from_cdr(data)
+            self._joints.append(data)
+            self._newest_ns = max(self._newest_ns, sample.stamp_ns)
         elif topic == f"/{self._cell}/event":
             self._take_event(data)
         elif topic.startswith(f"/{self._cell}/cam/"):
@@ -130,6 +164,25 @@ class LiveView:
             self._newest_ns = max(self._newest_ns, camera.colors[-1].stamp_ns)
         elif kind == "image" and stream == "depth":
             camera.depths.append(DepthImage.from_message(type_name, data))
+
+    @property
+    def _joint_topic(self) -> str:
+        return f"/{self._cell}/joint_states"
+
+    @property
+    def needs_joints(self) -> bool:
+        """Whether a camera was calibrated in the hand."""
+        return any(not place.fixed for place in self._places.values())
+
+    def cameras_from(self) -> str:
+        """By what the cameras are posed, in words."""
+        if self._calibration is None or not self._places:
+            return "cameras by /tf"
+        names = sorted(self._places)
+        return (
+            f"camera{'s' if len(names) > 1 else ''} {', '.join(names)} by robot-gst calibrate "
+            f"({self._calibration.calibration_id}), others by /tf"
+        )
 
     def urdf(self) -> str | None:
         """The robot description, None before it arrived."""
@@ -169,11 +222,17 @@ class LiveView:
                 for camera_id, camera in sorted(self._cameras.items())
             }
             transforms = [*self._static.values(), *self._moving]
+            joints, urdf = list(self._joints), self._urdf
             quiet_since_ns, newest_ns = self._quiet_since_ns, self._newest_ns
         if not cameras:
             return LiveFrames(frames=[], reasons=[f"no images on /{self._cell}/cam/**"])
-        tree = TransformTree(rooted_in_base(transforms))
-        frames: list[RgbdFrame] = []
+        cell = _Cell(
+            tree=TransformTree(rooted_in_base(transforms)),
+            places=self._places,
+            joints=joints,
+            urdf=urdf,
+        )
+        found: dict[str, _Posed] = {}
         reasons: list[str] = []
         for camera_id, camera in cameras.items():
             age_ns = newest_ns - max((image.stamp_ns for image in camera.colors), default=newest_ns)
@@ -181,9 +240,18 @@ class LiveView:
                 reasons.append(f"{camera_id}: silent for {age_ns * 1e-9:.1f} s of the cell's time")
                 continue
             try:
-                frames += _frames_of(camera_id, camera, tree, quiet_since_ns, max_per_camera)
+                found[camera_id] = _frames_of(
+                    camera_id, camera, cell, quiet_since_ns, max_per_camera
+                )
             except GstError as error:
                 reasons.append(f"{camera_id}: {error}")
+        root = common_root([item.root for item in found.values()])
+        reasons += [
+            f"{camera_id}: its poses are in frame {item.root!r}, not in {root!r}"
+            for camera_id, item in found.items()
+            if item.root != root
+        ]
+        frames = [f for item in found.values() if item.root == root for f in item.frames]
         return LiveFrames(frames=frames, reasons=reasons)
 
 
@@ -191,31 +259,89 @@ class CameraNotReadyError(TwinError):
     """A camera gives no frames yet; the message says what is missing."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Posed:
+    """Frames of one camera, and the frame their poses are in."""
+
+    root: str
+    frames: list[RgbdFrame]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Cell:
+    """What is known at one moment of where things are."""
+
+    tree: TransformTree
+    places: Mapping[str, CameraPlace]
+    joints: Sequence[bytes]
+    urdf: str | None
+
+    @cached_property
+    def track(self) -> PostureTrack:
+        """Where the hand was lately."""
+        if self.urdf is None:
+            raise CameraNotReadyError("no robot description has arrived, and it is in the hand")
+        arm = joint_track_of(self.joints)
+        if arm is None:
+            raise CameraNotReadyError("no joint states have arrived, and it is in the hand")
+        check_joints(arm, "the cell")
+        return PostureTrack(urdf=self.urdf, arm=arm, widths=None)
+
+    def poses(
+        self, camera_id: str, color: str, depth: str, stamps_ns: Int[np.ndarray, " num_stamps"]
+    ) -> CameraPoses:
+        """Where a camera was: where it was calibrated, else where ``/tf`` says."""
+        place = self.places.get(camera_id)
+        if place is None:
+            known = set(self.tree.frames())
+            unknown = [frame for frame in (color, depth) if frame not in known]
+            if unknown:
+                raise CameraNotReadyError(f"no transform to {unknown[0]}")
+            return CameraPoses(tree=self.tree, source="tf")
+        track = None if place.fixed else self.track
+        # Around each image too: between far images a motion of the hand would not show.
+        window = np.array([-STILL_WINDOW_NS, 0, STILL_WINDOW_NS])
+        instants = np.unique(stamps_ns[:, None] + window)
+        lost = unknown_postures(track, instants)
+        if lost.issuperset(stamps_ns.tolist()) and len(stamps_ns):
+            raise CameraNotReadyError("no joint states around its images, and it is in the hand")
+        posed = np.array([t for t in instants.tolist() if t not in lost], dtype=np.int64)
+        return CameraPoses(
+            tree=mounted_tree(place, (color, depth), self.tree, posed, track),
+            source="hand-eye",
+            unposed_ns=lost,
+            depth_scale=place.depth_scale,
+        )
+
+
 def _frames_of(
-    camera_id: str, camera: _Camera, tree: TransformTree, quiet_since_ns: int, max_frames: int
-) -> list[RgbdFrame]:
+    camera_id: str, camera: _Camera, cell: _Cell, quiet_since_ns: int, max_frames: int
+) -> _Posed:
     missing = [f"{name}/info" for name in ("color", "depth") if name not in camera.infos]
     if missing:
         raise CameraNotReadyError(f"no calibration on {' and '.join(missing)}")
-    known = set(tree.frames())
-    unknown = [info.frame_id for info in camera.infos.values() if info.frame_id not in known]
-    if unknown:
-        raise CameraNotReadyError(f"no transform to {unknown[0]}")
     frame_id = camera.infos["color"].frame_id
     pairs = [
         (color, depth)
         for color, depth in _pairs(camera)
         if color.stamp_ns - STILL_WINDOW_NS >= quiet_since_ns
-        and is_still(tree, frame_id, color.stamp_ns)
+    ]
+    stamps_ns = np.array([color.stamp_ns for color, _ in pairs], dtype=np.int64)
+    poses = cell.poses(camera_id, frame_id, camera.infos["depth"].frame_id, stamps_ns)
+    pairs = [
+        (color, depth)
+        for color, depth in pairs
+        if color.stamp_ns not in poses.unposed_ns and is_still(poses.tree, frame_id, color.stamp_ns)
     ]
     if not pairs:
         raise CameraNotReadyError("no colour and depth pair taken at rest since the last motion")
     oldest_ns = pairs[-1][0].stamp_ns - MAX_SPAN_NS
-    return [
-        _frame(camera_id, camera.infos, tree, color, depth)
+    frames = [
+        with_true_depth(_frame(camera_id, camera.infos, poses.tree, color, depth), poses)
         for color, depth in pairs[-max_frames:]
         if color.stamp_ns >= oldest_ns
     ]
+    return _Posed(root=poses.tree.root_of(frame_id), frames=frames)
 
 
 def _pairs(camera: _Camera) -> list[tuple[CompressedColor | RawColor, DepthImage]]:

@@ -1,6 +1,6 @@
 """Frames taken while their camera stood still, posed in the robot's base."""
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,10 +73,10 @@ def still_frames(
             failed.append(error)
     if failed and not usable:
         raise failed[0]
-    roots = [item.root for item in usable.values()]
+    root = common_root([item.root for item in usable.values()])
     frames: list[RgbdFrame] = []
     for camera_id, item in usable.items():
-        if item.root != (BASE_FRAME if BASE_FRAME in roots else roots[0]):
+        if item.root != root:
             continue
         stamps = np.array(item.stamps_ns, dtype=np.int64)
         chosen = spread(stamps, max_per_camera) if evenly else stamps[-max_per_camera:]
@@ -131,10 +131,19 @@ def _frames_at(
     episode: Episode, camera_id: str, poses: CameraPoses, stamps_ns: Collection[int]
 ) -> Iterator[RgbdFrame]:
     for frame in frames_at(episode, camera_id, poses.tree, stamps_ns):
-        if poses.depth_scale == 1.0:
-            yield frame
-        else:
-            yield replace(frame, depth_m=frame.depth_m * np.float32(poses.depth_scale))
+        yield with_true_depth(frame, poses)
+
+
+def common_root(roots: Sequence[str]) -> str | None:
+    """The frame in which objects are looked for: the robot's base where a camera is posed in it."""
+    return BASE_FRAME if BASE_FRAME in roots else next(iter(roots), None)
+
+
+def with_true_depth(frame: RgbdFrame, poses: CameraPoses) -> RgbdFrame:
+    """A frame whose depth is what a calibration makes of what was measured."""
+    if poses.depth_scale == 1.0:
+        return frame
+    return replace(frame, depth_m=frame.depth_m * np.float32(poses.depth_scale))
 
 
 def is_still(

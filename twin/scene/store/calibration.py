@@ -24,7 +24,7 @@ from bridge.task.robot import BASE_FRAME
 from bridge.whole_file import write_whole
 from twin.errors import TwinError
 from twin.robot.model import load_robot
-from twin.robot.posture import posture_track
+from twin.robot.posture import PostureTrack, posture_track
 
 CALIBRATION_FILE = "calibration.json"
 CALIBRATION_VERSION = 1
@@ -198,15 +198,35 @@ def calibrated_tree(
         RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
     color, depth = (streams.camera_info(episode, camera_id, s).frame_id for s in ("color", "depth"))
-    tree = streams.transform_tree(episode)
+    track = None if place.fixed else posture_track(episode)
+    return mounted_tree(place, (color, depth), streams.transform_tree(episode), stamps_ns, track)
+
+
+def mounted_tree(
+    place: CameraPlace,
+    frames: tuple[str, str],
+    tree: TransformTree,
+    stamps_ns: Int[np.ndarray, " num_frames"],
+    track: PostureTrack | None,
+) -> TransformTree:
+    """Pose a camera in the robot's base as it is mounted, recorded or live.
+
+    Args:
+        place: How it is mounted.
+        frames: Its colour and its depth frame.
+        tree: Knows how they lie to each other, or does not: then they count as aligned.
+        stamps_ns: The instants.
+        track: Where the hand was; a fixed camera needs none.
+    """
+    color, depth = frames
     T_color_depth = np.eye(4)
     known = color != depth and {color, depth} <= set(tree.frames())
     if known and tree.root_of(color) == tree.root_of(depth):
-        at = int(stamps_ns[0]) if len(stamps_ns) else episode.start_ns
+        at = int(stamps_ns[0]) if len(stamps_ns) else 0
         T_color_depth = se3.invert(tree.T_root_frame(color, at)) @ tree.T_root_frame(depth, at)
     T_camera_color = np.eye(4) if place.stream == "color" else se3.invert(T_color_depth)
     edges = []
-    for stamp, T_base_link in zip(stamps_ns, _links(episode, place, stamps_ns), strict=True):
+    for stamp, T_base_link in zip(stamps_ns, _links(place, stamps_ns, track), strict=True):
         T_base_color = T_base_link @ place.T_link_camera @ T_camera_color
         edges.append(_edge(color, T_base_color, int(stamp)))
         if color != depth:
@@ -215,11 +235,10 @@ def calibrated_tree(
 
 
 def _links(
-    episode: Episode, place: CameraPlace, stamps_ns: Int[np.ndarray, " num_frames"]
+    place: CameraPlace, stamps_ns: Int[np.ndarray, " num_frames"], track: PostureTrack | None
 ) -> list[np.ndarray]:
-    if place.fixed:
+    if track is None:
         return [np.eye(4)] * len(stamps_ns)
-    track = posture_track(episode)
     robot = load_robot(track.urdf)
     return [robot.T_base_link(place.link, track.at(int(stamp)).joints_rad) for stamp in stamps_ns]
 
@@ -233,9 +252,15 @@ def without_joints(
         EpisodeError: A camera in the hand, and no joint states.
         RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
-    if place.fixed:
+    return unknown_postures(None if place.fixed else posture_track(episode), stamps_ns)
+
+
+def unknown_postures(
+    track: PostureTrack | None, stamps_ns: Int[np.ndarray, " num_frames"]
+) -> frozenset[int]:
+    """Those of some instants around which a track has no joints, or what is no number."""
+    if track is None:
         return frozenset()
-    track = posture_track(episode)
     return frozenset(
         stamp
         for stamp in stamps_ns.tolist()
