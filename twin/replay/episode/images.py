@@ -5,9 +5,10 @@ and soft ones their nodes. Everything is drawn where cameras see it: the pose bi
 which put objects where the robot finds them, is taken back. An execution is seen from where the
 cameras were meanwhile. A plan is seen by the fixed cameras, and by those in the hand from where its
 own hand would have carried them: the recorded hand lags behind, and would get into their view.
+Cameras that were calibrated are where the calibration has them, the others where ``/tf`` does.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,12 +28,14 @@ from twin.replay.place.scene import ReplayScene
 from twin.replay.verdict.result import ReplayResult
 from twin.scene.draw.compose import carried_camera
 from twin.scene.frames.base import base_tree
+from twin.scene.frames.camera_poses import calibrated_tree_at
 from twin.scene.gaussians.cloud import GaussianCloud, concatenate
 from twin.scene.gaussians.moved import moved_cloud
 from twin.scene.gaussians.skin import Binding, bind, pose_cloud
 from twin.scene.objects.parts import read_objects, read_pose
 from twin.scene.raster.backend import open_rasteriser
 from twin.scene.robot.splats import posed, read_links
+from twin.scene.store.calibration import CameraPlace, read_calibration, without_joints
 from twin.scene.store.folder import SCENE_FILE, read_scene
 
 RATE_HZ = 5.0
@@ -102,17 +105,25 @@ def render_replay(
 
     Raises:
         PathNotFoundError: When the run was not rebuilt.
+        UnreadableCalibrationError: When ``calibration.json`` cannot be understood.
     """
     stage = _set_up(run, scene, result, correction)
     rasteriser = open_rasteriser()
-    tree = base_tree(episode)
+    tree, calibration = base_tree(episode), read_calibration(run)
+    places = {} if calibration is None else calibration.cameras
     for camera_id in streams.camera_ids(episode):
         info = streams.camera_info(episode, camera_id)
-        T_tcp_camera = _mounting(episode, tree, info.frame_id, result) if planned else None
-        for stamp_ns in _stamps(episode, camera_id, result, start_ns, executed=executed):
+        stamps = _stamps(episode, camera_id, result, start_ns, executed=executed)
+        seen = _Eye(tree=tree)
+        if camera_id in places:
+            seen = _calibrated(episode, camera_id, places[camera_id], stamps)
+        T_tcp_camera = _mounting(episode, seen.tree, info.frame_id, result) if planned else None
+        for stamp_ns in stamps:
+            if T_tcp_camera is None and stamp_ns in seen.lost_ns:
+                continue
             index = int(np.abs(result.stamps_ns - (stamp_ns - start_ns)).argmin())
             if T_tcp_camera is None:
-                T = tree.T_root_frame(info.frame_id, stamp_ns)
+                T = seen.tree.T_root_frame(info.frame_id, stamp_ns)
             else:
                 T = result.Ts_base_tcp[index] @ T_tcp_camera
             view = rasteriser.view(stage.at(result, scene, index), info.camera, T)
@@ -125,6 +136,26 @@ def render_replay(
                     data=encode_jpeg(view.image_u8()),
                 ),
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Eye:
+    """Where a camera was."""
+
+    tree: TransformTree
+    lost_ns: frozenset[int] = frozenset()
+    """Instants at which nobody knows."""
+
+
+def _calibrated(
+    episode: Episode, camera_id: str, place: CameraPlace, stamps: Sequence[int]
+) -> _Eye:
+    """A camera as it is mounted: objects were localised through it as it is."""
+    stamps_ns = np.array(stamps, dtype=np.int64)
+    return _Eye(
+        tree=calibrated_tree_at(episode, camera_id, place, stamps_ns),
+        lost_ns=without_joints(episode, place, stamps_ns),
+    )
 
 
 def _set_up(
@@ -181,5 +212,5 @@ def _mounting(
     """Where a camera sits in the hand; None for one that stands still."""
     if tree.root_of(frame_id) != BASE_FRAME:
         return None
-    T_base_camera = carried_camera(episode, frame_id, result.joints_rad[0])
+    T_base_camera = carried_camera(episode, frame_id, result.joints_rad[0], tree)
     return None if T_base_camera is None else se3.invert(result.Ts_base_tcp[0]) @ T_base_camera

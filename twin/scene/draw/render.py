@@ -16,13 +16,13 @@ from bridge.media.color import encode_png
 from bridge.task.robot import BASE_FRAME
 from twin.scene.draw.compose import carried_camera, compose
 from twin.scene.frames.base import base_tree
-from twin.scene.frames.pairs import paired_stamps_ns
+from twin.scene.frames.camera_poses import calibrated_tree_at
 from twin.scene.frames.stated import unknown_mask
 from twin.scene.frames.usable import name_of
 from twin.scene.raster.backend import open_rasteriser
 from twin.scene.raster.rasteriser import RasterConfig
 from twin.scene.settings import RenderConfig
-from twin.scene.store.calibration import calibrated_tree, read_calibration, without_joints
+from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import Scene, read_scene
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -152,8 +152,4 @@ def _tree_of(
     place = None if calibration is None else calibration.cameras.get(camera_id)
     if place is None:
         return base_tree(episode)
-    stamps = np.unique(np.append(paired_stamps_ns(episode, camera_id), stamp_ns))
-    lost = without_joints(episode, place, stamps)
-    return calibrated_tree(
-        episode, camera_id, place, np.array([t for t in stamps.tolist() if t not in lost])
-    )
+    return calibrated_tree_at(episode, camera_id, place, np.array([stamp_ns]))

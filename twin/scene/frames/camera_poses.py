@@ -15,6 +15,7 @@ from bridge.geometry import se3
 from bridge.terminal import Output
 from twin.scene.frames.base import base_tree
 from twin.scene.frames.odometry import CameraPath, TrackConfig, follow_camera
+from twin.scene.frames.pairs import paired_stamps_ns
 from twin.scene.frames.stated import FAR_NS, apart_s, unknown_mask
 from twin.scene.frames.usable import UnusableCameraError, name_of
 from twin.scene.settings import FrameConfig
@@ -134,6 +135,24 @@ def calibrated_poses(
         unposed_ns=without_joints(episode, place, stamps_ns),
         depth_scale=place.depth_scale,
     )
+
+
+def calibrated_tree_at(
+    episode: Episode,
+    camera_id: str,
+    place: CameraPlace,
+    stamps_ns: Int[np.ndarray, " num_stamps"],
+) -> TransformTree:
+    """Pose a calibrated camera at its images and at some more instants, where joints are known.
+
+    Raises:
+        EpisodeError: A camera in the hand, and no joint states.
+        RobotDescriptionError: A camera in the hand, and no usable robot description.
+    """
+    stamps = np.unique(np.concatenate([paired_stamps_ns(episode, camera_id), stamps_ns]))
+    lost = without_joints(episode, place, stamps)
+    known = np.array([t for t in stamps.tolist() if t not in lost], dtype=np.int64)
+    return calibrated_tree(episode, camera_id, place, known)
 
 
 def _say_unposed(

@@ -197,7 +197,9 @@ def calibrated_tree(
         EpisodeError: A camera in the hand, and no joint states.
         RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
-    color, depth = (streams.camera_info(episode, camera_id, s).frame_id for s in ("color", "depth"))
+    color = streams.camera_info(episode, camera_id).frame_id
+    has_depth = streams.find_camera_topic(episode, camera_id, "depth/info") is not None
+    depth = streams.camera_info(episode, camera_id, "depth").frame_id if has_depth else color
     track = None if place.fixed else posture_track(episode)
     return mounted_tree(place, (color, depth), streams.transform_tree(episode), stamps_ns, track)
 

@@ -35,6 +35,7 @@ from twin.replay.verdict.result import ReplayResult
 from twin.robot.model import load_robot
 from twin.scene.gaussians.cloud import GaussianCloud, as_float32
 from twin.scene.robot.splats import write_links
+from twin.scene.store.calibration import write_calibration
 from twin.scene.store.folder import background_hash, write_record
 from twin.scene.store.ply import write_ply
 
@@ -289,6 +290,75 @@ def test_a_toy_bends_with_its_nodes_wherever_the_robot_finds_it(
             expected = correction.as_seen(T) @ se3.invert(T)
             p_m = se3.apply(expected, moved).mean(axis=0)
             np.testing.assert_allclose(middle_of(view, RED), seen_at(T_BASE_SIDE, p_m), atol=2.0)
+
+
+def calibrate(run: RunFolder, **Ts_link_camera: tuple[str, np.ndarray]) -> None:
+    """Say of cameras where they are mounted."""
+    mounts = {}
+    for name, (link, T) in Ts_link_camera.items():
+        q, p = se3.split(T)
+        pose = {"p_m": p.tolist(), "q_wxyz": q.tolist()}
+        mounts[name] = {"link": link, "stream": "color", "T_link_camera": pose}
+    write_calibration(run, mounts, {})
+
+
+@pytest.mark.parametrize("planned", [False, True])
+def test_calibrated_cameras_see_from_where_the_calibration_has_them(
+    run: RunFolder, script: SimpleNamespace, *, planned: bool
+) -> None:
+    """As objects are localised: /tf says something else, which may be why it was calibrated."""
+    scene = script.scene()
+    write_scene(run, scene, "cube", block())
+    episode, result = write_recording(run, scene.urdf), result_of(scene, "cube")
+    robot = load_robot(scene.urdf)
+    T_side = T_BASE_SIDE @ se3.transform_from(np.array([0.99, 0.02, 0.05, 0.0]), np.zeros(3))
+    T_tcp_wrist = T_TCP_WRIST @ se3.transform_from(np.array([0.99, 0.1, 0.0, 0.0]), np.zeros(3))
+    T_tool_tcp = se3.invert(robot.T_base_link("tool0", HOME)) @ robot.T_base_tcp(HOME)
+    before = pictures(run, episode, result, scene, planned=planned)
+    calibrate(run, side=("base_link", T_side), wrist=("tool0", T_tool_tcp @ T_tcp_wrist))
+    images = pictures(run, episode, result, scene, planned=planned)
+    assert {name: list(found) for name, found in images.items()} == {
+        name: list(found) for name, found in before.items()
+    }
+    checked = 0
+    for t_ns, index in ((0, 0), (SECOND, 30), (2 * SECOND, 60)):
+        p_m = BIAS.as_seen(result.Ts_base_object["cube"][index])[:3, 3]
+        T_wrist = robot.T_base_tcp(result.joints_rad[index]) @ T_tcp_wrist
+        for name, T in (("side", T_side), ("wrist", T_wrist)):
+            if whole(expected := seen_at(T, p_m)):
+                found = middle_of(images[name][t_ns], RED)
+                np.testing.assert_allclose(found, expected, atol=1.5, err_msg=name)
+                checked += 1
+    assert checked >= 4
+
+
+def test_a_calibration_without_cameras_changes_no_picture(
+    run: RunFolder, script: SimpleNamespace
+) -> None:
+    scene = script.scene()
+    write_scene(run, scene, "cube", block())
+    episode, result = write_recording(run, scene.urdf), result_of(scene, "cube")
+    before = drawn(run, episode, result, scene)
+    write_calibration(run, {}, {"side": "never seen"})
+    assert drawn(run, episode, result, scene) == before
+
+
+def drawn(
+    run: RunFolder, episode: Episode, result: ReplayResult, scene: ReplayScene
+) -> list[tuple[str, int, bytes]]:
+    return [
+        (camera_id, image.stamp_ns, image.data)
+        for camera_id, image in render_replay(
+            run,
+            episode,
+            result,
+            scene,
+            start_ns=T0,
+            executed=True,
+            planned=True,
+            correction=BIAS,
+        )
+    ]
 
 
 def test_what_nobody_found_is_not_drawn_where_the_scan_had_it(
