@@ -13,7 +13,7 @@ from bridge.task.task_file import ObjectModel
 from twin.scene.gaussians.cloud import GaussianCloud, as_float32
 
 SPACING_M = 0.004
-GROWN_M = 0.01
+GROWN_M = 0.018
 """How far beyond the footprint holes are looked for."""
 TABLE_M = 0.008
 """Gaussians this near z = 0 are table."""

@@ -4,15 +4,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from bridge.geometry import se3
 from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.scene.gaussians.cloud import GaussianCloud
-from twin.scene.localise.colour import ColourConfig, likeness, linear_from_srgb
 from twin.scene.localise.fit import FitConfig, refine_on_points
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.objects.remains import Poses, with_halo
+from twin.scene.objects.remains import MIN_LIKENESS, Poses, alike, with_halo
 from twin.scene.shape.known import surface_distances
 from twin.scene.shape.reconstruct import ObjectShape
 
@@ -29,7 +28,7 @@ class SplitConfig:
     """Around the localised surface, coloured Gaussians are looked for to refine the pose."""
     margin_m: float = 0.006
     """Gaussians whose centre is nearer than this to the refined surface may belong to it."""
-    min_likeness: float = 0.35
+    min_likeness: float = MIN_LIKENESS
     """Near the table a Gaussian must also have the object's colour, see ``likeness``."""
     max_scale_m: float = 0.05
     """Larger Gaussians are background that happens to pass through."""
@@ -84,27 +83,18 @@ def owners(
         ids, distance = ids[small[ids]], distance[small[ids]]
         part = cloud.take(ids)
         height = part.means_m[:, 2].astype(np.float64)
-        alike = _alike(part, model, config)
+        colored = alike(part, model, config.min_likeness)
         if shape is None:
-            mine = (height > config.margin_m) | alike
+            mine = (height > config.margin_m) | colored
         else:
-            mine = (height > TABLE_BAND_M) | alike
+            mine = (height > TABLE_BAND_M) | colored
             mine &= np.maximum(distance, 0.0) < np.abs(height)
         # Of two surfaces that touch, the one of the Gaussian's own colour wins.
-        distance = np.abs(distance) + np.where(alike, 0.0, config.margin_m)
+        distance = np.abs(distance) + np.where(colored, 0.0, config.margin_m)
         wins = mine & (distance < nearest[ids])
         owner[ids[wins]] = index
         nearest[ids[wins]] = distance[wins]
     return with_halo(cloud, owner, poses, shapes)
-
-
-def _alike(
-    cloud: GaussianCloud, model: ObjectModel, config: SplitConfig
-) -> Bool[np.ndarray, " num_splats"]:
-    color_u8 = np.clip(np.rint(cloud.colors * 255), 0, 255).astype(np.uint8)
-    linear = linear_from_srgb(color_u8[None])[0]
-    like = likeness(linear, model.color_srgb, ColourConfig())
-    return np.asarray(like >= config.min_likeness)
 
 
 def _refined(
@@ -120,7 +110,7 @@ def _refined(
     if model.shape in ("mesh", SCANNED):
         return T_base_object
     ids, _ = _near(cloud, model, T_base_object, config.search_m, None)
-    ids = ids[_alike(cloud.take(ids), model, config)]
+    ids = ids[alike(cloud.take(ids), model, config.min_likeness)]
     if len(ids) < MIN_SPLATS_TO_REFINE:
         return T_base_object
     points = cloud.means_m[ids].astype(np.float64)

@@ -12,7 +12,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
+from bridge.task.task_file import ObjectModel, Task
 from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.localise.colour import ColourConfig, likeness, linear_from_srgb
 from twin.scene.shape.reconstruct import ObjectShape
 
 Poses = Mapping[str, Float[np.ndarray, "4 4"]]
@@ -24,6 +26,8 @@ STANDS_M = 0.008
 """Higher Gaussians are no table."""
 UNDER_M = 0.004
 """Table this near an object's surface is hidden by it."""
+MIN_LIKENESS = 0.35
+"""Of a Gaussian that has an object's colour."""
 
 
 def with_halo(
@@ -56,21 +60,42 @@ def with_halo(
 
 
 def hidden_table(
-    cloud: GaussianCloud, owner: Int[np.ndarray, " num_splats"], poses: Poses, shapes: Shapes
+    cloud: GaussianCloud,
+    owner: Int[np.ndarray, " num_splats"],
+    poses: Poses,
+    shapes: Shapes,
+    task: Task,
 ) -> Bool[np.ndarray, " num_splats"]:
-    """Tell which Gaussians of the table lie where an object stands: no camera saw them.
+    """Tell which Gaussians of the table nobody saw, or are a shifted object's: to be filled.
+
+    Those where an object stands, and around it those in its own colour. A table of that colour
+    loses nothing: the filling has it too.
 
     Args:
         cloud: As in ``with_halo``.
         owner: As in ``with_halo``; what belongs to an object is not asked.
         poses: Where the objects are.
         shapes: Reconstructed shapes in the frames of their objects.
+        task: Their colours.
     """
     on_top = cloud.means_m.astype(np.float64)
     on_top[:, 2] = np.maximum(on_top[:, 2], 0.0)  # below the table, the point above counts
     low = (owner < 0) & (cloud.means_m[:, 2] <= STANDS_M)
-    distance, _ = _nearest(cloud, poses, shapes, on_top)
-    return np.asarray(low & (distance < UNDER_M))
+    distance, nearest = _nearest(cloud, poses, shapes, on_top)
+    hidden = low & (distance < UNDER_M)
+    for number, key in enumerate(poses):
+        around = np.flatnonzero(low & ~hidden & (nearest == number) & (distance < HALO_M))
+        hidden[around] = alike(cloud.take(around), task.objects[key], MIN_LIKENESS)
+    return np.asarray(hidden)
+
+
+def alike(
+    cloud: GaussianCloud, model: ObjectModel, min_likeness: float
+) -> Bool[np.ndarray, " num_splats"]:
+    """Tell which Gaussians have an object's colour, see ``twin.scene.localise.colour.likeness``."""
+    color_u8 = np.clip(np.rint(cloud.colors * 255), 0, 255).astype(np.uint8)
+    linear = linear_from_srgb(color_u8[None])[0]
+    return np.asarray(likeness(linear, model.color_srgb, ColourConfig()) >= min_likeness)
 
 
 def _nearest(

@@ -82,7 +82,7 @@ def split_objects(
     for index, (key, T) in enumerate(poses.items()):
         part = moved_cloud(cloud.take(owner == index), se3.invert(T))
         objects[key] = ObjectSplats(cloud=part, T_base_object=T)
-    hidden = hidden_table(cloud, owner, poses, known)
+    hidden = hidden_table(cloud, owner, poses, known, task)
     background = cloud.take((owner < 0) & ~hidden)
     nothing = cloud.take(np.zeros(0, dtype=np.int64))
     filling = [fill_footprint(background, task.objects[key], T) for key, T in poses.items()]

@@ -79,7 +79,7 @@ def test_table_under_a_toy_is_dropped_and_filled_and_table_beside_it_is_kept(
     toy = toy_shifted(0.0)
     cloud = cloud_of(np.concatenate([toy, table]))
     given = owners(cloud, {"sloth": T}, TASK, {"sloth": shape})
-    hidden = hidden_table(cloud, given, {"sloth": T}, {"sloth": shape})[len(toy) :]
+    hidden = hidden_table(cloud, given, {"sloth": T}, {"sloth": shape}, TASK)[len(toy) :]
     stayed = given[len(toy) :] < 0
     assert hidden[stayed & (distance < 0.002)].all()
     assert not hidden[distance > 0.010].any()
@@ -106,4 +106,20 @@ def test_table_under_a_toy_is_dropped_and_filled_and_table_beside_it_is_kept(
 def test_without_a_reconstructed_shape_nothing_is_guessed() -> None:
     cloud = cloud_of(np.array([[0.48, -0.17, 0.0], [0.48, -0.17, -0.02]]))
     given = np.array([-1, -1])
-    assert not hidden_table(cloud, given, {"sloth": T}, {}).any()
+    assert not hidden_table(cloud, given, {"sloth": T}, {}, TASK).any()
+
+
+def test_what_a_shift_put_onto_the_table_in_the_toys_colour_is_dropped_too(
+    shape: ObjectShape,
+) -> None:
+    rng = np.random.default_rng(3)
+    table = np.column_stack([rng.uniform([0.36, -0.29], [0.60, -0.05], (9000, 2)), np.zeros(9000)])
+    distance = shape.sdf.distance(se3.apply(se3.invert(T), table))
+    ring = (distance > 0.005) & (distance < 0.014)
+    brown = tuple(c / 255 for c in SLOTH.color_srgb)
+    nobody = np.full(len(table), -1)
+    for color, dropped in ((WHITE, False), (brown, True)):
+        found = hidden_table(cloud_of(table, color), nobody, {"sloth": T}, {"sloth": shape}, TASK)
+        # Beyond the grid of distances they are lower bounds: some are farther away than they say.
+        assert (found[ring] == dropped).mean() > 0.97
+        assert not found[distance > 0.016].any()
