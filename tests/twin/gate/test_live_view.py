@@ -12,7 +12,8 @@ from bridge.episode.records import (
     string_to_cdr,
 )
 from bridge.episode.transcode import depth_to_compact
-from twin.scene.localise.live import KEPT_IMAGES, LiveView
+from twin.scene.localise.live import LiveView
+from twin.scene.localise.live_frames import KEPT_IMAGES
 
 
 def ready() -> LiveView:
