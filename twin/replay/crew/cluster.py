@@ -11,6 +11,7 @@ import socket
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -129,7 +130,7 @@ class RayRunner:
 def _connect(address: str, workers: int, folder: str | None) -> Any:
     settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address == LOCAL:
-        os.environ[TOKEN] = secrets.token_hex(32)
+        os.environ[TOKEN] = _own_token()
         os.environ.pop(TOKEN_PATH, None)
         os.environ.setdefault(NICENESS, "0")  # as processes without Ray have
         settings |= {"num_cpus": workers, "include_dashboard": False, "_temp_dir": folder}
@@ -155,6 +156,12 @@ def _connect(address: str, workers: int, folder: str | None) -> Any:
         )
         raise RayClusterError(message) from error
     return ray
+
+
+@cache
+def _own_token() -> str:
+    """The token of clusters started here: one for each process, which Ray reads only once."""
+    return secrets.token_hex(32)
 
 
 def _check_token() -> None:
