@@ -173,6 +173,8 @@ with RayRunner("local", 1) as runner:
 Path(sys.argv[2]).write_bytes(pickle.dumps(rows))
 import ray
 assert not ray.is_initialized()
+with RayRunner("local", 1):  # a second one of the same process
+    assert ray.is_initialized()
 """
 
 
