@@ -11,10 +11,11 @@ from scipy.spatial import cKDTree
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
 from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.objects.remains import HALO_M
 
 SPACING_M = 0.004
-GROWN_M = 0.018
-"""How far beyond the footprint holes are looked for."""
+GROWN_M = HALO_M + 0.003
+"""How far beyond the footprint holes are looked for: what is dropped reaches to the halo."""
 TABLE_M = 0.008
 """Gaussians this near z = 0 are table."""
 NEIGHBOURS = 12

@@ -65,6 +65,7 @@ def hidden_table(
     poses: Poses,
     shapes: Shapes,
     task: Task,
+    min_likeness: float = MIN_LIKENESS,
 ) -> Bool[np.ndarray, " num_splats"]:
     """Tell which Gaussians of the table nobody saw, or are a shifted object's: to be filled.
 
@@ -77,6 +78,7 @@ def hidden_table(
         poses: Where the objects are.
         shapes: Reconstructed shapes in the frames of their objects.
         task: Their colours.
+        min_likeness: Of a Gaussian in an object's own colour.
     """
     on_top = cloud.means_m.astype(np.float64)
     on_top[:, 2] = np.maximum(on_top[:, 2], 0.0)  # below the table, the point above counts
@@ -85,7 +87,7 @@ def hidden_table(
     hidden = low & (distance < UNDER_M)
     for number, key in enumerate(poses):
         around = np.flatnonzero(low & ~hidden & (nearest == number) & (distance < HALO_M))
-        hidden[around] = alike(cloud.take(around), task.objects[key], MIN_LIKENESS)
+        hidden[around] = alike(cloud.take(around), task.objects[key], min_likeness)
     return np.asarray(hidden)
 
 

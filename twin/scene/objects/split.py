@@ -75,6 +75,7 @@ def split_objects(
         shapes: Reconstructed at ``object_poses``; without one the task's shape decides, which for
             a toy is the box around it.
     """
+    config = SplitConfig() if config is None else config
     poses = object_poses(cloud, localised, task, config)
     known = {key: shape for key, shape in (shapes or {}).items() if isinstance(shape, ObjectShape)}
     owner = owners(cloud, poses, task, known, config)
@@ -82,7 +83,7 @@ def split_objects(
     for index, (key, T) in enumerate(poses.items()):
         part = moved_cloud(cloud.take(owner == index), se3.invert(T))
         objects[key] = ObjectSplats(cloud=part, T_base_object=T)
-    hidden = hidden_table(cloud, owner, poses, known, task)
+    hidden = hidden_table(cloud, owner, poses, known, task, config.min_likeness)
     background = cloud.take((owner < 0) & ~hidden)
     nothing = cloud.take(np.zeros(0, dtype=np.int64))
     filling = [fill_footprint(background, task.objects[key], T) for key, T in poses.items()]

@@ -9,7 +9,6 @@ from bridge.task.task_file import load_task
 from twin.scene.gaussians.cloud import GaussianCloud, as_float32
 from twin.scene.localise.surface import surface_of
 from twin.scene.objects.owners import owners
-from twin.scene.shape.from_mesh import shape_of_mesh
 from twin.scene.shape.known import pose_of
 from twin.scene.shape.reconstruct import ObjectShape
 
@@ -18,12 +17,6 @@ SLOTH = TASK.objects["sloth"]
 T = pose_of(np.array([0.48, -0.17, SLOTH.rest_height_m, 0.3]))
 WOOD = (150, 116, 84)
 """A table of nearly the sloth's own colour: colour alone cannot tell."""
-
-
-@pytest.fixture(scope="module")
-def shape() -> ObjectShape:
-    mesh = object_mesh(SLOTH)
-    return shape_of_mesh(mesh.vertices_m, mesh.triangles, mesh.vertices_m)
 
 
 @pytest.fixture(scope="module")

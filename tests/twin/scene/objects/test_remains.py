@@ -1,7 +1,6 @@
 """What is left on the table when an object is taken out: no outline of it, and no made-up table."""
 
 import numpy as np
-import pytest
 
 from bridge.geometry import se3
 from bridge.task.meshes.catalogue import object_mesh
@@ -12,7 +11,6 @@ from twin.scene.localise.surface import surface_of
 from twin.scene.objects.owners import owners
 from twin.scene.objects.remains import hidden_table
 from twin.scene.objects.split import split_objects
-from twin.scene.shape.from_mesh import shape_of_mesh
 from twin.scene.shape.known import pose_of
 from twin.scene.shape.reconstruct import ObjectShape
 
@@ -20,12 +18,6 @@ TASK = load_task("sloth_into_basket")
 SLOTH = TASK.objects["sloth"]
 T = pose_of(np.array([0.48, -0.17, SLOTH.rest_height_m, 0.3]))
 WHITE = (0.9, 0.9, 0.88)
-
-
-@pytest.fixture(scope="module")
-def shape() -> ObjectShape:
-    mesh = object_mesh(SLOTH)
-    return shape_of_mesh(mesh.vertices_m, mesh.triangles, mesh.vertices_m)
 
 
 def cloud_of(points_m: np.ndarray, color: tuple[float, float, float] = WHITE) -> GaussianCloud:
