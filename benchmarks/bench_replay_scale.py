@@ -70,14 +70,20 @@ def killed_and_resumed(run: Path, whole_s: float, *options: str) -> tuple[float,
     return spent_s + time.monotonic() - before, again
 
 
-def ray_start_s() -> float:
-    """How long a cluster on this machine takes to start and to stop [s]."""
-    from twin.replay.crew.cluster import RayRunner
+RAY_START = """
+import time
+from twin.replay.run.cluster import RayRunner
+before = time.monotonic()
+with RayRunner("local", 2):
+    pass
+print(time.monotonic() - before)
+"""
 
-    before = time.monotonic()
-    with RayRunner("local", 2):
-        pass
-    return time.monotonic() - before
+
+def ray_start_s() -> float:
+    """How long a replay waits for Ray to be imported, to start and to stop [s]."""
+    alone = [sys.executable, "-c", RAY_START]
+    return float(subprocess.run(alone, check=True, capture_output=True, cwd=ROOT).stdout)
 
 
 def measure(folder: Path, episodes: int) -> Sequence[Target]:

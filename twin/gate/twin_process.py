@@ -12,10 +12,10 @@ from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from bridge.terminal import Output
+from twin.crew.worker import Failed, Function, TimeIsUpError, Worker, WorkerDiedError
 from twin.gate.config import GateConfig
 from twin.gate.judge import UndecidedError
 from twin.gate.work import Look, Question, answer, get_ready, look
-from twin.replay.crew.worker import Failed, Function, TimeIsUpError, Worker, WorkerDiedError
 
 
 class TwinProcess:

@@ -1,9 +1,6 @@
 """Live many cases through at many points, in one process or several; the order changes nothing."""
 
-import multiprocessing
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 
 import numpy as np
@@ -12,20 +9,21 @@ from jaxtyping import Float
 from twin.calibrate.physics.case import Case, Prediction
 from twin.calibrate.physics.drive import predict
 from twin.calibrate.physics.parameters import PhysicsParameter, values_of
+from twin.crew.pool import Crew
+from twin.crew.worker import Failed
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 
-_State = tuple[Sequence[Case], Sequence[PhysicsParameter], PhysicsConfig, int]
-_state: list[_State] = []
-"""What this process of the pool works on; set once, because cases are large."""
+Piece = tuple[int, Case, Mapping[str, float], PhysicsConfig, int]
+"""Its number, and what ``predict`` takes."""
 
 
-class LostProcessError(TwinError):
-    """A process of the pool is gone, and with it what it was doing."""
+class LostPieceError(TwinError):
+    """A case could not be lived through, although it was tried again."""
 
 
 class Evaluator:
-    """Predictions of cases at points in units of the prior. A context manager: it owns a pool."""
+    """Predictions of cases at points in units of the prior. A context manager: it owns a crew."""
 
     def __init__(
         self,
@@ -36,7 +34,7 @@ class Evaluator:
         num_samples: int,
         workers: int = 1,
     ) -> None:
-        """Start the processes, where there is more than one.
+        """Have processes ready, where there is more than one.
 
         Args:
             cases: Everything that will be asked for.
@@ -46,17 +44,10 @@ class Evaluator:
             workers: Processes.
         """
         self.cases = list(cases)
-        self._args: _State = (self.cases, list(parameters), config, num_samples)
+        self._parameters = list(parameters)
+        self._config = config
         self.num_samples = num_samples
-        self._pool: ProcessPoolExecutor | None = None
-        if workers > 1:
-            # spawn: PyBullet and pinocchio hold memory that must not be forked.
-            self._pool = ProcessPoolExecutor(
-                max_workers=workers,
-                mp_context=multiprocessing.get_context("spawn"),
-                initializer=_begin,
-                initargs=(self._args,),
-            )
+        self._crew = Crew(workers) if workers > 1 else None
 
     def predict(
         self, points: Float[np.ndarray, "num_points num_parameters"], chosen: Sequence[int]
@@ -64,15 +55,20 @@ class Evaluator:
         """Predict the chosen cases, by their numbers, at every point.
 
         Raises:
-            LostProcessError: When a process was killed.
+            LostPieceError: When a case was begun again and its process died again.
         """
-        jobs = [(index, points[k]) for k in range(len(points)) for index in chosen]
-        if self._pool is None:
-            flat = [_predict(self._args, index, x) for index, x in jobs]
+        pairs = [(x, index) for x in points for index in chosen]
+        pieces = [self._piece(number, *pair) for number, pair in enumerate(pairs)]
+        if self._crew is None:
+            flat = [_predict(piece) for piece in pieces]
         else:
-            flat = _mapped(self._pool, jobs)
+            flat = _side_by_side(self._crew, pieces)
         size = len(chosen)
         return [flat[k * size : (k + 1) * size] for k in range(len(points))]
+
+    def _piece(self, number: int, x: Float[np.ndarray, " num_parameters"], index: int) -> Piece:
+        values = values_of(self._parameters, x)
+        return number, self.cases[index], values, self._config, self.num_samples
 
     def __enter__(self) -> "Evaluator":
         """Use as a context manager."""
@@ -84,33 +80,37 @@ class Evaluator:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """End the processes; what waits is not begun."""
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
+        """End the processes; what is being done is lost."""
+        if self._crew is not None:
+            self._crew.__exit__()
 
 
-def _mapped(
-    pool: ProcessPoolExecutor, jobs: Sequence[tuple[int, Float[np.ndarray, " num_parameters"]]]
-) -> list[Prediction]:
-    if not jobs:
-        return []
-    try:
-        return list(pool.map(_work, *zip(*jobs, strict=True)))
-    except BrokenProcessPool as error:
-        raise LostProcessError(
-            "a process that simulated was ended from outside, perhaps by a machine short of "
-            "memory, and nothing was written. Try again, with fewer --workers."
-        ) from error
+def _side_by_side(crew: Crew, pieces: Sequence[Piece]) -> list[Prediction]:
+    """Predict, and put the answers back into order."""
+    answers: dict[int, Prediction] = {}
+    for (number, case, *_), answer in crew.run(_predict, pieces, _cost):
+        if isinstance(answer, Failed):
+            raise _error_of(case, answer)
+        answers[number] = answer
+    return [answers[number] for number in range(len(pieces))]
 
 
-def _begin(state: _State) -> None:
-    _state[:] = [state]
+def _error_of(case: Case, failed: Failed) -> Exception:
+    """What to raise, as one process alone would have done; a bug keeps its trace."""
+    if not failed.known:
+        return RuntimeError(failed.trace)
+    return LostPieceError(
+        f"{case.episode} could not be simulated: {failed.message}. Nothing was written. Try again, "
+        "with fewer --workers."
+    )
 
 
-def _work(index: int, x: Float[np.ndarray, " num_parameters"]) -> Prediction:
-    return _predict(_state[0], index, x)
+def _cost(piece: Piece) -> float:
+    """Count the living-throughs."""
+    _, case, _, _, num_samples = piece
+    return 1.0 if case.success is None else 1.0 + num_samples
 
 
-def _predict(state: _State, index: int, x: Float[np.ndarray, " num_parameters"]) -> Prediction:
-    cases, parameters, config, num_samples = state
-    return predict(cases[index], values_of(parameters, x), config, num_samples)
+def _predict(piece: Piece) -> Prediction:
+    _, case, values, config, num_samples = piece
+    return predict(case, values, config, num_samples)

@@ -8,9 +8,9 @@ from bridge.episode.run import RunFolder
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
+from twin.crew.pool import Alone, Crew, Runner
+from twin.crew.worker import Failed
 from twin.replay.config import ReplayRunConfig
-from twin.replay.crew.pool import Alone, Crew, Runner
-from twin.replay.crew.worker import Failed
 from twin.replay.place.rebuilt import read_place, shape_hashes
 from twin.replay.run.prepare import Preparation, jobs_of
 from twin.replay.run.table import against_recorded, count_verdicts, executions_of, recorded_labels
@@ -73,7 +73,7 @@ def runner_for(config: ReplayRunConfig) -> Iterator[Runner]:
     """
     runner: Runner = Alone()
     if config.ray:
-        from twin.replay.crew.cluster import RayRunner  # noqa: PLC0415  # an extra
+        from twin.replay.run.cluster import RayRunner  # noqa: PLC0415  # an extra
 
         runner = RayRunner(config.ray, config.workers)
     elif config.workers > 1:

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import threading
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +15,10 @@ from bridge.sources.standin.probes import plan_probe
 from bridge.task.plan import Plan
 from bridge.task.robot import MAX_WIDTH_M, ur5_with_gripper_urdf
 from bridge.task.task_file import load_task
-from twin.calibrate.physics import drive
+from twin.calibrate.physics import drive, evaluate
 from twin.calibrate.physics.case import Case, Prediction, planar
 from twin.calibrate.physics.drive import gripper_only, predict
-from twin.calibrate.physics.evaluate import Evaluator, LostProcessError
+from twin.calibrate.physics.evaluate import Evaluator, LostPieceError
 from twin.calibrate.physics.fit import FitConfig, fit
 from twin.calibrate.physics.parameters import (
     FINGER_FRICTION,
@@ -182,14 +184,40 @@ def test_only_the_gripper_collides() -> None:
 
 
 @pytest.mark.slow
-def test_a_process_that_is_killed_ends_a_calibration_with_a_sentence(slide: Case) -> None:
-    """Memory ran out, say: Python's own word for it is a broken pool."""
-    with Evaluator(
-        [slide], rigid_parameters(CONFIG), CONFIG, num_samples=0, workers=2
-    ) as evaluator:
-        assert evaluator._pool is not None
-        os.kill(evaluator._pool.submit(os.getpid).result(), signal.SIGKILL)
-        # Enough that some of it is still to be done when the death is noticed.
-        points = np.zeros((100, 7))
-        with pytest.raises(LostProcessError, match=r"ended from outside.*fewer --workers"):
-            evaluator.predict(points, [0])
+def test_a_process_that_is_killed_while_it_simulates_costs_nothing(slide: Case) -> None:
+    """Whenever it is killed: the pool of the standard library waits for ever after some deaths."""
+    parameters = rigid_parameters(CONFIG)
+    points = np.zeros((12, len(parameters)))
+    points[:, 0] = np.linspace(-1, 1, len(points))
+    alone = Evaluator([slide], parameters, CONFIG, num_samples=0).predict(points, [0])
+    with Evaluator([slide], parameters, CONFIG, num_samples=0, workers=2) as evaluator:
+        evaluator.predict(points[:2], [0])
+        assert evaluator._crew is not None
+        first, second = [worker.pid for worker in evaluator._crew._idle]
+        assert first is not None
+        assert second is not None
+        os.kill(first, signal.SIGKILL)
+        killer = threading.Timer(0.05, os.kill, (second, signal.SIGKILL))
+        killer.start()
+        side = evaluator.predict(points, [0])
+        killer.join()
+    assert len(side) == len(alone)
+    for (one,), (other,) in zip(alone, side, strict=True):
+        np.testing.assert_array_equal(one.settled, other.settled)
+
+
+@pytest.mark.slow
+def test_a_case_no_process_survives_ends_a_calibration_with_a_sentence(
+    slide: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Memory runs out each time, say."""
+    monkeypatch.setattr(evaluate, "_predict", _die)
+    with (
+        Evaluator([slide], rigid_parameters(CONFIG), CONFIG, num_samples=0, workers=2) as evaluator,
+        pytest.raises(LostPieceError, match=r"SIGKILL.*2 times\. Nothing.*fewer --workers"),
+    ):
+        evaluator.predict(np.zeros((1, 7)), [0])
+
+
+def _die(piece: Any) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)

@@ -19,8 +19,8 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
+from twin.crew.pool import Alone, Crew
 from twin.replay.config import ReplayConfig, ReplayRunConfig
-from twin.replay.crew.pool import Alone, Crew
 from twin.replay.place.starts import StartState, StartStates
 from twin.replay.run import prepare, trajectories
 from twin.replay.run.executions import Execution, execution_of

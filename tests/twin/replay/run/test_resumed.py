@@ -19,11 +19,11 @@ from bridge.episode.records import string_to_cdr
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.task.record import parse_record
+from twin.crew.worker import Failed
 from twin.replay.config import ReplayConfig
-from twin.replay.crew import cluster
-from twin.replay.crew.cluster import RayClusterError, RayRunner, code_version, is_loopback
-from twin.replay.crew.worker import Failed
 from twin.replay.place.starts import StartState
+from twin.replay.run import cluster
+from twin.replay.run.cluster import RayClusterError, RayRunner, code_version, is_loopback
 from twin.replay.run.table import count_verdicts
 from twin.replay.run.text import describe_run
 from twin.replay.work.job import ReplayJob, row_of_existing
@@ -165,7 +165,7 @@ SCRIPT = """
 import pickle, sys
 from pathlib import Path
 from twin.replay.work.job import ReplayJob
-from twin.replay.crew.cluster import RayRunner
+from twin.replay.run.cluster import RayRunner
 from twin.replay.work.relive import run_job
 jobs = pickle.loads(Path(sys.argv[1]).read_bytes())
 with RayRunner("local", 1) as runner:
@@ -173,8 +173,12 @@ with RayRunner("local", 1) as runner:
 Path(sys.argv[2]).write_bytes(pickle.dumps(rows))
 import ray
 assert not ray.is_initialized()
-with RayRunner("local", 1):  # a second one of the same process
-    assert ray.is_initialized()
+deadly = "__import__('os').kill(__import__('os').getpid(), 9)"
+with RayRunner("local", 1) as runner:  # a second one of the same process
+    answers = dict(runner.run(eval, [deadly, *map(str, range(8))], len))
+assert [answers[str(number)] for number in range(8)] == list(range(8)), answers
+assert answers[deadly].known
+print(answers[deadly].message)
 """
 
 
@@ -197,6 +201,9 @@ def test_a_ray_cluster_makes_the_same_files(jobs: list[ReplayJob], tmp_path: Pat
         check=False,
     )
     assert done.returncode == 0, done.stderr
+    # What shared a task with the deadly piece came back all the same.
+    assert done.stdout.startswith("Ray lost it: ")
+    assert done.stdout.endswith(", 2 times\n")
     rows = {row["plan"]: row for row in pickle.loads((tmp_path / "rows").read_bytes())}
     assert set(rows) == {"a", "broken"}
     assert "in the frame 'world'" in rows["broken"]["error"]

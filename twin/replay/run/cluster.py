@@ -9,7 +9,7 @@ import os
 import secrets
 import socket
 import tempfile
-from collections import deque
+import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
@@ -17,20 +17,24 @@ from typing import Any, Protocol, runtime_checkable
 
 from bridge.episode import provenance
 from bridge.errors import GstError, MissingDependencyError, UsageError
+from twin.crew.pool import ATTEMPTS, Item, lost
+from twin.crew.worker import Answer, Failed, Function, do
 from twin.errors import TwinError
 from twin.physics.engine import ENGINE_VERSION
-from twin.replay.crew.pool import ATTEMPTS, Item, lost
-from twin.replay.crew.worker import Answer, Failed, Function, do
+from twin.replay.run.batches import Batches
 from twin.replay.work.job import REPLAY_VERSION
 
 LOCAL = "local"
 LOOPBACK = "127.0.0.1"
-WINDOW = 4
-"""Tasks per processor that are handed over before the first are back."""
+WINDOW = 2
+"""Tasks per processor that are handed over before the first are back: one waits while one runs."""
 MODE, TOKEN, TOKEN_PATH = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
 NICENESS = "RAY_worker_niceness"
 """Ray gives way to everything else on a machine (15) unless told otherwise."""
-ENVIRONMENT = (MODE, TOKEN, TOKEN_PATH, NICENESS)
+HIDDEN_LINES = "RAY_DEDUP_LOGS_SKIP_REGEX"
+"""Ray tells of each lost process on standard output, in the middle of what a program reads there;
+what was lost is in the answers."""
+ENVIRONMENT = (MODE, TOKEN, TOKEN_PATH, NICENESS, HIDDEN_LINES)
 ANSWER_S = 5.0
 """How long the head of a cluster may take to accept a connection."""
 TOKEN_FILE = Path(".ray") / "auth_token"
@@ -50,7 +54,7 @@ class NeedsPaths(Protocol):
 
 
 class RayRunner:
-    """Does pieces of work as Ray tasks; see ``twin.replay.crew.pool.Runner``."""
+    """Does pieces of work as Ray tasks; see ``twin.crew.pool.Runner``."""
 
     def __init__(self, address: str, workers: int) -> None:
         """Connect later.
@@ -90,24 +94,33 @@ class RayRunner:
     def run(
         self, function: Function, items: Sequence[Item], cost: Callable[[Item], float]
     ) -> Iterator[tuple[Item, Answer | Failed]]:
-        """See ``Runner``. A task whose process or node dies is tried once more by Ray itself."""
+        """See ``Runner``. What shared a task with work that lost its node is done again alone.
+
+        Alone it is tried once more by Ray itself.
+        """
         ray = self._ray
-        task = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_task)
-        todo = deque(sorted(items, key=cost, reverse=True))
-        window = WINDOW * max(1, int(ray.cluster_resources().get("CPU", 1)))
-        running: dict[Any, Item] = {}
+        processors = max(1, int(ray.cluster_resources().get("CPU", 1)))
+        todo = Batches(items, cost, processors)
+        running: dict[Any, list[Item]] = {}
         while todo or running:
-            while todo and len(running) < window:
-                item = todo.popleft()
-                running[task.remote(function, item, code_version())] = item
+            while todo and len(running) < WINDOW * processors:
+                batch = todo.take()
+                task = ray.remote(_tasks).options(
+                    num_cpus=1, max_retries=ATTEMPTS - 1 if len(batch) == 1 else 0
+                )
+                running[task.remote(function, batch, code_version())] = batch
             done, _ = ray.wait(list(running), num_returns=1)
             for reference in done:
-                item = running.pop(reference)
+                batch = running.pop(reference)
                 try:
-                    answer = ray.get(reference)
+                    answers, seconds = ray.get(reference)
+                    todo.learn(batch, seconds)
                 except ray.exceptions.RayError as error:
-                    answer = lost(f"Ray lost it: {_first_line(error)}")
-                yield item, answer
+                    if len(batch) > 1:
+                        todo.again(batch)
+                        continue
+                    answers = [lost(f"Ray lost it: {_first_line(error)}")]
+                yield from zip(batch, answers, strict=True)
 
     def __exit__(self, *_: object) -> None:
         """Leave; a cluster started here ends, any other one goes on."""
@@ -142,6 +155,7 @@ def _connect(address: str, workers: int, folder: str | None) -> Any:
         settings["_node_ip_address"] = LOOPBACK
     os.environ[MODE] = "token"
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault(HIDDEN_LINES, ".*")
     try:
         import ray  # noqa: PLC0415  # seconds, and only with --ray
     except ImportError as error:
@@ -220,6 +234,15 @@ def code_version() -> str:
     """What decides the bytes of a replay, besides its job."""
     about = provenance.software()
     return f"{about['version']}, replays {REPLAY_VERSION}, {ENGINE_VERSION}"
+
+
+def _tasks(
+    function: Function, items: Sequence[Any], version: str
+) -> tuple[list[Answer | Failed], float]:
+    """Do pieces of work on some node, one after another, and say how long all took [s]."""
+    before = time.monotonic()
+    answers = [_task(function, item, version) for item in items]
+    return answers, time.monotonic() - before
 
 
 def _task(function: Function, item: Any, version: str) -> Answer | Failed:

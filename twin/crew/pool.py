@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
-from twin.replay.crew.worker import Answer, Failed, Function, Worker, WorkerDiedError, do
+from twin.crew.worker import Answer, Failed, Function, Worker, WorkerDiedError, do
 
 ATTEMPTS = 2
 Item = TypeVar("Item")
@@ -133,4 +133,4 @@ class Crew:
 
 def lost(reason: str) -> Failed:
     """What a piece comes to whose process died each time."""
-    return Failed(message=f"{reason}, {ATTEMPTS} times; its work is left out", known=True)
+    return Failed(message=f"{reason}, {ATTEMPTS} times", known=True)

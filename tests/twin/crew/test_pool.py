@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from twin.replay.crew.pool import ATTEMPTS, Alone, Crew
-from twin.replay.crew.worker import Failed, TimeIsUpError, Worker, WorkerDiedError
+from twin.crew.pool import ATTEMPTS, Alone, Crew
+from twin.crew.worker import Failed, TimeIsUpError, Worker, WorkerDiedError
 
 KILL_ITSELF = "__import__('os').kill(__import__('os').getpid(), 9)"
 
@@ -102,14 +102,14 @@ def test_processes_have_one_thread_each_and_this_one_keeps_its_settings(
 def test_processes_end_with_their_owner_also_when_it_is_killed() -> None:
     code = (
         "import os, sys\n"
-        "from twin.replay.crew.pool import Crew\n"
+        "from twin.crew.pool import Crew\n"
         "if __name__ == '__main__':\n"
         "    crew = Crew(1)\n"
         "    ((_, pid),) = crew.run(eval, ['__import__(\"os\").getpid()'], len)\n"
         "    print(pid, flush=True)\n"
         "    sys.stdin.read()\n"
     )
-    root = Path(__file__).parents[4]
+    root = Path(__file__).parents[3]
     owner = subprocess.Popen(
         [sys.executable, "-c", code],
         stdin=subprocess.PIPE,

@@ -1,0 +1,1 @@
+"""Processes that do pieces of work, and may die without harm."""
