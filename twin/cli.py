@@ -32,8 +32,8 @@ def replay(
         output: How to talk.
     """
     from bridge.episode.run import RunFolder
+    from twin.replay.run.start import replay_run
     from twin.replay.run.text import describe_run
-    from twin.replay.run.trajectories import replay_run
 
     summary = replay_run(RunFolder.open(run), config, output)
     output.result(summary, describe_run(summary))

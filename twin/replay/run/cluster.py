@@ -20,9 +20,7 @@ from bridge.errors import GstError, MissingDependencyError, UsageError
 from twin.crew.pool import ATTEMPTS, Item, lost
 from twin.crew.worker import Answer, Failed, Function, do
 from twin.errors import TwinError
-from twin.physics.engine import ENGINE_VERSION
 from twin.replay.run.batches import Batches
-from twin.replay.work.job import REPLAY_VERSION
 
 LOCAL = "local"
 LOOPBACK = "127.0.0.1"
@@ -65,6 +63,7 @@ class RayRunner:
         """
         self._address, self._workers = address, workers
         self._ray: Any = None
+        self._first: list[Any] = []
         self._before: dict[str, str | None] = {}
         self._folder: tempfile.TemporaryDirectory[str] | None = None
 
@@ -89,6 +88,9 @@ class RayRunner:
         except BaseException:
             self._restore()
             raise
+        # Ray starts processes with the first tasks: they import while this process does.
+        first = self._ray.remote(num_cpus=1)(code_version)
+        self._first = [first.remote() for _ in range(self._processors())]
         return self
 
     def run(
@@ -99,16 +101,16 @@ class RayRunner:
         Alone it is tried once more by Ray itself.
         """
         ray = self._ray
-        processors = max(1, int(ray.cluster_resources().get("CPU", 1)))
+        processors = self._processors()
+        task = ray.remote(num_cpus=1)(_tasks)
         todo = Batches(items, cost, processors)
         running: dict[Any, list[Item]] = {}
         while todo or running:
             while todo and len(running) < WINDOW * processors:
                 batch = todo.take()
-                task = ray.remote(_tasks).options(
-                    num_cpus=1, max_retries=ATTEMPTS - 1 if len(batch) == 1 else 0
-                )
-                running[task.remote(function, batch, code_version())] = batch
+                retries = ATTEMPTS - 1 if len(batch) == 1 else 0
+                one = task.options(max_retries=retries)
+                running[one.remote(function, batch, code_version())] = batch
             done, _ = ray.wait(list(running), num_returns=1)
             for reference in done:
                 batch = running.pop(reference)
@@ -122,9 +124,13 @@ class RayRunner:
                     answers = [lost(f"Ray lost it: {_first_line(error)}")]
                 yield from zip(batch, answers, strict=True)
 
+    def _processors(self) -> int:
+        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
     def __exit__(self, *_: object) -> None:
         """Leave; a cluster started here ends, any other one goes on."""
         if self._ray is not None:
+            self._first.clear()
             self._ray.shutdown()
             self._ray = None
         self._restore()
@@ -232,6 +238,10 @@ def is_loopback(address: str) -> bool:
 
 def code_version() -> str:
     """What decides the bytes of a replay, besides its job."""
+    # A second, while which processes of a cluster start.
+    from twin.physics.engine import ENGINE_VERSION  # noqa: PLC0415
+    from twin.replay.work.job import REPLAY_VERSION  # noqa: PLC0415
+
     about = provenance.software()
     return f"{about['version']}, replays {REPLAY_VERSION}, {ENGINE_VERSION}"
 

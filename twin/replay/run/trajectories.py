@@ -1,14 +1,13 @@
 """Replay every trajectory of a run: each plan as planned, each execution as recorded."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 from bridge.episode.run import RunFolder
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
-from twin.crew.pool import Alone, Crew, Runner
+from twin.crew.pool import Runner
 from twin.crew.worker import Failed
 from twin.replay.config import ReplayRunConfig
 from twin.replay.place.rebuilt import read_place, shape_hashes
@@ -20,8 +19,16 @@ from twin.replay.work.relive import run_job
 from twin.scene.store.folder import SCENE_FILE, read_record, scene_hash_of
 
 
-def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[str, Any]:
+def replay_trajectories(
+    run: RunFolder, config: ReplayRunConfig, output: Output, runner: Runner
+) -> dict[str, Any]:
     """Replay all trial episodes of a run; replays that are there already are kept.
+
+    Args:
+        run: Whose episodes are replayed, and whose ``derived`` folder gets the replays.
+        config: Settings.
+        output: How to talk.
+        runner: What does the work.
 
     Returns:
         ``rows`` (one per trajectory), ``counts`` per trajectory and mode, ``skipped_episodes``
@@ -32,24 +39,23 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
         PathNotFoundError: When pictures are asked for and no scene was rebuilt.
     """
     scene_hash = _scene_hash(run, config, output)
-    with runner_for(config) as runner:
-        jobs, skipped = _all_jobs(run, scene_hash, config, runner, output)
-        _say_what_is_missing(run, jobs, output)
-        if config.render:
-            tasks = sorted({job.task for job in jobs})
-            for remark in describe_undrawn(read_record(run) or {}, tasks):
-                output.say(remark)
-        rows, todo = _there_already(jobs, config)
-        run.derived_dir.mkdir(parents=True, exist_ok=True)  # Ray asks each node whether it is there
-        told: set[tuple[str, str, str]] = set()  # one cause spoils all replays of a plan
-        with output.progress("replay", len(todo)) as advance:
-            for done, row in enumerate(_replayed(todo, runner, output), start=1):
-                rows.append(row)
-                advance(done, f"{row['episode']} {row['trajectory']} {row['mode']}")
-                what = (row["episode"], row["plan"], row["error"])
-                if row["error"] and what not in told:
-                    told.add(what)
-                    output.say(f"{row['episode']} {row['plan']}: {row['error']}")
+    jobs, skipped = _all_jobs(run, scene_hash, config, runner, output)
+    _say_what_is_missing(run, jobs, output)
+    if config.render:
+        tasks = sorted({job.task for job in jobs})
+        for remark in describe_undrawn(read_record(run) or {}, tasks):
+            output.say(remark)
+    rows, todo = _there_already(jobs, config)
+    run.derived_dir.mkdir(parents=True, exist_ok=True)  # Ray asks each node whether it is there
+    told: set[tuple[str, str, str]] = set()  # one cause spoils all replays of a plan
+    with output.progress("replay", len(todo)) as advance:
+        for done, row in enumerate(_replayed(todo, runner, output), start=1):
+            rows.append(row)
+            advance(done, f"{row['episode']} {row['trajectory']} {row['mode']}")
+            what = (row["episode"], row["plan"], row["error"])
+            if row["error"] and what not in told:
+                told.add(what)
+                output.say(f"{row['episode']} {row['plan']}: {row['error']}")
     rows.sort(key=lambda row: (row["episode"], row["plan"], row["trajectory"], row["mode"]))
     executions = executions_of(rows, recorded_labels(run, sorted({row["episode"] for row in rows})))
     return {
@@ -61,25 +67,6 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
         "skipped_episodes": skipped,
         "rows": rows,
     }
-
-
-@contextmanager
-def runner_for(config: ReplayRunConfig) -> Iterator[Runner]:
-    """Open what does the work: this process, several, or a Ray cluster.
-
-    Raises:
-        UsageError: When Ray has no token to show.
-        TwinError: When the cluster cannot be reached.
-    """
-    runner: Runner = Alone()
-    if config.ray:
-        from twin.replay.run.cluster import RayRunner  # noqa: PLC0415  # an extra
-
-        runner = RayRunner(config.ray, config.workers)
-    elif config.workers > 1:
-        runner = Crew(config.workers)
-    with runner:
-        yield runner
 
 
 def _all_jobs(

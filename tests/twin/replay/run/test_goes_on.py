@@ -23,8 +23,8 @@ from bridge.terminal import Output
 from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.place.starts import StartState, StartStates
 from twin.replay.run import prepare
+from twin.replay.run.start import replay_run
 from twin.replay.run.text import describe_run
-from twin.replay.run.trajectories import replay_run
 from twin.scene.localise.episode import Phase
 
 T0 = 1_700_000_000_000_000_000

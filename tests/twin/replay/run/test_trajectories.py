@@ -24,9 +24,9 @@ from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.place.starts import StartState, StartStates
 from twin.replay.run import prepare, trajectories
 from twin.replay.run.executions import Execution, execution_of
+from twin.replay.run.start import replay_run
 from twin.replay.run.table import count_verdicts
 from twin.replay.run.text import describe_run
-from twin.replay.run.trajectories import replay_run
 from twin.replay.verdict.result import ReplayResult
 from twin.replay.work import relive
 from twin.replay.work.job import ReplayJob, divergence_of, row_of_failure

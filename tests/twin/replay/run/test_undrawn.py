@@ -8,7 +8,7 @@ from bridge.episode.run import RunFolder
 from bridge.errors import PathNotFoundError
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
-from twin.replay.run.trajectories import replay_run
+from twin.replay.run.start import replay_run
 from twin.replay.run.undrawn import describe_undrawn
 
 

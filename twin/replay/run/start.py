@@ -1,0 +1,41 @@
+"""Open what does the work, and import what the work needs while that starts."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from bridge.episode.run import RunFolder
+from bridge.terminal import Output
+from twin.crew.pool import Alone, Crew, Runner
+from twin.replay.config import ReplayRunConfig
+
+
+def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[str, Any]:
+    """Replay all trial episodes of a run on what the settings ask for.
+
+    See ``twin.replay.run.trajectories.replay_trajectories``, and what ``runner_for`` raises.
+    """
+    with runner_for(config) as runner:
+        # A second, in which a cluster starts its processes.
+        from twin.replay.run.trajectories import replay_trajectories  # noqa: PLC0415
+
+        return replay_trajectories(run, config, output, runner)
+
+
+@contextmanager
+def runner_for(config: ReplayRunConfig) -> Iterator[Runner]:
+    """Open what does the work: this process, several, or a Ray cluster.
+
+    Raises:
+        UsageError: When Ray has no token to show.
+        TwinError: When the cluster cannot be reached.
+    """
+    runner: Runner = Alone()
+    if config.ray:
+        from twin.replay.run.cluster import RayRunner  # noqa: PLC0415  # an extra
+
+        runner = RayRunner(config.ray, config.workers)
+    elif config.workers > 1:
+        runner = Crew(config.workers)
+    with runner:
+        yield runner
