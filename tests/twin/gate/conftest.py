@@ -1,4 +1,4 @@
-"""Lets the tests of the gate import the module ``live_cell`` that lies beside them."""
+"""Lets the tests of the gate import the modules that lie beside them."""
 
 import sys
 from pathlib import Path

@@ -1,0 +1,101 @@
+"""Fakes for eyes, localisation and replay, and a gate between them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from bridge.task.plan import Plan, Stage, Waypoint
+from bridge.task.task_file import load_task
+from bridge.task.verdict import Factor, Verdict
+from twin.gate.config import GateConfig
+from twin.gate.judge import Gate
+
+TASK = load_task("cube_into_box")
+URDF = '<?xml version="1.0"?><robot xmlns:x="y" name="ur5_parallel_gripper"><link/></robot>'
+PLAN = Plan(
+    id="plan_1",
+    planner="scripted",
+    policy="scripted",
+    condition="without_replanning",
+    robot="ur5_parallel_gripper",
+    frame="base_link",
+    instruction="Put the red cube into the box.",
+    task="cube_into_box",
+    stages=(Stage(id="grasp", text="Grasp the cube."),),
+    tau=(Waypoint(t_ns=0, p_m=(0.4, 0.0, 0.3), q_wxyz=(1.0, 0.0, 0.0, 0.0), g=0),),
+)
+
+
+@dataclass
+class FakeEyes:
+    description: str | None = URDF
+    running: str | None = None
+    heard: int = 1
+    seen: list[Any] = field(default_factory=lambda: [SimpleNamespace(stamp_ns=1)])
+    reasons: list[str] = field(default_factory=lambda: ["side: silent for 9.0 s"])
+
+    def urdf(self) -> str | None:
+        return self.description
+
+    def executing(self) -> str | None:
+        return self.running
+
+    def newest_ns(self) -> int:
+        return 42
+
+    def heard_ns(self) -> int:
+        return self.heard
+
+    def frames(self, **_: Any) -> Any:
+        return SimpleNamespace(frames=self.seen, reasons=self.reasons)
+
+
+def found(**missing: str) -> dict[str, Any]:
+    return {
+        name: SimpleNamespace(
+            found=name not in missing, reason=missing.get(name), T_base_object=np.eye(4)
+        )
+        for name in TASK.objects
+    }
+
+
+def accept(plan: Plan, *_: Any) -> Verdict:
+    yes = Factor(value=True)
+    return Verdict(
+        plan_id=plan.id,
+        trajectory="planned",
+        mode="dynamic",
+        ik=yes,
+        clearance=yes,
+        terminal=yes,
+        engine="fake 1",
+        seed=0,
+    )
+
+
+def gate_with(
+    eyes: FakeEyes | None = None,
+    localise: Callable[..., Any] = lambda *_: found(),
+    replay: Callable[..., Verdict] = accept,
+    now_ns: Callable[[], int] = lambda: 0,
+    **settings: Any,
+) -> Gate:
+    config = GateConfig(**{"deadline_s": 5.0, "frame_wait_s": 0.0, **settings})
+    return Gate(
+        task=TASK,
+        config=config,
+        eyes=eyes or FakeEyes(),
+        localise=localise,
+        replay=replay,
+        now_ns=now_ns,
+    )
+
+
+def raising(error: Exception) -> Callable[..., Any]:
+    def call(*_: Any) -> Any:
+        raise error
+
+    return call
