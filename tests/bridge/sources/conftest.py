@@ -10,6 +10,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from rtde_server import RtdeServer, counting_state
+
 from bridge.episode.run import RunFolder
 from bridge.record.control import serve_control
 from bridge.record.recorder import Recorder
@@ -28,6 +30,12 @@ class Joined(NamedTuple):
 
     def episode_path(self, name: str) -> Path:
         return self.run.episodes_dir / f"{name}.mcap"
+
+
+@pytest.fixture
+def server() -> Iterator[RtdeServer]:
+    with RtdeServer(counting_state) as made:
+        yield made
 
 
 @pytest.fixture

@@ -33,6 +33,21 @@ FORMATS = {"DOUBLE": "d", "VECTOR6D": "6d", "INT32": "i", "UINT64": "Q", "UINT32
 State = Callable[[int], dict[str, object]]
 
 
+def counting_state(number: int) -> dict[str, object]:
+    """What the robot does: every value tells the sample it belongs to."""
+    return {
+        "actual_q": [number * 1e-3 + joint for joint in range(6)],
+        "actual_qd": [0.125] * 6,
+        "target_q": [number * 1e-3 + joint + 0.5 for joint in range(6)],
+        "actual_TCP_pose": [0.1, 0.2, 0.3, 0.0, 0.0, number * 1e-3],
+        "actual_TCP_force": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
+        "speed_scaling": 1.0 if number < 250 else 0.25,
+        "robot_mode": 7,
+        "safety_mode": 1 if number < 250 else 3,
+        "actual_digital_output_bits": int(number >= 250),
+    }
+
+
 @dataclass
 class RtdeServer:
     """Serves one client after another until closed; every choice is an attribute."""
