@@ -5,30 +5,25 @@ camera measured is carried into them instead.
 """
 
 from collections.abc import Sequence
-from itertools import product
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
 from twin.scene.frames.thumb import Thumb, meet
-from twin.scene.learn.pose_check import (
-    AXES,
-    CLEARLY_BETTER,
-    GOOD,
-    MIN_OVERLAP,
-    ORDERS,
-    SOLID_OVERLAP,
-    Convention,
+from twin.scene.learn.convention import OTHER_POSES
+from twin.scene.learn.pose_report import (
     PoseReport,
+    Score,
+    best_of,
+    is_clearly_better,
+    plain_report,
+    score_of,
 )
 
 MAX_OTHERS = 12
 """Images of other cameras that are carried over."""
-READINGS = tuple(
-    Convention(order=order, inverse=inverse, axes=axes)
-    for order, inverse, axes in product(ORDERS, (False, True), AXES)
-)
 
 
 def check_between(own: Sequence[Thumb], others: Sequence[Thumb]) -> PoseReport:
@@ -47,35 +42,19 @@ def check_between(own: Sequence[Thumb], others: Sequence[Thumb]) -> PoseReport:
     chosen = [others[int(place)] for place in places]
     if first is None or not chosen:
         return PoseReport(num_pairs=0, agreement=None, overlap=0.0)
-    recorded, overlap = _seen_alike(first, chosen, first.T_base_depth)
-    meets = overlap >= MIN_OVERLAP
-    plain = PoseReport(
-        num_pairs=len(chosen), agreement=recorded if meets else None, overlap=overlap
-    )
-    if meets and recorded >= GOOD:
+    T_base_first = first.T_base_depth
+    recorded = _seen_alike(first, chosen, T_base_first)
+    plain = plain_report(len(chosen), recorded)
+    if plain.is_sure:
         return plain
-    scored = []
-    for reading in READINGS[1:]:
-        agreement, share = _seen_alike(first, chosen, reading.read(first.T_base_depth))
-        scored.append((agreement if share >= SOLID_OVERLAP else 0.0, reading))
-    score, better = max(scored, key=lambda item: item[0])
-    if score < GOOD or (meets and score < recorded + CLEARLY_BETTER):
-        return plain
-    return PoseReport(
-        num_pairs=len(chosen),
-        agreement=recorded,
-        overlap=overlap,
-        better=better,
-        better_agreement=score,
+    better, score = best_of(
+        OTHER_POSES, lambda reading: _seen_alike(first, chosen, reading.read(T_base_first))
     )
+    if not is_clearly_better(score, plain):
+        return plain
+    return replace(plain, agreement=recorded.agreement, better=better, better_agreement=score)
 
 
-def _seen_alike(
-    own: Thumb, others: Sequence[Thumb], T_base_own: Float[np.ndarray, "4 4"]
-) -> tuple[float, float]:
-    """Agreement and overlap of all others; they count by their overlap."""
+def _seen_alike(own: Thumb, others: Sequence[Thumb], T_base_own: Float[np.ndarray, "4 4"]) -> Score:
     T_own_base = se3.invert(T_base_own)
-    met = [meet(other, own, T_own_base @ other.T_base_depth) for other in others]
-    total = sum(item.overlap for item in met)
-    agreed = sum(item.agreement * item.overlap for item in met)
-    return (agreed / total if total > 0 else 0.0), total / len(others)
+    return score_of([meet(other, own, T_own_base @ other.T_base_depth) for other in others])

@@ -12,14 +12,13 @@ from twin.scene.frames.points import NEAR_M
 from twin.scene.frames.thumb import Thumb
 from twin.scene.learn.between_cameras import check_between
 from twin.scene.learn.pose_check import (
-    GOOD,
     STILL_AGREEMENT,
     MovedCameraError,
     PoseConventionError,
-    PoseReport,
     check_poses,
     still_agreement,
 )
+from twin.scene.learn.pose_report import GOOD, PoseReport
 from twin.scene.settings import FrameConfig
 
 FEW_FRAMES = 5

@@ -12,7 +12,8 @@ from bridge.geometry import se3
 from twin.scene.frames.choice import choose_frames, find_sources
 from twin.scene.frames.thumb import Thumb, thumb_of
 from twin.scene.learn.between_cameras import check_between
-from twin.scene.learn.pose_check import BODY_AXES, FLIP_YZ, PoseConventionError
+from twin.scene.learn.convention import BODY_AXES, FLIP_YZ
+from twin.scene.learn.pose_check import PoseConventionError
 from twin.scene.learn.scan_check import CameraCheck, check_scan
 from twin.scene.settings import FrameConfig
 

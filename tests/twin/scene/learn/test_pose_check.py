@@ -9,7 +9,8 @@ import textured_room
 
 from bridge.geometry import se3
 from twin.scene.frames.thumb import Thumb, meet, thinned_camera, thumb_of
-from twin.scene.learn.pose_check import BODY_AXES, FLIP_YZ, check_poses
+from twin.scene.learn.convention import BODY_AXES, FLIP_YZ
+from twin.scene.learn.pose_check import check_poses
 
 NUM_FRAMES = 10
 
