@@ -175,7 +175,4 @@ def _static(path: Path, correction: Correction) -> StaticSdf | None:
 @lru_cache(maxsize=2)
 def _load_static(path: Path, mtime_ns: int, correction: Correction) -> StaticSdf:
     """One and the same grid each time: what is derived from it is remembered by its identity."""
-    found = StaticSdf.load(path)
-    if not np.isfinite(found.observed.values_m).all():
-        raise UnreadableArraysError(path=path, found="a distance is no number")
-    return correction.static(found)
+    return correction.static(StaticSdf.load(path))

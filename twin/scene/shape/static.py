@@ -104,6 +104,8 @@ class StaticSdf:
         values, state = found["observed_m"], found["state"]
         if not values.shape == state.shape == grid.values_m.shape or state.dtype != np.uint8:
             raise UnreadableArraysError(path=path, found="grids of different sizes")
+        if not np.isfinite(values).all():
+            raise UnreadableArraysError(path=path, found="a distance is no number")
         table = float(found["table_z_m"])
         return StaticSdf(
             conservative=grid,

@@ -1,5 +1,6 @@
 """The static scene's distances: from training views to the file in the scene folder."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cast_views
@@ -15,6 +16,7 @@ from twin.scene.shape.from_training import (
 )
 from twin.scene.shape.known import pose_of, surface_distances
 from twin.scene.shape.masked_view import ShapeError
+from twin.scene.shape.npz import UnreadableArraysError
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import FREE, SURFACE, UNSEEN, StaticConfig, StaticSdf, static_sdf
 
@@ -71,6 +73,18 @@ def test_the_static_scene_is_read_back_and_described(static: StaticSdf, tmp_path
     about = static.to_record()
     assert about["free"] + about["surface"] + about["unseen"] == pytest.approx(1.0, abs=1e-3)
     assert about["truncation_m"] == pytest.approx(3 * about["voxel_m"])
+
+
+def test_an_observed_distance_that_is_no_number_is_refused(
+    static: StaticSdf, tmp_path: Path
+) -> None:
+    """No check of clearance fails on it: whoever read it would take the place for free."""
+    values = static.observed.values_m.copy()
+    values[1, 1, 1] = np.nan
+    damaged = replace(static, observed=replace(static.observed, values_m=values))
+    damaged.save(tmp_path / "sdf.npz")
+    with pytest.raises(UnreadableArraysError, match="a distance is no number"):
+        StaticSdf.load(tmp_path / "sdf.npz")
 
 
 def test_a_budget_of_voxels_makes_them_larger(views: list[TrainingView]) -> None:
