@@ -1,6 +1,7 @@
 """Measure everything that follows from trial rows alone, wherever they came from."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from evaluator.compare.cells import agreement_intervals, cell_agreement
 from evaluator.compare.decisions import decisions
@@ -9,7 +10,7 @@ from evaluator.compare.gains import gain_tests, replanning_gains
 from evaluator.compare.measure import refuse_alike
 from evaluator.compare.pairing import pair_starts, paired_gain, start_distances
 from evaluator.compare.remarks import remarks, remarks_table
-from evaluator.compare.rows import Comparison, TrialRow
+from evaluator.compare.rows import Comparison, RateCell, TrialRow, is_streamed
 from evaluator.compare.stages import failures_table, stage_results
 from evaluator.compare.success import (
     WITH,
@@ -29,7 +30,22 @@ from evaluator.compare.tables import (
 )
 from evaluator.compare.varied import varied_sim
 from evaluator.compare.verdicts import agreement, gate_worth, reliability
-from evaluator.result import Measurement, Table
+from evaluator.result import Exclusion, Measurement, Table
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Found:
+    """What was measured, before it is laid out for readers."""
+
+    cells: tuple[RateCell, ...]
+    measurements: tuple[Measurement, ...]
+    exclusions: tuple[Exclusion, ...]
+    gains: list[Measurement]
+    again_tables: tuple[Table, ...]
+    gate_tables: tuple[Table, ...]
+    """What the gate is worth, and whether its success probability can be relied on."""
+    stage_tables: tuple[Table, ...]
+    decision_tables: tuple[Table, ...]
 
 
 def compare_rows(
@@ -54,11 +70,24 @@ def compare_rows(
     Raises:
         AlikeNamesError: When ids cannot tell two tasks, conditions or policies apart.
     """
+    empty = Comparison(run=run, source=source, stand_in=stand_in)
     if not rows:
-        return Comparison(run=run, source=source, stand_in=stand_in)
+        return empty
     for kind in ("task", "condition", "policy"):
         refuse_alike(kind, ((getattr(row, kind), row.episode or "streamed") for row in rows))
-    word = Comparison(run=run, source=source, stand_in=stand_in).recorded_word
+    found = _measure(rows, method)
+    return replace(
+        empty,
+        rows=tuple(rows),
+        cells=found.cells,
+        measurements=found.measurements,
+        tables=_tables(rows, found, empty.recorded_word, goal),
+        exclusions=found.exclusions,
+        missing=tuple(_missing(rows, found.measurements)),
+    )
+
+
+def _measure(rows: Sequence[TrialRow], method: str) -> _Found:
     rates = side_rates(rows, method=method)
     cells = rate_cells(rows, rates, method=method)
     gains = replanning_gains(cells, method=method)
@@ -68,7 +97,7 @@ def compare_rows(
     again, again_tables = varied_sim(rows)
     stages, stage_tables, other_stages = stage_results(rows)
     chosen, decision_tables = decisions(cells)
-    measurements: list[Measurement] = [
+    measurements = (
         *rates,
         *(rate for cell in cells for rate in cell.pair),
         *averages(cells, method=method),
@@ -86,34 +115,38 @@ def compare_rows(
         *chosen,
         *assisted_rates(rows),
         *sequences(rows, pairs),
-    ]
-    streamed = any(not row.episode for row in rows)
-    tables: tuple[Table, ...] = (
+    )
+    return _Found(
+        cells=cells,
+        measurements=measurements,
+        exclusions=(*unpaired, *other_stages),
+        gains=gains,
+        again_tables=again_tables,
+        gate_tables=(*worth_tables, *kept_tables),
+        stage_tables=stage_tables,
+        decision_tables=decision_tables,
+    )
+
+
+def _tables(
+    rows: Sequence[TrialRow], found: _Found, word: str, goal: float | None
+) -> tuple[Table, ...]:
+    """Lay out what was found; ``word`` is what the recorded side is called."""
+    cells, measurements = found.cells, found.measurements
+    return (
         success_table(cells, word),
         *layout_table(cells, measurements, word),
-        *gains_table(gains, word),
-        *again_tables,
+        *gains_table(found.gains, word),
+        *found.again_tables,
         *remarks_table(remarks(cells, measurements)),
         *agreement_intervals(cells),
         confusion_table(rows, word),
-        *worth_tables,
-        *kept_tables,
-        *stage_tables,
+        *found.gate_tables,
+        *found.stage_tables,
         *failures_table(rows, word),
-        *decision_tables,
+        *found.decision_tables,
         *stopping_table(rows, goal),
-        *(() if streamed else (trials_table(rows, word),)),
-    )
-    return Comparison(
-        run=run,
-        source=source,
-        stand_in=stand_in,
-        rows=tuple(rows),
-        cells=cells,
-        measurements=tuple(measurements),
-        tables=tables,
-        exclusions=(*unpaired, *other_stages),
-        missing=tuple(_missing(rows, measurements)),
+        *(() if is_streamed(rows) else (trials_table(rows, word),)),
     )
 
 
@@ -151,7 +184,7 @@ def _missing(rows: Sequence[TrialRow], measurements: Sequence[Measurement]) -> l
         without = trials_in(row for row in rows if getattr(row, side) is None)
         if without:
             found.append(f"{side}: {without} of {trials_in(rows)} trials have no {words[2:]}")
-    streamed = any(not row.episode for row in rows)
+    streamed = is_streamed(rows)
     found += [
         f"{words}: no data ({STREAMED if streamed else why})"
         for start, words, why in NO_DATA

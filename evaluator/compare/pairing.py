@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from evaluator.compare.measure import measured
-from evaluator.compare.rows import TrialRow
+from evaluator.compare.rows import TrialRow, is_streamed
 from evaluator.compare.success import WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Exclusion, Interval, Measurement
@@ -31,7 +31,7 @@ class StartPair:
 
 def pair_starts(rows: Sequence[TrialRow]) -> tuple[list[StartPair], list[Exclusion]]:
     """Pair trials on task, policy and start_id; what cannot be paired is listed."""
-    if any(not row.episode for row in rows):
+    if is_streamed(rows):
         reason = "a streamed table: starts are not paired; give the paired trials as a table apart"
         return [], [Exclusion(episode="all", scope="pairing of conditions", reason=reason)]
     conditions = {row.condition for row in rows}

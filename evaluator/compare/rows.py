@@ -109,6 +109,11 @@ class TrialRow:
         return RECORDED_WORDS[self.stand_in]
 
 
+def is_streamed(rows: Iterable[TrialRow]) -> bool:
+    """Whether rows come from a streamed table: one for equal trials, which are not told apart."""
+    return any(not row.episode for row in rows)
+
+
 @dataclass(frozen=True, kw_only=True)
 class RateCell:
     """Success rates of one task, condition and policy, recorded and in the twin."""
