@@ -1,6 +1,5 @@
 """Which camera a scene is drawn from: where the scene has it, or one sentence about why not."""
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,32 +12,11 @@ from bridge.episode.run import RunFolder
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.media.color import decode_color
-from bridge.terminal import Output
 from twin.scene.draw import render as render_module
 from twin.scene.draw.render import render
-from twin.scene.rebuild.run import rebuild
-from twin.scene.settings import FitConfig, InitialiseConfig, RebuildConfig, RenderConfig
+from twin.scene.settings import RenderConfig
 from twin.scene.store.calibration import write_calibration
 from twin.scene.store.folder import read_record, write_record
-
-QUIET = Output(quiet=True)
-CONFIG = RebuildConfig(
-    fit=FitConfig(iterations=6, threads=1),
-    initialise=InitialiseConfig(max_splats=300, flying_fraction=0.1),
-)
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = RunFolder.create(tmp_path_factory.mktemp("run") / "monday")
-    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9)
-    rebuild(run, CONFIG, QUIET)
-    return run.path
-
-
-@pytest.fixture
-def room(made: Path, tmp_path: Path) -> RunFolder:
-    return RunFolder(shutil.copytree(made, tmp_path / "monday"))
 
 
 def change(run: RunFolder, edit: Callable[[dict[str, Any]], object]) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import textured_room
+from small_scene import CONFIG, QUIET
 
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
@@ -15,7 +16,6 @@ from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.geometry import se3
 from bridge.media.color import decode_color
 from bridge.task.robot import ur5_with_gripper_urdf
-from bridge.terminal import Output
 from twin.scene.draw import compose as compose_module
 from twin.scene.draw.compose import compose, object_places
 from twin.scene.draw.render import render
@@ -23,16 +23,11 @@ from twin.scene.gaussians.cloud import GaussianCloud, as_float32, effective_colo
 from twin.scene.gaussians.moved import moved_cloud
 from twin.scene.rebuild.run import rebuild
 from twin.scene.robot.splats import write_links
-from twin.scene.settings import FitConfig, InitialiseConfig, RebuildConfig, RenderConfig
+from twin.scene.settings import RenderConfig
 from twin.scene.store.edited import describe_edit, take_back
-from twin.scene.store.folder import UnreadableSceneError, read_scene, write_record
+from twin.scene.store.folder import UnreadableSceneError, read_record, read_scene, write_record
 from twin.scene.store.ply import read_ply, write_ply
 
-QUIET = Output(quiet=True)
-CONFIG = RebuildConfig(
-    fit=FitConfig(iterations=6, threads=1),
-    initialise=InitialiseConfig(max_splats=300, flying_fraction=0.1),
-)
 T_BLOB = se3.transform_from(np.array([0.9, 0.1, 0.2, 0.3]), np.array([0.05, 0.1, 0.1]))
 EYE = {"eye": (0.0, -0.8, 0.6), "target": (0.0, 0.1, 0.0)}
 HOME = (-0.263, -1.709, 1.365, -1.227, -1.571, 1.308)
@@ -51,11 +46,11 @@ def blob(seed: int = 0, count: int = 60) -> GaussianCloud:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small scene with one object, which stands at T_BLOB."""
-    run = RunFolder.create(tmp_path_factory.mktemp("run") / "monday")
-    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9)
-    record = rebuild(run, CONFIG, QUIET)
+def rebuilt_once(rebuilt_once: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small scene with one object, which stands at T_BLOB."""
+    run = RunFolder(shutil.copytree(rebuilt_once, tmp_path_factory.mktemp("blob") / "monday"))
+    record = read_record(run)
+    assert record is not None
     place = run.scene_dir / "objects" / "blob"
     place.mkdir(parents=True)
     write_ply(place / "gaussians.ply", blob())
@@ -65,11 +60,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     record["objects"] = {"blob": {"folder": "objects/blob", "files": {"gaussians.ply": ""}}}
     write_record(run, record)
     return run.path
-
-
-@pytest.fixture
-def room(made: Path, tmp_path: Path) -> RunFolder:
-    return RunFolder(shutil.copytree(made, tmp_path / "monday"))
 
 
 def picture(run: RunFolder, tmp_path: Path, **settings: object) -> np.ndarray:

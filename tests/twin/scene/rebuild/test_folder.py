@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import textured_room
+from small_scene import CONFIG, QUIET
 
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
-from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
 from twin.replay.run.start import replay_run
 from twin.scene.fit.initialise import fuse
@@ -31,31 +31,12 @@ from twin.scene.settings import (
     FitConfig,
     FrameConfig,
     InitialiseConfig,
-    RebuildConfig,
     RenderConfig,
 )
 from twin.scene.store.calibration import write_physics
 from twin.scene.store.folder import UnreadableSceneError, read_record, read_scene, scene_hash_of
 
-QUIET = Output(quiet=True)
-CONFIG = RebuildConfig(
-    fit=FitConfig(iterations=6, threads=1),
-    initialise=InitialiseConfig(max_splats=300, flying_fraction=0.1),
-)
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = RunFolder.create(tmp_path_factory.mktemp("run") / "monday")
-    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9)
-    rebuild(run, CONFIG, QUIET)
-    return run.path
-
-
-@pytest.fixture
-def room(made: Path, tmp_path: Path) -> RunFolder:
-    return RunFolder(shutil.copytree(made, tmp_path / "monday"))
 
 
 def change_record(run: RunFolder, change: Callable[[dict[str, Any]], object]) -> None:
