@@ -119,8 +119,7 @@ def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
     else:
         with _ending_on_sigterm():
             _record(run, config, output)
-    workers = str(min(4, os.cpu_count() or 1))
-    replay = ["replay", str(path), "--workers", workers, "--samples", str(config.samples)]
+    replay = ["replay", str(path), "--samples", str(config.samples)]
     _step(output, "5/6 replaying every plan and execution in PyBullet", replay)
     _step(output, "6/6 evaluating", ["evaluate", str(path)], show_result=True)
     seconds = time.monotonic() - started

@@ -24,7 +24,7 @@ def replay(
 ) -> int:
     """Replay every plan and every execution of a run, and judge each: I(tau).
 
-    Example: robot-gst replay runs/today --workers 2
+    Example: robot-gst replay runs/today
 
     Args:
         run: Run folder.
@@ -149,7 +149,7 @@ def calibrate(
 
     Writes scene/calibration.json.
     Example: robot-gst calibrate runs/monday --cameras
-    Physics: robot-gst calibrate runs/monday --physics --workers 2
+    Physics: robot-gst calibrate runs/monday --physics
 
     Args:
         run: Run folder.

@@ -40,8 +40,9 @@ class CalibrateConfig:
     """With --physics: points the search tries; the intervals take about 60 more."""
     budget_s: Annotated[float, Parameter(name="--budget", converter=convert_duration)] = 900.0
     """With --physics: wall time after which the search ends: 900s, 10min or plain seconds."""
-    workers: int = 1
-    """With --physics: processes that simulate side by side."""
+    workers: int | None = None
+    """With --physics: processes that simulate side by side: one for each core, at most 8, when no
+    number is given."""
     samples: int = 4
     """With --physics: noisy starts of each judged trial behind its chance of success; 0: what the
     operator said of trials is not used."""

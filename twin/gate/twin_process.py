@@ -45,9 +45,8 @@ class TwinProcess:
         Raises:
             UndecidedError: When there is no answer in time, or none at all.
         """
-        found: Mapping[str, Any] = self._do(
-            "localisation", look, Look(frames=frames, task=task), ends_s
-        )
+        item = Look(run_path=self._run_path, frames=frames, task=task)
+        found: Mapping[str, Any] = self._do("localisation", look, item, ends_s)
         return found
 
     def replay(self, plan: Plan, found: Mapping[str, Any], urdf: str, ends_s: float) -> Verdict:

@@ -22,6 +22,8 @@ SAMPLING = 0.9
 class Look:
     """Frames in which a task's objects are to be found."""
 
+    run_path: Path
+    """Run folder whose scene knows the shapes of scanned objects, where it has been rebuilt."""
     frames: Any
     task: Task
 
@@ -46,14 +48,19 @@ def get_ready(_: None) -> None:
     """Import what takes seconds, so that the first plan does not wait for it."""
     import twin.replay.place.rebuilt  # noqa: PLC0415
     import twin.replay.verdict.rollout  # noqa: PLC0415
-    import twin.scene.localise.objects  # noqa: F401, PLC0415
+    import twin.scene.localise.objects  # noqa: PLC0415
+    import twin.scene.localise.scanned  # noqa: F401, PLC0415
 
 
 def look(item: Look) -> dict[str, Any]:
     """Find the objects."""
-    from twin.scene.localise.objects import localise_objects  # noqa: PLC0415
+    from twin.scene.localise.objects import LocaliseConfig, localise_objects  # noqa: PLC0415
+    from twin.scene.localise.scanned import scanned_surfaces  # noqa: PLC0415
 
-    return dict(localise_objects(item.frames, item.task))
+    config = LocaliseConfig()
+    scanned = scanned_surfaces(RunFolder.open(item.run_path), item.task, config.mesh.num_samples)
+    found = localise_objects(item.frames, item.task, config, surfaces=scanned.surfaces)
+    return dict(found)
 
 
 def answer(question: Question) -> Verdict:

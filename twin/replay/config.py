@@ -127,9 +127,9 @@ class ReplayRunConfig:
 
     episode: tuple[str, ...] = ()
     """Ids of the trial episodes to replay; all of them when none is given."""
-    workers: int = 1
-    """Processes that replay side by side, or processors of --ray local; a cluster that is there
-    uses its own."""
+    workers: int | None = None
+    """Processes that replay side by side, or processors of --ray local: one for each core, at most
+    8, when no number is given. A cluster that is there uses its own."""
     ray: str = ""
     """Replay on a Ray cluster instead: its HOST:PORT, or local to start one on this machine;
     docs/scale.md says how it is kept closed."""

@@ -15,6 +15,7 @@ from twin.calibrate.physics.fit import FitConfig, fit
 from twin.calibrate.physics.local import cloud_size
 from twin.calibrate.physics.parameters import rigid_parameters
 from twin.calibrate.physics.record import physics_record
+from twin.crew.size import default_size
 from twin.physics.config import PhysicsConfig
 from twin.scene.store.calibration import write_physics
 
@@ -42,9 +43,10 @@ def calibrate_physics(
             for kind in sorted({case.kind for case in cases})
         )
     )
+    workers = config.workers or default_size()
     with (
         Evaluator(
-            cases, parameters, physics, num_samples=config.samples, workers=config.workers
+            cases, parameters, physics, num_samples=config.samples, workers=workers
         ) as evaluator,
         output.progress("physics", total) as advance,
     ):

@@ -7,6 +7,7 @@ from typing import Any
 from bridge.episode.run import RunFolder
 from bridge.terminal import Output
 from twin.crew.pool import Alone, Crew, Runner
+from twin.crew.size import default_size
 from twin.replay.config import ReplayRunConfig
 
 
@@ -30,12 +31,13 @@ def runner_for(config: ReplayRunConfig) -> Iterator[Runner]:
         UsageError: When Ray has no token to show.
         TwinError: When the cluster cannot be reached.
     """
+    workers = config.workers or default_size()
     runner: Runner = Alone()
     if config.ray:
         from twin.replay.run.cluster import RayRunner  # noqa: PLC0415  # an extra
 
-        runner = RayRunner(config.ray, config.workers)
-    elif config.workers > 1:
-        runner = Crew(config.workers)
+        runner = RayRunner(config.ray, workers)
+    elif workers > 1:
+        runner = Crew(workers)
     with runner:
         yield runner

@@ -22,7 +22,7 @@ from bridge.terminal import Output
 from twin.crew.pool import Alone, Crew
 from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.place.starts import StartState, StartStates
-from twin.replay.run import prepare, trajectories
+from twin.replay.run import prepare, start, trajectories
 from twin.replay.run.executions import Execution, execution_of
 from twin.replay.run.start import replay_run
 from twin.replay.run.table import count_verdicts
@@ -194,7 +194,7 @@ def test_two_processes_say_what_one_process_says(
     config = ReplayRunConfig(replay=QUICK)
     replay_run(run, config, QUIET)
     before = {path.name: _messages(path) for path in run.derived("*.replay.*")}
-    monkeypatch.setattr(trajectories, "Crew", CrewForReplays)
+    monkeypatch.setattr(start, "Crew", CrewForReplays)
     summary = replay_run(run, replace(config, workers=2, force=True), QUIET)
     assert not any(row["skipped"] or row["error"] for row in summary["rows"])
     assert {path.name: _messages(path) for path in run.derived("*.replay.*")} == before

@@ -14,6 +14,7 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.task.meshes.catalogue import ToyMesh, toy_mesh
 from bridge.task.task_file import SCANNED, ObjectModel, Task, load_task
+from twin.gate.work import Look, look
 from twin.scene.localise.objects import localise_objects
 from twin.scene.localise.result import BOX_METHOD, MESH_METHOD
 from twin.scene.localise.scanned import scanned_surfaces
@@ -108,6 +109,18 @@ def test_meshes_of_scanned_objects_are_read_from_the_scene(
         json.dumps({"shape_source": "task file"})
     )
     assert not scanned_surfaces(run, scanned_task, 500).hashes
+
+
+def test_the_gate_lays_out_scanned_objects_by_the_scene_s_mesh(
+    run: RunFolder, scanned_task: Task, frames: list[Any]
+) -> None:
+    found = look(Look(run_path=run.path, frames=frames, task=scanned_task))["thing"]
+    assert found.found, found.reason
+    assert found.method == MESH_METHOD
+    assert np.linalg.norm(found.T_base_object[:3, 3] - POSE[:3, 3]) < 0.003
+    (run.scene_dir / "objects" / "thing" / "object.json").unlink()
+    unknown = look(Look(run_path=run.path, frames=frames, task=scanned_task))["thing"]
+    assert unknown.method == BOX_METHOD
 
 
 def test_a_damaged_scene_is_said_to_be_damaged(run: RunFolder, scanned_task: Task) -> None:

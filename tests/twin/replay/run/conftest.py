@@ -1,0 +1,11 @@
+"""What tests of whole runs share."""
+
+import pytest
+
+from twin.replay.run import start
+
+
+@pytest.fixture(autouse=True)
+def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test replaces is in this process: others start only where a test asks for them."""
+    monkeypatch.setattr(start, "default_size", lambda: 1)
