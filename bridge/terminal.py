@@ -1,6 +1,7 @@
 """What the commands print: data on stdout, progress and remarks on stderr."""
 
 import json
+import queue
 import signal
 import sys
 import threading
@@ -115,8 +116,18 @@ def _left(seconds: float) -> str:
 def stop_signals() -> Iterator[threading.Event]:
     """Set the event on SIGINT or SIGTERM instead of ending the process."""
     stopped = threading.Event()
+    # A handler interrupts the main thread anywhere, also while that holds the event's own lock:
+    # to set the event there would wait for ever. This queue may be used in a handler.
+    came: queue.SimpleQueue[bool] = queue.SimpleQueue()
+
+    def tell() -> None:
+        while came.get():
+            stopped.set()
+
+    teller = threading.Thread(target=tell, name="stop signals", daemon=True)
+    teller.start()
     before = {
-        number: signal.signal(number, lambda *_: stopped.set())
+        number: signal.signal(number, lambda *_: came.put(True))
         for number in (signal.SIGINT, signal.SIGTERM)
     }
     try:
@@ -124,3 +135,5 @@ def stop_signals() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        came.put(False)
+        teller.join()
