@@ -1,5 +1,6 @@
 """The application: addresses to pages. All state is in the address; nothing is ever written."""
 
+import shlex
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlencode
@@ -74,6 +75,7 @@ def _environment() -> Environment:
         wording.percent,
     ):
         environment.filters[function.__name__] = function
+    environment.filters["quoted"] = lambda path: shlex.quote(str(path))
     environment.globals["link"] = link
     return environment
 

@@ -1,5 +1,6 @@
 """What the evaluator says of a run: ``results.json`` where it is, and the rows behind it."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
@@ -11,6 +12,10 @@ from evaluator.compare.cache import FOLDER, SummaryCache
 from evaluator.result import Measurement, Results, load_results
 
 _ASKING = Lock()
+FROM_TRIALS = ("agreement.", "gain.", "rate.")
+"""Numbers that follow from trials, labels and replays, whatever else was asked of an evaluation."""
+DIGITS = 9
+"""Two versions of the program may sum up in another order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +45,21 @@ class Judgement:
                 return source.stand_in
         return None
 
+    def outdated(self) -> tuple[Measurement | None, Measurement | None] | None:
+        """Return the first number that the files of the run give otherwise than ``results.json``.
+
+        Returns:
+            As it is there and as it would be now; None on a side that does not have it. None when
+            all numbers hold, or when there is nothing to hold them against.
+        """
+        if self.results is None or self.comparison is None:
+            return None
+        said, now = (_from_trials(side.measurements) for side in (self.results, self.comparison))
+        for name in dict.fromkeys((*said, *now)):
+            if _counts(said.get(name)) != _counts(now.get(name)):
+                return said.get(name), now.get(name)
+        return None
+
     def row(self, episode_id: str) -> TrialRow | None:
         """Return the row of one episode."""
         return next((row for row in self.rows if row.episode == episode_id), None)
@@ -47,6 +67,18 @@ class Judgement:
     def measurement(self, measurement_id: str) -> Measurement | None:
         """Return one number, or None when the results do not have it."""
         return next((m for m in self.measurements if m.id == measurement_id), None)
+
+
+def _from_trials(measurements: Iterable[Measurement]) -> dict[str, Measurement]:
+    return {m.id: m for m in measurements if m.id.startswith(FROM_TRIALS)}
+
+
+def _counts(measurement: Measurement | None) -> tuple[float | None, int | None, int | None]:
+    """What makes a number another one; its interval is a matter of how it was asked for."""
+    if measurement is None:
+        return None, None, None
+    value = measurement.value
+    return None if value is None else round(value, DIGITS), measurement.k, measurement.n
 
 
 def agrees(row: TrialRow) -> bool | None:

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bridge.episode.catalogue import outcome_of
+from bridge.episode.metadata import Outcome
+from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.task.plan import Plan
 from bridge.task.verdict import Factor, Verdict
@@ -66,6 +69,8 @@ class EpisodePage:
     recording: Recording
     replays: tuple[Recording, ...]
     row: TrialRow | None
+    label: Outcome | None
+    """How it ended; a label given after the fact counts."""
     agrees: bool | None
     verdicts: tuple[VerdictView, ...]
     gated: bool
@@ -114,6 +119,7 @@ def build_page(
         recording=recording,
         replays=replays,
         row=row,
+        label=problems.attempt(lambda: outcome_of(run, Episode.open(path)), recording.outcome),
         agrees=None if row is None else agrees(row),
         verdicts=verdicts,
         gated=any(view.title == GATE_BEFORE and view.of_sent_plan for view in verdicts),

@@ -1,5 +1,6 @@
 """What the overview shows: headline numbers, rates per cell, and every trial."""
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +9,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run import RunFolder
 from bridge.errors import GstError
-from dashboards import headline
+from dashboards import headline, wording
 from dashboards.comparison import Judgement, agrees
 from dashboards.headline import Card, GainRow, RateTable
 from dashboards.scatter import Scatter, scatter
@@ -111,6 +112,8 @@ class Overview:
     exclusions: tuple[Exclusion, ...]
     missing: tuple[str, ...]
     notices: tuple[str, ...]
+    outdated: str | None
+    """That the numbers are older than the run, and which of them shows it."""
     next_command: str | None
 
 
@@ -156,6 +159,7 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         exclusions=judgement.results.exclusions if judgement.results else (),
         missing=judgement.results.missing if judgement.results else (),
         notices=_notices(judgement),
+        outdated=_outdated(judgement),
         next_command=_next_command(run, judgement),
     )
 
@@ -169,14 +173,29 @@ def _notices(judgement: Judgement) -> tuple[str, ...]:
     return tuple(notices)
 
 
+def _outdated(judgement: Judgement) -> str | None:
+    found = judgement.outdated()
+    if found is None:
+        return None
+    said, now = found
+    name = next(side.id for side in found if side is not None)
+    was, would_be = (wording.headline(m) if m else "not measured" for m in (said, now))
+    return (
+        f"The numbers on this page are older than the run: {name} was {was} and is {would_be} by "
+        "the recordings, labels and replays that lie there now."
+    )
+
+
 def _next_command(run: RunFolder, judgement: Judgement) -> str | None:
+    path = shlex.quote(str(run.path))
     if not run.episodes():
-        return f"robot-gst record {run.path}"
+        return f"robot-gst record {path}"
     if not (run.scene_dir / "scene.json").is_file() and not run.derived():
-        return f"robot-gst rebuild {run.path}"
+        return f"robot-gst rebuild {path}"
     if not run.derived("*.replay.*"):
-        return f"robot-gst replay {run.path}"
-    return f"robot-gst evaluate {run.path}" if judgement.results is None else None
+        return f"robot-gst replay {path}"
+    is_due = judgement.results is None or judgement.outdated() is not None
+    return f"robot-gst evaluate {path}" if is_due else None
 
 
 def _facets(rows: Sequence[TrialRow]) -> tuple[Facet, ...]:

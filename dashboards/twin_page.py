@@ -1,5 +1,6 @@
 """What the twin page shows: held-out views, recorded beside rendered."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,7 +59,7 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
         rated=any(view.psnr_db is not None for view in views),
         measurements=tuple(m for m in judgement.measurements if m.id.startswith("views.")),
         problems=tuple(problems),
-        next_command=f"robot-gst rebuild {run.path}",
+        next_command=f"robot-gst rebuild {shlex.quote(str(run.path))}",
         stand_in=judgement.stand_in,
     )
 

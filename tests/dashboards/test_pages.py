@@ -9,6 +9,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from visible import words
 
 from bridge.episode.run import RunFolder
 from dashboards.app import create_app
@@ -17,12 +18,6 @@ from dashboards.guard import COOKIE, Admission
 from dashboards.library import Library, derived_path, episode_path
 from evaluator.compare import compare_run
 from evaluator.result import load_results, write_results
-
-
-def words(text: str) -> str:
-    """Reduce a page to the words a reader sees."""
-    visible = re.sub(r"<(svg|head).*?</\1>|<[^>]+>", " ", text, flags=re.DOTALL)
-    return re.sub(r"\s+", " ", visible.replace("&nbsp;", " ").replace("\u00a0", " "))
 
 
 def test_the_overview_shows_the_numbers_of_results_json(

@@ -1,0 +1,61 @@
+"""What the pages say of a run that changed after it was evaluated."""
+
+import shutil
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from visible import words
+
+from bridge.episode.catalogue import label_episode
+from bridge.episode.metadata import Outcome
+from bridge.episode.run import RunFolder
+
+OLDER = "The numbers on this page are older than the run"
+
+
+@pytest.fixture
+def copy(shared_run: RunFolder, tmp_path: Path) -> RunFolder:
+    """Return a copy of the evaluated run, in a folder whose name a shell would take apart."""
+    return RunFolder(shutil.copytree(shared_run.path, tmp_path / "Zelle 3 (früh)"))
+
+
+def overview(synthetic: ModuleType, run: RunFolder) -> str:
+    return words(synthetic.browser_of(run).get("/").text)
+
+
+def test_numbers_that_still_hold_are_not_called_old(synthetic: ModuleType, copy: RunFolder) -> None:
+    assert OLDER not in overview(synthetic, copy)
+
+
+@pytest.mark.parametrize("change", ["label", "deleted", "replay"])
+def test_numbers_older_than_the_run_are_called_so(
+    synthetic: ModuleType, copy: RunFolder, change: str
+) -> None:
+    if change == "label":
+        label_episode(copy, "trial_0003", Outcome(result="failure", by="reviewer"))
+    elif change == "deleted":
+        (copy.episodes_dir / "trial_0001.mcap").unlink()
+    else:
+        copy.derived("trial_0001.replay.planned*")[0].unlink()
+    text = overview(synthetic, copy)
+    assert OLDER in text
+    assert "robot-gst evaluate" in text
+
+
+def test_a_label_given_afterwards_names_who_gave_it(synthetic: ModuleType, copy: RunFolder) -> None:
+    given = Outcome(result="failure", by="reviewer", detail="it was the wrong box")
+    label_episode(copy, "trial_0003", given)
+    text = words(synthetic.browser_of(copy).get("/episode/trial_0003").text)
+    assert "✗ failure labelled by reviewer: it was the wrong box" in text
+    assert "stand-in operator" not in text
+
+
+def test_commands_on_the_pages_can_be_pasted_into_a_shell(
+    synthetic: ModuleType, copy: RunFolder
+) -> None:
+    shutil.rmtree(copy.results_dir)
+    browser = synthetic.browser_of(copy)
+    for address in ("/", "/twin", "/episode/trial_0001"):
+        text = words(browser.get(address).text).replace("&#39;", "'")
+        assert f"'{copy.path}" in text, address
