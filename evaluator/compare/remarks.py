@@ -34,6 +34,16 @@ def remarks_table(found: Iterable[Remark]) -> tuple[Table, ...]:
     return (Table(id="remarks", title="Remarks", columns=("about", "remark"), rows=rows),)
 
 
+def with_remarks(tables: Iterable[Table], found: Iterable[Remark]) -> tuple[Table, ...]:
+    """Put remarks before those that are among some tables already."""
+    kept, found = list(tables), list(found)
+    if not found:
+        return tuple(kept)
+    old = [(str(a), str(b)) for table in kept if table.id == "remarks" for a, b in table.rows]
+    others = [table for table in kept if table.id != "remarks"]
+    return (*others, *remarks_table([*found, *old]))
+
+
 def _units(cells: Sequence[RateCell]) -> list[Remark]:
     found = {cell.task: cell for cell in cells if cell.unit != "trial"}
     remarks = []

@@ -16,8 +16,10 @@ from evaluator.compare.final_states import state_results
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.imported import imported_rows
 from evaluator.compare.label_results import label_results
+from evaluator.compare.made_alike import replay_remarks
 from evaluator.compare.pairing import START_LIMIT_M
 from evaluator.compare.part import Part
+from evaluator.compare.remarks import with_remarks
 from evaluator.compare.renders import compare_renders
 from evaluator.compare.replays import DerivedIndex
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
@@ -88,6 +90,10 @@ def compare_run(
         stand_in=_stand_in(contents, imported),
         method=method,
         goal=goal,
+    )
+    base = replace(
+        base,
+        tables=with_remarks(base.tables, replay_remarks(trials, contents.derived)),
     )
     missing = [] if rows else ["trials: the run holds no recorded trial"]
     base = replace(

@@ -18,7 +18,7 @@ from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.imported import row_from_record
 from evaluator.compare.published import check_published
 from evaluator.compare.rates import compare_rates
-from evaluator.compare.remarks import remarks_table
+from evaluator.compare.remarks import with_remarks
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.success import trials_in
 from evaluator.result import Exclusion
@@ -115,10 +115,7 @@ def _from_benchmark(
         f"{name} results are rollouts of a policy in that simulator, entered on the sim side: no "
         "plan was sent and nothing was replayed. Add real trials of the same starts to compare"
     )
-    old = [(str(a), str(b)) for t in base.tables if t.id == "remarks" for a, b in t.rows]
-    kept = (table for table in base.tables if table.id != "remarks")
-    tables = (*kept, *remarks_table([(name, remark), *old]))
-    base = replace(base, tables=tables)
+    base = replace(base, tables=with_remarks(base.tables, [(name, remark)]))
     return _with_source(base, path, ())
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import lean_checks
 import numpy as np
@@ -167,6 +168,8 @@ class RunMaker:
         num_poses: int = NUM_POSES,
         astray: int | None = None,
         varied: tuple[int, int] | None = None,
+        scene_hash: str | None = None,
+        settings: dict[str, Any] | None = None,
     ) -> Path:
         """Write one derived replay of a trial; ``varied``: successes and number of its samples."""
         source = self.run.episodes_dir / f"{name}.mcap"
@@ -178,8 +181,10 @@ class RunMaker:
             plan_id=plan_id,
             trajectory=trajectory,
             mode=mode,
+            scene_hash=scene_hash,
             engine="test",
             seed=1,
+            settings=settings or {},
         )
         stem = f"{name}.replay.{trajectory}.{mode}.{plan_id}.test.{tag}"
         path = self.run.derived_dir / f"{stem}.mcap"
