@@ -2,9 +2,9 @@
 
 The episodes are recorded trials of the stand-in cell (development seeds) under many names; every
 replay starts from nothing, localisation included, as ``robot-gst replay`` does it. Wall time, so
-only an idle machine with two cores gives a number worth keeping. What is compared runs in turns, and
-the median of the turns' ratios counts: a core of a shared machine is up to 1.5 times faster in some
-minutes than in others.
+only an idle machine with two cores gives a number worth keeping. What is compared runs in turns,
+and the median of the turns' ratios counts: a core of a shared machine is up to 1.5 times faster in
+some minutes than in others.
 The cluster is one that runs already, on the same two cores; what a command waits for, from the
 import of ray to the last answer, counts. First argument: episodes.
 """
