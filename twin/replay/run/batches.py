@@ -47,9 +47,10 @@ class Batches(Generic[Item]):
         most_cost = TASK_S * self._done_cost / self._spent_s if self._spent_s > 0 else 0.0
         batch = [self._todo.popleft()]
         total = self._cost(batch[0])
-        while (
-            len(batch) < most_pieces and (total := total + self._cost(self._todo[0])) <= most_cost
-        ):
+        while len(batch) < most_pieces:
+            total += self._cost(self._todo[0])
+            if total > most_cost:
+                break
             batch.append(self._todo.popleft())
         return batch
 
