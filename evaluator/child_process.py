@@ -8,6 +8,7 @@ import importlib
 import os
 import pickle
 import queue
+import selectors
 import signal
 import subprocess
 import sys
@@ -19,7 +20,8 @@ from typing import IO, Any, BinaryIO
 
 LENGTH_BYTES = 8
 """Before each message: how long it is."""
-
+PATIENCE_S = 60.0
+"""With a process that takes nothing of what it is sent, although it listens before all else."""
 
 Read = Callable[[int], bytes | None]
 """Returns at most so many bytes of a stream, none at its end."""
@@ -48,14 +50,25 @@ class ChildProcess:
             stderr=subprocess.DEVNULL,
             env={**os.environ, **(environment or {}), "PYTHONPATH": places},
         )
+        assert self.process.stdin is not None  # noqa: S101  # for the type checker
+        os.set_blocking(self.process.stdin.fileno(), False)
         self.end = weakref.finalize(self, _end, self.process)
         """End the process and wait for it; does nothing the second time."""
 
     def send(self, message: object) -> None:
-        """Hand over a message, and go on; one that has ended is found out when it should answer."""
+        """Hand over a message, and go on; one that has ended is found out when it should answer.
+
+        One that does not listen, because it was stopped say, is ended.
+        """
         assert self.process.stdin is not None  # noqa: S101  # for the type checker
-        with suppress(OSError):
-            send(self.process.stdin, message)
+        inlet, left = self.process.stdin.fileno(), memoryview(_packed(message))
+        with suppress(OSError), selectors.DefaultSelector() as room:
+            room.register(inlet, selectors.EVENT_WRITE)
+            while left:
+                if not room.select(PATIENCE_S):
+                    self.process.kill()
+                    return
+                left = left[os.write(inlet, left) :]
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
@@ -70,10 +83,13 @@ def send(stream: IO[bytes], message: object) -> None:
     Raises:
         OSError: When nobody listens any more.
     """
-    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
-    stream.write(len(data).to_bytes(LENGTH_BYTES, "big"))
-    stream.write(data)
+    stream.write(_packed(message))
     stream.flush()
+
+
+def _packed(message: object) -> bytes:
+    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    return len(data).to_bytes(LENGTH_BYTES, "big") + data
 
 
 def receive(read: Read) -> bytes:

@@ -208,11 +208,17 @@ class _Worker(ChildProcess):
 
     def answer(self) -> tuple[range, list[Any] | None] | None:
         """Return the items and what was found; None when it only says that it can begin."""
-        found = pickle.loads(receive(self.outlet.read))
+        found = pickle.loads(receive(self._read))
         if not self.is_ready:
             self.is_ready = True
             return None
         return self.asked.popleft(), found
+
+    def _read(self, size: int) -> bytes | None:
+        """Not for ever: a process may be stopped in the middle of an answer."""
+        if not wait([self.outlet], MAX_WAIT_S):
+            raise TimeoutError
+        return self.outlet.read(size)
 
 
 def serve(next_message: Callable[[], Any], outbox: BinaryIO) -> None:
