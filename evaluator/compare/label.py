@@ -16,8 +16,6 @@ from bridge.task.task_file import Task
 from evaluator.compare.known_task import known_task
 from evaluator.compare.tracks import TOOL
 
-WITNESS_VERSION = 1
-"""Raise it when the same files give another witness."""
 AFTER = "end"
 DECIDED_BY_A_LOOK = ("inside", "shape")
 """Clauses that one localisation decides. Whether something still moves, it cannot say."""

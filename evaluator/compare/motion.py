@@ -27,8 +27,6 @@ from evaluator.metrics.trajectory_align import find_lag_s, without_rigid_motion
 from evaluator.metrics.trajectory_steps import joint_errors, relative_errors
 from evaluator.packed import Packed, packed
 
-MOTION_VERSION = 1
-"""Raise it when the same files give another summary."""
 SAME_CLOCK_NS = 2 * NS_PER_S
 """A replay whose stamps start this close to the execution uses the cell's clock."""
 STEPS_PER_S = 10

@@ -17,8 +17,6 @@ from evaluator.compare.object_states import (
 )
 from evaluator.metrics.state import extents_apart_m, turn_between_rad, turns_alike
 
-STATE_VERSION = 1
-"""Raise it when the same files give another summary."""
 PLAN, PLANNED, EXECUTED, RECORDED = "plan", "planned", "executed", "recorded"
 PAIRS = (
     (PLAN, RECORDED),

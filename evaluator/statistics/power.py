@@ -11,7 +11,6 @@ from evaluator.statistics.proportion import normal_quantile
 ALPHA = 0.05
 """Two-sided."""
 POWER = 0.8
-MAX_TRIALS = 1_000_000
 MAX_PAIRS = 400
 """The exact paired power counts every outcome out; beyond this a normal formula is as good."""
 

@@ -1,7 +1,6 @@
 """Columns hold what was put in, agree with pyarrow's own ways, and never load pandas."""
 
 from array import array
-from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
@@ -12,7 +11,6 @@ from own_process import printed
 
 from evaluator.arrow_columns import ANSWER, NUMBER, TEXT, WHOLE, arrays_of, column_of, values_of
 
-ROOT = Path(__file__).resolve().parents[2]
 _SCALARS = {
     TEXT: st.text(max_size=5),
     WHOLE: st.integers(-(2**63), 2**63 - 1),

@@ -180,7 +180,7 @@ def _equations(
     """Weighted normal equations of each pair, in units of the standard deviations."""
     r = misfits(Ts_a, Ts_b, X, Z)
     inverse = np.repeat(1.0 / np.array(scales), 3)
-    J = _jacobian(Ts_b, Z, r) * inverse[:, None]
+    J = _jacobian(Ts_b, r) * inverse[:, None]
     weighted = np.swapaxes(J, 1, 2) * _weights(r, scales)[:, None, None]
     return weighted @ J, (weighted @ (r * inverse)[..., None])[..., 0]
 
@@ -202,9 +202,7 @@ def _steps(
     return np.asarray(-np.linalg.solve(left, (counts @ g)[..., None])[..., 0])
 
 
-def _jacobian(
-    Ts_b: np.ndarray, Z: np.ndarray, r: np.ndarray
-) -> Float[np.ndarray, "num_pairs 6 12"]:
+def _jacobian(Ts_b: np.ndarray, r: np.ndarray) -> Float[np.ndarray, "num_pairs 6 12"]:
     """Derivatives of the misfits with respect to X exp(x) and Z exp(z), for small misfits."""
     J = np.zeros((len(r), 6, 12))
     R_e, R_bt = se3.rotation_from_vector(r[:, 3:]), np.swapaxes(Ts_b[:, :3, :3], 1, 2)

@@ -18,8 +18,6 @@ from evaluator.metrics.lpips import LPIPS_METRICS, metric_id, open_nets
 from evaluator.metrics.lpips_torch import LpipsNet
 from evaluator.metrics.lpips_weights import LAYERS, LpipsWeightsError, read_heads
 
-ROOT = Path(__file__).parents[3]
-
 
 @pytest.fixture(scope="session")
 def golden(load_golden_script: Any) -> ModuleType:

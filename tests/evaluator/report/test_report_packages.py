@@ -21,8 +21,6 @@ from evaluator.report.parquet import (
 from evaluator.report.write import Written, summary_text, write_report
 from evaluator.result import load_results
 
-ROOT = Path(__file__).parents[3]
-
 
 def plain(frame: pd.DataFrame) -> list[dict[str, Any]]:
     """Rows as Python values; null becomes None."""

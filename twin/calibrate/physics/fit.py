@@ -89,7 +89,6 @@ class Fit:
     split: Split
     nominal: HeldOut
     calibrated: HeldOut
-    nominal_score: Score
     calibrated_score: Score
     num_evaluations: int
     promoted: bool
@@ -149,7 +148,6 @@ def fit(
         split=split,
         nominal=nominal,
         calibrated=calibrated,
-        nominal_score=nominal_score,
         calibrated_score=final_score,
         num_evaluations=count + 2,
         promoted=promoted,

@@ -34,12 +34,10 @@ class Emulator:
     centre: Float[np.ndarray, " num_parameters"]
     width: Float[np.ndarray, " num_parameters"]
     coefficients: Float[np.ndarray, "num_terms num_features"]
-    variance: Float[np.ndarray, " num_features"]
-    """What the quadratics leave unexplained."""
     bounds: Float[np.ndarray, "num_parameters 2"]
     observed: Observations
     scales: Scales
-    """Of the observations, with the variance above."""
+    """Of the observations, with the variance that the quadratics leave unexplained."""
 
     def features(self, x: Float[np.ndarray, " num_parameters"]) -> Float[np.ndarray, " n"]:
         """Predict."""
@@ -107,7 +105,6 @@ def fit_emulator(
         centre=centre,
         width=width,
         coefficients=np.stack([row[0] for row in rows], axis=1),
-        variance=variance,
         bounds=bounds,
         observed=observed,
         scales=scales_of(observed, variance),

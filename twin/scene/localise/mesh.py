@@ -60,8 +60,6 @@ class MeshFit:
     """Share of the mesh's facing surface that cameras saw through."""
     score: float
     """Lower is better."""
-    second_score: float
-    """Of the best pose that is turned by more than 30 degrees; infinite without any."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -274,7 +272,6 @@ def _choose(
         explained=float(near.mean()) if len(near) else 0.0,
         seen_through=through,
         score=score,
-        second_score=min((value for value, _ in rivals), default=float("inf")),
     )
 
 

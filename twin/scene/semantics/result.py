@@ -8,9 +8,6 @@ from jaxtyping import Bool, Float, Float32, UInt16
 
 from twin.errors import TwinError
 
-MAX_INSTANCES = 65535
-"""Labels are 16 bit, 0 is the background."""
-
 
 class SemanticsError(TwinError):
     """Masks, features or a query do not fit the scene they are meant for."""

@@ -113,7 +113,7 @@ def lattice(shape: ObjectShape, config: LatticeConfig | None = None) -> Lattice:
     number = number.reshape(-1, 8)
     tets = _tets(cells, number)
     regular = first + config.spacing_m * index.astype(np.float64)
-    nodes = _drawn_in(regular, tets, shape.sdf, config.spacing_m)
+    nodes = _drawn_in(regular, tets, shape.sdf)
     springs = _springs(nodes, tets, shape.sdf, config)
     lengths = np.linalg.norm(nodes[springs[:, 0]] - nodes[springs[:, 1]], axis=1)
     shares = np.zeros(len(nodes))
@@ -175,7 +175,6 @@ def _drawn_in(
     nodes: Float[np.ndarray, "num_nodes 3"],
     tets: Int[np.ndarray, "num_tets 4"],
     sdf: SdfGrid,
-    spacing_m: float,
 ) -> Float[np.ndarray, "num_nodes 3"]:
     """Move nodes outside of the solid to its surface, as far as no tetrahedron collapses."""
     target = nodes.copy()

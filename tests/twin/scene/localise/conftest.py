@@ -25,7 +25,6 @@ COLOR_CAMERA = Camera(width=WIDTH, height=HEIGHT, fx=310.0, fy=310.0, cx=158.0, 
 T_COLOR_DEPTH = np.eye(4)
 T_COLOR_DEPTH[0, 3] = 0.015
 TABLE_COLOR = (150, 140, 128)
-GREY = (120, 120, 124)
 LIGHT = np.array([0.3, -0.4, 0.87])
 
 
