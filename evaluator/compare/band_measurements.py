@@ -8,7 +8,7 @@ from statistics import median
 import numpy as np
 
 from bridge.geometry.trajectory import PoseTrajectory
-from evaluator.compare.measure import measured, slug
+from evaluator.compare.measure import interval_or_reason, measured, slug
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.trajectory_align import without_rigid_motion
 from evaluator.metrics.trajectory_bands import (
@@ -126,6 +126,7 @@ def distance_measurements(task: str, real: Side, simulated: Side) -> list[Measur
             )
             for name, unit, words in DISTANCES
         ]
+        _, why_none = interval_or_reason(median_interval, distance.of_recorded_m)
         measurements.append(
             make(
                 f"{first}median_over_recorded_m",
@@ -135,7 +136,7 @@ def distance_measurements(task: str, real: Side, simulated: Side) -> list[Measur
                 f"simulated runs, so where another recorded run would lie; {part}",
                 n=len(real.runs),
                 counted="run",
-                reason_without_interval=_too_few(distance.of_recorded_m),
+                reason_without_interval=why_none,
             )
         )
     return [*measurements, *_shape(task, real, simulated, what)]
@@ -231,15 +232,5 @@ def _field(record: BandDistance | Repeatability, name: str) -> float:
     return float(getattr(record, name))
 
 
-def _median(values: Sequence[float]) -> float | tuple[float, Interval | None]:
-    if _too_few(values) is not None:
-        return float(median(values))
-    return float(median(values)), median_interval(values)
-
-
-def _too_few(values: Sequence[float]) -> str | None:
-    try:
-        median_interval(values)
-    except UndefinedStatisticError as error:
-        return error.reason
-    return None
+def _median(values: Sequence[float]) -> tuple[float, Interval | None]:
+    return float(median(values)), interval_or_reason(median_interval, values)[0]

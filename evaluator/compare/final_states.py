@@ -5,7 +5,7 @@ from functools import partial
 from statistics import median
 
 from evaluator.compare.final_state_tables import Group, final_table, stage_table, state_id
-from evaluator.compare.measure import measured
+from evaluator.compare.measure import interval_or_reason, measured
 from evaluator.compare.part import Part
 from evaluator.compare.states import EXECUTED, PAIRS, PLAN, PLANNED, RECORDED, StateSummary
 from evaluator.errors import UndefinedStatisticError
@@ -84,7 +84,7 @@ def _measure(key: Group, states: Sequence[StateSummary]) -> list[Measurement]:
                 partial(_median, of_episode, states, name),
                 definition=f"{about}: median over {len(of_episode)} episodes of each one's mean "
                 "over its objects",
-                reason_without_interval=_too_few(of_episode),
+                reason_without_interval=interval_or_reason(median_interval, of_episode)[1],
             )
         )
         if name == "position":
@@ -94,7 +94,7 @@ def _measure(key: Group, states: Sequence[StateSummary]) -> list[Measurement]:
                     partial(_mean, of_episode, states, name),
                     definition=f"{about}: mean over {len(of_episode)} episodes of each one's mean "
                     "over its objects",
-                    reason_without_interval=_no_mean(of_episode),
+                    reason_without_interval=interval_or_reason(student_interval, of_episode)[1],
                     coverage_key=MEAN_KEY,
                     instead=USE_MEDIAN,
                 )
@@ -106,22 +106,14 @@ def _median(
     values: Sequence[float], states: Sequence[StateSummary], quantity: str
 ) -> float | tuple[float, Interval | None]:
     _some(values, states, quantity)
-    try:
-        interval: Interval | None = median_interval(values)
-    except UndefinedStatisticError:
-        interval = None
-    return float(median(values)), interval
+    return float(median(values)), interval_or_reason(median_interval, values)[0]
 
 
 def _mean(
     values: Sequence[float], states: Sequence[StateSummary], quantity: str
 ) -> float | tuple[float, Interval | None]:
     _some(values, states, quantity)
-    try:
-        interval: Interval | None = student_interval(values)
-    except UndefinedStatisticError:
-        interval = None
-    return sum(values) / len(values), interval
+    return sum(values) / len(values), interval_or_reason(student_interval, values)[0]
 
 
 def _some(values: Sequence[float], states: Sequence[StateSummary], quantity: str) -> None:
@@ -131,22 +123,6 @@ def _some(values: Sequence[float], states: Sequence[StateSummary], quantity: str
     raise UndefinedStatisticError(
         statistic="final state", reason="; ".join(sorted(reasons)) or UNKNOWN[quantity]
     )
-
-
-def _too_few(values: Sequence[float]) -> str | None:
-    try:
-        median_interval(values)
-    except UndefinedStatisticError as error:
-        return error.reason
-    return None
-
-
-def _no_mean(values: Sequence[float]) -> str | None:
-    try:
-        student_interval(values)
-    except UndefinedStatisticError as error:
-        return error.reason
-    return None
 
 
 def _left_out(states: Sequence[StateSummary]) -> tuple[Exclusion, ...]:

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 from evaluator.errors import AlikeNamesError, UndefinedStatisticError
 from evaluator.result import Interval, Measurement
@@ -44,6 +44,16 @@ def refuse_alike(kind: str, named: Iterable[tuple[str, str]]) -> None:
         owner = owners.setdefault(slug(name), name)
         if owner != name:
             raise AlikeNamesError(kind=kind, names=(owner, name), places=(places[owner], where))
+
+
+def interval_or_reason(
+    interval_of: Callable[[Sequence[float]], Interval], values: Sequence[float]
+) -> tuple[Interval | None, str | None]:
+    """Return the interval of some values, or None and the reason why they have none."""
+    try:
+        return interval_of(values), None
+    except UndefinedStatisticError as error:
+        return None, error.reason
 
 
 def measured(
