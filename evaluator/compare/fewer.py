@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 from evaluator.compare.measure import Statistic, measured
@@ -13,6 +13,7 @@ from evaluator.compare.success import Key, group_rows, names_of, rate_id, trials
 from evaluator.compare.verdicts import confusion_of
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Cell, Interval, Measurement, Table
+from evaluator.statistics.gate import Confusion
 from evaluator.statistics.proxy import (
     applicability,
     post_stratified,
@@ -45,22 +46,45 @@ def assisted_rates(rows: Sequence[TrialRow]) -> list[Measurement]:
     return measurements
 
 
-def _assisted_rate(
-    key: Key, paired: Sequence[TrialRow], alone: Sequence[TrialRow]
-) -> list[Measurement]:
-    counts = confusion_of(paired, lambda row: row.sim_planned)
-    alone_n = trials_in(alone)
-    alone_k = trials_in(row for row in alone if row.sim_planned)
-    many = f"{counts.n} trials with an outcome and {alone_n} starts that only the twin has"
-    overlap = StartOverlap(paired, alone)
+@dataclass(frozen=True)
+class _Assisted:
+    """One cell's rate by the trials in which the twin was tried, and by what it says of others."""
 
-    def p_random() -> float:
-        return applicability(counts.said_success, counts.n, alone_k, alone_n)
+    counts: Confusion
+    """What the twin said of the tried starts, against their outcomes."""
+    alone_k: int
+    """Successes among the starts that only the twin has."""
+    alone_n: int
+    overlap: StartOverlap
 
-    def checked() -> None:
+    def p_random(self) -> float:
+        return applicability(self.counts.said_success, self.counts.n, self.alone_k, self.alone_n)
+
+    def rate(self) -> tuple[float, Interval | None]:
+        self._check()
+        estimate = post_stratified(self.counts, self.alone_k, self.alone_n)
+        return estimate.value, estimate.interval
+
+    def rate_ppi(self) -> tuple[float, Interval | None]:
+        self._check()
+        counts = self.counts
+        real = [True] * counts.true_positive + [False] * counts.false_positive
+        real += [True] * counts.false_negative + [False] * counts.true_negative
+        said = [1.0] * counts.said_success + [0.0] * counts.said_failure
+        further = [1.0] * self.alone_k + [0.0] * (self.alone_n - self.alone_k)
+        estimate = ppi_plus_plus(real, said, further)
+        return estimate.value, estimate.interval
+
+    def saved(self) -> float:
+        self._check()
+        estimate = post_stratified(self.counts, self.alone_k, self.alone_n)
+        return float(trials_saved(estimate, self.counts.n))
+
+    def _check(self) -> None:
+        """Refuse an estimate where the tried starts are unlike the others."""
         for look, words in (
-            (p_random, "the tried starts are no random part of the twin's"),
-            (overlap.p_alike, "the tried starts lie elsewhere than the twin's others"),
+            (self.p_random, "the tried starts are no random part of the twin's"),
+            (self.overlap.p_alike, "the tried starts lie elsewhere than the twin's others"),
         ):
             try:
                 p = look()
@@ -71,23 +95,18 @@ def _assisted_rate(
                     statistic="rate from the twin", reason=f"{words} (p = {p:.3g})"
                 )
 
-    def stratified() -> tuple[float, Interval | None]:
-        checked()
-        estimate = post_stratified(counts, alone_k, alone_n)
-        return estimate.value, estimate.interval
 
-    def saved() -> float:
-        checked()
-        return float(trials_saved(post_stratified(counts, alone_k, alone_n), counts.n))
-
-    def ppi() -> tuple[float, Interval | None]:
-        checked()
-        real = [True] * counts.true_positive + [False] * counts.false_positive
-        real += [True] * counts.false_negative + [False] * counts.true_negative
-        said = [1.0] * counts.said_success + [0.0] * counts.said_failure
-        further = [1.0] * alone_k + [0.0] * (alone_n - alone_k)
-        estimate = ppi_plus_plus(real, said, further)
-        return estimate.value, estimate.interval
+def _assisted_rate(
+    key: Key, paired: Sequence[TrialRow], alone: Sequence[TrialRow]
+) -> list[Measurement]:
+    cell = _Assisted(
+        counts=confusion_of(paired, lambda row: row.sim_planned),
+        alone_k=trials_in(row for row in alone if row.sim_planned),
+        alone_n=trials_in(alone),
+        overlap=StartOverlap(paired, alone),
+    )
+    many = f"{cell.counts.n} trials with an outcome and {cell.alone_n} starts that only the "
+    many += "twin has"
 
     def make(name: str, compute: Statistic, unit: str, words: str) -> Measurement:
         return measured(
@@ -95,7 +114,7 @@ def _assisted_rate(
             compute,
             unit=unit,
             definition=f"{words}; {many}",
-            n=counts.n,
+            n=cell.counts.n,
             counted="trial",
             reason_without_interval="a count or a p-value",
             episodes=names_of(paired),
@@ -104,21 +123,21 @@ def _assisted_rate(
     return [
         make(
             "recorded_rate",
-            stratified,
+            cell.rate,
             "1",
             "recorded success rate with the twin's help: strata of the twin's answer, each with a "
             "Beta(1/2, 1/2) prior",
         ),
-        make("recorded_rate_ppi", ppi, "1", "the same by PPI++ (normal approximation)"),
-        make("trials_saved", saved, "count", "further trials Wilson's interval would need"),
+        make("recorded_rate_ppi", cell.rate_ppi, "1", "the same by PPI++ (normal approximation)"),
+        make("trials_saved", cell.saved, "count", "further trials Wilson's interval would need"),
         make(
             "random_starts_p",
-            p_random,
+            cell.p_random,
             "1",
             "p of Boschloo's test that the twin succeeds as often on the tried starts as on the "
             "others: small forbids the estimates",
         ),
-        *overlap.measurements(partial(_proxy_id, key)),
+        *cell.overlap.measurements(partial(_proxy_id, key)),
     ]
 
 
