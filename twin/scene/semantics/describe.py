@@ -220,27 +220,15 @@ def describe(
     """
     ids = np.flatnonzero(mask)
     p = cloud.means_m[ids].astype(np.float64)
-    lowest = float(np.quantile(p[:, 2], 0.01))
-    ground = lowest
-    if plane is not None:
-        under = float(np.median(p[:, 2] - plane.height_m(p) / plane.normal[2]))
-        ground = under if -0.02 < lowest - under < 0.05 else lowest
-    xyh = p - np.array([0.0, 0.0, ground])
+    up = np.array([0.0, 0.0, _ground_m(p, plane)])
+    xyh = p - up
     form = measure_form(xyh, CELL_M)
     color = np.clip(np.rint(np.median(cloud.colors[ids], axis=0) * 255), 0, 255)
     if key:
         label = label_of(key, colour_name(color / 255), is_open=form.cavity is not None)
     is_nameless_container = kind_of(label) == "other" and form.word == CONTAINER
     called = CONTAINER if is_nameless_container else label
-    if surface_m is None:
-        parts = find_parts(xyh, called, CELL_M, PartsConfig())
-    else:
-        surface = surface_m - np.array([0.0, 0.0, ground])
-        found = find_parts(surface, called, CELL_M, PartsConfig())
-        nearest = cKDTree(surface).query(xyh)[1]
-        masks = {name: part[nearest] for name, part in found.masks.items()}
-        parts = Parts(masks=masks, keypoints=found.keypoints)
-    up = np.array([0.0, 0.0, ground])
+    parts = _parts_of(xyh, called, None if surface_m is None else surface_m - up)
     T = np.eye(4)
     T[:2, :2] = [
         [np.cos(form.yaw_rad), -np.sin(form.yaw_rad)],
@@ -261,6 +249,29 @@ def describe(
         parts={name: _among(ids, part, len(cloud)) for name, part in parts.masks.items()},
         keypoints_m={name: point + up for name, point in parts.keypoints.items()},
     )
+
+
+def _ground_m(p: Float[np.ndarray, "num_points 3"], plane: SupportPlane | None) -> float:
+    """Height of what a thing stands on."""
+    lowest = float(np.quantile(p[:, 2], 0.01))
+    if plane is None:
+        return lowest
+    under = float(np.median(p[:, 2] - plane.height_m(p) / plane.normal[2]))
+    return under if -0.02 < lowest - under < 0.05 else lowest
+
+
+def _parts_of(
+    xyh: Float[np.ndarray, "num_points 3"],
+    called: str,
+    surface: Float[np.ndarray, "_ 3"] | None,
+) -> Parts:
+    """Parts of a thing's Gaussians, told apart on its reconstructed surface where there is one."""
+    if surface is None:
+        return find_parts(xyh, called, CELL_M, PartsConfig())
+    found = find_parts(surface, called, CELL_M, PartsConfig())
+    nearest = cKDTree(surface).query(xyh)[1]
+    masks = {name: part[nearest] for name, part in found.masks.items()}
+    return Parts(masks=masks, keypoints=found.keypoints)
 
 
 def _among(ids: np.ndarray, part: np.ndarray, num_splats: int) -> np.ndarray:
