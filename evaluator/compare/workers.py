@@ -218,7 +218,8 @@ class _Worker(ChildProcess):
         """Not for ever: a process may be stopped in the middle of an answer."""
         if not wait([self.outlet], MAX_WAIT_S):
             raise TimeoutError
-        return self.outlet.read(size)
+        found: bytes | None = self.outlet.read(size)
+        return found
 
 
 def serve(next_message: Callable[[], Any], outbox: BinaryIO) -> None:

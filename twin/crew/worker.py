@@ -26,6 +26,8 @@ ONE_THREAD: Mapping[str, str] = {
 }
 """Side by side, libraries that start a thread for each core only get in each other's way."""
 JOIN_S = 5.0
+WHOLE_S = 5.0
+"""For the rest of an answer that has begun, where there is a limit at all."""
 _starting = threading.Lock()
 
 
@@ -80,16 +82,15 @@ class Worker:
         """Of the process."""
         return self._process.pid
 
-    def begin(self, function: Function, item: Any) -> None:
+    def begin(self, function: Function, item: Any, timeout_s: float | None = None) -> None:
         """Give it a piece of work; the function is one of a module that can be imported.
 
         Raises:
             WorkerDiedError: When it is gone already.
+            TimeIsUpError: When it has not taken the piece in time; it was ended.
         """
-        try:
+        with self._speaking(timeout_s):
             self._pipe.send((function, item))
-        except OSError as error:
-            raise WorkerDiedError(status=self._status()) from error
         self.busy = True
 
     def finish(self, timeout_s: float | None = None) -> Answer | Failed:
@@ -97,17 +98,43 @@ class Worker:
 
         Raises:
             WorkerDiedError: When the process ended before it answered.
-            TimeIsUpError: When it has not answered yet; it goes on working.
+            TimeIsUpError: When it has not answered yet; it goes on working. One that stopped in
+                the middle of its answer was ended.
         """
-        try:
-            if not self._pipe.poll(timeout_s):
-                message = f"no answer within {timeout_s:g} s"
-                raise TimeIsUpError(message)
+        with self._speaking(None):
+            is_there = self._pipe.poll(timeout_s)
+        if not is_there:
+            message = f"no answer within {timeout_s:g} s"
+            raise TimeIsUpError(message)
+        with self._speaking(None if timeout_s is None else WHOLE_S):
             answer = self._pipe.recv()
-        except (EOFError, OSError) as error:
-            raise WorkerDiedError(status=self._status()) from error
         self.busy = False
         return answer
+
+    @contextmanager
+    def _speaking(self, timeout_s: float | None) -> Iterator[None]:
+        """Name a death, and cause it after a while: nothing else ends half a message."""
+        late = threading.Event()
+
+        def end() -> None:
+            late.set()
+            self._process.kill()
+
+        limit = None if timeout_s is None else threading.Timer(timeout_s, end)
+        if limit is not None:
+            limit.daemon = True
+            limit.start()
+        try:
+            yield
+        except (EOFError, OSError) as error:
+            if not late.is_set():
+                raise WorkerDiedError(status=self._status()) from error
+        finally:
+            if limit is not None:
+                limit.cancel()
+        if late.is_set():
+            message = f"it took no more, or said no more, for {timeout_s:g} s"
+            raise TimeIsUpError(message)
 
     def _status(self) -> int | None:
         self._process.join(JOIN_S)

@@ -4,6 +4,7 @@ import threading
 import time
 import traceback
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,14 +31,17 @@ class TwinProcess:
         self._worker: Worker | None = None
         self._start()
 
-    def _start(self) -> None:
+    def _start(self) -> Worker | None:
+        """Begin anew, unless the gate is being stopped."""
         worker = Worker()
-        worker.begin(get_ready, None)
+        with suppress(WorkerDiedError):  # at once: it is replaced when it should answer
+            worker.begin(get_ready, None)
         with self._swapping:
             if not self._closed:
                 self._worker = worker
-                return
+                return worker
         worker.close()
+        return None
 
     def localise(self, frames: Any, task: Task, ends_s: float) -> Mapping[str, Any]:
         """Find a task's objects.
@@ -71,13 +75,11 @@ class TwinProcess:
         return verdict
 
     def _do(self, what: str, function: Function, item: Any, ends_s: float) -> Any:
-        worker = self._worker
-        if worker is None:
-            raise UndecidedError("the gate is being stopped")
+        worker = self._worker_now()
         try:
             if worker.busy:  # with its imports
                 worker.finish(max(0.0, ends_s - time.monotonic()))
-            worker.begin(function, item)
+            worker.begin(function, item, max(0.0, ends_s - time.monotonic()))
             result = worker.finish(max(0.0, ends_s - time.monotonic()))
         except TimeIsUpError as error:
             self._replace(worker)
@@ -93,13 +95,25 @@ class TwinProcess:
             raise UndecidedError(result.message)
         return result
 
+    def _worker_now(self) -> Worker:
+        worker = self._worker
+        try:
+            if worker is None and not self._closed:  # the system gave no process the last time
+                worker = self._start()
+        except OSError as error:
+            raise UndecidedError(f"no process for the twin can be started: {error}") from error
+        if worker is None:
+            raise UndecidedError("the gate is being stopped")
+        return worker
+
     def _replace(self, worker: Worker) -> None:
         with self._swapping:
             if self._worker is not worker:
                 return
             self._worker = None
         worker.close()
-        self._start()
+        with suppress(OSError):  # the system gives no process: the next plan asks again
+            self._start()
 
     def close(self) -> None:
         """End it, also in the middle of something."""

@@ -9,11 +9,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from twin.crew import worker as crew_worker
 from twin.crew.pool import ATTEMPTS, Alone, Crew
 from twin.crew.worker import Failed, TimeIsUpError, Worker, WorkerDiedError
 
@@ -156,3 +158,33 @@ def test_a_worker_that_ends_says_how() -> None:
     with pytest.raises(WorkerDiedError, match="with exit code 3"):
         worker.finish(20.0)
     worker.close()
+
+
+@pytest.mark.parametrize("size", [100, 3_000_000])
+def test_a_worker_that_stops_listening_is_noticed_and_ended(size: int) -> None:
+    """Law: with a limit nothing waits for ever, however much of a piece was sent."""
+    with closing(Worker()) as worker:
+        worker.begin(len, b"")
+        assert worker.finish(60.0) == 0
+        assert worker.pid is not None
+        os.kill(worker.pid, signal.SIGSTOP)
+        started = time.monotonic()
+        with pytest.raises(TimeIsUpError):
+            _ask(worker, bytes(size), 0.1)
+        assert time.monotonic() - started < 5
+
+
+def _ask(worker: Worker, item: bytes, timeout_s: float) -> None:
+    worker.begin(len, item, timeout_s)
+    worker.finish(timeout_s)
+
+
+def test_half_an_answer_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew_worker, "WHOLE_S", 0.1)
+    with closing(Worker()) as worker:
+        worker.begin(bytes, 3_000_000)
+        assert worker.pipe.poll(60)
+        assert worker.pid is not None
+        os.kill(worker.pid, signal.SIGSTOP)  # a socket holds less than that
+        with pytest.raises(TimeIsUpError):
+            worker.finish(60.0)
