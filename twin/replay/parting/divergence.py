@@ -30,6 +30,7 @@ from jaxtyping import Bool, Float, Int
 from bridge.geometry import se3
 from bridge.task.record import check_record
 from twin.replay.config import PartingConfig
+from twin.replay.parting.lag import lag_s, without_lag
 from twin.replay.parting.trace import Touch, Trace
 
 SCHEMA_VERSION = 1
@@ -42,7 +43,6 @@ REST_M_S = 0.02
 """A gripper slower than this rests."""
 REST_STEPS = 12
 """So many steps before and after it moves are left out: two grippers start 0.2 s apart."""
-LAGS_S = np.arange(-0.2, 0.601, 0.01)
 SIDES = ("planned", "executed", "recorded")
 ORDER = ("tool_position", "tool_rotation", "gripper_width", "contact", "object_position")
 UNITS = {"tool_rotation": "rad", "contact": "s"}
@@ -117,7 +117,7 @@ def diverge(
     for first, second in combinations(ordered, 2):
         pair = (first.side, second.side)
         lags[pair] = lag_s(first, second)
-        found = sorted(_partings(first, _shifted(second, lags[pair]), config), key=_rank)
+        found = sorted(_partings(first, without_lag(second, lags[pair]), config), key=_rank)
         if found:
             found = [replace(parting, attribution=found[0].attribution) for parting in found]
         else:
@@ -128,48 +128,6 @@ def diverge(
         lag_s=lags.get(("planned", "recorded")),
         partings=tuple(partings),
         not_compared=tuple(not_compared),
-    )
-
-
-def lag_s(first: Trace, second: Trace) -> float:
-    """By how much the second tool comes later than the first: least mean distance [s]."""
-    end = min(first.end_ns, second.end_ns)
-    times = np.arange(0, max(end, 1), 4 * STEP_NS)
-    here = _positions(first, times)
-    costs = [
-        float(np.linalg.norm(_positions(second, times + round(lag * 1e9)) - here, axis=1).mean())
-        for lag in LAGS_S
-    ]
-    best = min(costs)
-    # A tool that hardly moves fits any lag: of equal ones the smallest.
-    near = [lag for lag, cost in zip(LAGS_S, costs, strict=True) if cost <= best + 1e-5]
-    return round(float(min(near, key=abs)), 3)
-
-
-def _positions(
-    trace: Trace, times_ns: Int[np.ndarray, " num_times"]
-) -> Float[np.ndarray, "num_times 3"]:
-    columns = [np.interp(times_ns, trace.tool.stamps_ns, column) for column in trace.tool.p_m.T]
-    return np.stack(columns, axis=1)
-
-
-def _shifted(trace: Trace, lag: float) -> Trace:
-    """The same trace with a lag taken out."""
-    shift = round(lag * 1e9)
-    tool = replace(trace.tool, stamps_ns=trace.tool.stamps_ns - shift)
-    return replace(
-        trace,
-        tool=tool,
-        width_times_ns=trace.width_times_ns - shift,
-        objects={
-            name: replace(track, stamps_ns=track.stamps_ns - shift)
-            for name, track in trace.objects.items()
-        },
-        touches={
-            name: None if touch is None else (touch[0] - shift, touch[1] - shift)
-            for name, touch in trace.touches.items()
-        },
-        end_ns=trace.end_ns - shift,
     )
 
 

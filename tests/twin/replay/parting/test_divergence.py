@@ -7,7 +7,8 @@ import pytest
 
 from bridge.geometry.trajectory import PoseTrajectory
 from twin.replay.config import PartingConfig
-from twin.replay.parting.divergence import diverge, lag_s
+from twin.replay.parting.divergence import diverge
+from twin.replay.parting.lag import lag_s
 from twin.replay.parting.trace import Trace
 
 CONFIG = PartingConfig()
