@@ -13,8 +13,9 @@ from bridge.episode.records import FrameTransform
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
 from bridge.terminal import Output
+from twin.scene.frames.aligner import TrackConfig
 from twin.scene.frames.base import base_tree
-from twin.scene.frames.odometry import CameraPath, TrackConfig, follow_camera
+from twin.scene.frames.odometry import CameraPath, follow_camera
 from twin.scene.frames.pairs import paired_stamps_ns
 from twin.scene.frames.stated import FAR_NS, apart_s, unknown_mask
 from twin.scene.frames.usable import UnusableCameraError, name_of
