@@ -113,7 +113,7 @@ def check_episode(path: Path, *, rerun: bool = False) -> CheckReport:
                 faults.add(text)
     if episode is not None:
         _check_parts(report, episode, faults)
-        _check_metadata(report, episode, faults)
+        _check_metadata(episode, faults)
     _judge_topics(report, episode, watch, faults)
     report.faults, report.num_faults = faults.listed, faults.count
     return report
@@ -201,7 +201,7 @@ def _check_parts(report: CheckReport, episode: Episode, faults: Faults) -> None:
             report.notes.append(f"{file.path.name} was recovered ({why}); {lost} bytes were lost")
 
 
-def _check_metadata(report: CheckReport, episode: Episode, faults: Faults) -> None:
+def _check_metadata(episode: Episode, faults: Faults) -> None:
     try:
         kind = episode.info.kind
         _ = episode.outcome, episode.derived  # raises when they cannot be read

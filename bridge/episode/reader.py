@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from mcap.summary import Summary
-
 from bridge.episode import metadata, schema
 from bridge.episode.mcap.file import McapFile, damaged
 from bridge.episode.mcap.gather import gathered
@@ -96,10 +94,6 @@ class Episode:
     def sha256(self) -> str:
         """SHA-256 of the bytes of all parts, one after the other, in hexadecimal; reads them."""
         return hash_files(self.parts)
-
-    @property
-    def _summary(self) -> Summary:
-        return self.files[0].summary
 
     @property
     def info(self) -> metadata.EpisodeInfo:

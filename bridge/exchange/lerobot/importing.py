@@ -91,7 +91,7 @@ def import_lerobot(
     report = ImportReport(files=[], frames=0, already_there=0, left_out=plan.left_out)
     missing = [entry for entry in entries if not _is_there(run, entry, origin)]
     report.already_there = len(entries) - len(missing)
-    for rows in iterate_rows(info, missing):
+    for rows in iterate_rows(missing):
         path = _write(info, plan, rows, run, cell, origin)
         report.files.append(path)
         report.frames += rows.entry.length

@@ -148,7 +148,7 @@ def _entry(info: DatasetInfo, path: Path, number: int, row: dict[str, Any]) -> E
         ) from error
 
 
-def iterate_rows(info: DatasetInfo, entries: Sequence[EpisodeEntry]) -> Iterator[EpisodeRows]:
+def iterate_rows(entries: Sequence[EpisodeEntry]) -> Iterator[EpisodeRows]:
     """Yield the rows of each wanted episode; every data file is read once, from front to back.
 
     Raises:

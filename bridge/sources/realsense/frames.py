@@ -1,14 +1,11 @@
 """What the device layer hands on: calibration and frames, without the camera library's types."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
 from bridge.geometry.camera import Camera
-
-Stream = Literal["color", "depth"]
 
 
 @dataclass(frozen=True, kw_only=True)
