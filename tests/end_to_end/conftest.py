@@ -1,7 +1,6 @@
 """Run the commands as a user would, each in its own process."""
 
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -10,6 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
+from loopback import free_endpoint
 
 ROOT = Path(__file__).parents[2]
 SHARED = Path(os.environ.get("GST_SHARED_DATA", ROOT.parent / "shared" / "data"))
@@ -26,13 +26,6 @@ def run_command(*arguments: str, timeout_s: float = 300.0) -> subprocess.Complet
         check=False,
         cwd=ROOT,
     )
-
-
-def _free_endpoint() -> str:
-    """Return a loopback endpoint nobody uses."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 @contextmanager
@@ -63,7 +56,7 @@ def gst() -> Gst:
 @pytest.fixture
 def endpoint() -> str:
     """Give a loopback endpoint nobody uses."""
-    return _free_endpoint()
+    return free_endpoint()
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ import json
 import os
 import queue
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from loopback import free_endpoint
 
 from bridge.episode import schema
 from bridge.episode.catalogue import Entry, label_episode
@@ -88,12 +88,6 @@ def following(run: Path, endpoint: str) -> Iterator[Live]:
         for stream in (live.child.stdout, live.child.stderr):
             if stream is not None:
                 stream.close()
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def record_trial(

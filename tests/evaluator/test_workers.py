@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
@@ -15,6 +14,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from other_processes import ended_within
 
 from bridge.terminal import Output
 from evaluator.compare import compare_run, run, workers
@@ -32,21 +32,6 @@ def begun(pool: Workers, number: int) -> Workers:
     for worker in pool.started:
         assert worker.is_ready or wait([worker.outlet], 30)
     return pool
-
-
-def is_running(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state != "Z"
-
-
-def ended_within(pid: int, seconds: float) -> bool:
-    limit = time.monotonic() + seconds
-    while is_running(pid) and time.monotonic() < limit:
-        time.sleep(0.02)
-    return not is_running(pid)
 
 
 @pytest.fixture(scope="module")

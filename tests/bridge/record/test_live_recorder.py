@@ -1,13 +1,13 @@
 """The recorder on the wire: from Python, with status, liveliness, previews and departures."""
 
 import json
-import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from loopback import free_endpoint
 from mcap.reader import make_reader
 
 from bridge.clock import AnchoredClock
@@ -32,9 +32,7 @@ WAIT_S = 10.0
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_endpoint()
 
 
 @pytest.fixture

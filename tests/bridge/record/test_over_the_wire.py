@@ -1,13 +1,13 @@
 """Recorder, control keys and the folder source joined by real sessions, in one process."""
 
 import json
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
+from loopback import free_endpoint
 from PIL import Image
 
 import robot_gst
@@ -34,9 +34,7 @@ class Joined(NamedTuple):
 
 @pytest.fixture
 def joined(run: RunFolder) -> Iterator[Joined]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
         recorder = Recorder(run, now_ns=session.now_ns)
         session.subscribe("**", recorder.receive)

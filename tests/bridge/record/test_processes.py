@@ -5,7 +5,6 @@ import json
 import os
 import resource
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -13,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from loopback import free_endpoint
 from mcap.reader import make_reader
 
 from bridge.errors import BridgeError
@@ -44,9 +44,7 @@ class Cell:
 
     def __init__(self, run_path: Path) -> None:
         """Find a free port."""
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.endpoint = free_endpoint()
         self.run_path = run_path
         self.children: list[subprocess.Popen[str]] = []
 

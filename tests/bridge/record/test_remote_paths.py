@@ -1,11 +1,11 @@
 """No request from the network names a file outside the run folder."""
 
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from loopback import free_endpoint
 
 from bridge.episode.run import RunFolder
 from bridge.errors import BridgeError
@@ -47,9 +47,7 @@ class Remote(NamedTuple):
 def remote(tmp_path: Path) -> Iterator[Remote]:
     around = tmp_path / "around"
     run = RunFolder.create(around / "inner" / "run")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
         recorder = Recorder(run, now_ns=session.now_ns)
         serve_control(session, recorder)

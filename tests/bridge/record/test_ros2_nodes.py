@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from loopback import free_endpoint
 from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -88,11 +89,7 @@ class Cell:
 
 @pytest.fixture
 def cell(run: RunFolder) -> Iterator[Cell]:
-    import socket
-
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
         made = Cell(session, endpoint, run)
         yield made

@@ -1,6 +1,5 @@
 """Lets the tests of this folder import the peers that lie beside them; a real recorder."""
 
-import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from loopback import free_endpoint
 from rtde_server import RtdeServer, counting_state
 
 from bridge.episode.run import RunFolder
@@ -40,9 +40,7 @@ def server() -> Iterator[RtdeServer]:
 
 @pytest.fixture
 def joined(tmp_path: Path) -> Iterator[Joined]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     run = RunFolder.create(tmp_path / "run")
     with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
         recorder = Recorder(run, now_ns=session.now_ns)

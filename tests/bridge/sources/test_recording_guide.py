@@ -4,7 +4,6 @@ import json
 import re
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -12,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from loopback import free_endpoint
 from rtde_server import RtdeServer
 
 import robot_gst
@@ -95,9 +95,7 @@ def finish(child: "subprocess.Popen[str]") -> tuple[int, str]:
 
 @pytest.mark.slow
 def test_from_an_arm_to_a_checked_episode_and_through_a_crash(start: Run, tmp_path: Path) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     run = str(tmp_path / "lab")
     here = ("--connect", endpoint)
 

@@ -1,9 +1,9 @@
 """A router and a client of it over real TCP on the loopback address."""
 
-import socket
 from collections.abc import Iterator
 
 import pytest
+from loopback import free_endpoint
 
 from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSession, open_session
@@ -11,9 +11,7 @@ from bridge.wire.session import WireSession, open_session
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_endpoint()
 
 
 @pytest.fixture

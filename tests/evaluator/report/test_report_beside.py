@@ -6,11 +6,11 @@ import pickle
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from other_processes import ended_within, is_running
 
 import robot_gst
 from evaluator.compare import Comparison, compare_csv
@@ -45,22 +45,6 @@ def second() -> Iterator[Beside]:
 def contents(folder: Path) -> dict[str, bytes]:
     files = (path for path in sorted(folder.rglob("*")) if path.is_file())
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
-
-
-def is_running(pid: int) -> bool:
-    """Whether a process that is not our child does anything still."""
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state != "Z"
-
-
-def ended_within(pid: int, seconds: float) -> bool:
-    limit = time.monotonic() + seconds
-    while is_running(pid) and time.monotonic() < limit:
-        time.sleep(0.02)
-    return not is_running(pid)
 
 
 @pytest.mark.slow

@@ -3,18 +3,19 @@
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gate_fakes
 import numpy as np
 import pytest
+from gate_fakes import TASK, accept
 
 from bridge.episode.run import RunFolder
 from bridge.errors import OptionError, UsageError
 from bridge.geometry import se3
-from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
@@ -24,19 +25,7 @@ from twin.gate.judge import Gate, UndecidedError
 from twin.gate.moved import turn_between, who_moved
 from twin.gate.twin_process import TwinProcess
 
-TASK = load_task("cube_into_box")
-PLAN = Plan(
-    id="plan_1",
-    planner="scripted",
-    policy="scripted",
-    condition="without_replanning",
-    robot="arm",
-    frame="base_link",
-    instruction="Put the red cube into the box.",
-    task="cube_into_box",
-    stages=(Stage(id="grasp", text="Grasp the cube."),),
-    tau=(Waypoint(t_ns=0, p_m=(0.4, 0.0, 0.3), q_wxyz=(1.0, 0.0, 0.0, 0.0), g=0),),
-)
+PLAN = replace(gate_fakes.PLAN, robot="arm")
 
 
 def frame(stamp_ns: int) -> Any:
@@ -86,18 +75,7 @@ def seen(T_cube: np.ndarray, sigma_m: float = 0.001) -> dict[str, Any]:
 
 
 def accepted(p_success: dict[str, float] | None = None) -> Verdict:
-    yes = Factor(value=True)
-    return Verdict(
-        plan_id=PLAN.id,
-        trajectory="planned",
-        mode="dynamic",
-        ik=yes,
-        clearance=yes,
-        terminal=yes,
-        engine="fake",
-        seed=0,
-        p_success=p_success,
-    )
+    return replace(accept(PLAN), p_success=p_success)
 
 
 def judged(

@@ -1,15 +1,17 @@
 """The gate on a real zenoh network on the loopback address, with a fake replay."""
 
 import json
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from gate_fakes import accept
+from loopback import free_endpoint
 
 from bridge.episode import schema
 from bridge.episode.records import (
@@ -41,9 +43,7 @@ S = 1_000_000_000
 @pytest.fixture
 def sessions() -> Iterator[tuple[WireSession, WireSession]]:
     """A router, and a client of it that plays the cell."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     with (
         open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as router,
         open_session(WireConfig(connect=(endpoint,))) as cell,
@@ -110,17 +110,7 @@ def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(
         return dict.fromkeys(task.objects, item)
 
     def replay(plan: Plan, poses: dict[str, Any], urdf: str, ends_s: float) -> Verdict:
-        yes = Factor(value=True)
-        return Verdict(
-            plan_id=plan.id,
-            trajectory="planned",
-            mode="dynamic",
-            ik=yes,
-            clearance=yes,
-            terminal=Factor(value=False, cause="inside"),
-            engine="fake",
-            seed=0,
-        )
+        return replace(accept(plan), terminal=Factor(value=False, cause="inside"))
 
     gate = Gate(
         task=load_task("cube_into_box"),
@@ -177,20 +167,6 @@ def everything_at(x_m: float = 0.0) -> dict[str, Any]:
     return dict.fromkeys(load_task("cube_into_box").objects, item)
 
 
-def yes(plan: Plan, *_: Any) -> Verdict:
-    good = Factor(value=True)
-    return Verdict(
-        plan_id=plan.id,
-        trajectory="planned",
-        mode="dynamic",
-        ik=good,
-        clearance=good,
-        terminal=good,
-        engine="fake",
-        seed=0,
-    )
-
-
 def ask(cell: WireSession, payload: bytes | None = None) -> Verdict:
     data = plan_for("arm") if payload is None else payload
     return Verdict.from_json(cell.query("lab/gate/verdict", data, timeout_s=10.0))
@@ -206,7 +182,7 @@ def test_a_replay_that_hangs_or_raises_is_null_on_the_wire_and_in_the_log(
         if next(kinds) == "raise":
             raise ZeroDivisionError("oops")
         go_on.wait(5)
-        return yes(plan)
+        return accept(plan)
 
     a_gate(router, LiveView("lab"), replay, lambda *_: everything_at(), deadline_s=0.4)
     published: list[Any] = []
@@ -239,7 +215,7 @@ def test_plans_that_may_not_wait_are_told_at_once_on_the_wire(
     def replay(plan: Plan, *_: Any) -> Verdict:
         inside.release()
         go_on.wait(8)
-        return yes(plan)
+        return accept(plan)
 
     a_gate(router, LiveView("lab"), replay, lambda *_: everything_at(), waiting=0)
     publish_one_frame(cell)
@@ -273,7 +249,7 @@ def test_an_object_moved_while_its_plan_is_judged_is_no_yes(
         ends = time.monotonic() + 5
         while last_seen() < 2 * S and time.monotonic() < ends:
             time.sleep(0.01)
-        return yes(plan)
+        return accept(plan)
 
     a_gate(router, eyes, replay, lambda *_: everything_at(next(places)))
     publish_one_frame(cell)
@@ -289,7 +265,7 @@ def test_pictures_that_are_old_on_the_cells_clock_are_no_basis(
 ) -> None:
     router, cell = sessions
     eyes = LiveView("lab")
-    a_gate(router, eyes, yes, lambda *_: everything_at(), frame_wait_s=0.1)
+    a_gate(router, eyes, accept, lambda *_: everything_at(), frame_wait_s=0.1)
     publish_one_frame(cell)
     assert ask(cell).accepted is True
     later = [
@@ -309,7 +285,7 @@ def test_a_plan_with_numbers_that_are_none_is_refused(
     sessions: tuple[WireSession, WireSession], number: bytes
 ) -> None:
     router, cell = sessions
-    a_gate(router, LiveView("lab"), yes, lambda *_: everything_at())
+    a_gate(router, LiveView("lab"), accept, lambda *_: everything_at())
     publish_one_frame(cell)
     payload = plan_for("arm").replace(b"0.4", number)
     assert payload != plan_for("arm")

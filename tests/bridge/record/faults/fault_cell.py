@@ -5,13 +5,14 @@ import contextlib
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from loopback import free_endpoint
 
 ROOT = Path(__file__).resolve().parents[4]
 CHILD = Path(__file__).with_name("fault_publisher.py")
@@ -172,9 +173,3 @@ class FaultCell:
 
     def path(self, episode: str) -> Path:
         return self.run / "episodes" / f"{episode}.mcap"
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 from fault_account import accounts_are_exact, check_code, ledger, lost, nothing_invented, read
-from fault_cell import FaultCell, PublisherChild, free_endpoint
+from fault_cell import FaultCell, PublisherChild
 from fault_messages import JOINTS, MIX, streams
+from loopback import free_endpoint
 
 from bridge.wire.attachment import Attachment, encode
 

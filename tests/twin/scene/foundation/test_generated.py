@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from block_shape import CAMERA, block_depth, block_mesh, camera_pose, placed
 from block_source import PYTORCH3D, SCALE, known_cloud, stored_quaternion, write_source
+from other_processes import is_running
 from small_files import glb_bytes, mesh_content
 
 from bridge.errors import UsageError
@@ -111,14 +112,6 @@ def test_a_worker_that_breaks_the_contract_is_told_apart(
         run_generator(wanted(), tmp_path / "work", worker(behaviour, source))
     assert len(caught.value.stderr) <= 1500
     assert "docs/foundation_models.md" in str(caught.value)
-
-
-def is_running(process_id: int) -> bool:
-    """Whether a process is there and not merely waiting to be buried."""
-    try:
-        return Path(f"/proc/{process_id}/stat").read_text().split(")")[1].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
 
 
 @pytest.mark.slow
