@@ -85,7 +85,15 @@ class RunFolder:
 
     @staticmethod
     def open(path: Path) -> "RunFolder":
-        """Open an existing run folder."""
+        """Open an existing run folder.
+
+        Raises:
+            UsageError: When there is a file.
+            PathNotFoundError: When there is nothing.
+        """
+        if path.is_file():
+            message = f"{path} is a file, not a run. Give the folder that its episodes/ lies in."
+            raise UsageError(message)
         if not path.is_dir():
             raise PathNotFoundError(
                 path=path, what="run folder", hint="Record into it first: robot-gst record RUN."
