@@ -9,6 +9,7 @@ from typing import Any
 
 from bridge.episode import schema
 from bridge.episode.run import RunFolder
+from bridge.errors import UsageError
 from bridge.task.task_file import load_task
 from bridge.terminal import Output, printable, stop_signals
 from bridge.wire.config import WireConfig
@@ -106,7 +107,8 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
 
     if not CELL_NAME.match(config.cell):
-        raise GateError(f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'.")
+        message = f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'."
+        raise UsageError(message)
     run, task = RunFolder.open(path), load_task(config.task)
     eyes = LiveView(config.cell, read_calibration(run))
     wire = WireConfig(connect=config.connect, config=config.zenoh_config)

@@ -11,12 +11,12 @@ import pytest
 from gate_fakes import PLAN, FakeEyes, gate_with
 
 from bridge.episode.run import RunFolder
-from bridge.errors import InvalidRecordError
+from bridge.errors import InvalidRecordError, UsageError
 from bridge.task.verdict import Verdict
 from bridge.terminal import Output, stop_signals
 from bridge.wire.errors import WireConfigError
 from twin.gate.config import GateConfig
-from twin.gate.service import GateError, run_gate, serve_gate, watch_cell
+from twin.gate.service import run_gate, serve_gate, watch_cell
 
 
 @dataclass
@@ -93,7 +93,7 @@ def test_stop_signals_set_the_event_and_give_the_handlers_back(number: int) -> N
 
 
 def test_a_cell_name_that_is_no_name_is_refused(tmp_path: Any) -> None:
-    with pytest.raises(GateError, match="not usable"):
+    with pytest.raises(UsageError, match="not usable"):
         run_gate(tmp_path, GateConfig(cell="**"), Output(quiet=True))
 
 
