@@ -39,8 +39,19 @@ class RerunFile:
             message = f"cannot write {self._part}: {error.strerror}. Choose another with --out."
             raise DashboardError(message) from error
         self.stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
-        self.stream.save(self._part)
+        try:
+            self.stream.save(self._part)
+        except RuntimeError as error:  # what Rerun makes of everything that goes wrong
+            raise self._unwritten(error) from error
         self.stream.send_recording_name(name)
+
+    def _unwritten(self, error: RuntimeError) -> DashboardError:
+        """Remove what there is, and say why there is no more."""
+        self._part.unlink(missing_ok=True)
+        return DashboardError(
+            f"cannot write {self._part}: {error}. Is the disk full? Make space, or choose another "
+            "place with --out."
+        )
 
     def note(self, text: str) -> None:
         """Remember something that is not shown, once."""
@@ -95,10 +106,20 @@ class RerunFile:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Finish the file and give it its name; after an error remove what there is."""
-        self.stream.flush(timeout_sec=FLUSH_S)
+        """Finish the file and give it its name; after an error remove what there is.
+
+        Raises:
+            DashboardError: When not everything could be written, as on a full disk.
+        """
+        unwritten: RuntimeError | None = None
+        try:
+            self.stream.flush(timeout_sec=FLUSH_S)
+        except RuntimeError as failed:
+            unwritten = failed
         self.stream.disconnect()
-        if kind is None:
+        if kind is None and unwritten is None:
             self._part.replace(self.path)
-        else:
-            self._part.unlink(missing_ok=True)
+            return
+        self._part.unlink(missing_ok=True)
+        if kind is None and unwritten is not None:
+            raise self._unwritten(unwritten) from unwritten

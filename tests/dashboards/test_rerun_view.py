@@ -7,6 +7,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import rerun as rr
 import rerun.chunk as rc
 from rerun_cell import CUBE_STL, T_BASE_CAMERA, urdf, write_cell_run, write_splats
 
@@ -23,6 +24,7 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.task.robot import ARM_JOINTS
 from dashboards.errors import DashboardError
+from dashboards.rerun_file import RerunFile
 from dashboards.rerun_robot import drawable
 from dashboards.rerun_scene import read_splats
 from dashboards.rerun_view import Exported, export_rrd, run_of
@@ -236,3 +238,15 @@ def test_the_drawn_robot_stands_on_base_link_whatever_is_above_it(tmp_path: Path
         drawable("<robot")
     with pytest.raises(DashboardError, match="root element <xacro>"):
         drawable("<xacro/>")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_is_one_clear_sentence_and_leaves_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "trial.rrd"
+    out.with_name("trial.rrd.part").symlink_to("/dev/full")
+    with (
+        pytest.raises(DashboardError, match=r"cannot write .*trial\.rrd\.part: .*disk full"),
+        RerunFile(out, recording_id="full", name="full") as file,
+    ):
+        file.always("about", rr.TextDocument("words" * 1000))
+    assert list(tmp_path.iterdir()) == []
