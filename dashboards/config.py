@@ -2,6 +2,10 @@
 
 from dataclasses import dataclass
 
+from bridge.errors import refuse_outside
+
+PORTS = {"port": (0, 65_535)}
+
 
 @dataclass(frozen=True, kw_only=True)
 class DashboardConfig:
@@ -11,3 +15,7 @@ class DashboardConfig:
     """Address to listen on; anything but the loopback address asks for a token."""
     port: int = 8600
     """Port to listen on; 0 takes any free one."""
+
+    def __post_init__(self) -> None:
+        """Refuse a port that no machine has."""
+        refuse_outside(self, PORTS)

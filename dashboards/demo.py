@@ -19,9 +19,10 @@ from pathlib import Path
 from cyclopts import Parameter
 
 from bridge.episode.run import RunFolder
-from bridge.errors import GstError
+from bridge.errors import GstError, refuse_outside
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
+from dashboards.config import PORTS
 from dashboards.errors import DashboardError
 
 START_TIMEOUT_S = 60.0
@@ -45,6 +46,10 @@ class DemoConfig:
     """Keep the dashboard running until Ctrl-C. Default: only on a terminal."""
     port: int = 0
     """Port of the dashboard; 0 takes a free one."""
+
+    def __post_init__(self) -> None:
+        """Refuse now what would end the demo after minutes."""
+        refuse_outside(self, PORTS)
 
     @property
     def trials(self) -> int:
@@ -108,6 +113,7 @@ class Background:
 def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
     """Record, rebuild, replay, evaluate, and say what to look at next."""
     started = time.monotonic()
+    load_task(config.task)  # refuse an unknown one before anything is made
     run = RunFolder.create(path)
     if run.episodes():
         output.say(

@@ -53,10 +53,6 @@ def listen(config: DashboardConfig) -> socket.socket:
     Raises:
         AddressTakenError: When another program has it, or it is not ours to bind.
     """
-    if not 0 <= config.port <= 65535:
-        raise AddressTakenError(
-            host=config.host, port=config.port, reason="a port is between 0 and 65535"
-        )
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
             config.host, config.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE

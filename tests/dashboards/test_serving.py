@@ -19,8 +19,11 @@ import robot_gst
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run import RunFolder
 from bridge.episode.writer import EpisodeWriter
+from bridge.errors import UsageError
+from bridge.terminal import Output
 from dashboards import demo
 from dashboards.config import DashboardConfig
+from dashboards.demo import DemoConfig, run_demo
 from dashboards.errors import AddressTakenError, NotHereError
 from dashboards.guard import Admission, host_name, is_loopback
 from dashboards.library import derived_paths, episode_path
@@ -36,10 +39,19 @@ def test_a_taken_port_is_one_clear_sentence() -> None:
             listen(DashboardConfig(port=port))
 
 
-@pytest.mark.parametrize("config", [DashboardConfig(port=70_000), DashboardConfig(port=-1)])
-def test_a_port_that_cannot_be_is_refused(config: DashboardConfig) -> None:
-    with pytest.raises(AddressTakenError, match="between 0 and 65535"):
-        listen(config)
+@pytest.mark.parametrize("port", [70_000, -1])
+@pytest.mark.parametrize("config", [DashboardConfig, DemoConfig])
+def test_a_port_that_cannot_be_is_refused_before_anything_is_done(
+    config: type[DashboardConfig | DemoConfig], port: int
+) -> None:
+    with pytest.raises(UsageError, match="at least 0 and at most 65535"):
+        config(port=port)
+
+
+def test_a_demo_of_an_unknown_task_is_refused_before_anything_is_recorded(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no task named 'nonsense'"):
+        run_demo(tmp_path / "run", DemoConfig(quick=True, task="nonsense"), Output(quiet=True))
+    assert not (tmp_path / "run").exists()
 
 
 def test_an_address_that_is_not_ours_is_refused() -> None:
