@@ -73,6 +73,7 @@ def _environment() -> Environment:
         wording.condition_word,
         wording.image_title,
         wording.percent,
+        wording.chance,
     ):
         environment.filters[function.__name__] = function
     environment.filters["quoted"] = lambda path: shlex.quote(str(path))

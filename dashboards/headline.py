@@ -22,6 +22,7 @@ SIDE_WORDS = {
     "recorded": "recorded",
     "sim_planned": "twin, planned",
     "sim_executed": "twin, executed",
+    "sim_varied": "twin, varied",
     "verdict": "gate accepted",
 }
 CARDS: tuple[tuple[str, str, tuple[str, ...]], ...] = (

@@ -16,6 +16,10 @@ from evaluator.result import Cell, Measurement, Table
 VIEWS_TITLE = "Held-out views: "
 """Before the file's name in the title of the table that rates its images."""
 
+FIRST = tuple(
+    f"views.all.{name}" for name in ("psnr_db", "psnr_gain_db", "ssim", "depth_mean_abs_m")
+)
+
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutView:
@@ -36,7 +40,10 @@ class TwinPage:
     files: tuple[str, ...]
     views: tuple[HeldOutView, ...]
     rated: bool
+    first: tuple[Measurement, ...]
+    """The numbers to read first."""
     measurements: tuple[Measurement, ...]
+    """All others."""
     problems: tuple[str, ...]
     next_command: str
     stand_in: bool | None
@@ -53,11 +60,13 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
         except GstError as error:
             problems.append(str(error))
     views.sort(key=_badness)
+    numbers = [m for m in judgement.measurements if m.id.startswith("views.")]
     return TwinPage(
         files=tuple(path.name for path in paths),
         views=tuple(views),
         rated=any(view.psnr_db is not None for view in views),
-        measurements=tuple(m for m in judgement.measurements if m.id.startswith("views.")),
+        first=tuple(m for m in numbers if m.id in FIRST),
+        measurements=tuple(m for m in numbers if m.id not in FIRST),
         problems=tuple(problems),
         next_command=f"robot-gst rebuild {shlex.quote(str(run.path))}",
         stand_in=judgement.stand_in,

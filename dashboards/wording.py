@@ -1,5 +1,7 @@
 """Numbers and outcomes as words: what a page prints, and nothing it computes."""
 
+from collections.abc import Mapping
+
 from bridge.task.verdict import Factor
 from evaluator.result import Interval, Measurement
 
@@ -55,11 +57,15 @@ def _figure(value: float, unit: str) -> tuple[str, str]:
     return text.replace("-", "−"), shown
 
 
+SHARES = ("average.", "rate.", "rate_common.")
+"""Rates that are means of shares have no count of their own."""
+
+
 def shown_unit(measurement: Measurement) -> str:
     """Return the unit to print in: a k/n of unit 1 is a fraction, a relative gain a change."""
     if measurement.id.startswith("gain.relative."):
         return "relative"
-    if measurement.unit == "1" and measurement.k is not None:
+    if measurement.unit == "1" and (measurement.k is not None or measurement.id.startswith(SHARES)):
         return "fraction"
     return measurement.unit
 
@@ -149,6 +155,13 @@ def short_evidence(measurement: Measurement | None) -> str:
     return ", ".join(parts)
 
 
+def chance(p_success: Mapping[str, float]) -> str:
+    """Print how many varied replays succeeded, and the interval of that share."""
+    low, high = (round(100 * p_success[name]) for name in ("low", "high"))
+    counts = f"{p_success['k']:g} of {p_success['n']:g} varied replays succeed"
+    return f"{counts}, {low} to {high}{NARROW}%"
+
+
 def size_text(num_bytes: int) -> str:
     """Print a file size."""
     size = float(num_bytes)
@@ -172,6 +185,7 @@ def condition_word(condition: str) -> str:
 def image_title(measurement: Measurement) -> str:
     """Name an image number ``views.<part>.<metric>`` as its metric and part."""
     _, part, metric = [*measurement.id.split(".", 2), "", ""][:3]
-    word, _, how = metric.removesuffix("_db").removesuffix("_m").replace("_", " ").partition(" ")
+    metric = metric.removesuffix("_db").removesuffix("_m").replace("ms_ssim", "ms-ssim")
+    word, _, how = metric.replace("_", " ").partition(" ")
     name = " ".join(filter(None, (word.upper(), how))) or measurement.id
     return name if part == "all" else f"{name}, {part}"

@@ -342,3 +342,14 @@ def test_nothing_can_be_written(shared_run: RunFolder) -> None:
     app = create_app(Library.open([shared_run.path]))
     methods = {method for route in app.routes for method in getattr(route, "methods", None) or ()}
     assert methods == {"GET", "HEAD"}
+
+
+def test_the_views_follow_the_few_numbers_to_read_first(browser: Any) -> None:
+    page = browser.get("/twin").text
+    first, views, all_numbers = (
+        page.index(text) for text in ('class="cards"', "Held-out views <", "All image numbers")
+    )
+    assert first < views < all_numbers
+    assert page[first:views].count("<article") <= 4
+    assert "held out: " not in words(page[first:views])
+    assert "MS-SSIM" in words(page[all_numbers:])
