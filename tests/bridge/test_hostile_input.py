@@ -209,7 +209,7 @@ def test_two_encodings_of_one_type_keep_their_own_schemas(tmp_path: Path) -> Non
         writer.write("/a", sample(1, (), []), type_name=schema.JOINT_STATE, log_time_ns=1)
         writer.write_foreign("/b", b"{}", schema_record=named, log_time_ns=2)
         writer.write_foreign("/a", b"{}", schema_record=named, log_time_ns=3)
-    summary = Episode.open(path)._summary
+    summary = Episode.open(path).files[0].summary
     found = {
         (channel.topic, channel.message_encoding, summary.schemas[channel.schema_id].encoding)
         for channel in summary.channels.values()
