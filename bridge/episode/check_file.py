@@ -19,21 +19,23 @@ from bridge.episode.check_summary import Seen, summary_faults
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.file import read_footer, read_header, read_summary
 from bridge.episode.mcap.format import MAGIC, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from bridge.episode.mcap.packed import (
+    MessageHead,
+    message_head,
+    parse_chunk,
+    records_in,
+    unpack_chunk,
+)
 from bridge.episode.mcap.rebuild import attachment_entry, chunk_entry
 from bridge.episode.mcap.walk import (
     DAMAGE,
     PIECE_BYTES,
     BrokenRecordError,
     ByteStream,
-    MessageHead,
     Place,
     attachment_of,
-    message_head,
     parse,
-    parse_chunk,
     read_body,
-    records_in,
-    unpack_chunk,
     walk,
 )
 

@@ -6,16 +6,9 @@ from dataclasses import dataclass, field
 from mcap import records
 from mcap.summary import Summary
 
+from bridge.episode.mcap.packed import MessageHead
 from bridge.episode.mcap.rebuild import metadata_entry
-from bridge.episode.mcap.walk import (
-    BrokenRecordError,
-    ByteStream,
-    MessageHead,
-    Place,
-    parse,
-    read_body,
-    walk,
-)
+from bridge.episode.mcap.walk import BrokenRecordError, ByteStream, Place, parse, read_body, walk
 
 
 @dataclass(kw_only=True)

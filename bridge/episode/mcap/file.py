@@ -20,13 +20,13 @@ from bridge.episode.mcap.format import (
     RECORD_HEAD,
     SCHEMA,
 )
+from bridge.episode.mcap.packed import message_head
 from bridge.episode.mcap.rebuild import rebuild_summary
 from bridge.episode.mcap.walk import (
     BrokenRecordError,
     ByteStream,
     Place,
     attachment_of,
-    message_head,
     parse,
     read_body,
     walk,

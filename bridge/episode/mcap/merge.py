@@ -16,19 +16,9 @@ from mcap import records
 
 from bridge.episode.mcap.file import McapFile, damaged
 from bridge.episode.mcap.format import CHUNK, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from bridge.episode.mcap.packed import MessageHead, message_head, parse_chunk, unpack_chunk
 from bridge.episode.mcap.table import MessageTable, mask_of, message_table, refuse_strays
-from bridge.episode.mcap.walk import (
-    DAMAGE,
-    BrokenRecordError,
-    ByteStream,
-    MessageHead,
-    Place,
-    message_head,
-    parse_chunk,
-    read_body,
-    unpack_chunk,
-    walk,
-)
+from bridge.episode.mcap.walk import DAMAGE, BrokenRecordError, ByteStream, Place, read_body, walk
 
 MEMORY_BYTES = 256 << 20
 """Unpacked chunks held at a time; one chunk may be larger."""

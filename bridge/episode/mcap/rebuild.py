@@ -5,18 +5,20 @@ from mcap.summary import Summary
 
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.format import MAGIC, MESSAGE_HEAD
+from bridge.episode.mcap.packed import (
+    ChunkHead,
+    message_head,
+    parse_chunk,
+    records_in,
+    unpack_chunk,
+)
 from bridge.episode.mcap.walk import (
     BrokenRecordError,
     ByteStream,
-    ChunkHead,
     Place,
     attachment_of,
-    message_head,
     parse,
-    parse_chunk,
     read_body,
-    records_in,
-    unpack_chunk,
     walk,
 )
 

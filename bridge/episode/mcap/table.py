@@ -21,7 +21,8 @@ from bridge.episode.mcap.format import (
     MESSAGE_INDEX,
     RECORD_HEAD,
 )
-from bridge.episode.mcap.walk import BrokenRecordError, records_in
+from bridge.episode.mcap.packed import records_in
+from bridge.episode.mcap.walk import BrokenRecordError
 
 _HEAD = np.dtype(
     [
