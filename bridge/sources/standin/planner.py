@@ -7,12 +7,10 @@ start begin with the same idea.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.sources.standin.cell_file import PlannerNoise
 from bridge.sources.standin.kinematics import (
@@ -22,8 +20,9 @@ from bridge.sources.standin.kinematics import (
     wrap_rad,
     yaw_of,
 )
+from bridge.sources.standin.stages import planned_stages, pose_record, stage_ids
 from bridge.sources.standin.trajectory import Leg, Track, follow_legs
-from bridge.task.plan import Plan, Stage
+from bridge.task.plan import Plan
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME, ROBOT_NAME
 from bridge.task.task_file import ObjectModel, Task
 
@@ -53,15 +52,6 @@ class GraspError:
 
 
 NO_ERROR = GraspError(along_m=0.0, across_m=0.0, yaw_rad=0.0, height_m=0.0, release_m=(0.0, 0.0))
-
-
-@dataclass(frozen=True, kw_only=True)
-class _StageIds:
-    """The stages of a task that one object goes through."""
-
-    pick: str
-    carry: str
-    place: str
 
 
 def draw_error(noise: PlannerNoise, *, start_seed: int, round_: int, index: int = 0) -> GraspError:
@@ -166,10 +156,10 @@ def plan_pick_and_place(
         task=task.name,
         instruction=task.instruction,
         grounding_source=GROUNDING,
-        entities={key: _pose_record(T) for key, T in seen.items()},
+        entities={key: pose_record(T) for key, T in seen.items()},
         keypoints_m=tuple(_point(seen[key][:3, 3]) for key in (*task.manipulated, container)),
         joint_names=ARM_JOINTS,
-        stages=_stages(task, legs_of, track.bounds, seen),
+        stages=planned_stages(task, legs_of, track.bounds, seen),
         tau=track.tau,
     )
 
@@ -248,7 +238,7 @@ def _legs(
     low = over.copy()
     below_tool = p[2] - (T_base_object[2, 3] - model.size_m[2] / 2)
     low[2] = T_base_container[2, 3] + container.size_m[2] + below_tool + RELEASE_CLEARANCE_M
-    ids = _stage_ids(task, object_id)
+    ids = stage_ids(task, object_id)
     moves = (
         ("pregrasp", ids.pick, above, 1.5, 0),
         ("grasp", ids.pick, p, 0.9, 0),
@@ -267,87 +257,6 @@ def _legs(
     ]
 
 
-def _stage_ids(task: Task, object_id: str) -> _StageIds:
-    """The stages that grasp, carry and release an object; placing may cover the carrying."""
-
-    def of(verb: str) -> str | None:
-        return next((stage["id"] for stage in task.stages if stage.get(verb) == object_id), None)
-
-    pick, carry, place = of("grasp"), of("carry"), of("release")
-    if pick is None or place is None:
-        message = (
-            f"task {task.name} has no stage that grasps {object_id} or none that releases it: "
-            "the scripted planner needs both. See docs/tasks.md."
-        )
-        raise UsageError(message)
-    return _StageIds(pick=pick, carry=carry or place, place=place)
-
-
-def _stages(
-    task: Task,
-    legs_of: Mapping[str, Sequence[Leg]],
-    bounds: Mapping[str, tuple[int, int]],
-    seen: Mapping[str, Float[np.ndarray, "4 4"]],
-) -> tuple[Stage, ...]:
-    stages = []
-    for index, table in enumerate(task.stages):
-        last = index == len(task.stages) - 1
-        object_id = _object_of(task, table)
-        predicted = _predicted(task, object_id, legs_of[object_id], seen, table)
-        start_ns, end_ns = bounds[table["id"]]
-        stages.append(
-            Stage(
-                id=table["id"],
-                text=table["text"],
-                grasp=table.get("grasp"),
-                release=table.get("release"),
-                allowed_contacts=tuple((a, b) for a, b in table.get("allowed_contacts", [])),
-                terminal=tuple(dict(item) for item in task.success) if last else (),
-                predicted_objects={object_id: _pose_record(predicted)},
-                t_start_ns=start_ns,
-                t_end_ns=end_ns,
-            )
-        )
-    return tuple(stages)
-
-
-def _object_of(task: Task, stage: Mapping[str, Any]) -> str:
-    """The object a stage handles."""
-    for verb in ("grasp", "carry", "release"):
-        if stage.get(verb) in task.manipulated:
-            return str(stage[verb])
-    message = (
-        f"stage {stage['id']} of task {task.name} grasps, carries and releases nothing: the "
-        "scripted planner cannot plan it. See docs/tasks.md."
-    )
-    raise UsageError(message)
-
-
-def _predicted(
-    task: Task,
-    object_id: str,
-    legs: Sequence[Leg],
-    seen: Mapping[str, Float[np.ndarray, "4 4"]],
-    table: Mapping[str, Any],
-) -> Float[np.ndarray, "4 4"]:
-    """Where a stage leaves its object: lifted, over the container, or on the container's floor."""
-    place = {leg.name: leg.T_base_tcp[:3, 3] for leg in legs}
-    T = seen[object_id].copy()
-    if table.get("release"):
-        container_id = task.containers[0]
-        floor_m = task.objects[container_id].wall_m + task.objects[object_id].size_m[2] / 2
-        T[:2, 3] = place["open"][:2]
-        T[2, 3] = seen[container_id][2, 3] + floor_m
-    else:
-        T[:3, 3] += place["carry" if table.get("carry") else "lift"] - place["close"]
-    return T
-
-
 def _point(p: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
     x, y, z = (float(value) for value in p)
     return x, y, z
-
-
-def _pose_record(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
-    q, p = se3.split(T)
-    return {"p_m": [float(v) for v in p], "q_wxyz": [float(v) for v in q]}
