@@ -35,6 +35,9 @@ what was lost is in the answers."""
 ENVIRONMENT = (MODE, TOKEN, TOKEN_PATH, NICENESS, HIDDEN_LINES)
 ANSWER_S = 5.0
 """How long the head of a cluster may take to accept a connection."""
+LOOK_S, EMPTY_LOOKS = 60.0, 5
+"""How often a cluster from which nothing comes is asked for its processors, and how often it may
+have none: one that makes nodes when they are asked for needs some minutes."""
 TOKEN_FILE = Path(".ray") / "auth_token"
 """Below the home folder; where Ray itself looks last."""
 
@@ -111,8 +114,7 @@ class RayRunner:
                 retries = ATTEMPTS - 1 if len(batch) == 1 else 0
                 one = task.options(max_retries=retries)
                 running[one.remote(function, batch, code_version())] = batch
-            done, _ = ray.wait(list(running), num_returns=1)
-            for reference in done:
+            for reference in self._done(list(running)):
                 batch = running.pop(reference)
                 try:
                     answers, seconds = ray.get(reference)
@@ -123,6 +125,25 @@ class RayRunner:
                         continue
                     answers = [lost(f"Ray lost it: {_first_line(error)}")]
                 yield from zip(batch, answers, strict=True)
+
+    def _done(self, running: list[Any]) -> list[Any]:
+        """Wait until something is done.
+
+        Raises:
+            RayClusterError: When the cluster has had no processor for minutes.
+        """
+        empty = 0
+        while empty < EMPTY_LOOKS:
+            done, _ = self._ray.wait(running, num_returns=1, timeout=LOOK_S)
+            if done:
+                return list(done)
+            empty = 0 if self._ray.cluster_resources().get("CPU", 0) else empty + 1
+        message = (
+            f"the Ray cluster at {self._address} has had no processor for "
+            f"{LOOK_S * EMPTY_LOOKS / 60:.0f} minutes: all its nodes ended, or none was started "
+            "beside its head. What was done is kept. Start a node, then run the command again."
+        )
+        raise RayClusterError(message)
 
     def _processors(self) -> int:
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
