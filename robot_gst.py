@@ -3,6 +3,7 @@
 Everything is lazy: a command's module is imported when the command runs.
 """
 
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -266,7 +267,29 @@ def run(arguments: Sequence[str]) -> int:
 
 def main() -> None:
     """Entry point of the ``robot-gst`` command."""
+    _prepare_streams()
     sys.exit(run(sys.argv[1:]))
+
+
+def _prepare_streams() -> None:
+    """Have all three standard streams, and let none of them end a command for a sign it lacks.
+
+    Where one was closed, the next file to be opened would get its number, and whatever a library
+    prints would end up in that file.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            opened = os.open(os.devnull, os.O_RDWR)
+            if opened != number:
+                os.dup2(opened, number)
+                os.close(opened)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "w" if number else "r", closefd=False))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def _take_config(tokens: list[str]) -> tuple[list[str], Path | None]:
