@@ -111,7 +111,7 @@ def _export(episode: Path, out: Path, output: Output) -> Path:
         ) from error
     done = export(episode, out, run_of(episode))
     for note in done.notes:
-        output.say(f"Not shown: {note}")
+        output.say(f"Note: {note}")
     text = f"{done.path}: {done.size_bytes / 1e6:.1f} MB, {', '.join(done.sides)}"
     data = {
         "path": str(done.path),

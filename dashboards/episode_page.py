@@ -42,6 +42,8 @@ class VerdictView:
     factors: tuple[FactorView, ...]
     file: str
     of_sent_plan: bool
+    counts: bool
+    """False of a replay that was made again since, with other settings or in another scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,13 +109,12 @@ def build_page(
     path = episode_path(run, episode_id)
     recording = read_recording(path)
     problems = Problems(list(recording.problems))
-    replays = _read_replays(derived_paths(run, episode_id, "replay"), problems)
+    replays = _read_replays(derived_paths(run, episode_id, "replay"), recording, problems)
     sent_plan = _sent_plan(recording)
     clock = PageClock.of(recording)
     verdicts = _verdicts(recording, replays, sent_plan, clock)
-    failure_t_s = next(
-        (f.t_s for view in verdicts if view.of_sent_plan for f in view.factors if _fails(f)), None
-    )
+    telling = (view for view in verdicts if view.of_sent_plan and view.counts)
+    failure_t_s = next((f.t_s for view in telling for f in view.factors if _fails(f)), None)
     cursor = clock.clamp(_first_known(t_s, failure_t_s, clock.end_s))
     return EpisodePage(
         recording=recording,
@@ -144,14 +145,31 @@ def _fails(view: FactorView) -> bool:
     return view.factor.value is False and view.t_s is not None
 
 
-def _read_replays(paths: Sequence[Path], problems: Problems) -> tuple[Recording, ...]:
+def _read_replays(
+    paths: Sequence[Path], recording: Recording, problems: Problems
+) -> tuple[Recording, ...]:
+    """Read what was made of a recording, in the order in which it was made.
+
+    What was made of other bytes than the file holds now comes first. Of several replays of one
+    trajectory the last counts, for the evaluator as here.
+    """
     found = []
-    for path in paths:
+    for path in sorted(paths, key=lambda path: (path.stat().st_mtime_ns, path.name)):
         replay = problems.attempt(lambda path=path: read_recording(path), None)  # type: ignore[misc]
         if replay is not None:
             found.append(replay)
             problems.texts.extend(replay.problems)
+    found.sort(key=lambda replay: _source_of(replay) == recording.sha256)
     return tuple(found)
+
+
+def _source_of(replay: Recording) -> str | None:
+    return None if replay.derived is None else replay.derived.source_sha256
+
+
+def _trajectory_of(replay: Recording) -> tuple[str | None, ...]:
+    made = replay.derived
+    return (replay.path.name,) if made is None else (made.plan_id, made.trajectory, made.mode)
 
 
 def _sent_plan(recording: Recording) -> Plan | None:
@@ -174,12 +192,15 @@ def _verdicts(
         before = started is None or stamp_ns <= started[0]
         title = GATE_BEFORE if before else "Gate, after motion began"
         views.append(_view(title, "recorded", verdict, recording, sent_id, clock))
+    last = {_trajectory_of(replay): replay for replay in replays}
     for replay in replays:
+        counts = last[_trajectory_of(replay)] is replay
         for _, verdict in replay.verdicts:
             title = f"{verdict.trajectory.capitalize()} in the twin"
-            views.append(_view(title, verdict.mode, verdict, replay, sent_id, clock))
+            subtitle = verdict.mode if counts else f"{verdict.mode}, made again since"
+            views.append(_view(title, subtitle, verdict, replay, sent_id, clock, counts=counts))
     order = {"Planned in the twin": 1, "Executed in the twin": 2}
-    views.sort(key=lambda view: (not view.of_sent_plan, order.get(view.title, 0)))
+    views.sort(key=lambda view: (not view.of_sent_plan, not view.counts, order.get(view.title, 0)))
     return tuple(views)
 
 
@@ -190,6 +211,8 @@ def _view(
     source: Recording,
     sent_id: str | None,
     clock: PageClock,
+    *,
+    counts: bool = True,
 ) -> VerdictView:
     factors = []
     for name, meaning in FACTORS:
@@ -211,6 +234,7 @@ def _view(
         factors=tuple(factors),
         file=source.path.name,
         of_sent_plan=sent_id is None or verdict.plan_id == sent_id,
+        counts=counts,
     )
 
 

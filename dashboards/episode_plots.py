@@ -99,7 +99,7 @@ def main_plots(
 
 
 def _shown_replays(replays: Sequence[Recording], sent_plan: Plan | None) -> dict[str, Recording]:
-    """Pick one planned and one executed replay of the sent plan, dynamic ones first."""
+    """Pick one planned and one executed replay of the sent plan: dynamic, and the last made."""
     chosen: dict[str, Recording] = {}
     for replay in replays:
         derived = replay.derived

@@ -187,5 +187,6 @@ def image_title(measurement: Measurement) -> str:
     _, part, metric = [*measurement.id.split(".", 2), "", ""][:3]
     metric = metric.removesuffix("_db").removesuffix("_m").replace("ms_ssim", "ms-ssim")
     word, _, how = metric.replace("_", " ").partition(" ")
-    name = " ".join(filter(None, (word.upper(), how))) or measurement.id
+    first = word.capitalize() if word == "depth" else word.upper()
+    name = " ".join(filter(None, (first, how))) or measurement.id
     return name if part == "all" else f"{name}, {part}"

@@ -1,5 +1,6 @@
 """What the pages say of a run that changed after it was evaluated."""
 
+import os
 import shutil
 from pathlib import Path
 from types import ModuleType
@@ -59,3 +60,16 @@ def test_commands_on_the_pages_can_be_pasted_into_a_shell(
     for address in ("/", "/twin", "/episode/trial_0001"):
         text = words(browser.get(address).text).replace("&#39;", "'")
         assert f"'{copy.path}" in text, address
+
+
+def test_of_a_trajectory_replayed_twice_the_last_replay_counts_on_the_page(
+    synthetic: ModuleType, copy: RunFolder
+) -> None:
+    (first,) = copy.derived("trial_0002.replay.planned*")
+    os.utime(first, ns=(10**18, 10**18))
+    first.rename(first.with_name(first.name.replace("a1b2c3d4", "ffffffff")))
+    last = synthetic.write_replay(copy, synthetic.TRIALS[1], "planned", True)
+    assert copy.derived("trial_0002.replay.planned*")[0] == last  # by name it is the first
+    text = words(synthetic.browser_of(copy).get("/episode/trial_0002").text)
+    assert "Twin, planned ✓ success" in text
+    assert text.index("✓ accepted") < text.index("dynamic, made again since ✗ refused")
