@@ -6,10 +6,15 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.task.task_file import Task
+from twin.errors import TwinError
 
 TIPPED = 0.7
 PLANAR = (0, 1, 5)
 """Of a localisation's covariance: x, y and the turn about the vertical."""
+
+
+class UnusableCaseError(TwinError):
+    """An episode from which nothing can be learned about physics."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,11 +15,11 @@ from bridge.episode.run import RunFolder
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
 from bridge.task.plan import Plan
-from bridge.task.robot import ARM_JOINTS, MAX_WIDTH_M
+from bridge.task.robot import ARM_JOINTS
 from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output
-from twin.calibrate.physics.case import PLANAR, Case, planar
-from twin.errors import TwinError
+from twin.calibrate.physics.case import PLANAR, Case, UnusableCaseError, planar
+from twin.calibrate.physics.gripper import Series, commands_of, holds, is_holding, widths_of
 from twin.robot.clock import check_clock
 from twin.robot.model import load_robot
 from twin.scene.localise.episode import write_localised
@@ -33,20 +33,8 @@ it lies afterwards."""
 BEFORE_S, AFTER_S = 0.1, 0.25
 GRID_S = 0.02
 LONGEST_GAP_S = 0.2
-HELD_M = 0.002
-"""Fingers that stop this far above what they were told hold something."""
-HELD_S = 0.15
-STILL_M = 3e-4
 UNKNOWN_SIGMA = (0.003, 0.003, 0.05)
 """x, y [m] and turn [rad] of a pose whose localisation says nothing of its error."""
-
-
-_Series = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]
-"""Times [s] and widths [m]."""
-
-
-class UnusableCaseError(TwinError):
-    """An episode from which nothing can be learned about physics."""
 
 
 class NothingToCalibrateError(UsageError):
@@ -123,11 +111,11 @@ def read_case(run: RunFolder, episode: Episode) -> Case:
     _check_joints(arm, start_ns, end_ns)
     times_s = (arm.stamps_ns - start_ns) * 1e-9
     inside = (times_s >= 0.0) & (arm.stamps_ns <= end_ns)
-    commands = _commands(episode, plan, start_ns)
-    widths = _widths(episode, start_ns)
+    commands = commands_of(episode, plan, start_ns)
+    widths = widths_of(episode, start_ns)
     moving = {key: before[key] for key in objects}
     stretches = _stretches(arm, urdf, (start_ns, end_ns), moving, after, commands, widths)
-    hold_times, held = _holds(commands, widths)
+    hold_times, held = holds(commands, widths)
     kept = np.array([np.any((stretches[:, 0] < t) & (t < stretches[:, 1])) for t in hold_times])
     order = [arm.names.index(name) for name in ARM_JOINTS]
     nowhere, unknown = np.full(3, np.nan), np.diag(np.square(UNKNOWN_SIGMA))
@@ -232,8 +220,8 @@ def _stretches(
     executed_ns: tuple[int, int],
     before: Mapping[str, Found],
     after: Mapping[str, Found],
-    commands: _Series,
-    widths: _Series,
+    commands: Series,
+    widths: Series,
 ) -> Float[np.ndarray, "num_stretches 2"]:
     """When the tool is near an object's way, or the fingers hold something, from the start [s]."""
     start_ns, end_ns = executed_ns
@@ -248,11 +236,7 @@ def _stretches(
         busy |= _distance_m(tool, start, end) < NEAR_M
     if not busy.any():
         raise UnusableCaseError("the tool never came near to an object.")
-    if len(widths[0]):
-        told = commands[1][np.searchsorted(commands[0], times_s, side="right") - 1]
-        width = np.interp(times_s, *widths)
-        still = np.abs(width - np.interp(times_s - HELD_S, *widths)) < STILL_M
-        busy |= still & (width > told + HELD_M)
+    busy |= is_holding(times_s, commands, widths)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], busy.astype(int), [0]])))
     merged: list[list[float]] = []
     for first, last in edges.reshape(-1, 2):
@@ -274,44 +258,3 @@ def _distance_m(
     along = end_m - start_m
     share = np.clip((points_m - start_m) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
     return np.asarray(np.linalg.norm(points_m - start_m - share[:, None] * along, axis=1))
-
-
-def _commands(episode: Episode, plan: Plan, start_ns: int) -> _Series:
-    """What the gripper was told and when [s, m]: from events, else from the plan."""
-    times, widths = [0.0], [MAX_WIDTH_M]
-    for event in streams.events(episode):
-        if event["type"] == "gripper" and event.get("plan_id") == plan.id:
-            told = (event.get("data") or {}).get("width_m")
-            shut = 0.0 if event.get("text") == "close" else MAX_WIDTH_M
-            times.append((int(event["stamp_ns"]) - start_ns) * 1e-9)
-            widths.append(shut if told is None else float(told))
-    if len(times) == 1:
-        for waypoint in plan.tau:
-            shut = 0.0 if waypoint.g else MAX_WIDTH_M
-            times.append(waypoint.t_ns * 1e-9)
-            widths.append(shut if waypoint.width_m is None else waypoint.width_m)
-    return np.array(times), np.array(widths)
-
-
-def _widths(episode: Episode, start_ns: int) -> _Series:
-    """Recorded opening [s, m]; empty where it was not recorded."""
-    try:
-        track = streams.joint_track(episode, "/gripper/state")
-    except GstError:
-        return np.zeros(0), np.zeros(0)
-    if not np.isfinite(track.position).all():
-        raise UnusableCaseError("gripper widths hold what is no number.")
-    return (track.stamps_ns - start_ns) * 1e-9, track.position[:, 0].astype(np.float64)
-
-
-def _holds(commands: _Series, widths: _Series) -> _Series:
-    """Widths at which the fingers stood still on something, just before they were opened again."""
-    times_s, width_m = widths
-    held_at, held = [], []
-    for index in np.flatnonzero(np.diff(commands[1]) > HELD_M) + 1:
-        opened_s, told_m = commands[0][index], commands[1][index - 1]
-        window = width_m[(times_s > opened_s - HELD_S) & (times_s <= opened_s)]
-        if len(window) > 1 and np.ptp(window) < STILL_M and window.mean() > told_m + HELD_M:
-            held_at.append(float(opened_s) - HELD_S / 2)
-            held.append(float(window.mean()))
-    return np.array(held_at), np.array(held)

@@ -25,9 +25,10 @@ from bridge.task.robot import ARM_JOINTS
 from bridge.task.task_file import Task
 from twin.calibrate.physics import data
 from twin.calibrate.physics import run as physics_run
-from twin.calibrate.physics.case import Case
-from twin.calibrate.physics.data import NothingToCalibrateError, UnusableCaseError, read_cases
+from twin.calibrate.physics.case import Case, UnusableCaseError
+from twin.calibrate.physics.data import NothingToCalibrateError, read_cases
 from twin.calibrate.physics.delay import best_shift_s, delay_of, mean_delay
+from twin.calibrate.physics.gripper import widths_of
 from twin.calibrate.physics.parameters import SURFACE_FRICTION, rigid_parameters
 from twin.calibrate.physics.record import describe_physics
 from twin.physics.config import PhysicsConfig
@@ -327,4 +328,4 @@ def test_widths_that_are_no_numbers_teach_nothing(
     )
     monkeypatch.setattr(data.streams, "joint_track", lambda *_: track)
     with pytest.raises(UnusableCaseError, match="gripper widths hold what is no number"):
-        data._widths(Episode.open(run.episodes()[0]), 0)
+        widths_of(Episode.open(run.episodes()[0]), 0)
