@@ -19,12 +19,8 @@ from twin.scene.semantics.cluster import (
 )
 from twin.scene.semantics.colour import colour_name, lab_from_srgb, without_shading
 from twin.scene.semantics.form import Form, measure_form
-from twin.scene.semantics.split import (
-    SplitConfig,
-    joined_by_outline,
-    split_by_colour,
-    split_by_valleys,
-)
+from twin.scene.semantics.split import SplitConfig, joined_by_outline, split_by_valleys
+from twin.scene.semantics.split_colour import split_by_colour
 from twin.scene.semantics.support import SupportConfig, SupportPlane, find_support
 
 SOURCE = "default segmenter"
