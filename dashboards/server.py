@@ -5,11 +5,12 @@ import secrets
 import signal
 import socket
 import sys
+import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Thread
 from types import FrameType
 
 import uvicorn
@@ -21,6 +22,9 @@ from dashboards.config import DashboardConfig
 from dashboards.errors import AddressTakenError
 from dashboards.guard import Admission, is_loopback
 from dashboards.library import Library
+
+END_S = 0.5
+"""How long threads without work take to end, with a wide margin."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,18 +95,27 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
         )
     )
     text = f"Dashboard: {address.url}\nFrom another computer: {address.ssh_line}\nStop with Ctrl-C."
-    asking = Thread(target=_ask_ahead, args=(library,), daemon=True)
-    asking.start()
+    others = set(threading.enumerate())
+    threading.Thread(target=_ask_ahead, args=(library,), daemon=True).start()
     with listener, _ending_on_signals(server):
         output.result({"url": address.url, "ssh": address.ssh_line, "runs": [*library.runs]}, text)
         server.run(sockets=[listener])
-    if asking.is_alive():
-        # Python ends threads by unwinding them, which aborts the process inside native code. What
-        # the evaluator keeps is written whole, so nothing is left half done.
+    if _are_at_work(set(threading.enumerate()) - others):
+        # Python waits for threads that make a page, a minute for a large run, and ends others by
+        # unwinding them, which aborts the process inside native code. What the evaluator keeps is
+        # written whole, so nothing is left half done.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(0)
     return 0
+
+
+def _are_at_work(threads: set[threading.Thread]) -> bool:
+    """Whether one of them goes on, a moment after it was told to end."""
+    ends_s = time.monotonic() + END_S
+    for thread in threads:
+        thread.join(max(0.0, ends_s - time.monotonic()))
+    return any(thread.is_alive() for thread in threads)
 
 
 def _ask_ahead(library: Library) -> None:
