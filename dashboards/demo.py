@@ -115,27 +115,32 @@ def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
     started = time.monotonic()
     load_task(config.task)  # refuse an unknown one before anything is made
     run = RunFolder.create(path)
+    with _ending_on_sigterm():
+        _steps(run, config, output)
+    seconds = time.monotonic() - started
+    _close(run, config, output, seconds)
+    return 0
+
+
+def _steps(run: RunFolder, config: DemoConfig, output: Output) -> None:
+    path = str(run.path)
     if run.episodes():
         output.say(
             f"{path} holds {len(run.episodes())} episodes already: they are kept and used. "
             "For a fresh recording choose another folder."
         )
         if not (run.scene_dir / "scene.json").is_file():  # an earlier demo was cut off
-            _step(output, "3/6 rebuilding the scene", ["rebuild", str(path)])
+            _step(output, "3/6 rebuilding the scene", ["rebuild", path])
     else:
-        with _ending_on_sigterm():
-            _record(run, config, output)
-    replay = ["replay", str(path), "--samples", str(config.samples)]
+        _record(run, config, output)
+    replay = ["replay", path, "--samples", str(config.samples)]
     _step(output, "5/6 replaying every plan and execution in PyBullet", replay)
-    _step(output, "6/6 evaluating", ["evaluate", str(path)], show_result=True)
-    seconds = time.monotonic() - started
-    _close(run, config, output, seconds)
-    return 0
+    _step(output, "6/6 evaluating", ["evaluate", path], show_result=True)
 
 
 @contextmanager
 def _ending_on_sigterm() -> Iterator[None]:
-    """Make SIGTERM end the demo as Ctrl-C does, so that recorder and gate end with it."""
+    """Make SIGTERM end the demo as Ctrl-C does, so that what it started ends with it."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield

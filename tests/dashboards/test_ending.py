@@ -1,6 +1,7 @@
-"""The dashboard ends when it is told to, whatever it is doing."""
+"""Dashboard and demo end when they are told to, whatever they are doing."""
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -10,7 +11,9 @@ from urllib.parse import urlsplit
 
 import pytest
 
+import robot_gst
 from bridge.episode.run import RunFolder
+from dashboards import demo
 
 ROOT = Path(__file__).resolve().parents[2]
 SLOW = """
@@ -49,3 +52,26 @@ def test_a_page_that_takes_minutes_does_not_hold_the_command(tmp_path: Path) -> 
                 assert process.wait(30) == 0
         finally:
             process.kill()
+
+
+def test_a_demo_terminated_while_it_replays_leaves_no_replay_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    run.scene_dir.mkdir()
+    (run.scene_dir / "scene.json").write_text("{}")
+    pid_file = tmp_path / "pid"
+    code = (
+        "import os, signal, sys, time; "
+        "open(sys.argv[1], 'w').write(str(os.getpid())); "
+        "os.kill(os.getppid(), signal.SIGTERM); time.sleep(60)"
+    )
+    monkeypatch.setattr(RunFolder, "episodes", lambda _: [run.path])
+    monkeypatch.setattr(demo, "_command", lambda _: [sys.executable, "-c", code, str(pid_file)])
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        assert robot_gst.run(["demo", str(run.path), "--quiet"]) == 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid_file.read_text()), 0)
