@@ -101,13 +101,17 @@ class Background:
 
     def stop(self) -> None:
         """Ask it to finish, as Ctrl-C would, and insist after a while."""
-        if self.process.poll() is None:
-            self.process.send_signal(signal.SIGTERM)
-            try:
-                self.process.wait(STOP_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                self.process.kill()
-                self.process.wait()
+        _stop(self.process)
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
 
 
 def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
@@ -191,11 +195,13 @@ def _step(output: Output, label: str, arguments: list[str], *, show_result: bool
     started = time.monotonic()
     quiet = ["--quiet"] if output.quiet else []
     stdout = None if show_result and not output.json else subprocess.DEVNULL
-    done = subprocess.run(_command([*arguments, *quiet]), stdout=stdout, check=False)
-    if done.returncode != 0:
-        raise StepFailedError(
-            command=f"robot-gst {' '.join(arguments)}", code=done.returncode, log=None
-        )
+    process = subprocess.Popen(_command([*arguments, *quiet]), stdout=stdout)
+    try:
+        code = process.wait()
+    finally:
+        _stop(process)
+    if code != 0:
+        raise StepFailedError(command=f"robot-gst {' '.join(arguments)}", code=code, log=None)
     output.say(f"    {time.monotonic() - started:.0f} s: robot-gst {' '.join(arguments)}")
 
 
