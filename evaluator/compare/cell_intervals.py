@@ -10,6 +10,7 @@ from evaluator.compare.rows import RateCell
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Cell, Interval, Table
 from evaluator.statistics.bootstrap import CellSample, refuse_no_width, student_interval
+from evaluator.statistics.columns import counted_cells
 from evaluator.statistics.correlation import fisher_interval, pearson
 from evaluator.statistics.coverage.chosen import Choice, choose_method
 from evaluator.statistics.coverage.stored import vouch
@@ -107,7 +108,7 @@ class CellIntervals:
     def _too_few(self, method: str) -> str:
         if self.unit == "cells":
             name = "Fisher's interval" if method == "fisher-z" else "an interval over cells"
-            return f"{self.num_units} cells; {name} needs {MIN_CLUSTERS}"
+            return f"{counted_cells(self.num_units)}; {name} needs {MIN_CLUSTERS}"
         why = "cells share tasks across conditions" if _is_shared(self._cells) else ""
         why = why or "cells share policies or tasks"
         return (

@@ -10,6 +10,7 @@ from evaluator.compare.rows import RateCell, TrialRow
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Measurement
 from evaluator.statistics.agreement import mean_rate
+from evaluator.statistics.columns import counted_cells
 
 SIM_DEFINITION = (
     "successes / trials in the twin: the plan actually sent, planned trajectory, dynamic replay; "
@@ -218,6 +219,7 @@ def _averages(
     method: str,
 ) -> list[Measurement]:
     units = sorted({cell.unit for cell in members})
+    over = counted_cells(len(members))
     countable = len(units) == 1 and all(rate.k is not None and rate.n for rate in rates)
     why = f"cells are counted in different units ({', '.join(units)})"
     why = why if len(units) > 1 else "the number of trials of a cell is not known"
@@ -228,7 +230,7 @@ def _averages(
             f"average.macro.{name}",
             lambda: _macro(rates),
             unit="1",
-            definition=f"mean of the unrounded {side} rates of {len(members)} cells {condition}: "
+            definition=f"mean of the unrounded {side} rates of {over} {condition}: "
             "every cell counts the same",
             n=len(members),
             counted="cell",
@@ -239,7 +241,7 @@ def _averages(
             f"average.pooled.{name}",
             sum(rate.k or 0 for rate in rates) if countable else 0,
             sum(rate.n or 0 for rate in rates) if countable else 0,
-            definition=f"successes / {units[0]}s over {len(members)} cells {condition} ({side}): "
+            definition=f"successes / {units[0]}s over {over} {condition} ({side}): "
             "every trial counts the same",
             counted=units[0],
             reason_if_undefined=why,

@@ -34,7 +34,7 @@ SECTIONS: tuple[Section, ...] = (
         title="Success rates",
         lead="How often a task succeeded in the twin and as labelled. Sim is planned-in-twin: the "
         "plan actually sent, replayed with physics.",
-        tables=("success", "layout"),
+        tables=("success", "layout", "remarks"),
         figures=("success",),
     ),
     Section(
@@ -81,7 +81,7 @@ SECTIONS: tuple[Section, ...] = (
             ("paired.start_distance_max_m", "Largest distance of paired starts"),
             ("sequence.replanning_evidence.recorded", "Evidence, valid at any time"),
         ),
-        tables=("gains", "remarks"),
+        tables=("gains",),
         figures=("gains",),
     ),
     Section(

@@ -15,6 +15,11 @@ Number = Fraction | float | int
 """Rates as exact fractions where counts are known, so that ties are ties."""
 
 
+def counted_cells(count: int) -> str:
+    """Write how many cells there are: "1 cell", "2 cells"."""
+    return "1 cell" if count == 1 else f"{count} cells"
+
+
 def exact(
     statistic: str, recorded: Sequence[Number], sim: Sequence[Number], *, at_least: int = 1
 ) -> tuple[list[Fraction], list[Fraction]]:
@@ -31,7 +36,7 @@ def exact(
     if count == 0:
         raise UndefinedStatisticError(statistic=statistic, reason="there are no cells")
     if count < at_least:
-        reason = f"{count} cell{'' if count == 1 else 's'}; it needs at least {at_least}"
+        reason = f"{counted_cells(count)}; it needs at least {at_least}"
         raise UndefinedStatisticError(statistic=statistic, reason=reason)
     return [Fraction(v) for v in recorded], [Fraction(v) for v in sim]
 

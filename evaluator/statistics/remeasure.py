@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
 from evaluator.statistics.bootstrap import weighted_ends
+from evaluator.statistics.columns import counted_cells
 from evaluator.statistics.proportion import LEVEL
 from evaluator.statistics.scales import NEAR, SCALES
 from evaluator.statistics.weighted import values_of
@@ -48,7 +49,7 @@ class Remeasured:
                 of its range, or when no redrawn rate changes it.
         """
         if len(self.recorded) < MIN_CELLS:
-            reason = f"{len(self.recorded)} cells; it needs at least {MIN_CELLS}"
+            reason = f"{counted_cells(len(self.recorded))}; it needs at least {MIN_CELLS}"
             raise UndefinedStatisticError(statistic=WHAT, reason=reason)
         scale = SCALES[statistic]
         (value,), (known,) = values_of(statistic, self._every[:1], self.recorded, self.sim)

@@ -8,6 +8,7 @@ import pytest
 from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.writer import EpisodeWriter
 from evaluator.compare import Comparison, compare_run
+from evaluator.report.write import write_report
 
 OLD, NEW = "0123456789ab", "ba9876543210"
 
@@ -97,3 +98,14 @@ def test_what_an_older_program_or_calibration_left_is_not_mentioned(two: Any, ne
         two.replay(name, settings=settings(grasp="friction"))
         two.replay(name, settings=settings(grasp="attach") | {newer: "next"}, tag="b")
     assert said_of_replays(compare_run(two.run)) == []
+
+
+def test_the_report_says_so_beside_the_rates_it_is_about(two: Any, tmp_path: Path) -> None:
+    two.replay("a", scene_hash=OLD)
+    two.replay("b", scene_hash=NEW)
+    report = write_report(compare_run(two.run), tmp_path / "out").report.read_text()
+    rates, remark, cells = (
+        report.index(text) for text in ('id="success"', f"1 in scene {OLD}", 'id="agreement"')
+    )
+    assert rates < remark < cells
+    assert "1 cells" not in report

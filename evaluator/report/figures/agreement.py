@@ -20,6 +20,7 @@ from evaluator.report.figures.drawing import (
     words,
 )
 from evaluator.result import Cell, Measurement, Table
+from evaluator.statistics.columns import counted_cells
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,7 +62,7 @@ def scatter(cells: Sequence[RateCell], word: str) -> Drawing | NotDrawn:
         caption="One mark per cell (task, condition, policy), over the trials where both sides are "
         "known; bars are 95 % intervals of both rates. Below the dashed line the twin is "
         "optimistic. Marks that coincide are set apart.",
-        alt=f"Scatter of {len(drawn)} cells: "
+        alt=f"Scatter of {counted_cells(len(drawn))}: "
         + listed([f"{c.label}: twin {_text(c.pair[0])}, {word} {_text(c.pair[1])}" for c in drawn]),
         table=_table("scatter", drawn, word, common=True),
         height_in=below + side + 0.12,
@@ -151,7 +152,7 @@ def success(cells: Sequence[RateCell], word: str) -> Drawing | NotDrawn:
         title=f"Success rates in the twin and {word}",
         caption="Circle: planned-in-twin; square: as labelled. Bars are 95 % intervals; the counts "
         f"stand at the right.{rest}",
-        alt=f"Rates of {len(known)} cells: "
+        alt=f"Rates of {counted_cells(len(known))}: "
         + listed([f"{c.label}: twin {_text(c.sim)}, {word} {_text(c.recorded)}" for c in known]),
         table=_table("success", known, word, common=False),
         height_in=0.7 + row * len(shown),
