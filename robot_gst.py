@@ -6,6 +6,7 @@ Everything is lazy: a command's module is imported when the command runs.
 import io
 import os
 import sys
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -308,8 +309,31 @@ def _take_config(tokens: list[str]) -> tuple[list[str], Path | None]:
                 continue
             if not path.is_file():
                 raise PathNotFoundError(path=path, what="settings file", hint="Check the path.")
+            _check_tables(path)
             return tokens[:index] + rest, path
     return tokens, None
+
+
+def _check_tables(path: Path) -> None:
+    """Refuse a table that is named like no command: nobody would ever read what stands in it.
+
+    Raises:
+        UsageError: Naming it, and the names there are.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except ValueError:  # which whoever reads the settings says better
+        return
+    known: dict[str, set[str]] = {name: set() for name, *_ in COMMANDS}
+    known |= {group: {name for name, *_ in members} for group, (_, members) in GROUPS.items()}
+    for name, table in content.items():
+        wrong = [name] if name not in known else []
+        if name in GROUPS and isinstance(table, dict):
+            wrong = [f"{name}.{member}" for member in table if member not in known[name]]
+        if wrong:
+            there = ", ".join(known if name not in known else sorted(known[name]))
+            message = f"{path} has [{wrong[0]}], which no command is called. There are: {there}."
+            raise UsageError(message)
 
 
 def _version() -> str:
