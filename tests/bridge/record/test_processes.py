@@ -74,6 +74,13 @@ class Cell:
         with open_session(WireConfig(connect=(self.endpoint,), connect_timeout_s=0.5)) as session:
             return RecorderClient(session, timeout_s=5.0).status()
 
+    def wait_for_messages(self, number: int) -> None:
+        """What a publisher has sent may still be on its way when that publisher has ended."""
+        end_s = time.monotonic() + WAIT_S
+        while (found := self.status().get("messages", 0)) < number:  # type: ignore[operator]
+            assert time.monotonic() < end_s, found
+            time.sleep(0.02)
+
     def command(self, *arguments: str) -> "subprocess.CompletedProcess[str]":
         child = spawn("robot_gst.py", *arguments, "--connect", self.endpoint)
         self.children.append(child)
@@ -131,12 +138,14 @@ def test_a_publisher_killed_in_mid_flight_ends_nothing(cell: Cell, tmp_path: Pat
     recorder = cell.record("--episode", "t1")
     cell.wait_until_ready()
     first = cell.publish(tmp_path / "first", "100000", "0.002")
-    while cell.status().get("messages", 0) < 150:  # type: ignore[operator]
-        time.sleep(0.02)
+    cell.wait_for_messages(150)
     first.kill()
     first.communicate()
+    time.sleep(0.2)
+    of_first = int(cell.status()["messages"])  # type: ignore[call-overload]
     second = cell.publish(tmp_path / "second", "20", "0.001")
     assert second.wait(timeout=WAIT_S) == 0
+    cell.wait_for_messages(of_first + 60)
     recorder.send_signal(signal.SIGINT)
     out, err = recorder.communicate(timeout=WAIT_S)
     assert recorder.returncode == 0, err
@@ -158,6 +167,7 @@ def test_a_signal_finishes_the_open_episode(
     recorder = cell.record("--episode", "t1", "--kind", "scan", "--json")
     cell.wait_until_ready()
     assert cell.publish(tmp_path / "account", "10", "0").wait(timeout=WAIT_S) == 0
+    cell.wait_for_messages(30)
     recorder.send_signal(number)
     out, err = recorder.communicate(timeout=WAIT_S)
     assert recorder.returncode == 0, err
