@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+DEADLINE_S = 200.0
+"""Below the time after which pytest ends itself, which would leave the process behind."""
 
 
 def printed(code: str, *arguments: str, folder: Path = ROOT) -> str:
@@ -14,6 +16,7 @@ def printed(code: str, *arguments: str, folder: Path = ROOT) -> str:
         capture_output=True,
         text=True,
         cwd=folder,
+        timeout=DEADLINE_S,
         check=False,
     )
     assert done.returncode == 0, done.stderr
