@@ -4,11 +4,20 @@ import os
 from pathlib import Path
 
 
+def part_of(path: Path) -> Path:
+    """Name the file that is written first: its own for each process, for two may write at once."""
+    return path.with_name(f"{path.name}.{os.getpid()}.part")
+
+
 def write_whole(path: Path, data: bytes) -> None:
-    """Write ``<path>.part``, sync it to disk, and give it its final name."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-    part.replace(path)
+    """Write the part, sync it to disk, and give it its final name; what fails leaves nothing."""
+    part = part_of(path)
+    try:
+        with part.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise

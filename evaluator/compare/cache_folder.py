@@ -123,7 +123,7 @@ class CacheFolder:
 
     def sweep(self) -> None:
         """Delete what killed evaluations left half-written."""
-        for path in self._path.glob("*.parquet.part"):
+        for path in self._path.glob("*.parquet*.part"):
             try:
                 if time.time() - path.stat().st_mtime > ABANDONED_S:
                     path.unlink()

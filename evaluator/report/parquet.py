@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bridge.exchange.trials_csv import TrialRecord
+from bridge.whole_file import part_of
 from evaluator.arrow_columns import ANSWER, NUMBER, TEXT, WHOLE, column_of
 from evaluator.result import Measurement
 
@@ -73,7 +74,7 @@ def write_measurements(path: Path, measurements: Sequence[Measurement]) -> Path:
 
 
 def _write(path: Path, columns: dict[str, list[Any]], types: dict[str, pa.DataType]) -> Path:
-    part = path.with_name(path.name + ".part")
+    part = part_of(path)
     arrays = [column_of(columns[name], kind) for name, kind in types.items()]
     table = pa.Table.from_arrays(arrays, names=list(types))
     pq.write_table(table, part, compression="zstd")
