@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from twin.crew.worker import Answer, Failed, Function, Worker, WorkerDiedError, do
+from twin.errors import TwinError
 
 ATTEMPTS = 2
 Item = TypeVar("Item")
@@ -62,6 +63,17 @@ class Alone:
         """Nothing to end."""
 
 
+class NoProcessError(TwinError):
+    """The system gives no process to work in."""
+
+    def __init__(self, error: OSError) -> None:
+        """Name the reason it gave."""
+        super().__init__(
+            f"the system gives no further process ({error.strerror or error}). End other programs, "
+            "or work in this one: --workers 1."
+        )
+
+
 @dataclass
 class _Piece:
     item: Any
@@ -80,7 +92,11 @@ class Crew:
     def run(
         self, function: Function, items: Sequence[Item], cost: Callable[[Item], float]
     ) -> Iterator[tuple[Item, Answer | Failed]]:
-        """See ``Runner``."""
+        """See ``Runner``; with fewer processes where the system gives no more.
+
+        Raises:
+            NoProcessError: When it gives none at all.
+        """
         todo = deque(_Piece(item) for item in sorted(items, key=cost, reverse=True))
         while todo or self._at_work:
             while todo and len(self._at_work) < self._size:
@@ -90,7 +106,13 @@ class Crew:
     def _begin(self, function: Function, todo: deque[_Piece]) -> None:
         """Give a free worker the next piece."""
         fresh = not self._idle
-        worker = Worker() if fresh else self._idle.pop()
+        try:
+            worker = Worker() if fresh else self._idle.pop()
+        except OSError as error:
+            if not self._at_work:
+                raise NoProcessError(error) from error
+            self._size = len(self._at_work)
+            return
         piece = todo.popleft()
         try:
             worker.begin(function, piece.item)

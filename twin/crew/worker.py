@@ -4,6 +4,7 @@ Whoever asked sees an answer, a death or a time that is up, and can start the pr
 """
 
 import contextlib
+import errno
 import multiprocessing
 import os
 import signal
@@ -25,6 +26,8 @@ ONE_THREAD: Mapping[str, str] = {
     "OMP_WAIT_POLICY": "passive",
 }
 """Side by side, libraries that start a thread for each core only get in each other's way."""
+REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
+"""What a disk says that is full, or may not be written; everything else is a bug here."""
 JOIN_S = 5.0
 WHOLE_S = 5.0
 """For the rest of an answer that has begun, where there is a limit at all."""
@@ -167,9 +170,18 @@ def do(function: Function, item: Any) -> Answer | Failed:
         return function(item)
     except GstError as error:
         return Failed(message=str(error), known=True)
+    except OSError as error:
+        if error.errno not in REFUSED:
+            return _bug(error)
+        where = f" at {error.filename}" if error.filename else ""
+        return Failed(message=f"the disk refuses{where}: {error.strerror}", known=True)
     except Exception as error:  # noqa: BLE001  # one bad piece does not stop a thousand
-        message = f"internal error: {type(error).__name__}: {error}"
-        return Failed(message=message, known=False, trace=traceback.format_exc())
+        return _bug(error)
+
+
+def _bug(error: Exception) -> Failed:
+    message = f"internal error: {type(error).__name__}: {error}"
+    return Failed(message=message, known=False, trace=traceback.format_exc())
 
 
 @contextmanager

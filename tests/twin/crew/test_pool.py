@@ -15,8 +15,9 @@ from typing import Any
 
 import pytest
 
+from twin.crew import pool
 from twin.crew import worker as crew_worker
-from twin.crew.pool import ATTEMPTS, Alone, Crew
+from twin.crew.pool import ATTEMPTS, Alone, Crew, NoProcessError
 from twin.crew.worker import Failed, TimeIsUpError, Worker, WorkerDiedError
 
 KILL_ITSELF = "__import__('os').kill(__import__('os').getpid(), 9)"
@@ -53,6 +54,15 @@ def test_what_goes_wrong_with_one_piece_is_its_answer_and_the_others_go_on(runne
     assert "NameError" in answers["nonsense"].message
 
 
+def test_a_disk_that_refuses_is_no_bug_and_a_missing_file_of_ours_is() -> None:
+    full = "(_ for _ in ()).throw(OSError(28, 'No space left on device', '/run/derived/a.mcap'))"
+    answers = run(Alone(), [f"next({full})", "open('/nowhere/at/all')"])
+    refused, missing = answers[f"next({full})"], answers["open('/nowhere/at/all')"]
+    assert refused.message == "the disk refuses at /run/derived/a.mcap: No space left on device"
+    assert refused.known
+    assert not missing.known
+
+
 def test_a_killed_process_costs_only_what_it_was_doing(tmp_path: Path) -> None:
     """What dies each time is tried once more and then named; all others are answered."""
     log = tmp_path / "log"
@@ -83,6 +93,22 @@ def test_a_process_killed_while_it_was_idle_is_replaced() -> None:
                 break
             time.sleep(0.01)
         assert list(crew.run(eval, ["40 + 2"], len)) == [("40 + 2", 42)]
+
+
+def test_where_the_system_gives_no_more_processes_the_others_do_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    left = [Worker]
+
+    def scarce() -> Worker:
+        if not left:
+            raise BlockingIOError(11, "Resource temporarily unavailable")
+        return left.pop()()
+
+    monkeypatch.setattr(pool, "Worker", scarce)
+    assert run(Crew(4), [f"{k}" for k in range(6)]) == {f"{k}": k for k in range(6)}
+    with pytest.raises(NoProcessError, match=r"\(Resource temporarily unavailable\).*--workers 1"):
+        run(Crew(4), ["1"])
 
 
 def test_the_longest_are_begun_first() -> None:

@@ -11,10 +11,11 @@ from twin.crew.pool import Runner
 from twin.crew.worker import Failed
 from twin.replay.config import ReplayRunConfig
 from twin.replay.place.rebuilt import read_place, shape_hashes
+from twin.replay.run.kept import there_already
 from twin.replay.run.prepare import Preparation, jobs_of
 from twin.replay.run.table import against_recorded, count_verdicts, executions_of, recorded_labels
 from twin.replay.run.undrawn import describe_undrawn
-from twin.replay.work.job import ReplayJob, row_of_existing, row_of_failure
+from twin.replay.work.job import ReplayJob, row_of_failure
 from twin.replay.work.relive import run_job
 from twin.scene.store.folder import SCENE_FILE, read_record, scene_hash_of
 
@@ -45,8 +46,9 @@ def replay_trajectories(
         tasks = sorted({job.task for job in jobs})
         for remark in describe_undrawn(read_record(run) or {}, tasks):
             output.say(remark)
-    rows, todo = _there_already(jobs, config)
-    run.derived_dir.mkdir(parents=True, exist_ok=True)  # Ray asks each node whether it is there
+    rows, todo = there_already(jobs, force=config.force)
+    if todo:
+        run.derived_dir.mkdir(parents=True, exist_ok=True)  # each node is asked whether it is there
     told: set[tuple[str, str, str]] = set()  # one cause spoils all replays of a plan
     with output.progress("replay", len(todo)) as advance:
         for done, row in enumerate(_replayed(todo, runner, output), start=1):
@@ -141,20 +143,6 @@ def _chosen(run: RunFolder, config: ReplayRunConfig) -> list[str]:
         )
         raise UsageError(message)
     return list(dict.fromkeys(config.episode)) or there
-
-
-def _there_already(
-    jobs: list[ReplayJob], config: ReplayRunConfig
-) -> tuple[list[dict[str, Any]], list[ReplayJob]]:
-    """Rows of the replays that were made before, and the jobs that are still to do."""
-    rows, todo = [], []
-    for job in jobs:
-        row = None if config.force else row_of_existing(job)
-        if row is None:
-            todo.append(job)
-        else:
-            rows.append(row)
-    return rows, todo
 
 
 def _replayed(todo: list[ReplayJob], runner: Runner, output: Output) -> Iterator[dict[str, Any]]:

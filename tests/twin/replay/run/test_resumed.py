@@ -22,8 +22,9 @@ from bridge.task.record import parse_record
 from twin.crew.worker import Failed
 from twin.replay.config import ReplayConfig
 from twin.replay.place.starts import StartState
-from twin.replay.run import cluster
+from twin.replay.run import cluster, kept
 from twin.replay.run.cluster import RayClusterError, RayRunner, code_version, is_loopback
+from twin.replay.run.kept import there_already
 from twin.replay.run.table import count_verdicts
 from twin.replay.run.text import describe_run
 from twin.replay.work.job import ReplayJob, row_of_existing
@@ -81,6 +82,27 @@ def test_a_half_written_replay_does_not_count(jobs: list[ReplayJob]) -> None:
     assert row_of_existing(jobs[0]) is None
     path.write_bytes(b"torn")
     assert row_of_existing(jobs[0]) is None
+
+
+def test_what_is_asked_for_last_counts_also_when_it_was_made_first(
+    jobs: list[ReplayJob], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The newest replay of a trajectory is the one that an evaluation takes."""
+    monkeypatch.setattr(kept, "row_of_existing", lambda job: {} if job.path().exists() else None)
+    sampled = replace(jobs[0], config=replace(QUICK, samples=4))
+    for age_s, job in enumerate((sampled, jobs[0], jobs[1])):
+        job.path().touch()
+        os.utime(job.path(), ns=(0, (10 - age_s) * 10**9))
+    before = {job.path(): job.path().stat().st_mtime_ns for job in (jobs[0], jobs[1], sampled)}
+
+    rows, todo = there_already(jobs, force=False)
+    assert (rows, todo) == ([{}, {}], [jobs[2]])
+    after = {path: path.stat().st_mtime_ns for path in before}
+    assert after[jobs[0].path()] > after[sampled.path()] == before[sampled.path()]
+    assert after[jobs[1].path()] == before[jobs[1].path()], "nothing else counts for that plan"
+    there_already(jobs, force=False)
+    assert {path: path.stat().st_mtime_ns for path in before} == after
+    assert there_already(jobs, force=True) == ([], jobs)
 
 
 def test_settings_of_samples_name_another_file(jobs: list[ReplayJob]) -> None:

@@ -19,6 +19,7 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
+from twin import cli
 from twin.crew.pool import Alone, Crew
 from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.place.starts import StartState, StartStates
@@ -258,6 +259,16 @@ def test_a_run_without_plans_says_so(tmp_path: Path) -> None:
     summary = replay_run(RunFolder.create(tmp_path / "empty"), ReplayRunConfig(), QUIET)
     assert describe_run(summary) == "No trial with a plan to replay."
     json.dumps(summary)
+
+
+def test_with_nothing_to_replay_the_command_was_used_wrongly_and_makes_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    assert cli.replay(folder) == 2
+    assert "No trial with a plan to replay." in capsys.readouterr().out
+    assert not list(folder.iterdir())
 
 
 def marks(*said: str) -> list[dict[str, Any]]:
