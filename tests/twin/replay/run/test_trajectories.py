@@ -261,14 +261,10 @@ def test_a_run_without_plans_says_so(tmp_path: Path) -> None:
     json.dumps(summary)
 
 
-def test_with_nothing_to_replay_the_command_was_used_wrongly_and_makes_no_folder(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = tmp_path / "empty"
-    folder.mkdir()
-    assert cli.replay(folder) == 2
-    assert "No trial with a plan to replay." in capsys.readouterr().out
-    assert not list(folder.iterdir())
+def test_a_folder_that_is_no_run_is_refused_and_stays_as_it_is(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="is not a run: it holds no folder episodes"):
+        cli.replay(tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def marks(*said: str) -> list[dict[str, Any]]:
