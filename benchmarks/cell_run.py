@@ -73,7 +73,9 @@ class _Topic:
         self._session.write(self._topic, self._type_name, bytes(data), source_ns)
 
 
-def record_ungated(run: RunFolder, task: str, seed: int, trials: int) -> list[Path]:
+def record_ungated(
+    run: RunFolder, task: str, seed: int, trials: int, cell_file: str = ""
+) -> list[Path]:
     """Record one session of trials that nobody judges beforehand, unless it is there.
 
     Args:
@@ -81,6 +83,7 @@ def record_ungated(run: RunFolder, task: str, seed: int, trials: int) -> list[Pa
         task: A task of ``datasets/tasks``.
         seed: Draws the laboratory and the starts.
         trials: How many.
+        cell_file: A cell of ``datasets/cells``; empty: the task's own.
 
     Returns:
         The episodes, one per trial.
@@ -90,7 +93,14 @@ def record_ungated(run: RunFolder, task: str, seed: int, trials: int) -> list[Pa
         return paths
     for path in paths:
         path.unlink(missing_ok=True)
-    config = SessionConfig(task=task, seed=seed, scan=False, trials=trials, conditions=(UNGATED,))
+    config = SessionConfig(
+        cell_file=cell_file,
+        task=task,
+        seed=seed,
+        scan=False,
+        trials=trials,
+        conditions=(UNGATED,),
+    )
     session = FileSession(run.episodes_dir)
     run_session(session, config, Output(quiet=True), start_ns=START_NS)
     return paths

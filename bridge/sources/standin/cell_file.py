@@ -103,12 +103,16 @@ class CellFile:
 def load_cell(name: str) -> CellFile:
     """Load ``datasets/cells/<name>.toml`` or a TOML file by path.
 
+    A file that says ``like = "other"`` holds what differs from that cell.
+
     Raises:
         UsageError: Unknown name (lists those that exist), or a file that is no cell.
     """
     path = dataset_file("cells", name)
     table = read_tables(path)
     try:
+        if "like" in table:
+            table = _laid_over(_named_as_like(table["like"]), table)
         return _cell_from(table)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         message = (
@@ -116,6 +120,25 @@ def load_cell(name: str) -> CellFile:
             "Compare it with datasets/cells/standin.toml."
         )
         raise UsageError(message) from error
+
+
+def _named_as_like(name: str) -> dict[str, Any]:
+    table = read_tables(dataset_file("cells", name))
+    if "like" in table:  # two files to look at are enough to know a cell
+        message = f"like {name!r}, which itself is like {table['like']!r}"
+        raise ValueError(message)
+    return table
+
+
+def _laid_over(base: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
+    """Lay what a table names over another; tables inside of it likewise."""
+    merged = dict(base)
+    for key, value in table.items():
+        if isinstance(value, dict) and isinstance(base.get(key), dict):
+            merged[key] = _laid_over(base[key], value)
+        else:
+            merged[key] = value
+    return merged
 
 
 def _cell_from(table: dict[str, Any]) -> CellFile:

@@ -1,11 +1,12 @@
 """Forward and inverse kinematics of the arm's controller: Pinocchio, tool frame ``tcp``."""
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pinocchio
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from bridge.errors import BridgeError
 from bridge.geometry import se3
@@ -23,14 +24,20 @@ JOINT_LIMIT_RAD = np.pi
 class UnreachablePoseError(BridgeError):
     """The arm cannot bring the tool to a pose."""
 
-    def __init__(self, *, p_m: tuple[float, float, float], residual_m: float) -> None:
-        """Remember the position asked for and how close the arm came."""
+    def __init__(
+        self, *, p_m: tuple[float, float, float], residual_m: float, beyond: Sequence[str] = ()
+    ) -> None:
+        """Remember the position asked for, how close the arm came, and joints past their limits."""
         self.p_m = p_m
         self.residual_m = residual_m
+        self.beyond = tuple(beyond)
         x, y, z = p_m
+        off = f"the best joints are {residual_m * 1e3:.1f} mm off"
+        if beyond:
+            off += f" with {' and '.join(beyond)} past {np.degrees(JOINT_LIMIT_RAD):.0f} deg"
         super().__init__(
-            f"the tool cannot reach ({x:.3f}, {y:.3f}, {z:.3f}) m in {BASE_FRAME}: the best joints "
-            f"are {residual_m * 1e3:.1f} mm off. Move the target nearer or change its orientation."
+            f"the tool cannot reach ({x:.3f}, {y:.3f}, {z:.3f}) m in {BASE_FRAME}: {off}. "
+            "Move the target nearer or change its orientation."
         )
 
 
@@ -73,7 +80,7 @@ class Kinematics:
         damping = DAMPING_START
         error = self._error(joints, target)
         for _ in range(MAX_ITERATIONS):
-            if _converged(error) and np.all(np.abs(joints) <= JOINT_LIMIT_RAD + 1e-9):
+            if _converged(error) and not _past_limit(joints).any():
                 return joints
             jacobian = self._jacobian(joints)
             normal = jacobian.T @ jacobian + damping * np.eye(6)
@@ -88,7 +95,11 @@ class Kinematics:
                 damping *= 8.0
         residual = self.T_base_tcp(joints)[:3, 3] - T_base_tcp[:3, 3]
         x, y, z = (float(value) for value in T_base_tcp[:3, 3])
-        raise UnreachablePoseError(p_m=(x, y, z), residual_m=float(np.linalg.norm(residual)))
+        raise UnreachablePoseError(
+            p_m=(x, y, z),
+            residual_m=float(np.linalg.norm(residual)),
+            beyond=[ARM_JOINTS[index] for index in np.flatnonzero(_past_limit(joints))],
+        )
 
     def _full(self, joints_rad: Float[np.ndarray, "6"]) -> Any:
         q = pinocchio.neutral(self._model)
@@ -120,6 +131,10 @@ def tool_down(p_m: Float[np.ndarray, "3"], yaw_rad: float) -> Float[np.ndarray, 
     T[:3, :3] = np.array([[-c, -s, 0.0], [-s, c, 0.0], [0.0, 0.0, -1.0]])
     T[:3, 3] = p_m
     return T
+
+
+def _past_limit(joints_rad: Float[np.ndarray, "6"]) -> Bool[np.ndarray, "6"]:
+    return np.asarray(np.abs(joints_rad) > JOINT_LIMIT_RAD + 1e-9)
 
 
 def _converged(error: Float[np.ndarray, "6"]) -> bool:

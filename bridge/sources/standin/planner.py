@@ -138,8 +138,12 @@ def plan_pick_and_place(
     track = Track.at_rest(T_home, joints_start_rad)
     legs_of: dict[str, list[Leg]] = {}
     for index, key in enumerate(task.manipulated):
-        choices = _ways(task, key, seen[key], seen[container], errors[index], slots[index])
-        track, legs_of[key] = _first_reachable(track, choices, kinematics, max_joint_speed_rad_s)
+        ways = _ways(task, key, seen[key], seen[container], errors[index], slots[index])
+        # From object to object the wrist can wind up until each way goes past a joint's limit.
+        unwound = [[_turned_back(track, T_home, legs[0].stage), *legs] for legs in ways]
+        track, legs_of[key] = _first_reachable(
+            track, [*ways, *unwound], kinematics, max_joint_speed_rad_s
+        )
     last = legs_of[task.manipulated[-1]][-1].stage
     home = Leg(name="home", stage=last, T_base_tcp=T_home, duration_s=1.4, g=0)
     track = follow_legs(track, [home], kinematics, max_joint_speed_rad_s)
@@ -192,6 +196,13 @@ def _first_reachable(
         except UnreachablePoseError:
             continue
     return follow_legs(track, choices[-1], kinematics, max_joint_speed_rad_s), choices[-1]
+
+
+def _turned_back(track: Track, T_home: Float[np.ndarray, "4 4"], stage: str) -> Leg:
+    """Turn the wrist where it is, to how it is at home."""
+    T = T_home.copy()
+    T[:3, 3] = track.T_base_tcp[:3, 3]
+    return Leg(name="turn_back", stage=stage, T_base_tcp=T, duration_s=1.0, g=0)
 
 
 def _ways(

@@ -1,6 +1,7 @@
 """The controller's kinematics against MuJoCo, which builds the arm on its own."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -118,3 +119,57 @@ def test_a_pose_out_of_reach_is_refused_with_its_position() -> None:
     far = tool_down(np.array([1.4, 0.0, 0.2]), 0.0)
     with pytest.raises(UnreachablePoseError, match=r"cannot reach \(1.400, 0.000, 0.200\)"):
         arm_kinematics().joints_for(far, HOME)
+
+
+def test_a_wrist_that_is_wound_up_turns_back_before_the_next_object(
+    ducks: Task, toys_cell: CellFile
+) -> None:
+    def lying(p_m: tuple[float, float, float], yaw: float) -> np.ndarray:
+        q = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+        return se3.transform_from(q, np.array(p_m))
+
+    # Each of these turns is reached alone; with both, the wrist has no way to the second's basket.
+    yaws = (-1.22, -1.18, 0.3, 1.02, -0.6)
+    seen = {"basket": lying((0.46, 0.24, 0.0), 0.15)}
+    for name, yaw in zip(ducks.manipulated, yaws, strict=True):
+        start = ducks.start[name]
+        seen[name] = lying((np.mean(start.x_m), np.mean(start.y_m), 0.03), yaw)
+    limit = toys_cell.max_joint_speed_rad_s
+    plan = plan_pick_and_place(
+        ducks,
+        seen,
+        replace(NO_ERROR, release_m=(-0.08, 0.04)),
+        kinematics=arm_kinematics(),
+        joints_start_rad=HOME,
+        max_joint_speed_rad_s=limit,
+        plan_id="plan_0",
+        condition="without_replanning",
+        start_id="five_ducks_into_basket/9000000",
+    )
+    joints = np.array([waypoint.joints_rad for waypoint in plan.tau])
+    assert np.abs(joints).max() <= np.pi + 1e-9
+    speed = np.abs(np.diff(joints, axis=0)) / (np.diff(plan.times_ns())[:, None] * 1e-9)
+    assert speed.max() <= limit + 1e-9
+    wrist = dict(zip((stage.id for stage in plan.stages), _wrist_ways(plan), strict=True))
+    assert wrist["pick_2"] > 2.0  # most of the way round, instead of past the limit
+    grasped = [stage.id for stage in plan.stages if stage.grasp]
+    assert grasped == [f"pick_{index}" for index in range(1, 6)]
+
+
+def _wrist_ways(plan: Plan) -> list[float]:
+    """How far the last joint turns in each stage [rad]."""
+    times, last = plan.times_ns(), np.array([waypoint.joints_rad[5] for waypoint in plan.tau])
+    return [
+        float(np.ptp(last[(times >= stage.t_start_ns) & (times <= stage.t_end_ns)]))
+        for stage in plan.stages
+    ]
+
+
+def test_a_pose_that_winds_a_joint_past_its_limit_names_the_joint() -> None:
+    kinematics = arm_kinematics()
+    wound = HOME.copy()
+    wound[5] = 3.13
+    past = wound.copy()
+    past[5] = 3.16
+    with pytest.raises(UnreachablePoseError, match="mm off with wrist_3_joint past 180 deg"):
+        kinematics.joints_for(kinematics.T_base_tcp(past), wound)

@@ -191,3 +191,35 @@ def test_a_cell_file_without_cameras_is_refused(tmp_path: Path) -> None:
     path.write_text('schema_version = 1\nname = "x"\n')
     with pytest.raises(UsageError, match="is not a cell file"):
         load_cell(str(path))
+
+
+def test_a_cell_like_another_differs_in_what_it_names_only(tmp_path: Path) -> None:
+    path = tmp_path / "calm.toml"
+    path.write_text(
+        'name = "calm"\nlike = "standin_toys"\n'
+        "[hidden.uniform]\ngrip_N = [8.0, 9.0]\n"
+        "[planner.five_ducks_into_basket]\nrelease_m = 0.01\n"
+    )
+    calm, toys = load_cell(str(path)), load_cell("standin_toys")
+    assert (calm.name, calm.uniform) == ("calm", {**toys.uniform, "grip_N": (8.0, 9.0)})
+    assert calm.planner == toys.planner
+    ducks = "five_ducks_into_basket"
+    assert calm.noise_for(ducks) == replace(toys.noise_for(ducks), release_m=0.01)
+    assert (calm.sensors, calm.normal) == (toys.sensors, toys.normal)
+    assert len(calm.clutter) == len(toys.clutter)
+
+
+@pytest.mark.parametrize(
+    ("said", "found"),
+    [
+        ('"{0}"', "which itself is like"),
+        ('"no_such_cell"', "no cell named 'no_such_cell'"),
+        ("3", "is not a cell file"),
+    ],
+)
+def test_what_no_cell_can_be_like_is_refused(tmp_path: Path, said: str, found: str) -> None:
+    other, path = tmp_path / "other.toml", tmp_path / "broken.toml"
+    other.write_text('name = "other"\nlike = "standin"\n')
+    path.write_text(f'name = "broken"\nlike = {said.format(other)}\n')
+    with pytest.raises(UsageError, match=found):
+        load_cell(str(path))
