@@ -245,6 +245,7 @@ def _measure_depth(
         )
         for name, statistic, values in (
             ("depth_mean_abs_m", "mean absolute depth error", [d.mean_abs_m for d in depths]),
+            ("depth_median_abs_m", "median absolute depth error", [d.median_abs_m for d in depths]),
             ("depth_rmse_m", "root mean square depth error", [d.rmse_m for d in depths]),
         )
     ]

@@ -18,6 +18,8 @@ class DepthScore:
     """Errors of one depth image."""
 
     mean_abs_m: float
+    median_abs_m: float
+    """Hardly moved by silhouettes, where one of both has already reached what lies behind."""
     rmse_m: float
     num_pixels: int
 
@@ -42,6 +44,7 @@ def score_depth(
     error = rendered_m[both].astype(np.float64) - recorded_m[both]
     return DepthScore(
         mean_abs_m=float(np.abs(error).mean()),
+        median_abs_m=float(np.median(np.abs(error))),
         rmse_m=float(np.sqrt(np.square(error).mean())),
         num_pixels=int(both.sum()),
     )

@@ -158,6 +158,7 @@ SECTIONS: tuple[Section, ...] = (
             ("views.all.ms_ssim", "MS-SSIM, raw"),
             ("views.all.gmsd", "GMSD, raw"),
             ("views.all.lpips*", ""),
+            ("views.all.depth_median_abs_m", "Depth, median absolute error"),
             ("views.all.depth_mean_abs_m", "Depth, mean absolute error"),
             ("image.*", ""),
         ),

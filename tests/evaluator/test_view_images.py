@@ -83,8 +83,11 @@ def test_depth_errors_are_those_of_pixels_that_both_have() -> None:
     rendered = np.array([[1.1, 5.0, 0.0, 2.8]])
     score = score_depth(recorded, rendered)
     assert score.num_pixels == 2
-    assert score.mean_abs_m == pytest.approx(0.15)
+    assert score.mean_abs_m == score.median_abs_m == pytest.approx(0.15)
     assert score.rmse_m == pytest.approx(np.sqrt((0.01 + 0.04) / 2))
+    edge = score_depth(np.array([[1.0, 1.0, 1.0]]), np.array([[1.01, 1.02, 3.0]]))
+    assert edge.median_abs_m == pytest.approx(0.02)
+    assert edge.mean_abs_m == pytest.approx(2.03 / 3)
     with pytest.raises(UndefinedStatisticError, match="no pixel"):
         score_depth(recorded, np.zeros_like(recorded))
     with pytest.raises(ImageShapeError):
@@ -149,6 +152,7 @@ def test_every_variant_of_a_view_is_measured_and_named(maker: Any) -> None:
     assert objects.value == pytest.approx(-10 * np.log10(difference.mean()), abs=1e-9)
     assert "mask 'objects'" in objects.definition
     assert results.get("views.all.depth_mean_abs_m").value == pytest.approx(0.01)
+    assert results.get("views.all.depth_median_abs_m").value == pytest.approx(0.01)
     (table,) = (t for t in results.tables if t.id == "views_0")
     row = dict(zip(table.columns, table.rows[0], strict=True))
     assert row["depth (mm)"] == 10.0

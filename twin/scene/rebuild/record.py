@@ -187,8 +187,10 @@ def _view_lines(views: Mapping[str, Any]) -> list[str]:
         if views[f"static_psnr_db{ending}"] is not None:
             line += f", {views[f'static_psnr_db{ending}']:.2f} dB raw where nothing moved"
         line += f"; SSIM {views[f'ssim{ending}']:.3f}"
-        if views[f"depth_mean_abs_m{ending}"] is not None:
-            line += f"; depth off by {1e3 * views[f'depth_mean_abs_m{ending}']:.1f} mm on average"
+        for name in ("median", "mean"):
+            value = views.get(f"depth_{name}_abs_m{ending}")  # older scenes have no median
+            if value is not None:
+                line += f"; {name} depth error {1e3 * value:.1f} mm"
         lines.append(line)
     if not views["images"]:
         lines.append("no frame could be held out: too few frames")

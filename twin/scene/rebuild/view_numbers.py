@@ -19,7 +19,10 @@ VIEWS_NOTE = (
     "evaluator computes the official numbers from the views episode"
 )
 MOST_DB = 100.0
-AVERAGED = ("psnr_db", "static_psnr_db", "gain_psnr_db", "ssim", "depth_mean_abs_m")
+AVERAGED = (
+    *("psnr_db", "static_psnr_db", "gain_psnr_db", "ssim"),
+    *("depth_mean_abs_m", "depth_median_abs_m"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +46,8 @@ class ViewNumbers:
     """Structural similarity of the whole image, as the fit sees it (zero padding)."""
     depth_mean_abs_m: float | None
     """Against the recorded depth where nothing moved and both exist."""
+    depth_median_abs_m: float | None
+    """The same; most of the mean are silhouettes."""
     coverage_fraction: float
     """Mean alpha of the rendered image."""
 
@@ -75,6 +80,7 @@ def rate_view(
         gain_psnr_db=finite_psnr_db(float(np.square(brightened(rendered, wanted) - wanted).mean())),
         ssim=_similarity(rendered, wanted),
         depth_mean_abs_m=float(difference.mean()) if both.any() else None,
+        depth_median_abs_m=float(np.median(difference)) if both.any() else None,
         coverage_fraction=float(view.alpha.mean()),
     )
 
