@@ -14,6 +14,7 @@ from bridge.errors import BridgeError, UsageError
 from bridge.geometry import se3
 from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.execution import execute_plan
+from bridge.sources.standin.kinematics import UnreachablePoseError
 from bridge.sources.standin.label import OPERATOR, label_trial, void_trial
 from bridge.sources.standin.planner import (
     POLICY_NAME,
@@ -218,9 +219,14 @@ class Operator:
         """Plan, and with replanning ask the gate until it accepts or the rounds are used up."""
         rounds = self._config.rounds if info.condition == "with_replanning" else 1
         parent: Plan | None = None
-        reason = ""
+        refused, why = 0, ""
         for round_ in range(rounds):
-            plan = self._candidate(info, start_seed, round_, parent)
+            try:
+                plan = self._candidate(info, start_seed, round_, parent)
+            except UnreachablePoseError as error:
+                why = f"the planner found no plan: {error}"
+                self._cell.streams.event("note", self._cell.now_ns, text=why)
+                continue
             self._cell.streams.plan(plan, self._cell.now_ns)
             if info.condition != "with_replanning":
                 if self._config.ask_always:
@@ -234,8 +240,9 @@ class Operator:
                 return self._unverified(plan, reason)
             self._note_refusal(plan, reason, last=round_ == rounds - 1)
             parent = plan
-        remark = f"nothing executed, the gate refused {rounds} plans, the last because {reason}"
-        return Decision(plan=None, void=False, remark=remark)
+            refused += 1
+            why = f"the gate refused {refused} plans, the last because {reason}"
+        return Decision(plan=None, void=False, remark=f"nothing executed, {why}")
 
     def _unverified(self, plan: Plan, reason: str) -> Decision:
         streams, now_ns = self._cell.streams, self._cell.now_ns

@@ -23,6 +23,7 @@ from bridge.errors import UsageError
 from bridge.media.color import decode_color
 from bridge.sources.standin import operator
 from bridge.sources.standin.cell import StandinCell
+from bridge.sources.standin.kinematics import UnreachablePoseError
 from bridge.sources.standin.operator import Operator
 from bridge.sources.standin.scan import ScanConfig, scan_joints
 from bridge.sources.standin.session import run_session
@@ -159,6 +160,24 @@ def test_plans_refused_in_every_round_are_recorded_and_nothing_is_executed(
     verb, request = session.control[-1]
     assert verb == "stop"
     assert "refused 3 plans" in request["outcome"]["detail"]
+
+
+def test_a_start_that_the_planner_cannot_plan_is_a_failed_trial_and_the_session_goes_on(
+    make_session: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def out_of_reach(*_: Any, start_id: str, **__: Any) -> Plan:
+        raise UnreachablePoseError(p_m=(0.4, 0.1, 0.2), residual_m=0.012)
+
+    monkeypatch.setattr(operator, "plan_pick_and_place", out_of_reach)
+    session, summary = with_replanning(make_session, None, rounds=2, trials=2)
+    assert summary["outcomes"] == {"with_replanning": {"failure": 2}}
+    assert not session.of("/plan")
+    assert [event["type"] for event in session.events()] == ["note", "note", "label"] * 2
+    ends = [request for verb, request in session.control if verb == "stop"]
+    for end in ends:
+        assert not end["discard"]
+        assert "nothing executed, the planner found no plan" in end["outcome"]["detail"]
+        assert "(0.400, 0.100, 0.200)" in end["outcome"]["detail"]
 
 
 def test_without_a_verdict_nothing_is_executed_and_the_trial_is_void(
