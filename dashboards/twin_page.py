@@ -17,8 +17,7 @@ VIEWS_TITLE = "Held-out views: "
 """Before the file's name in the title of the table that rates its images."""
 
 FIRST = tuple(
-    f"views.all.{name}"
-    for name in ("psnr_db", "psnr_gain_db", "ssim", "depth_median_abs_m", "depth_mean_abs_m")
+    f"views.all.{name}" for name in ("psnr_db", "psnr_gain_db", "ssim", "depth_median_abs_m")
 )
 
 
