@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import chain
+from itertools import chain, groupby
 from typing import Any
 
 from evaluator.compare.remarks import Remark
@@ -12,6 +12,7 @@ from evaluator.compare.trial import Trial
 ABOUT = "replays"
 CHANGES_NO_VERDICT = ("mode", "samples", "seed")
 """Settings that one evaluation may well find in several values."""
+MADE_BY = ("replay_version", "calibration_id")
 NO_SCENE = "no scene"
 HASH_DIGITS = 12
 
@@ -58,9 +59,16 @@ def _counted(values: Counter[str]) -> str:
 
 def _settings(used: Sequence[DerivedFile]) -> Iterable[str]:
     """Name the first setting in which replays that count differ."""
-    known = [settings for settings in map(_settings_of, used) if settings]
-    for name in dict.fromkeys(chain.from_iterable(known)):
-        values = Counter(str(settings.get(name)) for settings in known)
+    # Nearly always all are equal: those in a row are laid flat once.
+    runs = [
+        (dict(_leaves(made)), sum(1 for _ in same))
+        for made, same in groupby(map(_made_with, used))
+        if made
+    ]
+    for name in dict.fromkeys(chain.from_iterable(settings for settings, _ in runs)):
+        values: Counter[str] = Counter()
+        for settings, count in runs:
+            values[str(settings.get(name))] += count
         if len(values) > 1:
             shown = ", ".join(f"{value} in {count}" for value, count in values.most_common())
             yield (
@@ -76,16 +84,16 @@ def _tried(used: Sequence[DerivedFile], derived: Iterable[DerivedFile]) -> Itera
     for file in derived:
         if file.derived.kind == "replay" and file.derived.mode == "dynamic":
             beside.setdefault(_trajectory(file), []).append(file)
-    differ = [
-        (mine, others)
-        for file in used
-        if len(beside.get(_trajectory(file), ())) > 1
-        for mine in (_settings_of(file),)
-        for others in (_others(mine, beside[_trajectory(file)]),)
-        if others
-    ]
+    differ = []
+    for file in used:
+        files = beside.get(_trajectory(file), ())
+        if len(files) > 1:
+            mine = _made_with(file)
+            other = _asked_otherwise(mine, files)
+            if other is not None:
+                differ.append((mine, other))
     if differ:
-        mine, other = differ[0][0], differ[0][1]
+        mine, other = (dict(_leaves(made)) for made in differ[0])
         name = next((name for name in mine if mine[name] != other.get(name)), "a newer setting")
         yield (
             f"{len(differ)} of the {len(used)} that count were also made with other settings "
@@ -100,32 +108,31 @@ def _trajectory(file: DerivedFile) -> tuple[str | None, ...]:
     return made.source_episode, made.source_sha256, made.plan_id, made.trajectory, made.scene_hash
 
 
-def _others(mine: Mapping[str, Any], files: Iterable[DerivedFile]) -> Mapping[str, Any] | None:
-    """Settings of a replay that only the user's wish sets apart, None where there is none.
+def _asked_otherwise(
+    mine: Mapping[str, Any], files: Iterable[DerivedFile]
+) -> Mapping[str, Any] | None:
+    """What a replay was made with that only the user's wish sets apart, None where there is none.
 
     A newer program or calibration leaves older files behind, which surprises nobody.
     """
-    for settings in map(_settings_of, files):
-        same = all(mine.get(name) == settings.get(name) for name in MADE_BY)
-        if settings and same and settings != mine:
-            return settings
+    for made in map(_made_with, files):
+        same = all(mine.get(name) == made.get(name) for name in MADE_BY)
+        if made and same and made != mine:
+            return made
     return None
 
 
-MADE_BY = ("replay_version", "calibration_id")
-
-
-def _settings_of(file: DerivedFile) -> dict[str, Any]:
-    """Settings by their dotted names; none of a replay that another program made."""
+def _made_with(file: DerivedFile) -> dict[str, Any]:
+    """Settings that may change a verdict; none of a replay that another program made."""
     config = file.derived.settings.get("config")
     if not isinstance(config, dict):
         return {}
     kept = {name: config[name] for name in config if name not in CHANGES_NO_VERDICT}
-    made_by = {name: file.derived.settings.get(name) for name in MADE_BY}
-    return made_by | dict(_leaves(kept))
+    return {name: file.derived.settings.get(name) for name in MADE_BY} | kept
 
 
 def _leaves(values: Mapping[str, Any], before: str = "") -> Iterable[tuple[str, Any]]:
+    """Settings by their dotted names."""
     for name, value in values.items():
         if isinstance(value, dict):
             yield from _leaves(value, f"{before}{name}.")

@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from bridge.episode.run import RunFolder
+from bridge.errors import UsageError
 from bridge.terminal import Output
 from twin.crew.pool import Alone, Crew, Runner
 from twin.crew.size import default_size
@@ -15,7 +16,16 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
     """Replay all trial episodes of a run on what the settings ask for.
 
     See ``twin.replay.run.trajectories.replay_trajectories``, and what ``runner_for`` raises.
+
+    Raises:
+        UsageError: When the folder is no run.
     """
+    if not run.episodes_dir.is_dir():
+        message = (
+            f"{run.path} is not a run: it holds no folder episodes. "
+            "Give the folder that episodes/ lies in."
+        )
+        raise UsageError(message)
     with runner_for(config) as runner:
         # A second, in which a cluster starts its processes.
         from twin.replay.run.trajectories import replay_trajectories  # noqa: PLC0415

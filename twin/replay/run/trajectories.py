@@ -134,12 +134,6 @@ def _say_what_is_missing(run: RunFolder, jobs: list[ReplayJob], output: Output) 
 
 
 def _chosen(run: RunFolder, config: ReplayRunConfig) -> list[str]:
-    if not run.episodes_dir.is_dir():
-        message = (
-            f"{run.path} is not a run: it holds no folder episodes. "
-            "Give the folder that episodes/ lies in."
-        )
-        raise UsageError(message)
     there = [path.stem for path in run.episodes()]
     unknown = [name for name in config.episode if name not in there]
     if unknown:
