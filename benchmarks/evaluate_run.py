@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 
@@ -25,7 +25,9 @@ from bridge.episode.run import RunFolder  # noqa: E402
 from bridge.episode.writer import EpisodeWriter  # noqa: E402
 from bridge.task.plan import Plan, Stage, Waypoint  # noqa: E402
 from bridge.task.robot import ARM_JOINTS  # noqa: E402
+from bridge.task.task_file import load_task  # noqa: E402
 from bridge.task.verdict import Factor, Verdict  # noqa: E402
+from twin.replay.config import ReplayConfig  # noqa: E402
 
 START_NS = 100_000_000_000
 RATE_HZ = 125
@@ -111,6 +113,7 @@ def _write_trial(run: RunFolder, number: int, seconds: float) -> None:
             mode="dynamic",
             engine="bench",
             seed=number,
+            settings=_settings(task, number),
         )
         stem = f"{name}.replay.{trajectory}.dynamic"
         with EpisodeWriter(run.derived_dir / f"{stem}.mcap") as writer:
@@ -119,6 +122,16 @@ def _write_trial(run: RunFolder, number: int, seconds: float) -> None:
             verdict = _verdict(said, plan_id, trajectory)
             _raw(writer, "/bench/verdict", schema.VERDICT, verdict, 0)
             _series(writer, (variant + 1) % VARIANTS, seconds, START_NS, offset_m)
+
+
+def _settings(task: str, number: int) -> dict[str, object]:
+    """As much as a replay says of how it was made: its task and all its settings."""
+    return {
+        "replay_version": 0,
+        "calibration_id": None,
+        "task": asdict(load_task(task)),
+        "config": asdict(ReplayConfig(seed=number)),
+    }
 
 
 def _raw(writer: EpisodeWriter, topic: str, type_name: str, data: bytes, after_ns: int) -> None:
