@@ -21,11 +21,11 @@ HELP = (
     "execution, and say how far the twin can be trusted."
 )
 
-EPISODES, LIVE, IMPORTS = "bridge.cli.episodes", "bridge.cli.live", "bridge.cli.imports"
+EPISODES, LIVE, IMPORTS = "bridge.cli.episodes", "bridge.cli.publish", "bridge.cli.exchange"
 RECORDING = "bridge.cli.recording"
-DEVICES = "bridge.cli.devices"
+DEVICES = "bridge.cli.publish"
 EXCHANGE = "bridge.cli.exchange"
-CATALOGUE = "bridge.cli.catalogue"
+CATALOGUE = "bridge.cli.episodes"
 
 COMMANDS: tuple[tuple[str, str, str, str], ...] = (
     ("demo", "dashboards.cli:demo", "The whole loop on a stand-in cell, in minutes.", "runs/demo"),
@@ -45,7 +45,7 @@ COMMANDS: tuple[tuple[str, str, str, str], ...] = (
     ),
     (
         "recover",
-        "bridge.cli.recovery:recover",
+        "bridge.cli.episodes:recover",
         "Finish what a killed recorder left, and say what was lost.",
         "runs/demo",
     ),

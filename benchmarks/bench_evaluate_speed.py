@@ -20,7 +20,7 @@ from evaluate_run import Size, paths_of, write_run
 from measure import ROOT, Target, report_targets
 
 from bridge.episode import schema
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.terminal import Output
 
 FULL = 10_000

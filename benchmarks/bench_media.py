@@ -46,34 +46,35 @@ def depth_row(kind: str, depths: list[np.ndarray]) -> tuple[list[Target], dict[s
     import zstandard
 
     from bridge.episode import schema
-    from bridge.episode.records import DepthImage
-    from bridge.episode.transcode import depth_to_compact
-    from bridge.media import depth_codec, rvl
+    from bridge.episode.cdr.images import depth_to_compact
+    from bridge.episode.cdr.messages import DepthImage
+    from bridge.media import depth as depth_module
+    from bridge.media import rvl
 
     raw = [DepthImage(stamp_ns=0, frame_id="c", depth_mm=d).to_cdr() for d in depths]
     compact = [depth_to_compact(message) for message in raw]
-    streams = [depth_codec.encode_rvl(depth) for depth in depths]
+    streams = [depth_module.encode_rvl(depth) for depth in depths]
     pngs = [png_of(cv2, depth) for depth in depths]
     zstd = zstandard.ZstdCompressor(level=1)
     for depth, stream, png in zip(depths, streams, pngs, strict=True):
-        np.testing.assert_array_equal(depth_codec.decode_rvl(stream, depth.size), depth.ravel())
+        np.testing.assert_array_equal(depth_module.decode_rvl(stream, depth.size), depth.ravel())
         np.testing.assert_array_equal(cv2.imdecode(png, cv2.IMREAD_UNCHANGED), depth)
 
     size = depths[0].size
     png_ms = frame_ms(lambda depth: png_of(cv2, depth), depths)
     png_back_ms = frame_ms(lambda png: cv2.imdecode(png, cv2.IMREAD_UNCHANGED), pngs)
-    encode_ms = frame_ms(depth_codec.encode_rvl, depths)
-    decode_ms = frame_ms(lambda stream: depth_codec.decode_rvl(stream, size), streams)
+    encode_ms = frame_ms(depth_module.encode_rvl, depths)
+    decode_ms = frame_ms(lambda stream: depth_module.decode_rvl(stream, size), streams)
     bytes_raw = sum(depth.nbytes for depth in depths)
     details = {
-        "native": depth_codec.NATIVE,
+        "native": depth_module.NATIVE,
         "ms": {
             "Image to CompressedImage, whole message": frame_ms(depth_to_compact, raw),
             "CompressedImage to depth, whole message": frame_ms(
                 lambda data: DepthImage.from_message(schema.COMPRESSED_IMAGE, data), compact
             ),
             "RVL then zstd 1": frame_ms(
-                lambda depth: zstd.compress(depth_codec.encode_rvl(depth)), depths
+                lambda depth: zstd.compress(depth_module.encode_rvl(depth)), depths
             ),
             "raw, zstd 1": frame_ms(lambda depth: zstd.compress(depth.tobytes()), depths),
             "NumPy twin, encode": frame_ms(rvl.encode_rvl, depths[:1]),
@@ -112,11 +113,12 @@ def png_of(cv2: Any, depth: np.ndarray) -> np.ndarray:
 def color_row(colors: list[np.ndarray]) -> tuple[list[Target], dict[str, Any]]:
     import cv2
 
-    from bridge.episode import cdr, schema
-    from bridge.episode.transcode import image_to_jpeg
+    from bridge.episode import schema
+    from bridge.episode.cdr import codec
+    from bridge.episode.cdr.images import image_to_jpeg
 
     messages = [
-        cdr.encode(
+        codec.encode(
             schema.IMAGE,
             {
                 "height": color.shape[0],

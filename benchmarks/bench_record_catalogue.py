@@ -29,10 +29,9 @@ def wall_seconds(work: Callable[[], object], repeats: int = REPEATS) -> list[flo
 
 def main() -> None:
     """Tiny episodes of a few tasks and outcomes."""
-    from bridge.episode.catalogue import list_episodes
-    from bridge.episode.catalogue.reading import read_entry
+    from bridge.episode.catalogue import list_episodes, read_entry
     from bridge.episode.metadata import EpisodeInfo, Outcome
-    from bridge.episode.run import RunFolder
+    from bridge.episode.run_folder import RunFolder
     from bridge.episode.writer import EpisodeWriter
 
     with tempfile.TemporaryDirectory() as folder:

@@ -27,9 +27,8 @@ from measure import ROOT, Target, report_targets
 from standin_incline import mujoco_friction
 from standin_settled import COMPARED, errors_m, settled_poses
 
-from bridge.episode.run import RunFolder
-from bridge.sources.standin.cell_file import load_cell
-from bridge.sources.standin.hidden import draw_hidden
+from bridge.episode.run_folder import RunFolder
+from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.probes import PROBES
 from bridge.sources.standin.session import run_session
 from bridge.sources.standin.settings import SessionConfig

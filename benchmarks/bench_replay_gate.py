@@ -63,7 +63,7 @@ def judge_task(task_name: str, options: argparse.Namespace) -> list[Judged]:
     """Record and judge one task's trials, as far as they are not there yet."""
     from cell_run import record_ungated
 
-    from bridge.episode.run import RunFolder
+    from bridge.episode.run_folder import RunFolder
     from bridge.task.task_file import load_task
     from bridge.terminal import Output
     from twin.gate.config import GateConfig

@@ -100,7 +100,7 @@ def ray_cluster(folder: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
 def measure(folder: Path, episodes: int) -> Sequence[Target]:
     from cell_run import record_ungated, with_copies
 
-    from bridge.episode.run import RunFolder
+    from bridge.episode.run_folder import RunFolder
 
     recorded = RunFolder.create(folder / "recorded")
     paths = record_ungated(recorded, TASK, SEED, RECORDED)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from measure import ROOT, Target, print_targets, report_targets
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 
 CACHE = ROOT / "build" / "benchmarks"
 CLEAN_SPLATS, KITCHEN_SPLATS = 140_000, 60_000

@@ -8,7 +8,7 @@ from typing import Any
 from bridge.clock import ns_from_s
 from bridge.episode import metadata
 from bridge.episode.metadata import EpisodeInfo, Outcome
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.sources.standin.session import run_session
 from bridge.sources.standin.settings import SessionConfig

@@ -14,10 +14,10 @@ from pathlib import Path
 import coal
 import numpy as np
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
-from bridge.task.meshes.basket import basket_parts
 from bridge.task.meshes.catalogue import object_mesh
+from bridge.task.meshes.toys import basket_parts
 from bridge.task.task_file import ObjectModel, load_task
 from twin.replay.clearance.bodies import placed_panels, placement_of
 from twin.robot.collision import signed_distance

@@ -18,10 +18,10 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from bridge.episode import schema  # noqa: E402
+from bridge.episode.cdr.messages import JointSample, PoseSample  # noqa: E402
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome  # noqa: E402
 from bridge.episode.provenance import hash_file  # noqa: E402
-from bridge.episode.records import JointSample, PoseSample  # noqa: E402
-from bridge.episode.run import RunFolder  # noqa: E402
+from bridge.episode.run_folder import RunFolder  # noqa: E402
 from bridge.episode.writer import EpisodeWriter  # noqa: E402
 from bridge.task.plan import Plan, Stage, Waypoint  # noqa: E402
 from bridge.task.robot import ARM_JOINTS  # noqa: E402

@@ -9,8 +9,7 @@ from bridge.episode.streams import RgbdFrame
 from bridge.geometry.camera import Camera
 from bridge.media.color import decode_color, encode_jpeg
 from bridge.sources.standin.cell import CellConfig, StandinCell
-from bridge.sources.standin.cell_file import load_cell
-from bridge.sources.standin.hidden import draw_hidden, nominal_hidden
+from bridge.sources.standin.cell_file import draw_hidden, load_cell, nominal_hidden
 from bridge.sources.standin.operator import STILL_S
 from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
 from bridge.sources.standin.streams import Streams

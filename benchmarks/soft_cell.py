@@ -8,8 +8,7 @@ from functools import cache
 import numpy as np
 
 from bridge.sources.standin.cell import HOME_SEED_RAD
-from bridge.sources.standin.cell_file import load_cell
-from bridge.sources.standin.hidden import nominal_hidden
+from bridge.sources.standin.cell_file import load_cell, nominal_hidden
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.planner import GraspError, plan_pick_and_place
 from bridge.sources.standin.world import World as MujocoWorld

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from bridge.sources.standin.world_model import PAD_SOLIMP, PAD_SOLREF, STEP_S
+from bridge.sources.standin.world import PAD_SOLIMP, PAD_SOLREF, STEP_S
 from twin.calibrate.physics.incline import (
     LEAD_S,
     REST_S,

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.schema import TRUTH_PREFIX
 from bridge.terminal import Output
 from twin.calibrate.physics.case import Case, planar

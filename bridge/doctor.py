@@ -32,7 +32,7 @@ NATIVE = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
+class InstallCheck:
     """One line of the report."""
 
     what: str
@@ -41,7 +41,7 @@ class Finding:
     advice: str = ""
 
 
-def examine() -> list[Finding]:
+def examine() -> list[InstallCheck]:
     """Look at packages, the native extensions, system libraries and programs; import nothing."""
     findings = [_package(name, extra) for extra, names in EXTRAS.items() for name in names]
     findings.extend(_native(*each) for each in NATIVE)
@@ -50,32 +50,32 @@ def examine() -> list[Finding]:
     return findings
 
 
-def _package(name: str, extra: str) -> Finding:
+def _package(name: str, extra: str) -> InstallCheck:
     try:
         found = metadata.version(name)
     except metadata.PackageNotFoundError:
         advice = f"pip install 'robot-gst[{extra}]'" if extra != "base" else "pip install robot-gst"
         is_optional = extra in OPTIONAL
         found = "missing (optional)" if is_optional else "missing"
-        return Finding(what=f"{name} [{extra}]", found=found, ok=is_optional, advice=advice)
-    return Finding(what=f"{name} [{extra}]", found=found, ok=True)
+        return InstallCheck(what=f"{name} [{extra}]", found=found, ok=is_optional, advice=advice)
+    return InstallCheck(what=f"{name} [{extra}]", found=found, ok=True)
 
 
-def _native(what: str, module: str, without: str) -> Finding:
+def _native(what: str, module: str, without: str) -> InstallCheck:
     if find_spec(module) is not None:
-        return Finding(what=what, found="built", ok=True)
+        return InstallCheck(what=what, found="built", ok=True)
     advice = "run make, or pip install . with a C++17 compiler present"
-    return Finding(what=what, found=f"not built: {without}", ok=False, advice=advice)
+    return InstallCheck(what=what, found=f"not built: {without}", ok=False, advice=advice)
 
 
-def _program(name: str, advice: str) -> Finding:
+def _program(name: str, advice: str) -> InstallCheck:
     found = shutil.which(name)
-    return Finding(
+    return InstallCheck(
         what=name, found="present" if found else "missing", ok=True, advice="" if found else advice
     )
 
 
-def _system_libraries() -> list[Finding]:
+def _system_libraries() -> list[InstallCheck]:
     """Open3D opens these when imported."""
     wanted = {"libEGL.so.1": "libegl1", "libGL.so.1": "libgl1", "libX11.so.6": "libx11-6"}
     wanted |= {"libusb-1.0.so.0": "libusb-1.0-0", "libudev.so.1": "libudev1"}
@@ -85,7 +85,7 @@ def _system_libraries() -> list[Finding]:
     for library, package in wanted.items():
         present = any((folder / library).exists() for folder in folders)
         findings.append(
-            Finding(
+            InstallCheck(
                 what=library,
                 found="present" if present else "missing",
                 ok=present,

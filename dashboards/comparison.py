@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, PathNotFoundError
 from evaluator.compare import Comparison, TrialRow, compare_run
 from evaluator.compare.cache import FOLDER, SummaryCache

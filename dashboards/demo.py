@@ -18,7 +18,7 @@ from pathlib import Path
 
 from cyclopts import Parameter
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, refuse_outside
 from bridge.task.task_file import load_task
 from bridge.terminal import Output

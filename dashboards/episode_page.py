@@ -8,7 +8,7 @@ from typing import Any
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.metadata import Outcome
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.task.plan import Plan
 from bridge.task.verdict import Factor, Verdict
 from dashboards import episode_plots

@@ -8,8 +8,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import color_file_from_message
 from bridge.episode.reader import Episode
-from bridge.episode.records import color_file_from_message
 from dashboards.errors import NotHereError
 
 RENDERED = "rendered:"

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from glob import escape
 from pathlib import Path
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from dashboards.errors import NotHereError
 
 

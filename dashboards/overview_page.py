@@ -7,7 +7,7 @@ from pathlib import Path
 
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from dashboards import headline, wording
 from dashboards.comparison import Judgement, agrees

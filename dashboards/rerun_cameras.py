@@ -8,8 +8,8 @@ import numpy as np
 import rerun as rr
 
 from bridge.episode import streams
+from bridge.episode.cdr.messages import CameraInfo, DepthImage, color_file_from_message
 from bridge.episode.reader import Episode
-from bridge.episode.records import CameraInfo, DepthImage, color_file_from_message
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
 from bridge.geometry import se3

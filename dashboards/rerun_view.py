@@ -18,7 +18,7 @@ from bridge.episode import streams
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.metadata import Outcome
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.task_file import Task, load_task

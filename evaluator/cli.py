@@ -105,7 +105,7 @@ def _compare(
     force: bool,
     output: Output,
 ) -> "tuple[Comparison, Path]":
-    from bridge.episode.run import RunFolder
+    from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError
     from evaluator.compare import compare_csv, compare_run
     from evaluator.compare.cache import FOLDER, SummaryCache

@@ -31,7 +31,7 @@ def replay(
         config: Settings.
         output: How to talk.
     """
-    from bridge.episode.run import RunFolder
+    from bridge.episode.run_folder import RunFolder
     from twin.replay.run.start import replay_run
     from twin.replay.run.text import describe_run
 
@@ -78,7 +78,7 @@ def rebuild(
         config: Settings.
         output: How to talk.
     """
-    from bridge.episode.run import RunFolder
+    from bridge.episode.run_folder import RunFolder
     from twin.scene.rebuild.record import describe_scene
     from twin.scene.rebuild.run import rebuild as rebuild_scene
 
@@ -103,7 +103,7 @@ def render(
         config: Settings.
         output: How to talk.
     """
-    from bridge.episode.run import RunFolder
+    from bridge.episode.run_folder import RunFolder
     from twin.scene.draw.compose import describe_drawn
     from twin.scene.draw.render import render as render_scene
 
@@ -130,7 +130,7 @@ def import_splats(
         object: Object whose Gaussians these are; empty: the background, which makes a new scene.
         output: How to talk.
     """
-    from bridge.episode.run import RunFolder
+    from bridge.episode.run_folder import RunFolder
     from twin.scene.store.edited import describe_edit, take_back
 
     about = take_back(RunFolder.open(run), file, object)
@@ -156,7 +156,7 @@ def calibrate(
         config: Settings.
         output: How to talk.
     """
-    from bridge.episode.run import RunFolder
+    from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError
 
     run_folder = RunFolder.open(run)

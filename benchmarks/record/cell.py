@@ -13,8 +13,9 @@ from typing import Literal
 import numpy as np
 
 from bridge.clock import split_ns
-from bridge.episode import cdr, schema
-from bridge.episode.records import JointSample
+from bridge.episode import schema
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.messages import JointSample
 from record.frames import add_noise, enlarge, native_frames
 
 _STAMP = struct.Struct("<iI")
@@ -115,4 +116,4 @@ def _image_cdr(frame: np.ndarray, encoding: str, frame_id: str) -> bytes:
         "step": frame.nbytes // height,
         "data": frame.tobytes(),
     }
-    return cdr.encode(schema.IMAGE, message)
+    return codec.encode(schema.IMAGE, message)

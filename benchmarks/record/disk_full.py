@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.errors import GstError
-from bridge.wire.recorder_client import RecorderClient
+from bridge.record.control import RecorderClient
 from bridge.wire.session import WireSample
 from record.cell import CellSpec
 from record.children import Publisher, children

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import CompressedColor, DepthImage, JointSample
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.records import CompressedColor, DepthImage, JointSample
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 from bridge.media.color import encode_jpeg
 from record.frames import add_noise, native_frames

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from bridge.errors import BridgeError
+from bridge.record.control import RecorderClient
 from bridge.wire.config import WireConfig
-from bridge.wire.recorder_client import RecorderClient
 from bridge.wire.session import WireSession, open_session
 from record.children import WAIT_S, Child, free_endpoint, wait_until
 

@@ -18,7 +18,8 @@ from mcap.writer import CompressionType, Writer
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from bridge.episode import cdr, schema  # noqa: E402
+from bridge.episode import schema
+from bridge.episode.cdr import codec  # noqa: E402
 from bridge.wire.config import WireConfig  # noqa: E402
 from bridge.wire.session import WireSample, open_session  # noqa: E402
 
@@ -54,7 +55,7 @@ class Reference:
     def encode(self, waiting: "queue.Queue[WireSample | None]") -> None:
         """Compress the images of one stream until None comes."""
         while (sample := waiting.get()) is not None:
-            image = cdr.decode(schema.IMAGE, sample.data)
+            image = codec.decode(schema.IMAGE, sample.data)
             shape = (image["height"], image["width"])
             if image["encoding"] == "rgb8":
                 pixels = np.frombuffer(image["data"], np.uint8).reshape(*shape, 3)
@@ -64,7 +65,7 @@ class Reference:
                 level = [cv2.IMWRITE_PNG_COMPRESSION, 1]
                 kind, data = "png", cv2.imencode(".png", pixels, level)[1].tobytes()
             message = {"header": image["header"], "format": kind, "data": data}
-            encoded = cdr.encode(schema.COMPRESSED_IMAGE, message)
+            encoded = codec.encode(schema.COMPRESSED_IMAGE, message)
             self.write(sample, schema.COMPRESSED_IMAGE, encoded)
 
     def write(self, sample: WireSample, type_name: str, data: bytes) -> None:

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bridge.episode.run import part_paths
+from bridge.episode.run_folder import part_paths
 from record.cell import CellSpec
 from record.children import Publisher, children
 from record.recorders import OurRecorder, ReferenceRecorder

@@ -11,7 +11,8 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
-from bridge.episode import cdr, schema
+from bridge.episode import schema
+from bridge.episode.cdr import codec
 from record.cell import CellSpec, Stream, streams_of
 
 COLOR_SAMPLE = 50
@@ -110,8 +111,8 @@ def verify(files: Sequence[Path], account: Path, spec: CellSpec) -> dict[str, To
 def _is_same(stream: Stream, type_name: str, message: Message, expected: bytearray) -> bool:
     if type_name != schema.COMPRESSED_IMAGE:
         return message.data == expected
-    found = cdr.decode(schema.COMPRESSED_IMAGE, message.data)
-    sent = cdr.decode(schema.IMAGE, bytes(expected))
+    found = codec.decode(schema.COMPRESSED_IMAGE, message.data)
+    sent = codec.decode(schema.IMAGE, bytes(expected))
     if found["header"] != sent["header"]:
         return False
     if stream.is_color:
@@ -132,7 +133,7 @@ def _depth(found: dict[str, Any], data: bytes) -> np.ndarray:
         import cv2
 
         return cv2.imdecode(np.frombuffer(found["data"], np.uint8), cv2.IMREAD_UNCHANGED)
-    from bridge.episode.records import DepthImage
+    from bridge.episode.cdr.messages import DepthImage
 
     return DepthImage.from_message(schema.COMPRESSED_IMAGE, data).depth_mm
 

@@ -8,7 +8,7 @@ import scan_objects
 from measure import Target
 
 from bridge.geometry import se3
-from bridge.task.meshes.surface_net import mesh_of
+from bridge.task.meshes.solids import mesh_of
 from bridge.task.meshes.toys import DESIGNS
 from bridge.task.task_file import ObjectModel
 from twin.scene.gaussians.cloud import concatenate

@@ -22,8 +22,8 @@ def load(folder: Path) -> tuple[list[RgbdFrame], list[RgbdFrame]]:
     """Every fifth frame trains; the frame two after each is held out."""
     from PIL import Image
 
-    from bridge.sources.folder_index import read_index
-    from bridge.sources.folder_record import read_stored_depth
+    from bridge.sources.folder.frames import read_stored_depth
+    from bridge.sources.folder.messages import read_index
 
     index = read_index(folder)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.terminal import Output
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -40,7 +40,7 @@ def shelf_folder() -> Path | None:
 
 def shelf_scan(source: Path, folder: Path) -> RunFolder:
     """Import the frames of the wrist camera as one scan."""
-    from bridge.cli.imports import import_rgbd
+    from bridge.cli.exchange import import_rgbd
 
     import_rgbd(source, folder, output=QUIET)
     return RunFolder.open(folder)

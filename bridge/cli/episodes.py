@@ -2,8 +2,23 @@
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bridge.terminal import Output
+
+if TYPE_CHECKING:
+    from bridge.episode.recover import RecoveryReport
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from bridge.episode.catalogue_store import CatalogueQuery
+from bridge.terminal import Advance
+
+if TYPE_CHECKING:
+    from bridge.episode.catalogue_store import Entry
+
 
 OUTPUT = Output()
 
@@ -125,3 +140,186 @@ def doctor(*, output: Output = OUTPUT) -> int:
     ]
     output.result({"findings": [asdict(item) for item in findings]}, "\n".join(lines))
     return 0 if all(item.ok for item in findings) else 1
+
+
+# --- The command that finishes what a killed recorder left.
+
+
+def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OUTPUT) -> int:
+    """Make readable episodes of files whose writer was killed, and say what was lost.
+
+    Exit code 0 recovered, 1 when nothing could be read in one of them.
+    Example: robot-gst recover runs/monday
+
+    Args:
+        paths: Files of any MCAP writer, or folders to search for ``*.mcap.part``.
+        in_place: Finish the file itself; without it a copy is made where the disk has room.
+        output: How to talk.
+    """
+    from bridge.episode import recover as recovery
+    from bridge.errors import GstError
+
+    files: list[Path] = []
+    for path in paths:
+        files.extend(sorted(path.rglob("*.mcap.part")) if path.is_dir() else [path])
+    reports = []
+    for path in files:
+        try:
+            reports.append(recovery.recover(path, in_place=True if in_place else None))
+        except GstError as error:
+            if len(files) == 1:
+                raise
+            reports.append(recovery.RecoveryReport(path=path, output=None, reason=str(error)))
+    text = "\n".join(_describe(report) for report in reports) or "nothing to recover"
+    output.result({"files": [asdict(report) for report in reports]}, text)
+    return 1 if any(report.output is None for report in reports) else 0
+
+
+def _describe(report: "RecoveryReport") -> str:
+    if report.output is None:
+        return f"{report.path}: nothing could be read ({report.reason})"
+    state = "was complete" if report.finished else "recovered"
+    lines = [
+        f"{report.path.name}: {state}, now {report.output}",
+        f"  {report.messages} messages on {len(report.topics)} topics, "
+        f"{report.attachments} attachments, {report.bytes_lost} bytes lost",
+    ]
+    if report.reason:
+        lines.append(f"  {report.reason}")
+    if report.original is not None:
+        lines.append(f"  the damaged original is kept: {report.original}")
+    return "\n".join(lines)
+
+
+# --- Commands about all episodes of a run: list, label, export the list.
+
+EVERYTHING = CatalogueQuery()
+WORTH_A_BAR = 200
+"""New episodes to read before progress is shown."""
+
+
+def ls(
+    run: Path,
+    /,
+    *,
+    query: Annotated[CatalogueQuery, Parameter(name="*")] = EVERYTHING,
+    output: Output = OUTPUT,
+) -> int:
+    """List the episodes of a run, or those that pass the filters.
+
+    Exit code 1 when one of them cannot be read.
+    Example: robot-gst ls runs/demo --kind trial --outcome failure --sort start --reverse
+
+    Args:
+        run: Run folder.
+        query: Which, and in what order.
+        output: How to talk.
+    """
+    entries = _find(run, query, output)
+    lines = [_line(entry) for entry in entries]
+    if not lines:
+        empty = f"no episodes in {run}. Record some: robot-gst record {run}"
+        lines = [empty if query == EVERYTHING else f"no episode in {run} passes these filters"]
+    output.result({"episodes": [vars(entry) for entry in entries]}, "\n".join(lines))
+    return 1 if any(entry.error for entry in entries) else 0
+
+
+def _find(run: Path, query: CatalogueQuery, output: Output) -> "list[Entry]":
+    from bridge.episode.catalogue import find_episodes
+    from bridge.episode.run_folder import RunFolder
+
+    with ExitStack() as stack:
+        shown: list[Advance] = []
+
+        def advance(done: int, total: int) -> None:
+            if not shown and total > WORTH_A_BAR:
+                shown.append(stack.enter_context(output.progress("read episodes", total)))
+            for show in shown:
+                show(done, "")
+
+        return find_episodes(RunFolder.open(run), query, advance=advance)
+
+
+def _line(entry: "Entry") -> str:
+    flags = [f"{entry.parts} parts"] if entry.parts > 1 else []
+    flags += [f"{entry.lost} lost"] if entry.lost else []
+    flags += [
+        text
+        for text, there in (
+            ("recovered, tail missing", entry.recovered),
+            ("stand-in", entry.stand_in),
+            (_shown(entry.error), entry.error),
+        )
+        if there
+    ]
+    return (
+        f"{_shown(entry.id):<28} {_shown(entry.kind):<9} {_shown(entry.condition):<20} "
+        f"{_shown(entry.outcome):<8} {entry.duration_s:7.1f} s {entry.size_bytes / 1e6:7.1f} MB"
+        f"{'  ' + ', '.join(flags) if flags else ''}"
+    )
+
+
+def _shown(text: str, most: int = 200) -> str:
+    """Text of other programs without what would move the cursor, and not endless."""
+    text = text[:most]
+    if text.isprintable():
+        return text
+    return "".join(sign if sign.isprintable() else "?" for sign in text)
+
+
+def label(
+    run: Path,
+    episode: str,
+    /,
+    *,
+    result: Literal["success", "failure", "unknown"],
+    by: str = "operator",
+    detail: str | None = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Say after the fact how an episode ended; kept in notes/, the episode is not rewritten.
+
+    Example: robot-gst label runs/monday trial_0003 --result failure --detail "slipped"
+
+    Args:
+        run: Run folder.
+        episode: Id of the episode: its file name without .mcap.
+        result: success, failure or unknown.
+        by: Who says so.
+        detail: What happened, in words.
+        output: How to talk.
+    """
+    from bridge.episode.catalogue import label_episode
+    from bridge.episode.metadata import Outcome
+    from bridge.episode.run_folder import RunFolder
+
+    outcome = Outcome(result=result, k=int(result == "success"), n=1, by=by, detail=detail)
+    path = label_episode(RunFolder.open(run), episode, outcome)
+    output.result({"label": asdict(outcome), "file": str(path)}, f"{episode}: {result} ({path})")
+    return 0
+
+
+def export_catalogue(
+    run: Path,
+    out: Path,
+    /,
+    *,
+    query: Annotated[CatalogueQuery, Parameter(name="*")] = EVERYTHING,
+    output: Output = OUTPUT,
+) -> int:
+    """Write the list of a run's episodes as a Parquet table, one row per episode.
+
+    Example: robot-gst export catalogue runs/monday monday.parquet --kind trial
+
+    Args:
+        run: Run folder.
+        out: The Parquet file to write; replaced if it is there.
+        query: Which, and in what order.
+        output: How to talk.
+    """
+    from bridge.episode.catalogue import write_parquet
+
+    entries = _find(run, query, output)
+    write_parquet(entries, out)
+    output.result({"file": str(out), "episodes": len(entries)}, f"{out}: {len(entries)} episodes")
+    return 0

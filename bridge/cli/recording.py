@@ -110,9 +110,9 @@ def ctl(
         output: How to talk.
     """
     from bridge.errors import UsageError
+    from bridge.record.control import RecorderClient
     from bridge.record.status import describe_answer, describe_list, describe_status
     from bridge.wire.config import WireConfig
-    from bridge.wire.recorder_client import RecorderClient
     from bridge.wire.session import open_session
 
     outcome = None

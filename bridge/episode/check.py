@@ -6,21 +6,54 @@ losses, or a recording that was cut off and recovered, leaves a whole file (``ex
 of other programs are held to the format only; our contract is asked of ours.
 """
 
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from bridge.episode import schema, streams
-from bridge.episode.check_decode import Decoder
 from bridge.episode.check_file import Faults, FileCheck
-from bridge.episode.check_rerun import rerun_faults
-from bridge.episode.check_topics import Pauses, TopicCheck, TopicWatch
-from bridge.episode.parts import name_of_part, record_of
-from bridge.episode.reader import Episode
-from bridge.episode.run import part_name
+from bridge.episode.check_topics import Decoder, Pauses, TopicCheck, TopicWatch
+from bridge.episode.reader import Episode, name_of_part, record_of
+from bridge.episode.run_folder import part_name
 from bridge.episode.writer import LIBRARY
-from bridge.errors import BridgeError
+from bridge.errors import BridgeError, MissingDependencyError
+
+# --- A second opinion: Rerun's own MCAP checker.
+
+TIMEOUT_S = 3600
+
+
+def rerun_faults(path: Path) -> list[str]:
+    """Run ``rerun mcap check --full`` on a file and return what it objects to.
+
+    Raises:
+        MissingDependencyError: When Rerun is not installed.
+    """
+    beside = Path(sys.executable).with_name("rerun")
+    command = str(beside) if beside.is_file() else shutil.which("rerun")
+    if command is None:
+        raise MissingDependencyError(
+            package="rerun-sdk", extra="dashboard", purpose="the second opinion of --rerun"
+        )
+    try:
+        done = subprocess.run(
+            [command, "mcap", "check", "--full", str(path)],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=TIMEOUT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return [f"{path.name}: rerun mcap check did not end within {TIMEOUT_S} s"]
+    if done.returncode == 0:
+        return []
+    said = (done.stderr.strip() or done.stdout.strip()).splitlines()
+    return [f"{path.name}: rerun mcap check says: {said[-1] if said else 'nothing'}"]
 
 
 @dataclass(kw_only=True)

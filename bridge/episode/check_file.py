@@ -7,37 +7,184 @@ record at a time, and the index.
 import struct
 import zlib
 from array import array
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt64
 from mcap import records
+from mcap.summary import Summary
 
-from bridge.episode.check_summary import Seen, summary_faults
 from bridge.episode.mcap import format as mcap_format
-from bridge.episode.mcap.file import read_footer, read_header, read_summary
-from bridge.episode.mcap.format import MAGIC, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
-from bridge.episode.mcap.packed import (
-    MessageHead,
-    message_head,
-    parse_chunk,
-    records_in,
-    unpack_chunk,
+from bridge.episode.mcap.file import (
+    attachment_entry,
+    chunk_entry,
+    metadata_entry,
+    read_footer,
+    read_header,
+    read_summary,
 )
-from bridge.episode.mcap.rebuild import attachment_entry, chunk_entry
+from bridge.episode.mcap.format import MAGIC, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
 from bridge.episode.mcap.walk import (
     DAMAGE,
     PIECE_BYTES,
     BrokenRecordError,
     ByteStream,
+    MessageHead,
     Place,
     attachment_of,
+    message_head,
     parse,
+    parse_chunk,
     read_body,
+    records_in,
+    unpack_chunk,
     walk,
 )
+
+# --- Compare what the summary of an MCAP file says with what a walk through its data found.
+
+
+@dataclass(kw_only=True)
+class Seen:
+    """What the walk found."""
+
+    schemas: dict[int, records.Schema] = field(default_factory=dict)
+    channels: dict[int, records.Channel] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    """Messages by channel."""
+    start_ns: int | None = None
+    end_ns: int = 0
+    chunks: list[records.ChunkIndex] = field(default_factory=list)
+    """Of the chunks whose head can be read."""
+    num_chunks: int = 0
+    attachments: list[records.AttachmentIndex] = field(default_factory=list)
+    num_broken_attachments: int = 0
+    metadata: list[records.MetadataIndex] = field(default_factory=list)
+
+    def count(self, head: MessageHead) -> None:
+        """Take a message."""
+        self.counts[head.channel_id] = self.counts.get(head.channel_id, 0) + 1
+        if self.start_ns is None or head.log_time_ns < self.start_ns:
+            self.start_ns = head.log_time_ns
+        self.end_ns = max(self.end_ns, head.log_time_ns)
+
+    def define(self, place: Place, record: records.McapRecord | None) -> Iterator[str]:
+        """Take a schema, channel or metadata record; yields what is wrong with it."""
+        if isinstance(record, records.Metadata):
+            self.metadata.append(metadata_entry(place, record))
+        elif isinstance(record, records.Schema):
+            if record.id == 0:
+                yield "a schema has the id 0, which means none"
+            if self.schemas.setdefault(record.id, record) != record:
+                yield f"schema {record.id} is announced twice with different contents"
+        elif isinstance(record, records.Channel):
+            if record.schema_id and record.schema_id not in self.schemas:
+                yield f"channel {record.id} uses schema {record.schema_id}, not announced before"
+            if self.channels.setdefault(record.id, record) != record:
+                yield f"channel {record.id} is announced twice with different contents"
+
+
+def summary_faults(
+    stream: ByteStream, seen: Seen, summary: Summary | None, footer: records.Footer, footer_at: int
+) -> Iterator[str]:
+    """Yield a sentence for every place where summary and data disagree.
+
+    What a writer may leave out (statistics, repeated records, an index as a whole) is no fault.
+    """
+    if summary is None:
+        return
+    in_data = len(seen.schemas), len(seen.channels)
+    # Topics nobody spoke on may stand in the summary only, counted or not (libmcap 1.1).
+    for schema in summary.schemas.values():
+        if seen.schemas.setdefault(schema.id, schema) != schema:
+            yield f"the summary's schema {schema.id} ({schema.name}) is not that of the data"
+    for channel in summary.channels.values():
+        if seen.channels.setdefault(channel.id, channel) != channel:
+            yield f"the summary's channel {channel.id} ({channel.topic}) is not that of the data"
+    if summary.statistics is not None:
+        yield from _statistics_faults(seen, summary.statistics, *in_data)
+    yield from _index_faults("chunk", summary.chunk_indexes, seen.chunks, "chunk_start_offset")
+    yield from _index_faults("attachment", summary.attachment_indexes, seen.attachments, "offset")
+    yield from _index_faults("metadata", summary.metadata_indexes, seen.metadata, "offset")
+    if footer.summary_offset_start:
+        yield from _offset_faults(stream, footer, footer_at)
+
+
+def _statistics_faults(
+    seen: Seen, said: records.Statistics, num_schemas: int, num_channels: int
+) -> Iterator[str]:
+    num_attachments = len(seen.attachments) + seen.num_broken_attachments
+    pairs = {
+        "messages": (said.message_count, sum(seen.counts.values())),
+        "schemas": (said.schema_count, _either(said.schema_count, seen.schemas, num_schemas)),
+        "channels": (
+            said.channel_count,
+            _either(said.channel_count, seen.channels, num_channels),
+        ),
+        "attachments": (said.attachment_count, num_attachments),
+        "metadata records": (said.metadata_count, len(seen.metadata)),
+        "chunks": (said.chunk_count, seen.num_chunks),
+    }
+    for what, (count, found) in pairs.items():
+        if count != found:
+            yield f"the summary says {count} {what}, {found} were read"
+    times = (said.message_start_time, said.message_end_time)
+    # Log time 0 means "none yet" to the Go writer, which then states the next one.
+    start_ns = said.message_start_time if seen.start_ns == 0 else seen.start_ns
+    if seen.counts and times != (start_ns, seen.end_ns):
+        yield f"the summary says messages from {times}, they are from {(start_ns, seen.end_ns)}"
+    for channel_id in sorted(said.channel_message_counts.keys() | seen.counts.keys()):
+        count = said.channel_message_counts.get(channel_id, 0)
+        found = seen.counts.get(channel_id, 0)
+        if count != found and said.channel_message_counts:
+            channel = seen.channels.get(channel_id)
+            name = channel.topic if channel else f"channel {channel_id}"
+            yield f"{name}: the summary says {count} messages, {found} were read"
+
+
+def _either(said: int, everywhere: Collection[int], in_data: int) -> int:
+    """Return the count that agrees, if one does."""
+    return in_data if said == in_data else len(everywhere)
+
+
+def _index_faults(what: str, said: list, found: list, key: str) -> Iterator[str]:  # type: ignore[type-arg]
+    if not said:
+        return  # a file without this index
+    there = {getattr(entry, key): entry for entry in found}
+    for entry in said:
+        at = getattr(entry, key)
+        other = there.pop(at, None)
+        if other is None:
+            yield f"the {what} index points at byte {at}, where none lies"
+        elif other != entry:
+            names = [n for n in vars(entry) if getattr(entry, n) != getattr(other, n)]
+            yield f"the {what} index of byte {at} is wrong about {', '.join(names)}"
+    for at in there:
+        yield f"the {what} at byte {at} is not in the index"
+
+
+def _offset_faults(stream: ByteStream, footer: records.Footer, footer_at: int) -> Iterator[str]:
+    for place in walk(stream, footer.summary_offset_start, footer_at):
+        record = parse(place.opcode, read_body(stream, place))
+        if not isinstance(record, records.SummaryOffset):
+            yield f"a record of kind {place.opcode} among the summary's offsets"
+            continue
+        start, end = record.group_start, record.group_start + record.group_length
+        is_inside = footer.summary_start <= start <= end <= footer.summary_offset_start
+        if not is_inside or not _are_all(record.group_opcode, stream, start, end):
+            yield f"the summary's offset of records of kind {record.group_opcode} is wrong"
+
+
+def _are_all(opcode: int, stream: ByteStream, start: int, end: int) -> bool:
+    """Whether whole records of one kind, or none, lie between two offsets."""
+    try:
+        return all(place.opcode == opcode for place in walk(stream, start, end))
+    except BrokenRecordError:
+        return False
+
 
 _INDEX_HEAD = struct.Struct("<HI")
 NEVER = 1 << 64

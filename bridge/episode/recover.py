@@ -12,14 +12,19 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from bridge.episode.mcap.damaged import RecordFile, finished_data_end
 from bridge.episode.mcap.part_file import PartFile, lock_dead, sync_folder
-from bridge.episode.mcap.record_file import RecordFile, finished_data_end
 from bridge.episode.mcap.scan import scan
-from bridge.episode.recover_copy import CopyTarget
-from bridge.episode.recover_in_place import InPlaceTarget, NeedsCopyError
-from bridge.episode.recover_tally import RECORD_NAME, Tally, to_metadata
-from bridge.episode.recover_tally import RecoveryReport as RecoveryReport
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.salvage import (
+    RECORD_NAME,
+    CopyTarget,
+    InPlaceTarget,
+    NeedsCopyError,
+    RecoveryTally,
+    to_metadata,
+)
+from bridge.episode.salvage import RecoveryReport as RecoveryReport
 from bridge.errors import BridgeError, GstError, PathNotFoundError
 
 PART, SUFFIX, TEMPORARY, UNREADABLE = ".part", ".mcap", ".recovering", ".unreadable"
@@ -120,7 +125,7 @@ def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
     data_end = finished_data_end(source)
     if data_end is None:
         return None
-    tally = Tally()
+    tally = RecoveryTally()
     for found in scan(source):
         tally.take(found)
     if tally.losses or tally.reached_end != data_end:
@@ -132,7 +137,7 @@ def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
 def _recover_copy(path: Path, source: RecordFile) -> RecoveryReport:
     temporary = path.with_name(_final_name(path) + TEMPORARY)
     temporary.unlink(missing_ok=True)  # of a recovery that was killed; the lock is ours
-    tally = Tally()
+    tally = RecoveryTally()
     target: CopyTarget | None = None
     try:
         for found in scan(source):
@@ -158,7 +163,7 @@ def _recover_copy(path: Path, source: RecordFile) -> RecoveryReport:
 
 
 def _recover_in_place(path: Path, source: RecordFile) -> RecoveryReport:
-    tally = Tally()
+    tally = RecoveryTally()
     target = InPlaceTarget(source, PartFile(path, source.descriptor))
     try:
         for found in scan(source):

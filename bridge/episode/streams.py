@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from bridge.episode import schema
-from bridge.episode.alike import joints_of, poses_of
-from bridge.episode.cdr import decode
-from bridge.episode.reader import Episode
-from bridge.episode.records import (
+from bridge.episode.cdr.batch import joints_of, poses_of
+from bridge.episode.cdr.codec import decode
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,
@@ -24,6 +23,7 @@ from bridge.episode.records import (
     string_from_cdr,
     transforms_from_cdr,
 )
+from bridge.episode.reader import Episode
 from bridge.episode.transforms import TransformTree
 from bridge.errors import EpisodeError
 from bridge.geometry import se3

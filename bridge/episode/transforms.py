@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from bridge.episode.records import FrameTransform
+from bridge.episode.cdr.messages import FrameTransform
 from bridge.errors import BridgeError
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory

@@ -14,12 +14,130 @@ from types import TracebackType
 from typing import Any
 
 from bridge.episode import metadata, provenance, schema
-from bridge.episode.channels import Channel, Channels
-from bridge.episode.grouping import LARGE_BYTES, first_bytes, is_large, is_worth_compressing
-from bridge.episode.mcap.chunks import EncodedChunk, OpenChunk
-from bridge.episode.mcap.data_section import DataSection
+from bridge.episode.mcap import format as mcap_format
+from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk, Summary
 from bridge.episode.mcap.format import Buffer, Payload, num_bytes
 from bridge.episode.mcap.part_file import BackgroundSync, cannot_write, open_part
+
+# --- The channels of a file being written: one for each topic and schema, numbered as they come.
+
+
+class Channel:
+    """One topic with one schema, and the chunk its messages go to."""
+
+    __slots__ = ("definition", "group", "id", "is_large", "next_sequence", "type_name")
+
+    def __init__(self, channel_id: int, type_name: str, definition: bytes) -> None:
+        """Begin without a group."""
+        self.id = channel_id
+        self.type_name = type_name
+        self.definition = definition
+        """Schema and channel records, repeated in every group the channel writes to."""
+        self.next_sequence = 0
+        self.is_large = False
+        self.group: OpenChunk | None = None
+
+
+class Channels:
+    """Finds or makes the channel of a message, and tells the summary of new ones.
+
+    A topic whose schema changes its text, not only its name, gets a second channel.
+    """
+
+    def __init__(self, summary: Summary) -> None:
+        """Begin without channels."""
+        self._summary = summary
+        self._schemas: dict[tuple[str, str, bytes], tuple[int, bytes]] = {}
+        self._channels: dict[tuple[str, str, int], Channel] = {}
+        self._known: dict[tuple[str, int, str], tuple[Channel, schema.Schema | None]] = {}
+
+    def find(self, topic: str, record: schema.Schema | None, message_encoding: str) -> Channel:
+        """Return the channel of a topic.
+
+        Args:
+            topic: With its leading slash.
+            record: Schema of the messages, or none.
+            message_encoding: Used where there is no schema.
+        """
+        # Comparing schemas by identity spares hashing their text for every message; the value
+        # keeps the schema alive, so that its identity is not given to another.
+        quick_key = (topic, id(record), message_encoding)
+        found = self._known.get(quick_key)
+        if found is not None:
+            return found[0]
+        encoding = message_encoding if record is None else record.message_encoding
+        schema_id, definition = (0, b"") if record is None else self._schema(record)
+        key = (topic, encoding, schema_id)
+        channel = self._channels.get(key)
+        if channel is None:
+            channel_id = len(self._channels) + 1
+            encoded = mcap_format.channel(channel_id, schema_id, topic, encoding)
+            type_name = "" if record is None else record.name
+            channel = Channel(channel_id, type_name, definition + encoded)
+            self._channels[key] = channel
+            self._summary.channels[channel_id] = encoded
+        self._known[quick_key] = (channel, record)
+        return channel
+
+    def _schema(self, record: schema.Schema) -> tuple[int, bytes]:
+        key = (record.name, record.schema_encoding, record.data)
+        if key not in self._schemas:
+            schema_id = len(self._schemas) + 1
+            encoded = mcap_format.schema(schema_id, *key)
+            self._schemas[key] = (schema_id, encoded)
+            self._summary.schemas[schema_id] = encoded
+        return self._schemas[key]
+
+
+# --- Which messages share a chunk, and which chunks are worth compressing.
+#
+# A reader of one small topic must not unpack images, and bytes that are packed already (JPEG,
+# PNG, H.264) cost CPU time without getting smaller. So each large stream has chunks of its own
+# and all small topics share theirs (the recorder study, sections 1.1 and 1.6).
+
+LARGE_BYTES = 1 << 16
+"""A topic with a message of this size counts as a large stream from then on."""
+
+_LARGE_TYPES = frozenset(
+    {
+        schema.IMAGE,
+        schema.COMPRESSED_IMAGE,
+        "foxglove.CompressedImage",
+        "foxglove.CompressedVideo",
+        "foxglove.RawImage",
+    }
+)
+_PACKED_TYPES = frozenset(
+    {schema.COMPRESSED_IMAGE, "foxglove.CompressedImage", "foxglove.CompressedVideo"}
+)
+_DEPTH_ENCODINGS = (b"16UC1\0", b"mono16\0", b"32FC1\0")
+_HEAD_BYTES = 512
+"""An encoding's name stands near the front of an image message."""
+
+
+def is_large(type_name: str, length: int) -> bool:
+    """Say whether a message of this many bytes belongs to a stream with chunks of its own."""
+    return type_name in _LARGE_TYPES or length >= LARGE_BYTES
+
+
+def first_bytes(data: Payload) -> bytes:
+    """Return the front of a message, enough to see its encoding."""
+    if isinstance(data, Buffer):
+        return bytes(memoryview(data).cast("B")[:_HEAD_BYTES])
+    return b"".join(first_bytes(piece) for piece in data[:4])[:_HEAD_BYTES]
+
+
+def is_worth_compressing(type_name: str, front: bytes) -> bool:
+    """Judge a stream by its type and the front of its first message: zstd for depth and unknown.
+
+    Raw colour is left as it is: zstd takes a quarter off it for more CPU time than JPEG.
+    """
+    if type_name in _PACKED_TYPES:
+        return b"compressedDepth rvl" in front
+    if type_name == schema.IMAGE:
+        return any(encoding in front for encoding in _DEPTH_ENCODINGS)
+    return True
+
 
 PROFILE = "ros2"
 LIBRARY = "robot-gst"

@@ -22,10 +22,10 @@ from jaxtyping import Float
 
 from bridge.clock import ns_from_s
 from bridge.episode import schema
+from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.provenance import hash_file, hash_settings
-from bridge.episode.records import PoseSample
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import BridgeError, PathNotFoundError
 from bridge.geometry import se3

@@ -11,7 +11,28 @@ from pathlib import Path
 from typing import Any
 
 from bridge.episode.provenance import hash_file, software
-from bridge.errors import BridgeError, UsageError
+from bridge.episode.reader import Episode
+from bridge.errors import BridgeError, EpisodeError, UsageError
+
+# --- Errors about a message say which one of which topic of which file it was.
+
+
+@contextmanager
+def message_named(episode: Episode, topic: str, number: int) -> Iterator[None]:
+    """Name the message in whatever goes wrong in the block; ``number`` counts from 1.
+
+    Raises:
+        EpisodeError: In place of the ``BridgeError`` that came out.
+    """
+    try:
+        yield
+    except BridgeError as error:
+        raise EpisodeError(
+            path=episode.path,
+            found=f"message {number} of {topic}: {error}",
+            hint="robot-gst check lists everything that is wrong with it.",
+        ) from error
+
 
 NOTE_NAME = "robot_gst_export.json"
 """Says what an exported folder is made of; also the proof that ``--force`` may replace it."""

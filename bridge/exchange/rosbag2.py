@@ -15,11 +15,11 @@ from mcap import records
 
 from bridge.episode import schema
 from bridge.episode.mcap.file import McapFile, damaged
-from bridge.episode.mcap.merge import Selection, Stored, merged
+from bridge.episode.mcap.messages import Selection, Stored, merged
 from bridge.episode.mcap.walk import DAMAGE
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.provenance import hash_file
-from bridge.episode.run import RunFolder, check_episode_id
+from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import BridgeError, EpisodeError, MissingDependencyError, PathNotFoundError
 

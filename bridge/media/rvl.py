@@ -4,7 +4,7 @@ Wilson, "Fast lossless depth image compression" (2017), in the layout ROS uses: 
 of measurements alternate; each run is its length, each measurement the zigzag difference to the
 measurement before it; numbers are 3 bits a nibble, lowest first, the top bit saying that more
 follow; the first nibble is the highest of a little-endian 32-bit word.
-``bridge.media.depth_codec`` uses ``_depth`` (native) instead of this module when it can;
+``bridge.media.depth`` uses ``_depth`` (native) instead of this module when it can;
 ``tests/parity`` compares the two.
 """
 

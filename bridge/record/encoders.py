@@ -10,21 +10,83 @@ import traceback
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from bridge.episode import schema
-from bridge.episode.cdr import MalformedMessageError
-from bridge.episode.transcode import (
+from bridge.episode.cdr.codec import MalformedMessageError
+from bridge.episode.cdr.images import (
     COLOR_LAYOUTS,
     DEPTH_ENCODINGS,
     depth_to_compact,
     image_header,
     image_to_jpeg,
+    pixel_rows,
 )
+from bridge.episode.cdr.messages import CompressedColor, video_message
+from bridge.media.color import UnreadableImageError, decode_color
+from bridge.media.video import H264Encoder, VideoEncodingError
 from bridge.record.config import RecorderConfig
-from bridge.record.entries import Item
-from bridge.record.inspection import GOOD, Finding, fits, inspect
-from bridge.record.shedding import REDUCED_QUALITY, Shed
-from bridge.record.video import VideoStreams
+from bridge.record.inspection import GOOD, MessageState, fits, inspect
+from bridge.record.queue import REDUCED_QUALITY, Item, LoadShedding
 from bridge.wire.session import WireSample
+
+# --- H.264 beside the pictures: one ``.../preview`` topic for each colour stream, for people only.
+
+RATE_HZ = 30.0
+"""What the encoder plans with; the true rate may differ."""
+_ORDER = {"BGR": [2, 1, 0], "RGBA": [0, 1, 2], "BGRA": [2, 1, 0], "GRAY": [0, 0, 0]}
+
+
+class VideoStreams:
+    """One encoder for each colour stream; each is used by its stream's thread alone."""
+
+    def __init__(self) -> None:
+        """Check that videos can be made at all.
+
+        Raises:
+            MissingDependencyError: When PyAV is not installed.
+        """
+        H264Encoder(64, 64, RATE_HZ)
+        self._encoders: dict[str, tuple[tuple[int, ...], H264Encoder]] = {}
+
+    def frame(self, sample: WireSample) -> WireSample | None:
+        """Return the video frame that goes with a colour image; None when it cannot be one."""
+        try:
+            pixels, stamp_ns, frame_id = _pixels(sample)
+            size, encoder = self._encoders.get(sample.topic, ((), None))
+            if encoder is None or size != pixels.shape:
+                encoder = H264Encoder(pixels.shape[1], pixels.shape[0], RATE_HZ)
+                self._encoders[sample.topic] = (pixels.shape, encoder)
+            data = encoder.encode(pixels, stamp_ns)
+        except (MalformedMessageError, UnreadableImageError, VideoEncodingError):
+            return None
+        return replace(
+            sample,
+            topic=preview_topic(sample.topic),
+            type_name=schema.COMPRESSED_VIDEO,
+            message_encoding="protobuf",
+            type_hash="",
+            data=video_message(stamp_ns, frame_id, data),
+        )
+
+
+def preview_topic(topic: str) -> str:
+    """Name the video of an image topic: ``.../color/image`` has ``.../color/preview``."""
+    return topic.removesuffix("/image") + "/preview"
+
+
+def _pixels(sample: WireSample) -> tuple[np.ndarray, int, str]:
+    if sample.type_name == schema.COMPRESSED_IMAGE:
+        image = CompressedColor.from_cdr(sample.data)
+        return decode_color(image.data), image.stamp_ns, image.frame_id
+    header = image_header(sample.data)
+    layout, channels = COLOR_LAYOUTS[header.encoding]
+    rows = pixel_rows(sample.data, header, channels)
+    pixels = rows.reshape(header.height, header.width, channels)
+    if layout in _ORDER:
+        pixels = pixels[..., _ORDER[layout]]
+    return pixels, header.stamp_ns, header.frame_id
+
 
 MAX_THREADS = 32
 """Streams beyond this many share the threads of others."""
@@ -36,7 +98,7 @@ Preview = Callable[[WireSample, str], None]
 class ImageEncoder:
     """Turns raw images into what an episode holds."""
 
-    def __init__(self, config: RecorderConfig, shed: Callable[[], Shed]) -> None:
+    def __init__(self, config: RecorderConfig, shed: Callable[[], LoadShedding]) -> None:
         """Choose the profile; ``shed`` says how far shedding has gone.
 
         Raises:
@@ -53,7 +115,7 @@ class ImageEncoder:
         original = item.sample
         self._look_and_transcode(item)
         is_good_color = item.finding is GOOD and self.kinds.get(original.topic) == "color"
-        if self._video is not None and is_good_color and self._shed() < Shed.PREVIEWS:
+        if self._video is not None and is_good_color and self._shed() < LoadShedding.PREVIEWS:
             item.extra = self._video.frame(original)
 
     def _look_and_transcode(self, item: Item) -> None:
@@ -66,11 +128,11 @@ class ImageEncoder:
             return
         try:
             header = image_header(sample.data)
-            item.finding = GOOD if fits(header) else Finding.UNDECODABLE
+            item.finding = GOOD if fits(header) else MessageState.UNDECODABLE
             if item.finding is GOOD:
                 self._transcode(item, header.encoding)
         except MalformedMessageError:
-            item.finding = Finding.UNDECODABLE
+            item.finding = MessageState.UNDECODABLE
 
     def _transcode(self, item: Item, encoding: str) -> None:
         data, reduced, topic = None, False, item.sample.topic
@@ -78,7 +140,7 @@ class ImageEncoder:
             self.kinds[topic] = "color"
             if self._config.color == "jpeg":
                 quality = self._config.jpeg_quality
-                if self._shed() >= Shed.COLOR_QUALITY and quality > REDUCED_QUALITY:
+                if self._shed() >= LoadShedding.COLOR_QUALITY and quality > REDUCED_QUALITY:
                     quality, reduced = REDUCED_QUALITY, True
                 data = image_to_jpeg(item.sample.data, quality)
         elif encoding in DEPTH_ENCODINGS:
@@ -142,7 +204,7 @@ class EncoderThreads:
                     self._treat(item)
             except Exception:  # noqa: BLE001  # a bug must not end the stream: record it as it is
                 traceback.print_exc()
-                item.finding = item.finding or Finding.UNDECODABLE
+                item.finding = item.finding or MessageState.UNDECODABLE
             self._done(item, before - len(item.sample.data))
 
     def _treat(self, item: Item) -> None:

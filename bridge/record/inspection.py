@@ -10,16 +10,17 @@ from collections.abc import Callable
 from enum import StrEnum
 from functools import lru_cache
 
-from bridge.episode import cdr, schema
-from bridge.episode.transcode import DEPTH_ENCODINGS, ImageHeader, image_header
-from bridge.episode.video import VideoFrame
+from bridge.episode import schema
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.images import DEPTH_ENCODINGS, ImageHeader, image_header
+from bridge.episode.cdr.messages import VideoFrame
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _TAIL_BYTES = 64
 """Cameras may pad a JPEG behind its end mark."""
 
 
-class Finding(StrEnum):
+class MessageState(StrEnum):
     """What is known about one message."""
 
     GOOD = "good"
@@ -28,7 +29,7 @@ class Finding(StrEnum):
     UNKNOWN_TYPE = "unknown_type"
 
 
-GOOD = Finding.GOOD
+GOOD = MessageState.GOOD
 """Looked up for every message."""
 
 
@@ -37,19 +38,19 @@ def resolve_type(topic: str, type_name: str) -> str:
     return type_name or schema.type_of_topic(topic) or ""
 
 
-def inspect(type_name: str, message_encoding: str, data: bytes) -> Finding:
+def inspect(type_name: str, message_encoding: str, data: bytes) -> MessageState:
     """Check a message without building anything from it."""
     return inspector(type_name, message_encoding)(data)
 
 
 @lru_cache(maxsize=4096)
-def inspector(type_name: str, message_encoding: str) -> Callable[[bytes], Finding]:
+def inspector(type_name: str, message_encoding: str) -> Callable[[bytes], MessageState]:
     """Return the check for the messages of one type."""
     known = schema.schema_for(type_name) if type_name else None
     if known is None:
-        return lambda data: Finding.UNKNOWN_TYPE
+        return lambda data: MessageState.UNKNOWN_TYPE
     if message_encoding not in ("", known.message_encoding):
-        return lambda data: Finding.UNDECODABLE
+        return lambda data: MessageState.UNDECODABLE
     if known.message_encoding == "cdr":
         return lambda data: _inspect_cdr(type_name, data)
     if known.message_encoding == "json":
@@ -58,23 +59,23 @@ def inspector(type_name: str, message_encoding: str) -> Callable[[bytes], Findin
     return _inspect_video
 
 
-def _inspect_video(data: bytes) -> Finding:
+def _inspect_video(data: bytes) -> MessageState:
     try:
         VideoFrame.from_protobuf(data)
-    except cdr.MalformedMessageError:
-        return Finding.UNDECODABLE
+    except codec.MalformedMessageError:
+        return MessageState.UNDECODABLE
     return GOOD
 
 
-def _inspect_cdr(type_name: str, data: bytes) -> Finding:
+def _inspect_cdr(type_name: str, data: bytes) -> MessageState:
     try:
         if type_name == schema.IMAGE:
-            return GOOD if fits(image_header(data)) else Finding.UNDECODABLE
-        cdr.validate(type_name, data)
-    except cdr.MalformedMessageError:
-        return Finding.UNDECODABLE
+            return GOOD if fits(image_header(data)) else MessageState.UNDECODABLE
+        codec.validate(type_name, data)
+    except codec.MalformedMessageError:
+        return MessageState.UNDECODABLE
     if type_name == schema.COMPRESSED_IMAGE and _is_cut_jpeg(data):
-        return Finding.UNDECODABLE
+        return MessageState.UNDECODABLE
     return GOOD
 
 
@@ -97,16 +98,16 @@ def _is_cut_jpeg(data: bytes) -> bool:
     return data.startswith(_JPEG_START, at) and _JPEG_END not in data[-_TAIL_BYTES:]
 
 
-def _inspect_json(newest: int, data: bytes) -> Finding:
+def _inspect_json(newest: int, data: bytes) -> MessageState:
     try:
         record = json.loads(data)
     except (ValueError, RecursionError):
-        return Finding.UNDECODABLE
+        return MessageState.UNDECODABLE
     if not isinstance(record, dict):
-        return Finding.UNDECODABLE
+        return MessageState.UNDECODABLE
     version = record.get("schema_version", 1)
     if not isinstance(version, int):
-        return Finding.UNDECODABLE
+        return MessageState.UNDECODABLE
     if version > newest:
-        return Finding.NEWER_VERSION
+        return MessageState.NEWER_VERSION
     return GOOD

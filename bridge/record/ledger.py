@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
-from bridge.record.entries import MAX_WARNINGS, Dropped, Item, second_of
-from bridge.record.inspection import GOOD, Finding
+from bridge.record.inspection import GOOD, MessageState
+from bridge.record.queue import MAX_WARNINGS, Dropped, Item, second_of
 
 OTHER_TOPICS = "(further topics)"
 """The account of topics beyond those an episode may have."""
@@ -123,7 +123,7 @@ class Ledger:
     def _was_booked(self, ticket: int) -> bool:
         return any(first <= ticket and (end is None or ticket < end) for first, end in self._spans)
 
-    def count_received(self, item: Item, finding: Finding) -> None:
+    def count_received(self, item: Item, finding: MessageState) -> None:
         """Book a message that was written."""
         sample = item.sample
         tally = self._tally(sample.topic, second_of(sample.received_ns))

@@ -1,21 +1,154 @@
 """What the recorder is doing: idle, recording or paused; and the steps between. One thread."""
 
 import contextlib
+import errno
+import os
+import tempfile
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
-from bridge.clock import s_from_ns
+from bridge.clock import ns_from_s, s_from_ns
 from bridge.episode import metadata
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.record.config import BYTES_PER_MB, RecorderConfig
-from bridge.record.entries import Command, Dropped, Item
+from bridge.record.episode_recording import EpisodeRecording
 from bridge.record.errors import DiskError, LifecycleError, NoSpaceError
-from bridge.record.latched import LatchedMessages, LatchedTopics
-from bridge.record.preroll import PreRoll
-from bridge.record.reserve import FooterReserve, free_bytes
-from bridge.record.take import Take
+from bridge.record.queue import (
+    OVERHEAD_BYTES,
+    Command,
+    Dropped,
+    Item,
+    LatchedMessages,
+    LatchedTopics,
+)
+
+# --- Space held back on the disk, so that an episode can be finished when everything else is full.
+
+
+class DiskReserve:
+    """An allocated file without a name: it vanishes with the process, whatever ends it."""
+
+    def __init__(self, folder: Path, size_mb: int) -> None:
+        """Choose where and how much; nothing is allocated yet."""
+        self._folder = folder
+        self._bytes = size_mb * BYTES_PER_MB
+        self._descriptor: int | None = None
+
+    def hold(self) -> None:
+        """Allocate it, if it is not yet.
+
+        Raises:
+            NoSpaceError: When the disk has not that much left.
+        """
+        if self._descriptor is not None or not self._bytes:
+            return
+        try:
+            descriptor = _nameless(self._folder)
+        except OSError:  # the folder cannot be written: creating the episode says so better
+            return
+        try:
+            os.posix_fallocate(descriptor, 0, self._bytes)
+        except OSError as error:
+            os.close(descriptor)
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise NoSpaceError(
+                    folder=self._folder, free_mb=0, wanted_mb=self._bytes // BYTES_PER_MB
+                ) from error
+            return  # a file system or a limit that allows none: record without
+        self._descriptor = descriptor
+
+    def release(self) -> None:
+        """Give the space back to the disk."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+
+def _nameless(folder: Path) -> int:
+    if hasattr(os, "O_TMPFILE"):
+        with contextlib.suppress(OSError):  # some file systems have no such files
+            return os.open(folder, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
+    descriptor, name = tempfile.mkstemp(prefix=".reserve-", dir=folder)
+    Path(name).unlink()
+    return descriptor
+
+
+def free_bytes(folder: Path) -> int:
+    """What an ordinary user may still write there."""
+    found = os.statvfs(folder)
+    return found.f_bavail * found.f_frsize
+
+
+# --- The last seconds before a start, kept in memory: bounded in seconds and in bytes.
+
+
+class PreRoll:
+    """Holds messages as they would be written; what falls out at the old end is passed on."""
+
+    def __init__(self, *, seconds: float, max_bytes: int, passed: Callable[[Item], None]) -> None:
+        """Set the bounds.
+
+        Args:
+            seconds: How far back it reaches [s]; 0 holds nothing.
+            max_bytes: Memory; with less than the seconds need, it reaches less far.
+            passed: Called with each message that is too old now.
+        """
+        self._span_ns = ns_from_s(seconds)
+        self._max_bytes = max_bytes
+        self._passed = passed
+        self._entries: deque[Item | Dropped] = deque()
+        self.bytes = 0
+
+    @property
+    def is_on(self) -> bool:
+        """Say whether anything is held at all."""
+        return self._span_ns > 0
+
+    def add(self, entry: Item | Dropped) -> None:
+        """Hold a message, or the count of messages that were left out."""
+        if not self.is_on:
+            if isinstance(entry, Item):
+                self._passed(entry)
+            return
+        self._entries.append(entry)
+        self.bytes += _size(entry)
+        while self.bytes > self._max_bytes:
+            self._let_go()
+
+    def trim(self, now_ns: int) -> None:
+        """Let go of what is too old."""
+        while self._entries and self._entries[0].received_ns < now_ns - self._span_ns:
+            self._let_go()
+
+    def _let_go(self) -> None:
+        entry = self._entries.popleft()
+        self.bytes -= _size(entry)
+        if isinstance(entry, Item):
+            self._passed(entry)
+
+    def held(self, now_ns: int) -> list[Item | Dropped]:
+        """Return what lies within the span, in order of arrival."""
+        self.trim(now_ns)
+        return sorted(self._entries, key=lambda entry: entry.ticket)
+
+    def empty(self) -> None:
+        """Let go of everything: it is in an episode now."""
+        while self._entries:
+            self._let_go()
+
+    def seconds(self, now_ns: int) -> float:
+        """How far back it reaches now [s]."""
+        first = self._entries[0].received_ns if self._entries else now_ns
+        return max(0, now_ns - first) / 1e9
+
+
+def _size(entry: Item | Dropped) -> int:
+    return OVERHEAD_BYTES + (len(entry.sample.data) if isinstance(entry, Item) else 0)
+
 
 Answer = dict[str, Any]
 
@@ -38,7 +171,7 @@ class Lifecycle:
             queued_bytes: How much waits in the queues.
             latched: Topics whose last message stays true.
         """
-        self.take: Take | None = None
+        self.take: EpisodeRecording | None = None
         self.is_paused = False
         self.is_closing = False
         self.is_finishing = False
@@ -56,7 +189,7 @@ class Lifecycle:
         self._run = run
         self._config = config
         self._queued_bytes = queued_bytes
-        self._reserve = FooterReserve(run.episodes_dir, config.disk.footer_mb)
+        self._reserve = DiskReserve(run.episodes_dir, config.disk.footer_mb)
         self._unwritable: set[str] = set()
 
     @property
@@ -88,7 +221,7 @@ class Lifecycle:
         elif not self.is_paused:
             take.ledger.count_dropped(entry)
 
-    def _write(self, take: Take, item: Item) -> None:
+    def _write(self, take: EpisodeRecording, item: Item) -> None:
         """One message that cannot be written is counted as lost; recording goes on."""
         try:
             take.write(item)
@@ -174,10 +307,10 @@ class Lifecycle:
 
     def _open(
         self, info: metadata.EpisodeInfo, held: list[Item | Dropped], command: Command
-    ) -> Take:
+    ) -> EpisodeRecording:
         self._reserve.hold()
         first_ns = [entry.received_ns for entry in held]
-        take = Take(
+        take = EpisodeRecording(
             self._run.episodes_dir,
             info,
             self._config,
@@ -188,7 +321,7 @@ class Lifecycle:
         take.ledger.begin(held[0].ticket if held else command.ticket)
         return take
 
-    def _write_held(self, take: Take, held: list[Item | Dropped]) -> None:
+    def _write_held(self, take: EpisodeRecording, held: list[Item | Dropped]) -> None:
         for entry in held:
             if isinstance(entry, Item):
                 self._write(take, entry)
@@ -201,7 +334,7 @@ class Lifecycle:
         first_ns = min([entry.received_ns for entry in held], default=now_ns)
         return {"preroll_s": s_from_ns(now_ns - first_ns)}
 
-    def _open_take(self) -> Take:
+    def _open_take(self) -> EpisodeRecording:
         if self.take is None:
             raise LifecycleError("nothing is being recorded. Start an episode first.")
         return self.take
@@ -291,7 +424,7 @@ class Lifecycle:
             self._reserve.release()
 
 
-def counts(take: Take) -> Answer:
+def counts(take: EpisodeRecording) -> Answer:
     """What an episode holds and lacks so far."""
     total = take.ledger.total()
     return {

@@ -10,29 +10,180 @@ with open_recorder(Path("runs/monday")) as recorder:
 
 import contextlib
 import json
+import re
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from bridge.episode import schema
-from bridge.episode.catalogue.reading import read_entry
+from bridge.episode.catalogue import read_entry
+from bridge.episode.cdr.codec import MalformedMessageError
+from bridge.episode.cdr.images import COLOR_LAYOUTS, image_header, pixel_rows
+from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.metadata import Outcome
 from bridge.episode.recover import recover_parts
-from bridge.episode.recover_tally import RecoveryReport
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.salvage import RecoveryReport
+from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
 from bridge.record.config import RecorderConfig
 from bridge.record.control import parse_info, parse_outcome, serve_control
-from bridge.record.departures import Departures
-from bridge.record.preview import Previews
+from bridge.record.queue import LoadShedding
 from bridge.record.recorder import Recorder
 from bridge.record.ros2 import watch_ros2
+from bridge.wire import rmw
 from bridge.wire.config import DEFAULT_ENDPOINT, WireConfig
 from bridge.wire.errors import WireError
+from bridge.wire.publisher import WirePublisher
 from bridge.wire.qos import Qos
-from bridge.wire.ros_types import read_definitions
-from bridge.wire.session import WireSample, WireSession, open_session
+from bridge.wire.rmw import read_definitions
+from bridge.wire.session import Subscriber, WireSample, WireSession, open_session
+
+# --- Small pictures of the cameras on ``rec/<recorder>/preview/<camera>``, while someone looks.
+
+WIDTH = 320
+QUALITY = 70
+MAX_PREVIEWS = 64
+_CAMERA = re.compile(r"/cam/([^/]+)/color/image$")
+
+
+class Previews:
+    """Makes previews on the encoders' threads; every image of every stream passes here."""
+
+    def __init__(
+        self, session: WireSession, recorder: str, rate_hz: float, shed: Callable[[], LoadShedding]
+    ) -> None:
+        """Publish nothing yet.
+
+        Args:
+            session: Where to publish.
+            recorder: Name of the recorder.
+            rate_hz: At most this many a second for each camera; 0 makes none.
+            shed: Says how far shedding has gone; previews go first.
+        """
+        self._session = session
+        self._recorder = recorder
+        self._period_s = 1 / rate_hz if rate_hz else None
+        self._shed = shed
+        self._publishers: dict[str, WirePublisher] = {}
+        self._names: set[str] = set()
+        self._watched: frozenset[str] = frozenset()
+        self._next_s: dict[str, float] = {}
+
+    def look(self, topics: list[str]) -> frozenset[str]:
+        """Return which image topics somebody watches; called about once a second."""
+        if self._period_s is None:
+            return self._watched
+        for topic in topics[:MAX_PREVIEWS]:
+            if topic not in self._publishers and "/depth/" not in topic:
+                name = f"/rec/{self._recorder}/preview/{self._name(topic)}"
+                try:
+                    publisher = self._session.publisher(
+                        name, schema.COMPRESSED_IMAGE, qos=Qos.PREVIEW
+                    )
+                except WireError:  # a name that is no key cannot be watched either
+                    continue
+                self._publishers[topic] = publisher
+        self._watched = frozenset(
+            topic for topic, publisher in self._publishers.items() if publisher.has_subscribers()
+        )
+        return self._watched
+
+    def _name(self, topic: str) -> str:
+        found = _CAMERA.search(topic)
+        name = found[1] if found else ""
+        if not name or name in self._names:  # two cells may call their cameras the same
+            name = topic.strip("/").replace("/", "_")
+        self._names.add(name)
+        return name
+
+    def show(self, sample: WireSample, kind: str) -> None:
+        """Send a small copy of an image, if somebody looks and it is time for one."""
+        topic = sample.topic
+        if topic not in self._watched or kind == "depth" or self._shed() >= LoadShedding.PREVIEWS:
+            return
+        now_s = time.monotonic()
+        if now_s < self._next_s.get(topic, 0.0):
+            return
+        self._next_s[topic] = now_s + (self._period_s or 0.0)
+        try:
+            picture = small_picture(sample)
+        except (MalformedMessageError, UnreadableImageError, ValueError):
+            return
+        if picture is not None:
+            self._publishers[topic].put(picture.to_cdr(), source_ns=picture.stamp_ns)
+
+
+def small_picture(sample: WireSample) -> CompressedColor | None:
+    """Make a JPEG about ``WIDTH`` pixels wide of a colour image, or None of anything else.
+
+    Raises:
+        MalformedMessageError: The message contradicts itself.
+        UnreadableImageError: The picture in it is broken.
+    """
+    if sample.type_name in ("", schema.COMPRESSED_IMAGE):
+        original = CompressedColor.from_cdr(sample.data)
+        pixels, layout = decode_color(original.data), "RGB"
+        stamp_ns, frame_id = original.stamp_ns, original.frame_id
+    else:
+        header = image_header(sample.data)
+        if header.encoding not in COLOR_LAYOUTS:
+            return None
+        layout, channels = COLOR_LAYOUTS[header.encoding]
+        rows = pixel_rows(sample.data, header, channels)
+        pixels = rows.reshape(header.height, header.width, channels)
+        stamp_ns, frame_id = header.stamp_ns, header.frame_id
+    step = -(-pixels.shape[1] // WIDTH)
+    data = encode_jpeg(pixels[::step, ::step], QUALITY, layout=layout)
+    return CompressedColor(stamp_ns=stamp_ns, frame_id=frame_id, format="jpeg", data=data)
+
+
+# --- Notices publishers that left, so that nothing they said is repeated in later episodes.
+#
+# A source of ours declares ``<prefix>/alive``; with it go the latched messages under
+# ``/<prefix>/``. A ROS 2 publisher has a token; with the last one of a topic go that topic's
+# latched messages. What a source without either has said is remembered until the recorder ends.
+
+ALIVE = "/alive"
+
+
+class PublisherLiveliness:
+    """Watches liveliness tokens and tells the recorder what to forget."""
+
+    def __init__(self, session: WireSession, recorder: Recorder) -> None:
+        """Begin to watch."""
+        self._recorder = recorder
+        self._lock = threading.Lock()
+        self._tokens: dict[str, str] = {}
+        self._watching: list[Subscriber] = [
+            session.watch_alive(f"**{ALIVE}", self._on_source),
+            session.watch_alive(rmw.TOKENS, self._on_ros),
+        ]
+
+    def close(self) -> None:
+        """Stop watching."""
+        for subscriber in self._watching:
+            subscriber.close()
+
+    def _on_source(self, key: str, alive: bool) -> None:
+        if not alive and not key.startswith("rec/"):
+            self._recorder.forget(f"/{key.removesuffix(ALIVE)}/")
+
+    def _on_ros(self, key: str, alive: bool) -> None:
+        endpoint = rmw.parse_token(key)
+        if endpoint is None or endpoint.kind is not rmw.EntityKind.PUBLISHER:
+            return
+        with self._lock:
+            if alive:
+                self._tokens[key] = endpoint.topic
+                return
+            was_there = self._tokens.pop(key, None) is not None
+            is_last = endpoint.topic not in self._tokens.values()
+        if was_there and is_last:
+            self._recorder.forget(endpoint.topic)
+
 
 STATUS_PERIOD_S = 1.0
 CONTROL_PREFIX = "/rec/"
@@ -74,7 +225,7 @@ class LiveRecorder:
             session.subscribe(key, self._take, max_bytes=config.queues.max_message_bytes)
             for key in config.topics
         ]
-        self._departures = Departures(session, core)
+        self._departures = PublisherLiveliness(session, core)
         self._graph = watch_ros2(session, core, config.msg_folder)
         core.also_tell("ros2_warnings", self._graph.warnings)
         self._services = serve_control(session, core)

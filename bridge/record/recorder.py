@@ -16,15 +16,13 @@ from pathlib import Path
 from bridge.clock import StepWatch
 from bridge.episode import metadata
 from bridge.episode.catalogue import label_episode, list_episodes, note_finished
-from bridge.episode.run import RunFolder, check_episode_id, part_name
+from bridge.episode.run_folder import RunFolder, check_episode_id, part_name
 from bridge.errors import BridgeError, GstError
 from bridge.record.config import RecorderConfig
 from bridge.record.encoders import EncoderThreads, ImageEncoder, Preview
-from bridge.record.entries import Command, Dropped, Item
 from bridge.record.errors import DiskError, LifecycleError
-from bridge.record.intake import Intake
 from bridge.record.lifecycle import Answer, Lifecycle
-from bridge.record.merge import Merge
+from bridge.record.queue import Command, Dropped, InputQueue, Item, Merge
 from bridge.record.status import Status
 from bridge.wire.session import WireSample
 
@@ -64,7 +62,7 @@ class Recorder:
         self._run = run
         encoder = ImageEncoder(self.config, lambda: self.intake.shed)
         self._encoders = EncoderThreads(encoder, self._take_back, preview)
-        self.intake = Intake(self.config.queues, self._encoders.submit, encoder.kinds)
+        self.intake = InputQueue(self.config.queues, self._encoders.submit, encoder.kinds)
         self._merge = Merge()
         self._life = Lifecycle(
             run, self.config, lambda: self.intake.queued_bytes, self.intake.latched

@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from bridge.errors import GstError, MissingDependencyError
 from bridge.wire import keys, rmw
-from bridge.wire.ros_types import is_known_definition, type_hash_of
+from bridge.wire.rmw import is_known_definition, type_hash_of
 from bridge.wire.session import WireSample, WireSession
 
 HISTORY_TIMEOUT_S = 2.0

@@ -5,10 +5,10 @@ from collections.abc import Callable
 from typing import Any
 
 from bridge.clock import s_from_ns
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.record.config import RecorderConfig
-from bridge.record.intake import Intake
 from bridge.record.lifecycle import Lifecycle, counts
+from bridge.record.queue import InputQueue
 
 STALLED_S = 1.0
 """A writer that has not moved for this long is waiting for its disk."""
@@ -21,7 +21,7 @@ class Status:
         self,
         run: RunFolder,
         config: RecorderConfig,
-        intake: Intake,
+        intake: InputQueue,
         life: Lifecycle,
         now_ns: Callable[[], int],
     ) -> None:

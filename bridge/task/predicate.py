@@ -13,8 +13,24 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.task.contact import Contact
 from bridge.task.task_file import ObjectModel, Task
+
+# --- Who came close to whom, and when: what clearance and the contact predicate speak of.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contact:
+    """One stretch of time in which two bodies were closer than the margin."""
+
+    start_ns: int
+    """From the start of the trajectory."""
+    end_ns: int
+    bodies: tuple[str, str]
+    allowed: bool
+    """Whether the active stage allowed them to touch."""
+    min_distance_m: float
+    """Smallest signed distance; negative where they overlapped."""
+
 
 ALLOWED_CONTACTS = "allowed_contacts"
 """No contact outside the allowed pairs over the whole execution."""
@@ -39,7 +55,7 @@ class Rollout:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
+class PredicateResult:
     """What one predicate said. ``value`` is None when the states do not decide it."""
 
     kind: str
@@ -49,12 +65,12 @@ class Finding:
     """The object it is about."""
 
 
-def evaluate_success(task: Task, rollout: Rollout) -> list[Finding]:
+def evaluate_success(task: Task, rollout: Rollout) -> list[PredicateResult]:
     """Evaluate every success predicate of a task on a rollout's final state."""
     return [_evaluate(spec, task, rollout) for spec in task.success]
 
 
-def evaluate_contacts(task: Task, rollout: Rollout, *, tolerance_m: float = 0.0) -> Finding:
+def evaluate_contacts(task: Task, rollout: Rollout, *, tolerance_m: float = 0.0) -> PredicateResult:
     """Say whether nothing touched what it may not, from the start of the execution to its end.
 
     Asked of every rollout; the tolerance of a task that lists the predicate itself counts.
@@ -69,7 +85,7 @@ def evaluate_contacts(task: Task, rollout: Rollout, *, tolerance_m: float = 0.0)
     return _evaluate(spec, task, rollout)
 
 
-def all_hold(findings: list[Finding]) -> bool | None:
+def all_hold(findings: list[PredicateResult]) -> bool | None:
     """Conjunction in three-valued logic."""
     values = [finding.value for finding in findings]
     if False in values:
@@ -90,14 +106,14 @@ def already_true_at_start(task: Task, rollout: Rollout) -> bool:
     return bool(inside) and all(value is True for value in inside)
 
 
-def _evaluate(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
+def _evaluate(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
     rule = _RULES.get(spec["kind"])
     if rule is None:
         message = f"success predicate {spec['kind']!r} is unknown. Known: {', '.join(_RULES)}."
         raise UsageError(message)
     object_id = str(spec.get("object", ""))
     if spec["kind"] != ALLOWED_CONTACTS and object_id not in rollout.Ts_base_object:
-        return Finding(
+        return PredicateResult(
             kind=spec["kind"],
             value=None,
             detail=f"{object_id} was not localised",
@@ -106,10 +122,12 @@ def _evaluate(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
     return replace(rule(spec, task, rollout), object_id=object_id)
 
 
-def _inside(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
+def _inside(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
     container_id = spec["container"]
     if container_id not in rollout.Ts_base_object:
-        return Finding(kind="inside", value=None, detail=f"{container_id} was not localised")
+        return PredicateResult(
+            kind="inside", value=None, detail=f"{container_id} was not localised"
+        )
     container = task.objects[container_id]
     T_container_base = se3.invert(rollout.Ts_base_object[container_id][-1])
     p = se3.apply(T_container_base, rollout.Ts_base_object[spec["object"]][-1][:3, 3])
@@ -117,7 +135,7 @@ def _inside(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
     detail = f"{spec['object']} centre is {abs(excess) * 1e3:.0f} mm " + (
         f"outside {container_id}" if excess > 0 else f"within {container_id}"
     )
-    return Finding(kind="inside", value=bool(excess <= 0), detail=detail)
+    return PredicateResult(kind="inside", value=bool(excess <= 0), detail=detail)
 
 
 def _cavity_excess_m(
@@ -129,16 +147,16 @@ def _cavity_excess_m(
     return float(np.max(np.abs(p_container - centre) - inner / 2 + margin_m))
 
 
-def _settled(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
+def _settled(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
     held_ns = round(spec["for_s"] * 1e9)
     stamps = rollout.stamps_ns
     tail = stamps >= stamps[-1] - held_ns
     if tail.sum() < 2 or stamps[-1] - stamps[0] < held_ns:
-        return Finding(kind="settled", value=None, detail="too short to tell")
+        return PredicateResult(kind="settled", value=None, detail="too short to tell")
     p = rollout.Ts_base_object[spec["object"]][tail][:, :3, 3]
     seconds = np.diff(stamps[tail]) * 1e-9
     speed = float(np.max(np.linalg.norm(np.diff(p, axis=0), axis=1) / seconds))
-    return Finding(
+    return PredicateResult(
         kind="settled",
         value=bool(speed <= spec["max_speed_m_s"]),
         detail=f"{spec['object']} moves at up to {speed * 1e3:.0f} mm/s "
@@ -146,40 +164,46 @@ def _settled(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
     )
 
 
-def _no_finger_contact(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
+def _no_finger_contact(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
     contact = rollout.finger_contact.get(spec["object"])
     if contact is None:
-        return Finding(kind="no_finger_contact", value=None, detail="finger contact is not known")
+        return PredicateResult(
+            kind="no_finger_contact", value=None, detail="finger contact is not known"
+        )
     touching = bool(contact[-1])
     detail = f"a finger {'touches' if touching else 'does not touch'} {spec['object']} at the end"
-    return Finding(kind="no_finger_contact", value=not touching, detail=detail)
+    return PredicateResult(kind="no_finger_contact", value=not touching, detail=detail)
 
 
-def _shape(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
+def _shape(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
     object_id = spec["object"]
     model = task.objects[object_id]
     if model.soft is None:
-        return Finding(kind="shape", value=True, detail=f"{object_id} is rigid")
+        return PredicateResult(kind="shape", value=True, detail=f"{object_id} is rigid")
     if object_id in rollout.broken:
-        return Finding(kind="shape", value=False, detail=f"{object_id} {rollout.broken[object_id]}")
+        return PredicateResult(
+            kind="shape", value=False, detail=f"{object_id} {rollout.broken[object_id]}"
+        )
     extents = rollout.extents_m.get(object_id)
     if extents is None:
-        return Finding(kind="shape", value=None, detail=f"the shape of {object_id} is not known")
+        return PredicateResult(
+            kind="shape", value=None, detail=f"the shape of {object_id} is not known"
+        )
     change = float(np.max(np.abs(extents[-1] / np.array(model.size_m) - 1.0)))
     if not np.isfinite(change):
         detail = f"the extents of {object_id} are no numbers"
-        return Finding(kind="shape", value=False, detail=detail)
-    return Finding(
+        return PredicateResult(kind="shape", value=False, detail=detail)
+    return PredicateResult(
         kind="shape",
         value=bool(change <= spec["tolerance_fraction"]),
         detail=f"an extent of {object_id} differs by {change:.0%} from rest",
     )
 
 
-def _allowed_contacts(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Finding:
+def _allowed_contacts(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
     kind = ALLOWED_CONTACTS
     if rollout.contacts is None:
-        return Finding(kind=kind, value=None, detail="contacts are not known")
+        return PredicateResult(kind=kind, value=None, detail="contacts are not known")
     said = "inferred: " if rollout.contacts_inferred else ""
     only, deepest = spec.get("object"), -float(spec.get("tolerance_m", 0.0))
     wrong = [
@@ -191,16 +215,18 @@ def _allowed_contacts(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> 
     ]
     if not wrong:
         detail = f"{said}nothing touched what it may not touch"
-        return Finding(kind=kind, value=True, detail=detail)
+        return PredicateResult(kind=kind, value=True, detail=detail)
     first = min(wrong, key=lambda contact: contact.start_ns)
     detail = (
         f"{said}{first.bodies[0]} touched {first.bodies[1]} at {first.start_ns * 1e-9:.2f} s, "
         f"{-first.min_distance_m * 1e3:.1f} mm deep"
     )
-    return Finding(kind=kind, value=False, detail=detail)
+    return PredicateResult(kind=kind, value=False, detail=detail)
 
 
-def objects_done(findings: list[Finding], manipulated: tuple[str, ...]) -> dict[str, bool | None]:
+def objects_done(
+    findings: list[PredicateResult], manipulated: tuple[str, ...]
+) -> dict[str, bool | None]:
     """Per manipulated object: whether everything asked of it holds."""
     return {
         key: all_hold([finding for finding in findings if finding.object_id == key])
@@ -208,7 +234,7 @@ def objects_done(findings: list[Finding], manipulated: tuple[str, ...]) -> dict[
     }
 
 
-_RULES: dict[str, Callable[[Mapping[str, Any], Task, Rollout], Finding]] = {
+_RULES: dict[str, Callable[[Mapping[str, Any], Task, Rollout], PredicateResult]] = {
     "inside": _inside,
     "settled": _settled,
     "no_finger_contact": _no_finger_contact,

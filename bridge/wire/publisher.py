@@ -2,13 +2,59 @@
 
 import contextlib
 import shutil
+import struct
 import uuid
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bridge.wire import attachment
 from bridge.wire.errors import WireConfigError, WireError, cause_of
-from bridge.wire.library import zenoh, zenoh_shm
+from bridge.wire.zenoh_config import zenoh, zenoh_shm
+
+# --- The attachment each message carries: sequence number, source time and publisher identity.
+#
+# The bytes are those of rmw_zenoh, so that native and ROS 2 publishers look alike: int64
+# sequence, int64 source time [ns], length 16 and a 16-byte publisher id, little endian, 33 bytes.
+# ROS 2 Jazzy's first releases put each field's name before it (77 bytes); both are read.
+
+GID_BYTES = 16
+_PLAIN = struct.Struct("<qqB16s")
+_NAMED = struct.Struct("<B15sqB16sqB10sB16s")
+_NAMES = (b"sequence_number", b"source_timestamp", b"source_gid")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attachment:
+    """Who sent a message, when, and which in a row it is."""
+
+    sequence: int
+    source_ns: int
+    gid: bytes
+    """16 bytes that no other publisher has."""
+
+
+def encode(attachment: Attachment) -> bytes:
+    """Serialise in the 33-byte form."""
+    return _PLAIN.pack(attachment.sequence, attachment.source_ns, GID_BYTES, attachment.gid)
+
+
+def decode(data: bytes | None) -> Attachment | None:
+    """Read the 33-byte or the 77-byte form; anything else is no attachment."""
+    if data is None:
+        return None
+    if len(data) == _PLAIN.size:
+        sequence, source_ns, length, gid = _PLAIN.unpack(data)
+        if length != GID_BYTES:
+            return None
+    elif len(data) == _NAMED.size:
+        fields = _NAMED.unpack(data)
+        _, sequence_name, sequence, _, time_name, source_ns, _, gid_name, length, gid = fields
+        if (sequence_name, time_name, gid_name) != _NAMES or length != GID_BYTES:
+            return None
+    else:
+        return None
+    return Attachment(sequence=sequence, source_ns=source_ns, gid=gid)
+
 
 BYTES_PER_MB = 1_000_000
 SHARED_FROM_BYTES = 3072
@@ -71,7 +117,7 @@ class WirePublisher:
 
     def put(self, data: bytes | bytearray, *, source_ns: int) -> None:
         """Send one serialised message made at ``source_ns``."""
-        note = attachment.Attachment(sequence=self._sequence, source_ns=source_ns, gid=self.gid)
+        note = Attachment(sequence=self._sequence, source_ns=source_ns, gid=self.gid)
         self._sequence += 1
         payload: Any = data
         if self._pool is not None and len(data) >= SHARED_FROM_BYTES:
@@ -81,7 +127,7 @@ class WirePublisher:
             else:
                 payload = placed
         try:
-            self._inner.put(payload, attachment=attachment.encode(note))
+            self._inner.put(payload, attachment=encode(note))
         except zenoh.ZError as error:
             raise WireError(f"cannot publish: {cause_of(error)}. Is the session open?") from error
 

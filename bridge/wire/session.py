@@ -6,14 +6,22 @@ samples finds them already delivered.
 """
 
 import contextlib
+import hashlib
+import queue
 import sys
+import threading
+import time
+import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
 from types import TracebackType
 from typing import Any
 
 from bridge.clock import AnchoredClock
 from bridge.episode import schema
-from bridge.wire import keys
+from bridge.errors import GstError
+from bridge.wire import keys, publisher
 from bridge.wire.config import WireConfig as WireConfig
 from bridge.wire.errors import (
     BadTopicError,
@@ -26,15 +34,146 @@ from bridge.wire.errors import (
     cause_of,
     public,
 )
-from bridge.wire.library import zenoh
 from bridge.wire.publisher import BYTES_PER_MB, SharedPool
 from bridge.wire.publisher import WirePublisher as WirePublisher
 from bridge.wire.qos import Qos
-from bridge.wire.sample import WireSample as WireSample
-from bridge.wire.sample import copy_sample
-from bridge.wire.service import MAX_WAITING
-from bridge.wire.service import Service as Service
-from bridge.wire.zenoh_config import zenoh_config
+from bridge.wire.zenoh_config import zenoh, zenoh_config
+
+# --- Answering requests on one key.
+
+MAX_WAITING = 32
+"""Requests that wait for one service; each may hold a whole plan."""
+CLOSE_S = 5.0
+"""How long a request in work may take when the service stops."""
+
+
+class Service:
+    """Answers requests on one key on its own threads, as many side by side as there are."""
+
+    def __init__(
+        self,
+        key: str,
+        handler: Callable[[bytes], bytes],
+        max_waiting: int,
+        side_by_side: int = 1,
+    ) -> None:
+        """Use ``WireSession.serve``."""
+        self._key = key
+        self._handler = handler
+        self._max_waiting = max_waiting
+        self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._inner: Any = None
+        self._threads = [
+            threading.Thread(target=self._work, name=f"serve {key}", daemon=True)
+            for _ in range(side_by_side)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def start(self, inner: Any) -> None:
+        """Keep the queryable that feeds this service."""
+        self._inner = inner
+
+    def take(self, query: Any) -> None:
+        """Queue a request, on the network thread; one too many is refused at once."""
+        if self._requests.qsize() < self._max_waiting:
+            self._requests.put(query)
+            return
+        with query, contextlib.suppress(zenoh.ZError):
+            query.reply_err(
+                f"busy: {self._max_waiting} requests on {self._key} wait already. "
+                "Ask again later, or start another one under its own name."
+            )
+
+    def _work(self) -> None:
+        while (query := self._requests.get()) is not None:
+            with query, contextlib.suppress(zenoh.ZError):  # the asker may be gone
+                payload = b"" if query.payload is None else query.payload.to_bytes()
+                try:
+                    query.reply(self._key, self._handler(payload))
+                except GstError as error:
+                    query.reply_err(str(error))
+                except Exception as error:  # noqa: BLE001  # a bug in one answer, not the end
+                    traceback.print_exc()
+                    query.reply_err(f"internal error: {type(error).__name__}: {error}")
+
+    def close(self) -> None:
+        """Stop answering; a request in work is finished first."""
+        if self._inner is not None:
+            with contextlib.suppress(zenoh.ZError):
+                self._inner.undeclare()
+        for _ in self._threads:
+            self._requests.put(None)
+        ends_s = time.monotonic() + CLOSE_S
+        for thread in self._threads:
+            thread.join(timeout=max(0.0, ends_s - time.monotonic()))
+
+
+# --- A message as it arrived, copied out of the network's own memory at once.
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WireSample:
+    """One message as it arrived."""
+
+    topic: str
+    type_name: str
+    """"" when the publisher did not say."""
+    message_encoding: str
+    """cdr, json or ""."""
+    type_hash: str = ""
+    """RIHS01 hash of the ROS 2 definition the publisher was built with; "" when it did not say."""
+    data: bytes
+    source_ns: int | None
+    """When the publisher says it made the message."""
+    sequence: int | None
+    """Counts the publisher's messages; None when they are not numbered."""
+    source_gid: bytes | None
+    """16 bytes that no other publisher has."""
+    received_ns: int
+    oversize_bytes: int = 0
+    """Size of a payload beyond the subscription's limit; then ``data`` is empty, not a copy."""
+
+
+def copy_sample(sample: Any, received_ns: int, *, max_bytes: int = sys.maxsize) -> WireSample:
+    """Read a zenoh sample. Its payload is copied: a kept one would pin the sender's memory."""
+    size = len(sample.payload)
+    is_oversize = size > max_bytes
+    named = keys.read_key(str(sample.key_expr))
+    type_name, message_encoding = keys.parse_encoding(str(sample.encoding))
+    raw = sample.attachment
+    note = publisher.decode(None if raw is None else raw.to_bytes())
+    if note is None:
+        sequence, gid = _source_of(sample.source_info)
+        source_ns = None
+    else:
+        sequence, gid, source_ns = note.sequence, note.gid, note.source_ns
+    return WireSample(
+        topic=named.topic,
+        type_name=type_name or named.type_name,
+        message_encoding=message_encoding or ("cdr" if named.type_name else ""),
+        type_hash=named.type_hash,
+        data=b"" if is_oversize else sample.payload.to_bytes(),
+        source_ns=source_ns,
+        sequence=sequence,
+        source_gid=gid,
+        received_ns=received_ns,
+        oversize_bytes=size if is_oversize else 0,
+    )
+
+
+def _source_of(info: Any) -> tuple[int | None, bytes | None]:
+    """Number and publisher of a sample that zenoh itself numbered (an AdvancedPublisher does)."""
+    if info is None:
+        return None, None
+    source = info.source_id
+    return int(info.source_sn), _gid(str(source.zid), int(source.eid))
+
+
+@lru_cache(maxsize=4096)
+def _gid(session: str, entity: int) -> bytes:
+    name = f"{session}/{entity}".encode()
+    return hashlib.blake2b(name, digest_size=publisher.GID_BYTES).digest()
 
 
 class Subscriber:

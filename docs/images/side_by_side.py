@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.media.color import decode_color
 from evaluator.compare.view_images import RECORDED, RENDERED, images_of, score_views
 

@@ -6,10 +6,10 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from bridge.episode.catalogue.entry import LABEL_SUFFIX
+from bridge.episode.catalogue_store import LABEL_SUFFIX
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.terminal import Output
 from evaluator.compare.cache import SummaryCache

@@ -2,9 +2,8 @@
 
 from collections.abc import Container
 
-from bridge.episode.run import RunFolder
-from bridge.exchange.trials_csv import TrialRecord, read_trials
-from bridge.exchange.trials_import import trials_path
+from bridge.episode.run_folder import RunFolder
+from bridge.exchange.trials_csv import TrialRecord, read_trials, trials_path
 from evaluator.compare.rows import TrialRow
 from evaluator.result import Exclusion
 

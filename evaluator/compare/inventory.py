@@ -12,10 +12,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.episode.catalogue.entry import stamp_of
+from bridge.episode.catalogue_store import stamp_of
 from bridge.episode.provenance import hash_files
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder, grouped_parts
+from bridge.episode.run_folder import RunFolder, grouped_parts
 from bridge.errors import GstError
 from bridge.terminal import Output
 from evaluator.compare.cache import SummaryCache

@@ -8,10 +8,10 @@ from jaxtyping import Float
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema, streams
-from bridge.episode.cdr import MalformedMessageError
+from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.reader import Episode
 from bridge.geometry import se3
-from bridge.task.predicate import Finding, Rollout, all_hold, evaluate_success, objects_done
+from bridge.task.predicate import PredicateResult, Rollout, all_hold, evaluate_success, objects_done
 from bridge.task.task_file import Task
 from evaluator.compare.known_task import known_task
 from evaluator.compare.tracks import TOOL
@@ -81,7 +81,7 @@ def summarise_witness(
     )
 
 
-def _told(findings: list[Finding]) -> str:
+def _told(findings: list[PredicateResult]) -> str:
     wrong = [f.detail for f in findings if f.value is not True]
     return "; ".join(wrong) or "; ".join(f.detail for f in findings if f.kind == "inside")
 

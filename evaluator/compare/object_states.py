@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import schema, streams
-from bridge.episode.point_cloud import PointCloudSample
+from bridge.episode.cdr.messages import PointCloudSample, PoseSample
 from bridge.episode.reader import Episode, RawMessage
-from bridge.episode.records import PoseSample
 from bridge.errors import BridgeError
 from bridge.geometry import se3
 from bridge.task.plan import Plan

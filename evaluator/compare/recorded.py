@@ -13,7 +13,7 @@ from bridge.episode import schema
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.metadata import EpisodeInfo, Outcome, build
 from bridge.episode.reader import Episode, RawMessage
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.task.plan import SCHEMA_VERSION, Plan
 from bridge.task.record import parse_record

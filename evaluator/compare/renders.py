@@ -9,7 +9,7 @@ import numpy as np
 
 from bridge.episode.provenance import software
 from bridge.errors import GstError, PathNotFoundError, UsageError
-from bridge.exchange.tables import seconds_text
+from bridge.exchange.csv_export import seconds_text
 from bridge.media.color import decode_color
 from evaluator.compare.image_sets import ImageSet, folder_set, list_files, read_mask
 from evaluator.compare.measure import slug

@@ -6,8 +6,8 @@ from typing import Any, TypeVar
 
 from bridge.episode.provenance import hash_file, software
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
-from bridge.exchange.trials_import import trials_path
+from bridge.episode.run_folder import RunFolder
+from bridge.exchange.trials_csv import trials_path
 from bridge.terminal import Output
 from evaluator.compare.bands import BandReport, compare_bands
 from evaluator.compare.cache import SummaryCache

@@ -13,8 +13,8 @@ from functools import partial
 import numpy as np
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.reader import Episode
-from bridge.episode.records import CompressedColor, DepthImage
 from bridge.errors import GstError
 from bridge.media.color import JPEG_MAGIC, decode_color
 from evaluator.compare.parallel import spread

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from bridge.episode import schema
 from bridge.episode.catalogue import Entry, list_episodes
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.task.record import parse_record
 from bridge.terminal import Output

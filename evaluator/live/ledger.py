@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from bridge.episode.catalogue.entry import Entry
+from bridge.episode.catalogue_store import Entry
 
 OUTCOMES = {"success": True, "failure": False}
 

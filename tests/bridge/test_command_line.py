@@ -13,7 +13,7 @@ import pytest
 import robot_gst
 from bridge.episode.catalogue import label_episode, list_episodes
 from bridge.episode.metadata import EpisodeInfo, Outcome
-from bridge.episode.run import RunFolder, check_episode_id
+from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.whole_file import write_whole

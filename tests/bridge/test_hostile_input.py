@@ -15,17 +15,17 @@ from mcap.writer import Writer
 import robot_gst
 from bridge.episode import schema, streams
 from bridge.episode.catalogue import label_episode, list_episodes
-from bridge.episode.cdr import MalformedMessageError
-from bridge.episode.check import check_episode
-from bridge.episode.metadata import EpisodeInfo, Outcome
-from bridge.episode.reader import Episode
-from bridge.episode.records import (
+from bridge.episode.cdr.codec import MalformedMessageError
+from bridge.episode.cdr.messages import (
     FrameTransform,
     JointSample,
     transforms_from_cdr,
     transforms_to_cdr,
 )
-from bridge.episode.run import RunFolder
+from bridge.episode.check import check_episode
+from bridge.episode.metadata import EpisodeInfo, Outcome
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import AmbiguousFrameError, TransformTree
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError, InvalidRecordError, UsageError

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 
 PROGRAM = (sys.executable, "-m", "robot_gst")

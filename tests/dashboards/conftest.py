@@ -12,10 +12,10 @@ import pytest
 from starlette.applications import Starlette
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import CompressedColor, JointSample, PoseSample
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.provenance import hash_file
-from bridge.episode.records import CompressedColor, JointSample, PoseSample
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan, Stage, Waypoint

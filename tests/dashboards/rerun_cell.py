@@ -6,9 +6,7 @@ from types import ModuleType
 import numpy as np
 
 from bridge.episode import schema
-from bridge.episode.metadata import Derived, EpisodeInfo
-from bridge.episode.reader import Episode
-from bridge.episode.records import (
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,
@@ -17,7 +15,9 @@ from bridge.episode.records import (
     string_to_cdr,
     transforms_to_cdr,
 )
-from bridge.episode.run import RunFolder
+from bridge.episode.metadata import Derived, EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera

@@ -7,7 +7,7 @@ import pytest
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from dashboards.clock import PageClock
 from dashboards.recording import Recording, read_recording
 

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 import pytest
 
 import robot_gst
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from dashboards import demo
 
 ROOT = Path(__file__).resolve().parents[2]

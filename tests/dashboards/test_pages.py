@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from visible import words
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from dashboards.app import create_app
 from dashboards.errors import NotHereError
 from dashboards.guard import COOKIE, Admission

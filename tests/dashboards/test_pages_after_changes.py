@@ -10,7 +10,7 @@ from visible import words
 
 from bridge.episode.catalogue import label_episode
 from bridge.episode.metadata import Outcome
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 
 OLDER = "The numbers on this page are older than the run"
 

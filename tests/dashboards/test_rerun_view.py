@@ -12,13 +12,10 @@ import rerun.chunk as rc
 from rerun_cell import CUBE_STL, T_BASE_CAMERA, urdf, write_cell_run, write_splats
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import CompressedColor, JointSample
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.records import (
-    CompressedColor,
-    JointSample,
-)
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import joint_track
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError

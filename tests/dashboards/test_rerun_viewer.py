@@ -8,7 +8,7 @@ from rerun_cell import write_cell_run
 
 import robot_gst
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from dashboards import rerun_viewer
 

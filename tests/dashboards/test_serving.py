@@ -17,7 +17,7 @@ from headless import CHROMIUM, NO_CHROMIUM, chromium
 
 import robot_gst
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.terminal import Output

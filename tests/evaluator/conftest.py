@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.provenance import hash_file
-from bridge.episode.records import PoseSample
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.verdict import Factor, Verdict

@@ -10,9 +10,9 @@ from own_process import printed
 
 from bridge.episode import schema
 from bridge.episode.catalogue import label_episode
+from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
-from bridge.episode.records import CompressedColor
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import PathNotFoundError
 from bridge.media.color import encode_jpeg

@@ -15,7 +15,7 @@ from bridge.episode.catalogue import label_episode
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.terminal import Output
 from evaluator.cli import evaluate
 from evaluator.compare import Comparison, compare_run, inventory

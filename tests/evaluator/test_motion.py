@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from bridge.episode import schema
+from bridge.episode.cdr.batch import joint_messages, pose_messages
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.repeated import joint_messages, pose_messages
 from bridge.episode.streams import JointTrack
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry.trajectory import PoseTrajectory

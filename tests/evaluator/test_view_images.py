@@ -8,8 +8,8 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.metadata import Derived, EpisodeInfo
-from bridge.episode.records import CompressedColor, DepthImage
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from evaluator.compare.run import compare_run

@@ -7,7 +7,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from evaluator.compare import Comparison, compare_run, view_summary
 from evaluator.compare.cache import FOLDER, SummaryCache
 from evaluator.result import write_results

@@ -20,13 +20,14 @@ import atheris
 with atheris.instrument_imports(include=["bridge"]):
     from mcap.writer import CompressionType, Writer
 
-    from bridge.episode import cdr, schema
+    from bridge.episode import schema
+    from bridge.episode.cdr import codec
     from bridge.episode.check import check_episode
     from bridge.episode.reader import Episode
     from bridge.episode.recover import recover
-    from bridge.episode.ros2_definitions import DEFINITIONS
+    from bridge.episode.schema import DEFINITIONS
     from bridge.errors import GstError
-    from bridge.wire import attachment
+    from bridge.wire import publisher
 
 LIMIT_BYTES = 3 << 30
 TYPES = sorted(DEFINITIONS)
@@ -73,11 +74,11 @@ def cdr_target(data: bytes) -> None:
         return
     name, raw = TYPES[data[0] % len(TYPES)], data[1:]
     good = []
-    for function in (cdr.decode, cdr.validate):
+    for function in (codec.decode, codec.validate):
         try:
             function(name, raw)
             good.append(True)
-        except cdr.MalformedMessageError:
+        except codec.MalformedMessageError:
             good.append(False)
     if good[0] != good[1]:
         message = f"{name}: decode and validate disagree on {raw.hex()}"
@@ -86,8 +87,8 @@ def cdr_target(data: bytes) -> None:
 
 def attachment_target(data: bytes) -> None:
     """Read the attachment of a message."""
-    found = attachment.decode(data)
-    if found is not None and len(data) == 33 and attachment.encode(found) != data:
+    found = publisher.decode(data)
+    if found is not None and len(data) == 33 and publisher.encode(found) != data:
         message = f"{data.hex()} changed on the way"
         raise AssertionError(message)
 
@@ -119,7 +120,7 @@ def mcap_seeds() -> list[bytes]:
             schema_id = writer.register_schema(schema.STRING, "ros2msg", text)
             channel = writer.register_channel("/robot_description", "cdr", schema_id)
             for n in range(4):
-                data = cdr.encode(schema.STRING, {"data": "text"})
+                data = codec.encode(schema.STRING, {"data": "text"})
                 writer.add_message(channel, n, data, n, sequence=n)
             writer.add_attachment(1, 1, "a", "text/plain", b"attached")
             writer.add_metadata("episode", {"id": '"x"', "kind": '"trial"'})
@@ -134,10 +135,10 @@ def seed(target: str, corpus: Path) -> None:
     if target in ("read", "recover"):
         seeds = mcap_seeds()
     elif target == "cdr":
-        seeds = [bytes([n]) + cdr.encode(name, {}) for n, name in enumerate(TYPES)]
+        seeds = [bytes([n]) + codec.encode(name, {}) for n, name in enumerate(TYPES)]
     else:
-        one = attachment.Attachment(sequence=1, source_ns=2, gid=bytes(16))
-        seeds = [attachment.encode(one), bytes(77)]
+        one = publisher.Attachment(sequence=1, source_ns=2, gid=bytes(16))
+        seeds = [publisher.encode(one), bytes(77)]
     for number, data in enumerate(seeds):
         (corpus / f"seed-{number}").write_bytes(data)
 

@@ -9,8 +9,13 @@ from jaxtyping import Float
 from PIL import Image
 
 from bridge.episode import schema
-from bridge.episode.point_cloud import PointCloudSample
-from bridge.episode.records import CompressedColor, DepthImage, JointSample, PoseSample
+from bridge.episode.cdr.messages import (
+    CompressedColor,
+    DepthImage,
+    JointSample,
+    PointCloudSample,
+    PoseSample,
+)
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.task.plan import Plan

@@ -7,7 +7,7 @@ from evaluation_log import NUM_STEPS, START_NS, Log, wobble
 from jaxtyping import Float
 
 from bridge.episode.metadata import Derived, EpisodeInfo
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 
 

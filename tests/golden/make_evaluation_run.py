@@ -23,7 +23,7 @@ from jaxtyping import Float
 from bridge.episode import schema
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.provenance import hash_file
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.task.plan import Plan, Waypoint
 from bridge.task.plan import Stage as PlanStage

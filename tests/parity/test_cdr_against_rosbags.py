@@ -9,9 +9,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from bridge.episode import cdr
-from bridge.episode.cdr_plan import PRIMITIVES, fields_of
-from bridge.episode.ros2_definitions import DEFINITIONS, schema_text
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.codec import PRIMITIVES, fields_of
+from bridge.episode.schema import DEFINITIONS, schema_text
 
 pytestmark = pytest.mark.parity
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -61,7 +61,7 @@ def test_joint_states_are_byte_for_byte_those_of_rosbags(
         "velocity": array,
         "effort": array,
     }
-    assert cdr.encode("sensor_msgs/msg/JointState", message) == bytes(theirs)
+    assert codec.encode("sensor_msgs/msg/JointState", message) == bytes(theirs)
 
 
 def test_camera_info_written_by_rosbags_is_read_field_by_field() -> None:
@@ -80,11 +80,11 @@ def test_camera_info_written_by_rosbags_is_read_field_by_field() -> None:
         types["sensor_msgs/msg/RegionOfInterest"](1, 2, 3, 4, True),
     )
     data = bytes(STORE.serialize_cdr(info, "sensor_msgs/msg/CameraInfo"))
-    message = cdr.decode("sensor_msgs/msg/CameraInfo", data)
+    message = codec.decode("sensor_msgs/msg/CameraInfo", data)
     assert (message["height"], message["width"], message["binning_y"]) == (480, 640, 2)
     np.testing.assert_array_equal(message["p"], np.arange(12.0))
     assert message["roi"]["do_rectify"] is True
-    assert cdr.encode("sensor_msgs/msg/CameraInfo", message) == data
+    assert codec.encode("sensor_msgs/msg/CameraInfo", message) == data
 
 
 values_of = {
@@ -157,18 +157,18 @@ def test_random_messages_of_rosbags_are_read_in_both_byte_orders(
 ) -> None:
     message = data.draw(messages_of(name))
     raw = bytes(STORE.serialize_cdr(to_rosbags(name, message), name, little_endian=little_endian))
-    decoded = cdr.decode(name, raw)
+    decoded = codec.decode(name, raw)
     assert same(decoded, STORE.deserialize_cdr(raw, name))
-    cdr.validate(name, raw)
+    codec.validate(name, raw)
     if little_endian:
-        assert cdr.encode(name, message) == raw
-        assert same(cdr.decode(name, memoryview(raw)), STORE.deserialize_cdr(raw, name))
+        assert codec.encode(name, message) == raw
+        assert same(codec.decode(name, memoryview(raw)), STORE.deserialize_cdr(raw, name))
 
 
 @settings(max_examples=300, deadline=None)
 @given(st.data(), st.sampled_from(sorted(DEFINITIONS)))
 def test_a_look_accepts_exactly_what_decoding_reads(data: st.DataObject, name: str) -> None:
-    raw = bytearray(cdr.encode(name, data.draw(messages_of(name))))
+    raw = bytearray(codec.encode(name, data.draw(messages_of(name))))
     for _ in range(data.draw(st.integers(0, 3))):
         raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
     del raw[data.draw(st.integers(0, len(raw))) :]
@@ -176,17 +176,17 @@ def test_a_look_accepts_exactly_what_decoding_reads(data: st.DataObject, name: s
     def refused(function: Callable[[str, bytes], object]) -> bool:
         try:
             function(name, bytes(raw))
-        except cdr.MalformedMessageError:
+        except codec.MalformedMessageError:
             return True
         return False
 
-    assert refused(cdr.decode) == refused(cdr.validate)
+    assert refused(codec.decode) == refused(codec.validate)
 
 
 def test_a_look_at_a_large_image_copies_nothing() -> None:
-    data = cdr.encode("sensor_msgs/msg/Image", {"encoding": "16UC1", "data": bytes(50_000_000)})
+    data = codec.encode("sensor_msgs/msg/Image", {"encoding": "16UC1", "data": bytes(50_000_000)})
     tracemalloc.start()
-    cdr.validate("sensor_msgs/msg/Image", data)
+    codec.validate("sensor_msgs/msg/Image", data)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 100_000
@@ -197,13 +197,13 @@ def test_a_look_at_a_large_image_copies_nothing() -> None:
 def test_arbitrary_bytes_are_read_or_refused_but_never_crash(data: bytes, name: str) -> None:
     refused = False
     try:
-        message = cdr.decode(name, b"\x00\x01\x00\x00" + data)
-    except cdr.MalformedMessageError:
+        message = codec.decode(name, b"\x00\x01\x00\x00" + data)
+    except codec.MalformedMessageError:
         refused = True
     assert refused or isinstance(message, dict)
 
 
 def test_a_message_that_claims_a_giant_array_is_refused() -> None:
-    data = cdr.ENCAPSULATION_LE + b"\0" * 8 + b"\x01\0\0\0\0\0\0\0" + b"\xff\xff\xff\x7f"
-    with pytest.raises(cdr.MalformedMessageError, match="not a valid"):
-        cdr.decode("sensor_msgs/msg/JointState", data)
+    data = codec.ENCAPSULATION_LE + b"\0" * 8 + b"\x01\0\0\0\0\0\0\0" + b"\xff\xff\xff\x7f"
+    with pytest.raises(codec.MalformedMessageError, match="not a valid"):
+        codec.decode("sensor_msgs/msg/JointState", data)

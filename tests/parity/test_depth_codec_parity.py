@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bridge.media import rvl
-from bridge.media.depth_codec import PNG_FORMAT, unpack
+from bridge.media.depth import PNG_FORMAT, unpack
 
 native = pytest.importorskip("bridge.media._depth")
 pytestmark = pytest.mark.parity

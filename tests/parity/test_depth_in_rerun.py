@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.episode import cdr, schema
-from bridge.episode.records import CompressedColor, DepthImage
-from bridge.episode.transcode import depth_to_compact, image_to_jpeg
-from bridge.episode.video import VideoFrame, video_message
+from bridge.episode import schema
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.images import depth_to_compact, image_to_jpeg
+from bridge.episode.cdr.messages import CompressedColor, DepthImage, VideoFrame, video_message
 from bridge.episode.writer import EpisodeWriter
-from bridge.media.depth_codec import RVL_FORMAT, unpack
+from bridge.media.depth import RVL_FORMAT, unpack
 
 pytestmark = pytest.mark.parity
 START_NS = 1_800_000_000_000_000_000
@@ -30,7 +30,7 @@ def color(index: int) -> bytes:
     stamp = {"sec": START_NS // 10**9, "nanosec": index}
     fields = {"height": 24, "width": 32, "encoding": "bgr8", "step": 96}
     header = {"stamp": stamp, "frame_id": "camera"}
-    return cdr.encode(schema.IMAGE, {"header": header, **fields, "data": pixels.tobytes()})
+    return codec.encode(schema.IMAGE, {"header": header, **fields, "data": pixels.tobytes()})
 
 
 def write(path: Path) -> None:

@@ -15,8 +15,16 @@ from bridge.episode.check import check_episode
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.file import McapFile
 from bridge.episode.mcap.format import MAGIC, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
-from bridge.episode.mcap.packed import message_head, parse_chunk, records_in, unpack_chunk
-from bridge.episode.mcap.walk import attachment_of, parse, read_body, walk
+from bridge.episode.mcap.walk import (
+    attachment_of,
+    message_head,
+    parse,
+    parse_chunk,
+    read_body,
+    records_in,
+    unpack_chunk,
+    walk,
+)
 from bridge.episode.reader import Episode
 
 pytestmark = pytest.mark.parity

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
 from bridge.task.robot import BASE_FRAME

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import streams
+from bridge.episode.cdr.messages import DepthImage
 from bridge.episode.reader import Episode
-from bridge.episode.records import DepthImage
 from bridge.errors import BridgeError, GstError
 from bridge.task.robot import BASE_FRAME
 from twin.robot.model import load_robot

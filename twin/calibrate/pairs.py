@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.reader import Episode
-from bridge.episode.records import PoseSample
 from bridge.errors import PathNotFoundError, UsageError
 from bridge.geometry import se3
 from twin.robot.model import load_robot

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.episode import schema
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.task.task_file import load_task
 from bridge.terminal import Output, printable, stop_signals

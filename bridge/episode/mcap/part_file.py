@@ -11,8 +11,7 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from bridge.episode.mcap.checksum import crc32
-from bridge.episode.mcap.format import Buffer, num_bytes
+from bridge.episode.mcap.format import Buffer, crc32, num_bytes
 from bridge.errors import BridgeError, UsageError
 
 MAX_PIECES = 1024

@@ -9,9 +9,30 @@ import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from bridge.errors import BridgeError, MissingDependencyError, PathNotFoundError
+from bridge.errors import BridgeError, MissingDependencyError, PathNotFoundError, refuse_outside
+
+# --- How a run becomes a LeRobot dataset. Imports nothing heavy.
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeRobotConfig:
+    """How a run becomes a dataset."""
+
+    fps: int | None = None
+    """Rows per second; the rate of the first camera if not given, 30 without cameras."""
+    action: Literal["auto", "plan", "next-state"] = "auto"
+    """plan: what the executed plan commands for the next row; auto: that if all trials have it."""
+    episodes: tuple[str, ...] = ()
+    """Only the episodes with these ids, of any kind."""
+    crf: int = 23
+    """Quality of the H.264 video, lower is better."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense."""
+        refuse_outside(self, {"fps": (1, 1000), "crf": (0, 51)})
+
 
 VERSION = "v3.0"
 INFO_PATH = "meta/info.json"

@@ -1,19 +1,110 @@
 """RealSense frames and calibration as messages of an episode."""
 
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8, UInt16
+
 from bridge.clock import split_ns
-from bridge.episode import cdr, schema
-from bridge.episode.message import StampedMessage
-from bridge.episode.records import (
+from bridge.episode import schema
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,
     FrameTransform,
     transforms_to_cdr,
 )
+from bridge.episode.schema import StampedMessage
+from bridge.errors import PathNotFoundError
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
-from bridge.sources.realsense.config import RealSenseConfig
-from bridge.sources.realsense.frames import Calibration, ColorFrame, DepthFrame
-from bridge.sources.realsense.mounts import Mount
+from bridge.sources.realsense.config import MountsError, RealSenseConfig
+
+# --- Where the cameras hang: the user's calibration, read from a small JSON file.
+
+ROUNDED = 0.01
+"""Quaternions written by hand have few digits; a length this far from one is still a rotation."""
+Mount = tuple[str, Float[np.ndarray, "4 4"]]
+"""Parent frame and ``T_parent_color``."""
+
+
+def read_mounts(path: Path, cameras: list[str]) -> dict[str, Mount]:
+    """Read the pose of the colour cameras.
+
+    Args:
+        path: The file named by --mounts.
+        cameras: Names that may occur in it.
+
+    Raises:
+        MountsError: When an entry is not a pose of a known camera.
+    """
+    if not path.is_file():
+        raise PathNotFoundError(path=path, what="mounts file", hint="Check --mounts.")
+    try:
+        entries = json.loads(path.read_bytes())
+    except ValueError as error:
+        raise MountsError(path=path, found=f"not JSON ({error})") from error
+    if not isinstance(entries, dict):
+        raise MountsError(path=path, found="not a table of cameras")
+    mounts = {}
+    for name, entry in entries.items():
+        if name not in cameras:
+            listed = ", ".join(cameras)
+            raise MountsError(path=path, found=f"camera {name!r} is not one of {listed}")
+        mounts[name] = _mount(path, name, entry)
+    return mounts
+
+
+def _mount(path: Path, name: str, entry: object) -> Mount:
+    try:
+        parent = str(entry["parent"])  # type: ignore[index]
+        p_m = np.array(entry["p_m"], dtype=np.float64)  # type: ignore[index]
+        q_wxyz = np.array(entry["q_wxyz"], dtype=np.float64)  # type: ignore[index]
+    except (KeyError, TypeError, ValueError) as error:
+        raise MountsError(path=path, found=f"{name}: {error!r}") from error
+    if p_m.shape != (3,) or q_wxyz.shape != (4,) or not parent:
+        raise MountsError(path=path, found=f"{name}: wrong number of values")
+    if not (np.isfinite(p_m).all() and abs(np.linalg.norm(q_wxyz) - 1.0) < ROUNDED):
+        raise MountsError(path=path, found=f"{name}: q_wxyz is not a unit quaternion")
+    return parent, se3.transform_from(q_wxyz, p_m)
+
+
+# --- What the device layer hands on: calibration and frames, without the camera library's types.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """Intrinsics of both streams and how they are mounted to each other."""
+
+    color_camera: Camera
+    depth_camera: Camera
+    T_color_depth: Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColorFrame:
+    """An undistorted colour image (sRGB)."""
+
+    number: int
+    """The device's frame counter of this stream."""
+    stamp_ns: int
+    image_u8: UInt8[np.ndarray, "height width 3"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthFrame:
+    """Depth along the optical axis in whole millimetres; 0 is "no measurement"."""
+
+    number: int
+    stamp_ns: int
+    depth_mm: UInt16[np.ndarray, "height width"]
+
+
+Frame = ColorFrame | DepthFrame
 
 
 class CameraMessages:
@@ -87,7 +178,7 @@ class CameraMessages:
             "step": 3 * width,
             "data": frame.image_u8.tobytes(),
         }
-        return cdr.encode(schema.IMAGE, message)
+        return codec.encode(schema.IMAGE, message)
 
     def depth(self, frame: DepthFrame) -> bytes:
         """Serialise a depth image."""

@@ -5,15 +5,15 @@ from collections.abc import Callable
 from typing import Any
 
 from bridge.errors import GstError
-from bridge.sources.announcer import Announcer
-from bridge.sources.numbered import NumberedPublisher
-from bridge.sources.realsense.config import DEFAULT_CAMERA, RealSenseConfig
-from bridge.sources.realsense.device import CameraDevice, describe_device, serial_of
-from bridge.sources.realsense.errors import CameraNotFoundError, CameraStreamError
-from bridge.sources.realsense.frames import ColorFrame, Frame
-from bridge.sources.realsense.library import rs
-from bridge.sources.realsense.messages import CameraMessages
-from bridge.sources.realsense.mounts import Mount, read_mounts
+from bridge.sources.device_samples import Announcer, NumberedPublisher
+from bridge.sources.realsense.config import (
+    DEFAULT_CAMERA,
+    CameraNotFoundError,
+    CameraStreamError,
+    RealSenseConfig,
+)
+from bridge.sources.realsense.device import CameraDevice, describe_device, rs, serial_of
+from bridge.sources.realsense.messages import CameraMessages, ColorFrame, Frame, Mount, read_mounts
 from bridge.terminal import Output
 from bridge.wire.qos import Qos
 from bridge.wire.session import WireSession

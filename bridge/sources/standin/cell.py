@@ -10,11 +10,9 @@ from jaxtyping import Float, Int
 
 from bridge.clock import ns_from_s
 from bridge.errors import BridgeError
-from bridge.sources.standin.cell_file import CellFile
-from bridge.sources.standin.hidden import HiddenParameters
+from bridge.sources.standin.cell_file import CellFile, HiddenParameters
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down
-from bridge.sources.standin.render import Layer, Renderer
-from bridge.sources.standin.sensor import measure_color, measure_depth
+from bridge.sources.standin.render import Layer, Renderer, measure_color, measure_depth
 from bridge.sources.standin.streams import Streams
 from bridge.sources.standin.surfaces import (
     clutter_surfaces,

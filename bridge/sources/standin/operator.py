@@ -4,6 +4,7 @@ import contextlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,8 @@ from jaxtyping import Float
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.errors import BridgeError, UsageError
 from bridge.geometry import se3
-from bridge.sources.standin.cell import StandinCell
-from bridge.sources.standin.execution import execute_plan
+from bridge.sources.standin.cell import StandinCell, TruthLog
 from bridge.sources.standin.kinematics import UnreachablePoseError
-from bridge.sources.standin.label import OPERATOR, label_trial, void_trial
 from bridge.sources.standin.planner import (
     POLICY_NAME,
     draw_errors,
@@ -27,9 +26,153 @@ from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
 from bridge.sources.standin.settings import CONDITIONS, SessionConfig
 from bridge.sources.standin.streams import Session
 from bridge.task.plan import Plan
-from bridge.task.robot import ROBOT_NAME
+from bridge.task.predicate import all_hold, evaluate_success, objects_done
+from bridge.task.robot import MAX_WIDTH_M, ROBOT_NAME
+from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from bridge.terminal import Output
+
+# --- The operator's eye: an outcome from what really happened, by the task's hard predicates.
+
+OPERATOR = "stand-in operator"
+LIFTED_M = 0.05
+"""An object that rose this far at any time was grasped."""
+RESULTS = {True: "success", False: "failure", None: "unknown"}
+
+
+def label_trial(task: Task, truth: TruthLog, *, executed: bool, remark: str = "") -> Outcome:
+    """Say how a trial ended, as a person would from looking.
+
+    A task with several objects is counted by object: k of n are where they belong.
+
+    Args:
+        task: Its predicates decide.
+        truth: True states of the whole trial.
+        executed: Whether anything was executed.
+        remark: Put in front of the detail.
+    """
+    rollout = truth.rollout()
+    findings = evaluate_success(task, rollout)
+    verdict = all_hold(findings)
+    done = objects_done(findings, task.manipulated)
+    several = len(task.manipulated) > 1
+    # With several objects only what went wrong is worth reading.
+    told = [item for item in findings if not several or item.value is not True]
+    detail = "; ".join(finding.detail for finding in told) or "every object is where it belongs"
+    return Outcome(
+        result=RESULTS[verdict],
+        unit="object" if several else "trial",
+        k=sum(value is True for value in done.values()) if several else int(verdict is True),
+        n=len(task.manipulated),
+        by=OPERATOR,
+        detail=f"{remark}: {detail}" if remark else detail,
+        stages=_stage_results(task, truth, done, verdict) if executed else (),
+    )
+
+
+def void_trial(task: Task, reason: str) -> Outcome:
+    """Outcome of a trial in which nothing was executed because nobody answered."""
+    count = len(task.manipulated)
+    unit = "object" if count > 1 else "trial"
+    return Outcome(result="unknown", unit=unit, k=0, n=count, by=OPERATOR, detail=reason)
+
+
+def _stage_results(
+    task: Task, truth: TruthLog, done: Mapping[str, bool | None], verdict: bool | None
+) -> tuple[dict[str, str], ...]:
+    return tuple(
+        {"id": stage["id"], "result": RESULTS[_stage_result(stage, task, truth, done, verdict)]}
+        for stage in task.stages
+    )
+
+
+def _stage_result(
+    stage: Mapping[str, Any],
+    task: Task,
+    truth: TruthLog,
+    done: Mapping[str, bool | None],
+    verdict: bool | None,
+) -> bool | None:
+    if stage.get("grasp"):
+        heights = [float(T[2, 3]) for T in truth.poses[stage["grasp"]]]
+        return max(heights) - heights[0] > LIFTED_M
+    if stage.get("carry"):
+        return any(_above(truth.poses[stage["carry"]], truth, task, key) for key in task.containers)
+    return done[stage["release"]] if stage.get("release") else verdict
+
+
+def _above(
+    Ts_base_object: list[Float[np.ndarray, "4 4"]], truth: TruthLog, task: Task, container_id: str
+) -> bool:
+    """Whether an object was ever over a container's cavity, higher than its rim."""
+    container = task.objects[container_id]
+    half = np.array(container.inner_m[:2]) / 2
+    T_container_base = se3.invert(truth.poses[container_id][0])
+    p = se3.apply(T_container_base, np.array([T[:3, 3] for T in Ts_base_object]))
+    over = np.all(np.abs(p[:, :2]) < half, axis=1) & (p[:, 2] > container.size_m[2])
+    return bool(over.any())
+
+
+# --- Executing a plan on the cell, with the events that say what was going on.
+
+SETTLE_S = 0.8
+"""The arm waits after a plan, so that the final state is seen at rest."""
+
+
+def execute_plan(cell: StandinCell, plan: Plan) -> None:
+    """Move as ``joints_rad`` says; events mark the plan, its stages and the gripper."""
+    streams = cell.streams
+    times = plan.times_ns()
+    joints = np.array([waypoint.joints_rad for waypoint in plan.tau], dtype=np.float64)
+    streams.event("execution_started", cell.now_ns, plan_id=plan.id)
+    stage_id: str | None = None
+    gripper: tuple[int, float | None] | None = None
+    for first, last in _pieces(plan):
+        stage = plan.stage_at(int(times[first]))
+        if stage is not None and stage.id != stage_id:
+            _end_stage(cell, plan, stage_id)
+            stage_id = stage.id
+            streams.event("stage_started", cell.now_ns, plan_id=plan.id, stage_id=stage_id)
+        waypoint = plan.tau[last]
+        if (waypoint.g, waypoint.width_m) != gripper:
+            g, width = gripper = (waypoint.g, waypoint.width_m)
+            cell.grip((0.0 if g else MAX_WIDTH_M) if width is None else width)
+            streams.event(
+                "gripper",
+                cell.now_ns,
+                plan_id=plan.id,
+                text="close" if g else "open",
+                data={"width_m": width},
+            )
+        cell.follow(times[first : last + 1] - times[first], joints[first : last + 1])
+    _end_stage(cell, plan, stage_id)
+    streams.event("execution_ended", cell.now_ns, plan_id=plan.id)
+    cell.wait(SETTLE_S)
+
+
+def _end_stage(cell: StandinCell, plan: Plan, stage_id: str | None) -> None:
+    if stage_id is not None:
+        cell.streams.event("stage_ended", cell.now_ns, plan_id=plan.id, stage_id=stage_id)
+
+
+def _pieces(plan: Plan) -> list[tuple[int, int]]:
+    """Cut the trajectory where the gripper's command or the stage changes.
+
+    A waypoint's ``g`` and width hold for the time before it: the piece that ends there runs under
+    them.
+    """
+    times = plan.times_ns()
+    stages = [plan.stage_at(int(t)) for t in times]
+    cuts = [0]
+    for k in range(1, len(plan.tau) - 1):
+        after, here = plan.tau[k + 1], plan.tau[k]
+        gripper_changes = (after.g, after.width_m) != (here.g, here.width_m)
+        stage_changes = stages[k] is not stages[k - 1]
+        if gripper_changes or stage_changes:
+            cuts.append(k)
+    cuts.append(len(plan.tau) - 1)
+    return list(pairwise(cuts))
+
 
 RESET_STREAM = 404
 PROBE_STREAM = 505

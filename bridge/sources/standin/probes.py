@@ -21,12 +21,14 @@ from jaxtyping import Float
 from bridge.errors import BridgeError, UsageError
 from bridge.sources.standin.kinematics import (
     Kinematics,
+    Leg,
+    Track,
     UnreachablePoseError,
+    follow_legs,
     tool_down,
     wrap_rad,
     yaw_of,
 )
-from bridge.sources.standin.trajectory import Leg, Track, follow_legs
 from bridge.task.plan import Plan, Stage
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M, ROBOT_NAME
 from bridge.task.task_file import Task

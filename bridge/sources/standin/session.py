@@ -8,8 +8,7 @@ from typing import Any
 from bridge.clock import AnchoredClock
 from bridge.errors import BridgeError
 from bridge.sources.standin.cell import CellConfig, StandinCell, StoppedError
-from bridge.sources.standin.cell_file import load_cell
-from bridge.sources.standin.hidden import draw_hidden
+from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.operator import Operator
 from bridge.sources.standin.settings import SessionConfig
 from bridge.sources.standin.streams import Session, Streams

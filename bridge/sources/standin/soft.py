@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bridge.geometry import se3
-from bridge.sources.standin.hidden import HiddenParameters
+from bridge.sources.standin.cell_file import HiddenParameters
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.meshes.lattice import CORNERS, cage_nodes, cage_weights, make_lattice
 from bridge.task.task_file import ObjectModel, Task

@@ -9,13 +9,13 @@ from jaxtyping import Float, UInt8, UInt16
 
 from bridge.clock import split_ns
 from bridge.episode import schema
-from bridge.episode.point_cloud import PointCloudSample
-from bridge.episode.records import (
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,
     FrameTransform,
     JointSample,
+    PointCloudSample,
     PoseSample,
     joint_trajectory_to_cdr,
     string_to_cdr,

@@ -7,10 +7,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bridge.errors import UsageError
-from bridge.task.meshes.basket import basket_design
-from bridge.task.meshes.solids import Solid
-from bridge.task.meshes.surface_net import mesh_of
-from bridge.task.meshes.toys import DESIGNS, Paint
+from bridge.task.meshes.solids import Solid, mesh_of
+from bridge.task.meshes.toys import DESIGNS, Paint, basket_design
 from bridge.task.task_file import BASKET, ObjectModel
 
 

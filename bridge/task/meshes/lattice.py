@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.errors import UsageError
 from bridge.task.meshes.catalogue import ToyMesh
-from bridge.task.meshes.solids import Solid
-from bridge.task.meshes.surface_net import project
+from bridge.task.meshes.solids import Solid, project
 
 KEPT_DISTANCE = 0.20
 """A cell belongs to the body when its centre is less than this many cells outside."""

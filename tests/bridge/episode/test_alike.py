@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.episode.alike import joints_of, poses_of
-from bridge.episode.cdr import MalformedMessageError
-from bridge.episode.records import JointSample, PoseSample
-from bridge.episode.repeated import joint_messages, pose_messages
+from bridge.episode.cdr.batch import joint_messages, joints_of, pose_messages, poses_of
+from bridge.episode.cdr.codec import MalformedMessageError
+from bridge.episode.cdr.messages import JointSample, PoseSample
 from bridge.episode.streams import joint_track_of, pose_track_of
 from bridge.geometry import se3
 

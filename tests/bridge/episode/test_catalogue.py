@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 import robot_gst
+from bridge.episode import catalogue as catalogue_find
+from bridge.episode import catalogue as catalogue_reading
 from bridge.episode import metadata
 from bridge.episode.catalogue import (
     Entry,
@@ -16,14 +18,11 @@ from bridge.episode.catalogue import (
     label_episode,
     list_episodes,
     note_finished,
+    read_entry,
 )
-from bridge.episode.catalogue import find as catalogue_find
-from bridge.episode.catalogue import reading as catalogue_reading
-from bridge.episode.catalogue.query import CatalogueQuery
-from bridge.episode.catalogue.reading import read_entry
-from bridge.episode.catalogue.store import FILE_NAME, VERSION, CatalogueStore
+from bridge.episode.catalogue_store import FILE_NAME, VERSION, CatalogueQuery, CatalogueStore
 from bridge.episode.metadata import EpisodeInfo, Outcome
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import OptionError, UsageError
 

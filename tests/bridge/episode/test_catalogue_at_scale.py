@@ -11,7 +11,7 @@ import pytest
 
 from bridge.episode.catalogue import list_episodes
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 import robot_gst
-from bridge.episode import cdr, schema
+from bridge.episode import schema
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.messages import CameraInfo, DepthImage, JointSample
 from bridge.episode.check import CheckReport, check_episode
 from bridge.episode.check_topics import SequenceWatch
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.records import CameraInfo, DepthImage, JointSample
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry.camera import Camera
 
@@ -214,7 +215,7 @@ def test_topics_outside_the_contract_need_only_be_valid(tmp_path: Path) -> None:
             ("/camera/camera_info", schema.CAMERA_INFO, info),
             ("/camera/compressed", schema.COMPRESSED_IMAGE, webp),
         ):
-            writer.write(topic, cdr.encode(name, record), type_name=name, log_time_ns=1)
+            writer.write(topic, codec.encode(name, record), type_name=name, log_time_ns=1)
 
     report = check(tmp_path, fill)
     assert (report.exit_code, report.notes) == (0, [])

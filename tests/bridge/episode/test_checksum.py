@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.episode.mcap import checksum
+from bridge.episode.mcap import format
 
 START = st.integers(0, 2**32 - 1)
 
 
 @given(a=st.binary(max_size=5000), b=st.binary(max_size=5000))
 def test_joined_crcs_are_the_crc_of_the_join(a: bytes, b: bytes) -> None:
-    assert checksum.joined_crc(zlib.crc32(a), zlib.crc32(b), len(b)) == zlib.crc32(a + b)
+    assert format.joined_crc(zlib.crc32(a), zlib.crc32(b), len(b)) == zlib.crc32(a + b)
 
 
 @pytest.mark.parity
@@ -24,7 +24,7 @@ def test_any_start_length_and_place_in_memory_gives_zlibs_answer(
     data: bytes, start: int, skip: int
 ) -> None:
     piece = memoryview(data)[skip:]
-    assert checksum.crc32(piece, start) == zlib.crc32(piece, start)
+    assert format.crc32(piece, start) == zlib.crc32(piece, start)
 
 
 @pytest.mark.parity
@@ -32,10 +32,10 @@ def test_any_start_length_and_place_in_memory_gives_zlibs_answer(
 def test_large_buffers_of_every_kind_give_zlibs_answer(size: int) -> None:
     data = os.urandom(size)
     for buffer in (data, bytearray(data), memoryview(data)):
-        assert checksum.crc32(buffer, 5) == zlib.crc32(data, 5)
+        assert format.crc32(buffer, 5) == zlib.crc32(data, 5)
 
 
 def test_without_the_extension_zlib_does_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "bridge.episode._crc32", None)
     monkeypatch.delattr("bridge.episode._crc32", raising=False)
-    assert checksum._fastest() is zlib.crc32
+    assert format._fastest() is zlib.crc32

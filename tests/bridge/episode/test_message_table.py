@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from test_reader_merge import Sent, mcap_bytes, sent, variants
 
 from bridge.episode.mcap import format as mcap_format
-from bridge.episode.mcap import merge, table
-from bridge.episode.mcap.chunks import OpenChunk
-from bridge.episode.mcap.table import by_index, by_walk, message_table
+from bridge.episode.mcap import messages as messages_module
+from bridge.episode.mcap.data_section import OpenChunk
+from bridge.episode.mcap.messages import by_index, by_walk, message_table
 from bridge.episode.mcap.walk import BrokenRecordError
 from bridge.episode.reader import Episode
 from bridge.errors import EpisodeError
@@ -37,7 +37,9 @@ def chunk(messages: Sequence[Message], *, extra: bytes = b"") -> tuple[bytes, by
     return data, b"".join(listed)
 
 
-def same(found: table.MessageTable | None, expected: table.MessageTable) -> bool:
+def same(
+    found: messages_module.MessageTable | None, expected: messages_module.MessageTable
+) -> bool:
     return found is not None and all(map(np.array_equal, found, expected))
 
 
@@ -114,8 +116,10 @@ def test_a_stray_or_damaged_chunk_is_named_by_its_file(
     episode = Episode.open(path)
     (found,) = episode.payloads(["/a"])
     assert len(found) == 50
-    stray = table.MessageTable(*(np.zeros(1, dtype=kind) for kind in ("u8", "u2", "i8", "i8")))
-    monkeypatch.setattr(merge, "message_table", lambda data, index: stray)
+    stray = messages_module.MessageTable(
+        *(np.zeros(1, dtype=kind) for kind in ("u8", "u2", "i8", "i8"))
+    )
+    monkeypatch.setattr(messages_module, "message_table", lambda data, index: stray)
     with pytest.raises(EpisodeError, match=r"x\.mcap: damaged .*channel 0, which was never"):
         episode.payloads(["/a"])
     with pytest.raises(EpisodeError, match=r"x\.mcap: damaged .*channel 0, which was never"):

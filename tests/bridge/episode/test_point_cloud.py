@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from bridge.episode import cdr, schema
-from bridge.episode.point_cloud import PointCloudSample
+from bridge.episode import schema
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.messages import PointCloudSample
 
 POINTS = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32).astype(np.float64)
 
@@ -32,16 +33,16 @@ def test_rosbags_reads_the_same_cloud() -> None:
 
 
 def test_a_cloud_of_another_layout_is_refused() -> None:
-    message = cdr.decode(
+    message = codec.decode(
         schema.POINT_CLOUD, PointCloudSample(stamp_ns=0, frame_id="", points_m=POINTS).to_cdr()
     )
     message["fields"][0]["name"] = "intensity"
-    with pytest.raises(cdr.MalformedMessageError, match="intensity"):
-        PointCloudSample.from_cdr(cdr.encode(schema.POINT_CLOUD, message))
+    with pytest.raises(codec.MalformedMessageError, match="intensity"):
+        PointCloudSample.from_cdr(codec.encode(schema.POINT_CLOUD, message))
     message["fields"][0]["name"] = "x"
     message["width"] = 99
-    with pytest.raises(cdr.MalformedMessageError, match="bytes"):
-        PointCloudSample.from_cdr(cdr.encode(schema.POINT_CLOUD, message))
+    with pytest.raises(codec.MalformedMessageError, match="bytes"):
+        PointCloudSample.from_cdr(codec.encode(schema.POINT_CLOUD, message))
 
 
 def test_the_topic_of_a_soft_object_carries_clouds() -> None:

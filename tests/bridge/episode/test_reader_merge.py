@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from bridge.episode.mcap import merge
+from bridge.episode.mcap import messages as messages_module
 from bridge.episode.reader import Episode
 from bridge.errors import EpisodeError
 
@@ -120,8 +120,10 @@ def test_a_chunk_without_the_topic_is_never_unpacked(
     messages = [("/big" if n % 10 else "/small", n, bytes(1000)) for n in range(100)]
     path.write_bytes(mcap_bytes(messages, chunk_size=100))
     unpacked = []
-    real = merge.unpack_chunk
-    monkeypatch.setattr(merge, "unpack_chunk", lambda *a, **k: unpacked.append(1) or real(*a, **k))
+    real = messages_module.unpack_chunk
+    monkeypatch.setattr(
+        messages_module, "unpack_chunk", lambda *a, **k: unpacked.append(1) or real(*a, **k)
+    )
     assert len(list(Episode.open(path).messages(["/small"]))) == 10
     assert len(unpacked) == 10
 
@@ -145,7 +147,7 @@ def test_chunks_that_all_overlap_are_read_in_order_with_bounded_memory(
     random.Random(5).shuffle(times)
     messages = [("/a", n, random.Random(n).randbytes(20_000)) for n in times]
     path.write_bytes(mcap_bytes(messages, chunk_size=200_000))
-    monkeypatch.setattr(merge, "MEMORY_BYTES", 800_000)
+    monkeypatch.setattr(messages_module, "MEMORY_BYTES", 800_000)
     episode = Episode.open(path)
     tracemalloc.start()
     found = [message.log_time_ns for message in episode.messages()]

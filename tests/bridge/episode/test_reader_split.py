@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.episode import schema, streams
+from bridge.episode.cdr.messages import JointSample, string_to_cdr
 from bridge.episode.check import check_all, check_episode
 from bridge.episode.metadata import EpisodeInfo, Outcome, to_strings
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
-from bridge.episode.records import JointSample, string_to_cdr
-from bridge.episode.run import part_name
+from bridge.episode.run_folder import part_name
 from bridge.episode.writer import EpisodeWriter
 
 JOINTS = "/c/joint_states"

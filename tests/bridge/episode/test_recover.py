@@ -14,7 +14,7 @@ from mcap.writer import CompressionType
 from mcap_samples import linear, put, read_all, some_messages, write_official, write_ours
 
 from bridge.episode.recover import RecoveryError, RecoveryReport, recover, recover_parts
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 from bridge.errors import PathNotFoundError, UsageError
 

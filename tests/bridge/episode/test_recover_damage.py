@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_samples import read_all, some_messages, write_official, write_ours
 
-from bridge.episode.mcap.parse import MAX_CHUNK_BYTES
+from bridge.episode.mcap.damaged import MAX_CHUNK_BYTES
 from bridge.episode.recover import RecoveryError, recover
 from bridge.episode.writer import EpisodeWriter
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bridge.episode.records import JointSample, PoseSample
-from bridge.episode.repeated import joint_messages, pose_messages
+from bridge.episode.cdr.batch import joint_messages, pose_messages
+from bridge.episode.cdr.messages import JointSample, PoseSample
 from bridge.geometry import se3
 
 STAMPS = np.array([0, 1, 999_999_999, 1_000_000_000, 1_700_000_000_123_456_789])

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.episode.run import (
+from bridge.episode.run_folder import (
     RunFolder,
     first_part,
     first_parts,

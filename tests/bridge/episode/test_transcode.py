@@ -6,15 +6,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.episode import cdr, schema
-from bridge.episode.cdr import MalformedMessageError
-from bridge.episode.records import (
-    CompressedColor,
-    DepthImage,
-    RawColor,
-    color_from_message,
-)
-from bridge.episode.transcode import COLOR_LAYOUTS, depth_to_compact, image_header, image_to_jpeg
+from bridge.episode import schema
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.codec import MalformedMessageError
+from bridge.episode.cdr.images import COLOR_LAYOUTS, depth_to_compact, image_header, image_to_jpeg
+from bridge.episode.cdr.messages import CompressedColor, DepthImage, RawColor, color_from_message
 from bridge.errors import BridgeError
 from bridge.media.color import UnreadableImageError
 
@@ -35,7 +31,7 @@ def image(pixels: np.ndarray, encoding: str, **fields: object) -> bytes:
         "data": pixels.tobytes(),
         **fields,
     }
-    return cdr.encode(schema.IMAGE, message)
+    return codec.encode(schema.IMAGE, message)
 
 
 def padded(pixels: np.ndarray, encoding: str, padding: int, **fields: object) -> bytes:
@@ -71,7 +67,7 @@ def test_a_header_says_where_the_pixels_are() -> None:
 def test_headers_of_any_alignment_agree_with_the_full_decoder(frame_id: str) -> None:
     stamped = {"stamp": STAMP, "frame_id": frame_id}
     data = image(np.zeros((2, 3, 3), dtype=np.uint8), "rgb8", header=stamped)
-    header, full = image_header(data), cdr.decode(schema.IMAGE, data)
+    header, full = image_header(data), codec.decode(schema.IMAGE, data)
     assert header.frame_id == full["header"]["frame_id"] == frame_id
     assert data[header.data_offset :] == full["data"]
     compact = image_to_jpeg(data)

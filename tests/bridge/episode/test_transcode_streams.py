@@ -3,10 +3,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.episode import cdr, schema, streams
+from bridge.episode import schema, streams
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.images import depth_to_compact, image_to_jpeg
+from bridge.episode.cdr.messages import CameraInfo, DepthImage, FrameTransform, transforms_to_cdr
 from bridge.episode.reader import Episode
-from bridge.episode.records import CameraInfo, DepthImage, FrameTransform, transforms_to_cdr
-from bridge.episode.transcode import depth_to_compact, image_to_jpeg
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry.camera import Camera
 
@@ -23,7 +24,7 @@ def color(index: int) -> bytes:
     stamp = {"sec": 0, "nanosec": (index + 1) * STEP_NS}
     pixels = np.full((24, 32, 3), [10 * index, 100, 200], dtype=np.uint8)
     fields = {"height": 24, "width": 32, "encoding": "bgr8", "step": 96, "data": pixels.tobytes()}
-    return cdr.encode(schema.IMAGE, {"header": {"stamp": stamp, "frame_id": "eye"}, **fields})
+    return codec.encode(schema.IMAGE, {"header": {"stamp": stamp, "frame_id": "eye"}, **fields})
 
 
 def record(path: Path, *, is_color_raw: bool, is_depth_raw: bool) -> Episode:

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.episode import protobuf, schema
-from bridge.episode.cdr import MalformedMessageError
-from bridge.episode.video import VideoFrame, video_message
+from bridge.episode.cdr.codec import MalformedMessageError
+from bridge.episode.cdr.messages import VideoFrame, video_message
 
 NS = 1_700_000_000_123_456_789
 

@@ -7,9 +7,7 @@ import pytest
 from mcap.reader import make_reader
 
 from bridge.episode import metadata, schema, streams
-from bridge.episode.check import check_episode
-from bridge.episode.reader import Episode
-from bridge.episode.records import (
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,
@@ -18,6 +16,8 @@ from bridge.episode.records import (
     PoseSample,
     transforms_to_cdr,
 )
+from bridge.episode.check import check_episode
+from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import BridgeError, EpisodeError, SchemaVersionError, UsageError
 from bridge.geometry.camera import Camera

@@ -12,7 +12,7 @@ import pytest
 from mcap_samples import linear, read_all, some_messages, write_ours
 
 from bridge.episode.recover import recover, recover_parts
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 
 CHILD = Path(__file__).with_name("writer_child.py")
 MAX_TAIL_NS = 500_000_000
@@ -112,7 +112,7 @@ def test_reruns_checker_accepts_what_was_written_and_what_was_recovered(tmp_path
     if not rerun.exists():
         pytest.skip("rerun is not installed")
     from bridge.episode import schema
-    from bridge.episode.records import string_to_cdr
+    from bridge.episode.cdr.messages import string_to_cdr
     from bridge.episode.writer import EpisodeWriter, WriterConfig
 
     path = tmp_path / "whole.mcap"

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from bridge.episode import schema
-from bridge.episode.metadata import EpisodeInfo, Outcome
-from bridge.episode.records import (
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,
@@ -21,6 +20,7 @@ from bridge.episode.records import (
     PoseSample,
     transforms_to_cdr,
 )
+from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera

@@ -10,9 +10,9 @@ import pytest
 
 import robot_gst
 from bridge.episode import schema
+from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.records import JointSample
 from bridge.episode.streams import joint_track, pose_track
 from bridge.episode.writer import EpisodeWriter
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import pose_track
 from bridge.errors import PathNotFoundError
 from bridge.exchange.kinova import (

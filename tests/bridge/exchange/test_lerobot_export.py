@@ -16,7 +16,7 @@ import pytest
 
 import robot_gst
 from bridge.episode.reader import Episode
-from bridge.exchange.lerobot.stats import RunningStats
+from bridge.exchange.lerobot.writer import RunningStats
 
 av = pytest.importorskip("av")
 pq = pytest.importorskip("pyarrow.parquet")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from lerobot_dataset import LENGTHS, Dataset, png, run, shade, state
 
+from bridge.episode.cdr.messages import CompressedColor, JointSample
 from bridge.episode.reader import Episode
-from bridge.episode.records import CompressedColor, JointSample
 from bridge.media.color import decode_color
 
 

@@ -14,7 +14,7 @@ import robot_gst
 from bridge.episode.check import check_episode
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import BridgeError, EpisodeError, PathNotFoundError, UsageError
 from bridge.exchange.rosbag2 import find_files, import_bag
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import robot_gst
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.exchange.trials_csv import read_trials
 from evaluator.compare import compare_run
 

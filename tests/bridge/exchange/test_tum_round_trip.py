@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 import robot_gst
+from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.reader import Episode
-from bridge.episode.records import CompressedColor, DepthImage
 from bridge.episode.streams import rgbd_frames, transform_tree
 from bridge.geometry import se3
 
@@ -179,10 +179,11 @@ def test_poses_of_a_real_sequence_come_through_the_import(tmp_path: Path) -> Non
 
 
 def test_raw_colour_and_packed_depth_are_written_too(tmp_path: Path) -> None:
-    from bridge.episode import cdr, schema
+    from bridge.episode import schema
+    from bridge.episode.cdr import codec
+    from bridge.episode.cdr.images import depth_to_compact
+    from bridge.episode.cdr.messages import CameraInfo, FrameTransform, transforms_to_cdr
     from bridge.episode.metadata import EpisodeInfo
-    from bridge.episode.records import CameraInfo, FrameTransform, transforms_to_cdr
-    from bridge.episode.transcode import depth_to_compact
     from bridge.episode.writer import EpisodeWriter
     from bridge.geometry.camera import Camera
 
@@ -204,7 +205,7 @@ def test_raw_colour_and_packed_depth_are_written_too(tmp_path: Path) -> None:
         for topic, data, name in (
             ("/tf_static", transforms_to_cdr([pose]), schema.TF_MESSAGE),
             ("/x/cam/e/color/info", info, schema.CAMERA_INFO),
-            ("/x/cam/e/color/image", cdr.encode(schema.IMAGE, raw), schema.IMAGE),
+            ("/x/cam/e/color/image", codec.encode(schema.IMAGE, raw), schema.IMAGE),
             ("/x/cam/e/depth/image", compact, schema.COMPRESSED_IMAGE),
         ):
             writer.write(topic, data, type_name=name, log_time_ns=1)

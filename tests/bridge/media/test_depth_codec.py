@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from bridge.media import depth_codec
+from bridge.media import depth as depth_module
 from bridge.media.color import MAX_PIXELS, UnreadableImageError
-from bridge.media.depth_codec import PNG_FORMAT, RVL_FORMAT, is_compressed_depth, pack_rvl, unpack
+from bridge.media.depth import PNG_FORMAT, RVL_FORMAT, is_compressed_depth, pack_rvl, unpack
 
 sides = hnp.array_shapes(min_dims=2, max_dims=2, max_side=12)
 depths = hnp.arrays(np.uint16, sides, elements=st.sampled_from([0, 0, 1, 7, 800, 805, 65535]))
@@ -34,7 +34,7 @@ def png(depth: np.ndarray) -> bytes:
 
 
 def test_the_extension_is_built() -> None:
-    assert depth_codec.NATIVE, "run `make setup`: RVL falls back to NumPy"
+    assert depth_module.NATIVE, "run `make setup`: RVL falls back to NumPy"
 
 
 @given(depths)

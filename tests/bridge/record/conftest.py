@@ -9,8 +9,8 @@ import pytest
 
 from bridge.clock import AnchoredClock
 from bridge.episode import schema
-from bridge.episode.records import JointSample
-from bridge.episode.run import RunFolder
+from bridge.episode.cdr.messages import JointSample
+from bridge.episode.run_folder import RunFolder
 from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
 

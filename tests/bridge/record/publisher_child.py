@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from bridge.episode import schema
-from bridge.episode.records import DepthImage, JointSample
+from bridge.episode.cdr.messages import DepthImage, JointSample
+from bridge.record.control import RecorderClient
 from bridge.wire.config import WireConfig
-from bridge.wire.recorder_client import RecorderClient
 from bridge.wire.session import open_session
 
 

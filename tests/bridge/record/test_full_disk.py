@@ -17,11 +17,11 @@ from bridge.episode.mcap.part_file import PartFile
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.recover import recover_parts
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.record.config import DiskConfig, RecorderConfig
 from bridge.record.errors import DiskError, NoSpaceError
+from bridge.record.lifecycle import DiskReserve
 from bridge.record.recorder import Recorder
-from bridge.record.reserve import FooterReserve
 from bridge.wire.session import WireSample
 
 MakeSample = Callable[..., WireSample]
@@ -137,7 +137,7 @@ def test_the_space_held_back_has_no_name_and_comes_back(small_disk: Path) -> Non
         found = os.statvfs(small_disk)
         return (found.f_blocks - found.f_bfree) * found.f_frsize / 1e6
 
-    reserve = FooterReserve(small_disk, 5)
+    reserve = DiskReserve(small_disk, 5)
     reserve.hold()
     reserve.hold()
     assert 4.9 < used_mb() < 5.2

@@ -12,14 +12,14 @@ from bridge.clock import AnchoredClock
 from bridge.episode import schema
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import events
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import BridgeError, UsageError
 from bridge.record.config import EpisodeAbout, QueueConfig, RecorderConfig
 from bridge.record.control import parse_info, parse_outcome
 from bridge.record.errors import ControlError, DiskError, LifecycleError
-from bridge.record.keyboard import Keys
+from bridge.record.process import Keys
 from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
 
@@ -231,7 +231,7 @@ def test_a_message_nobody_thought_of_ends_nothing(
 
     recorder.start(EpisodeInfo(id="t1", kind="trial"))
     with monkeypatch.context() as patch:
-        patch.setattr("bridge.episode.cdr.validate", inspect_badly)
+        patch.setattr("bridge.episode.cdr.codec.validate", inspect_badly)
         recorder.receive(make_sample())
         recorder.receive(make_sample())
         recorder.mark("behind both")

@@ -12,19 +12,19 @@ from mcap.reader import make_reader
 
 from bridge.clock import AnchoredClock
 from bridge.episode import schema
+from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.records import CompressedColor
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 from bridge.errors import UsageError
 from bridge.media.color import decode_color, encode_jpeg
 from bridge.record.config import RecorderConfig
+from bridge.record.control import RecorderClient
 from bridge.record.live import LiveRecorder, open_recorder
 from bridge.record.recorder import Recorder
 from bridge.task.record import parse_record
 from bridge.wire.config import WireConfig
-from bridge.wire.recorder_client import RecorderClient
 from bridge.wire.session import WireSample, WireSession, open_session
 
 WAIT_S = 10.0

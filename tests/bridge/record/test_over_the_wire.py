@@ -13,16 +13,15 @@ from PIL import Image
 import robot_gst
 from bridge.episode import schema
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
-from bridge.record.control import serve_control
+from bridge.episode.run_folder import RunFolder
+from bridge.record.control import RecorderClient, serve_control
 from bridge.record.recorder import Recorder
 from bridge.record.status import describe_status
-from bridge.sources.folder_config import FolderConfig
-from bridge.sources.folder_index import read_index
-from bridge.sources.folder_publish import publish_folder_frames
+from bridge.sources.folder.config import FolderConfig
+from bridge.sources.folder.messages import read_index
+from bridge.sources.folder.publish import publish_folder_frames
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import RemoteError
-from bridge.wire.recorder_client import RecorderClient
 from bridge.wire.session import WireSession, open_session
 
 

@@ -14,7 +14,7 @@ from bridge.episode import schema
 from bridge.episode.check import check_episode
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import events
 from bridge.errors import UsageError
 from bridge.record.config import DiskConfig, RecorderConfig

@@ -16,8 +16,8 @@ from loopback import free_endpoint
 from mcap.reader import make_reader
 
 from bridge.errors import BridgeError
+from bridge.record.control import RecorderClient
 from bridge.wire.config import WireConfig
-from bridge.wire.recorder_client import RecorderClient
 from bridge.wire.session import open_session
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -11,12 +11,19 @@ from hypothesis import strategies as st
 
 from bridge.episode import schema
 from bridge.record.config import QueueConfig
-from bridge.record.entries import Command, Dropped, Entry, Item
-from bridge.record.inspection import Finding
-from bridge.record.intake import Intake
+from bridge.record.inspection import MessageState
 from bridge.record.ledger import Ledger
-from bridge.record.merge import Merge
-from bridge.record.shedding import Shed, keep_every, next_level
+from bridge.record.queue import (
+    Command,
+    Dropped,
+    Entry,
+    InputQueue,
+    Item,
+    LoadShedding,
+    Merge,
+    keep_every,
+    next_level,
+)
 from bridge.wire.session import WireSample
 
 MakeSample = Callable[..., WireSample]
@@ -29,7 +36,7 @@ class Queues:
         """Open the queues."""
         self.images: deque[Item] = deque()
         self.kinds: dict[str, str] = {}
-        self.intake = Intake(QueueConfig(**limits), self.images.append, self.kinds)  # type: ignore[arg-type]
+        self.intake = InputQueue(QueueConfig(**limits), self.images.append, self.kinds)  # type: ignore[arg-type]
 
     def encode(self, count: int | None = None) -> None:
         for _ in range(len(self.images) if count is None else count):
@@ -88,7 +95,7 @@ def test_every_message_is_kept_or_counted(
             queues.encode()
     for entry in queues.drain():
         if isinstance(entry, Item):
-            ledger.count_received(entry, Finding.GOOD)
+            ledger.count_received(entry, MessageState.GOOD)
         elif isinstance(entry, Dropped):
             ledger.count_dropped(entry)
     total = ledger.total()
@@ -211,14 +218,14 @@ def test_too_large_and_too_many_are_dropped_and_said(make_sample: MakeSample) ->
 
 
 def test_shedding_keeps_its_order_and_comes_back() -> None:
-    levels, level = [], Shed.NOTHING
+    levels, level = [], LoadShedding.NOTHING
     for fill in (0.1, 0.3, 0.6, 0.75, 0.9, 0.7, 0.6, 0.4, 0.2, 0.1):
         level = next_level(level, fill)
         levels.append(int(level))
     assert levels == [0, 1, 2, 3, 4, 4, 2, 2, 0, 0]
-    assert [keep_every(item, "color") for item in Shed] == [1, 1, 1, 2, 4]
-    assert [keep_every(item, "depth") for item in Shed] == [1, 1, 1, 1, 2]
-    assert [keep_every(item, "") for item in Shed] == [1] * 5
+    assert [keep_every(item, "color") for item in LoadShedding] == [1, 1, 1, 2, 4]
+    assert [keep_every(item, "depth") for item in LoadShedding] == [1, 1, 1, 1, 2]
+    assert [keep_every(item, "") for item in LoadShedding] == [1] * 5
 
 
 def test_shed_images_are_counted_as_such() -> None:

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from bridge.clock import AnchoredClock
-from bridge.episode import cdr, schema
+from bridge.episode import schema
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.messages import CompressedColor, DepthImage, VideoFrame
 from bridge.episode.check import check_episode
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.records import CompressedColor, DepthImage
-from bridge.episode.run import RunFolder
-from bridge.episode.video import VideoFrame
+from bridge.episode.run_folder import RunFolder
 from bridge.media.color import decode_color, encode_jpeg
 from bridge.record.config import QueueConfig, RecorderConfig
-from bridge.record.preview import WIDTH, small_picture
+from bridge.record.live import WIDTH, small_picture
 from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
 
@@ -42,7 +42,7 @@ def raw_image(pixels: np.ndarray, encoding: str, *, step: int | None = None) -> 
         "step": pixels.nbytes // height if step is None else step,
         "data": pixels.tobytes(),
     }
-    return cdr.encode(schema.IMAGE, message)
+    return codec.encode(schema.IMAGE, message)
 
 
 def depth_image(height: int = 24, width: int = 32) -> bytes:

@@ -7,13 +7,12 @@ from typing import NamedTuple
 import pytest
 from loopback import free_endpoint
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import BridgeError
-from bridge.record.control import serve_control
+from bridge.record.control import RecorderClient, serve_control
 from bridge.record.recorder import Recorder
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import RemoteError
-from bridge.wire.recorder_client import RecorderClient
 from bridge.wire.session import open_session
 
 HOSTILE = (

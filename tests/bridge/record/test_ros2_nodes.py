@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.record.recorder import Recorder
 from bridge.record.ros2 import Ros2Graph, watch_ros2
 from bridge.wire.config import WireConfig

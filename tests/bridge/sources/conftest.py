@@ -12,11 +12,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 from loopback import free_endpoint
 from rtde_server import RtdeServer, counting_state
 
-from bridge.episode.run import RunFolder
-from bridge.record.control import serve_control
+from bridge.episode.run_folder import RunFolder
+from bridge.record.control import RecorderClient, serve_control
 from bridge.record.recorder import Recorder
 from bridge.wire.config import WireConfig
-from bridge.wire.recorder_client import RecorderClient
 from bridge.wire.session import WireSession, open_session
 
 

@@ -13,15 +13,13 @@ import pytest
 from PIL import Image
 
 import robot_gst
+from bridge.episode.cdr.messages import CameraInfo, DepthImage, transforms_from_cdr
 from bridge.episode.reader import Episode
-from bridge.episode.records import CameraInfo, DepthImage, transforms_from_cdr
 from bridge.episode.streams import rgbd_frames
 from bridge.errors import PathNotFoundError, UsageError
-from bridge.sources.errors import FolderError
-from bridge.sources.folder import folder_messages, frame_times_ns
-from bridge.sources.folder_config import FolderConfig
-from bridge.sources.folder_index import read_index
-from bridge.sources.folder_tum_lists import StampedFile, associate
+from bridge.sources.folder.config import FolderConfig, FolderError
+from bridge.sources.folder.messages import folder_messages, frame_times_ns, read_index
+from bridge.sources.folder.tum import StampedFile, associate
 
 BESIDE = Path(__file__).parents[4] / "shared" / "data"
 DATA = Path(os.environ.get("GST_SHARED_DATA", BESIDE))
@@ -297,7 +295,7 @@ def test_a_published_tum_folder_keeps_the_distances_between_its_times(tum: Path)
         def put(self, data: bytes, *, source_ns: int) -> None:
             self._sent.append(source_ns)
 
-    from bridge.sources.folder_publish import publish_folder_frames
+    from bridge.sources.folder.publish import publish_folder_frames
 
     session = Session()
     begun = time.monotonic()

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.clock import NS_PER_S
-from bridge.sources.host_clock import SETTLE_NS, HostClock
+from bridge.sources.device_samples import SETTLE_NS, HostClock
 
 MS = 1_000_000
 

@@ -19,19 +19,19 @@ from software_camera import SoftwareCamera  # noqa: E402
 
 import robot_gst  # noqa: E402
 from bridge.episode import schema, streams  # noqa: E402
+from bridge.episode.cdr.messages import CompressedColor, DepthImage  # noqa: E402
 from bridge.episode.check import check_episode  # noqa: E402
 from bridge.episode.reader import Episode  # noqa: E402
-from bridge.episode.records import CompressedColor, DepthImage  # noqa: E402
 from bridge.media.color import decode_color  # noqa: E402
-from bridge.sources import announcer  # noqa: E402
+from bridge.sources import device_samples  # noqa: E402
 from bridge.sources.realsense import publish  # noqa: E402
-from bridge.sources.realsense.config import RealSenseConfig  # noqa: E402
-from bridge.sources.realsense.device import CameraDevice  # noqa: E402
-from bridge.sources.realsense.errors import (  # noqa: E402
+from bridge.sources.realsense.config import (
     CameraNotFoundError,
     CameraStreamError,
+    RealSenseConfig,  # noqa: E402
 )
-from bridge.sources.realsense.frames import ColorFrame, DepthFrame  # noqa: E402
+from bridge.sources.realsense.device import CameraDevice  # noqa: E402
+from bridge.sources.realsense.messages import ColorFrame, DepthFrame  # noqa: E402
 from bridge.sources.realsense.publish import choose_cameras, publish_cameras  # noqa: E402
 from bridge.terminal import Output  # noqa: E402
 
@@ -338,7 +338,7 @@ def test_a_camera_that_was_unplugged_is_taken_up_again(
 def test_a_recorder_that_comes_late_gets_the_calibration(
     joined: Joined, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(announcer, "REPEAT_S", 1.0)
+    monkeypatch.setattr(device_samples, "REPEAT_S", 1.0)
     camera = SoftwareCamera()
     running = Running(joined, RealSenseConfig(cell="lab"), lambda: [camera.device])
     running.wait("/lab/cam/camera/depth/info", 2)  # said again by itself

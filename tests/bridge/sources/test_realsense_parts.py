@@ -12,11 +12,16 @@ rs = pytest.importorskip("pyrealsense2", reason="the extra [realsense] is not in
 from software_camera import intrinsics  # noqa: E402
 
 from bridge.errors import UsageError  # noqa: E402
-from bridge.sources.realsense.config import RealSenseConfig  # noqa: E402
-from bridge.sources.realsense.errors import MountsError  # noqa: E402
-from bridge.sources.realsense.mounts import read_mounts  # noqa: E402
-from bridge.sources.realsense.rectify import Rectifier, is_distorted  # noqa: E402
-from bridge.sources.realsense.stamps import FrameStamps  # noqa: E402
+from bridge.sources.realsense.config import (
+    MountsError,  # noqa: E402
+    RealSenseConfig,  # noqa: E402
+)
+from bridge.sources.realsense.device import (  # noqa: E402
+    FrameStamps,  # noqa: E402
+    Rectifier,
+    is_distorted,
+)
+from bridge.sources.realsense.messages import read_mounts  # noqa: E402
 
 D405 = (-0.0547, 0.0575, 0.0004, 0.0006, -0.0186)
 

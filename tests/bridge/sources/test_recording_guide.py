@@ -15,7 +15,7 @@ from loopback import free_endpoint
 from rtde_server import RtdeServer
 
 import robot_gst
-from bridge.sources.realsense.mounts import read_mounts
+from bridge.sources.realsense.messages import read_mounts
 
 ROOT = Path(__file__).resolve().parents[3]
 GUIDE = (ROOT / "docs" / "recording.md").read_text()

@@ -14,23 +14,16 @@ import pytest
 from PIL import Image
 
 from bridge.episode import schema
-from bridge.episode.message import StampedMessage
+from bridge.episode.cdr.messages import CameraInfo, CompressedColor, DepthImage, transforms_from_cdr
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.records import (
-    CameraInfo,
-    CompressedColor,
-    DepthImage,
-    transforms_from_cdr,
-)
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.schema import StampedMessage
 from bridge.episode.streams import rgbd_frames
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.exchange.rgbd import write_scan
-from bridge.sources.errors import FolderError
-from bridge.sources.folder import folder_messages
-from bridge.sources.folder_config import FolderConfig
-from bridge.sources.folder_index import read_index
+from bridge.sources.folder.config import FolderConfig, FolderError
+from bridge.sources.folder.messages import folder_messages, read_index
 
 BESIDE = Path(__file__).parents[4] / "shared" / "data"
 DATA = Path(os.environ.get("GST_SHARED_DATA", BESIDE))

@@ -14,9 +14,9 @@ from conftest import Joined
 from rtde_server import RtdeServer
 
 import robot_gst
-from bridge.sources.ur import link
-from bridge.sources.ur.client import RtdeClient, Wish
-from bridge.sources.ur.errors import ControllerError, NotRtdeError
+from bridge.sources.ur import rtde as client_module
+from bridge.sources.ur.config import ControllerError, NotRtdeError
+from bridge.sources.ur.rtde import RtdeClient, Wish
 
 ANSWER_S = 20.0
 
@@ -108,8 +108,8 @@ def test_a_peer_that_is_no_controller_is_one_sentence(data: bytes, words: str) -
 def test_a_peer_that_never_finishes_is_left_in_time(
     pause_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert link.AGREE_S <= 5.0
-    monkeypatch.setattr(link, "AGREE_S", 2.5)
+    assert client_module.AGREE_S <= 5.0
+    monkeypatch.setattr(client_module, "AGREE_S", 2.5)
     text = b"\x00\x09M\x02hi\x01x\x00"  # words without end are no agreement either
     peer = Peer(text * 40 if pause_s else b"", pause_s=pause_s, stay=True)
     try:

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.episode.records import FrameTransform, JointSample, PoseSample, transforms_to_cdr
-from bridge.episode.records import transforms_from_cdr as read_transforms
+from bridge.episode.cdr.messages import FrameTransform, JointSample, PoseSample, transforms_to_cdr
+from bridge.episode.cdr.messages import transforms_from_cdr as read_transforms
 from bridge.geometry import se3
 from bridge.sources.ur import messages
-from bridge.sources.ur.template import MessageTemplate
+from bridge.sources.ur.messages import MessageTemplate
 from bridge.task.record import check_record
 from bridge.task.robot import ARM_JOINTS
 

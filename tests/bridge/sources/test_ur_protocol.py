@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.sources.ur.config import UrConfig
-from bridge.sources.ur.gripper import parse_signal
+from bridge.sources.ur.config import UrConfig, parse_signal
 from bridge.sources.ur.messages import tool_pose
-from bridge.sources.ur.protocol import (
+from bridge.sources.ur.rtde import (
     BrokenPackageError,
     Kind,
     Package,

@@ -13,9 +13,9 @@ from rtde_server import TYPES, RtdeServer, counting_state
 
 import robot_gst
 from bridge.episode import schema, streams
+from bridge.episode.cdr.messages import JointSample, transforms_from_cdr
 from bridge.episode.check import check_episode
 from bridge.episode.reader import Episode
-from bridge.episode.records import JointSample, transforms_from_cdr
 from bridge.sources.ur.config import UrConfig
 from bridge.sources.ur.publish import publish_arm
 from bridge.terminal import Output

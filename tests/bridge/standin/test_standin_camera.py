@@ -7,10 +7,8 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.sources.standin.cell_file import CellFile, SensorModel
-from bridge.sources.standin.hidden import HiddenParameters
-from bridge.sources.standin.render import Picture, Renderer
-from bridge.sources.standin.sensor import measure_color, measure_depth
+from bridge.sources.standin.cell_file import CellFile, HiddenParameters, SensorModel
+from bridge.sources.standin.render import Picture, Renderer, measure_color, measure_depth
 from bridge.sources.standin.surfaces import Surface, box_surface, room_surfaces
 
 CAMERA = Camera(width=40, height=30, fx=35.0, fy=35.0, cx=20.0, cy=15.0)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from bridge.sources.standin.cell_file import CellFile
-from bridge.sources.standin.hidden import HiddenParameters
+from bridge.sources.standin.cell_file import CellFile, HiddenParameters
 from bridge.sources.standin.kinematics import (
     UnreachablePoseError,
     arm_kinematics,

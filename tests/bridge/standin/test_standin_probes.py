@@ -11,9 +11,9 @@ import pytest
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.sources.standin import execution, operator
+from bridge.sources.standin import operator
 from bridge.sources.standin.cell import StandinCell
-from bridge.sources.standin.execution import execute_plan
+from bridge.sources.standin.operator import execute_plan
 from bridge.sources.standin.probes import PROBES, NoRoomForProbeError, plan_probe
 from bridge.sources.standin.session import run_session
 from bridge.sources.standin.settings import SessionConfig
@@ -164,4 +164,4 @@ def test_plans_that_only_open_and_close_are_cut_where_they_always_were(
     plan = planned("drop", make_cell(make_session()), cube())
     g = [waypoint.g for waypoint in plan.tau]
     changes = [k for k in range(1, len(g) - 1) if g[k + 1] != g[k]]
-    assert execution._pieces(plan) == list(pairwise([0, *changes, len(g) - 1]))
+    assert operator._pieces(plan) == list(pairwise([0, *changes, len(g) - 1]))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bridge.episode import schema
-from bridge.episode.records import (
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,

@@ -7,14 +7,18 @@ from typing import Any
 import numpy as np
 
 from bridge.sources.standin.cell import CellConfig, StandinCell, TruthLog
-from bridge.sources.standin.cell_file import CellFile, load_cell
-from bridge.sources.standin.hidden import HiddenParameters, draw_hidden, nominal_hidden
-from bridge.sources.standin.label import label_trial, void_trial
-from bridge.sources.standin.operator import Operator
+from bridge.sources.standin.cell_file import (
+    CellFile,
+    HiddenParameters,
+    draw_hidden,
+    load_cell,
+    nominal_hidden,
+)
+from bridge.sources.standin.operator import Operator, label_trial, void_trial
 from bridge.sources.standin.session import describe, run_session
 from bridge.sources.standin.settings import SessionConfig
 from bridge.sources.standin.streams import Streams
-from bridge.sources.standin.world_model import TABLE_CENTRE_M, TABLE_SIZE_M
+from bridge.sources.standin.world import TABLE_CENTRE_M, TABLE_SIZE_M
 from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output
 

@@ -9,17 +9,14 @@ import numpy as np
 import pytest
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import PointCloudSample, PoseSample
 from bridge.episode.metadata import Outcome
-from bridge.episode.point_cloud import PointCloudSample
-from bridge.episode.records import PoseSample
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.sources.standin.cell import CellConfig, StandinCell
-from bridge.sources.standin.cell_file import CellFile
-from bridge.sources.standin.execution import execute_plan
-from bridge.sources.standin.hidden import draw_hidden, nominal_hidden
+from bridge.sources.standin.cell_file import CellFile, draw_hidden, nominal_hidden
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down, yaw_of
-from bridge.sources.standin.label import label_trial
+from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.planner import (
     NO_ERROR,
     draw_error,

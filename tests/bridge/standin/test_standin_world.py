@@ -9,17 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import Outcome
-from bridge.episode.records import JointSample
 from bridge.errors import UsageError
 from bridge.sources.standin.cell import StandinCell
-from bridge.sources.standin.cell_file import CellFile, load_cell
-from bridge.sources.standin.execution import execute_plan
-from bridge.sources.standin.hidden import HiddenParameters, draw_hidden
-from bridge.sources.standin.label import label_trial
+from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden, load_cell
+from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.planner import NO_ERROR, GraspError, plan_pick_and_place
-from bridge.sources.standin.world import World
-from bridge.sources.standin.world_model import STEP_S
+from bridge.sources.standin.world import STEP_S, World
 from bridge.task.task_file import Task
 
 

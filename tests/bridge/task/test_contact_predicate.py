@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bridge.task.contact import Contact
 from bridge.task.predicate import (
     ALLOWED_CONTACTS,
+    Contact,
     Rollout,
     all_hold,
     evaluate_contacts,

@@ -13,8 +13,7 @@ from jsonschema import Draft202012Validator
 import bridge
 import evaluator
 from bridge.errors import InvalidRecordError
-from bridge.task.quick_check import compile_check
-from bridge.task.record import check_record
+from bridge.task.record import check_record, compile_check
 from bridge.task.verdict import Factor, Verdict
 from evaluator.result import Exclusion, Interval, Measurement, Results, Table
 

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from bridge.errors import UsageError
-from bridge.task.meshes.basket import basket_parts
 from bridge.task.meshes.catalogue import ToyMesh, basket_mesh, object_mesh, toy_mesh
 from bridge.task.meshes.lattice import cage_nodes, cage_weights, make_lattice, volumes_m3
-from bridge.task.meshes.solids import ellipsoid
-from bridge.task.meshes.surface_net import OpenSurfaceError, is_closed, mesh_of
+from bridge.task.meshes.solids import OpenSurfaceError, ellipsoid, is_closed, mesh_of
+from bridge.task.meshes.toys import basket_parts
 from bridge.task.task_file import load_task
 
 SIZES = {

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.wire.attachment import Attachment, decode, encode
+from bridge.wire.publisher import Attachment, decode, encode
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 GIDS = st.binary(min_size=16, max_size=16)

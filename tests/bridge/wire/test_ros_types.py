@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from bridge.episode import ros2_definitions
+from bridge.episode import schema
 from bridge.errors import MissingDependencyError, UsageError
-from bridge.wire import ros_types
-from bridge.wire.ros_types import is_known_definition, ros_schema, type_hash_of
+from bridge.wire import rmw
+from bridge.wire.rmw import is_known_definition, ros_schema, type_hash_of
 
 # Printed by `ros2 topic info --verbose` of ROS 2 Jazzy and seen in keys of rmw_zenoh.
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -25,14 +25,14 @@ def test_the_hash_is_the_one_on_the_wire() -> None:
     assert type_hash_of("std_msgs/msg/String") == STRING_HASH
 
 
-@pytest.mark.parametrize("name", sorted(ros2_definitions.DEFINITIONS))
+@pytest.mark.parametrize("name", sorted(schema.DEFINITIONS))
 def test_our_own_definitions_have_the_fields_of_ros(name: str) -> None:
     from rosbags.typesys import get_types_from_msg
 
     found = ros_schema(name)
     assert found is not None
     assert (found.name, found.schema_encoding, found.message_encoding) == (name, "ros2msg", "cdr")
-    ours = get_types_from_msg(ros2_definitions.schema_text(name), name)
+    ours = get_types_from_msg(schema.schema_text(name), name)
     theirs = get_types_from_msg(found.data.decode(), name)
     assert {key: fields for key, (_, fields) in ours.items()} == {
         key: fields for key, (_, fields) in theirs.items()
@@ -99,12 +99,12 @@ def test_a_folder_that_is_none_is_wrong_use(tmp_path: Path) -> None:
 def test_rosbags_is_loaded_only_when_asked_and_missed_in_one_sentence(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    code = "import sys, bridge.wire.ros_types; sys.exit('rosbags' in sys.modules)"
+    code = "import sys, bridge.wire.rmw; sys.exit('rosbags' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
     monkeypatch.setitem(sys.modules, "rosbags", None)
-    ros_types._typesys.cache_clear()
+    rmw._typesys.cache_clear()
     try:
         with pytest.raises(MissingDependencyError, match="rosbags"):
-            ros_types._typesys()
+            rmw._typesys()
     finally:
-        ros_types._typesys.cache_clear()
+        rmw._typesys.cache_clear()

@@ -22,10 +22,10 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from bridge.episode import schema
+from bridge.record.control import RecorderClient
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import NoPeerError, NoReplyError
 from bridge.wire.qos import Qos
-from bridge.wire.recorder_client import RecorderClient
 from bridge.wire.session import WireSample, WireSession, open_session
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.terminal import Output
 from evaluator.cli import evaluate

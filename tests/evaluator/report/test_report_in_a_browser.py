@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import pytest
 from own_process import printed
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from evaluator.report.page import POLICY
 
 CHECKS = Path(__file__).with_name("checks.js").read_text()

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from own_process import printed
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.exchange.trials_csv import TrialRecord, read_trials
 from evaluator.compare import compare_run
 from evaluator.report.parquet import (

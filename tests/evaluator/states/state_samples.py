@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import PointCloudSample, PoseSample
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.point_cloud import PointCloudSample
 from bridge.episode.reader import Episode
-from bridge.episode.records import PoseSample
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.task.plan import Plan, Stage, Waypoint

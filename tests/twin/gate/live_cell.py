@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from bridge.episode.records import (
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from gate_fakes import TASK, accept
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import OptionError, UsageError
 from bridge.geometry import se3
 from bridge.task.task_file import load_task

@@ -14,7 +14,7 @@ from gate_fakes import accept
 from loopback import free_endpoint
 
 from bridge.episode import schema
-from bridge.episode.records import (
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from gate_fakes import PLAN, FakeEyes, gate_with
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import InvalidRecordError, UsageError
 from bridge.task.verdict import Verdict
 from bridge.terminal import Output, stop_signals

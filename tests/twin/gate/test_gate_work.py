@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.task.plan import Plan
 from bridge.task.robot import ROBOT_NAME, ur5_with_gripper_urdf

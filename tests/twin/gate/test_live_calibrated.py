@@ -10,9 +10,7 @@ import pytest
 from live_cell import CAMERA, IMAGE, S, calibrate, event, look, place, shoot
 
 from bridge.episode import schema
-from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.reader import Episode
-from bridge.episode.records import (
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,
@@ -21,7 +19,9 @@ from bridge.episode.records import (
     string_to_cdr,
     transforms_to_cdr,
 )
-from bridge.episode.run import RunFolder
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3

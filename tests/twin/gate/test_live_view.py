@@ -4,14 +4,10 @@ import numpy as np
 import pytest
 from live_cell import IMAGE, S, calibrate, event, look, place, shoot
 
-from bridge.episode import cdr, schema
-from bridge.episode.records import (
-    CompressedColor,
-    DepthImage,
-    PoseSample,
-    string_to_cdr,
-)
-from bridge.episode.transcode import depth_to_compact
+from bridge.episode import schema
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.images import depth_to_compact
+from bridge.episode.cdr.messages import CompressedColor, DepthImage, PoseSample, string_to_cdr
 from twin.scene.localise.live import LiveView
 from twin.scene.localise.live_frames import KEPT_IMAGES
 
@@ -38,7 +34,7 @@ def test_raw_colour_and_compressed_depth_are_frames_too() -> None:
         "step": 24,
         "data": pixels.tobytes(),
     }
-    raw_color = cdr.encode(schema.IMAGE, message)
+    raw_color = codec.encode(schema.IMAGE, message)
     view = ready()
     view.take("/standin/cam/side/color/image", raw_color, 0, schema.IMAGE)
     view.take("/standin/cam/side/depth/image", compact, 0, schema.COMPRESSED_IMAGE)

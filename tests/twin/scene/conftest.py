@@ -8,7 +8,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 
 
 @pytest.fixture(scope="session")

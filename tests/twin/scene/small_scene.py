@@ -4,7 +4,7 @@ from pathlib import Path
 
 import textured_room
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.terminal import Output
 from twin.scene.rebuild.run import rebuild
 from twin.scene.settings import FitConfig, InitialiseConfig, RebuildConfig

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 
 from bridge.episode import schema
-from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.records import (
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,
     FrameTransform,
     transforms_to_cdr,
 )
+from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.task.contact import Contact
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan, Stage
+from bridge.task.predicate import Contact
 from twin.replay.clearance.bodies import GRIPPER, group_of, placement_of
 from twin.replay.clearance.nodes import planes_of
 from twin.replay.clearance.surroundings import Pair, Surroundings

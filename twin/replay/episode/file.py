@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Int
 
 from bridge.episode import schema
+from bridge.episode.cdr.batch import joint_messages, pose_messages
+from bridge.episode.cdr.messages import CompressedColor, PointCloudSample, string_to_cdr
 from bridge.episode.metadata import Derived, EpisodeInfo
-from bridge.episode.point_cloud import PointCloudSample
-from bridge.episode.records import CompressedColor, string_to_cdr
-from bridge.episode.repeated import joint_messages, pose_messages
 from bridge.episode.writer import EpisodeWriter
 from bridge.task.plan import Plan, Stage
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME, GRIPPER

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import streams
+from bridge.episode.cdr.messages import CompressedColor, color_from_message
 from bridge.episode.reader import Episode
-from bridge.episode.records import CompressedColor, color_from_message
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
 from bridge.media.color import encode_jpeg

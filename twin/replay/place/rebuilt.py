@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import provenance
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.task.task_file import ObjectModel, Task
 from twin.replay.place.calibrated import Correction, correction_of
 from twin.replay.place.scene import ReplayScene

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.task.task_file import Task

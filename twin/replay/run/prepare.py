@@ -9,7 +9,7 @@ from pathlib import Path
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.task.plan import Plan
 from bridge.task.task_file import load_task
 from twin.replay.config import ReplayRunConfig

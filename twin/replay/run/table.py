@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bridge.episode import streams
-from bridge.episode.catalogue.labels import outcome_of
+from bridge.episode.catalogue import outcome_of
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 
 WORDS = {True: "accepted", False: "rejected", None: "undecided"}

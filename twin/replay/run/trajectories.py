@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Any
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.task.task_file import load_task
 from bridge.terminal import Output

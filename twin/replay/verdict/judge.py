@@ -5,7 +5,7 @@ from typing import Any
 
 from bridge.task.predicate import (
     ALLOWED_CONTACTS,
-    Finding,
+    PredicateResult,
     Rollout,
     all_hold,
     already_true_at_start,
@@ -69,13 +69,13 @@ def terminal_factor(
     )
 
 
-def _why_true(findings: list[Finding]) -> str:
+def _why_true(findings: list[PredicateResult]) -> str:
     if len(findings) > MANY:
         return "every object is where it belongs"
     return _once(finding.detail for finding in findings)
 
 
-def _why_open(findings: list[Finding], scene: ReplayScene) -> str:
+def _why_open(findings: list[PredicateResult], scene: ReplayScene) -> str:
     """What was not localised is said in the words of the clearance, which is open for it too."""
     if not findings:
         return "the task asks for nothing"

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from bridge.task.contact import Contact
-from bridge.task.predicate import Rollout
+from bridge.task.predicate import Contact, Rollout
 from bridge.task.verdict import Verdict
 from twin.replay.chance.samples import Sample
 

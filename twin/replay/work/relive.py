@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from bridge.episode import schema, streams
+from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
-from bridge.episode.records import CompressedColor
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import EpisodeError, GstError
 from bridge.task.plan import Plan
 from bridge.task.task_file import load_task

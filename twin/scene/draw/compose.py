@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3

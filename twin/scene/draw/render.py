@@ -7,7 +7,7 @@ from jaxtyping import Float, Float32, UInt16
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
 from bridge.errors import BridgeError, UsageError
 from bridge.geometry import se3

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import FrameTransform, transforms_from_cdr
 from bridge.episode.reader import Episode
-from bridge.episode.records import FrameTransform, transforms_from_cdr
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
 from bridge.task.robot import BASE_FRAME

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Int
 
 from bridge.episode import streams
+from bridge.episode.cdr.messages import FrameTransform
 from bridge.episode.reader import Episode
-from bridge.episode.records import FrameTransform
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
 from bridge.terminal import Output

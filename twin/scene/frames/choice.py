@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from bridge.episode import schema, streams
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
 from bridge.errors import BridgeError
 from bridge.terminal import Output

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Int
 
 from bridge.episode import streams
-from bridge.episode.cdr import decode
+from bridge.episode.cdr.codec import decode
+from bridge.episode.cdr.messages import DepthImage, color_from_message, stamp_of
 from bridge.episode.reader import Episode, RawMessage
-from bridge.episode.records import DepthImage, color_from_message, stamp_of
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.transforms import TransformTree
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from bridge.episode import streams
+from bridge.episode.cdr.messages import color_from_message
 from bridge.episode.reader import Episode
-from bridge.episode.records import color_from_message
 from bridge.episode.transforms import TransformTree
 from bridge.errors import EpisodeError
 from bridge.geometry import se3

@@ -3,8 +3,8 @@
 import numpy as np
 
 from bridge.episode import streams
+from bridge.episode.cdr.messages import DepthImage, color_from_message
 from bridge.episode.reader import Episode
-from bridge.episode.records import DepthImage, color_from_message
 from bridge.errors import BridgeError
 from twin.errors import TwinError
 

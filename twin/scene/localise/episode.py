@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import provenance, schema, streams
+from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
-from bridge.episode.records import PoseSample
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError
 from bridge.task.robot import BASE_FRAME

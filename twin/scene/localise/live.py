@@ -8,8 +8,9 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
-from bridge.episode import cdr, schema
-from bridge.episode.records import (
+from bridge.episode import schema
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.messages import (
     CameraInfo,
     DepthImage,
     FrameTransform,
@@ -84,7 +85,7 @@ class LiveView:
             with self._lock:
                 self._take(topic, data, type_name or schema.type_of_topic(topic) or "")
                 self._heard_ns = max(self._heard_ns, received_ns)
-        except (GstError, cdr.MalformedMessageError, ValueError):
+        except (GstError, codec.MalformedMessageError, ValueError):
             self.malformed += 1
 
     def _take(self, topic: str, data: bytes, type_name: str) -> None:

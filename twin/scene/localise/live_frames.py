@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Int
 
-from bridge.episode.records import CameraInfo, CompressedColor, DepthImage, RawColor
+from bridge.episode.cdr.messages import CameraInfo, CompressedColor, DepthImage, RawColor
 from bridge.episode.streams import PAIRING_TOLERANCE_NS, RgbdFrame, joint_track_of
 from bridge.episode.transforms import TransformTree
 from twin.errors import TwinError

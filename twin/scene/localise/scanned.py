@@ -4,7 +4,7 @@ import json
 from dataclasses import dataclass, field
 
 from bridge.episode import provenance
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.task.task_file import SCANNED, Task
 from twin.scene.localise.surface import Surface, surface_of
 from twin.scene.shape.files import MESH, TASK_SHAPE

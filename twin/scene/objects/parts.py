@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder, check_episode_id
+from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task, load_task

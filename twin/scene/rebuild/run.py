@@ -15,7 +15,7 @@ import numpy as np
 
 from bridge.episode import provenance
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import BridgeError, UsageError
 from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output

@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Bool
 
 from bridge.episode import schema, streams
+from bridge.episode.cdr.messages import CameraInfo, CompressedColor, DepthImage
 from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
-from bridge.episode.records import CameraInfo, CompressedColor, DepthImage
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.color import encode_png

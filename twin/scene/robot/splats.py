@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
 from bridge.episode import provenance
-from bridge.episode.run import RunFolder, check_episode_id
+from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.geometry import se3
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import Posture

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bridge.episode import provenance, streams
+from bridge.episode.cdr.messages import FrameTransform
 from bridge.episode.reader import Episode
-from bridge.episode.records import FrameTransform
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
 from bridge.task.robot import BASE_FRAME

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from bridge.episode import provenance
-from bridge.episode.run import RunFolder, check_episode_id
+from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.errors import PathNotFoundError, UsageError
 from twin.scene.gaussians.cloud import GaussianCloud
 from twin.scene.store.folder import (

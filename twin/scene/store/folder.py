@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.episode import provenance
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import PathNotFoundError
 from bridge.whole_file import write_whole
 from twin.errors import TwinError

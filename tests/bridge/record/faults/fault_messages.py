@@ -5,8 +5,9 @@ import io
 import numpy as np
 from PIL import Image
 
-from bridge.episode import cdr, schema
-from bridge.episode.records import CompressedColor, DepthImage, JointSample
+from bridge.episode import schema
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.messages import CompressedColor, DepthImage, JointSample
 
 STAMP = slice(4, 12)
 """Where a stamped CDR message holds its stamp; another one makes another message."""
@@ -42,7 +43,7 @@ def image(pixels: np.ndarray, encoding: str, **fields: object) -> bytes:
         "data": pixels.tobytes(),
         **fields,
     }
-    return cdr.encode(schema.IMAGE, message)
+    return codec.encode(schema.IMAGE, message)
 
 
 def jpeg(height: int = 480, width: int = 640) -> bytes:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import robot_gst
-from bridge.record.parts import Parts
+from bridge.record.episode_recording import EpisodeFiles
 
 
 def main() -> None:
@@ -33,14 +33,14 @@ def main() -> None:
         return result
 
     setattr(owner, call, counted)
-    close: Callable[[Parts], Path] = Parts.close
+    close: Callable[[EpisodeFiles], Path] = EpisodeFiles.close
 
-    def close_armed(parts: Parts) -> Path:
+    def close_armed(parts: EpisodeFiles) -> Path:
         nonlocal armed
         armed = True
         return close(parts)
 
-    Parts.close = close_armed  # type: ignore[method-assign]
+    EpisodeFiles.close = close_armed  # type: ignore[method-assign]
     sys.exit(robot_gst.main())
 
 

@@ -14,11 +14,10 @@ from fault_messages import JOINTS, RAW, depth_mm, image
 from bridge.clock import AnchoredClock
 from bridge.episode import schema
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.record.config import DiskConfig, RecorderConfig
 from bridge.record.encoders import ImageEncoder
-from bridge.record.entries import Command, Item
-from bridge.record.merge import Merge
+from bridge.record.queue import Command, Item, Merge
 from bridge.record.recorder import Recorder
 from bridge.record.sequence import Step
 from bridge.wire.session import WireSample
@@ -105,10 +104,12 @@ def test_a_write_that_is_refused_in_the_middle_of_many_loses_none_silently(
             raise OSError(number, os.strerror(number))
         return real(self, *_)  # type: ignore[arg-type]
 
-    from bridge.record.take import Take
+    from bridge.record.episode_recording import EpisodeRecording
 
-    real = Take._append
-    monkeypatch.setattr(Take, "_append", lambda *a: refuse(*a) if "raw" in a[2].topic else real(*a))
+    real = EpisodeRecording._append
+    monkeypatch.setattr(
+        EpisodeRecording, "_append", lambda *a: refuse(*a) if "raw" in a[2].topic else real(*a)
+    )
     for index in range(40):
         recorder.receive(raw(sequence=index))
         recorder.receive(make_sample(sequence=index))
@@ -141,9 +142,9 @@ def test_what_a_barrier_has_not_let_through_yet_is_given_up_with_the_rest(
 
 
 def test_the_encoder_itself_flags_what_it_cannot_read(raw: MakeSample) -> None:
-    from bridge.record.shedding import Shed
+    from bridge.record.queue import LoadShedding
 
-    encoder = ImageEncoder(RecorderConfig(), lambda: Shed.NOTHING)
+    encoder = ImageEncoder(RecorderConfig(), lambda: LoadShedding.NOTHING)
     sample = replace(raw(), data=b"\0\1\0\0short")
     item = Item(sample, Step(), 0, schema.IMAGE, 9, is_bulk=True)
     encoder.encode(item)

@@ -17,8 +17,8 @@ from fault_account import check_code, metadata, nothing_invented, read
 from fault_cell import Child, FaultCell, PublisherChild, Sent
 from fault_messages import MIX
 
+from bridge.record.control import RecorderClient
 from bridge.wire.config import WireConfig
-from bridge.wire.recorder_client import RecorderClient
 from bridge.wire.session import open_session
 
 TAIL_S = 0.5

@@ -19,7 +19,7 @@ from fault_account import LiveCell, accounts_are_exact, check_code, ledger, lost
 from fault_messages import color, depth_mm, image, joints, jpeg
 
 from bridge.episode import schema
-from bridge.wire.attachment import Attachment, encode
+from bridge.wire.publisher import Attachment, encode
 
 GID, OTHER_GID = b"g" * 16, b"h" * 16
 

@@ -11,7 +11,7 @@ from fault_cell import FaultCell, PublisherChild
 from fault_messages import JOINTS, MIX, streams
 from loopback import free_endpoint
 
-from bridge.wire.attachment import Attachment, encode
+from bridge.wire.publisher import Attachment, encode
 
 STOP_S = 3.0
 HUGE_BYTES = 200_000_000

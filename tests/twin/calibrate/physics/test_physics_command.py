@@ -12,11 +12,11 @@ import pytest
 
 import robot_gst
 from bridge.episode import schema
-from bridge.episode.catalogue.labels import write_label
+from bridge.episode.catalogue import write_label
+from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
-from bridge.episode.records import JointSample
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import JointTrack
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from bridge.episode import schema
-from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.reader import Episode
-from bridge.episode.records import (
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     FrameTransform,
@@ -19,7 +17,9 @@ from bridge.episode.records import (
     string_to_cdr,
     transforms_to_cdr,
 )
-from bridge.episode.run import RunFolder
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import FrameNotFoundError, TransformTree
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3

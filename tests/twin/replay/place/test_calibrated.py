@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from bridge.episode import schema, streams
+from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.records import string_to_cdr
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.task.task_file import load_task

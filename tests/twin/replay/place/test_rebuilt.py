@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.task.task_file import load_task
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel

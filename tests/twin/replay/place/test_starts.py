@@ -6,7 +6,7 @@ import pytest
 
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import PathNotFoundError
 from bridge.task.task_file import load_task

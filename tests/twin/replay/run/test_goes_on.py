@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import JointSample, string_to_cdr
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.records import JointSample, string_to_cdr
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.task.plan import Plan
 from bridge.task.robot import ARM_JOINTS

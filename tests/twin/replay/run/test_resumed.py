@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from bridge.episode import schema, streams
+from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.records import string_to_cdr
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.task.record import parse_record

@@ -11,10 +11,10 @@ import pytest
 from mcap.reader import make_reader
 
 from bridge.episode import schema, streams
+from bridge.episode.cdr.messages import JointSample, string_to_cdr
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.records import JointSample, string_to_cdr
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.task.verdict import Factor, Verdict

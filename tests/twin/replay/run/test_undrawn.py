@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import PathNotFoundError
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig

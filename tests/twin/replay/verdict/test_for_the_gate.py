@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.terminal import Output
 from twin.gate.config import GateConfig
 from twin.gate.judge import UndecidedError

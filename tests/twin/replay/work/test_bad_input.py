@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.records import JointSample
 from bridge.episode.writer import EpisodeWriter
 from twin.replay.config import ReplayConfig
 from twin.replay.failure import NotEvaluatedError

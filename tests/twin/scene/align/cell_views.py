@@ -7,10 +7,8 @@ from functools import cache
 import numpy as np
 
 from bridge.geometry import se3
-from bridge.sources.standin.cell_file import load_cell
-from bridge.sources.standin.hidden import nominal_hidden
-from bridge.sources.standin.render import Renderer
-from bridge.sources.standin.sensor import measure_depth
+from bridge.sources.standin.cell_file import load_cell, nominal_hidden
+from bridge.sources.standin.render import Renderer, measure_depth
 from bridge.sources.standin.surfaces import object_surfaces, robot_surfaces, room_surfaces
 from bridge.task.robot import ur5_with_gripper_urdf
 from bridge.task.task_file import load_task

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import textured_room
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.media.color import decode_color

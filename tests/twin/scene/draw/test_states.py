@@ -11,7 +11,7 @@ import textured_room
 from small_scene import CONFIG, QUIET
 
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.geometry import se3
 from bridge.media.color import decode_color

@@ -8,7 +8,7 @@ import pytest
 import textured_room
 
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import JointTrack
 from bridge.errors import GstError
 from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf

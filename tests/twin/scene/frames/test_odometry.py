@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.exchange.rgbd import write_scan
 from bridge.geometry import se3
-from bridge.sources.folder import folder_messages
-from bridge.sources.folder_config import FolderConfig
-from bridge.sources.folder_index import read_index
+from bridge.sources.folder.config import FolderConfig
+from bridge.sources.folder.messages import folder_messages, read_index
 from twin.scene.frames.choice import choose_frames, find_sources
 from twin.scene.settings import FrameConfig
 

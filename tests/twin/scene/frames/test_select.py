@@ -9,7 +9,7 @@ import textured_room
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from twin.scene.frames.choice import choose_frames, find_sources
 from twin.scene.frames.select import path_length_m, pick, sharpness, smear_px

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import textured_room
 
-from bridge.episode import cdr, schema, streams
+from bridge.episode import schema, streams
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.messages import CameraInfo, FrameTransform
 from bridge.episode.reader import Episode
-from bridge.episode.records import CameraInfo, FrameTransform
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
@@ -143,8 +144,8 @@ def test_a_lens_that_distorts_is_refused_by_the_name_of_its_camera(
     encode = CameraInfo.to_cdr
 
     def distorted(self: CameraInfo) -> bytes:
-        message = cdr.decode(schema.CAMERA_INFO, encode(self))
-        return cdr.encode(schema.CAMERA_INFO, {**message, "d": np.array([0.1, 0, 0, 0, 0])})
+        message = codec.decode(schema.CAMERA_INFO, encode(self))
+        return codec.encode(schema.CAMERA_INFO, {**message, "d": np.array([0.1, 0, 0, 0, 0])})
 
     with monkeypatch.context() as spoilt:
         spoilt.setattr(CameraInfo, "to_cdr", distorted)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import textured_room
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from twin.scene.frames.choice import choose_frames, find_sources
 from twin.scene.frames.thumb import Thumb, thumb_of

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import textured_room
 
-from bridge.cli.imports import import_rgbd
-from bridge.episode.run import RunFolder
+from bridge.cli.exchange import import_rgbd
+from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.terminal import Output

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import textured_room
 
-from bridge.episode.records import FrameTransform
-from bridge.episode.run import RunFolder
+from bridge.episode.cdr.messages import FrameTransform
+from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.terminal import Output
 from twin.scene.frames.choice import FrameChoice, choose_frames, find_sources, root_frame

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from bridge.episode import schema
-from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.reader import Episode
-from bridge.episode.records import (
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,
     FrameTransform,
     transforms_to_cdr,
 )
-from bridge.episode.run import RunFolder
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame, localisations
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import GstError

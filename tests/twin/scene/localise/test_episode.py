@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from bridge.episode import schema, streams
-from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.reader import Episode
-from bridge.episode.records import (
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,
@@ -20,7 +18,9 @@ from bridge.episode.records import (
     PoseSample,
     transforms_to_cdr,
 )
-from bridge.episode.run import RunFolder
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.color import encode_jpeg

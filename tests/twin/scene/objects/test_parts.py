@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.scene.gaussians.cloud import GaussianCloud, as_float32

@@ -14,7 +14,7 @@ from small_scene import CONFIG, QUIET
 
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from twin.replay.config import ReplayRunConfig

@@ -7,9 +7,9 @@ import pytest
 import textured_room
 
 from bridge.episode import streams
+from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.reader import Episode
-from bridge.episode.records import CompressedColor, DepthImage
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import PathNotFoundError, UsageError
 from bridge.media.color import decode_color
 from bridge.terminal import Output

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from bridge.episode import schema
+from bridge.episode.cdr.messages import JointSample, string_to_cdr
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
-from bridge.episode.records import JointSample, string_to_cdr
-from bridge.episode.run import RunFolder
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from bridge.episode import schema
-from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.records import (
+from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,
@@ -17,7 +16,8 @@ from bridge.episode.records import (
     string_to_cdr,
     transforms_to_cdr,
 )
-from bridge.episode.run import RunFolder
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.media.color import encode_png

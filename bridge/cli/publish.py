@@ -1,0 +1,222 @@
+"""Commands that publish: an RGB-D folder, the stand-in cell."""
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from bridge.sources.folder.config import FolderConfig
+from bridge.sources.realsense.config import RealSenseConfig
+from bridge.sources.standin.settings import SessionConfig
+from bridge.sources.ur.config import UrConfig
+from bridge.terminal import Output, stop_signals
+from bridge.wire.config import DEFAULT_ENDPOINT
+
+OUTPUT = Output()
+FOLDER = FolderConfig()
+STANDIN = SessionConfig()
+LOOPBACK = (DEFAULT_ENDPOINT,)
+
+
+def publish_folder(
+    folder: Path,
+    /,
+    *,
+    config: Annotated[FolderConfig, Parameter(name="*")] = FOLDER,
+    fast: bool = False,
+    episode: str | None = None,
+    recorder: str = "main",
+    connect: tuple[str, ...] = LOOPBACK,
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Publish an RGB-D folder (scene.json, TUM or 7-Scenes layout) as if it were a live camera.
+
+    Example: robot-gst publish folder data/kitchen --cell kitchen --camera kinect --episode scan
+
+    Args:
+        folder: Folder of one of the three layouts (docs/rgbd_folder.md).
+        config: Names and rate.
+        fast: Send as fast as the recorder takes it; stamps keep their distance.
+        episode: Ask the recorder to record this episode from the first to the last frame.
+        recorder: Name of the recorder.
+        connect: Where it listens.
+        zenoh_config: zenoh configuration (JSON5).
+        output: How to talk.
+    """
+    from bridge.errors import GstError
+    from bridge.record.control import RecorderClient
+    from bridge.record.status import describe_answer
+    from bridge.sources.folder.messages import num_frames, read_index
+    from bridge.sources.folder.publish import publish_folder_frames
+    from bridge.wire.config import WireConfig
+    from bridge.wire.session import open_session
+
+    index = read_index(folder, config)
+    output.say(f"{index.path}: {index.summary}")
+    answer: dict[str, Any] | None = None
+    wire = WireConfig(connect=connect, config=zenoh_config)
+    with stop_signals() as stop, open_session(wire) as session:
+        client = RecorderClient(session, recorder)
+        if episode is not None:
+            info = {"kind": "scan", "cell": config.cell, "tags": [f"folder:{index.name}"]}
+            client.start(episode, info)
+        try:
+            with output.progress("publish", num_frames(index, config)) as advance:
+                sent = publish_folder_frames(
+                    session, index, config, fast=fast, should_stop=stop.is_set, advance=advance
+                )
+        except GstError:
+            if episode is not None:  # a part of a folder is no scan
+                with contextlib.suppress(GstError):  # the first error is the one to show
+                    client.stop(discard=True)
+            raise
+        if episode is not None:
+            answer = client.stop()
+    text = f"{sent['frames']} of {sent['of']} frames, {sent['messages']} messages sent"
+    if answer is not None:
+        text += f"\n{describe_answer(answer)}"
+    output.result({"sent": sent, "recorded": answer}, text)
+    return 0
+
+
+def publish_standin(
+    *,
+    config: Annotated[SessionConfig, Parameter(name="*")] = STANDIN,
+    connect: tuple[str, ...] = LOOPBACK,
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Run the stand-in cell: a simulated laboratory that records a scan, trials, then probes.
+
+    It needs a recorder (robot-gst record RUN) and, with replanning, a gate (robot-gst gate RUN).
+    SIGINT or SIGTERM finish the open episode.
+    Example: robot-gst publish standin --trials 3 --seed 1
+    Scan only: robot-gst publish standin --trials 0
+    Probes of physics only: robot-gst publish standin --trials 0 --no-scan --probes 4
+    Soft toys: robot-gst publish standin --task sloth_into_basket --conditions without_replanning
+
+    Args:
+        config: What the session does.
+        connect: Where the recorder listens.
+        zenoh_config: zenoh configuration (JSON5).
+        output: How to talk.
+    """
+    from bridge.sources.standin.session import describe, run_session
+    from bridge.wire.config import WireConfig
+    from bridge.wire.session import open_session
+
+    wire = WireConfig(connect=connect, config=zenoh_config)
+    with stop_signals() as stop, open_session(wire) as session:
+        summary = run_session(session, config, output, should_stop=stop.is_set)
+    output.result(summary, describe(summary))
+    return 0
+
+
+# --- Commands that publish hardware: RealSense cameras and UR arms.
+
+REALSENSE = RealSenseConfig()
+UR = UrConfig()
+Duration = Annotated[float | None, Parameter(name=("--duration", "--duration-s"))]
+
+
+def publish_realsense(
+    *,
+    config: Annotated[RealSenseConfig, Parameter(name="*")] = REALSENSE,
+    list: Annotated[bool, Parameter(negative=())] = False,
+    duration_s: Duration = None,
+    connect: tuple[str, ...] = LOOPBACK,
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Publish RealSense cameras (D435, D405 and others): colour, depth, calibration.
+
+    It runs until SIGINT or SIGTERM; a camera that was unplugged is taken up again.
+    Example: robot-gst publish realsense --cell lab --camera side=123622270224
+
+    Args:
+        config: Which cameras, and how.
+        list: Say what is attached and end.
+        duration_s: Stop after this long [s].
+        connect: Where the recorder listens.
+        zenoh_config: zenoh configuration (JSON5).
+        output: How to talk.
+    """
+    from bridge.sources.realsense.device import describe_device
+    from bridge.sources.realsense.publish import attached_devices, choose_cameras, publish_cameras
+    from bridge.wire.config import WireConfig
+    from bridge.wire.session import open_session
+
+    list_devices = attached_devices()
+    if list:
+        found = [describe_device(device) for device in list_devices()]
+        output.result({"cameras": found}, "\n".join(found) or "no RealSense camera is attached")
+        return 0
+    choose_cameras(config, list_devices)
+    wire = WireConfig(
+        connect=connect, config=zenoh_config, shared_memory_mb=config.shared_memory_mb
+    )
+    with _stopping(duration_s) as stop, open_session(wire) as session:
+        counts = publish_cameras(
+            session, config, stop=stop, output=output, list_devices=list_devices
+        )
+    lines = [
+        f"{camera}: {sent['color_frames']} colour and {sent['depth_frames']} depth frames sent, "
+        f"{sent['color_lost']} and {sent['depth_lost']} lost on the way from the camera"
+        for camera, sent in counts.items()
+    ]
+    output.result({"cameras": counts}, "\n".join(lines))
+    return 0
+
+
+def publish_ur(
+    host: str,
+    /,
+    *,
+    config: Annotated[UrConfig, Parameter(name="*")] = UR,
+    duration_s: Duration = None,
+    connect: tuple[str, ...] = LOOPBACK,
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Publish a UR arm over RTDE: joints, TCP, gripper, URDF, robot and safety mode. Reads only.
+
+    It runs until SIGINT or SIGTERM; a robot that went away is taken up again.
+    Example: robot-gst publish ur 192.168.1.10 --cell lab --gripper tool_analog_in:0
+
+    Args:
+        host: Name or address of the controller.
+        config: What is read, and how.
+        duration_s: Stop after this long [s].
+        connect: Where the recorder listens.
+        zenoh_config: zenoh configuration (JSON5).
+        output: How to talk.
+    """
+    from bridge.sources.ur.publish import describe_counts, publish_arm
+    from bridge.wire.config import WireConfig
+    from bridge.wire.session import open_session
+
+    wire = WireConfig(connect=connect, config=zenoh_config)
+    with _stopping(duration_s) as stop, open_session(wire) as session:
+        counts = publish_arm(session, host, config, stop=stop, output=output)
+    output.result(counts, describe_counts(counts))
+    return 0
+
+
+@contextmanager
+def _stopping(duration_s: float | None) -> Iterator[threading.Event]:
+    """An event that is set by a signal, or when the time is over."""
+    with stop_signals() as stop:
+        timer = None if duration_s is None else threading.Timer(duration_s, stop.set)
+        if timer is not None:
+            timer.daemon = True
+            timer.start()
+        try:
+            yield stop
+        finally:
+            if timer is not None:
+                timer.cancel()

@@ -1,0 +1,268 @@
+"""A run's episodes at a glance: listed, filtered and labelled.
+
+The answers come from ``catalogue.sqlite`` in the run folder, a cache that is brought up to date
+before each answer: one look at the folder, and only files that changed are opened.
+"""
+
+import contextlib
+import json
+import sqlite3
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+from bridge.episode.catalogue_store import (
+    FILE_NAME,
+    LABEL_SUFFIX,
+    CatalogueQuery,
+    CatalogueStore,
+    Trace,
+    is_damaged,
+    printable,
+    scan,
+    trace,
+)
+from bridge.episode.catalogue_store import Entry as Entry
+from bridge.episode.metadata import Outcome, build
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import EPISODE_ID, RunFolder, check_episode_id, first_part
+from bridge.errors import GstError, MissingDependencyError, PathNotFoundError
+from bridge.task.record import check_record, parse_record
+from bridge.whole_file import write_whole
+
+# --- The catalogue as a Parquet table, for DuckDB, pandas and spreadsheets.
+
+
+def write_parquet(entries: Sequence[Entry], path: Path) -> None:
+    """Write one row per episode; columns are the fields of ``Entry``, times in ns.
+
+    Raises:
+        MissingDependencyError: Without pa.
+    """
+    try:
+        import pyarrow as pa  # noqa: PLC0415  # only for this export
+        from pyarrow import parquet  # noqa: PLC0415
+    except ImportError as error:
+        raise MissingDependencyError(
+            package="pyarrow", extra="report", purpose="exporting the catalogue to Parquet"
+        ) from error
+
+    types: dict[Any, Any] = {
+        str: pa.string(),
+        str | None: pa.string(),
+        int: pa.int64(),
+        int | None: pa.int64(),
+        float: pa.float64(),
+        bool: pa.bool_(),
+        tuple[str, ...]: pa.list_(pa.string()),
+    }
+    names = [(item.name, types[item.type]) for item in fields(Entry)]
+    rows = [{**vars(entry), "tags": list(entry.tags)} for entry in entries]
+    table = pa.Table.from_pylist(rows, schema=pa.schema(names))
+    sink = pa.BufferOutputStream()
+    parquet.write_table(table, sink, compression="zstd")
+    write_whole(path, sink.getvalue().to_pybytes())
+
+
+# --- Answers from the catalogue after bringing it up to date.
+#
+# The modules that open episodes are imported only when there is something to open.
+
+Advance = Callable[[int, int], None]
+"""Called as ``advance(done, total)`` while files are read."""
+BATCH = 256
+"""Episodes read between two writes; an interrupted first listing keeps what it has."""
+
+
+def find_episodes(
+    run: RunFolder, query: CatalogueQuery, *, advance: Advance | None = None
+) -> list[Entry]:
+    """Return the episodes that pass all filters.
+
+    Args:
+        run: The run folder; if it cannot be written, the answer is the same but takes longer.
+        query: What to look for.
+        advance: Called while files are read that the catalogue does not know yet.
+    """
+    path = run.path / FILE_NAME
+    try:
+        return _answer(run, CatalogueStore(path), query, advance)
+    except sqlite3.Error as error:
+        damaged = is_damaged(error)
+    if damaged:
+        with contextlib.suppress(OSError, sqlite3.Error):
+            path.unlink()
+            return _answer(run, CatalogueStore(path), query, advance)
+    return _answer(run, CatalogueStore(None), query, advance)
+
+
+def _answer(
+    run: RunFolder, opened: CatalogueStore, query: CatalogueQuery, advance: Advance | None
+) -> list[Entry]:
+    with opened as store:
+        _refresh(run, store, scan(run), advance)
+        return store.select(*query.to_sql())
+
+
+def _refresh(
+    run: RunFolder, store: CatalogueStore, traces: dict[str, Trace], advance: Advance | None
+) -> None:
+    known = store.stamps()
+    gone = known.keys() - traces.keys()
+    stale = [
+        found for file, found in traces.items() if not found.stamp or known.get(file) != found.stamp
+    ]
+    if gone:
+        _change(store, [], gone)
+    if not stale:
+        return
+    # noqa: PLC0415  # half of the time
+
+    for start in range(0, len(stale), BATCH):
+        rows = []
+        for found in stale[start : start + BATCH]:
+            rows.append((read_entry(run, found.path), found.stamp))
+            if advance is not None:
+                advance(start + len(rows), len(stale))
+        _change(store, rows)
+
+
+def _change(store: CatalogueStore, rows: list[tuple[Entry, str]], gone: Iterable[str] = ()) -> None:
+    try:
+        store.change(rows, gone)
+    except sqlite3.OperationalError as error:
+        if is_damaged(error):
+            raise
+        store.move_to_memory()
+        store.change(rows, gone)
+
+
+# --- Labels given after the fact: a sidecar under ``notes/``; no episode is rewritten.
+
+
+def sidecar_path(run: RunFolder, episode_id: str) -> Path:
+    """Where the label of an episode is kept."""
+    return run.notes_dir / f"{check_episode_id(episode_id)}{LABEL_SUFFIX}"
+
+
+def outcome_of(run: RunFolder, episode: Episode) -> Outcome | None:
+    """Return the label given after the fact if there is one, else what the episode says."""
+    if not EPISODE_ID.fullmatch(episode.path.stem):
+        return episode.outcome  # a file of another program; it cannot have been labelled here
+    path = sidecar_path(run, episode.path.stem)
+    if not path.is_file():
+        return episode.outcome
+    return build(Outcome, parse_record(path.read_bytes(), name="outcome"))
+
+
+def write_label(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:
+    """Write the sidecar of a finished episode.
+
+    Raises:
+        PathNotFoundError: When there is no such episode; lists those that are there.
+        InvalidRecordError: When the outcome does not fit its schema.
+    """
+    path = sidecar_path(run, episode_id)
+    episode = run.episodes_dir / f"{episode_id}.mcap"
+    if not episode.is_file():
+        names = ", ".join(path.stem for path in run.episodes()[:10]) or "none"
+        raise PathNotFoundError(path=episode, what="episode", hint=f"Episodes here: {names}.")
+    record = json.loads(json.dumps(asdict(outcome)))
+    check_record(record, name="outcome")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, (json.dumps(record, indent=1) + "\n").encode())
+    return path
+
+
+# --- Opens an episode and sums it up in one line of the catalogue.
+
+_LARGEST = 2**63 - 1
+
+
+def read_entry(run: RunFolder, path: Path) -> Entry:
+    """Open an episode and sum it up; a broken one is listed with its error."""
+    parts: tuple[Path, ...] = (path,)
+    name: dict[str, Any] = {"file": printable(path.name), "id": printable(path.stem)}
+    try:
+        episode = Episode.open(path)
+        parts = episode.parts
+        info, outcome = episode.info, outcome_of(run, episode)
+        messages = sum(topic.count for topic in episode.topics().values())
+    except GstError as error:
+        return Entry(**name, **_extent(parts), error=printable(str(error)))
+    records = episode.metadata_records
+    return Entry(
+        **name,
+        **_extent(parts),
+        kind=printable(info.kind),
+        task=printable(info.task),
+        condition=printable(info.condition),
+        policy=printable(info.policy),
+        start_id=None if info.start_id is None else printable(info.start_id),
+        trial=None if info.trial is None else _fit(info.trial),
+        operator=printable(info.operator),
+        robot=printable(info.robot),
+        cell=printable(info.cell),
+        stand_in=info.stand_in,
+        tags=tuple(printable(str(tag)) for tag in info.tags),
+        outcome=printable(outcome.result) if outcome else "unknown",
+        start_ns=_fit(episode.start_ns),
+        duration_s=episode.duration_s,
+        messages=messages,
+        lost=_declared_lost(records.get("drops")),
+        recovered="recovered" in records,
+    )
+
+
+def _extent(parts: tuple[Path, ...]) -> dict[str, Any]:
+    sizes = [part.stat().st_size for part in parts if part.is_file()]
+    return {"size_bytes": sum(sizes), "parts": len(parts)}
+
+
+def _declared_lost(drops: dict[str, Any] | None) -> int | None:
+    if drops is None:
+        return None
+    counts: Iterable[Any] = (drops.get(name, 0) for name in ("gaps", "queue_drops", "shed"))
+    found = [count for count in counts if isinstance(count, int)]
+    return _fit(sum(found)) if len(found) == 3 else None
+
+
+def _fit(number: int) -> int:
+    """Clamp to what a database column holds; other programs write what they like."""
+    return max(-_LARGEST, min(_LARGEST, number))
+
+
+# --- List all of a run, label an episode, enter a finished one.
+
+EVERYTHING = CatalogueQuery()
+NOTE_BUSY_S = 0.2
+"""How long a recorder waits for another process that is writing the catalogue [s]."""
+
+
+def list_episodes(run: RunFolder) -> list[Entry]:
+    """Return an entry for every recorded episode; a broken one is listed with its error."""
+    return find_episodes(run, EVERYTHING)
+
+
+def label_episode(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:
+    """Write a label beside the run; the episode file is not touched."""
+    path = write_label(run, episode_id, outcome)
+    note_finished(run, run.episodes_dir / f"{episode_id}.mcap")
+    return path
+
+
+def note_finished(run: RunFolder, path: Path) -> None:
+    """Enter one episode, so that whoever reads the database finds it; takes milliseconds.
+
+    Never raises: the next listing enters what is missing.
+
+    Args:
+        run: The run folder.
+        path: Any part of a finished episode.
+    """
+    with contextlib.suppress(Exception):  # a cache is not worth an episode
+        first = first_part(path)
+        found = trace(run, first)
+        with CatalogueStore(run.path / FILE_NAME, busy_s=NOTE_BUSY_S) as store:
+            store.change([(read_entry(run, first), found.stamp)])

@@ -1,0 +1,514 @@
+"""Typed records over the ROS 2 messages an episode holds, with their CDR form.
+
+``stamp_ns`` is the source time (``header.stamp``). Camera intrinsics follow ``Camera`` (pixel
+centres at +0.5) in memory and ROS (centres at whole numbers) on disk.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8, UInt16
+
+from bridge.clock import join_ns, split_ns
+from bridge.episode import protobuf, schema
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.codec import MalformedMessageError, Message
+from bridge.episode.cdr.images import (
+    COLOR_LAYOUTS,
+    DEPTH_ENCODINGS,
+    image_header,
+    image_to_jpeg,
+    pixel_rows,
+)
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.media import depth
+from bridge.media.color import decode_color
+from bridge.media.video import VIDEO_FORMAT
+
+# --- The preview stream of a camera: H.264 frames as ``foxglove.CompressedVideo`` in protobuf.
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoFrame:
+    """One frame of a video stream; it may need the frames before it to be shown."""
+
+    stamp_ns: int
+    frame_id: str
+    data: bytes
+    format: str
+
+    @staticmethod
+    def from_protobuf(data: bytes) -> "VideoFrame":
+        """Read a foxglove.CompressedVideo.
+
+        Raises:
+            MalformedMessageError: The bytes are no such message.
+        """
+        found: dict[int, bytes] = {}
+        try:
+            for number, value in protobuf.fields(memoryview(data)):
+                if 1 <= number <= 4:
+                    if isinstance(value, int):
+                        raise ValueError(_not_bytes(number))
+                    found[number] = bytes(value)
+            return VideoFrame(
+                stamp_ns=_stamp(found.get(1, b"")),
+                frame_id=found.get(2, b"").decode(),
+                data=found.get(3, b""),
+                format=found.get(4, b"").decode(),
+            )
+        except ValueError as error:
+            raise MalformedMessageError(
+                type_name=schema.COMPRESSED_VIDEO, found=str(error)
+            ) from error
+
+
+def _not_bytes(number: int) -> str:
+    return f"field {number} is a number"
+
+
+def _stamp(data: bytes) -> int:
+    parts = {1: 0, 2: 0}
+    for number, value in protobuf.fields(memoryview(data)):
+        if number in parts:
+            if not isinstance(value, int):
+                message = "the time is not made of numbers"
+                raise ValueError(message)
+            parts[number] = protobuf.signed(value)
+    return join_ns(parts[1], parts[2])
+
+
+def video_message(stamp_ns: int, frame_id: str, data: bytes) -> bytes:
+    """Serialise one H.264 frame (Annex B) as foxglove.CompressedVideo."""
+    seconds, nanos = split_ns(stamp_ns)
+    timestamp = protobuf.number_field(1, seconds) + protobuf.number_field(2, nanos)
+    return b"".join(
+        [
+            protobuf.bytes_field(1, timestamp),
+            protobuf.bytes_field(2, frame_id.encode()),
+            protobuf.bytes_field(3, data),
+            protobuf.bytes_field(4, VIDEO_FORMAT.encode()),
+        ]
+    )
+
+
+def _header(stamp_ns: int, frame_id: str) -> dict[str, object]:
+    sec, nanosec = split_ns(stamp_ns)
+    return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
+
+
+def stamp_of(message: Message) -> int:
+    """Return ``header.stamp`` of a decoded message [ns]."""
+    stamp = message["header"]["stamp"]
+    return join_ns(stamp["sec"], stamp["nanosec"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointSample:
+    """Joint positions, and velocities and efforts where known [rad, m; per second; Nm, N]."""
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    position: Float[np.ndarray, " num_joints"]
+    velocity: Float[np.ndarray, " num_velocities"]
+    effort: Float[np.ndarray, " num_efforts"]
+
+    def to_cdr(self) -> bytes:
+        """Serialise as sensor_msgs/JointState."""
+        message = {
+            "header": _header(self.stamp_ns, ""),
+            "name": list(self.names),
+            "position": self.position,
+            "velocity": self.velocity,
+            "effort": self.effort,
+        }
+        return codec.encode(schema.JOINT_STATE, message)
+
+    @staticmethod
+    def from_cdr(data: bytes) -> "JointSample":
+        """Read a sensor_msgs/JointState."""
+        message = codec.decode(schema.JOINT_STATE, data)
+        if len(message["position"]) not in (0, len(message["name"])):
+            found = f"{len(message['position'])} positions of {len(message['name'])} joints"
+            raise codec.MalformedMessageError(type_name=schema.JOINT_STATE, found=found)
+        return JointSample(
+            stamp_ns=stamp_of(message),
+            names=tuple(message["name"]),
+            position=np.asarray(message["position"]),
+            velocity=np.asarray(message["velocity"]),
+            effort=np.asarray(message["effort"]),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompressedColor:
+    """A JPEG or PNG colour image as it travels; ``format`` also tells compressed depth."""
+
+    stamp_ns: int
+    frame_id: str
+    format: str
+    data: bytes
+
+    def to_cdr(self) -> bytes:
+        """Serialise as sensor_msgs/CompressedImage."""
+        message = {
+            "header": _header(self.stamp_ns, self.frame_id),
+            "format": self.format,
+            "data": self.data,
+        }
+        return codec.encode(schema.COMPRESSED_IMAGE, message)
+
+    @staticmethod
+    def from_cdr(data: bytes) -> "CompressedColor":
+        """Read a sensor_msgs/CompressedImage."""
+        message = codec.decode(schema.COMPRESSED_IMAGE, data)
+        return CompressedColor(
+            stamp_ns=stamp_of(message),
+            frame_id=message["header"]["frame_id"],
+            format=message["format"],
+            data=message["data"],
+        )
+
+    def image_u8(self) -> UInt8[np.ndarray, "height width 3"]:
+        """Decode to sRGB; raises ``UnreadableImageError``."""
+        return decode_color(self.data)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawColor:
+    """An uncompressed colour image: pixels in the order that ``encoding`` states."""
+
+    stamp_ns: int
+    frame_id: str
+    encoding: str
+    pixels: UInt8[np.ndarray, "height width channels"]
+
+    @staticmethod
+    def from_cdr(data: bytes) -> "RawColor":
+        """Read a sensor_msgs/Image of 8-bit colour or grey; refuses other encodings."""
+        header = image_header(data)
+        if header.encoding not in COLOR_LAYOUTS:
+            raise _no_color(header.encoding)
+        channels = COLOR_LAYOUTS[header.encoding][1]
+        rows = pixel_rows(data, header, channels)
+        return RawColor(
+            stamp_ns=header.stamp_ns,
+            frame_id=header.frame_id,
+            encoding=header.encoding,
+            pixels=rows.reshape(header.height, header.width, channels),
+        )
+
+    def image_u8(self) -> UInt8[np.ndarray, "height width 3"]:
+        """Put the channels in order; grey becomes three equal ones, alpha is dropped."""
+        layout, channels = COLOR_LAYOUTS[self.encoding]
+        order = [0, 0, 0] if channels == 1 else [layout.index(channel) for channel in "RGB"]
+        return self.pixels[..., order]
+
+
+def _no_color(encoding: str) -> codec.MalformedMessageError:
+    found = f"encoding {encoding!r}, expected one of {', '.join(COLOR_LAYOUTS)}"
+    return codec.MalformedMessageError(type_name=schema.IMAGE, found=found)
+
+
+def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColor:
+    """Read a colour image, compressed or raw; both have ``stamp_ns`` and ``image_u8()``.
+
+    Raises:
+        MalformedMessageError: The bytes are no such message.
+    """
+    return (RawColor if type_name == schema.IMAGE else CompressedColor).from_cdr(data)
+
+
+def color_file_from_message(type_name: str, data: bytes) -> CompressedColor:
+    """Read a colour image as a file to show: as it was recorded, or as JPEG when it is raw.
+
+    Raises:
+        MalformedMessageError: The bytes are no such message, or hold no 8-bit colour.
+    """
+    if type_name != schema.IMAGE:
+        return CompressedColor.from_cdr(data)
+    jpeg = image_to_jpeg(data)
+    if jpeg is None:
+        raise _no_color(image_header(data).encoding)
+    return CompressedColor.from_cdr(jpeg)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthImage:
+    """Depth along the optical axis in whole millimetres; 0 is "no measurement"."""
+
+    stamp_ns: int
+    frame_id: str
+    depth_mm: UInt16[np.ndarray, "height width"]
+
+    def to_cdr(self) -> bytes:
+        """Serialise as sensor_msgs/Image with encoding 16UC1."""
+        height, width = self.depth_mm.shape
+        message = {
+            "header": _header(self.stamp_ns, self.frame_id),
+            "height": height,
+            "width": width,
+            "encoding": "16UC1",
+            "is_bigendian": 0,
+            "step": 2 * width,
+            "data": self.depth_mm.astype("<u2").tobytes(),
+        }
+        return codec.encode(schema.IMAGE, message)
+
+    @staticmethod
+    def from_cdr(data: bytes) -> "DepthImage":
+        """Read a sensor_msgs/Image; refuses other encodings and sizes that do not match."""
+        header = image_header(data)
+        if header.encoding not in DEPTH_ENCODINGS:
+            raise codec.MalformedMessageError(
+                type_name=schema.IMAGE, found=f"encoding {header.encoding!r}, expected '16UC1'"
+            )
+        rows = np.ascontiguousarray(pixel_rows(data, header, 2))
+        return DepthImage(
+            stamp_ns=header.stamp_ns,
+            frame_id=header.frame_id,
+            depth_mm=rows.view(">u2" if header.is_bigendian else "<u2").astype(np.uint16),
+        )
+
+    @staticmethod
+    def from_message(type_name: str, data: bytes) -> "DepthImage":
+        """Read depth in any form an episode may hold: raw, or compressed as RVL or PNG.
+
+        Raises:
+            MalformedMessageError: The bytes are no such message, or hold no 16-bit depth.
+            UnreadableImageError: What is compressed cannot be decoded.
+        """
+        if type_name == schema.IMAGE:
+            return DepthImage.from_cdr(data)
+        image = CompressedColor.from_cdr(data)
+        return DepthImage(
+            stamp_ns=image.stamp_ns,
+            frame_id=image.frame_id,
+            depth_mm=depth.unpack(image.format, image.data),
+        )
+
+    def depth_m(self) -> Float[np.ndarray, "height width"]:
+        """Depth in metres, 0 where there is no measurement."""
+        return self.depth_mm.astype(np.float32) * np.float32(1e-3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraInfo:
+    """Intrinsics of one image stream and the frame its images are taken in."""
+
+    stamp_ns: int
+    frame_id: str
+    camera: Camera
+
+    def to_cdr(self) -> bytes:
+        """Serialise as sensor_msgs/CameraInfo without distortion."""
+        fx, fy, cx, cy = self.camera.to_ros()
+        message = {
+            "header": _header(self.stamp_ns, self.frame_id),
+            "height": self.camera.height,
+            "width": self.camera.width,
+            "distortion_model": "plumb_bob",
+            "d": [0.0] * 5,
+            "k": [fx, 0, cx, 0, fy, cy, 0, 0, 1],
+            "r": [1, 0, 0, 0, 1, 0, 0, 0, 1],
+            "p": [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0],
+        }
+        return codec.encode(schema.CAMERA_INFO, message)
+
+    @staticmethod
+    def from_cdr(data: bytes) -> "CameraInfo":
+        """Read a sensor_msgs/CameraInfo; refuses lens distortion instead of ignoring it."""
+        message = codec.decode(schema.CAMERA_INFO, data)
+        if np.any(np.asarray(message["d"]) != 0):
+            raise codec.MalformedMessageError(
+                type_name=schema.CAMERA_INFO,
+                found="lens distortion is not zero; publish rectified images",
+            )
+        k = message["k"]
+        camera = Camera.from_ros(
+            width=message["width"],
+            height=message["height"],
+            fx=float(k[0]),
+            fy=float(k[4]),
+            cx=float(k[2]),
+            cy=float(k[5]),
+        )
+        return CameraInfo(
+            stamp_ns=stamp_of(message), frame_id=message["header"]["frame_id"], camera=camera
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameTransform:
+    """``T_parent_child`` at one instant."""
+
+    stamp_ns: int
+    parent: str
+    child: str
+    T_parent_child: Float[np.ndarray, "4 4"]
+
+
+def _pose_fields(
+    T: Float[np.ndarray, "4 4"], position: str, rotation: str
+) -> dict[str, dict[str, float]]:
+    q, p = se3.split(T)
+    return {
+        position: dict(zip("xyz", map(float, p), strict=True)),
+        rotation: dict(zip("wxyz", map(float, q), strict=True)),
+    }
+
+
+def _transform_of(
+    position: dict[str, float], rotation: dict[str, float], *, type_name: str
+) -> Float[np.ndarray, "4 4"]:
+    q = np.array([rotation[axis] for axis in "wxyz"])
+    if not 1e-6 < np.linalg.norm(q) < 1e6:
+        raise codec.MalformedMessageError(type_name=type_name, found=f"{q} (wxyz) is no rotation")
+    return se3.transform_from(q, np.array([position[axis] for axis in "xyz"]))
+
+
+def transforms_to_cdr(transforms: list[FrameTransform]) -> bytes:
+    """Serialise as tf2_msgs/TFMessage."""
+    items = [
+        {
+            "header": _header(item.stamp_ns, item.parent),
+            "child_frame_id": item.child,
+            "transform": _pose_fields(item.T_parent_child, "translation", "rotation"),
+        }
+        for item in transforms
+    ]
+    return codec.encode(schema.TF_MESSAGE, {"transforms": items})
+
+
+def transforms_from_cdr(data: bytes) -> list[FrameTransform]:
+    """Read a tf2_msgs/TFMessage."""
+    return [
+        FrameTransform(
+            stamp_ns=stamp_of(item),
+            parent=item["header"]["frame_id"],
+            child=item["child_frame_id"],
+            T_parent_child=_transform_of(
+                item["transform"]["translation"],
+                item["transform"]["rotation"],
+                type_name=schema.TF_MESSAGE,
+            ),
+        )
+        for item in codec.decode(schema.TF_MESSAGE, data)["transforms"]
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseSample:
+    """Pose ``T_frame_body`` of one body at one instant (geometry_msgs/PoseStamped)."""
+
+    stamp_ns: int
+    frame_id: str
+    T_frame_body: Float[np.ndarray, "4 4"]
+
+    def to_cdr(self) -> bytes:
+        """Serialise as geometry_msgs/PoseStamped."""
+        message = {
+            "header": _header(self.stamp_ns, self.frame_id),
+            "pose": _pose_fields(self.T_frame_body, "position", "orientation"),
+        }
+        return codec.encode(schema.POSE_STAMPED, message)
+
+    @staticmethod
+    def from_cdr(data: bytes) -> "PoseSample":
+        """Read a geometry_msgs/PoseStamped."""
+        message = codec.decode(schema.POSE_STAMPED, data)
+        pose = message["pose"]
+        return PoseSample(
+            stamp_ns=stamp_of(message),
+            frame_id=message["header"]["frame_id"],
+            T_frame_body=_transform_of(
+                pose["position"], pose["orientation"], type_name=schema.POSE_STAMPED
+            ),
+        )
+
+
+def string_to_cdr(text: str) -> bytes:
+    """Serialise as std_msgs/String."""
+    return codec.encode(schema.STRING, {"data": text})
+
+
+def string_from_cdr(data: bytes) -> str:
+    """Read a std_msgs/String."""
+    return str(codec.decode(schema.STRING, data)["data"])
+
+
+def joint_trajectory_to_cdr(
+    *,
+    stamp_ns: int,
+    names: tuple[str, ...],
+    times_ns: list[int],
+    positions_rad: Float[np.ndarray, "num_points num_joints"],
+) -> bytes:
+    """Serialise as trajectory_msgs/JointTrajectory, for viewers."""
+    points = []
+    for t_ns, row in zip(times_ns, positions_rad, strict=True):
+        sec, nanosec = split_ns(t_ns)
+        points.append({"positions": row, "time_from_start": {"sec": sec, "nanosec": nanosec}})
+    message = {"header": _header(stamp_ns, ""), "joint_names": list(names), "points": points}
+    return codec.encode(schema.JOINT_TRAJECTORY, message)
+
+
+# --- Clouds of points: sensor_msgs/PointCloud2 with x, y and z as float32, and nothing else.
+
+FLOAT32 = 7
+"""PointField's number for this type."""
+POINT_STEP = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointCloudSample:
+    """Points of one body at one instant."""
+
+    stamp_ns: int
+    frame_id: str
+    points_m: Float[np.ndarray, "num_points 3"]
+
+    def to_cdr(self) -> bytes:
+        """Serialise as sensor_msgs/PointCloud2."""
+        sec, nanosec = split_ns(self.stamp_ns)
+        count = len(self.points_m)
+        message = {
+            "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": self.frame_id},
+            "height": 1,
+            "width": count,
+            "fields": [
+                {"name": name, "offset": 4 * index, "datatype": FLOAT32, "count": 1}
+                for index, name in enumerate("xyz")
+            ],
+            "point_step": POINT_STEP,
+            "row_step": POINT_STEP * count,
+            "data": self.points_m.astype("<f4").tobytes(),
+            "is_dense": True,
+        }
+        return codec.encode(schema.POINT_CLOUD, message)
+
+    @staticmethod
+    def from_cdr(data: bytes) -> "PointCloudSample":
+        """Read a cloud as ``to_cdr`` writes it.
+
+        Raises:
+            MalformedMessageError: Another layout of fields, or bytes that are no cloud.
+        """
+        message = codec.decode(schema.POINT_CLOUD, data)
+        layout = [(item["name"], item["offset"], item["datatype"]) for item in message["fields"]]
+        raw, count = bytes(message["data"]), int(message["width"]) * int(message["height"])
+        if (
+            layout != [(name, 4 * index, FLOAT32) for index, name in enumerate("xyz")]
+            or message["is_bigendian"]
+            or int(message["point_step"]) != POINT_STEP
+            or len(raw) != POINT_STEP * count
+        ):
+            raise codec.MalformedMessageError(
+                type_name=schema.POINT_CLOUD, found=f"fields {layout} over {len(raw)} bytes"
+            )
+        return PointCloudSample(
+            stamp_ns=stamp_of(message),
+            frame_id=message["header"]["frame_id"],
+            points_m=np.frombuffer(raw, dtype="<f4").reshape(-1, 3).astype(np.float64),
+        )

@@ -1,0 +1,527 @@
+"""Yield the messages of one or several MCAP files in log order, holding few chunks at a time.
+
+Chunks may overlap in time. Each is unpacked when its first log time comes up and forgotten after
+its last message; one without a wanted topic is never read. Where so many overlap that their data
+would pass ``MEMORY_BYTES``, the one needed last is forgotten and unpacked again in its turn.
+"""
+
+import heapq
+import struct
+from array import array
+from collections.abc import Iterable, Iterator, Sequence, Set
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int64, UInt16, UInt64
+from mcap import records
+
+from bridge.episode.mcap.file import McapFile, damaged
+from bridge.episode.mcap.format import (
+    CHUNK,
+    MESSAGE,
+    MESSAGE_FIELDS,
+    MESSAGE_HEAD,
+    MESSAGE_INDEX,
+    RECORD_HEAD,
+)
+from bridge.episode.mcap.walk import (
+    DAMAGE,
+    BrokenRecordError,
+    ByteStream,
+    MessageHead,
+    Place,
+    message_head,
+    parse_chunk,
+    read_body,
+    records_in,
+    unpack_chunk,
+    walk,
+)
+
+# --- Where the messages of an unpacked chunk lie: by its message index, as far as that is right.
+#
+# Walking from record to record takes a microsecond each, and a chunk of joints and poses holds
+# thousands. The index behind the chunk says where they begin. It is only a hint: each record it
+# names is looked at, and with what lies between them they must fill the chunk. Where they do not,
+# and where there is no index, the chunk is walked through. Both ways give the same (tests compare
+# them).
+
+_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel_id", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time_ns", "<u8"),
+        ("publish_time_ns", "<u8"),
+    ]
+)
+"""``MESSAGE_HEAD`` in NumPy's words."""
+_INDEX_HEAD = struct.Struct("<HI")
+"""Channel, and bytes of the entries that follow."""
+_ENTRY_BYTES = 16
+NUM_CHANNEL_IDS = 1 << 16
+
+
+class MessageTable(NamedTuple):
+    """The messages of one chunk, in the order in which they lie there."""
+
+    log_times_ns: UInt64[np.ndarray, " num_messages"]
+    channel_ids: UInt16[np.ndarray, " num_messages"]
+    starts: Int64[np.ndarray, " num_messages"]
+    """Where each record begins in the chunk's data."""
+    ends: Int64[np.ndarray, " num_messages"]
+    """The first byte after it."""
+
+
+def mask_of(channel_ids: Iterable[int]) -> Bool[np.ndarray, " num_channel_ids"]:
+    """Return a mask over all channel ids there can be, true at these."""
+    mask = np.zeros(NUM_CHANNEL_IDS, dtype=bool)
+    mask[list(channel_ids)] = True
+    return mask
+
+
+def refuse_strays(
+    channel_ids: UInt16[np.ndarray, " num_messages"],
+    announced: Bool[np.ndarray, " num_channel_ids"],
+) -> None:
+    """Raise BrokenRecordError when a message is of a channel that was never announced."""
+    is_known = announced[channel_ids]
+    if not is_known.all():
+        channel_id = int(channel_ids[int(np.argmin(is_known))])
+        message = f"a message is of channel {channel_id}, which was never announced"
+        raise BrokenRecordError(message)
+
+
+def message_table(data: bytes, index: bytes) -> MessageTable:
+    """List the messages in a chunk.
+
+    Args:
+        data: The chunk's records, unpacked.
+        index: The message index records that follow the chunk; may be empty, or anything else.
+
+    Raises:
+        BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
+    """
+    table = by_index(data, index)
+    return by_walk(data) if table is None else table
+
+
+def by_walk(data: bytes) -> MessageTable:
+    """List the messages in a chunk by going from record to record.
+
+    Raises:
+        BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
+    """
+    times_ns, channel_ids = array("Q"), array("H")
+    starts, ends = array("q"), array("q")
+    for opcode, at, length in records_in(data):
+        if opcode == MESSAGE:
+            _, _, channel_id, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(data, at)
+            times_ns.append(log_time_ns)
+            channel_ids.append(channel_id)
+            starts.append(at)
+            ends.append(at + RECORD_HEAD.size + length)
+    return MessageTable(
+        np.array(times_ns, dtype=np.uint64),
+        np.array(channel_ids, dtype=np.uint16),
+        np.array(starts, dtype=np.int64),
+        np.array(ends, dtype=np.int64),
+    )
+
+
+def by_index(data: bytes, index: bytes) -> MessageTable | None:
+    """List the messages in a chunk where its index says; None where it does not say all or wrong.
+
+    Args:
+        data: The chunk's records, unpacked.
+        index: The message index records that follow the chunk.
+    """
+    listed = _entries(index)
+    if listed is None:
+        return None
+    channel_ids, times_ns, offsets = listed
+    if int(offsets.max()) > len(data) - MESSAGE_HEAD.size:
+        return None
+    order = np.argsort(offsets, kind="stable")
+    starts = offsets[order].astype(np.int64)
+    anywhere = np.ndarray(len(data) - _HEAD.itemsize + 1, dtype=_HEAD, buffer=data, strides=(1,))
+    heads = anywhere[starts]
+    lengths = heads["length"]
+    is_right = (
+        (heads["opcode"] == MESSAGE)
+        & (lengths >= MESSAGE_FIELDS)
+        & (lengths <= (len(data) - RECORD_HEAD.size - starts).astype(np.uint64))
+        & (heads["channel_id"] == channel_ids[order])
+        & (heads["log_time_ns"] == times_ns[order])
+    )
+    if not is_right.all():
+        return None
+    ends = starts + RECORD_HEAD.size + lengths.astype(np.int64)
+    if not _fill(data, starts, ends):
+        return None
+    return MessageTable(times_ns[order], channel_ids[order], starts, ends)
+
+
+def _entries(
+    index: bytes,
+) -> (
+    tuple[
+        UInt16[np.ndarray, " num_messages"],
+        UInt64[np.ndarray, " num_messages"],
+        UInt64[np.ndarray, " num_messages"],
+    ]
+    | None
+):
+    """Return channel, log time and offset of each entry; None where these are no such records."""
+    channels, pairs, at = list[int](), [], 0
+    while at < len(index):
+        body = at + RECORD_HEAD.size
+        if len(index) - body < _INDEX_HEAD.size:
+            return None
+        opcode, length = RECORD_HEAD.unpack_from(index, at)
+        channel_id, size = _INDEX_HEAD.unpack_from(index, body)
+        at = body + length
+        is_right = opcode == MESSAGE_INDEX and size == length - _INDEX_HEAD.size
+        if not is_right or size % _ENTRY_BYTES or at > len(index):
+            return None
+        found = np.frombuffer(index, "<u8", size // 8, body + _INDEX_HEAD.size)
+        channels.append(channel_id)
+        pairs.append(found.reshape(-1, 2))
+    counts = [len(found) for found in pairs]
+    if not sum(counts):
+        return None
+    every = np.concatenate(pairs)
+    return np.repeat(np.array(channels, dtype=np.uint16), counts), every[:, 0], every[:, 1]
+
+
+def _fill(
+    data: bytes,
+    starts: Int64[np.ndarray, " num_messages"],
+    ends: Int64[np.ndarray, " num_messages"],
+) -> bool:
+    """Whether messages and the other whole records between them fill a chunk."""
+    froms = np.concatenate([np.zeros(1, dtype=np.int64), ends])
+    tos = np.append(starts, len(data))
+    if (froms > tos).any():
+        return False
+    for gap in np.flatnonzero(froms < tos).tolist():
+        try:
+            kinds = [opcode for opcode, _, _ in records_in(data[froms[gap] : tos[gap]])]
+        except BrokenRecordError:
+            return False
+        if MESSAGE in kinds:
+            return False
+    return True
+
+
+MEMORY_BYTES = 256 << 20
+"""Unpacked chunks held at a time; one chunk may be larger."""
+NEVER = 1 << 64
+"""After every log time there can be."""
+
+
+class Stored(NamedTuple):
+    """One message as it lies in a file."""
+
+    file: McapFile
+    channel: records.Channel
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+    data: bytes
+
+
+class Selection(NamedTuple):
+    """Which messages are wanted."""
+
+    topics: frozenset[str] | None = None
+    """None for all."""
+    start_ns: int | None = None
+    """Included."""
+    end_ns: int | None = None
+    """Excluded."""
+
+    def overlaps(self, start_ns: int, end_ns: int) -> bool:
+        """Whether a stretch of time, ends included, holds a wanted one."""
+        return (self.start_ns is None or end_ns >= self.start_ns) and (
+            self.end_ns is None or start_ns < self.end_ns
+        )
+
+
+class _OpenFile:
+    """A file while it is read: opened at its first message, closed after its last."""
+
+    def __init__(self, file: McapFile, number: int, select: Selection) -> None:
+        self.file = file
+        self.number = number
+        self.select = select
+        self.wanted_channels = {
+            channel_id
+            for channel_id, channel in file.summary.channels.items()
+            if select.topics is None or channel.topic in select.topics
+        }
+        self._announced = mask_of(file.summary.channels)
+        self._chosen = mask_of(self.wanted_channels)
+        self.pending = 0
+        """Sources that still have messages."""
+        self._stream: ByteStream | None = None
+
+    def stream(self) -> ByteStream:
+        if self._stream is None:
+            self._stream = self.file.path.open("rb")
+        return self._stream
+
+    def close(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+
+    def wanted(
+        self,
+        log_times_ns: UInt64[np.ndarray, " num_messages"],
+        channel_ids: UInt16[np.ndarray, " num_messages"],
+    ) -> Bool[np.ndarray, " num_messages"]:
+        """Say of each message whether it is wanted; raises BrokenRecordError for a stray one."""
+        refuse_strays(channel_ids, self._announced)
+        wanted: Bool[np.ndarray, " num_messages"] = self._chosen[channel_ids]
+        if self.select.start_ns is not None:
+            wanted &= log_times_ns >= self.select.start_ns
+        if self.select.end_ns is not None:
+            wanted &= log_times_ns < self.select.end_ns
+        return wanted
+
+
+class _Chunk:
+    """One chunk: where it lies and, once its time has come, what is wanted of it."""
+
+    def __init__(self, file: _OpenFile, index: records.ChunkIndex) -> None:
+        self.file = file
+        self.index = index
+        self.offset: int = index.chunk_start_offset
+        self.size: int = index.uncompressed_size
+        self.next_ns: int = index.message_start_time
+        self.is_done = False
+        self._data = b""
+        self._wanted: _Wanted | None = None
+        self._position = 0
+
+    @property
+    def is_loaded(self) -> bool:
+        return self._wanted is not None
+
+    def load(self) -> None:
+        self._data, table = read_chunk(self.file.stream(), self.index, self.file.file.data_end)
+        self.size = len(self._data)
+        self._wanted = _wanted_of(table, self.file)
+        self._look_ahead()
+
+    def unload(self) -> None:
+        self._data, self._wanted = b"", None
+
+    def _look_ahead(self) -> None:
+        times_ns = self._wanted.times_ns if self._wanted else ()
+        self.is_done = self._position >= len(times_ns)
+        if not self.is_done:
+            self.next_ns = int(times_ns[self._position])
+
+    def take_until(self, limit_ns: int, wins_tie: bool) -> Iterator[tuple[MessageHead, bytes]]:
+        """Yield messages before the limit, or at it where this chunk comes first."""
+        data, wanted, position = self._data, self._wanted or _Wanted(), self._position
+        times_ns, places = wanted.times_ns, wanted.places
+        while position < len(times_ns):
+            time_ns = times_ns[position]
+            if time_ns >= limit_ns and (time_ns > limit_ns or not wins_tie):
+                break
+            at = places[position]
+            position += 1
+            head = message_head(data, at, at)
+            start = at + MESSAGE_HEAD.size
+            yield head, data[start : start + head.length]
+        self._position = position
+        self._look_ahead()
+
+
+class _Wanted(NamedTuple):
+    """Wanted messages of one chunk in log order. 16 bytes each, however many there are."""
+
+    times_ns: array = array("Q")  # type: ignore[type-arg]
+    places: array = array("Q")  # type: ignore[type-arg]
+
+
+def _wanted_of(table: MessageTable, file: _OpenFile) -> _Wanted:
+    mask = file.wanted(table.log_times_ns, table.channel_ids)
+    times_ns, places = table.log_times_ns[mask], table.starts[mask]
+    if (times_ns[1:] < times_ns[:-1]).any():
+        order = np.argsort(times_ns, kind="stable")
+        times_ns, places = times_ns[order], places[order]
+    return _Wanted(array("Q", times_ns.tobytes()), array("Q", places.tobytes()))
+
+
+def read_chunk(
+    stream: ByteStream, index: records.ChunkIndex, data_end: int
+) -> tuple[bytes, MessageTable]:
+    """Unpack a chunk, its CRC checked, and list its messages.
+
+    Raises:
+        BrokenRecordError: When there is none where the index says, or it is damaged.
+    """
+    offset = index.chunk_start_offset
+    place = next(walk(stream, offset, data_end), None)
+    if place is None or place.opcode != CHUNK:
+        message = f"the index points at byte {offset}, where no chunk lies"
+        raise BrokenRecordError(message)
+    chunk = parse_chunk(read_body(stream, place))
+    # Whatever claims more than there is cannot be the index of this chunk.
+    length = index.message_index_length
+    listed = stream.read(length) if length <= data_end - place.end else b""
+    data = unpack_chunk(chunk, whose=f"the chunk at byte {offset}")
+    return data, message_table(data, listed)
+
+
+class _Loose:
+    """The messages of a file that lie outside chunks, read one by one."""
+
+    size = 0
+    offset = 0
+    is_loaded = True
+
+    def __init__(self, file: _OpenFile) -> None:
+        self.file = file
+        found = file.file.loose()
+        times = np.array(found.log_times_ns, dtype=np.uint64)
+        wanted = file.wanted(times, np.array(found.channel_ids, dtype=np.uint16))
+        order = np.argsort(times[wanted], kind="stable")
+        self._times_ns = times[wanted][order]
+        self._offsets = np.array(found.offsets, dtype=np.uint64)[wanted][order]
+        self._position = 0
+        self.next_ns = 0
+        self.is_done = False
+        self._look_ahead()
+
+    def load(self) -> None:
+        """Nothing is held."""
+
+    def unload(self) -> None:
+        """Nothing is held."""
+
+    def _look_ahead(self) -> None:
+        self.is_done = self._position >= len(self._times_ns)
+        if not self.is_done:
+            self.next_ns = int(self._times_ns[self._position])
+
+    def take_until(self, limit_ns: int, wins_tie: bool) -> Iterator[tuple[MessageHead, bytes]]:
+        """Yield messages before the limit, or at it where this source comes first."""
+        stream = self.file.stream()
+        while not self.is_done and (
+            self.next_ns < limit_ns or (self.next_ns == limit_ns and wins_tie)
+        ):
+            offset = int(self._offsets[self._position])
+            self._position += 1
+            self._look_ahead()
+            stream.seek(offset)
+            head = message_head(stream.read(MESSAGE_HEAD.size), 0, offset)
+            payload_at = offset + MESSAGE_HEAD.size - RECORD_HEAD.size
+            yield head, read_body(stream, Place(MESSAGE, payload_at, head.length))
+
+
+_Source = _Chunk | _Loose
+_Entry = tuple[int, int, int, _Source]
+"""Log time, number of the file, offset: the order of messages; then where they come from."""
+
+
+def merged(files: Sequence[McapFile], select: Selection) -> Iterator[Stored]:
+    """Yield the wanted messages in order of log time, then of file, then of place in the file.
+
+    Raises:
+        EpisodeError: When a file is damaged or cannot be read.
+    """
+    opened = [_OpenFile(file, number, select) for number, file in enumerate(files)]
+    heap: list[_Entry] = []
+    for file in opened:
+        try:
+            for source in _sources(file):
+                heap.append((source.next_ns, file.number, source.offset, source))
+                file.pending += 1
+        except DAMAGE as error:
+            raise damaged(file.file.path, error) from error
+    heapq.heapify(heap)
+    try:
+        yield from _drained(heap)
+    finally:
+        for file in opened:
+            file.close()
+
+
+def _sources(file: _OpenFile) -> Iterable[_Source]:
+    if file.wanted_channels and file.file.loose().offsets:
+        loose = _Loose(file)
+        if not loose.is_done:
+            yield loose
+    for index in file.file.summary.chunk_indexes:
+        if not file.select.overlaps(index.message_start_time, index.message_end_time):
+            continue
+        if may_hold(index, file.wanted_channels):
+            yield _Chunk(file, index)
+
+
+def may_hold(index: records.ChunkIndex, channel_ids: Set[int]) -> bool:
+    """Whether a chunk may hold messages of some channels; one without an index may hold any."""
+    listed = index.message_index_offsets
+    return not listed or not channel_ids.isdisjoint(listed)
+
+
+def _drained(heap: list[_Entry]) -> Iterator[Stored]:
+    held = _Held()
+    while heap:
+        *_, source = heapq.heappop(heap)
+        file = source.file
+        try:
+            if source.is_loaded:
+                limit = heap[0][:3] if heap else (NEVER, 0, 0)
+                wins_tie = (file.number, source.offset) < limit[1:]
+                channels = file.file.summary.channels
+                for head, data in source.take_until(limit[0], wins_tie):
+                    yield Stored(
+                        file.file,
+                        channels[head.channel_id],
+                        head.log_time_ns,
+                        head.publish_time_ns,
+                        head.sequence,
+                        data,
+                    )
+            else:
+                held.load(source)
+        except DAMAGE as error:
+            raise damaged(file.file.path, error) from error
+        if source.is_done:
+            held.forget(source)
+            file.pending -= 1
+            if not file.pending:
+                file.close()
+        else:
+            heapq.heappush(heap, (source.next_ns, file.number, source.offset, source))
+
+
+class _Held:
+    """The chunks whose data is in memory."""
+
+    def __init__(self) -> None:
+        self._sources: set[_Source] = set()
+        self._bytes = 0
+
+    def load(self, source: _Source) -> None:
+        """Read a chunk, after those needed last made room for it."""
+        while self._sources and self._bytes + source.size > MEMORY_BYTES:
+            last = max(self._sources, key=lambda held: held.next_ns)
+            self.forget(last)
+        source.load()
+        self._sources.add(source)
+        self._bytes += source.size
+
+    def forget(self, source: _Source) -> None:
+        """Drop a chunk's data; it can be read again."""
+        if source in self._sources:
+            self._sources.remove(source)
+            self._bytes -= source.size
+        source.unload()

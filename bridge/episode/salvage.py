@@ -1,0 +1,499 @@
+"""Carry everything whole from a broken MCAP file into a new one.
+
+Chunks are copied byte for byte. Messages outside chunks are put into chunks, because readers that
+use the index see nothing else. Message indexes, summary and footer are made anew.
+"""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from bridge.episode import provenance
+from bridge.episode.mcap import format as mcap
+from bridge.episode.mcap.damaged import Contents, Cursor, RecordFile, parse_channel, parse_schema_id
+from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk
+from bridge.episode.mcap.format import crc32
+from bridge.episode.mcap.part_file import PartFile
+from bridge.episode.mcap.scan import (
+    AttachmentSpan,
+    Chunk,
+    CutChunk,
+    Damage,
+    DataEnd,
+    Found,
+    IndexSpan,
+    Plain,
+    TopMessage,
+)
+from bridge.episode.metadata import from_strings
+
+# --- Count what recovery kept and what it lost, and say so in the file and to the caller.
+
+RECORD_NAME = "recovered"
+MAX_REASONS = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecoveryReport:
+    """What recovery did with one file."""
+
+    path: Path
+    output: Path | None
+    """The finished episode; None when nothing could be read."""
+    messages: int = 0
+    topics: dict[str, int] = field(default_factory=dict)
+    """Messages by topic."""
+    bytes_kept: int = 0
+    bytes_lost: int = 0
+    """Bytes of the file that hold no whole record; what never reached the disk is not known."""
+    reason: str = ""
+    finished: bool = False
+    """It was complete already."""
+    attachments: int = 0
+    metadata: int = 0
+    last_log_time_ns: dict[str, int] = field(default_factory=dict)
+    """By topic: nothing after it was found."""
+    original: Path | None = None
+    """Where a part that is damaged inside was kept, for someone who can read more of it."""
+
+
+@dataclass(kw_only=True)
+class RecoveryTally:
+    """Counts while a file is being read."""
+
+    messages: dict[int, int] = field(default_factory=dict)
+    """By channel id."""
+    last_ns: dict[int, int] = field(default_factory=dict)
+    topics: dict[int, str] = field(default_factory=dict)
+    attachments: int = 0
+    metadata: int = 0
+    bytes_kept: int = 0
+    bytes_lost: int = 0
+    losses: list[str] = field(default_factory=list)
+    has_data: bool = False
+    """Found a header or anything behind one."""
+    reached_end: int | None = None
+    """Where the writer ended the data, if it did."""
+    earlier: dict[str, object] = field(default_factory=dict)
+    """What a recovery before this one wrote into the file."""
+    damaged_inside: bool = False
+
+    def take(self, found: Found) -> None:
+        """Count one thing found in the file."""
+        match found:
+            case Damage():
+                self.bytes_lost += found.length
+                self.damaged_inside |= not found.at_end
+                self.losses.append(found.what)
+                return
+            case DataEnd():
+                self.reached_end = found.offset
+                return
+            case IndexSpan():
+                return
+            case CutChunk():
+                self._take_cut(found)
+            case Chunk():
+                self._count(found.contents)
+                self.bytes_kept += found.length
+            case TopMessage():
+                self._add(found.channel_id, 1, found.log_time_ns)
+                self.bytes_kept += found.length
+            case AttachmentSpan():
+                self.attachments += 1
+                self.bytes_kept += found.length
+            case Plain():
+                self._take_plain(found)
+        self.has_data = True
+
+    def _take_plain(self, found: Plain) -> None:
+        self.bytes_kept += found.length
+        if found.opcode == mcap.CHANNEL:
+            self._define([found.raw])
+        elif found.opcode == mcap.METADATA:
+            self.metadata += 1
+            cursor = Cursor(found.raw, mcap.RECORD_HEAD.size)
+            if cursor.text() == RECORD_NAME:
+                self.earlier = from_strings(cursor.text_map())
+
+    def _take_cut(self, found: CutChunk) -> None:
+        lost = found.unpacked_size - found.contents.size
+        kept = found.contents.num_messages
+        self._count(found.contents)
+        self.bytes_kept += found.contents.size
+        self.bytes_lost += lost
+        self.losses.append(
+            f"at byte {found.offset} the file ends inside a chunk; "
+            f"{kept} whole messages of it were kept, without a CRC to prove them"
+        )
+
+    def _count(self, contents: Contents) -> None:
+        self._define(contents.definitions)
+        for channel_id, entries in contents.index.items():
+            self._add(channel_id, len(entries) // 2, max(entries[::2]))
+
+    def _add(self, channel_id: int, count: int, last_ns: int) -> None:
+        self.messages[channel_id] = self.messages.get(channel_id, 0) + count
+        self.last_ns[channel_id] = max(self.last_ns.get(channel_id, 0), last_ns)
+
+    def _define(self, definitions: list[bytes]) -> None:
+        for raw in definitions:
+            if raw[0] == mcap.CHANNEL:
+                channel = parse_channel(raw)
+                self.topics.setdefault(channel.id, channel.topic)
+
+    def topic_of(self, channel_id: int) -> str:
+        """Name of a channel, also of one whose definition was lost."""
+        return self.topics.get(channel_id, unknown_topic(channel_id))
+
+    @property
+    def reason(self) -> str:
+        """Why the file had to be recovered, and what was lost, in one line."""
+        before = self.earlier.get("reason")
+        parts = [str(before)] if before else []
+        if self.reached_end is None:
+            parts.append("its writer did not finish it")
+        elif not self.losses and not before:
+            parts.append("its closing part was missing or wrong")
+        parts += self.losses[:MAX_REASONS]
+        if len(self.losses) > MAX_REASONS:
+            parts.append(f"and {len(self.losses) - MAX_REASONS} more places")
+        return "; ".join(parts)
+
+    def report(self, path: Path, output: Path | None, *, finished: bool) -> RecoveryReport:
+        """Say what was done with a file."""
+        counts: dict[str, int] = {}
+        last: dict[str, int] = {}
+        for channel_id, count in self.messages.items():
+            topic = self.topic_of(channel_id)
+            counts[topic] = counts.get(topic, 0) + count
+            last[topic] = max(last.get(topic, 0), self.last_ns[channel_id])
+        before = self.earlier.get("bytes_lost")
+        return RecoveryReport(
+            path=path,
+            output=output,
+            messages=sum(counts.values()),
+            topics=dict(sorted(counts.items())),
+            bytes_kept=self.bytes_kept,
+            bytes_lost=self.bytes_lost + (before if isinstance(before, int) else 0),
+            reason=str(self.earlier.get("reason", "")) if finished else self.reason,
+            finished=finished,
+            attachments=self.attachments,
+            metadata=self.metadata,
+            last_log_time_ns=dict(sorted(last.items())),
+        )
+
+
+def to_metadata(report: RecoveryReport) -> dict[str, str]:
+    """Return the ``recovered`` metadata record of an episode; every value is JSON."""
+    values = {
+        "reason": report.reason,
+        "bytes_lost": report.bytes_lost,
+        "messages": report.messages,
+        "last_log_time_ns": report.last_log_time_ns,
+        "tool": provenance.software(),
+    }
+    return {name: json.dumps(value) for name, value in values.items()}
+
+
+def unknown_topic(channel_id: int) -> str:
+    """Name a channel whose definition was lost."""
+    return f"/recovered/channel_{channel_id}"
+
+
+CHUNK_BYTES = 1 << 20
+LIBRARY = "robot-gst recover"
+
+
+class CopyTarget:
+    """The new file."""
+
+    def __init__(self, source: RecordFile, path: Path) -> None:
+        """Create ``path``; OSError when it exists or cannot be written."""
+        self._source = source
+        self.section = DataSection(PartFile.create(path))
+        self._loose = OpenChunk(compress=False, gather=True)
+        self._made_schemas: set[int] = set()
+        self._made_channels: set[int] = set()
+
+    def take(self, found: Found) -> None:
+        """Copy one thing; index spans, damage and the old end are left behind."""
+        if self.section.file.offset == 0:
+            is_header = isinstance(found, Plain) and found.opcode == mcap.HEADER
+            header = found.raw if is_header else mcap.header("", LIBRARY)  # type: ignore[union-attr]
+            self.section.file.append([mcap.MAGIC + header])
+        match found:
+            case Plain():
+                self._take_plain(found)
+            case Chunk():
+                self._define(found.contents)
+                self.section.add_chunk(verbatim(found))
+            case CutChunk():
+                self._define(found.contents)
+                self.section.add_chunk(salvaged(found.records, found.contents))
+            case TopMessage():
+                self._take_message(found)
+            case AttachmentSpan():
+                self._take_attachment(found)
+            case _:
+                pass
+
+    def finish(self, metadata_name: str, values: dict[str, str]) -> PartFile:
+        """Write the rest and sync; the caller verifies, renames and closes."""
+        self._flush_loose()
+        self.section.add_metadata(metadata_name, values)
+        self.section.seal()
+        self.section.file.sync_data()
+        return self.section.file
+
+    def _take_plain(self, found: Plain) -> None:
+        if found.opcode == mcap.HEADER:
+            return
+        if found.opcode in (mcap.SCHEMA, mcap.CHANNEL):
+            self._book(found.raw)
+        offset = self.section.file.offset
+        self.section.file.append([found.raw])
+        if found.opcode == mcap.METADATA:
+            name = Cursor(found.raw, mcap.RECORD_HEAD.size).text()
+            self.section.summary.add_metadata(name, offset=offset, length=found.length)
+
+    def _book(self, raw: bytes) -> None:
+        """Tell the summary of a definition; the first one of an id counts."""
+        summary = self.section.summary
+        if raw[0] == mcap.SCHEMA:
+            _define_once(summary.schemas, self._made_schemas, parse_schema_id(raw), raw)
+            return
+        channel = parse_channel(raw)
+        _define_once(summary.channels, self._made_channels, channel.id, raw)
+        if channel.schema_id and channel.schema_id not in summary.schemas:
+            self._make(mcap.schema(channel.schema_id, "unknown", "", b""))
+            self._made_schemas.add(channel.schema_id)
+
+    def _make(self, raw: bytes) -> None:
+        """Define a schema or channel whose own definition was lost; readers refuse without."""
+        self._book(raw)
+        self.section.file.append([raw])
+
+    def _define(self, contents: Contents) -> None:
+        for raw in contents.definitions:
+            self._book(raw)
+        for channel_id in contents.index:
+            self._require_channel(channel_id)
+
+    def _require_channel(self, channel_id: int) -> None:
+        if channel_id not in self.section.summary.channels:
+            self._make(mcap.channel(channel_id, 0, unknown_topic(channel_id), ""))
+            self._made_channels.add(channel_id)
+
+    def _take_message(self, found: TopMessage) -> None:
+        self._require_channel(found.channel_id)
+        if self._loose.size + found.length > CHUNK_BYTES:
+            self._flush_loose()
+        raw = self._source.read(found.offset, found.length)
+        _, _, channel_id, sequence, log_ns, publish_ns = mcap.MESSAGE_HEAD.unpack_from(raw)
+        data = memoryview(raw)[mcap.MESSAGE_HEAD.size :]
+        self._loose.add(channel_id, sequence, log_ns, publish_ns, data, len(data))
+
+    def _flush_loose(self) -> None:
+        if self._loose.has_messages:
+            self.section.add_chunk(self._loose.encode())
+
+    def _take_attachment(self, found: AttachmentSpan) -> None:
+        offset = self.section.file.offset
+        for block in self._source.blocks(found.offset, found.length):
+            self.section.file.append([block])
+        self.section.summary.add_attachment(
+            found.name,
+            media_type=found.media_type,
+            log_time_ns=found.log_time_ns,
+            create_time_ns=found.create_time_ns,
+            data_size=found.data_size,
+            offset=offset,
+            length=found.length,
+        )
+
+
+def _define_once(known: dict[int, bytes], made: set[int], number: int, raw: bytes) -> None:
+    if number not in known or number in made:
+        made.discard(number)
+        known[number] = raw
+
+
+def verbatim(found: Chunk) -> EncodedChunk:
+    """Return a chunk as it stands in the file."""
+    start_ns, end_ns = found.contents.time_range()
+    return EncodedChunk(
+        buffers=[found.raw],
+        length=found.length,
+        crc=crc32(found.raw, 0),
+        start_ns=start_ns,
+        end_ns=end_ns,
+        compression=found.head.compression,
+        compressed_size=found.head.data_bytes,
+        uncompressed_size=found.head.uncompressed_size,
+        index=found.contents.index,
+    )
+
+
+def salvaged_head(records: bytes, contents: Contents) -> bytes:
+    """Return the head of an unpacked chunk with the records that were saved from a cut one."""
+    start_ns, end_ns = contents.time_range()
+    return mcap.chunk_head(
+        start_ns=start_ns,
+        end_ns=end_ns,
+        size=len(records),
+        crc=crc32(records, 0),
+        compression="",
+        data_size=len(records),
+    )
+
+
+def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
+    """Return the records saved from a cut chunk as a whole one."""
+    head = salvaged_head(records, contents)
+    start_ns, end_ns = contents.time_range()
+    return EncodedChunk(
+        buffers=[head, records],
+        length=len(head) + len(records),
+        crc=crc32(records, crc32(head, 0)),
+        start_ns=start_ns,
+        end_ns=end_ns,
+        compression="",
+        compressed_size=len(records),
+        uncompressed_size=len(records),
+        index=contents.index,
+    )
+
+
+# --- Finish a broken MCAP file where it lies, for a disk without room for a copy.
+#
+# Only the end of the file is touched: what is whole stays, the torn rest is cut off, and the
+# closing part is written. Killed at any moment, it can be done again.
+
+
+class NeedsCopyError(Exception):
+    """The damage is not at the end only. Never leaves recovery."""
+
+
+class InPlaceTarget:
+    """The same file. ``take`` everything first; nothing is written before ``finish``."""
+
+    def __init__(self, source: RecordFile, part: PartFile) -> None:
+        """Book into ``part``, which is the source itself opened for writing."""
+        self._source = source
+        self.section = DataSection(part)
+        self._end = 0
+        self._chunk: Chunk | None = None
+        self._indexes: list[IndexSpan] = []
+        self._cut: CutChunk | None = None
+
+    def take(self, found: Found) -> None:
+        """Book one thing.
+
+        Raises:
+            NeedsCopyError: For damage with something whole after it, and for definitions that
+                were lost with it.
+        """
+        match found:
+            case IndexSpan():
+                self._indexes.append(found)
+            case Damage():
+                if not found.at_end:
+                    raise NeedsCopyError
+            case CutChunk() if found.head.compression == "":
+                self._define(found.contents)
+                self._cut = found
+            case CutChunk() | DataEnd():
+                pass
+            case _:
+                self._close_chunk()
+                self._take_whole(found)
+                self._end = found.end
+
+    def _take_whole(self, found: Chunk | Plain | TopMessage | AttachmentSpan) -> None:
+        summary = self.section.summary
+        match found:
+            case Chunk():
+                self._define(found.contents)
+                self._chunk = found
+            case Plain() if found.opcode == mcap.METADATA:
+                name = Cursor(found.raw, mcap.RECORD_HEAD.size).text()
+                summary.add_metadata(name, offset=found.offset, length=found.length)
+            case Plain() if found.opcode in (mcap.SCHEMA, mcap.CHANNEL):
+                self._book(found.raw)
+            case TopMessage():
+                self._require(found.channel_id)
+                stamp_ns = found.log_time_ns
+                summary.add_messages({found.channel_id: 1}, start_ns=stamp_ns, end_ns=stamp_ns)
+            case AttachmentSpan():
+                summary.add_attachment(
+                    found.name,
+                    media_type=found.media_type,
+                    log_time_ns=found.log_time_ns,
+                    create_time_ns=found.create_time_ns,
+                    data_size=found.data_size,
+                    offset=found.offset,
+                    length=found.length,
+                )
+
+    def _book(self, raw: bytes) -> None:
+        summary = self.section.summary
+        if raw[0] == mcap.SCHEMA:
+            summary.schemas.setdefault(parse_schema_id(raw), raw)
+            return
+        channel = parse_channel(raw)
+        if channel.schema_id and channel.schema_id not in summary.schemas:
+            raise NeedsCopyError
+        summary.channels.setdefault(channel.id, raw)
+
+    def _define(self, contents: Contents) -> None:
+        for raw in contents.definitions:
+            self._book(raw)
+        for channel_id in contents.index:
+            self._require(channel_id)
+
+    def _require(self, channel_id: int) -> None:
+        if channel_id not in self.section.summary.channels:
+            raise NeedsCopyError
+
+    def _close_chunk(self) -> None:
+        """Tell the summary of a chunk, and of its message indexes if all of them are right."""
+        chunk, self._chunk = self._chunk, None
+        indexes, self._indexes = self._indexes, []
+        if chunk is None:
+            return
+        offsets = {}
+        for span in indexes:
+            raw = self._source.read(span.offset, span.length)
+            for channel_id, entries in chunk.contents.index.items():
+                if raw == mcap.message_index(channel_id, entries):
+                    offsets[channel_id] = span.offset
+        right = offsets.keys() == chunk.contents.index.keys()
+        index_length = indexes[-1].end - chunk.end if indexes and right else 0
+        encoded = verbatim(chunk)
+        self.section.book(encoded, chunk.offset, offsets if right else {}, index_length)
+
+    def finish(self, metadata_name: str, values: dict[str, str]) -> PartFile:
+        """Cut off what is torn, write the rest and sync.
+
+        Raises:
+            OSError: When there is no room even for that; what was whole still is.
+        """
+        file = self.section.file
+        if self._cut is not None:
+            self._close_chunk()
+            self._end = self._cut.offset
+            head = salvaged_head(self._cut.records, self._cut.contents)
+            file.overwrite(self._cut.offset, head)
+            self._end += len(head) + len(self._cut.records)
+        file.truncate(self._end, self._source.crc(0, self._end))
+        if self._cut is not None:
+            self.section.add_indexes(
+                salvaged(self._cut.records, self._cut.contents), self._cut.offset
+            )
+        elif self._chunk is not None:
+            self.section.add_indexes(verbatim(self._chunk), self._chunk.offset)
+        self.section.add_metadata(metadata_name, values)
+        self.section.seal()
+        file.sync_data()
+        return file

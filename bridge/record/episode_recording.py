@@ -1,0 +1,499 @@
+"""One episode while it is being recorded. Used by the writer thread only."""
+
+import contextlib
+import json
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from bridge.clock import ns_from_s
+from bridge.episode import metadata, schema
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.run_folder import part_name
+from bridge.episode.writer import EpisodeWriter, WriterConfig
+from bridge.errors import BridgeError, MissingDependencyError
+from bridge.record.config import BYTES_PER_MB, DiskConfig, RecorderConfig
+from bridge.record.inspection import MessageState, inspector, resolve_type
+from bridge.record.ledger import Ledger
+from bridge.record.queue import Command, Dropped, Item, second_of
+from bridge.wire.rmw import ros_schema, type_hash_of
+from bridge.wire.session import WireSample
+
+# --- Which schema each message of an episode is written with, and how it is looked at.
+
+HASH_PREFIX = "RIHS01_"
+_SHOWN = len(HASH_PREFIX) + 12
+
+
+@dataclass(slots=True)
+class Channel:
+    """One topic with one definition of its type."""
+
+    record: schema.Schema | None
+    inspect: Callable[[bytes], MessageState]
+    last_ns: list[int]
+    """Shared by the channels of a topic."""
+
+    def later(self, stamp_ns: int) -> int:
+        """Log times of a topic never run backwards, also when two threads deliver at once."""
+        last_ns = self.last_ns
+        if stamp_ns > last_ns[0]:
+            last_ns[0] = stamp_ns
+        return last_ns[0]
+
+
+class Channels:
+    """Remembers the channels of one episode; a topic with two definitions gets two."""
+
+    def __init__(
+        self, max_topics: int, warn: Callable[[str], None], msg_folder: Path | None = None
+    ) -> None:
+        """Start empty.
+
+        Args:
+            max_topics: Further ones are refused.
+            warn: Called with what a person should know.
+            msg_folder: Definitions of ROS 2 types of one's own.
+        """
+        self._msg_folder = msg_folder
+        self._max_topics = max_topics
+        self._warn = warn
+        self._channels: dict[tuple[str, str, str, str], Channel] = {}
+        self._last_ns: dict[str, list[int]] = {}
+        self._records: dict[str, schema.Schema | None] = {}
+        self._hashes: dict[str, str] = {}
+
+    def of(self, sample: WireSample, type_name: str) -> Channel | None:
+        """Return the channel of a message, or None when there are too many."""
+        key = (sample.topic, type_name, sample.message_encoding, sample.type_hash)
+        channel = self._channels.get(key)
+        if channel is None and len(self._channels) < self._max_topics:
+            channel = self._channels[key] = self._new(sample, type_name)
+        return channel
+
+    def later(self, topic: str, stamp_ns: int) -> int:
+        """Return a log time for a record of our own."""
+        last_ns = self._last_ns.setdefault(topic, [0])
+        last_ns[0] = max(last_ns[0], stamp_ns)
+        return last_ns[0]
+
+    def _new(self, sample: WireSample, type_name: str) -> Channel:
+        topic = sample.topic
+        record, is_strange = self._schema(sample, type_name)
+        if self._records.setdefault(topic, record) != record:
+            self._warn(f"{topic} carries several definitions, each on a channel of its own")
+        if is_strange:
+            self._warn(
+                f"{topic}: {type_name} was built from another definition ({sample.type_hash})"
+            )
+        look = inspector("" if is_strange else type_name, sample.message_encoding)
+        last_ns = self._last_ns.setdefault(topic, [0])
+        return Channel(record, look, last_ns)
+
+    def _schema(self, sample: WireSample, type_name: str) -> tuple[schema.Schema | None, bool]:
+        """The schema to register: a known one, one with a name only, or none; and if it is strange.
+
+        MCAP reads an empty schema encoding as "no schema available", which keeps the name. A
+        definition that nobody knows must not borrow another's text: its hash goes into the name.
+        """
+        if not type_name:
+            return None, False
+        encoding = sample.message_encoding
+        known = schema.schema_for(type_name)
+        if encoding not in ("", known.message_encoding if known else "cdr"):
+            return _name_only(type_name, encoding), False
+        type_hash = sample.type_hash if sample.type_hash.startswith(HASH_PREFIX) else ""
+        newest = _newest_hash(type_name, self._msg_folder) if type_hash else None
+        if known is not None and newest in (None, type_hash):
+            return known, False
+        found = _from_ros(type_name, type_hash, self._msg_folder)
+        if found is not None:
+            return found, False
+        is_first = not type_hash or self._hashes.setdefault(type_name, type_hash) == type_hash
+        if newest is None and is_first:
+            return _name_only(type_name, encoding), False
+        return _name_only(f"{type_name}#{type_hash[:_SHOWN]}", encoding), True
+
+
+def _name_only(name: str, encoding: str) -> schema.Schema:
+    return schema.Schema(name=name, schema_encoding="", message_encoding=encoding, data=b"")
+
+
+def _newest_hash(type_name: str, folder: Path | None) -> str | None:
+    try:
+        return type_hash_of(type_name, folder=folder)
+    except MissingDependencyError:
+        return None
+
+
+def _from_ros(type_name: str, type_hash: str, folder: Path | None) -> schema.Schema | None:
+    try:
+        return ros_schema(type_name, type_hash=type_hash, folder=folder)
+    except MissingDependencyError:
+        return None
+
+
+# --- The files of one episode: one, or several when it is split by size or time.
+
+
+class EpisodeFiles:
+    """Opens one part after the other; a full one is finished on a thread of its own."""
+
+    def __init__(self, folder: Path, info: EpisodeInfo, config: DiskConfig, now_ns: int) -> None:
+        """Create the first part.
+
+        Raises:
+            UsageError: When the episode exists, or is being written.
+            BridgeError: When the folder cannot be written.
+        """
+        self._folder = folder
+        self._info = info
+        self._split_bytes = config.split_mb * BYTES_PER_MB
+        self._split_ns = ns_from_s(config.split_s)
+        self._config = WriterConfig(flush_s=config.flush_s, sync_s=config.sync_s)
+        self._full: list[EpisodeWriter] = []
+        self._finisher: threading.Thread | None = None
+        self._error: OSError | None = None
+        self._paths: list[Path] = []
+        self._said: EpisodeWriter | None = None
+        self.index = 1
+        self.writer = self._open(now_ns)
+
+    @property
+    def first_path(self) -> Path:
+        """The finished first file; its name is the episode's."""
+        return self._folder / part_name(self._info.id, 1)
+
+    @property
+    def open_path(self) -> Path:
+        """The file that is being written."""
+        return self.writer.part_path
+
+    def _open(self, now_ns: int) -> EpisodeWriter:
+        path = self._folder / part_name(self._info.id, self.index)
+        writer = EpisodeWriter(path, config=self._config)
+        try:
+            writer.describe(self._info)
+        except OSError as error:
+            writer.discard()
+            raise BridgeError(
+                f"cannot write {writer.part_path}: {error.strerror}. Choose another folder."
+            ) from error
+        self._opened_ns = now_ns
+        self._paths.append(path)
+        return writer
+
+    def is_full(self, now_ns: int) -> bool:
+        """Say whether the next message belongs into the next part."""
+        if self._split_bytes and self.writer.bytes_written >= self._split_bytes:
+            return True
+        return bool(self._split_ns) and now_ns - self._opened_ns >= self._split_ns
+
+    def roll(self, now_ns: int) -> None:
+        """Go on in a new part.
+
+        Raises:
+            OSError: When the disk refuses it.
+        """
+        full = self.writer
+        self._say_part(full, is_last=False)
+        self.index += 1
+        try:
+            self.writer = self._open(now_ns)
+        except BridgeError as error:
+            self.index -= 1
+            if isinstance(error.__cause__, OSError):
+                raise error.__cause__ from error
+            raise
+        self._join()
+        self._full.append(full)
+        self._finisher = threading.Thread(target=self._finish, name="finish part", daemon=True)
+        self._finisher.start()
+
+    def _say_part(self, writer: EpisodeWriter, *, is_last: bool) -> None:
+        if (self._split_bytes or self._split_ns) and writer is not self._said:
+            values = {"index": json.dumps(self.index), "last": json.dumps(is_last)}
+            writer.add_metadata("split", values)
+            self._said = writer
+
+    def _finish(self) -> None:
+        try:
+            while self._full:
+                self._full[0].close()
+                del self._full[0]
+        except OSError as error:
+            self._error = error
+
+    def _join(self) -> None:
+        if self._finisher is not None:
+            self._finisher.join()
+            self._finisher = None
+        self.tick()
+
+    def tick(self) -> None:
+        """Write what has waited long enough; raises OSError for any part."""
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+        self.writer.tick()
+
+    def close(self) -> Path:
+        """Finish all parts; may be called again after an OSError."""
+        if self._finisher is not None:
+            self._finisher.join()
+            self._finisher = None
+        self._error = None
+        while self._full:
+            self._full[0].close()
+            del self._full[0]
+        self._say_part(self.writer, is_last=True)
+        self.writer.close()
+        return self.first_path
+
+    def abandon(self) -> None:
+        """Stop without finishing; ``.part`` files stay for recovery."""
+        if self._finisher is not None:
+            self._finisher.join()
+        for writer in (*self._full, self.writer):
+            with contextlib.suppress(OSError):  # the disk that failed may fail again
+                writer.abandon()
+
+    def discard(self) -> None:
+        """Remove all parts: the take was not wanted."""
+        if self._finisher is not None:
+            self._finisher.join()
+        for writer in (*self._full, self.writer):
+            writer.discard()
+        for path in self._paths:
+            path.unlink(missing_ok=True)
+
+
+class EpisodeRecording:
+    """Writes messages as they came, books losses, and finishes the file."""
+
+    def __init__(
+        self,
+        folder: Path,
+        info: metadata.EpisodeInfo,
+        config: RecorderConfig,
+        *,
+        start_ns: int,
+        latched: Callable[[], list[WireSample]],
+        others: Mapping[str, Callable[[], object]],
+    ) -> None:
+        """Create the episode file and say in it who and what it is.
+
+        Args:
+            folder: Where episodes lie.
+            info: What is being recorded.
+            config: The recorder's settings.
+            start_ns: When it begins [ns].
+            latched: What was said before and still holds, repeated at the start of each file.
+            others: What else goes into the ``recorder`` record, by name; asked at the end.
+
+        Raises:
+            UsageError: When the episode exists already.
+            BridgeError: When the folder cannot be written.
+        """
+        self.info = info
+        self.ledger = Ledger(config.queues.max_topics)
+        self.start_ns = start_ns
+        self.outcome: metadata.Outcome | None = None
+        self._config = config
+        self._latched = latched
+        self._others = others
+        self._paused_ns: list[list[int]] = []
+        self._channels = Channels(config.queues.max_topics, self.ledger.warn, config.msg_folder)
+        self._num_latched = 0
+        self._closed_second = second_of(start_ns)
+        self._records: deque[dict[str, Any]] = deque()
+        self._clock_steps_ns: list[int] = []
+        self._is_summed_up = False
+        self._parts = EpisodeFiles(folder, info, config.disk, start_ns)
+        try:
+            self._repeat_latched(start_ns)
+        except OSError as error:
+            self._parts.discard()
+            raise BridgeError(
+                f"cannot write {self.part_path}: {error.strerror}. Choose another folder."
+            ) from error
+
+    @property
+    def part_path(self) -> Path:
+        """The file while it is open."""
+        return self._parts.open_path
+
+    @property
+    def path(self) -> Path:
+        """The episode's file when it is finished; its first one if it is split."""
+        return self._parts.first_path
+
+    @property
+    def num_parts(self) -> int:
+        """Files so far."""
+        return self._parts.index
+
+    def _repeat_latched(self, stamp_ns: int) -> None:
+        samples = self._latched()
+        for sample in samples:
+            channel = self._channels.of(sample, resolve_type(sample.topic, sample.type_name))
+            if channel is not None:
+                self._append(channel, sample, stamp_ns)
+        self._num_latched = len(samples)
+
+    def write(self, item: Item) -> None:
+        """Append a message, whatever it is, and book it."""
+        channel = self._channels.of(item.sample, item.type_name)
+        if channel is None:
+            self.ledger.count_refused(item)
+            return
+        finding = item.finding or channel.inspect(item.sample.data)
+        try:
+            self._append(channel, item.sample, item.sample.received_ns)
+        except OSError:
+            self.ledger.count_refused(item)
+            raise
+        self.ledger.count_received(item, finding)
+
+    def write_beside(self, sample: WireSample) -> None:
+        """Append something the recorder made itself; it is in no account."""
+        channel = self._channels.of(sample, sample.type_name)
+        if channel is not None:
+            self._append(channel, sample, sample.received_ns)
+
+    def _append(self, channel: Channel, sample: WireSample, stamp_ns: int) -> None:
+        log_ns = channel.later(stamp_ns)
+        source_ns = sample.source_ns
+        self._parts.writer.write_foreign(
+            sample.topic,
+            sample.data,
+            schema_record=channel.record,
+            message_encoding=sample.message_encoding,
+            log_time_ns=log_ns,
+            publish_time_ns=source_ns if source_ns is not None and source_ns >= 0 else log_ns,
+            sequence=sample.sequence,
+        )
+
+    def tick(self, now_ns: int, health: dict[str, int]) -> None:
+        """Write what has waited long enough, and the ledger of the seconds that are over.
+
+        Args:
+            now_ns: The recorder's clock.
+            health: Numbers that go into each ledger record.
+        """
+        # A message may wait in the queue while its second ends: give it one second more.
+        before = second_of(now_ns) - 1
+        if before > self._closed_second:
+            self._closed_second = before
+            self._write_ledger(before, now_ns, health)
+        if self._parts.is_full(now_ns):
+            self._parts.roll(now_ns)
+            self._repeat_latched(now_ns)
+        self._parts.tick()
+
+    def _write_ledger(self, before: int | None, now_ns: int, health: dict[str, int]) -> None:
+        closed = self.ledger.close_seconds(before)
+        self._records.extend({**record, **health} for record in closed)
+        while self._records:
+            self._write_json(schema.DROPS_TOPIC, self._records[0], schema.DROPS, now_ns)
+            self._records.popleft()
+
+    def _write_json(
+        self, topic: str, record: dict[str, Any], type_name: str, stamp_ns: int
+    ) -> None:
+        log_ns = self._channels.later(topic, stamp_ns)
+        self._parts.writer.write_json(topic, record, type_name=type_name, log_time_ns=log_ns)
+
+    def write_event(
+        self,
+        kind: str,
+        *,
+        stamp_ns: int,
+        text: str = "",
+        outcome: metadata.Outcome | None = None,
+        data: dict[str, Any] | None = None,
+    ) -> None:
+        """Append a mark or a label to the cell's events; a label is the outcome from now on."""
+        record: dict[str, Any] = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind}
+        if text:
+            record["text"] = text
+        if data is not None:
+            record["data"] = data
+        if outcome is not None:
+            record["outcome"] = asdict(outcome)
+        topic = f"/{self.info.cell or 'recorder'}/event"
+        self._write_json(topic, record, schema.EVENT, stamp_ns)
+        self.outcome = outcome or self.outcome
+
+    def note_clock_step(self, step_ns: int, *, stamp_ns: int) -> None:
+        """Write down that the system clock has jumped; log times have not."""
+        self._clock_steps_ns.append(step_ns)
+        self.write_event("clock_step", stamp_ns=stamp_ns, data={"step_ns": step_ns})
+
+    def pause(self, command: Command) -> None:
+        """Leave out, and count as no loss, what comes after this command."""
+        self.write_event("paused", stamp_ns=command.received_ns)
+        self.ledger.pause(command.ticket)
+        self._paused_ns.append([command.received_ns])
+
+    def resume(self, command: Command) -> None:
+        """Record and count again what comes after this command."""
+        self.ledger.resume(command.ticket)
+        self._paused_ns[-1].append(command.received_ns)
+        self.write_event("resumed", stamp_ns=command.received_ns)
+
+    def refuse(self, entries: Iterable[Item | Dropped]) -> None:
+        """Book messages that came before the end and can no longer be written."""
+        for entry in entries:
+            if isinstance(entry, Item):
+                self.ledger.count_refused(entry)
+            else:
+                self.ledger.count_dropped(entry)
+
+    def close(
+        self,
+        *,
+        end_ns: int,
+        reason: str,
+        outcome: metadata.Outcome | None,
+        health: dict[str, int],
+    ) -> Path:
+        """Write the accounts, finish the file and give it its final name.
+
+        May be called again after an OSError, when there is space.
+        """
+        self._write_ledger(None, end_ns, health)
+        if not self._is_summed_up:
+            self._sum_up(end_ns, reason, outcome or self.outcome)
+            self._is_summed_up = True
+        return self._parts.close()
+
+    def _sum_up(self, end_ns: int, reason: str, outcome: metadata.Outcome | None) -> None:
+        writer = self._parts.writer
+        if outcome is not None:
+            writer.add_metadata("outcome", metadata.to_strings(outcome))
+        writer.add_metadata("drops", self.ledger.to_metadata())
+        recorder = {
+            "settings": asdict(self._config),
+            "start_ns": self.start_ns,
+            "end_ns": end_ns,
+            "stopped_by": reason,
+            "latched_messages_repeated": self._num_latched,
+            "clock_steps_ns": self._clock_steps_ns,
+            "paused": [[*span, end_ns][:2] for span in self._paused_ns],
+            "parts": self.num_parts,
+            **{name: ask() for name, ask in self._others.items()},
+        }
+        values = {name: json.dumps(value, default=str) for name, value in recorder.items()}
+        writer.add_metadata("recorder", values)
+
+    def discard(self) -> None:
+        """Remove the file: the take was not wanted."""
+        self._parts.discard()
+
+    def abandon(self) -> None:
+        """Stop without finishing; the ``.part`` file stays."""
+        self._parts.abandon()

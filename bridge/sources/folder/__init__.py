@@ -1,0 +1,1 @@
+"""RGB-D folders in three layouts, as the messages of a live camera."""

@@ -1,0 +1,163 @@
+"""What every layout of an RGB-D folder is read into, and the checks they share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt16
+
+from bridge.errors import PathNotFoundError
+from bridge.geometry.camera import Camera
+from bridge.geometry.trajectory import PoseTrajectory
+from bridge.media.color import UnreadableImageError
+from bridge.media.depth import decode_depth_png
+from bridge.sources.folder.config import FolderConfig, FolderError
+
+ROTATION_TOLERANCE = 0.01
+"""Poses written with five digits are off by 5e-4; more than this is not a rotation."""
+VGA = (640, 480)
+"""Size of the images that nominal intrinsics are given for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FolderFrame:
+    """The files of one instant."""
+
+    color_path: Path
+    depth_path: Path
+    T_world_depth: Float[np.ndarray, "4 4"]
+    color_stamp_ns: int | None = None
+    """When the colour image was taken, where the folder says so [ns]."""
+    depth_stamp_ns: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FolderIndex:
+    """Everything a folder says about its frames, checked."""
+
+    path: Path
+    """The file that lists the frames, or the folder where file names do."""
+    layout: str
+    """scene.json, TUM or 7-Scenes."""
+    name: str
+    depth_unit_m: float
+    depth_invalid_values: tuple[int, ...]
+    depth_encoding: str
+    depth_camera: Camera
+    color_camera: Camera | None
+    """None: the same as the depth camera, at the size of the colour images."""
+    T_depth_color: Float[np.ndarray, "4 4"]
+    frames: tuple[FolderFrame, ...]
+    num_unposed: int
+    """Frames left out because their pose is not known."""
+    num_unpaired: int = 0
+    """Colour images left out because no depth image was taken at their time."""
+    poses: PoseTrajectory | None = None
+    """``T_world_depth`` at the folder's own rate; None: one pose per frame."""
+    assumed: dict[str, str] = field(default_factory=dict)
+    """What the folder does not say and which values were taken instead."""
+
+    @property
+    def has_times(self) -> bool:
+        """Whether the frames carry the times they were taken at."""
+        return self.frames[0].color_stamp_ns is not None
+
+    @property
+    def summary(self) -> str:
+        """What was found, for people."""
+        times = "with its own times" if self.has_times else "without times"
+        text = f"{self.layout} layout {times}: {len(self.frames)} frames"
+        if self.num_unposed:
+            text += f", {self.num_unposed} without a pose left out"
+        if self.num_unpaired:
+            text += f", {self.num_unpaired} colour images without depth left out"
+        return text
+
+
+def nearest_rotation(
+    path: Path, R: Float[np.ndarray, "3 3"], where: str
+) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation nearest to a matrix written with few digits.
+
+    Raises:
+        FolderError: When the matrix is not close to any rotation.
+    """
+    u, singular, v = np.linalg.svd(R)
+    if np.any(np.abs(singular - 1) > ROTATION_TOLERANCE) or np.linalg.det(R) < 0:
+        raise FolderError(
+            path=path,
+            found=f"the rotation of {where} is none (singular values {np.round(singular, 3)})",
+            hint="Poses are camera-to-world, row by row.",
+        )
+    return np.asarray(u @ v)
+
+
+def read_stored_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
+    """Read the numbers of a 16-bit depth image.
+
+    Raises:
+        FolderError: When it is no such image.
+    """
+    try:
+        return decode_depth_png(path.read_bytes())
+    except (UnreadableImageError, OSError) as error:
+        raise FolderError(
+            path=path, found=str(error), hint="Restore the file or remove the frame."
+        ) from error
+
+
+def require_image(path: Path, *, what: str, named_by: str) -> Path:
+    """Return the path if the file is there.
+
+    Raises:
+        PathNotFoundError: Saying who names the file.
+    """
+    if not path.is_file():
+        raise PathNotFoundError(
+            path=path,
+            what=f"{what} image",
+            hint=f"{named_by}; restore it or remove the frame.",
+        )
+    return path
+
+
+def camera_of(
+    intrinsics: Sequence[float] | None,
+    nominal: tuple[float, float, float, float],
+    size: tuple[int, int],
+    *,
+    option: str,
+    path: Path,
+) -> Camera:
+    """Make a camera from ``(fx, fy, cx, cy)`` [px, pixel centres at whole numbers].
+
+    Args:
+        intrinsics: As given by the user, or None.
+        nominal: Documented values, valid for 640 x 480 images only.
+        size: Width and height of the images.
+        option: The option that sets the intrinsics, for the message.
+        path: The folder, for the message.
+
+    Raises:
+        FolderError: When nothing is known for images of this size.
+    """
+    if intrinsics is None and size != VGA:
+        raise FolderError(
+            path=path,
+            found=f"images of {size[0]} x {size[1]} pixels, and no intrinsics for that size",
+            hint=f"Give them: {option} FX FY CX CY.",
+        )
+    fx, fy, cx, cy = nominal if intrinsics is None else intrinsics
+    return Camera.from_ros(width=size[0], height=size[1], fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+def refuse_scale_without_use(config: FolderConfig, path: Path) -> None:
+    """Refuse options that a self-describing index answers itself."""
+    for name in ("depth_intrinsics", "color_intrinsics", "depth_unit_m"):
+        if getattr(config, name) is not None:
+            raise FolderError(
+                path=path,
+                found=f"--{name.replace('_', '-')} was given, but the file holds this itself",
+                hint="Correct the file, or leave the option out.",
+            )

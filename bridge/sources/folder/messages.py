@@ -1,0 +1,289 @@
+"""An RGB-D folder as the messages of a live camera."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8, UInt16
+
+from bridge.clock import ns_from_s
+from bridge.episode import schema
+from bridge.episode.cdr.messages import (
+    CameraInfo,
+    CompressedColor,
+    DepthImage,
+    FrameTransform,
+    transforms_to_cdr,
+)
+from bridge.episode.provenance import hash_file
+from bridge.episode.schema import StampedMessage
+from bridge.errors import PathNotFoundError, UsageError
+from bridge.geometry.camera import Camera
+from bridge.media.color import JPEG_MAGIC, UnreadableImageError, decode_color, encode_jpeg
+from bridge.media.depth import to_millimetres
+from bridge.sources.folder.config import DEFAULT_RATE_HZ, FolderConfig, FolderError
+from bridge.sources.folder.frames import FolderFrame, FolderIndex, read_stored_depth
+from bridge.sources.folder.scene_json import INDEX_NAME, read_scene
+from bridge.sources.folder.sevenscenes import find_frames, read_sevenscenes
+from bridge.sources.folder.tum import find_lists, read_tum
+
+# --- Which layout an RGB-D folder has, and its frames.
+#
+# Three layouts are told apart by their files: our own index ``scene.json``, the lists of the TUM
+# RGB-D benchmark (``rgb.txt`` and ``depth.txt``, or ``associations.txt``), and the numbered files
+# of 7-Scenes (``frame-000000.color.png``). ``docs/rgbd_folder.md`` describes each.
+
+DEFAULTS = FolderConfig()
+
+
+def read_index(folder: Path, config: FolderConfig = DEFAULTS) -> FolderIndex:
+    """Find out a folder's layout and read it; every image it names must exist.
+
+    Args:
+        folder: The folder.
+        config: Intrinsics and depth unit for layouts that do not hold them.
+
+    Raises:
+        PathNotFoundError: When the folder or an image is not there.
+        FolderError: When the layout is unknown, or something in it makes no sense.
+    """
+    if not folder.is_dir():
+        raise PathNotFoundError(
+            path=folder, what="RGB-D folder", hint="Give a folder of one of the known layouts."
+        )
+    if (folder / INDEX_NAME).is_file():
+        return read_scene(folder, config)
+    if find_lists(folder):
+        return read_tum(folder, config)
+    if find_frames(folder):
+        return read_sevenscenes(folder, config)
+    raise _unknown(folder)
+
+
+def _unknown(folder: Path) -> FolderError | PathNotFoundError:
+    """Say what was looked for, and where it may be instead."""
+    below = sorted(
+        path.name
+        for path in folder.iterdir()
+        if path.is_dir() and ((path / INDEX_NAME).is_file() or find_lists(path))
+    )
+    below += sorted(path.name for path in folder.iterdir() if path.is_dir() and find_frames(path))
+    if below:
+        return FolderError(
+            path=folder,
+            found=f"no frames of its own, but {', '.join(below[:5])} below it hold some",
+            hint="Give one of those folders.",
+        )
+    return PathNotFoundError(
+        path=folder / INDEX_NAME,
+        what="index",
+        hint=(
+            "Known layouts: scene.json; TUM (rgb.txt, depth.txt, groundtruth.txt); 7-Scenes "
+            "(frame-000000.color.png, .depth.png, .pose.txt). docs/rgbd_folder.md describes them."
+        ),
+    )
+
+
+WORLD = "world"
+INFO_PERIOD_S = 1.0
+"""Calibration and static transforms are repeated this often [s]."""
+
+
+def num_frames(index: FolderIndex, config: FolderConfig) -> int:
+    """How many frames will be sent."""
+    return min(len(index.frames), config.max_frames or len(index.frames))
+
+
+def frame_times_ns(
+    index: FolderIndex, config: FolderConfig, start_ns: int | None = None
+) -> list[tuple[int, int]]:
+    """Stamps of colour and depth of every frame that will be sent [ns].
+
+    Real times are kept; moved so that the first is ``start_ns`` where that is given. A folder
+    without times gets the configured rate, from ``start_ns`` or 0.
+
+    Raises:
+        UsageError: When a rate is asked of a folder that has real times.
+    """
+    count = num_frames(index, config)
+    if not index.has_times:
+        period_ns = ns_from_s(1.0 / (config.rate_hz or DEFAULT_RATE_HZ))
+        stamps = [(start_ns or 0) + number * period_ns for number in range(count)]
+        return [(stamp_ns, stamp_ns) for stamp_ns in stamps]
+    if config.rate_hz is not None:
+        message = (
+            f"--rate-hz {config.rate_hz:g} was given, but {index.path} says when each frame was "
+            "taken. Leave the option out."
+        )
+        raise UsageError(message)
+    times = [
+        (frame.color_stamp_ns or 0, frame.depth_stamp_ns or 0) for frame in index.frames[:count]
+    ]
+    shift_ns = 0 if start_ns is None else start_ns - min(times[0])
+    return [(color_ns + shift_ns, depth_ns + shift_ns) for color_ns, depth_ns in times]
+
+
+def describe_folder(index: FolderIndex, config: FolderConfig) -> dict[str, Any]:
+    """What an episode's metadata says about the folder it came from."""
+    rate_hz = config.rate_hz or DEFAULT_RATE_HZ
+    nominal = f"nominal, {rate_hz:g} Hz from 0; the folder has none"
+    return {
+        "folder": index.name,
+        "layout": index.layout,
+        "index_sha256": hash_file(index.path) if index.path.is_file() else None,
+        "depth_unit_m": index.depth_unit_m,
+        "depth_rounded_to_m": 1e-3,
+        "frames_left_out_without_pose": index.num_unposed,
+        "frames_left_out_without_depth": index.num_unpaired,
+        "times": "the folder's own" if index.has_times else nominal,
+        "assumed": index.assumed,
+    }
+
+
+def folder_messages(
+    index: FolderIndex, config: FolderConfig, start_ns: int | None
+) -> Iterator[list[StampedMessage]]:
+    """Yield the messages of one frame after another.
+
+    Args:
+        index: The checked index.
+        config: Names and rate.
+        start_ns: Stamp of the first frame; None keeps the folder's own times (0 without any).
+
+    Raises:
+        FolderError: When an image cannot be read or has another size than its camera.
+        UsageError: When a rate is asked of a folder that has real times.
+    """
+    times = frame_times_ns(index, config, start_ns)
+    shift_ns = times[0][0] - (index.frames[0].color_stamp_ns or 0)
+    poses = _pose_messages(index, config, times, shift_ns)
+    pose = next(poses, None)
+    color_camera: Camera | None = None
+    next_info_ns = min(times[0])
+    for number, (frame, stamps) in enumerate(zip(index.frames, times, strict=False), start=1):
+        color = _read_color(frame)
+        if color_camera is None:
+            color_camera = _color_camera(index, color.shape)
+        _check_size(frame.color_path, color.shape[:2], color_camera)
+        messages = []
+        if min(stamps) >= next_info_ns:
+            messages += _calibration(index, config, color_camera, min(stamps))
+            next_info_ns = min(stamps) + ns_from_s(INFO_PERIOD_S)
+        while pose is not None and (pose.stamp_ns <= max(stamps) or number == len(times)):
+            messages.append(pose)
+            pose = next(poses, None)
+        messages += _images(index, config, frame, color, stamps)
+        yield sorted(messages, key=lambda message: message.stamp_ns)
+
+
+def _pose_messages(
+    index: FolderIndex, config: FolderConfig, times: list[tuple[int, int]], shift_ns: int
+) -> Iterator[StampedMessage]:
+    """One pose per frame, or all that the folder has from before the first to after the last."""
+    if index.poses is None:
+        stamps = [color_ns for color_ns, _ in times]
+        transforms = [frame.T_world_depth for frame in index.frames[: len(times)]]
+    else:
+        inside = index.poses.stamps_ns + shift_ns
+        ends = [at for pair in times for at in pair]
+        first = max(int(np.searchsorted(inside, min(ends), side="right")) - 1, 0)
+        last = int(np.searchsorted(inside, max(ends))) + 1
+        stamps = [int(at) for at in inside[first:last]]
+        transforms = list(index.poses.transforms()[first:last])
+    for stamp_ns, T_world_depth in zip(stamps, transforms, strict=True):
+        pose = FrameTransform(
+            stamp_ns=stamp_ns,
+            parent=WORLD,
+            child=f"{config.camera}_depth_optical",
+            T_parent_child=T_world_depth,
+        )
+        yield _message("/tf", schema.TF_MESSAGE, transforms_to_cdr([pose]), stamp_ns)
+
+
+def _images(
+    index: FolderIndex,
+    config: FolderConfig,
+    frame: FolderFrame,
+    color: UInt8[np.ndarray, "height width 3"],
+    stamps: tuple[int, int],
+) -> list[StampedMessage]:
+    color_ns, depth_ns = stamps
+    depth = DepthImage(
+        stamp_ns=depth_ns,
+        frame_id=f"{config.camera}_depth_optical",
+        depth_mm=_read_depth(index, frame),
+    )
+    stored = frame.color_path.read_bytes()
+    image = CompressedColor(
+        stamp_ns=color_ns,
+        frame_id=f"{config.camera}_color_optical",
+        format="jpeg",
+        data=stored if stored[:2] == JPEG_MAGIC else encode_jpeg(color),
+    )
+    prefix = f"/{config.cell}/cam/{config.camera}"
+    return [
+        _message(f"{prefix}/depth/image", schema.IMAGE, depth.to_cdr(), depth_ns),
+        _message(f"{prefix}/color/image", schema.COMPRESSED_IMAGE, image.to_cdr(), color_ns),
+    ]
+
+
+def _calibration(
+    index: FolderIndex, config: FolderConfig, color_camera: Camera, stamp_ns: int
+) -> list[StampedMessage]:
+    messages = []
+    for stream, camera in (("depth", index.depth_camera), ("color", color_camera)):
+        frame_id = f"{config.camera}_{stream}_optical"
+        info = CameraInfo(stamp_ns=stamp_ns, frame_id=frame_id, camera=camera)
+        topic = f"/{config.cell}/cam/{config.camera}/{stream}/info"
+        messages.append(_message(topic, schema.CAMERA_INFO, info.to_cdr(), stamp_ns))
+    between = FrameTransform(
+        stamp_ns=stamp_ns,
+        parent=f"{config.camera}_depth_optical",
+        child=f"{config.camera}_color_optical",
+        T_parent_child=index.T_depth_color,
+    )
+    messages.append(
+        _message("/tf_static", schema.TF_MESSAGE, transforms_to_cdr([between]), stamp_ns)
+    )
+    return messages
+
+
+def _message(topic: str, type_name: str, data: bytes, stamp_ns: int) -> StampedMessage:
+    return StampedMessage(topic=topic, type_name=type_name, data=data, stamp_ns=stamp_ns)
+
+
+def _color_camera(index: FolderIndex, shape: tuple[int, ...]) -> Camera:
+    """The camera of the colour images; registered ones may be a resized depth camera's."""
+    if index.color_camera is not None:
+        return index.color_camera
+    return index.depth_camera.scaled(shape[1] / index.depth_camera.width)
+
+
+def _read_color(frame: FolderFrame) -> UInt8[np.ndarray, "height width 3"]:
+    try:
+        return decode_color(frame.color_path.read_bytes())
+    except (UnreadableImageError, OSError) as error:
+        raise FolderError(
+            path=frame.color_path, found=str(error), hint="Restore the file or remove the frame."
+        ) from error
+
+
+def _read_depth(index: FolderIndex, frame: FolderFrame) -> UInt16[np.ndarray, "height width"]:
+    stored = read_stored_depth(frame.depth_path)
+    _check_size(frame.depth_path, stored.shape, index.depth_camera)
+    return to_millimetres(
+        stored,
+        unit_m=index.depth_unit_m,
+        invalid_values=index.depth_invalid_values,
+        encoding=index.depth_encoding,
+    )
+
+
+def _check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
+    if shape != (camera.height, camera.width):
+        raise FolderError(
+            path=path,
+            found=f"{shape[1]} x {shape[0]} pixels, camera {camera.width} x {camera.height}",
+            hint="Correct the intrinsics or the image.",
+        )
