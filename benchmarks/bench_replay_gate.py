@@ -93,7 +93,7 @@ def judge_trial(run: Any, path: Path, config: Any, twin: Any) -> Judged:
     """Ask the gate about one recorded trial, or read what it said before."""
     from bridge.episode.provenance import hash_settings
     from bridge.episode.reader import Episode
-    from twin.replay.work.job import REPLAY_VERSION
+    from twin.replay.job import REPLAY_VERSION
     from twin.scene.store.calibration import read_calibration
 
     settings = {"config": repr(config), "replay_version": REPLAY_VERSION}

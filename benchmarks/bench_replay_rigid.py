@@ -72,8 +72,8 @@ def slip_m(result: object) -> float:
 
 def physics_alone(scene: object, plan: object, config: object) -> tuple[float, float]:
     """CPU seconds of the simulation of a path that is known, and how long it lasts."""
-    from twin.replay.follow.dynamics import simulate
-    from twin.replay.follow.path import path_of_plan
+    from twin.replay.dynamics import simulate
+    from twin.replay.path import path_of_plan
     from twin.robot.collision import hulls_of
     from twin.robot.model import load_robot
 
@@ -87,8 +87,8 @@ def physics_alone(scene: object, plan: object, config: object) -> tuple[float, f
 def complete(scene: object, plan: object, config: object, folder: Path) -> tuple[float, object]:
     """CPU seconds from the plan to the written episode, and the result."""
     from bridge.episode.metadata import Derived, EpisodeInfo
-    from twin.replay.episode.file import ReplayOrigin, write_replay
-    from twin.replay.verdict.rollout import replay_plan
+    from twin.replay.output import ReplayOrigin, write_replay
+    from twin.replay.verdict import replay_plan
 
     start = time.process_time()
     result = replay_plan(plan, scene, config)
@@ -108,7 +108,7 @@ def complete(scene: object, plan: object, config: object, folder: Path) -> tuple
 
 def digest(repeats: int) -> str:
     """Hash of one replay, which is the same each time, or the hashes that differ."""
-    from twin.replay.verdict.rollout import replay_plan
+    from twin.replay.verdict import replay_plan
 
     rng = np.random.default_rng(0)
     scene, plan, config = randomised(rng)

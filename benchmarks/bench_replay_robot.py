@@ -38,9 +38,8 @@ def cpu_us(work: Callable[[], object], *, repeats: int, each: int = 1) -> float:
 def inverse_rows(num_poses: int) -> list[Target]:
     from bridge.task.robot import ur5_with_gripper_urdf
     from twin.robot.config import IkConfig
-    from twin.robot.inverse import pose_error, solve_ik
+    from twin.robot.inverse import UrInverse, pose_error, solve_ik
     from twin.robot.model import load_robot
-    from twin.robot.ur_inverse import UrInverse
 
     robot = load_robot(ur5_with_gripper_urdf())
     inverse = UrInverse.for_robot(robot)
@@ -168,7 +167,7 @@ def clearance_rows(num_states: int) -> list[Target]:
     from bridge.task.robot import ur5_with_gripper_urdf
     from bridge.task.task_file import load_task
     from twin.replay.clearance.surroundings import Surroundings
-    from twin.replay.place.scene import ReplayScene
+    from twin.replay.scene import ReplayScene
     from twin.robot.collision import hulls_of, signed_distance
     from twin.robot.model import load_robot
 
@@ -234,7 +233,7 @@ def clearance_rows(num_states: int) -> list[Target]:
 
 def candidate_rows(lookup: object) -> list[Target]:
     from bridge.geometry import se3
-    from twin.replay.clearance.candidates import candidate_clearance
+    from twin.replay.clearance.distance_grid import candidate_clearance
 
     rng = np.random.default_rng(SEED)
     points = rng.normal(size=(200, 3))

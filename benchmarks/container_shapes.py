@@ -20,8 +20,7 @@ from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.meshes.toys import basket_parts
 from bridge.task.task_file import ObjectModel, load_task
 from twin.replay.clearance.bodies import placed_panels, placement_of
-from twin.robot.collision import signed_distance
-from twin.robot.hulls import convex_hull
+from twin.robot.collision import convex_hull, signed_distance
 from twin.scene.shape.files import read_parts
 
 NUM_POINTS = 3000

@@ -19,7 +19,7 @@ from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
 from twin.physics.world import World
 from twin.replay.config import ReplayConfig
-from twin.replay.follow.path import JointPath, path_of_plan
+from twin.replay.path import JointPath, path_of_plan
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 from twin.scene.shape.from_mesh import shape_of_mesh

@@ -23,10 +23,9 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.schema import TRUTH_PREFIX
 from bridge.terminal import Output
-from twin.calibrate.physics.case import Case, planar
-from twin.calibrate.physics.data import read_cases
-from twin.calibrate.physics.drive import predict
+from twin.calibrate.physics.cases import Case, planar, read_cases
 from twin.calibrate.physics.parameters import BIAS
+from twin.calibrate.physics.simulate import predict
 from twin.physics.config import PhysicsConfig
 
 COMPARED = {

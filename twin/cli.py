@@ -32,8 +32,8 @@ def replay(
         output: How to talk.
     """
     from bridge.episode.run_folder import RunFolder
-    from twin.replay.run.start import replay_run
-    from twin.replay.run.text import describe_run
+    from twin.replay.summary import describe_run
+    from twin.replay.workers import replay_run
 
     summary = replay_run(RunFolder.open(run), config, output)
     output.result(summary, describe_run(summary))
@@ -164,8 +164,7 @@ def calibrate(
         message = "say what to calibrate: robot-gst calibrate RUN --cameras, or --physics."
         raise UsageError(message)
     if config.physics:
-        from twin.calibrate.physics.record import describe_physics
-        from twin.calibrate.physics.run import calibrate_physics
+        from twin.calibrate.physics.run import calibrate_physics, describe_physics
 
         physics, calibration_id = calibrate_physics(run_folder, config, output)
         output.result(

@@ -9,12 +9,10 @@ from scipy import ndimage
 
 from bridge.geometry.box import box_corners
 from twin.replay import _clearance
-from twin.replay.clearance.bodies import half_space_solid, solid_of
-from twin.replay.clearance.grid import GridLookup
-from twin.replay.clearance.near import NearPairs
-from twin.replay.clearance.shells import FINE_M, Shells, shell_of
-from twin.robot.collision import signed_distance
-from twin.robot.hulls import convex_hull
+from twin.replay.clearance.bodies import NearPairs, half_space_solid, solid_of
+from twin.replay.clearance.bounding_spheres import FINE_M, BoundingSpheres, bounding_spheres_of
+from twin.replay.clearance.distance_grid import GridLookup
+from twin.robot.collision import convex_hull, signed_distance
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid
 
 pytestmark = pytest.mark.parity
@@ -39,8 +37,8 @@ def poses(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_no_point_is_nearer_than_the_tree_says(grid: SdfGrid) -> None:
     rng = np.random.default_rng(2)
-    pieces = [shell_of(rng.uniform(-s, s, (25, 3))) for s in (0.02, 0.05, 0.08)]
-    together, lookup = Shells(pieces), GridLookup(grid)
+    pieces = [bounding_spheres_of(rng.uniform(-s, s, (25, 3))) for s in (0.02, 0.05, 0.08)]
+    together, lookup = BoundingSpheres(pieces), GridLookup(grid)
     inside = 0
     for seed in range(40):
         R, t = poses(3, seed)
@@ -54,7 +52,9 @@ def test_no_point_is_nearer_than_the_tree_says(grid: SdfGrid) -> None:
 
 
 def test_the_same_bits_on_every_call(grid: SdfGrid) -> None:
-    shell = Shells([shell_of(np.random.default_rng(3).uniform(-0.05, 0.05, (25, 3)))])
+    shell = BoundingSpheres(
+        [bounding_spheres_of(np.random.default_rng(3).uniform(-0.05, 0.05, (25, 3)))]
+    )
     lookup = GridLookup(grid)
     R, t = poses(1, 7)
     first = shell.distances_m(lookup, R, t)

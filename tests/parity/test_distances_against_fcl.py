@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from bridge.task.robot import ur5_with_gripper_urdf
-from twin.robot.collision import RobotHulls, hulls_of, signed_distance
-from twin.robot.hulls import convex_hull
+from twin.robot.collision import RobotHulls, convex_hull, hulls_of, signed_distance
 from twin.robot.model import load_robot
 
 pytestmark = pytest.mark.parity

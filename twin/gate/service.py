@@ -15,18 +15,20 @@ from bridge.terminal import Output, printable, stop_signals
 from bridge.wire.config import WireConfig
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
-from twin.gate.judge import Eyes, Gate
+from twin.gate.gate import Gate, Perception
 from twin.gate.twin_process import TwinProcess
 
 CELL_NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
-SAID = {True: "accepted", False: "rejected", None: "no verdict"}
+VERDICT_WORDS = {True: "accepted", False: "rejected", None: "no verdict"}
 
 
 class GateError(TwinError):
     """The gate cannot be set up as asked."""
 
 
-def make_gate(config: GateConfig, eyes: Eyes, now_ns: Callable[[], int], twin: TwinProcess) -> Gate:
+def make_gate(
+    config: GateConfig, eyes: Perception, now_ns: Callable[[], int], twin: TwinProcess
+) -> Gate:
     """Put the real localisation and replay behind the gate."""
     return Gate(
         task=load_task(config.task),
@@ -38,7 +40,9 @@ def make_gate(config: GateConfig, eyes: Eyes, now_ns: Callable[[], int], twin: T
     )
 
 
-def serve_gate(session: Any, gate: Gate, eyes: Eyes, config: GateConfig, output: Output) -> None:
+def serve_gate(
+    session: Any, gate: Gate, eyes: Perception, config: GateConfig, output: Output
+) -> None:
     """Answer on ``<cell>/gate/verdict`` and publish every verdict on ``/<cell>/verdict``.
 
     A published verdict carries the time of the newest thing seen, on the cell's own clock, so
@@ -56,7 +60,7 @@ def serve_gate(session: Any, gate: Gate, eyes: Eyes, config: GateConfig, output:
         seconds = time.monotonic() - started
         p = verdict.p_success
         share = f" {p['k']:g} of {p['n']:g} samples succeed." if p else ""
-        text = f"{verdict.plan_id}: {SAID[verdict.accepted]} in {seconds:.1f} s.{share}"
+        text = f"{verdict.plan_id}: {VERDICT_WORDS[verdict.accepted]} in {seconds:.1f} s.{share}"
         output.say(printable(f"{text} {verdict.reason or ''}".rstrip()))
         return data
 
@@ -82,7 +86,7 @@ def watch_cell(
         session.subscribe(key, on_sample)
 
 
-def be_the_only_one(session: Any, cell: str) -> None:
+def claim_gate(session: Any, cell: str) -> None:
     """Let other gates of this cell see that there is one.
 
     Whoever asks takes the first answer that comes, and of two gates one may know another task or
@@ -117,7 +121,7 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
         open_session(wire) as session,
         TwinProcess(run.path, task, config, output) as twin,
     ):
-        be_the_only_one(session, config.cell)
+        claim_gate(session, config.cell)
         watch_cell(session, config.cell, eyes.take, joints=eyes.needs_joints)
         gate = make_gate(config, eyes, session.now_ns, twin)
         serve_gate(session, gate, eyes, config, output)

@@ -1,18 +1,97 @@
 """The robot in PyBullet: its motors, its fingers, where its links are."""
 
 import tempfile
-from collections.abc import Sequence
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
 from bridge.task.robot import ARM_JOINTS, FINGER_JOINTS, FINGER_LINKS, MAX_WIDTH_M, TCP_FRAME
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
-from twin.physics.description import Hulls, write_description
 from twin.physics.engine import pybullet
+
+# --- The robot description as PyBullet should load it.
+#
+# PyBullet gives links without ``<inertial>`` a mass of 1 kg, massless frames included, and makes
+# its own hulls of meshes; both are settled here so that it simulates the robot that was described.
+
+_TINY_MASS_KG = 1e-3
+_TINY_INERTIA_KG_M2 = 1e-6
+
+Hulls = Mapping[str, Sequence[Float[np.ndarray, "num_points 3"]]]
+
+
+def write_description(urdf: str, mesh_hulls_m: Hulls, folder: Path) -> Path:
+    """Write ``robot.urdf`` and its hull meshes into a folder.
+
+    Args:
+        urdf: Description without package URIs.
+        mesh_hulls_m: Per link, the hulls that stand for its mesh collision elements, in the
+            link's frame [m].
+        folder: Where the files go.
+
+    Returns:
+        The path of the URDF file.
+    """
+    root = ET.fromstring(urdf)
+    for number, link in enumerate(root.findall("link")):
+        for visual in link.findall("visual"):
+            link.remove(visual)
+        if link.find("inertial") is None:
+            link.append(_tiny_inertial())
+        hulls = mesh_hulls_m.get(link.get("name", ""), ())
+        if hulls:  # by number: a name may hold a slash
+            _replace_meshes(link, hulls, folder, f"link_{number}")
+    path = folder / "robot.urdf"
+    path.write_text(ET.tostring(root, encoding="unicode"))
+    return path
+
+
+def _tiny_inertial() -> ET.Element:
+    inertial = ET.Element("inertial")
+    ET.SubElement(inertial, "mass", value=str(_TINY_MASS_KG))
+    inertia = ET.SubElement(inertial, "inertia", ixy="0", ixz="0", iyz="0")
+    for axis in ("ixx", "iyy", "izz"):
+        inertia.set(axis, str(_TINY_INERTIA_KG_M2))
+    return inertial
+
+
+def _replace_meshes(
+    link: ET.Element,
+    hulls: Sequence[Float[np.ndarray, "num_points 3"]],
+    folder: Path,
+    stem: str,
+) -> None:
+    for collision in link.findall("collision"):
+        if collision.find("geometry/mesh") is not None:
+            link.remove(collision)
+    for index, points in enumerate(hulls):
+        path = folder / f"{stem}_{index}.obj"
+        path.write_text(_obj(points))
+        collision = ET.SubElement(link, "collision")
+        geometry = ET.SubElement(collision, "geometry")
+        ET.SubElement(geometry, "mesh", filename=str(path))
+
+
+def _obj(points_m: Float[np.ndarray, "num_points 3"]) -> str:
+    return _obj_of(np.asarray(points_m, dtype=np.float64).tobytes())
+
+
+@lru_cache(maxsize=64)
+def _obj_of(points: bytes) -> str:
+    """Every world of a process loads the same robot: its hulls are written out once."""
+    points_m = np.frombuffer(points).reshape(-1, 3)
+    triangles = ConvexHull(points_m).simplices + 1
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in points_m]
+    lines += [f"f {a} {b} {c}" for a, b, c in triangles]
+    return "\n".join(lines) + "\n"
+
 
 SLOWEST_M_S = 1e-4
 """Stalled fingers still creep this fast: PyBullet takes a speed of 0 for no limit."""
@@ -278,3 +357,59 @@ class Arm:
 
 def _numbers(joints: Joints) -> list[float]:
     return joints if isinstance(joints, list) else joints.tolist()
+
+
+# --- Fingers that press on what does not yield get their force in fewer iterations of the solver.
+#
+# The solver begins each step with fingers that press by nothing, and each of its iterations adds
+# what stops a finger at the speed it is driven with. At the usual speed 20 N take 45 iterations;
+# all else takes 10. Fingers that stand still although they are told to close are therefore driven
+# faster. Their force is the same. What they hold may give way: then they are at the usual speed
+# again before they have gone far. docs/decisions/0049-stalled-fingers.md.
+
+PRESS_M_S = 0.8
+"""Speed with which stalled fingers are driven; until somebody looks they go 7 mm at most."""
+STALLED_M_S = 0.02
+"""Fingers slower than this are stopped by something."""
+SHORT_M = 0.0005
+"""Fingers this near to where they were told to be have arrived there."""
+EVERY_STEPS = 2
+"""How often fingers are asked."""
+PATIENCE = 2
+"""So many times they must have been found to be stopped."""
+
+
+class Press:
+    """Watches the fingers of an arm."""
+
+    def __init__(self, arm: Arm) -> None:
+        """Start with fingers at their usual speed.
+
+        Args:
+            arm: Whose fingers.
+        """
+        self._arm = arm
+        self._steps = 0
+        self._found = 0
+
+    def update(self, *, anew: bool) -> None:
+        """Drive the fingers for the next step. Call once per step.
+
+        Args:
+            anew: Contacts begin anew: fingers may find less in their way than there is.
+        """
+        self._steps += 1
+        if anew:
+            self._found = 0
+            self._arm.press(None)
+        elif self._arm.closing and self._steps % EVERY_STEPS == 0:
+            self._found = self._found + 1 if self._stalled() else 0
+            self._arm.press(PRESS_M_S if self._found >= PATIENCE else None)
+        elif not self._arm.closing:
+            self._found = 0
+
+    def _stalled(self) -> bool:
+        return all(
+            short_m > SHORT_M and abs(speed_m_s) < STALLED_M_S
+            for short_m, speed_m_s in self._arm.fingers()
+        )

@@ -5,14 +5,197 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, Int32
+from jaxtyping import Bool, Float, Float32, Int, Int32
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
+from bridge.errors import UsageError
 from bridge.task.meshes.catalogue import ToyMesh, toy_mesh
-from bridge.task.meshes.lattice import Lattice, make_lattice, volumes_m3
+from bridge.task.meshes.lattice import Lattice, fill, make_lattice, volumes_m3
 from bridge.task.task_file import ObjectModel
 from twin.errors import TwinError
-from twin.physics.soft_coarse import coarse_lattice
-from twin.physics.soft_shape import surface_triangles
+
+# --- Shapes of tetrahedra in motion: surface, rigid fit, and points that follow.
+
+
+def rigid_fit(
+    rest_m: Float[np.ndarray, "num_nodes 3"],
+    nodes_m: Float[np.ndarray, "num_nodes 3"],
+    mass_fraction: Float[np.ndarray, " num_nodes"],
+) -> Float[np.ndarray, "4 4"]:
+    """Rigid motion that brings the nodes at rest nearest to where they are: Kabsch (1976).
+
+    Squared distances are weighted by mass. Nodes that are no numbers give a pose that is none.
+    """
+    T = np.eye(4)
+    if not np.isfinite(nodes_m).all():
+        T[:3] = np.nan
+        return T
+    weight = mass_fraction / mass_fraction.sum()
+    middle_rest, middle = weight @ rest_m, weight @ nodes_m
+    cross = ((nodes_m - middle) * weight[:, None]).T @ (rest_m - middle_rest)
+    left, _, right = np.linalg.svd(cross)
+    flip = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))])
+    T[:3, :3] = left @ flip @ right
+    T[:3, 3] = middle - T[:3, :3] @ middle_rest
+    return T
+
+
+def surface_triangles(
+    tets: Int32[np.ndarray, "num_tets 4"],
+) -> Int32[np.ndarray, "num_triangles 3"]:
+    """Faces that belong to one tetrahedron only, outward for positively oriented tetrahedra."""
+    faces = np.concatenate([tets[:, list(f)] for f in ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))])
+    _, first, count = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    return np.ascontiguousarray(faces[np.sort(first[count == 1])])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Skin:
+    """Points that follow the tetrahedra they lie in or nearest to."""
+
+    node_ids: Int[np.ndarray, "num_points 4"]
+    weights: Float[np.ndarray, "num_points 4"]
+
+    def points_m(
+        self, nodes_m: Float[np.ndarray, "num_nodes 3"]
+    ) -> Float[np.ndarray, "num_points 3"]:
+        """Where the points are."""
+        return np.asarray(self._followed @ nodes_m[: self._followed.shape[1]])
+
+    @cached_property
+    def _followed(self) -> csr_array:
+        rows = np.repeat(np.arange(len(self.node_ids)), 4)
+        shape = (len(self.node_ids), int(self.node_ids.max()) + 1)
+        return csr_array((self.weights.ravel(), (rows, self.node_ids.ravel())), shape=shape)
+
+
+def bind_points(
+    points_m: Float[np.ndarray, "num_points 3"],
+    nodes_m: Float[np.ndarray, "num_nodes 3"],
+    tets: Int32[np.ndarray, "num_tets 4"],
+) -> Skin:
+    """Barycentric coordinates in the tetrahedron that holds a point, or leaves it out the least."""
+    corner = nodes_m[tets[:, 0]]
+    to_weights = np.linalg.inv(np.swapaxes(nodes_m[tets[:, 1:]] - corner[:, None], 1, 2))
+    best = np.full(len(points_m), -np.inf)
+    weights, owner = np.zeros((len(points_m), 4)), np.zeros(len(points_m), dtype=np.int64)
+    for index in range(len(tets)):
+        inner = (points_m - corner[index]) @ to_weights[index].T
+        found = np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
+        least = found.min(axis=1)
+        better = least > best
+        best[better], owner[better], weights[better] = least[better], index, found[better]
+    return Skin(node_ids=tets[owner].astype(np.int64), weights=weights)
+
+
+# --- A coarser lattice for a body whose own is finer than physics can pay for.
+#
+# Substeps shorten with the cells and their number grows with the cube: a lattice of half the
+# spacing costs about sixteen times as much. What is drawn keeps its detail: the fine surface
+# follows as skin.
+
+FINER = 0.75
+"""Lattices are made coarser whose spacing is less than this share of the wanted one."""
+_SPLIT = 6
+"""Parts of a triangle's edge at which its surface is sampled."""
+_NEAREST = 48
+"""Tetrahedra by their middles among which the one that holds a point is looked for: in a lattice of
+cubes, five each, it is among the 32 nearest."""
+_ROUNDED = 1.00001
+"""Nodes are in single precision: what is four cells long would else get five."""
+_SHRINK = 0.85
+"""Cells get smaller by this factor until the body is in one piece."""
+
+
+def coarse_lattice(
+    nodes_m: Float32[np.ndarray, "num_nodes 3"],
+    tets: Int32[np.ndarray, "num_tets 4"],
+    cell_m: float,
+) -> tuple[Lattice, float] | None:
+    """Fill the solid that a lattice fills with larger cells.
+
+    Args:
+        nodes_m: Nodes of the fine lattice at rest [m].
+        tets: Its tetrahedra.
+        cell_m: What the distance of neighbouring nodes should be [m].
+
+    Returns:
+        The coarse lattice in one piece and its spacing [m]; None where the fine one is the
+        coarsest that is in one piece, or is not finer.
+    """
+    return _coarse_lattice(
+        np.ascontiguousarray(nodes_m).tobytes(),
+        np.ascontiguousarray(tets).tobytes(),
+        cell_m,
+    )
+
+
+@lru_cache(maxsize=16)
+def _coarse_lattice(nodes: bytes, tets: bytes, cell_m: float) -> tuple[Lattice, float] | None:
+    points = np.frombuffer(nodes, dtype=np.float32).reshape(-1, 3).astype(np.float64)
+    fours = np.frombuffer(tets, dtype=np.int32).reshape(-1, 4)
+    # A cube of five tetrahedra: the label of a lattice may be any number.
+    spacing_m = float(np.cbrt(5 * volumes_m3(points, fours).mean()))
+    if spacing_m >= FINER * cell_m:
+        return None
+    distance = _SignedDistance(points, fours)
+    while spacing_m < FINER * cell_m:
+        try:
+            found = fill(distance, points.min(axis=0), points.max(axis=0), cell_m * _ROUNDED)
+        except UsageError:
+            found = None
+        if found is not None and _in_one_piece(found):
+            return found, cell_m
+        cell_m *= _SHRINK
+    return None
+
+
+def _in_one_piece(lattice: Lattice) -> bool:
+    tets = lattice.tetrahedra
+    pairs = np.concatenate([tets[:, [0, k]] for k in (1, 2, 3)])
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(lattice.points_m),) * 2)
+    return int(connected_components(graph, directed=False)[0]) == 1
+
+
+class _SignedDistance:
+    """Distance to the surface of a lattice, negative inside.
+
+    To samples of the surface, a sixth of an edge apart: what is as far as a cell is off by a
+    hundredth of one.
+    """
+
+    def __init__(
+        self, nodes_m: Float[np.ndarray, "num_nodes 3"], tets: Int32[np.ndarray, "num_tets 4"]
+    ) -> None:
+        corners = nodes_m[surface_triangles(tets)]
+        steps = [(i, j) for i in range(_SPLIT + 1) for j in range(_SPLIT + 1 - i)]
+        weights = np.array([(i, j, _SPLIT - i - j) for i, j in steps]) / _SPLIT
+        self._surface = cKDTree(np.einsum("sk,tkc->tsc", weights, corners).reshape(-1, 3))
+        self._middles = cKDTree(nodes_m[tets].mean(axis=1))
+        self._corner = nodes_m[tets[:, 0]]
+        edges = nodes_m[tets[:, 1:]] - self._corner[:, None]
+        self._to_weights = np.linalg.inv(np.swapaxes(edges, 1, 2))
+
+    def __call__(
+        self, points_m: Float[np.ndarray, "num_points 3"]
+    ) -> Float[np.ndarray, " num_points"]:
+        distance, _ = self._surface.query(points_m)
+        return np.asarray(np.where(self._inside(points_m), -distance, distance))
+
+    def _inside(
+        self, points_m: Float[np.ndarray, "num_points 3"]
+    ) -> Bool[np.ndarray, " num_points"]:
+        _, near = self._middles.query(points_m, k=min(_NEAREST, self._middles.n))
+        near = near.reshape(len(points_m), -1)
+        local = points_m[:, None] - self._corner[near]
+        inner = np.einsum("nkij,nkj->nki", self._to_weights[near], local)
+        least = np.minimum(inner.min(axis=2), 1.0 - inner.sum(axis=2))
+        return np.asarray((least >= -1e-9).any(axis=1))
+
 
 POISSON_RANGE = (0.0, 0.45)
 """Beyond, a lattice of linear tetrahedra locks."""

@@ -8,21 +8,79 @@ same bits on every run.
 """
 
 from collections.abc import Sequence
+from math import cos
 from types import TracebackType
 
 import numpy as np
 from jaxtyping import Float, Float32
 
 from bridge.geometry import se3
-from bridge.task.robot import BASE_FRAME
-from twin.physics.anchors import FrictionAnchors
-from twin.physics.arm import Arm, Joints, PhysicsError
+from bridge.task.robot import BASE_FRAME, TCP_FRAME
+from twin.physics.arm import Arm, Hulls, Joints, PhysicsError, Press
 from twin.physics.config import PhysicsConfig
-from twin.physics.description import Hulls
 from twin.physics.engine import give_client_back, pybullet, take_client
-from twin.physics.press import Press
 from twin.physics.soft import SoftHealth, SoftModel
 from twin.physics.soft_world import SoftWorld
+
+# --- Friction that holds where it held: PyBullet's friction anchors, with fresh contact normals.
+#
+# Without anchors friction acts against velocities only, and what the solver leaves of them adds
+# up to a creep that takes hundreds of iterations to keep small. With an anchor a contact point
+# stays where it took hold while its force is within Coulomb's cone, and is let go when it is not.
+# The engine then keeps all of the point, also its normal in the world, which goes wrong when what
+# is held turns. So a body that has turned by a little takes hold anew.
+# docs/decisions/0046-friction-anchors.md.
+
+TURN_RAD = 0.03
+"""A body that has turned by this much takes hold anew."""
+EVERY_STEPS = 4
+"""How often bodies are asked; the fastest joint turns by 0.05 rad meanwhile."""
+_DYNAMIC, _ALL = 1, -1
+"""PyBullet's collision group and mask of bodies that move."""
+
+
+class FrictionAnchors:
+    """The anchors of the rigid bodies that move freely in one PyBullet client."""
+
+    def __init__(self, client: int) -> None:
+        """Start without bodies.
+
+        Args:
+            client: PyBullet's number of the world.
+        """
+        self._client = client
+        self._held: dict[int, tuple[float, ...]] = {}
+        self._steps = 0
+
+    def add(self, body: int) -> None:
+        """Let a body's contacts hold from now on."""
+        self._held[body] = self._orientation(body)
+        pybullet.changeDynamics(body, -1, frictionAnchor=1, physicsClientId=self._client)
+
+    def refresh(self) -> bool:
+        """Let bodies that have turned take hold anew in the next step; whether any does.
+
+        Call once per step.
+        """
+        self._steps += 1
+        if self._steps % EVERY_STEPS:
+            return False
+        anew = False
+        for body, (x0, y0, z0, w0) in self._held.items():
+            x, y, z, w = now = self._orientation(body)
+            if abs(x * x0 + y * y0 + z * z0 + w * w0) < cos(TURN_RAD / 2):
+                self._held[body] = now
+                # Setting the group that it has already is how PyBullet drops contact points.
+                pybullet.setCollisionFilterGroupMask(
+                    body, -1, _DYNAMIC, _ALL, physicsClientId=self._client
+                )
+                anew = True
+        return anew
+
+    def _orientation(self, body: int) -> tuple[float, ...]:
+        _, q = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
+        return tuple(q)
+
 
 Box = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 """Centre and extents in the owner's frame [m]."""
@@ -265,3 +323,64 @@ class World:
     ) -> None:
         """Close."""
         self.close()
+
+
+# --- Tie an object to the tool instead of holding it by friction: ``--grasp attach``, not the
+# default.
+#
+# For robots or grippers whose friction nobody knows. What is tied cannot slip, so a verdict made
+# this way says nothing about the grasp; the engine's name carries the word wherever it is shown.
+
+PRESS_M = 0.001
+"""Fingers that are told to go this much farther than they are press on something."""
+OPEN_M = 0.002
+"""An object is let go when the fingers are told to be this much wider than when it was tied."""
+
+
+class Attachment:
+    """Holds at most one rigid object by a fixed joint, from the touch to the command to open."""
+
+    def __init__(self, world: World) -> None:
+        """Start with empty fingers."""
+        self._world = world
+        self._constraint: int | None = None
+        self._width_m = 0.0
+
+    def update(self, command_m: float) -> None:
+        """Tie what the fingers press on, or let go. Call once per step.
+
+        Args:
+            command_m: The distance the fingers are told to have.
+        """
+        if self._constraint is not None:
+            if command_m > self._width_m + OPEN_M:
+                pybullet.removeConstraint(self._constraint, physicsClientId=self._world.client)
+                self._constraint = None
+            return
+        width_m = self._world.width_m()
+        if command_m > width_m - PRESS_M:
+            return
+        for object_id in self._world.free_ids:
+            if self._world.finger_touches(object_id):
+                self._constraint, self._width_m = self._tie(object_id), width_m
+                return
+
+    def _tie(self, object_id: str) -> int:
+        T_tcp_base = se3.invert(self._world.T_base_link(TCP_FRAME))
+        q, p = se3.split(T_tcp_base @ self._world.T_base_object(object_id))
+        w, x, y, z = q.tolist()
+        return int(
+            pybullet.createConstraint(
+                self._world.robot_id,
+                self._world.link_id(TCP_FRAME),
+                self._world.free_ids[object_id],
+                -1,
+                pybullet.JOINT_FIXED,
+                [0, 0, 0],
+                np.asarray(p).tolist(),
+                [0, 0, 0],
+                [x, y, z, w],
+                [0, 0, 0, 1],
+                physicsClientId=self._world.client,
+            )
+        )

@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from twin.robot.config import IkConfig
-from twin.robot.inverse import HOME_RAD, solve_ik
+from twin.robot.inverse import HOME_RAD, NUM_BRANCHES, UrInverse, solve_ik
 from twin.robot.model import RobotModel
-from twin.robot.ur_inverse import NUM_BRANCHES, UrInverse
 
 Clearance = Callable[
     [Float[np.ndarray, "num_postures num_joints"]], Float[np.ndarray, " num_postures"]

@@ -2,17 +2,19 @@
 
 Levenberg-Marquardt on the SE(3) error with a warm start, because the next waypoint of a
 trajectory is near; random restarts, from a fixed seed, only where there is no warm start. Works
-for any arm; ``twin.robot.ur_inverse`` knows all answers at once for arms of one kind.
+for any arm; ``twin.robot.inverse`` knows all answers at once for arms of one kind.
 """
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import pinocchio as pin
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.linalg.lapack import dposv
 
+from bridge.geometry import se3
 from twin.robot.config import IkConfig
 from twin.robot.model import RobotModel
 
@@ -119,3 +121,292 @@ def _descend(
         and position <= config.position_tolerance_m
         and rotation <= config.rotation_tolerance_rad,
     )
+
+
+# --- Whether an arm has the geometry of a UR, and its lengths, read off its joint axes.
+#
+# Nothing depends on how a description places its link frames: the axes at zero joints decide. A
+# Denavit-Hartenberg chain is laid through them and must then reproduce pinocchio's kinematics.
+
+_SAME_DIRECTION = 1e-4
+_SHORTEST_M = 1e-4
+_WORST = 1e-5
+"""Deviation from pinocchio [m and rad] up to which an arm counts as one; rpy="1.5708" is 4e-6."""
+_NUM_CHECKS = 12
+
+_ALPHA = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class UrGeometry:
+    """Lengths and fixed frames; d1 is part of ``T_base_0`` and d6 of ``T_6_tcp``."""
+
+    a2_m: float
+    """Upper arm."""
+    a3_m: float
+    """Forearm."""
+    d4_m: float
+    """How far the wrist stands beside the plane that holds the first axis."""
+    d5_m: float
+    """From the fourth axis to the sixth."""
+    signs: Float[np.ndarray, "6"]
+    offsets_rad: Float[np.ndarray, "6"]
+    """theta = signs * joints + offsets."""
+    T_base_0: Float[np.ndarray, "4 4"]
+    """First axis along z; the origin is where the first two axes meet."""
+    T_6_tcp: Float[np.ndarray, "4 4"]
+    """Sixth axis along z; the origin is where the last two axes meet."""
+    deviation: float = 0.0
+    """Largest entry of the difference to pinocchio's poses over random postures."""
+
+    def forward(self, joints_rad: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
+        """Pose ``T_base_tcp`` of one posture."""
+        theta = self.signs * joints_rad + self.offsets_rad
+        a = (0.0, self.a2_m, self.a3_m, 0.0, 0.0, 0.0)
+        d = (0.0, 0.0, 0.0, self.d4_m, self.d5_m, 0.0)
+        T = self.T_base_0
+        for row in zip(theta, a, d, _ALPHA, strict=True):
+            T = T @ _link(*row)
+        return np.asarray(T @ self.T_6_tcp)
+
+
+def ur_geometry(robot: RobotModel) -> UrGeometry | None:
+    """Read the geometry off the joint axes; None when the arm has another one."""
+    axes = _axes(robot)
+    if axes is None:
+        return None
+    geometry = _through(*axes, robot.T_base_tcp(np.zeros(6)))
+    return None if geometry is None else _checked(geometry, robot)
+
+
+def _axes(
+    robot: RobotModel,
+) -> tuple[Float[np.ndarray, "6 3"], Float[np.ndarray, "6 3"]] | None:
+    """Direction of each joint axis at zero and the point on it nearest the base's origin."""
+    if len(robot.arm_ids) != 6:
+        return None
+    q = robot.configuration(np.zeros(6))
+    twists = np.array(pin.computeJointJacobians(robot.model, robot.model.createData(), q))
+    twists = twists[:, robot.arm_velocity_ids].T
+    directions = twists[:, 3:]
+    if not np.allclose(np.linalg.norm(directions, axis=1), 1.0):
+        return None
+    return directions, np.cross(directions, twists[:, :3])
+
+
+def _through(
+    w: Float[np.ndarray, "6 3"], p: Float[np.ndarray, "6 3"], T_base_tcp: Float[np.ndarray, "4 4"]
+) -> UrGeometry | None:
+    """Lay the chain through the axes; None when they do not stand to each other as a UR's do."""
+    across = [w[0] @ w[1], w[3] @ w[4], w[4] @ w[5]]
+    along = [np.linalg.norm(np.cross(w[1], w[2])), np.linalg.norm(np.cross(w[1], w[3]))]
+    if np.abs([*across, *along]).max() > _SAME_DIRECTION:
+        return None
+    origin = _meeting(p[0], w[0], p[1], w[1])
+    x1, y1, z1 = np.cross(w[0], w[1]), w[0], w[1]
+    elbow, wrist = ((point - origin) @ np.stack([x1, y1], axis=1) for point in (p[2], p[3]))
+    fore = wrist - elbow
+    a2, a3 = float(np.hypot(*elbow)), float(np.hypot(*fore))
+    if min(a2, a3) < _SHORTEST_M:
+        return None
+    wrist_45, wrist_56 = _meeting(p[3], w[3], p[4], w[4]), _meeting(p[4], w[4], p[5], w[5])
+    upper_rad, fore_rad = (float(np.arctan2(v[1], v[0])) for v in (elbow, fore))
+    turned_rad = float(np.arctan2(w[4] @ x1, -w[4] @ y1))
+    x4 = np.cos(turned_rad) * x1 + np.sin(turned_rad) * y1
+    bent_rad = float(np.arctan2(-w[5] @ x4, w[5] @ z1))
+    T_base_0 = np.eye(4)
+    T_base_0[:3, :3] = np.stack([x1, -z1, w[0]], axis=1)
+    T_base_0[:3, 3] = origin
+    chain = UrGeometry(
+        a2_m=a2,
+        a3_m=a3,
+        d4_m=float((wrist_45 - origin) @ z1),
+        d5_m=float((wrist_56 - wrist_45) @ w[4]),
+        signs=np.array([1.0, 1.0, np.sign(w[2] @ z1), np.sign(w[3] @ z1), 1.0, 1.0]),
+        offsets_rad=np.array(
+            [0.0, upper_rad, fore_rad - upper_rad, turned_rad - fore_rad, bent_rad, 0.0]
+        ),
+        T_base_0=T_base_0,
+        T_6_tcp=np.eye(4),
+    )
+    T_6_tcp = np.linalg.solve(chain.forward(np.zeros(6)), T_base_tcp)
+    return UrGeometry(**{**vars(chain), "T_6_tcp": T_6_tcp})
+
+
+def _checked(geometry: UrGeometry, robot: RobotModel) -> UrGeometry | None:
+    rng = np.random.default_rng(0)
+    postures = rng.uniform(-np.pi, np.pi, (_NUM_CHECKS, 6))
+    worst = max(
+        float(np.abs(geometry.forward(row) - robot.T_base_tcp(row)).max()) for row in postures
+    )
+    if not worst < _WORST:
+        return None
+    return UrGeometry(**{**vars(geometry), "deviation": worst})
+
+
+def _meeting(
+    p: Float[np.ndarray, "3"],
+    v: Float[np.ndarray, "3"],
+    q: Float[np.ndarray, "3"],
+    w: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "3"]:
+    """Where two lines that are square to each other meet: the point of the first one."""
+    along = np.linalg.solve(np.stack([v, -w, np.cross(v, w)], axis=1), q - p)[0]
+    return np.asarray(p + along * v)
+
+
+def _link(theta: float, a_m: float, d_m: float, alpha: float) -> Float[np.ndarray, "4 4"]:
+    """Rotate about z, move along z, move along the new x, rotate about it."""
+    c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
+    return np.array(
+        [
+            [c, -s * ca, s * sa, a_m * c],
+            [s, c * ca, -c * sa, a_m * s],
+            [0.0, sa, ca, d_m],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+# --- Closed-form inverse kinematics of UR-type arms: all eight branches of many poses at once.
+#
+# The second, third and fourth axes are parallel, so the direction n they share and the wrist
+# point (where the last two axes meet) give the joints one after another (Hawkins 2013, "Analytic
+# inverse kinematics for the Universal Robots UR-5/UR-10 arms"):
+#
+#     n . wrist = d4                      two shoulders     n seen from the tool
+# two wrists, and with them the fifth axis     what is left is a planar arm        two elbows
+#
+# Angles come from two-argument arctangents of quantities that stay exact near the singularities.
+
+NUM_BRANCHES = 8
+"""Branch number: 4 * shoulder + 2 * wrist + elbow, each 0 or 1."""
+_BEYOND = 1e-9
+"""A cosine may leave [-1, 1] by this: a stretched arm, reached to a fraction of a nanometre."""
+_SINGULAR = 1e-9
+"""Sine of the fifth joint below which the sixth may be anything."""
+_LIMIT_SLACK_RAD = 1e-9
+
+_TURN = 2 * np.pi
+
+
+@dataclass(frozen=True, kw_only=True)
+class UrInverse:
+    """All joints of a UR-type arm that reach a pose."""
+
+    geometry: UrGeometry
+    lower_rad: Float[np.ndarray, "6"]
+    upper_rad: Float[np.ndarray, "6"]
+
+    @staticmethod
+    def for_robot(robot: RobotModel) -> "UrInverse | None":
+        """Return the inverse of a robot's arm, None when its geometry is not that of a UR."""
+        return _for_robot(robot)
+
+    def all_branches(
+        self, Ts_base_tcp: Float[np.ndarray, "num_poses 4 4"]
+    ) -> tuple[Float[np.ndarray, "num_poses 8 6"], Bool[np.ndarray, "num_poses 8"]]:
+        """Solve many poses.
+
+        Args:
+            Ts_base_tcp: Rigid poses of the tool centre point.
+
+        Returns:
+            Joints [rad], one turn of each joint, within the limits; and which of them are
+            solutions. Out of reach, outside the limits, not a number, or with a joint that may be
+            anything (the wrist point on the first axis, the fifth joint straight): not valid, and
+            all joints are 0.
+        """
+        joints, valid, _ = self.solve(Ts_base_tcp)
+        return joints, valid
+
+    def solve(
+        self, Ts_base_tcp: Float[np.ndarray, "num_poses 4 4"]
+    ) -> tuple[
+        Float[np.ndarray, "num_poses 8 6"],
+        Bool[np.ndarray, "num_poses 8"],
+        Bool[np.ndarray, " num_poses"],
+    ]:
+        """``all_branches``, and at which poses some branch has a straight wrist.
+
+        There the pose is within reach on that branch too, by joints that nobody can number.
+        """
+        finite = np.isfinite(Ts_base_tcp).all(axis=(1, 2))
+        theta, valid, singular = _angles(
+            self.geometry, np.where(finite[:, None, None], Ts_base_tcp, 0.0)
+        )
+        joints = (theta - self.geometry.offsets_rad) * self.geometry.signs
+        joints -= _TURN * np.rint(joints / _TURN)
+        joints += _TURN * (joints < self.lower_rad - _LIMIT_SLACK_RAD)
+        joints -= _TURN * (joints > self.upper_rad + _LIMIT_SLACK_RAD)
+        inside = (joints >= self.lower_rad - _LIMIT_SLACK_RAD) & (
+            joints <= self.upper_rad + _LIMIT_SLACK_RAD
+        )
+        valid &= inside.all(axis=2) & finite[:, None]
+        return np.where(valid[..., None], joints, 0.0), valid, singular & finite
+
+
+@lru_cache(maxsize=4)
+def _for_robot(robot: RobotModel) -> UrInverse | None:
+    geometry = ur_geometry(robot)
+    if geometry is None:
+        return None
+    return UrInverse(geometry=geometry, lower_rad=robot.lower_rad, upper_rad=robot.upper_rad)
+
+
+def _angles(
+    geometry: UrGeometry, Ts_base_tcp: Float[np.ndarray, "num_poses 4 4"]
+) -> tuple[
+    Float[np.ndarray, "num_poses 8 6"],
+    Bool[np.ndarray, "num_poses 8"],
+    Bool[np.ndarray, " num_poses"],
+]:
+    """Angles of the Denavit-Hartenberg chain; axes of the arrays: pose, shoulder, wrist, elbow."""
+    g = geometry
+    T = se3.invert(g.T_base_0) @ Ts_base_tcp @ se3.invert(g.T_6_tcp)
+    R = T[:, :3, :3]
+    x, y, z = (T[:, i, 3, None] for i in range(3))
+    theta = np.empty((len(T), 2, 2, 2, 6))
+
+    radius = np.hypot(x, y)
+    sine = np.divide(g.d4_m, radius, out=np.full_like(radius, 2.0), where=radius > _SINGULAR)
+    valid = (np.abs(sine) <= 1 + _BEYOND)[..., None, None]
+    lean = np.arcsin(np.clip(sine, -1.0, 1.0))
+    first = np.arctan2(y, x) + np.concatenate([lean, np.pi - lean], axis=1)
+    c1, s1 = np.cos(first), np.sin(first)
+    theta[..., 0] = first[..., None, None]
+
+    # n, the direction of the parallel axes, in the frame of the tool: (s5 c6, -s5 s6, c5).
+    nx, ny, nz = (R[:, 0, k, None] * s1 - R[:, 1, k, None] * c1 for k in range(3))
+    s5 = np.hypot(nx, ny)
+    safe = np.maximum(s5, _SINGULAR)
+    wrist = np.array([1.0, -1.0])
+    theta[..., 4] = np.arctan2(s5[..., None] * wrist, nz[..., None])[..., None]
+    sixth = np.arctan2(-ny, nx)
+    theta[..., 5] = (sixth[..., None] + np.array([0.0, np.pi]))[..., None]
+    singular = (s5 <= _SINGULAR) & valid[..., 0, 0]
+    valid = valid & (s5 > _SINGULAR)[..., None, None]
+
+    # The fifth axis, in the plane of the arm.
+    c6, s6 = nx / safe, -ny / safe
+    across = -s6 * (R[:, 0, 0, None] * c1 + R[:, 1, 0, None] * s1) - c6 * (
+        R[:, 0, 1, None] * c1 + R[:, 1, 1, None] * s1
+    )
+    up = -s6 * R[:, 2, 0, None] - c6 * R[:, 2, 1, None]
+    across, up = across[..., None] * wrist, up[..., None] * wrist
+
+    px = (x * c1 + y * s1)[..., None] - g.d5_m * across
+    py = z[..., None] - g.d5_m * up
+    c3 = (px**2 + py**2 - g.a2_m**2 - g.a3_m**2) / (2 * g.a2_m * g.a3_m)
+    valid = valid & ((np.abs(c3) <= 1 + _BEYOND) & (np.hypot(px, py) > _SINGULAR))[..., None]
+    c3 = np.clip(c3, -1.0, 1.0)
+    s3 = np.sqrt((1.0 - c3) * (1.0 + c3))
+    elbow = np.array([1.0, -1.0])
+    third = np.arctan2(s3, c3)[..., None] * elbow
+    inner = np.arctan2(g.a3_m * s3, g.a2_m + g.a3_m * c3)[..., None] * elbow
+    theta[..., 2] = third
+    theta[..., 1] = np.arctan2(py, px)[..., None] - inner
+    theta[..., 3] = np.arctan2(across, -up)[..., None] - theta[..., 1] - third
+    shape = (len(T), NUM_BRANCHES)
+    everywhere = np.broadcast_to(valid, theta.shape[:-1]).reshape(shape)
+    return theta.reshape(*shape, 6), everywhere.copy(), singular.any(axis=1)

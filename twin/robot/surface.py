@@ -16,9 +16,8 @@ import open3d
 import pinocchio as pin
 from jaxtyping import Float, Float32, Int, Int64
 
-from twin.robot.description import RobotDescriptionError
-from twin.robot.hulls import collision_geometry
-from twin.robot.model import RobotModel
+from twin.robot.collision import collision_geometry
+from twin.robot.model import RobotDescriptionError, RobotModel
 from twin.robot.posture import Posture
 
 NOT_SEEN = ("ee_link",)

@@ -26,9 +26,9 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
-from twin.calibrate import fixed_camera
+from twin.calibrate import cameras
+from twin.calibrate.cameras import placement
 from twin.calibrate.pairs import recorded_pairs
-from twin.calibrate.placement import placement
 from twin.robot.model import load_robot
 from twin.scene.align.align import RobotNotAlignedError
 from twin.scene.store.calibration import (
@@ -257,9 +257,9 @@ def test_the_search_begins_where_tf_believes_the_camera_also_below_a_world(
         begun.append(start)
         raise RobotNotAlignedError(found="nothing", hint="Look elsewhere.")
 
-    monkeypatch.setattr(fixed_camera, "align_robot", look)
+    monkeypatch.setattr(cameras, "align_robot", look)
     with pytest.raises(RobotNotAlignedError):
-        fixed_camera.find_fixed_camera(
+        cameras.find_fixed_camera(
             [Episode.open(path) for path in run.episodes()], "side", max_postures=2, seed=0
         )
     first, whole_table = begun

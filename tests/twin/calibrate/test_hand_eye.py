@@ -9,16 +9,17 @@ import pytest
 
 from bridge.errors import PathNotFoundError, UsageError
 from bridge.geometry import se3
-from twin.calibrate.closed_form import solve_hand_eye, solve_robot_world
-from twin.calibrate.pairs import CSV_COLUMNS, PosePairs, read_pairs
-from twin.calibrate.robot_world import (
+from twin.calibrate.hand_eye import (
     UndeterminedCameraError,
     _jacobian,
     _moved,
+    find_camera,
     misfits,
     solve,
+    solve_hand_eye,
+    solve_robot_world,
 )
-from twin.calibrate.target import find_camera
+from twin.calibrate.pairs import CSV_COLUMNS, PosePairs, read_pairs
 
 SHARED = Path(os.environ.get("GST_SHARED_DATA", Path(__file__).parents[4] / "shared" / "data"))
 MOVEIT = SHARED / "handeye_moveit_samples" / "pose_samples.json"

@@ -16,9 +16,17 @@ from typing import Any
 import pytest
 
 from twin.crew import pool
-from twin.crew import worker as crew_worker
-from twin.crew.pool import ATTEMPTS, Alone, Crew, NoProcessError
-from twin.crew.worker import Failed, TimeIsUpError, Worker, WorkerDiedError
+from twin.crew import pool as crew_worker
+from twin.crew.pool import (
+    ATTEMPTS,
+    Alone,
+    Crew,
+    Failed,
+    NoProcessError,
+    TimeIsUpError,
+    Worker,
+    WorkerDiedError,
+)
 
 KILL_ITSELF = "__import__('os').kill(__import__('os').getpid(), 9)"
 

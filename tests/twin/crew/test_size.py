@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from twin.crew.size import MOST, default_size
+from twin.crew.pool import MOST, default_size
 
 
 @pytest.mark.parametrize(("cores", "size"), [(1, 1), (2, 2), (64, MOST)])

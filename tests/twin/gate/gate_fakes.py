@@ -11,7 +11,7 @@ from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.gate.config import GateConfig
-from twin.gate.judge import Gate
+from twin.gate.gate import Gate
 
 TASK = load_task("cube_into_box")
 URDF = '<?xml version="1.0"?><robot xmlns:x="y" name="ur5_parallel_gripper"><link/></robot>'

@@ -16,7 +16,7 @@ from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
-from twin.gate.judge import Gate, PlanTooLargeError, no_verdict, robot_name
+from twin.gate.gate import Gate, PlanTooLargeError, no_verdict, robot_name
 
 
 def test_the_verdict_is_the_replays_from_the_localised_poses() -> None:

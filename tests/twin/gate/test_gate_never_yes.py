@@ -21,8 +21,7 @@ from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
 from twin.gate import twin_process
 from twin.gate.config import GateConfig
-from twin.gate.judge import Gate, UndecidedError
-from twin.gate.moved import turn_between, who_moved
+from twin.gate.gate import Gate, UndecidedError, turn_between, who_moved
 from twin.gate.twin_process import TwinProcess
 
 PLAN = replace(gate_fakes.PLAN, robot="arm")

@@ -32,8 +32,8 @@ from bridge.wire.config import WireConfig
 from bridge.wire.errors import RemoteError
 from bridge.wire.session import WireSession, open_session
 from twin.gate.config import GateConfig
-from twin.gate.judge import Gate
-from twin.gate.service import GateError, be_the_only_one, serve_gate, watch_cell
+from twin.gate.gate import Gate
+from twin.gate.service import GateError, claim_gate, serve_gate, watch_cell
 from twin.scene.localise.live import LiveView
 
 CAMERA = Camera(width=8, height=6, fx=10.0, fy=10.0, cx=4.0, cy=3.0)
@@ -298,14 +298,14 @@ def test_a_second_gate_in_a_cell_is_refused_until_the_first_is_gone(
 ) -> None:
     """Of two answers the first one counts, and one of them may come from an older scene."""
     router, cell = sessions
-    be_the_only_one(cell, "lab")
+    claim_gate(cell, "lab")
     _until(lambda: bool(router.query_alive("lab/gate/alive")))
     with pytest.raises(GateError, match=r"a gate answers on lab/gate/verdict already"):
-        be_the_only_one(router, "lab")
-    be_the_only_one(router, "another_lab")
+        claim_gate(router, "lab")
+    claim_gate(router, "another_lab")
     cell.close()
     _until(lambda: not router.query_alive("lab/gate/alive"))
-    be_the_only_one(router, "lab")
+    claim_gate(router, "lab")
 
 
 def _until(holds: Callable[[], bool]) -> None:

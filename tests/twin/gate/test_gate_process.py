@@ -10,10 +10,10 @@ import pytest
 
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
-from twin.crew.worker import Worker, WorkerDiedError
+from twin.crew.pool import Worker, WorkerDiedError
 from twin.gate import twin_process
 from twin.gate.config import GateConfig
-from twin.gate.judge import UndecidedError
+from twin.gate.gate import UndecidedError
 from twin.gate.twin_process import TwinProcess
 
 

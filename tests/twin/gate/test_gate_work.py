@@ -14,10 +14,10 @@ from bridge.task.plan import Plan
 from bridge.task.robot import ROBOT_NAME, ur5_with_gripper_urdf
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
-from twin.gate.work import Question, answer
+from twin.gate.twin_process import Question, answer
+from twin.replay import verdict as verdict_module
 from twin.replay.config import ReplayConfig
-from twin.replay.place.scene import ReplayScene
-from twin.replay.verdict import rollout
+from twin.replay.scene import ReplayScene
 from twin.scene.store.calibration import write_physics
 
 
@@ -33,7 +33,7 @@ def asked(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> tuple[ReplayScene,
         seen.append((scene, config))
         raise SeenError
 
-    monkeypatch.setattr(rollout, "replay_plan", replay_plan)
+    monkeypatch.setattr(verdict_module, "replay_plan", replay_plan)
     with pytest.raises(SeenError):
         answer(question_of(run))
     return seen[0]
@@ -95,7 +95,7 @@ def test_a_yes_that_knows_less_than_a_scene_could_tell_says_what_is_missing(
         plan_id="p", trajectory="planned", mode="dynamic", ik=yes, clearance=yes, terminal=yes,
         engine="fake", seed=0,
     )  # fmt: skip
-    monkeypatch.setattr(rollout, "replay_plan", lambda *_: SimpleNamespace(verdict=verdict))
+    monkeypatch.setattr(verdict_module, "replay_plan", lambda *_: SimpleNamespace(verdict=verdict))
     said = answer(question_of(run))
     assert said.accepted is True
     assert said.warnings == (

@@ -7,11 +7,11 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.task.robot import ur5_with_gripper_urdf
-from twin.physics import anchors
+from twin.physics import world as world_module
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
 from twin.physics.world import World
-from twin.robot.description import with_absolute_meshes
+from twin.robot.model import with_absolute_meshes
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
 SIZE = np.array([0.04, 0.04, 0.04])
@@ -114,8 +114,8 @@ def test_what_is_held_does_not_creep(urdf: str) -> None:
 
 def test_contact_normals_turn_with_what_is_held(urdf: str, monkeypatch: pytest.MonkeyPatch) -> None:
     errors = {}
-    for every in (anchors.EVERY_STEPS, 10**9):
-        monkeypatch.setattr(anchors, "EVERY_STEPS", every)
+    for every in (world_module.EVERY_STEPS, 10**9):
+        monkeypatch.setattr(world_module, "EVERY_STEPS", every)
         with World(urdf, {}, PhysicsConfig()) as world:
             gripping(world, 0.05)
             found = [normal_error_rad(world) for _ in turning(world, 1.2)]

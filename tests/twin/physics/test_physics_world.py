@@ -10,12 +10,11 @@ from bridge.geometry import se3
 from bridge.geometry.box import box_corners
 from bridge.task.robot import ur5_with_gripper_urdf
 from twin.physics import engine
-from twin.physics.arm import Arm
+from twin.physics.arm import Arm, write_description
 from twin.physics.config import PhysicsConfig
-from twin.physics.description import write_description
 from twin.physics.engine import pybullet
 from twin.physics.world import PhysicsError, World
-from twin.robot.description import with_absolute_meshes
+from twin.robot.model import with_absolute_meshes
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
 SIZE = np.array([0.04, 0.04, 0.04])

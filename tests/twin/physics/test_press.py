@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from bridge.task.robot import FINGER_JOINTS, ur5_with_gripper_urdf
-from twin.physics import press
+from twin.physics import arm
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
 from twin.physics.world import World
-from twin.robot.description import with_absolute_meshes
+from twin.robot.model import with_absolute_meshes
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
 SIZE = np.array([0.04, 0.04, 0.04])
@@ -63,7 +63,7 @@ def test_the_whole_force_is_there_after_a_few_iterations(
     few = replace(STRONG, solver_iterations=20)
     with World(urdf, {}, few) as world:
         np.testing.assert_allclose(np.abs(holding(world)[-20:, :, 1]), 30.0, rtol=1e-6)
-    monkeypatch.setattr(press, "PATIENCE", 10**9)
+    monkeypatch.setattr(arm, "PATIENCE", 10**9)
     with World(urdf, {}, few) as world:
         assert np.abs(holding(world)[-20:, :, 1]).max() < 20.0, "at the usual speed it is not"
 
@@ -92,9 +92,9 @@ def test_fingers_whose_cube_is_gone_are_slow_again_after_a_few_steps(urdf: str) 
         )
         speeds = np.abs(run(world, 12, CLOSED_M)[:, :, 0])
         free_m_s = 1.05 * STRONG.finger_speed_m_s
-        assert (speeds.max(axis=1) > free_m_s).sum() <= press.EVERY_STEPS
+        assert (speeds.max(axis=1) > free_m_s).sum() <= arm.EVERY_STEPS
         usual_m = 2 * STRONG.finger_speed_m_s * 12 / STRONG.rate_hz
-        farthest_m = 2 * press.EVERY_STEPS * press.PRESS_M_S / STRONG.rate_hz
+        farthest_m = 2 * arm.EVERY_STEPS * arm.PRESS_M_S / STRONG.rate_hz
         assert world.width_m() > width_m - usual_m - farthest_m - 1e-3
 
 

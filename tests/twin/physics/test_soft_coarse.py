@@ -9,11 +9,8 @@ import pytest
 from bridge.task.meshes.catalogue import toy_mesh
 from bridge.task.meshes.lattice import volumes_m3
 from bridge.task.task_file import ObjectModel, load_task
-from twin.physics.colliders import box_piece
-from twin.physics.soft import SoftModel, health_of
-from twin.physics.soft_coarse import coarse_lattice
-from twin.physics.soft_shape import bind_points
-from twin.physics.soft_solver import SoftSolver, add_body
+from twin.physics.soft import SoftModel, bind_points, coarse_lattice, health_of
+from twin.physics.soft_solver import SoftSolver, add_body, box_piece
 from twin.scene.shape.from_mesh import shape_of_mesh
 from twin.scene.shape.lattice import lattice
 

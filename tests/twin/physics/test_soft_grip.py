@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from twin.physics.colliders import box_piece
 from twin.physics.soft import SoftModel
-from twin.physics.soft_solver import SoftSolver, add_body
+from twin.physics.soft_solver import SoftSolver, add_body, box_piece
 
 PERIOD_S = 1 / 240
 PAD_M = (0.022, 0.014, 0.022)

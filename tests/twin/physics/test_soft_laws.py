@@ -11,10 +11,8 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.task.meshes.lattice import volumes_m3
-from twin.physics.colliders import box_piece
-from twin.physics.soft import BURST_STRETCH, MAX_STRETCH, SoftModel, health_of
-from twin.physics.soft_shape import rigid_fit
-from twin.physics.soft_solver import SoftSolver, add_body
+from twin.physics.soft import BURST_STRETCH, MAX_STRETCH, SoftModel, health_of, rigid_fit
+from twin.physics.soft_solver import SoftSolver, add_body, box_piece
 
 PERIOD_S = 1 / 240
 SUBSTEPS = 10

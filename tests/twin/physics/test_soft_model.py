@@ -7,8 +7,7 @@ import pytest
 
 from bridge.task.meshes.lattice import volumes_m3
 from bridge.task.task_file import ObjectModel, load_task
-from twin.physics.soft import SoftBodyError, SoftModel
-from twin.physics.soft_shape import bind_points, rigid_fit, surface_triangles
+from twin.physics.soft import SoftBodyError, SoftModel, bind_points, rigid_fit, surface_triangles
 
 
 @pytest.fixture(scope="module")

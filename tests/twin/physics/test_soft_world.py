@@ -12,7 +12,7 @@ from twin.physics.arm import PhysicsError
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
 from twin.physics.world import World
-from twin.robot.description import with_absolute_meshes
+from twin.robot.model import with_absolute_meshes
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
 Boxes = Callable[..., SoftModel]

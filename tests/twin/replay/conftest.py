@@ -18,8 +18,8 @@ from scripted_plans import (
 )
 
 from twin.replay.config import ReplayConfig
-from twin.replay.verdict.result import ReplayResult
-from twin.replay.verdict.rollout import replay_plan
+from twin.replay.result import ReplayResult
+from twin.replay.verdict import replay_plan
 
 
 @pytest.fixture(scope="session")

@@ -10,8 +10,8 @@ from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.robot import ARM_JOINTS, ROBOT_NAME, ur5_with_gripper_urdf
 from bridge.task.task_file import Task, load_task
-from twin.replay.place.scene import ReplayScene
-from twin.replay.verdict.result import ReplayResult
+from twin.replay.result import ReplayResult
+from twin.replay.scene import ReplayScene
 from twin.robot.config import IkConfig
 from twin.robot.inverse import solve_ik
 from twin.robot.model import load_robot

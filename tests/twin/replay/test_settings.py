@@ -9,11 +9,10 @@ import pytest
 from bridge.errors import OptionError
 from twin.gate.config import GateConfig
 from twin.physics.config import PhysicsConfig
-from twin.replay.config import PartingConfig, ReplayConfig
-from twin.replay.variation import VariationConfig
+from twin.replay.config import DivergenceConfig, ReplayConfig, VariationConfig
 from twin.robot.config import IkConfig
 
-CONFIGS = (GateConfig, ReplayConfig, PartingConfig, VariationConfig, PhysicsConfig, IkConfig)
+CONFIGS = (GateConfig, ReplayConfig, DivergenceConfig, VariationConfig, PhysicsConfig, IkConfig)
 NUMBERS = [
     (config, item.name)
     for config in CONFIGS

@@ -9,9 +9,8 @@ from bridge.geometry import se3
 from bridge.task.robot import ur5_with_gripper_urdf
 from twin.robot.config import IkConfig
 from twin.robot.follow import NO_BRANCH, follow_poses
-from twin.robot.inverse import pose_error
+from twin.robot.inverse import UrInverse, pose_error
 from twin.robot.model import RobotModel, load_robot
-from twin.robot.ur_inverse import UrInverse
 
 HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
 

@@ -10,8 +10,7 @@ import pytest
 
 from bridge.task.robot import ur5_with_gripper_urdf
 from twin.robot.collision import RobotHulls, hulls_of, signed_distance
-from twin.robot.description import RobotDescriptionError
-from twin.robot.model import load_robot
+from twin.robot.model import RobotDescriptionError, load_robot
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
 

@@ -8,9 +8,8 @@ import pytest
 from bridge.geometry import se3
 from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
 from twin.robot.config import IkConfig
-from twin.robot.description import RobotDescriptionError, with_absolute_meshes
 from twin.robot.inverse import pose_error, solve_ik
-from twin.robot.model import RobotModel, load_robot
+from twin.robot.model import RobotDescriptionError, RobotModel, load_robot, with_absolute_meshes
 
 HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
 
@@ -24,7 +23,7 @@ def robot() -> RobotModel:
 def test_pinocchio_and_pybullet_agree_on_forward_kinematics(
     robot: RobotModel, tmp_path: Path
 ) -> None:
-    from twin.physics.description import write_description
+    from twin.physics.arm import write_description
     from twin.physics.engine import pybullet
 
     client = pybullet.connect(pybullet.DIRECT)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bridge.task.robot import ur5_with_gripper_urdf
+from twin.robot.inverse import UrInverse
 from twin.robot.model import RobotModel, load_robot
-from twin.robot.ur_inverse import UrInverse
 
 HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
 ROBOTS = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix/share/example-robot-data/robots"

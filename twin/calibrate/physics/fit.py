@@ -3,17 +3,16 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from cmaes import CMA
 from jaxtyping import Float
 
-from twin.calibrate.physics.case import Case, Prediction
-from twin.calibrate.physics.hold_out import HeldOut, Split, judge, split_cases
-from twin.calibrate.physics.likelihood import Score, features_of, observations_of, score
-from twin.calibrate.physics.local import (
+from twin.calibrate.physics.cases import Case, Prediction
+from twin.calibrate.physics.emulator import (
     Emulator,
-    Interval,
+    ProfileInterval,
     cloud,
     cloud_size,
     fit_emulator,
@@ -21,8 +20,160 @@ from twin.calibrate.physics.local import (
     profile,
     spread,
 )
+from twin.calibrate.physics.likelihood import (
+    DiscrepancyPosterior,
+    Score,
+    features_of,
+    observations_of,
+    score,
+)
 from twin.calibrate.physics.parameters import PhysicsParameter
-from twin.calibrate.physics.search import search
+
+# --- Keep episodes back, whole ones, and say what parameters are worth on them.
+
+SHARE = 0.3
+SPLIT_STREAM = 808
+
+
+@dataclass(frozen=True, kw_only=True)
+class Split:
+    """Numbers of the cases that are learned from, and of those that are not."""
+
+    training: tuple[int, ...]
+    held_out: tuple[int, ...]
+
+
+def split_cases(cases: Sequence[Case], seed: int) -> Split:
+    """Hold out a share of each kind of episode; of a kind with one episode nothing."""
+    rng = np.random.default_rng([SPLIT_STREAM, seed])
+    held: list[int] = []
+    for kind in sorted({case.kind for case in cases}):
+        mine = [index for index, case in enumerate(cases) if case.kind == kind]
+        count = max(round(SHARE * len(mine)), 1) if len(mine) > 1 else 0
+        held += rng.permutation(mine)[:count].tolist()
+    training = [index for index in range(len(cases)) if index not in held]
+    return Split(training=tuple(training), held_out=tuple(sorted(held)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldOut:
+    """What one set of parameters says about episodes it was not fitted to."""
+
+    log_likelihood: float
+    settled_error_m: tuple[float, ...]
+    """Per object: how far it was found from where it was predicted to settle."""
+    width_error_m: tuple[float, ...]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return plain numbers; a median of nothing is None."""
+        return {
+            "log_likelihood": self.log_likelihood,
+            "num_poses": len(self.settled_error_m),
+            "settled_error_median_m": _median(self.settled_error_m),
+            "settled_error_mean_m": _mean(self.settled_error_m),
+            "settled_errors_m": list(self.settled_error_m),
+            "num_widths": len(self.width_error_m),
+            "width_error_median_m": _median(self.width_error_m),
+        }
+
+
+def judge(
+    cases: Sequence[Case],
+    predictions: Sequence[Prediction],
+    beliefs: DiscrepancyPosterior,
+    num_samples: int,
+) -> HeldOut:
+    """Compare predictions of held-out cases with what was seen.
+
+    Args:
+        cases: The held-out ones.
+        predictions: Theirs.
+        beliefs: In errors, as the training episodes left them for the same parameters.
+        num_samples: Noisy starts behind each share of successes.
+    """
+    observed = observations_of(cases, num_samples)
+    predicted = features_of(cases, predictions)
+    found = score(observed, predicted, beliefs=beliefs)
+    off = np.linalg.norm((observed.settled - predicted.settled)[:, :2], axis=1)
+    return HeldOut(
+        log_likelihood=found.log_likelihood,
+        settled_error_m=tuple(off.tolist()),
+        width_error_m=tuple(np.abs(observed.widths_m - predicted.widths_m).tolist()),
+    )
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if values else None
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None
+
+
+# --- Look for the best point: the covariance matrix adaptation evolution strategy.
+#
+# Hansen, "The CMA evolution strategy: a tutorial" (2016), in the package ``cmaes``. All points
+# see the same noise (common random numbers), so that differences between them are the parameters'
+# own.
+
+SIGMA = 0.6
+"""First step size in units of the prior."""
+NARROW = 0.03
+"""The search ends when every parameter is searched for within this."""
+
+Objective = Callable[[Float[np.ndarray, "num_points num_parameters"]], list[float]]
+"""Log-posterior of each point."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Best:
+    """Where the search ended."""
+
+    x: Float[np.ndarray, " num_parameters"]
+    log_posterior: float
+    num_evaluations: int
+
+
+def search(
+    worth: Objective,
+    bounds: Float[np.ndarray, "num_parameters 2"],
+    *,
+    evaluations: int,
+    seed: int,
+    has_time: Callable[[], bool],
+    advance: Callable[[int, str], None],
+) -> Best:
+    """Maximise from the nominal point.
+
+    Args:
+        worth: The log-posterior.
+        bounds: Limits of each parameter.
+        evaluations: At most so many points; a generation that was begun is finished.
+        seed: Of the points that are drawn.
+        has_time: Asked before each generation.
+        advance: Told how many points were tried.
+    """
+    start = np.zeros(len(bounds))
+    best = Best(x=start, log_posterior=worth(start[None])[0], num_evaluations=1)
+    if len(bounds) < 2:  # the package asks for at least two dimensions
+        bounds = np.concatenate([bounds, [[-1.0, 1.0]]])
+    size = len(start)
+    optimiser = CMA(mean=np.zeros(len(bounds)), sigma=SIGMA, bounds=bounds, seed=seed)
+    count = 1
+    while count < evaluations and has_time():
+        points = np.stack([optimiser.ask() for _ in range(optimiser.population_size)])
+        values = worth(points[:, :size])
+        optimiser.tell([(x, -value) for x, value in zip(points, values, strict=True)])
+        count += len(points)
+        top = int(np.argmax(values))
+        if values[top] > best.log_posterior:
+            best = Best(x=points[top, :size], log_posterior=values[top], num_evaluations=count)
+        advance(count, f"best log-posterior {best.log_posterior:.1f}")
+        spread = np.std(points[:, :size], axis=0)
+        if optimiser.should_stop() or float(spread.max()) < NARROW:
+            break
+    return Best(x=best.x, log_posterior=best.log_posterior, num_evaluations=count)
+
 
 IDENTIFIED = 0.5
 """A parameter is identified when the data leave at most this share of the prior's width."""
@@ -209,20 +360,20 @@ def _interval(
     best: Float[np.ndarray, " num_parameters"],
     index: int,
     covariance: Float[np.ndarray, "num_parameters num_parameters"],
-) -> Interval:
+) -> ProfileInterval:
     """By profile where data say something; the curvature is enough to say that they do not."""
     sigma, at = float(np.sqrt(covariance[index, index])), float(best[index])
     if sigma <= IDENTIFIED:
         return profile(emulator, best, index, covariance)
-    return Interval(low=at - 1.96 * sigma, high=at + 1.96 * sigma, sigma=sigma, closed=False)
+    return ProfileInterval(low=at - 1.96 * sigma, high=at + 1.96 * sigma, sigma=sigma, closed=False)
 
 
-def _is_identified(interval: Interval) -> bool:
+def _is_identified(interval: ProfileInterval) -> bool:
     return interval.closed and interval.sigma <= IDENTIFIED
 
 
 def _estimate(
-    parameter: PhysicsParameter, best: float, final: float, interval: Interval, known: bool
+    parameter: PhysicsParameter, best: float, final: float, interval: ProfileInterval, known: bool
 ) -> Estimate:
     share = interval.sigma
     low, high = parameter.value(interval.low), parameter.value(interval.high)

@@ -1,23 +1,251 @@
 """``robot-gst calibrate RUN --physics``: everything in order, from the run to the scene."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import minimize_scalar
+from scipy.stats import t as student
+
+from bridge.episode import provenance, streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
+from bridge.task.robot import ARM_JOINTS
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
-from twin.calibrate.physics.data import read_cases
-from twin.calibrate.physics.delay import Delay, delay_of, mean_delay
-from twin.calibrate.physics.evaluate import Evaluator
-from twin.calibrate.physics.fit import FitConfig, fit
-from twin.calibrate.physics.local import cloud_size
-from twin.calibrate.physics.parameters import rigid_parameters
-from twin.calibrate.physics.record import physics_record
-from twin.crew.size import default_size
+from twin.calibrate.physics.cases import Case, read_cases
+from twin.calibrate.physics.emulator import cloud_size
+from twin.calibrate.physics.fit import Estimate, Fit, FitConfig, fit
+from twin.calibrate.physics.incline import pybullet_friction
+from twin.calibrate.physics.parameters import (
+    BIAS,
+    FINGER_FRICTION,
+    GRIP_FORCE,
+    MASS_SCALE,
+    SURFACE_FRICTION,
+    rigid_parameters,
+)
+from twin.calibrate.physics.simulate import Evaluator
+from twin.crew.pool import default_size
 from twin.physics.config import PhysicsConfig
+from twin.physics.engine import ENGINE_VERSION
 from twin.scene.store.calibration import write_physics
+
+# --- How long after its command the arm gets where it was told to be.
+
+LONGEST_S = 0.5
+FIRST_S = 3.0
+"""Later, controllers that wait for the gripper run behind the plan for other reasons."""
+MOVES_RAD = 0.05
+FEWEST = 3
+"""Episodes from which an interval can be given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Delay:
+    """The delay over episodes, with a 95 % interval of its mean."""
+
+    value_s: float
+    low_s: float
+    high_s: float
+    num_episodes: int
+
+
+def delay_of(episode: Episode) -> float | None:
+    """Shift that lays the recorded joints best over those of the executed plan [s].
+
+    None where the plan has no joints of its own, was not executed, or hardly moves.
+    """
+    for _, plan in streams.plans(episode):
+        interval = streams.executed_interval_ns(episode, plan.id)
+        if interval is None or any(item.joints_rad is None for item in plan.tau):
+            continue
+        track = streams.joint_track(episode)
+        if set(ARM_JOINTS) - set(track.names):
+            return None
+        told = np.array([item.joints_rad for item in plan.tau], dtype=np.float64)
+        end_s = min((interval[1] - interval[0]) * 1e-9, FIRST_S)
+        times_s = np.arange(0.0, end_s, 0.008)
+        stamps = interval[0] + np.rint(times_s * 1e9).astype(np.int64)
+        seen = track.at(stamps)[:, [track.names.index(name) for name in ARM_JOINTS]]
+        return best_shift_s(plan.times_ns() * 1e-9, told, times_s, seen)
+    return None
+
+
+def best_shift_s(
+    told_s: Float[np.ndarray, " num_waypoints"],
+    told_rad: Float[np.ndarray, "num_waypoints num_joints"],
+    seen_s: Float[np.ndarray, " num_samples"],
+    seen_rad: Float[np.ndarray, "num_samples num_joints"],
+) -> float | None:
+    """Delay with the least squared distance between two tracks; None when nothing moves."""
+    if len(seen_s) < 2 or float(np.ptp(seen_rad, axis=0).max()) < MOVES_RAD:
+        return None
+
+    def cost(delay_s: float) -> float:
+        columns = [np.interp(seen_s - delay_s, told_s, column) for column in told_rad.T]
+        return float(np.mean((np.stack(columns, axis=1) - seen_rad) ** 2))
+
+    return float(minimize_scalar(cost, bounds=(0.0, LONGEST_S), method="bounded").x)
+
+
+def mean_delay(delays_s: list[float]) -> Delay | None:
+    """Mean of several episodes; None with too few for an interval."""
+    if len(delays_s) < FEWEST:
+        return None
+    values = np.array(delays_s)
+    mean = float(values.mean())
+    half = float(student.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
+    return Delay(value_s=mean, low_s=mean - half, high_s=mean + half, num_episodes=len(values))
+
+
+# --- Keep a calibration of physics, and say it in a table.
+
+FIELDS = {
+    FINGER_FRICTION: "finger_friction",
+    SURFACE_FRICTION: "surface_friction",
+    GRIP_FORCE: "grip_force_N",
+}
+"""Parameters that are fields of ``PhysicsConfig``; the frictions after division by the objects'."""
+LOG_95 = 2 * 1.96
+
+
+def physics_record(
+    found: Fit,
+    cases: Sequence[Case],
+    config: PhysicsConfig,
+    delay: Delay | None,
+    skipped: Mapping[str, str],
+) -> dict[str, Any]:
+    """The ``physics`` part of ``calibration.json``.
+
+    ``identified`` has the fields of ``PhysicsConfig`` that replays take over, empty when nothing
+    was promoted.
+    """
+    by_name = {item.parameter.name: item for item in found.estimates}
+    record = {
+        "promoted": found.promoted,
+        "why": found.why,
+        "engine": ENGINE_VERSION,
+        "identified": _identified(by_name, config) if found.promoted else {},
+        "pose_bias": _others(by_name, BIAS, promoted=found.promoted),
+        "masses": _others(by_name, (MASS_SCALE,), promoted=found.promoted),
+        "parameters": {name: _parameter(item) for name, item in by_name.items()},
+        "command_delay_s": _delay_record(delay),
+        "effective_friction": _effective(by_name, config) if found.promoted else {},
+        "held_out": {
+            "episodes": [cases[index].episode for index in found.split.held_out],
+            "nominal": found.nominal.to_record(),
+            "calibrated": found.calibrated.to_record(),
+        },
+        "errors": found.calibrated_score.beliefs.most_likely(),
+        "sources": {case.episode: {"kind": case.kind, "sha256": case.sha256} for case in cases},
+        "skipped": dict(skipped),
+        "num_evaluations": found.num_evaluations,
+    }
+    # No times in here: the same inputs give the same id.
+    return {**record, "id": provenance.hash_settings(record)}
+
+
+def _identified(by_name: Mapping[str, Estimate], config: PhysicsConfig) -> dict[str, Any]:
+    fields = {}
+    for name, field in FIELDS.items():
+        item = by_name.get(name)
+        if item is None or not item.identified:
+            continue
+        unit = 1.0 if name == GRIP_FORCE else config.object_friction
+        fields[field] = {
+            "value": item.value / unit,
+            "low": item.low / unit,
+            "high": item.high / unit,
+            "sigma_log": float(np.log(item.high / item.low)) / LOG_95,
+        }
+    return fields
+
+
+def _others(
+    by_name: Mapping[str, Estimate], names: Sequence[str], *, promoted: bool
+) -> dict[str, Any]:
+    return {
+        name: {"value": item.value, "low": item.low, "high": item.high}
+        for name in names
+        if promoted and (item := by_name.get(name)) is not None and item.identified
+    }
+
+
+def _parameter(item: Estimate) -> dict[str, Any]:
+    return {
+        "about": item.parameter.about,
+        "unit": item.parameter.unit,
+        "nominal": item.parameter.nominal,
+        "value": item.value,
+        "best": item.best,
+        "low": item.low,
+        "high": item.high,
+        "identified": item.identified,
+        "why": item.why,
+        "share_of_prior": item.sigma_share,
+    }
+
+
+def _delay_record(delay: Delay | None) -> dict[str, Any]:
+    if delay is None:
+        return {"identified": False, "why": "fewer than 3 executed plans with joints of their own"}
+    return {
+        "identified": True,
+        "value": delay.value_s,
+        "low": delay.low_s,
+        "high": delay.high_s,
+        "num_episodes": delay.num_episodes,
+        "why": "recorded joints laid over the commanded ones",
+    }
+
+
+def _effective(by_name: Mapping[str, Estimate], config: PhysicsConfig) -> dict[str, float]:
+    """What the engine makes of the found coefficients, by the incline test."""
+    own = config.object_friction
+    return {
+        name: pybullet_friction(own, by_name[name].value / own, config)
+        for name in (FINGER_FRICTION, SURFACE_FRICTION)
+        if name in by_name and by_name[name].identified
+    }
+
+
+def describe_physics(record: Mapping[str, Any], calibration_id: str) -> str:
+    """Say in a line per parameter what was found."""
+    lines = [f"physics: {record['why']}; calibration {calibration_id}, {record['engine']}"]
+    for name, item in record["parameters"].items():
+        word = "identified" if item["identified"] else "not identified"
+        lines.append(
+            f"  {name:<22} {item['value']:>8.4g} [{item['low']:.4g}, {item['high']:.4g}] "
+            f"{item['unit']:<3} {word}: {item['why']}"
+        )
+    delay = record["command_delay_s"]
+    told = (
+        f"{delay['value']:>8.4g} [{delay['low']:.4g}, {delay['high']:.4g}] s   identified"
+        if delay["identified"]
+        else "         not identified"
+    )
+    lines.append(f"  {'command_delay_s':<22} {told}: {delay['why']}")
+    errors = record["errors"]
+    own = ", ".join(f"{kind} {size * 1e3:.2g} mm" for kind, size in errors["pose_m"].items())
+    lines.append(
+        f"  likeliest errors: {errors['noise_share']:.0%} of what localisation states changes from "
+        f"pose to pose; the twin's own: {own or 'no pose'}"
+    )
+    held = record["held_out"]
+    for label in ("nominal", "calibrated"):
+        item = held[label]
+        median = item["settled_error_median_m"]
+        error = "no pose" if median is None else f"settled poses off by {median * 1e3:.1f} mm"
+        lines.append(
+            f"  held out, {label}: {error} (median of {item['num_poses']}), "
+            f"log-likelihood {item['log_likelihood']:.1f}"
+        )
+    return "\n".join(lines)
 
 
 def calibrate_physics(
@@ -56,11 +284,11 @@ def calibrate_physics(
             settings,
             advance=lambda done, note: advance(min(done, total), note),
         )
-    record = physics_record(found, cases, physics, _delay(run), skipped)
+    record = physics_record(found, cases, physics, _measured_delay(run), skipped)
     return record, str(write_physics(run, record)["calibration_id"])
 
 
-def _delay(run: RunFolder) -> Delay | None:
+def _measured_delay(run: RunFolder) -> Delay | None:
     delays = []
     for path in run.episodes():
         try:

@@ -1,15 +1,19 @@
 """Convex pieces with what holds them, and the names bodies have in contacts and failures."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import coal
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import ConvexHull
 
 from bridge.geometry.box import box_corners
 from bridge.task.robot import GRIPPER_LINKS
 from bridge.task.task_file import ObjectModel
-from twin.robot.hulls import convex_hull
+from twin.replay._clearance import Bounds
+from twin.robot.collision import RobotHulls, convex_hull
 
 TABLE = "table"
 GRIPPER = "gripper"
@@ -75,3 +79,122 @@ def placed_panels(
         T_object_panel[:3, 3] = centre
         placed.append((T_base_object @ T_object_panel, extents))
     return placed
+
+
+# --- Pairs of convex bodies with a lower bound of their distance, nearest first.
+#
+# A body is at least as far away as the box and the sphere that hold it. Where boxes are turned
+# against each other this is nearly exact, so most pairs need no distance (tests/parity compares).
+
+_SLACK_M = 1e-6
+"""Measured distances are exact to this much: bounds stay below them."""
+
+
+class NearPairs:
+    """Some pairs of bodies; where each body is, is written into ``R`` and ``t``."""
+
+    def __init__(self, solids: Sequence[Solid], pairs: Sequence[tuple[int, int]]) -> None:
+        """Lay boxes and spheres out.
+
+        Args:
+            solids: The bodies.
+            pairs: Two of them each.
+        """
+        self.R: Float[np.ndarray, "num_bodies 3 3"] = np.tile(np.eye(3), (len(solids), 1, 1))
+        """Rotations ``R_base_body``."""
+        self.t: Float[np.ndarray, "num_bodies 3"] = np.zeros((len(solids), 3))
+        """Positions of the bodies' frames [m]."""
+        self._bounds = np.empty(len(pairs))
+        self._order = np.empty(len(pairs), dtype=np.int32)
+        self._native = Bounds(
+            np.array([solid.centre for solid in solids], dtype=np.float64).reshape(-1, 3),
+            np.array([solid.half_m for solid in solids], dtype=np.float64).reshape(-1, 3),
+            np.array([solid.radius_m for solid in solids], dtype=np.float64),
+            np.array(pairs, dtype=np.int32).reshape(-1, 2),
+        )
+
+    def nearest_first(self) -> Iterator[tuple[float, int]]:
+        """Yield a bound that the signed distance is not below [m], and the number of the pair."""
+        self._native.nearest_first(self.R, self.t, self._bounds, self._order)
+        return zip((self._bounds - _SLACK_M).tolist(), self._order.tolist(), strict=True)
+
+
+class OwnLinks:
+    """The robot's links against each other."""
+
+    def __init__(self, hulls: RobotHulls) -> None:
+        """Choose the pairs that must stay apart.
+
+        Args:
+            hulls: The robot.
+        """
+        self._hulls = hulls
+        solids = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
+        self._near = NearPairs(solids, hulls.pairs)
+
+    def touch(self) -> bool:
+        """Whether any touch where the hulls have been placed."""
+        self._near.R[:] = self._hulls.rotations
+        self._near.t[:] = self._hulls.translations
+        for bound_m, index in self._near.nearest_first():
+            if bound_m > 0:
+                return False
+            if self._hulls.pair_distance_m(index) <= 0:
+                return True
+        return False
+
+
+@lru_cache(maxsize=4)
+def own_links(hulls: RobotHulls) -> OwnLinks:
+    """Return the pairs of a robot, made once."""
+    return OwnLinks(hulls)
+
+
+# --- Distances of soft bodies, which are given by their nodes.
+#
+# A node inside a convex piece lies behind all of its planes; outside, the largest height over a
+# plane is a lower bound of the distance, exact over the faces. Between nodes nothing is known: a
+# body is as large as its nodes say.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planes:
+    """The faces of a convex piece, in the frame of its link."""
+
+    normals: Float[np.ndarray, "num_planes 3"]
+    """Outward, unit length."""
+    offsets_m: Float[np.ndarray, " num_planes"]
+
+    def distance_m(
+        self,
+        points_m: Float[np.ndarray, "num_points 3"],
+        R: Float[np.ndarray, "3 3"],
+        t: Float[np.ndarray, "3"],
+    ) -> float:
+        """Smallest signed distance of points to the placed piece [m], never too large outside."""
+        local = (points_m - t) @ R
+        return float((local @ self.normals.T + self.offsets_m).max(axis=1).min())
+
+
+@lru_cache(maxsize=4)
+def planes_of(hulls: RobotHulls) -> tuple[Planes, ...]:
+    """Return the planes of each of a robot's hulls."""
+    found = []
+    for hull in hulls.hulls:
+        equations = np.unique(ConvexHull(hull.points_m).equations.round(9), axis=0)
+        found.append(Planes(normals=equations[:, :3], offsets_m=equations[:, 3]))
+    return tuple(found)
+
+
+def distances_to_boxes_m(
+    points_m: Float[np.ndarray, "num_points 3"],
+    R_box_base: Float[np.ndarray, "num_boxes 3 3"],
+    p_box_base: Float[np.ndarray, "num_boxes 3"],
+    half_m: Float[np.ndarray, "num_boxes 3"],
+) -> Float[np.ndarray, " num_boxes"]:
+    """Smallest signed distance of points to each box around the origin of its frame [m]."""
+    local = R_box_base @ points_m.T + p_box_base[:, :, None]
+    q = np.abs(local) - half_m[:, :, None]
+    out = np.maximum(q, 0.0)
+    outside = np.sqrt(np.einsum("bcn,bcn->bn", out, out))
+    return np.asarray((outside + np.minimum(q.max(axis=1), 0.0)).min(axis=1))

@@ -10,22 +10,33 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.geometry.box import box_corners
+from bridge.task.robot import GRIPPER_LINKS, MAX_WIDTH_M
 from twin.replay.clearance.bodies import (
     SCENE,
     TABLE,
+    NearPairs,
     Solid,
     box_solid,
+    distances_to_boxes_m,
+    own_links,
     placed_panels,
     placement_of,
+    planes_of,
     solid_of,
 )
-from twin.replay.clearance.grid import GridLookup
-from twin.replay.clearance.near import NearPairs
-from twin.replay.clearance.nodes import distances_to_boxes_m, planes_of
-from twin.replay.clearance.shells import Shells, shell_of, shells_of_robot
-from twin.replay.clearance.standing import standing_bodies, standing_links
-from twin.replay.clearance.unnamed import unnamed_scene
-from twin.replay.place.scene import ReplayScene
+from twin.replay.clearance.bounding_spheres import (
+    BoundingSpheres,
+    bounding_spheres_of,
+    robot_bounding_spheres,
+)
+from twin.replay.clearance.distance_grid import GridLookup
+from twin.replay.clearance.static_obstacles import (
+    static_obstacles,
+    stationary_links,
+    unmodelled_obstacles,
+)
+from twin.replay.config import ReplayConfig
+from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, signed_distance
 
 Pair = tuple[str, int, str, int]
@@ -73,9 +84,9 @@ class Surroundings:
                 Ts_panel_base[:, :3, 3],
             )
             self._half_m = np.stack([extents / 2 for _, _, (_, extents) in self._panels])
-        self.standing = standing_bodies(self._panels, scene.table_height_m)
+        self.standing = static_obstacles(self._panels, scene.table_height_m)
         self._pairings: dict[tuple[tuple[str, ...], tuple[str, ...]], _Pairing] = {}
-        standing, foot = standing_links(hulls)
+        standing, foot = stationary_links(hulls)
         self._mobile = [i for i, hull in enumerate(hulls.hulls) if hull.link not in standing]
         self.links = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
         self.objects = {
@@ -85,14 +96,14 @@ class Surroundings:
         self.lookup: GridLookup | None = None
         if scene.static_sdf is not None:
             panels = [panel for _, _, panel in self._panels]
-            grid = unnamed_scene(scene.static_sdf, scene.table_height_m, foot, panels)
+            grid = unmodelled_obstacles(scene.static_sdf, scene.table_height_m, foot, panels)
             self.lookup = None if grid is None else GridLookup(grid)
-        self._shells: Shells | None = None
-        self._object_shells: dict[str, Shells] = {}
+        self._shells: BoundingSpheres | None = None
+        self._object_shells: dict[str, BoundingSpheres] = {}
         if self.lookup is not None:
-            self._shells = shells_of_robot(hulls, standing)
+            self._shells = robot_bounding_spheres(hulls, standing)
             self._object_shells = {
-                name: _box_shell(scene.task.objects[name].size_m)
+                name: _box_spheres(scene.task.objects[name].size_m)
                 for name in scene.movable()
                 if scene.task.objects[name].soft is None
             }
@@ -235,5 +246,40 @@ class Surroundings:
 
 
 @lru_cache(maxsize=32)
-def _box_shell(size_m: tuple[float, float, float]) -> Shells:
-    return Shells([shell_of(box_corners(np.array(size_m)))])
+def _box_spheres(size_m: tuple[float, float, float]) -> BoundingSpheres:
+    return BoundingSpheres([bounding_spheres_of(box_corners(np.array(size_m)))])
+
+
+# --- Which postures of the arm touch: what the choice between branches of a path asks.
+
+
+def posture_clearance(
+    scene: ReplayScene, hulls: RobotHulls, config: ReplayConfig
+) -> Callable[[Float[np.ndarray, "num_postures num_joints"]], Float[np.ndarray, " num_postures"]]:
+    """Return a function that says how much room postures leave: negative when links touch.
+
+    The arm against itself and against what stands still, with ``eps_col_m`` taken off. The gripper
+    is where the path says, whatever the arm does, so it is left out; so are objects.
+    """
+    around = Surroundings(scene, hulls, config.eps_col_m)
+    links = own_links(hulls)
+
+    def room_m(
+        joints_rad: Float[np.ndarray, "num_postures num_joints"],
+    ) -> Float[np.ndarray, " num_postures"]:
+        return np.array([one(row) for row in joints_rad])
+
+    def one(joints_rad: Float[np.ndarray, " num_joints"]) -> float:
+        hulls.place(joints_rad, MAX_WIDTH_M)
+        if links.touch():
+            return hulls.self_distance().distance_m
+        distances, _ = around.measure(
+            {},
+            [],
+            near_m=config.eps_col_m,
+            counts=lambda body, other: body not in GRIPPER_LINKS,
+        )
+        arm = [d for (body, *_), d in distances.items() if body not in GRIPPER_LINKS]
+        return min(arm, default=np.inf) - config.eps_col_m
+
+    return room_m

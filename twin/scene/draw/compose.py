@@ -13,8 +13,7 @@ from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
 from bridge.task.robot import ARM_JOINTS
-from twin.robot.description import RobotDescriptionError
-from twin.robot.model import load_robot
+from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture, posture_track
 from twin.scene.frames.base import base_tree
 from twin.scene.gaussians.cloud import GaussianCloud, concatenate

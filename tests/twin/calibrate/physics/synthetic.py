@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from bridge.task.task_file import load_task
-from twin.calibrate.physics.case import Case, Prediction
+from twin.calibrate.physics.cases import Case, Prediction
 from twin.calibrate.physics.parameters import (
     BIAS,
     FINGER_FRICTION,

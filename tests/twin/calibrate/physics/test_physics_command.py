@@ -23,17 +23,20 @@ from bridge.geometry import se3
 from bridge.task.plan import Plan, Waypoint
 from bridge.task.robot import ARM_JOINTS
 from bridge.task.task_file import Task
-from twin.calibrate.physics import data
+from twin.calibrate.physics import cases as cases_module
 from twin.calibrate.physics import run as physics_run
-from twin.calibrate.physics.case import Case, UnusableCaseError
-from twin.calibrate.physics.data import NothingToCalibrateError, read_cases
-from twin.calibrate.physics.delay import best_shift_s, delay_of, mean_delay
-from twin.calibrate.physics.gripper import widths_of
+from twin.calibrate.physics.cases import (
+    Case,
+    NoUsableEpisodesError,
+    UnusableCaseError,
+    read_cases,
+    widths_of,
+)
 from twin.calibrate.physics.parameters import SURFACE_FRICTION, rigid_parameters
-from twin.calibrate.physics.record import describe_physics
+from twin.calibrate.physics.run import best_shift_s, delay_of, describe_physics, mean_delay
 from twin.physics.config import PhysicsConfig
-from twin.replay.place.calibrated import physics_of
-from twin.robot.clock import BackwardTimeError
+from twin.replay.rebuilt_scene import physics_of
+from twin.robot.posture import BackwardTimeError
 from twin.scene.store.calibration import read_calibration, write_calibration, write_physics
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -224,9 +227,9 @@ def with_localisations(
 
 @pytest.mark.slow
 def test_recorded_probes_become_cases(probed: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(data, "write_localised", with_localisations)
+    monkeypatch.setattr(cases_module, "write_localised", with_localisations)
     # Starts are drawn anew here, so the tool is only sometimes near them: look further away.
-    monkeypatch.setattr(data, "NEAR_M", 0.5)
+    monkeypatch.setattr(cases_module, "NEAR_M", 0.5)
     from bridge.terminal import Output
 
     cases, skipped = read_cases(probed, Output(quiet=True))
@@ -244,9 +247,9 @@ def test_recorded_probes_become_cases(probed: RunFolder, monkeypatch: pytest.Mon
     # The cell hides 20 to 80 ms, and its servos follow about 50 ms behind.
     assert all(delay is not None and 0.04 < delay < 0.16 for delay in delays)
     monkeypatch.setattr(
-        data, "write_localised", lambda *a, **k: with_localisations(*a, lose="cube", **k)
+        cases_module, "write_localised", lambda *a, **k: with_localisations(*a, lose="cube", **k)
     )
-    with pytest.raises(NothingToCalibrateError, match="never localised after the plan: cube"):
+    with pytest.raises(NoUsableEpisodesError, match="never localised after the plan: cube"):
         read_cases(probed, Output(quiet=True))
 
 
@@ -254,8 +257,8 @@ def test_recorded_probes_become_cases(probed: RunFolder, monkeypatch: pytest.Mon
 def test_a_label_given_afterwards_is_what_calibration_believes(
     probed: RunFolder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(data, "write_localised", with_localisations)
-    monkeypatch.setattr(data, "NEAR_M", 0.5)
+    monkeypatch.setattr(cases_module, "write_localised", with_localisations)
+    monkeypatch.setattr(cases_module, "NEAR_M", 0.5)
     (path,) = probed.episodes()
     episode, trials = Episode.open(path), RunFolder.create(tmp_path / "trials")
     with EpisodeWriter(trials.episodes_dir / path.name) as writer:
@@ -269,11 +272,11 @@ def test_a_label_given_afterwards_is_what_calibration_believes(
                 publish_time_ns=message.publish_time_ns,
             )
     trial = Episode.open(trials.episodes()[0])
-    assert data.read_case(trials, trial).success is True
+    assert cases_module.read_case(trials, trial).success is True
     write_label(trials, trial.path.stem, Outcome(result="failure"))
-    assert data.read_case(trials, trial).success is False
+    assert cases_module.read_case(trials, trial).success is False
     write_label(trials, trial.path.stem, Outcome(result="unknown"))
-    assert data.read_case(trials, trial).success is None
+    assert cases_module.read_case(trials, trial).success is None
 
 
 def test_a_clock_that_goes_back_while_a_probe_is_executed_teaches_nothing(
@@ -306,7 +309,7 @@ def test_a_clock_that_goes_back_while_a_probe_is_executed_teaches_nothing(
                 publish_time_ns=stamp,
             )
     with pytest.raises(BackwardTimeError, match=r"goes back by 0\.99 s at 0\.99 s of plan 'p'"):
-        data.read_case(run, Episode.open(path))
+        cases_module.read_case(run, Episode.open(path))
 
 
 def test_joints_that_are_no_numbers_teach_nothing() -> None:
@@ -314,9 +317,9 @@ def test_joints_that_are_no_numbers_teach_nothing() -> None:
     position = np.zeros((len(stamps), 6))
     position[3] = np.nan
     arm = JointTrack(names=ARM_JOINTS, stamps_ns=stamps, position=position)
-    data._check_joints(arm, int(stamps[10]), int(stamps[-1]))
+    cases_module._check_joints(arm, int(stamps[10]), int(stamps[-1]))
     with pytest.raises(UnusableCaseError, match="no number while the plan was executed"):
-        data._check_joints(arm, 0, int(stamps[-1]))
+        cases_module._check_joints(arm, 0, int(stamps[-1]))
 
 
 def test_widths_that_are_no_numbers_teach_nothing(
@@ -326,6 +329,6 @@ def test_widths_that_are_no_numbers_teach_nothing(
     track = JointTrack(
         names=("gripper_width",), stamps_ns=np.arange(3), position=np.array([[0.0], [np.nan], [0]])
     )
-    monkeypatch.setattr(data.streams, "joint_track", lambda *_: track)
+    monkeypatch.setattr(cases_module.streams, "joint_track", lambda *_: track)
     with pytest.raises(UnusableCaseError, match="gripper widths hold what is no number"):
         widths_of(Episode.open(run.episodes()[0]), 0)

@@ -15,16 +15,15 @@ from bridge.sources.standin.probes import plan_probe
 from bridge.task.plan import Plan
 from bridge.task.robot import MAX_WIDTH_M, ur5_with_gripper_urdf
 from bridge.task.task_file import load_task
-from twin.calibrate.physics import drive, evaluate
-from twin.calibrate.physics.case import Case, Prediction, planar
-from twin.calibrate.physics.drive import gripper_only, predict
-from twin.calibrate.physics.evaluate import Evaluator, LostPieceError
+from twin.calibrate.physics import simulate
+from twin.calibrate.physics.cases import Case, Prediction, planar
 from twin.calibrate.physics.fit import FitConfig, fit
 from twin.calibrate.physics.parameters import (
     FINGER_FRICTION,
     SURFACE_FRICTION,
     rigid_parameters,
 )
+from twin.calibrate.physics.simulate import Evaluator, LostPieceError, gripper_only, predict
 from twin.physics.config import PhysicsConfig
 from twin.physics.world import World
 
@@ -147,9 +146,9 @@ def test_what_lies_still_is_not_watched_longer_and_would_have_stayed(
             steps.append(None)
             super().step()
 
-    monkeypatch.setattr(drive, "World", Counted)
+    monkeypatch.setattr(simulate, "World", Counted)
     soon, quick = told(slide), len(steps)
-    monkeypatch.setattr(drive, "REST", -1.0)
+    monkeypatch.setattr(simulate, "REST", -1.0)
     late = told(slide)
     assert len(steps) - quick > quick + 0.3 * CONFIG.rate_hz
     np.testing.assert_allclose(soon.settled, late.settled, atol=5e-5)
@@ -211,7 +210,7 @@ def test_a_case_no_process_survives_ends_a_calibration_with_a_sentence(
     slide: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Memory runs out each time, say."""
-    monkeypatch.setattr(evaluate, "_predict", _die)
+    monkeypatch.setattr(simulate, "_predict", _die)
     with (
         Evaluator([slide], rigid_parameters(CONFIG), CONFIG, num_samples=0, workers=2) as evaluator,
         pytest.raises(LostPieceError, match=r"SIGKILL.*2 times\. Nothing.*fewer --workers"),

@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.calibrate.physics.case import Case
-from twin.calibrate.physics.fit import Fit, FitConfig, fit
-from twin.calibrate.physics.hold_out import split_cases
+from twin.calibrate.physics.cases import Case
+from twin.calibrate.physics.fit import Fit, FitConfig, fit, split_cases
 from twin.calibrate.physics.parameters import (
     FINGER_FRICTION,
     MASS_SCALE,

@@ -9,20 +9,18 @@ import pytest
 from scipy import integrate, stats
 
 from bridge.geometry import se3
-from twin.calibrate.physics.beliefs import (
-    EXPECTED_M,
-    NOISE_SHARE,
-    POSE_DISCREPANCY_M,
-    WIDTH_DISCREPANCY_M,
-    Beliefs,
-)
-from twin.calibrate.physics.case import Case, Prediction, planar
+from twin.calibrate.physics.cases import Case, Prediction, planar
 from twin.calibrate.physics.likelihood import (
     DEGREES,
+    EXPECTED_M,
     LEVER_M,
+    NOISE_SHARE,
+    POSE_DISCREPANCY_M,
     SHARED_WAY,
     SHARED_WIDTH_M,
+    WIDTH_DISCREPANCY_M,
     WIDTH_SIGMA_M,
+    DiscrepancyPosterior,
     Features,
     Score,
     features_of,
@@ -144,7 +142,9 @@ def scattered(
     ]
 
 
-def worth(cases: list[Case], pose: np.ndarray, beliefs: Beliefs | None = None) -> Score:
+def worth(
+    cases: list[Case], pose: np.ndarray, beliefs: DiscrepancyPosterior | None = None
+) -> Score:
     said = Prediction(settled=pose[None], held_widths_m=np.zeros(0), success=np.nan)
     return score(
         observations_of(cases, 0), features_of(cases, [said] * len(cases)), beliefs=beliefs

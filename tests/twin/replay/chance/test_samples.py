@@ -16,13 +16,18 @@ from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
-from twin.replay.chance.draw import draw_variation, given_standing, sample_rng
-from twin.replay.chance.samples import Sample, replay_samples, with_probability
-from twin.replay.config import ReplayConfig, ReplayRunConfig
-from twin.replay.follow.path import path_of_plan
-from twin.replay.place.calibrated import calibrated
-from twin.replay.place.scene import ReplayScene
-from twin.replay.variation import VariationConfig
+from twin.replay.config import ReplayConfig, ReplayRunConfig, VariationConfig
+from twin.replay.monte_carlo import (
+    Sample,
+    draw_variation,
+    given_standing,
+    replay_samples,
+    sample_rng,
+    with_probability,
+)
+from twin.replay.path import path_of_plan
+from twin.replay.rebuilt_scene import calibrated
+from twin.replay.scene import ReplayScene
 from twin.robot.model import load_robot
 from twin.scene.store.calibration import Calibration
 

@@ -8,7 +8,7 @@ from scripted_plans import joints_over
 
 from twin.replay.clearance import ClearanceMonitor, active_stage
 from twin.replay.config import ReplayConfig
-from twin.replay.place.scene import ReplayScene
+from twin.replay.scene import ReplayScene
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 

@@ -7,10 +7,9 @@ import pytest
 from scripted_plans import joints_over
 
 from bridge.geometry import se3
-from twin.replay.clearance.bodies import TABLE, placement_of
-from twin.replay.clearance.near import own_links
+from twin.replay.clearance.bodies import TABLE, own_links, placement_of
 from twin.replay.clearance.surroundings import Pair, Surroundings
-from twin.replay.place.scene import ReplayScene
+from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, hulls_of, signed_distance
 from twin.robot.model import load_robot
 

@@ -11,16 +11,14 @@ from scripted_plans import joints_over
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.replay.clearance import SCENE, ClearanceMonitor
-from twin.replay.clearance.candidates import candidate_clearance
-from twin.replay.clearance.grid import GridLookup
-from twin.replay.clearance.nodes import distances_to_boxes_m, planes_of
-from twin.replay.clearance.shells import shell_of
-from twin.replay.clearance.standing import standing_links
-from twin.replay.clearance.sweep import Reach, State
-from twin.replay.clearance.unnamed import unnamed_scene
+from twin.replay.clearance.bodies import distances_to_boxes_m, planes_of
+from twin.replay.clearance.bounding_spheres import bounding_spheres_of
+from twin.replay.clearance.distance_grid import GridLookup, candidate_clearance
+from twin.replay.clearance.monitor import Reach, State
+from twin.replay.clearance.static_obstacles import stationary_links, unmodelled_obstacles
 from twin.replay.config import ReplayConfig
-from twin.replay.place.calibrated import Correction
-from twin.replay.place.scene import ReplayScene
+from twin.replay.rebuilt_scene import Correction
+from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, hulls_of
 from twin.robot.config import IkConfig
 from twin.robot.inverse import solve_ik
@@ -127,7 +125,7 @@ def test_the_robots_own_foot_is_not_in_its_way(script: SimpleNamespace) -> None:
 
 
 def test_a_scene_of_a_table_only_costs_nothing_more(hulls: RobotHulls) -> None:
-    assert unnamed_scene(static_of(), 0.0, standing_links(hulls)[1], []) is None
+    assert unmodelled_obstacles(static_of(), 0.0, stationary_links(hulls)[1], []) is None
 
 
 def test_taking_a_container_out_leaves_distances_that_are_never_too_large() -> None:
@@ -136,8 +134,10 @@ def test_taking_a_container_out_leaves_distances_that_are_never_too_large() -> N
     wall: Box = ((0.6, 0.1, 0.2), (0.04, 0.6, 0.4))
     T = np.eye(4)
     T[:3, 3] = box[0]
-    local = unnamed_scene(static_of(box, wall, table_m=None), -0.1, None, [(T, np.array(box[1]))])
-    full = unnamed_scene(static_of(wall, table_m=None), -0.1, None, [])
+    local = unmodelled_obstacles(
+        static_of(box, wall, table_m=None), -0.1, None, [(T, np.array(box[1]))]
+    )
+    full = unmodelled_obstacles(static_of(wall, table_m=None), -0.1, None, [])
     assert local is not None
     assert full is not None
     close = np.abs(full.values_m) < 0.1
@@ -165,7 +165,7 @@ def test_no_point_of_a_hull_is_farther_from_its_shell_than_is_subtracted(
 
     rng = np.random.default_rng(5)
     for hull in hulls.hulls[3:]:
-        shell = shell_of(hull.points_m, 0.004)
+        shell = bounding_spheres_of(hull.points_m, 0.004)
         corners = hull.points_m[ConvexHull(hull.points_m).simplices]
         weights = rng.dirichlet(np.ones(3), size=len(corners))
         points = np.einsum("nk,nkj->nj", weights, corners)
@@ -173,7 +173,7 @@ def test_no_point_of_a_hull_is_farther_from_its_shell_than_is_subtracted(
 
 
 def test_everything_below_a_point_of_a_shell_is_within_its_radius() -> None:
-    shell = shell_of(np.random.default_rng(6).uniform(-0.05, 0.05, (30, 3)))
+    shell = bounding_spheres_of(np.random.default_rng(6).uniform(-0.05, 0.05, (30, 3)))
     parent = np.full(len(shell.points_m), -1)
     for index, (begin, end) in enumerate(shell.children):
         assert np.all(parent[begin:end] == -1)
@@ -375,6 +375,6 @@ def test_a_pose_bias_moves_what_was_seen_of_a_container_with_the_container() -> 
     static = static_of((tuple(seen[:3, 3].tolist()), tuple(extents.tolist())), table_m=None)
     correction = Correction(bias=(0.021, -0.026, 0.0))
     moved = correction.poses({"box": seen})["box"]
-    assert unnamed_scene(static, 0.0, None, [(moved, extents)]) is not None
-    assert unnamed_scene(correction.static(static), 0.0, None, [(moved, extents)]) is None
-    assert unnamed_scene(static, 0.0, None, [(seen, extents)]) is None
+    assert unmodelled_obstacles(static, 0.0, None, [(moved, extents)]) is not None
+    assert unmodelled_obstacles(correction.static(static), 0.0, None, [(moved, extents)]) is None
+    assert unmodelled_obstacles(static, 0.0, None, [(seen, extents)]) is None

@@ -28,10 +28,10 @@ from bridge.media.color import decode_color
 from bridge.task.robot import ARM_JOINTS
 from bridge.task.verdict import Factor, Verdict
 from twin.physics.soft import SoftModel
-from twin.replay.episode.images import RATE_HZ, render_replay
-from twin.replay.place.calibrated import Correction
-from twin.replay.place.scene import ReplayScene
-from twin.replay.verdict.result import ReplayResult
+from twin.replay.images import RATE_HZ, render_replay
+from twin.replay.rebuilt_scene import Correction
+from twin.replay.result import ReplayResult
+from twin.replay.scene import ReplayScene
 from twin.robot.model import load_robot
 from twin.scene.gaussians.cloud import GaussianCloud, as_float32
 from twin.scene.robot.splats import write_links

@@ -8,12 +8,11 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.task.robot import ur5_with_gripper_urdf
-from twin.physics.attach import Attachment
 from twin.physics.config import PhysicsConfig
-from twin.physics.world import World
+from twin.physics.world import Attachment, World
 from twin.replay.config import ReplayConfig
-from twin.replay.verdict.rollout import engine_of
-from twin.robot.description import with_absolute_meshes
+from twin.replay.verdict import engine_of
+from twin.robot.model import with_absolute_meshes
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
 SLIPPERY = replace(PhysicsConfig(), finger_friction=0.0, object_friction=0.02)

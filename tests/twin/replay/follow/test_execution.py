@@ -8,15 +8,15 @@ import pytest
 from bridge.episode.streams import JointTrack
 from bridge.task.robot import ARM_JOINTS
 from twin.replay.config import ReplayConfig
-from twin.replay.follow.execution import (
+from twin.replay.execution import (
+    check_covers,
+    check_length,
     closed_mask,
     cut_track,
     path_of_execution,
     stages_as_executed,
 )
-from twin.replay.follow.path import JointPath
-from twin.replay.follow.track_checks import check_covers, check_length
-from twin.replay.follow.usable import UnusablePlanError
+from twin.replay.path import JointPath, UnusablePlanError
 
 OPEN_M, HELD_M = 0.085, 0.040
 

@@ -8,11 +8,10 @@ import pytest
 
 from bridge.geometry import se3
 from twin.replay.config import ReplayConfig
+from twin.replay.dynamics import free_start, lifted, outline_m
 from twin.replay.failure import NotEvaluatedError
-from twin.replay.follow.furnish import lifted, outline_m
-from twin.replay.follow.overlap import free_start
-from twin.replay.place.scene import ReplayScene
-from twin.replay.verdict.rollout import replay_plan
+from twin.replay.scene import ReplayScene
+from twin.replay.verdict import replay_plan
 
 LIMIT_M = 0.006
 

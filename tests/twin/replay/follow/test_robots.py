@@ -13,14 +13,18 @@ from bridge.geometry import se3
 from bridge.task.plan import Plan, Waypoint
 from bridge.task.robot import ROBOT_NAME, ur5_with_gripper_urdf
 from twin.replay.config import ReplayConfig
-from twin.replay.follow.path import check_path, path_of_plan
-from twin.replay.follow.usable import MAX_WAYPOINTS, UnusablePlanError, check_usable
-from twin.replay.verdict.rollout import replay_plan
+from twin.replay.path import (
+    MAX_WAYPOINTS,
+    UnusablePlanError,
+    check_path,
+    check_usable,
+    path_of_plan,
+)
+from twin.replay.verdict import replay_plan
 from twin.robot.collision import RobotHulls, hulls_of
 from twin.robot.config import IkConfig
-from twin.robot.description import RobotDescriptionError
 from twin.robot.inverse import solve_ik
-from twin.robot.model import RobotModel, load_robot
+from twin.robot.model import RobotDescriptionError, RobotModel, load_robot
 
 KINEMATIC = ReplayConfig(mode="kinematic")
 HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
@@ -294,7 +298,7 @@ def test_a_branch_that_touches_is_not_taken_where_another_is_free() -> None:
 
 def test_every_failure_along_a_path_names_its_first_instant() -> None:
     """Limit, jump and self-collision, each put in on purpose at a known time."""
-    from twin.replay.follow.path import JointPath
+    from twin.replay.path import JointPath
 
     robot = load_robot(ur5_with_gripper_urdf())
     hulls = hulls_of(robot)

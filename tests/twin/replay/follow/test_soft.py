@@ -6,16 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from twin.gate.judge import no_verdict
+from twin.gate.gate import no_verdict
 from twin.physics.soft import SoftHealth
 from twin.physics.world import World
 from twin.replay.clearance.monitor import allowed_pairs
 from twin.replay.config import ReplayConfig
-from twin.replay.follow.dynamics import Burst, burst_of
-from twin.replay.follow.furnish import outline_m, soft_models
-from twin.replay.verdict.judge import terminal_factor
-from twin.replay.verdict.result import ReplayResult
-from twin.replay.verdict.rollout import replay_plan
+from twin.replay.dynamics import Burst, burst_of, outline_m, soft_models
+from twin.replay.result import ReplayResult
+from twin.replay.verdict import replay_plan, terminal_factor
 
 CONFIG = ReplayConfig()
 SOUND = SoftHealth(num_inverted=0, max_stretch=1.1, is_finite=True)

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from bridge.geometry.trajectory import PoseTrajectory
-from twin.replay.config import PartingConfig
-from twin.replay.parting.divergence import diverge
-from twin.replay.parting.lag import lag_s
-from twin.replay.parting.trace import Trace
+from twin.replay.config import DivergenceConfig
+from twin.replay.divergence import diverge, lag_s
+from twin.replay.trace import Trace
 
-CONFIG = PartingConfig()
+CONFIG = DivergenceConfig()
 END_S = 4.0
 UP = np.array([1.0, 0.0, 0.0, 0.0])
 

@@ -9,12 +9,12 @@ import pytest
 from bridge.task.predicate import evaluate_success
 from bridge.task.task_file import SoftMaterial
 from twin.replay.config import ReplayConfig
-from twin.replay.follow.execution import path_of_execution
-from twin.replay.parting.recorded import Recording, states_of_recording, trace_of_recording
-from twin.replay.place.starts import StartState
-from twin.replay.verdict.result import ReplayResult
-from twin.replay.verdict.rollout import replay_plan
-from twin.replay.work.compare import recorded_findings
+from twin.replay.execution import path_of_execution
+from twin.replay.job import recorded_findings
+from twin.replay.result import ReplayResult
+from twin.replay.scene import StartState
+from twin.replay.trace import Recording, states_of_recording, trace_of_recording
+from twin.replay.verdict import replay_plan
 from twin.robot.model import load_robot
 
 CONFIG = ReplayConfig(mode="kinematic", sample_rate_hz=30)

@@ -18,13 +18,17 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.physics.config import PhysicsConfig
-from twin.replay.chance.draw import draw_variation, sample_rng
 from twin.replay.config import ReplayConfig
-from twin.replay.place.calibrated import Correction, calibrated, correction_of, for_task
-from twin.replay.place.rebuilt import read_place
-from twin.replay.place.starts import StartState
-from twin.replay.work.job import ReplayJob
-from twin.replay.work.relive import run_job
+from twin.replay.job import ReplayJob, run_job
+from twin.replay.monte_carlo import draw_variation, sample_rng
+from twin.replay.rebuilt_scene import (
+    Correction,
+    calibrated,
+    correction_of,
+    for_task,
+    read_rebuilt_scene,
+)
+from twin.replay.scene import StartState
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import StaticSdf
 from twin.scene.store.calibration import Calibration, read_calibration, write_physics
@@ -91,7 +95,7 @@ def test_samples_are_drawn_around_what_was_found_and_as_widely_as_it_leaves_open
     known = with_calibration(run, pose_bias=BIAS, masses=MASSES)
     seen = script.scene()
     sure = {name: np.zeros((6, 6)) for name in seen.Ts_base_object}
-    place = read_place(run, seen.task)
+    place = read_rebuilt_scene(run, seen.task)
     scene = place.scene(seen.task, seen.urdf, seen.Ts_base_object, covariances=sure)
     config = calibrated(ReplayConfig(), known)
     draws = [draw_variation(sample_rng(0, "s", k), scene, config) for k in range(150)]
@@ -174,14 +178,16 @@ def test_distances_are_found_where_the_robot_finds_them(tmp_path: Path) -> None:
               "sources": [], "views": []}  # fmt: skip
     (run.scene_dir / "scene.json").write_text(json.dumps(record))
     task, points = load_task("cube_into_box"), rng.uniform(0.0, 0.05, (50, 3))
-    plain = read_place(run, task).static_sdf
+    plain = read_rebuilt_scene(run, task).static_sdf
     with_calibration(run, pose_bias=BIAS)
-    moved = read_place(run, task).static_sdf
+    moved = read_rebuilt_scene(run, task).static_sdf
     assert plain is not None
     assert moved is not None
     for name in ("conservative", "observed"):
         before, after = getattr(plain, name), getattr(moved, name)
         found = after.distance(points + np.array([0.006, -0.004, 0.0]))
         np.testing.assert_allclose(found, before.distance(points), atol=1e-9)
-    assert read_place(run, task).static_sdf is moved, "what is derived from it is remembered"
+    assert read_rebuilt_scene(run, task).static_sdf is moved, (
+        "what is derived from it is remembered"
+    )
     assert moved.table_z_m == 0.0

@@ -11,8 +11,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.task.task_file import load_task
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
-from twin.replay.place.calibrated import physics_for
-from twin.replay.place.rebuilt import TASK_SHAPE, read_place, shape_hashes
+from twin.replay.rebuilt_scene import TASK_SHAPE, physics_for, read_rebuilt_scene, shape_hashes
 from twin.scene.shape.lattice import Lattice
 from twin.scene.shape.npz import UnreadableArraysError
 from twin.scene.shape.sdf import SdfGrid
@@ -58,13 +57,13 @@ def write_object(run: RunFolder, *, watertight: bool) -> None:
 
 
 def test_without_a_scene_the_task_file_says_everything(tmp_path: Path) -> None:
-    place = read_place(RunFolder.create(tmp_path / "run"), TASK)
+    place = read_rebuilt_scene(RunFolder.create(tmp_path / "run"), TASK)
     assert (place.scene_hash, place.static_sdf, dict(place.lattices)) == (None, None, {})
     assert set(place.shape_sources.values()) == {TASK_SHAPE}
 
 
 def test_the_lattice_of_the_scene_is_taken_and_named(run: RunFolder) -> None:
-    place = read_place(run, TASK)
+    place = read_rebuilt_scene(run, TASK)
     assert place.scene_hash == "abc"
     assert place.shape_sources["sloth"].startswith("lattice of the scene")
     body = SoftModel.from_lattice(place.lattices["sloth"], TASK.objects["sloth"])
@@ -74,21 +73,21 @@ def test_the_lattice_of_the_scene_is_taken_and_named(run: RunFolder) -> None:
 
 def test_a_mesh_that_is_not_watertight_is_not_believed(run: RunFolder) -> None:
     write_object(run, watertight=False)
-    place = read_place(run, TASK)
+    place = read_rebuilt_scene(run, TASK)
     assert not place.lattices
     assert "not watertight" in place.shape_sources["sloth"]
 
 
 def test_a_lattice_of_another_size_is_another_body(run: RunFolder) -> None:
     lattice_of_task(stretch=1.5).save(run.scene_dir / "objects" / "sloth" / "soft.npz")
-    place = read_place(run, TASK)
+    place = read_rebuilt_scene(run, TASK)
     assert not place.lattices
     assert "% off)" in place.shape_sources["sloth"]
 
 
 def test_a_damaged_lattice_is_passed_over_with_the_reason(run: RunFolder) -> None:
     (run.scene_dir / "objects" / "sloth" / "soft.npz").write_bytes(b"no arrays")
-    place = read_place(run, TASK)
+    place = read_rebuilt_scene(run, TASK)
     assert not place.lattices
     assert "soft.npz" in place.shape_sources["sloth"]
     assert any("sloth: shape of the task file" in remark for remark in place.remarks)
@@ -113,12 +112,12 @@ def test_distances_that_cannot_be_read_are_no_free_way(run: RunFolder) -> None:
     path = run.scene_dir / "sdf.npz"
     path.write_bytes(b"no arrays")
     with pytest.raises(UnreadableArraysError, match=r"sdf\.npz: .*robot-gst rebuild RUN --force"):
-        read_place(run, TASK)
+        read_rebuilt_scene(run, TASK)
     write_distances(run, np.nan)
     with pytest.raises(UnreadableArraysError, match=r"sdf\.npz: a distance is no number"):
-        read_place(run, TASK)
+        read_rebuilt_scene(run, TASK)
     write_distances(run, -0.1)
-    assert read_place(run, TASK).static_sdf is not None
+    assert read_rebuilt_scene(run, TASK).static_sdf is not None
 
 
 def test_other_shapes_are_other_replays(run: RunFolder) -> None:

@@ -12,7 +12,7 @@ from bridge.errors import PathNotFoundError
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
 from twin.cli import replay
-from twin.replay.place.starts import localised_starts
+from twin.replay.scene import localised_starts
 
 
 def test_an_episode_without_cameras_starts_from_nothing_and_says_why(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from twin.replay.run.batches import SHARE, TASK_S, Batches
+from twin.replay.workers import SHARE, TASK_S, Batches
 
 
 def one(cost: float) -> float:

@@ -5,13 +5,13 @@ from typing import Any
 
 import pytest
 
-from twin.replay.run import cluster
-from twin.replay.run.cluster import RayClusterError, RayRunner
+from twin.replay import workers
+from twin.replay.workers import RayClusterError, RayRunner
 
 
 def runner(monkeypatch: pytest.MonkeyPatch, cpus: list[float]) -> RayRunner:
     """One whose cluster has so many processors at each look, and is done after the last."""
-    monkeypatch.setattr(cluster, "code_version", lambda: "same")
+    monkeypatch.setattr(workers, "code_version", lambda: "same")
     looks = iter(cpus)
 
     def wait(running: list[str], **_: Any) -> tuple[list[str], list[str]]:

@@ -20,11 +20,11 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.task.plan import Plan
 from bridge.task.robot import ARM_JOINTS
 from bridge.terminal import Output
+from twin.replay import runner
 from twin.replay.config import ReplayConfig, ReplayRunConfig
-from twin.replay.place.starts import StartState, StartStates
-from twin.replay.run import prepare
-from twin.replay.run.start import replay_run
-from twin.replay.run.text import describe_run
+from twin.replay.scene import StartState, StartStates
+from twin.replay.summary import describe_run
+from twin.replay.workers import replay_run
 from twin.scene.localise.episode import Phase
 
 T0 = 1_700_000_000_000_000_000
@@ -129,7 +129,7 @@ def run(tmp_path: Path, script: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
         phase = Phase(name="start", plan_id=None, after_ns=None, before_ns=None)
         return StartStates(task, [phase], [StartState(Ts_base_object=poses, reasons=reasons)])
 
-    monkeypatch.setattr(prepare, "localised_starts", starts)
+    monkeypatch.setattr(runner, "localised_starts", starts)
     return folder
 
 

@@ -19,16 +19,14 @@ from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.task.record import parse_record
-from twin.crew.worker import Failed
+from twin.crew.pool import Failed
+from twin.replay import runner, workers
 from twin.replay.config import ReplayConfig
-from twin.replay.place.starts import StartState
-from twin.replay.run import cluster, kept
-from twin.replay.run.cluster import RayClusterError, RayRunner, code_version, is_loopback
-from twin.replay.run.kept import there_already
-from twin.replay.run.table import count_verdicts
-from twin.replay.run.text import describe_run
-from twin.replay.work.job import ReplayJob, row_of_existing
-from twin.replay.work.relive import run_job
+from twin.replay.job import ReplayJob, row_of_existing, run_job
+from twin.replay.runner import there_already
+from twin.replay.scene import StartState
+from twin.replay.summary import count_verdicts, describe_run
+from twin.replay.workers import RayClusterError, RayRunner, code_version, is_loopback
 
 T0 = 1_700_000_000_000_000_000
 QUICK = ReplayConfig(settle_after_s=0.3, settle_before_s=0.1)
@@ -88,7 +86,7 @@ def test_what_is_asked_for_last_counts_also_when_it_was_made_first(
     jobs: list[ReplayJob], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The newest replay of a trajectory is the one that an evaluation takes."""
-    monkeypatch.setattr(kept, "row_of_existing", lambda job: {} if job.path().exists() else None)
+    monkeypatch.setattr(runner, "row_of_existing", lambda job: {} if job.path().exists() else None)
     sampled = replace(jobs[0], config=replace(QUICK, samples=4))
     for age_s, job in enumerate((sampled, jobs[0], jobs[1])):
         job.path().touch()
@@ -154,31 +152,31 @@ def test_an_address_of_this_machine_is_one() -> None:
 def test_a_cluster_without_a_token_is_refused(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    for name in (cluster.MODE, cluster.TOKEN, cluster.TOKEN_PATH):
+    for name in (workers.MODE, workers.TOKEN, workers.TOKEN_PATH):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
     with pytest.raises(UsageError, match="--ray needs the cluster's token"), RayRunner("h:1", 1):
         pass
-    monkeypatch.setenv(cluster.MODE, "disabled")
+    monkeypatch.setenv(workers.MODE, "disabled")
     with pytest.raises(UsageError, match="only speaks to a cluster with tokens"):
         RayRunner("h:1", 1).__enter__()
-    assert os.environ[cluster.MODE] == "disabled"
+    assert os.environ[workers.MODE] == "disabled"
 
 
 def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingDependencyError, match=r"robot-gst\[cluster\]"):
         RayRunner("local", 1).__enter__()
-    assert cluster.TOKEN not in os.environ
+    assert workers.TOKEN not in os.environ
 
 
 def test_a_node_that_sees_no_files_or_runs_other_code_says_so(jobs: list[ReplayJob]) -> None:
     elsewhere = replace(jobs[0], folder=Path("/nowhere/derived"))
-    answer = cluster._task(run_job, elsewhere, code_version())
+    answer = workers._task(run_job, elsewhere, code_version())
     assert isinstance(answer, Failed)
     assert "does not see /nowhere/derived" in answer.message
     assert "under the same path" in answer.message
-    answer = cluster._task(run_job, jobs[0], "0.0.0, replays 1, bullet-1")
+    answer = workers._task(run_job, jobs[0], "0.0.0, replays 1, bullet-1")
     assert isinstance(answer, Failed)
     assert "install the same version on every node" in answer.message
 
@@ -186,9 +184,9 @@ def test_a_node_that_sees_no_files_or_runs_other_code_says_so(jobs: list[ReplayJ
 SCRIPT = """
 import pickle, sys
 from pathlib import Path
-from twin.replay.work.job import ReplayJob
-from twin.replay.run.cluster import RayRunner
-from twin.replay.work.relive import run_job
+from twin.replay.job import ReplayJob
+from twin.replay.workers import RayRunner
+from twin.replay.job import run_job
 jobs = pickle.loads(Path(sys.argv[1]).read_bytes())
 with RayRunner("local", 1) as runner:
     rows = [answer for _, answer in runner.run(run_job, jobs, ReplayJob.cost)]
@@ -252,8 +250,8 @@ def test_nobody_at_an_address_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -
             pass
 
     monkeypatch.setitem(sys.modules, "ray", Ray)
-    monkeypatch.setenv(cluster.TOKEN, "x" * 32)
-    monkeypatch.delenv(cluster.MODE, raising=False)
+    monkeypatch.setenv(workers.TOKEN, "x" * 32)
+    monkeypatch.delenv(workers.MODE, raising=False)
     with socket.create_server(("127.0.0.1", 0)) as somebody_else:
         there = f"127.0.0.1:{somebody_else.getsockname()[1]}"
         with pytest.raises(RayClusterError, match=rf"no Ray cluster to use at {there}: Failed to"):

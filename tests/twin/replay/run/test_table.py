@@ -3,17 +3,17 @@
 from typing import Any
 
 from bridge.task.verdict import Factor, Verdict
-from twin.replay.run.table import (
+from twin.replay.job import predicates_hold
+from twin.replay.summary import (
     EXECUTED,
     PLANNED,
     SEEN,
     against_recorded,
     count_verdicts,
     cross_table,
+    describe_run,
     executions_of,
 )
-from twin.replay.run.text import describe_run
-from twin.replay.work.job import predicates_hold
 
 
 def row(episode: str, trajectory: str, accepted: bool | None, **more: Any) -> dict[str, Any]:

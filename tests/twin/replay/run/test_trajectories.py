@@ -21,16 +21,16 @@ from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
 from twin import cli
 from twin.crew.pool import Alone, Crew
+from twin.replay import job as job_module
+from twin.replay import runner as runner_module
+from twin.replay import workers
 from twin.replay.config import ReplayConfig, ReplayRunConfig
-from twin.replay.place.starts import StartState, StartStates
-from twin.replay.run import prepare, start, trajectories
-from twin.replay.run.executions import Execution, execution_of
-from twin.replay.run.start import replay_run
-from twin.replay.run.table import count_verdicts
-from twin.replay.run.text import describe_run
-from twin.replay.verdict.result import ReplayResult
-from twin.replay.work import relive
-from twin.replay.work.job import ReplayJob, divergence_of, row_of_failure
+from twin.replay.job import ReplayJob, divergence_of, row_of_failure
+from twin.replay.result import ReplayResult
+from twin.replay.runner import Execution, execution_of
+from twin.replay.scene import StartState, StartStates
+from twin.replay.summary import count_verdicts, describe_run
+from twin.replay.workers import replay_run
 from twin.scene.localise.episode import Phase
 
 T0 = 1_700_000_000_000_000_000
@@ -94,7 +94,7 @@ def run(
         phase = Phase(name="start", plan_id=None, after_ns=None, before_ns=START)
         return StartStates(scene.task, [phase], [StartState(Ts_base_object=scene.Ts_base_object)])
 
-    monkeypatch.setattr(prepare, "localised_starts", starts)
+    monkeypatch.setattr(runner_module, "localised_starts", starts)
     return folder
 
 
@@ -134,7 +134,7 @@ def test_every_plan_and_every_execution_becomes_one_episode(
     assert "planned dynamic, never executed" in capsys.readouterr().out
 
     done: list[ReplayJob] = []
-    monkeypatch.setattr(trajectories, "run_job", lambda job: done.append(job) or again["rows"][0])
+    monkeypatch.setattr(runner_module, "run_job", lambda job: done.append(job) or again["rows"][0])
     replay_run(run, ReplayRunConfig(replay=QUICK), QUIET)
     assert not done
     replay_run(run, ReplayRunConfig(replay=QUICK, force=True), QUIET)
@@ -184,7 +184,7 @@ class CrewForReplays(Crew):
 
     def run(self, function: Any, items: Any, cost: Any) -> Any:
         """See ``Crew``."""
-        runner = Alone() if function is prepare.jobs_of else super()
+        runner = Alone() if function is runner_module.jobs_of else super()
         return runner.run(function, items, cost)
 
 
@@ -195,7 +195,7 @@ def test_two_processes_say_what_one_process_says(
     config = ReplayRunConfig(replay=QUICK)
     replay_run(run, config, QUIET)
     before = {path.name: _messages(path) for path in run.derived("*.replay.*")}
-    monkeypatch.setattr(start, "Crew", CrewForReplays)
+    monkeypatch.setattr(workers, "Crew", CrewForReplays)
     summary = replay_run(run, replace(config, workers=2, force=True), QUIET)
     assert not any(row["skipped"] or row["error"] for row in summary["rows"])
     assert {path.name: _messages(path) for path in run.derived("*.replay.*")} == before
@@ -220,7 +220,7 @@ def test_an_episode_named_twice_is_replayed_once(
         done.append(job)
         return row_of_failure(job, "only looked at")
 
-    monkeypatch.setattr(trajectories, "run_job", note)
+    monkeypatch.setattr(runner_module, "run_job", note)
     replay_run(run, ReplayRunConfig(episode=("trial_0001", "trial_0001")), QUIET)
     assert len(done) == len({job.path() for job in done}) == 4
 
@@ -237,7 +237,7 @@ def test_what_the_scene_lacks_is_said_once_for_all_replays(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_scene(run)
-    monkeypatch.setattr(trajectories, "run_job", lambda job: row_of_failure(job, "looked at"))
+    monkeypatch.setattr(runner_module, "run_job", lambda job: row_of_failure(job, "looked at"))
     replay_run(run, ReplayRunConfig(), Output())
     said = capsys.readouterr().err
     assert said.count("cube_into_box: the scene has no sdf.npz: only the table") == 1
@@ -303,8 +303,8 @@ def test_a_recording_that_ends_while_the_robot_moves_says_so(
     events = marks(".>.")
     for event in events:
         event["plan_id"] = "round-1"
-    monkeypatch.setattr(prepare.streams, "events", lambda _: events)
-    monkeypatch.setattr(relive, "_replay", lambda job: (VERDICT, None))
+    monkeypatch.setattr(runner_module.streams, "events", lambda _: events)
+    monkeypatch.setattr(job_module, "_replay", lambda job: (VERDICT, None))
     summary = replay_run(run, ReplayRunConfig(replay=QUICK), QUIET)
     said = {(r["plan"], r["trajectory"], r["mode"]): r for r in summary["rows"]}
     assert len(said) == 4

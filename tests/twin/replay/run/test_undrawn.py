@@ -8,8 +8,8 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import PathNotFoundError
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
-from twin.replay.run.start import replay_run
-from twin.replay.run.undrawn import describe_undrawn
+from twin.replay.runner import describe_undrawn
+from twin.replay.workers import replay_run
 
 
 def test_pictures_without_a_scene_are_refused_before_anything_is_replayed(tmp_path: Path) -> None:

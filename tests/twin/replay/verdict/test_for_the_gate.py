@@ -13,10 +13,10 @@ import pytest
 from bridge.episode.run_folder import RunFolder
 from bridge.terminal import Output
 from twin.gate.config import GateConfig
-from twin.gate.judge import UndecidedError
+from twin.gate.gate import UndecidedError
 from twin.gate.twin_process import TwinProcess
 from twin.replay.config import ReplayConfig
-from twin.replay.verdict.result import ReplayResult
+from twin.replay.result import ReplayResult
 
 
 def soon(seconds: float) -> float:

@@ -10,12 +10,12 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.task.plan import Plan
 from bridge.task.verdict import Factor
-from twin.gate.judge import no_verdict
+from twin.gate.gate import no_verdict
 from twin.replay.config import ReplayConfig
-from twin.replay.follow.path import JointPath
-from twin.replay.verdict.hold import Hold, holds_of, slips, unless_slipped
-from twin.replay.verdict.result import ReplayResult
-from twin.replay.verdict.rollout import replay_joints, replay_plan
+from twin.replay.path import JointPath
+from twin.replay.result import ReplayResult
+from twin.replay.slip import GraspedObject, grasped_objects, slips, unless_slipped
+from twin.replay.verdict import replay_joints, replay_plan
 
 RATE_HZ = 60
 LIMIT_M = 0.01
@@ -71,8 +71,8 @@ def sliding(seconds: tuple[float, float], far_m: float, script: SimpleNamespace)
     return np.interp(np.arange(steps) / RATE_HZ, seconds, (0.0, far_m))
 
 
-def hold_of(plan: Plan, result: ReplayResult) -> Hold:
-    (hold,) = holds_of(plan, path_of(plan), result)
+def hold_of(plan: Plan, result: ReplayResult) -> GraspedObject:
+    (hold,) = grasped_objects(plan, path_of(plan), result)
     return hold
 
 
@@ -112,14 +112,14 @@ def test_what_slides_before_the_hand_leaves_or_after_it_opened_did_not_slip(
 
 def test_a_gripper_that_acts_later_holds_longer(script: SimpleNamespace) -> None:
     plan, result = carried(script)
-    (late,) = holds_of(plan, path_of(plan).with_late_gripper(0.2), result)
+    (late,) = grasped_objects(plan, path_of(plan).with_late_gripper(0.2), result)
     assert late.stamps_ns[-1] * 1e-9 == pytest.approx(OPENS_S + 0.2, abs=0.02)
 
 
 def test_a_grasp_that_misses_is_no_hold(script: SimpleNamespace) -> None:
     plan, result = carried(script)
     nothing = {"cube": np.zeros(len(result.stamps_ns), dtype=bool)}
-    assert holds_of(plan, path_of(plan), replace(result, finger_contact=nothing)) == []
+    assert grasped_objects(plan, path_of(plan), replace(result, finger_contact=nothing)) == []
 
 
 def test_what_is_touched_beside_the_object_that_is_grasped_is_no_hold(
@@ -127,13 +127,13 @@ def test_what_is_touched_beside_the_object_that_is_grasped_is_no_hold(
 ) -> None:
     plan, result = carried(script)
     stages = tuple(replace(stage, grasp=stage.grasp and "duck") for stage in plan.stages)
-    assert holds_of(replace(plan, stages=stages), path_of(plan), result) == []
+    assert grasped_objects(replace(plan, stages=stages), path_of(plan), result) == []
 
 
 def test_a_hand_that_never_leaves_carries_nothing(script: SimpleNamespace) -> None:
     plan, result = carried(script)
     still = np.repeat(result.Ts_base_tcp[:1], len(result.stamps_ns), axis=0)
-    assert holds_of(plan, path_of(plan), replace(result, Ts_base_tcp=still)) == []
+    assert grasped_objects(plan, path_of(plan), replace(result, Ts_base_tcp=still)) == []
 
 
 def test_a_slip_takes_a_yes_and_an_open_answer_away_and_leaves_a_no_as_it_is(

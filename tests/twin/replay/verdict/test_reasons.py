@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from bridge.task.verdict import Factor
-from twin.gate.judge import no_verdict
+from twin.gate.gate import no_verdict
 from twin.replay.config import ReplayConfig
 from twin.replay.failure import with_reasons
-from twin.replay.place.scene import ReplayScene
-from twin.replay.verdict.judge import reason_of, terminal_factor
-from twin.replay.verdict.result import ReplayResult
+from twin.replay.result import ReplayResult
+from twin.replay.scene import ReplayScene
+from twin.replay.verdict import reason_of, terminal_factor
 
 CONFIG = ReplayConfig()
 STEPS = 120

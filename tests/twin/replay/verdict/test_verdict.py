@@ -11,9 +11,9 @@ from bridge.geometry import se3
 from twin.physics.world import World
 from twin.replay.config import Mode, ReplayConfig
 from twin.replay.failure import NotEvaluatedError
-from twin.replay.follow.usable import UnusablePlanError
-from twin.replay.verdict.result import ReplayResult
-from twin.replay.verdict.rollout import replay_joints, replay_plan
+from twin.replay.path import UnusablePlanError
+from twin.replay.result import ReplayResult
+from twin.replay.verdict import replay_joints, replay_plan
 
 KINEMATIC = ReplayConfig(mode="kinematic")
 

@@ -13,13 +13,13 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
 from twin.replay.config import ReplayConfig
+from twin.replay.execution import path_of_execution
 from twin.replay.failure import NotEvaluatedError
-from twin.replay.follow.execution import path_of_execution
-from twin.replay.follow.usable import UnusablePlanError
-from twin.replay.place.starts import StartState
-from twin.replay.verdict.result import ReplayResult
-from twin.replay.work.job import ReplayJob, row_of_failure
-from twin.robot.clock import BackwardTimeError, check_clock
+from twin.replay.job import ReplayJob, row_of_failure
+from twin.replay.path import UnusablePlanError
+from twin.replay.result import ReplayResult
+from twin.replay.scene import StartState
+from twin.robot.posture import BackwardTimeError, check_clock
 
 T0 = 1_700_000_000_000_000_000
 

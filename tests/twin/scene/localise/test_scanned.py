@@ -14,7 +14,7 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.task.meshes.catalogue import ToyMesh, toy_mesh
 from bridge.task.task_file import SCANNED, ObjectModel, Task, load_task
-from twin.gate.work import Look, look
+from twin.gate.twin_process import Look, look
 from twin.scene.localise.objects import localise_objects
 from twin.scene.localise.result import BOX_METHOD, MESH_METHOD
 from twin.scene.localise.scanned import scanned_surfaces

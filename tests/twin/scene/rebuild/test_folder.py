@@ -18,7 +18,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from twin.replay.config import ReplayRunConfig
-from twin.replay.run.start import replay_run
+from twin.replay.workers import replay_run
 from twin.scene.fit.initialise import fuse
 from twin.scene.frames.choice import choose_frames, find_sources
 from twin.scene.frames.points import DepthLimits, FrameSurface

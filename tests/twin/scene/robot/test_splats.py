@@ -16,8 +16,7 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
-from twin.robot.description import RobotDescriptionError
-from twin.robot.model import load_robot
+from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture, posture_track
 from twin.robot.surface import PosedSurface, sample_surface
 from twin.scene.frames.points import DepthLimits, FrameSurface

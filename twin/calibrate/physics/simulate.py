@@ -1,0 +1,279 @@
+"""Live one case through: the recorded arm, the commanded gripper, and parameters to be judged.
+
+Only the gripper collides: the arm's own shapes touch nothing in a probe, and leaving them out makes
+an evaluation several times quicker.
+"""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from types import TracebackType
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.task.predicate import Rollout, all_hold, evaluate_success
+from bridge.task.robot import GRIPPER_LINKS
+from twin.calibrate.physics.cases import Case, Prediction, planar
+from twin.calibrate.physics.parameters import (
+    BIAS,
+    MASS_SCALE,
+    PhysicsParameter,
+    apply_values,
+    shifted,
+    values_of,
+)
+from twin.crew.pool import Crew, Failed
+from twin.errors import TwinError
+from twin.physics.config import PhysicsConfig
+from twin.physics.world import World
+from twin.robot.model import parse_description
+
+SETTLE_S = 0.6
+"""The robot stands still for this long before the final state is read, or until all lies still."""
+REST_S, REST = 0.05, 2e-5
+"""Whatever moves or turns by less [m and quaternion] in this time lies still."""
+TAIL_HZ = 60
+SAMPLE_STREAM = 606
+
+
+def predict(
+    case: Case, values: Mapping[str, float], config: PhysicsConfig, num_samples: int
+) -> Prediction:
+    """Say what a case would have shown if the parameters were these.
+
+    The nominal start gives settled poses and widths. For a trial that was judged, noisy starts, the
+    same for all parameters (common random numbers), give the share that succeeds.
+
+    Args:
+        case: What the robot did, and where the objects were.
+        values: By name; what is missing counts as nominal.
+        config: Everything that is not a parameter.
+        num_samples: Noisy starts of a judged trial.
+    """
+    physics = apply_values(values, config)
+    nominal = _live(case, values, physics, np.zeros((len(case.objects), 3)))
+    success = float("nan")
+    if case.success is not None and num_samples > 0:
+        seed = int(case.sha256[:15] or "0", 16)
+        rng = np.random.default_rng([SAMPLE_STREAM, seed])
+        results = []
+        for _ in range(num_samples):
+            noise = np.stack(
+                [rng.multivariate_normal(np.zeros(3), C) for C in case.start_covariance]
+            )
+            results.append(_live(case, values, physics, noise).success)
+        success = float(np.mean(results))
+    return Prediction(settled=nominal.settled, held_widths_m=nominal.held_widths_m, success=success)
+
+
+def _live(
+    case: Case,
+    values: Mapping[str, float],
+    physics: PhysicsConfig,
+    noise: Float[np.ndarray, "num_objects 3"],
+) -> Prediction:
+    rate = physics.rate_hz
+    steps = int(np.ceil(case.stretches_s[-1, 1] * rate))
+    times_s = np.arange(steps + 1) / rate
+    targets = np.stack(
+        [np.interp(times_s, case.joint_times_s, column) for column in case.joints_rad.T], axis=1
+    )
+    velocities = np.diff(targets, axis=0) * rate
+    index = np.searchsorted(case.width_times_s, times_s, side="right") - 1
+    widths = case.width_commands_m[np.clip(index, 0, None)]
+    holds = np.rint(case.hold_times_s * rate).astype(int)
+    bias = np.array([values.get(name, 0.0) for name in BIAS])
+    held: dict[int, float] = {}
+    statics = {
+        key: shifted(T, bias) for key, T in case.Ts_base_start.items() if key not in case.objects
+    }
+    with World(gripper_only(case.urdf), {}, physics) as world:
+        _spawn(world, case, values, statics, bias + noise)
+        for begin_s, end_s in case.stretches_s:
+            first, last = int(begin_s * rate), min(int(np.ceil(end_s * rate)), steps)
+            world.reset_robot(targets[first], float(widths[first]))
+            for step in range(first, last):
+                world.command(targets[step + 1], velocities[step], float(widths[step]))
+                world.step()
+                if step in holds:
+                    held[step] = world.width_m()
+        success = _settle(world, case, statics, targets[-1], float(widths[-1]))
+        settled = np.stack([planar(world.T_base_object(key)) for key in case.objects])
+    return Prediction(
+        settled=settled - bias,
+        held_widths_m=np.array([held[int(step)] for step in holds], dtype=np.float64),
+        success=success,
+    )
+
+
+def _spawn(
+    world: World,
+    case: Case,
+    values: Mapping[str, float],
+    statics: Mapping[str, Float[np.ndarray, "4 4"]],
+    shifts: Float[np.ndarray, "num_objects 3"],
+) -> None:
+    world.add_table(0.0)
+    for key, T in statics.items():
+        world.add_static(case.task.objects[key].panels(), T)
+    for key, shift in zip(case.objects, shifts, strict=True):
+        model = case.task.objects[key]
+        mass_kg = model.mass_kg * values.get(MASS_SCALE, 1.0)
+        world.add_free(
+            key, np.array(model.size_m), mass_kg, shifted(case.Ts_base_start[key], shift)
+        )
+
+
+def _settle(
+    world: World,
+    case: Case,
+    statics: Mapping[str, Float[np.ndarray, "4 4"]],
+    joints_rad: Float[np.ndarray, " num_joints"],
+    width_m: float,
+) -> float:
+    """Let things come to rest, and say whether the task's goal holds then."""
+    rate = world.config.rate_hz
+    stamps: list[int] = []
+    poses: dict[str, list[Float[np.ndarray, "4 4"]]] = {key: [] for key in case.objects}
+    touches: dict[str, list[bool]] = {key: [] for key in case.objects}
+    still = np.zeros(len(joints_rad))
+    before: Float[np.ndarray, "num_objects 7"] | None = None
+    for step in range(round(SETTLE_S * rate)):
+        world.command(joints_rad, still, width_m)
+        world.step()
+        if case.success is None and step % round(REST_S * rate) == 0:
+            now = np.array([world.object_pose(key) for key in case.objects])
+            if before is not None and np.abs(now - before).max() < REST:
+                break
+            before = now
+        if case.success is not None and step % (rate // TAIL_HZ) == 0:
+            stamps.append(round(step * 1e9 / rate))
+            for key in case.objects:
+                poses[key].append(world.T_base_object(key))
+                touches[key].append(world.finger_touches(key))
+    if case.success is None:
+        return float("nan")
+    fixed = {key: np.repeat(T[None], len(stamps), axis=0) for key, T in statics.items()}
+    rollout = Rollout(
+        stamps_ns=np.array(stamps, dtype=np.int64),
+        Ts_base_object={**{key: np.array(Ts) for key, Ts in poses.items()}, **fixed},
+        finger_contact={key: np.array(rows, dtype=bool) for key, rows in touches.items()},
+    )
+    return float(all_hold(evaluate_success(case.task, rollout)) is True)
+
+
+@lru_cache(maxsize=4)
+def gripper_only(urdf: str) -> str:
+    """Leave only the gripper's collision shapes in a description, and no pictures."""
+    root = parse_description(urdf)
+    for link in root.findall("link"):
+        drop = ["visual"] if link.get("name") in GRIPPER_LINKS else ["visual", "collision"]
+        for tag in drop:
+            for element in link.findall(tag):
+                link.remove(element)
+    return ET.tostring(root, encoding="unicode")
+
+
+# --- Live many cases through at many points, in one process or several; the order changes nothing.
+
+Piece = tuple[int, Case, Mapping[str, float], PhysicsConfig, int]
+"""Its number, and what ``predict`` takes."""
+
+
+class LostPieceError(TwinError):
+    """A case could not be lived through, although it was tried again."""
+
+
+class Evaluator:
+    """Predictions of cases at points in units of the prior. A context manager: it owns a crew."""
+
+    def __init__(
+        self,
+        cases: Sequence[Case],
+        parameters: Sequence[PhysicsParameter],
+        config: PhysicsConfig,
+        *,
+        num_samples: int,
+        workers: int = 1,
+    ) -> None:
+        """Have processes ready, where there is more than one.
+
+        Args:
+            cases: Everything that will be asked for.
+            parameters: What the numbers of a point mean.
+            config: Everything that is not a parameter.
+            num_samples: Noisy starts of each judged trial.
+            workers: Processes.
+        """
+        self.cases = list(cases)
+        self._parameters = list(parameters)
+        self._config = config
+        self.num_samples = num_samples
+        self._crew = Crew(workers) if workers > 1 else None
+
+    def predict(
+        self, points: Float[np.ndarray, "num_points num_parameters"], chosen: Sequence[int]
+    ) -> list[list[Prediction]]:
+        """Predict the chosen cases, by their numbers, at every point.
+
+        Raises:
+            LostPieceError: When a case was begun again and its process died again.
+        """
+        pairs = [(x, index) for x in points for index in chosen]
+        pieces = [self._piece(number, *pair) for number, pair in enumerate(pairs)]
+        if self._crew is None:
+            flat = [_predict(piece) for piece in pieces]
+        else:
+            flat = _side_by_side(self._crew, pieces)
+        size = len(chosen)
+        return [flat[k * size : (k + 1) * size] for k in range(len(points))]
+
+    def _piece(self, number: int, x: Float[np.ndarray, " num_parameters"], index: int) -> Piece:
+        values = values_of(self._parameters, x)
+        return number, self.cases[index], values, self._config, self.num_samples
+
+    def __enter__(self) -> "Evaluator":
+        """Use as a context manager."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """End the processes; what is being done is lost."""
+        if self._crew is not None:
+            self._crew.__exit__()
+
+
+def _side_by_side(crew: Crew, pieces: Sequence[Piece]) -> list[Prediction]:
+    """Predict, and put the answers back into order."""
+    answers: dict[int, Prediction] = {}
+    for (number, case, *_), answer in crew.run(_predict, pieces, _cost):
+        if isinstance(answer, Failed):
+            raise _error_of(case, answer)
+        answers[number] = answer
+    return [answers[number] for number in range(len(pieces))]
+
+
+def _error_of(case: Case, failed: Failed) -> Exception:
+    """What to raise, as one process alone would have done; a bug keeps its trace."""
+    if not failed.known:
+        return RuntimeError(failed.trace)
+    return LostPieceError(
+        f"{case.episode} could not be simulated: {failed.message}. Nothing was written. Try again, "
+        "with fewer --workers."
+    )
+
+
+def _cost(piece: Piece) -> float:
+    """Count the living-throughs."""
+    _, case, _, _, num_samples = piece
+    return 1.0 if case.success is None else 1.0 + num_samples
+
+
+def _predict(piece: Piece) -> Prediction:
+    _, case, values, config, num_samples = piece
+    return predict(case, values, config, num_samples)

@@ -1,0 +1,351 @@
+"""Judging plans one at a time, before a deadline, from where the objects are seen at rest.
+
+What cannot be decided is answered with ``accepted: null`` and a reason; nothing is ever accepted
+by default.
+"""
+
+import queue
+import re
+import threading
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.errors import GstError
+from bridge.task.plan import Plan
+from bridge.task.robot import BASE_FRAME
+from bridge.task.task_file import ObjectModel, Task
+from bridge.task.verdict import Factor, Verdict
+from twin.errors import TwinError
+from twin.gate.config import GateConfig
+from twin.replay.failure import with_reasons
+from twin.scene.shape.known import yaw_period_rad
+
+# --- Whether objects are still where a verdict took them to be.
+
+SIGMAS = 4.0
+"""What localisation says of its own errors, so many times, is no motion."""
+
+
+def who_moved(
+    before: Mapping[str, Any],
+    after: Mapping[str, Any],
+    task: Task,
+    *,
+    moved_m: float,
+    moved_rad: float,
+) -> list[str]:
+    """Name the objects that lie elsewhere than before, with how far.
+
+    Args:
+        before: Objects as localised for the verdict.
+        after: As localised just now.
+        task: Knows which turns look the same.
+        moved_m: Shift that counts [m], unless localisation is less sure than that.
+        moved_rad: Turn about the vertical that counts [rad], unless it is less sure than that.
+    """
+    told = []
+    for name, old in before.items():
+        new = after[name]
+        shift_m = float(np.linalg.norm(new.T_base_object[:3, 3] - old.T_base_object[:3, 3]))
+        turn_rad = turn_between(old.T_base_object, new.T_base_object, task.objects[name])
+        sigma_m, sigma_rad = _sigmas(old)
+        near = shift_m <= max(moved_m, SIGMAS * sigma_m)
+        if not (near and turn_rad <= max(moved_rad, SIGMAS * sigma_rad)):  # also what is no number
+            told.append(f"{name} by {shift_m * 1e3:.0f} mm and {np.degrees(turn_rad):.0f} degrees")
+    return told
+
+
+def turn_between(
+    T_first: Float[np.ndarray, "4 4"], T_second: Float[np.ndarray, "4 4"], model: ObjectModel
+) -> float:
+    """Turn about the vertical from one pose to another, among those that look the same [rad]."""
+    period = 2 * np.pi if model.soft is not None else yaw_period_rad(model)
+    yaws = [np.arctan2(T[1, 0], T[0, 0]) for T in (T_first, T_second)]
+    return float(abs(np.mod(yaws[1] - yaws[0] + period / 2, period) - period / 2))
+
+
+def _sigmas(item: Any) -> tuple[float, float]:
+    covariance = getattr(item, "covariance", None)
+    if covariance is None:
+        return 0.0, 0.0
+    return float(np.sqrt(np.trace(covariance[:3, :3]))), float(np.sqrt(covariance[5, 5]))
+
+
+ENGINE_NONE = "none"
+POLL_S = 0.05
+ANSWER_S = 0.1
+"""Kept back from the deadline for answering."""
+LOOK_AGAIN = 1.5
+"""Times the first localisation, kept back for looking again before a yes."""
+MAX_PLAN_BYTES = 32_000_000
+"""Ten minutes of waypoints with joints at 125 Hz take less."""
+
+
+class PlanTooLargeError(TwinError):
+    """A payload is too large to be read before the deadline."""
+
+    def __init__(self, *, num_bytes: int) -> None:
+        """Remember the size."""
+        self.num_bytes = num_bytes
+        super().__init__(
+            f"a payload of {num_bytes / 1e6:.0f} MB is not read as a plan; at most "
+            f"{MAX_PLAN_BYTES / 1e6:.0f} MB are. Send fewer waypoints, or split the plan."
+        )
+
+
+class UndecidedError(TwinError):
+    """There is no basis for a verdict; the message says what is missing."""
+
+
+@runtime_checkable
+class Perception(Protocol):
+    """What the gate sees of the cell: ``twin.scene.localise.live.LiveView``, or a fake."""
+
+    def urdf(self) -> str | None:
+        """The robot description."""
+
+    def executing(self) -> str | None:
+        """The plan being executed right now."""
+
+    def newest_ns(self) -> int:
+        """The latest time on the cell's own clock."""
+
+    def heard_ns(self) -> int:
+        """When the last message arrived."""
+
+    def frames(self, *, max_age_ns: int, max_per_camera: int) -> Any:
+        """The latest frames at rest."""
+
+
+Localise = Callable[[Any, Task, float], Mapping[str, Any]]
+"""Frames, the task and when to be done, on the monotonic clock [s]; objects as localised."""
+Replay = Callable[[Plan, Mapping[str, Any], str, float], Verdict]
+"""A plan, the objects as localised, the URDF and when to be done, on the monotonic clock [s]."""
+
+
+class Gate:
+    """Judges plans one at a time; every answer comes before the deadline."""
+
+    def __init__(
+        self,
+        *,
+        task: Task,
+        config: GateConfig,
+        eyes: Perception,
+        localise: Localise,
+        replay: Replay,
+        now_ns: Callable[[], int],
+    ) -> None:
+        """Put together what sees, what finds objects and what replays."""
+        self._task = task
+        self._config = config
+        self._eyes = eyes
+        self._localise = localise
+        self._replay = replay
+        self._now_ns = now_ns
+        self._turn = threading.Lock()
+        self._counting = threading.Lock()
+        self._inside = 0
+        self._contact_ns = 0
+
+    def judge(self, payload: bytes) -> Verdict:
+        """Judge one plan; the deadline counts from here, reading it included.
+
+        Raises:
+            InvalidRecordError: When the payload is no gst plan.
+            PlanTooLargeError: When it is too large to be looked at; nothing else is an error.
+        """
+        ends_s = time.monotonic() + self._config.deadline_s
+        if len(payload) > MAX_PLAN_BYTES:
+            raise PlanTooLargeError(num_bytes=len(payload))
+        plan = Plan.from_json(payload)
+        with self._counting:
+            if self._inside > self._config.waiting:
+                return no_verdict(plan, f"{self._inside} plans are being judged already; ask later")
+            self._inside += 1
+        try:
+            return self._before_deadline(plan, ends_s)
+        finally:
+            with self._counting:
+                self._inside -= 1
+
+    def _before_deadline(self, plan: Plan, ends_s: float) -> Verdict:
+        limit = f"the deadline of {self._config.deadline_s:g} s"
+        if not self._turn.acquire(timeout=max(0.0, ends_s - time.monotonic())):
+            return no_verdict(plan, f"an earlier plan was still being judged at {limit}")
+        if time.monotonic() >= ends_s:
+            self._turn.release()
+            return no_verdict(plan, f"it had only just been read at {limit}")
+        answers: queue.SimpleQueue[Verdict] = queue.SimpleQueue()
+
+        def work() -> None:
+            try:
+                answers.put(self._decide(plan, ends_s - ANSWER_S))
+            finally:
+                self._turn.release()
+
+        # What runs in this process cannot be interrupted: past the deadline it finishes unheard,
+        # and until then holds the turn. A daemon thread does not keep the process from ending.
+        worker = threading.Thread(target=work, name=f"judge {plan.id}", daemon=True)
+        try:
+            worker.start()
+        except RuntimeError as error:
+            self._turn.release()
+            return no_verdict(plan, f"no thread to judge it in: {error}")
+        try:
+            return answers.get(timeout=max(0.0, ends_s - time.monotonic()))
+        except queue.Empty:
+            return no_verdict(plan, f"the replay was not done at {limit}")
+
+    def _decide(self, plan: Plan, ends_s: float) -> Verdict:
+        silent_ns = self._now_ns() - max(self._eyes.heard_ns(), self._contact_ns)
+        try:
+            urdf = self._check(plan)
+            if silent_ns > self._config.max_silence_s * 1e9:
+                raise UndecidedError(
+                    f"nothing has arrived from the cell for {silent_ns * 1e-9:.0f} s"
+                )
+            verdict = self._judged(plan, urdf, ends_s)
+            # A cell that waits for the verdict may stand still meanwhile: not counted as silence.
+            self._contact_ns = self._now_ns() - silent_ns
+            return verdict
+        except GstError as error:
+            return no_verdict(plan, str(error))
+        except Exception as error:  # noqa: BLE001  # a bug must not become a yes, nor silence
+            traceback.print_exc()
+            return no_verdict(plan, f"internal error: {type(error).__name__}: {error}")
+
+    def _judged(self, plan: Plan, urdf: str, ends_s: float) -> Verdict:
+        frames = self._wait_for_frames()
+        started_s = time.monotonic()
+        found = self._find_objects(frames, ends_s)
+        again_s = LOOK_AGAIN * (time.monotonic() - started_s)
+        verdict = self._replay(plan, found, urdf, ends_s - again_s)
+        if verdict.accepted is not True:
+            return verdict
+        verdict = self._likely(verdict)
+        if verdict.accepted is True:
+            self._look_again(found, frames, ends_s)
+        return verdict
+
+    def _check(self, plan: Plan) -> str:
+        """Refuse plans this gate cannot judge; return the robot description."""
+        if plan.task and plan.task != self._task.name:
+            raise UndecidedError(
+                f"plan {plan.id} is for task {plan.task!r}; this gate judges {self._task.name!r}. "
+                "Start it with --task."
+            )
+        if plan.frame != BASE_FRAME:
+            raise UndecidedError(
+                f"plan {plan.id} is given in frame {plan.frame!r}; only {BASE_FRAME!r}, the "
+                "robot's root, is judged"
+            )
+        urdf = self._eyes.urdf()
+        if urdf is None:
+            raise UndecidedError("no robot description has arrived on /robot_description")
+        robot = robot_name(urdf)
+        if plan.robot != robot:
+            raise UndecidedError(
+                f"plan {plan.id} is for robot {plan.robot!r}; the cell's robot is {robot!r}"
+            )
+        running = self._eyes.executing()
+        if running is not None:
+            raise UndecidedError(f"{running} is being executed; objects are judged at rest")
+        return urdf
+
+    def _find_objects(self, frames: Any, ends_s: float) -> Mapping[str, Any]:
+        found = self._localise(frames, self._task, ends_s)
+        missing = {name: item.reason for name, item in found.items() if not item.found}
+        if missing:
+            raise UndecidedError(f"not every object was found: {with_reasons(missing)}")
+        return found
+
+    def _wait_for_frames(self) -> Any:
+        ends = time.monotonic() + self._config.frame_wait_s
+        while True:
+            live = self._frames()
+            if live.frames:
+                return live.frames
+            if time.monotonic() >= ends:
+                raise UndecidedError(f"no usable frames: {'; '.join(live.reasons)}")
+            time.sleep(POLL_S)
+
+    def _frames(self) -> Any:
+        return self._eyes.frames(
+            max_age_ns=round(self._config.max_frame_age_s * 1e9),
+            max_per_camera=self._config.frames,
+        )
+
+    def _likely(self, verdict: Verdict) -> Verdict:
+        """Refuse what too few samples confirm."""
+        wanted = self._config.min_p_success
+        if wanted <= 0:
+            return verdict
+        p = verdict.p_success
+        if p is None:
+            raise UndecidedError(
+                f"no varied replay was done in time, and {wanted:.0%} of them are to succeed"
+            )
+        if p["value"] >= wanted:
+            return verdict
+        detail = f"{p['k']:g} of {p['n']:g} varied replays succeed, {wanted:.0%} are asked for"
+        unlikely = Factor(value=False, cause="probability", detail=detail)
+        return replace(verdict, terminal=unlikely, reason=f"terminal: probability: {detail}")
+
+    def _look_again(self, found: Mapping[str, Any], frames: Any, ends_s: float) -> None:
+        """Before a yes: the cell must still be as it was judged.
+
+        Raises:
+            UndecidedError: When something was started or moved meanwhile, or nobody can see.
+        """
+        running = self._eyes.executing()
+        if running is not None:
+            raise UndecidedError(f"{running} was started while the plan was being judged")
+        live = self._frames()
+        if not live.frames:
+            raise UndecidedError(
+                f"the cell was lost from sight while the plan was judged: {'; '.join(live.reasons)}"
+            )
+        if _newest(live.frames) <= _newest(frames):
+            return
+        moved = who_moved(
+            found,
+            self._find_objects(live.frames, ends_s),
+            self._task,
+            moved_m=self._config.moved_m,
+            moved_rad=self._config.moved_rad,
+        )
+        if moved:
+            raise UndecidedError(f"moved while the plan was being judged: {'; '.join(moved)}")
+
+
+def _newest(frames: Any) -> int:
+    return max(int(frame.stamp_ns) for frame in frames)
+
+
+def no_verdict(plan: Plan, reason: str) -> Verdict:
+    """The answer when nothing can be decided: accepted null, with the reason."""
+    undecided = Factor(value=None)
+    return Verdict(
+        plan_id=plan.id,
+        trajectory="planned",
+        mode="dynamic",
+        ik=undecided,
+        clearance=undecided,
+        terminal=undecided,
+        engine=ENGINE_NONE,
+        seed=0,
+        reason=reason,
+    )
+
+
+def robot_name(urdf: str) -> str:
+    """Return the name in a URDF's ``<robot>`` element, "" when there is none."""
+    found = re.search(r"<robot\b[^>]*?\bname\s*=\s*[\"']([^\"']*)[\"']", urdf)
+    return found[1] if found else ""

@@ -1,1 +1,0 @@
-"""Varied replays: success as a probability."""

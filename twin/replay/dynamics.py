@@ -1,0 +1,345 @@
+"""Let physics answer: drive the robot along a path and watch the objects."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import coal
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from bridge.geometry import se3
+from bridge.geometry.box import box_corners
+from bridge.task.task_file import ObjectModel
+from twin.physics.soft import BURST_STRETCH, SoftHealth, SoftModel
+from twin.physics.world import Attachment, World
+from twin.replay.clearance.bodies import placed_panels, placement_of
+from twin.replay.config import ReplayConfig
+from twin.replay.failure import NotEvaluatedError
+from twin.replay.path import JointPath
+from twin.replay.scene import ReplayScene
+from twin.robot.collision import RobotHulls, convex_hull, signed_distance
+
+# --- Put a replay's objects into a physics world: boxes, containers of panels, soft bodies.
+
+LIFT_M = 0.0002
+"""Objects localised into their support start this far above it instead."""
+
+
+def soft_models(scene: ReplayScene) -> dict[str, SoftModel]:
+    """The soft objects that were localised: the scene's lattice where it has one, else the task's.
+
+    Their extents at rest are those of the task file either way, so that the same shape predicate
+    judges both.
+    """
+    models = {}
+    for name in scene.movable():
+        model = scene.task.objects[name]
+        if model.soft is not None:
+            arrays = scene.lattices.get(name)
+            models[name] = (
+                SoftModel.from_task(model)
+                if arrays is None
+                else SoftModel.from_lattice(arrays, model)
+            )
+    return models
+
+
+def spawn(world: World, scene: ReplayScene, soft: Mapping[str, SoftModel]) -> None:
+    """Put table, containers and objects where the scene says.
+
+    Args:
+        world: An empty one.
+        scene: Where they are.
+        soft: The bodies of ``soft_models``.
+    """
+    world.add_table(scene.table_height_m)
+    for name, T in scene.containers().items():
+        world.add_static(scene.task.objects[name].panels(), T)
+    for name, T in scene.movable().items():
+        model = scene.task.objects[name]
+        T_free = lifted(T, outline_m(model, soft.get(name)), scene.table_height_m)
+        if name in soft:
+            world.add_soft(name, soft[name], T_free)
+        else:
+            world.add_free(name, np.array(model.size_m), model.mass_kg, T_free)
+
+
+def outline_m(model: ObjectModel, soft: SoftModel | None) -> Float[np.ndarray, "num_points 3"]:
+    """Points whose convex hull holds the object, in its own frame [m]."""
+    if soft is not None:
+        return np.asarray(soft.nodes_m, dtype=np.float64)
+    return box_corners(np.array(model.size_m))
+
+
+def lifted(
+    T_base_object: Float[np.ndarray, "4 4"],
+    points_m: Float[np.ndarray, "num_points 3"],
+    table_height_m: float,
+) -> Float[np.ndarray, "4 4"]:
+    """Raise an object whose localised pose reaches into the table until it stands just above."""
+    lowest = float(se3.apply(T_base_object, points_m)[:, 2].min())
+    T = T_base_object.copy()
+    T[2, 3] += max(0.0, table_height_m + LIFT_M - lowest)
+    return T
+
+
+@dataclass(frozen=True, kw_only=True)
+class Burst:
+    """A soft body that stopped being one."""
+
+    object_id: str
+    t_ns: int
+    found: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class States:
+    """What a replay saw, settling at the end included."""
+
+    stamps_ns: Int[np.ndarray, " num_steps"]
+    joints_rad: Float[np.ndarray, "num_steps num_joints"]
+    width_m: Float[np.ndarray, " num_steps"]
+    Ts_base_object: dict[str, Float[np.ndarray, "num_steps 4 4"]]
+    finger_contact: dict[str, Bool[np.ndarray, " num_steps"]]
+    nodes_m: dict[str, Float32[np.ndarray, "num_steps _ 3"]] = field(default_factory=dict)
+    """Of soft objects, base frame [m]."""
+    extents_m: dict[str, Float[np.ndarray, "num_steps 3"]] = field(default_factory=dict)
+    """Of soft objects, along their own axes [m]."""
+    broken: dict[str, str] = field(default_factory=dict)
+    """Soft objects that are no bodies any more at the end, and what was found."""
+    burst: Burst | None = None
+    """The first that burst; the replay ended there."""
+
+
+def simulate(
+    path: JointPath, scene: ReplayScene, hulls: RobotHulls, config: ReplayConfig
+) -> States:
+    """Follow a path with position-controlled motors and free objects.
+
+    Every run of the same inputs gives the same bits: one fresh client, fixed steps. A soft body
+    that bursts ends it: what comes after would be noise.
+    """
+    rate = config.physics.rate_hz
+    stride = rate // config.sample_rate_hz
+    moving_steps = int(np.ceil(path.end_ns() * 1e-9 * rate))
+    # Whole samples, so that the last one lies at the end of settling.
+    total = -(-(moving_steps + round(config.settle_after_s * rate)) // stride) * stride
+    times_ns = (np.arange(total + 1) * (1e9 / rate)).round().astype(np.int64)
+    postures = path.joints_at(times_ns)
+    targets = postures.tolist()
+    velocities = (np.diff(postures, axis=0) * rate).tolist()
+    widths = path.width_at(times_ns).tolist()
+    stamps = times_ns.tolist()
+    soft = soft_models(scene)
+    samples = _Samples(scene, soft)
+    with World(hulls.robot.urdf, _mesh_hulls(hulls), config.physics) as world:
+        spawn(world, scene, soft)
+        world.reset_robot(postures[0], widths[0])
+        world.command(targets[0], [0.0] * len(targets[0]), widths[0])
+        for _ in range(round(config.settle_before_s * rate)):
+            world.step()
+        samples.take(world, 0)
+        tie = Attachment(world) if config.grasp == "attach" else None
+        for step in range(total):
+            world.command(targets[step + 1], velocities[step], widths[step])
+            world.step()
+            if tie is not None:
+                tie.update(widths[step])
+            if (step + 1) % stride == 0 and not samples.take(world, stamps[step + 1]):
+                break
+        return samples.states(world)
+
+
+@lru_cache(maxsize=4)
+def _mesh_hulls(hulls: RobotHulls) -> dict[str, list[Float[np.ndarray, "num_points 3"]]]:
+    found: dict[str, list[Float[np.ndarray, "num_points 3"]]] = {}
+    for hull in hulls.hulls:
+        if hull.from_mesh:
+            found.setdefault(hull.link, []).append(hull.points_m)
+    return found
+
+
+class _Samples:
+    """Collects states while a world runs."""
+
+    def __init__(self, scene: ReplayScene, soft: dict[str, SoftModel]) -> None:
+        self._objects = list(scene.movable())
+        self._soft = list(soft)
+        self._still = scene.containers()
+        self._stamps: list[int] = []
+        self._joints: list[Float[np.ndarray, " num_joints"]] = []
+        self._widths: list[float] = []
+        self._rigid = [name for name in self._objects if name not in soft]
+        self._poses: dict[str, list[tuple[float, ...]]] = {name: [] for name in self._rigid}
+        self._fits: dict[str, list[Float[np.ndarray, "4 4"]]] = {name: [] for name in soft}
+        self._touch: dict[str, list[bool]] = {name: [] for name in self._objects}
+        self._nodes: dict[str, list[Float32[np.ndarray, "num_nodes 3"]]] = {n: [] for n in soft}
+        self._extents: dict[str, list[np.ndarray]] = {name: [] for name in soft}
+        self._burst: Burst | None = None
+
+    def take(self, world: World, t_ns: int) -> bool:
+        """Keep the state; False, and nothing kept, when a soft body has burst."""
+        for name in self._soft:
+            found = burst_of(world.soft_health(name))
+            if found is not None:
+                self._burst = Burst(object_id=name, t_ns=t_ns, found=found)
+                if self._stamps:
+                    return False
+                raise NotEvaluatedError(f"{name} before anything moved: {found}")
+        self._stamps.append(t_ns)
+        joints, width = world.posture()
+        self._joints.append(joints)
+        self._widths.append(width)
+        for name in self._objects:
+            self._touch[name].append(world.finger_touches(name))
+        for name in self._rigid:
+            self._poses[name].append(world.object_pose(name))
+        for name in self._soft:
+            self._fits[name].append(world.T_base_object(name))
+            self._nodes[name].append(world.soft_nodes_m(name).copy())
+            self._extents[name].append(world.soft_extents_m(name))
+        return True
+
+    def states(self, world: World) -> States:
+        poses = {name: self._Ts_base_object(name) for name in self._objects}
+        poses |= {
+            name: np.repeat(T[None], len(self._stamps), axis=0) for name, T in self._still.items()
+        }
+        return States(
+            stamps_ns=np.array(self._stamps, dtype=np.int64),
+            joints_rad=np.stack(self._joints),
+            width_m=np.array(self._widths),
+            Ts_base_object=poses,
+            finger_contact={name: np.array(items) for name, items in self._touch.items()},
+            nodes_m={name: np.stack(items) for name, items in self._nodes.items()},
+            extents_m={name: np.array(rows, dtype=float) for name, rows in self._extents.items()},
+            broken=self._broken(world),
+            burst=self._burst,
+        )
+
+    def _Ts_base_object(self, name: str) -> Float[np.ndarray, "num_steps 4 4"]:
+        if name in self._fits:
+            return np.stack(self._fits[name])
+        rows = np.array(self._poses[name])
+        if not np.isfinite(rows).all():
+            raise NotEvaluatedError(f"physics lost {name}: its place is no number any more")
+        return se3.transform_from(rows[:, 3:], rows[:, :3])
+
+    def _broken(self, world: World) -> dict[str, str]:
+        found = {}
+        if self._burst is not None:
+            found[self._burst.object_id] = self._burst.found
+        for name in self._soft:
+            health = world.soft_health(name)
+            if not health.sound and name not in found:
+                found[name] = f"at the end: {health.describe()}"
+        return found
+
+
+def burst_of(health: SoftHealth) -> str | None:
+    """Say in what way a soft body has burst; None when it has not."""
+    burst = not health.is_finite or not health.max_stretch < BURST_STRETCH
+    return health.describe() if burst else None
+
+
+# --- Objects that were localised into each other: small overlaps are resolved, large ones refused.
+#
+# Physics answers an overlap with a kick, and what follows says nothing about the plan.
+
+GAP_M = 0.0002
+"""What was moved apart stays this far apart."""
+TOUCH_M = 0.0005
+"""Overlaps up to this are what contact looks like."""
+SOFT_SHARE = 2.0
+"""A soft body may overlap so many times as deep: at rest it was pressed together, and its hull
+covers more than itself."""
+ROUNDS = 6
+
+
+@dataclass(frozen=True)
+class _Solid:
+    name: str
+    shape: coal.CollisionGeometry
+    T: Float[np.ndarray, "4 4"]
+    soft: bool = False
+    still: bool = False
+
+
+def free_start(
+    scene: ReplayScene, soft: Mapping[str, SoftModel], max_depth_m: float
+) -> ReplayScene:
+    """Move objects apart that lie in each other or in a container by little.
+
+    The object that can move is moved, along the direction of least depth; of two, each by half.
+    Objects are their convex hulls. The table is left to ``furnish``, which lifts what reaches in.
+
+    Args:
+        scene: Where the objects were localised.
+        soft: The soft ones' bodies.
+        max_depth_m: Deeper overlaps of rigid objects are refused.
+
+    Raises:
+        NotEvaluatedError: Naming both objects and the depth.
+    """
+    movable = scene.movable()
+    shapes = {
+        name: convex_hull(outline_m(scene.task.objects[name], soft.get(name))) for name in movable
+    }
+    still = _still(scene)
+    moved = {name: T.copy() for name, T in movable.items()}
+    for _ in range(ROUNDS):
+        solids = [_Solid(n, shapes[n], T, soft=n in soft) for n, T in moved.items()]
+        if not _apart(solids, still, moved, max_depth_m):
+            break
+    else:
+        names = ", ".join(moved)
+        raise NotEvaluatedError(f"the objects ({names}) start in each other and cannot be parted")
+    return replace(scene, Ts_base_object={**scene.Ts_base_object, **moved})
+
+
+def _apart(
+    solids: list[_Solid],
+    still: list[_Solid],
+    moved: dict[str, Float[np.ndarray, "4 4"]],
+    max_depth_m: float,
+) -> bool:
+    """One round; says whether anything had to be moved."""
+    anything = False
+    for index, solid in enumerate(solids):
+        for other in [*still, *solids[index + 1 :]]:
+            depth, normal = _overlap(solid, other)
+            if depth <= TOUCH_M:
+                continue
+            limit = max_depth_m * (SOFT_SHARE if solid.soft or other.soft else 1.0)
+            if depth > limit:
+                raise NotEvaluatedError(
+                    f"{solid.name} starts {depth * 1e3:.0f} mm inside {other.name}; up to "
+                    f"{limit * 1e3:.0f} mm are moved apart. Localise them again, or look whether "
+                    "one hides the other"
+                )
+            share = 1.0 if other.still else 0.5
+            moved[solid.name][:3, 3] -= share * (depth + GAP_M) * normal
+            if not other.still:
+                moved[other.name][:3, 3] += share * (depth + GAP_M) * normal
+            anything = True
+    return anything
+
+
+def _still(scene: ReplayScene) -> list[_Solid]:
+    return [
+        _Solid(name, coal.Box(*extents), T_base_panel, still=True)
+        for name, T in scene.containers().items()
+        for T_base_panel, extents in placed_panels(scene.task.objects[name], T)
+    ]
+
+
+def _overlap(first: _Solid, second: _Solid) -> tuple[float, Float[np.ndarray, "3"]]:
+    """Depth, negative when apart, and the direction from the first into the second."""
+    result = coal.DistanceResult()
+    distance = signed_distance(
+        first.shape, placement_of(first.T), second.shape, placement_of(second.T), result
+    )
+    normal = np.array(result.normal, dtype=np.float64)
+    length = float(np.linalg.norm(normal))
+    return -distance, normal / length if length > 0 else np.array([0.0, 0.0, -1.0])

@@ -1,1 +1,0 @@
-"""A replay as an episode: its messages and its pictures."""

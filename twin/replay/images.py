@@ -1,0 +1,216 @@
+"""What the recorded cameras would have seen of a replay: the rebuilt scene's Gaussians, moved.
+
+The background stands still, links follow the replayed joints, rigid objects their replayed poses
+and soft ones their nodes. Everything is drawn where cameras see it: the pose bias of a calibration,
+which put objects where the robot finds them, is taken back. An execution is seen from where the
+cameras were meanwhile. A plan is seen by the fixed cameras, and by those in the hand from where its
+own hand would have carried them: the recorded hand lags behind, and would get into their view.
+Cameras that were calibrated are where the calibration has them, the others where ``/tf`` does.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode import streams
+from bridge.episode.cdr.messages import CompressedColor, color_from_message
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.transforms import TransformTree
+from bridge.geometry import se3
+from bridge.media.color import encode_jpeg
+from bridge.task.robot import BASE_FRAME
+from twin.replay.dynamics import soft_models
+from twin.replay.rebuilt_scene import Correction
+from twin.replay.result import ReplayResult
+from twin.replay.scene import ReplayScene
+from twin.scene.draw.compose import carried_camera
+from twin.scene.frames.base import base_tree
+from twin.scene.frames.camera_poses import calibrated_tree_at
+from twin.scene.gaussians.cloud import GaussianCloud, concatenate
+from twin.scene.gaussians.moved import moved_cloud
+from twin.scene.gaussians.skin import Binding, bind, pose_cloud
+from twin.scene.objects.parts import read_objects, read_pose
+from twin.scene.raster.backend import open_rasteriser
+from twin.scene.robot.splats import posed, read_links
+from twin.scene.store.calibration import CameraPlace, read_calibration, without_joints
+from twin.scene.store.folder import SCENE_FILE, read_scene
+
+RATE_HZ = 5.0
+"""Of the images of a plan that was never executed."""
+MAX_IMAGES = 300
+"""Per camera; more are thinned out evenly."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stage:
+    """Everything that can be drawn, ready to be moved."""
+
+    still: GaussianCloud
+    objects: Mapping[str, GaussianCloud]
+    """Those that can move, in their own frames."""
+    bindings: Mapping[str, Binding]
+    """Of soft ones: which nodes carry which Gaussians."""
+    links: Mapping[str, GaussianCloud]
+    T_root_base: Float[np.ndarray, "4 4"]
+    correction: Correction
+
+    def at(self, result: ReplayResult, scene: ReplayScene, index: int) -> GaussianCloud:
+        """The scene at one of the replay's states."""
+        parts = [self.still]
+        for name, cloud in self.objects.items():
+            Ts = result.Ts_base_object.get(name)
+            T = scene.Ts_base_object[name] if Ts is None else Ts[index]
+            nodes = result.nodes_m.get(name)
+            if nodes is not None and name in self.bindings:
+                seen = self.correction.nodes_as_seen(nodes[index], T)
+                parts.append(pose_cloud(cloud, self.bindings[name], seen))
+            else:
+                parts.append(moved_cloud(cloud, self.correction.as_seen(T)))
+        if self.links:
+            robot = posed(
+                self.links,
+                result.joints_rad[index],
+                scene.urdf,
+                width_m=float(result.width_m[index]),
+            )
+            parts.append(moved_cloud(robot, self.T_root_base))
+        return concatenate(parts)
+
+
+def render_replay(
+    run: RunFolder,
+    episode: Episode,
+    result: ReplayResult,
+    scene: ReplayScene,
+    *,
+    start_ns: int,
+    executed: bool,
+    planned: bool,
+    correction: Correction,
+) -> Iterator[tuple[str, CompressedColor]]:
+    """Yield camera ids with JPEG images, stamped with source times.
+
+    Args:
+        run: Whose rebuilt scene is drawn.
+        episode: The recording, for the cameras.
+        result: The replay.
+        scene: Where it happened.
+        start_ns: Source time that is the replay's time 0.
+        executed: Whether the plan was executed then, so that there are instants to compare with.
+        planned: Whether the hand moves as planned, and cameras in it with it.
+        correction: What moved localised objects into the replay's scene.
+
+    Raises:
+        PathNotFoundError: When the run was not rebuilt.
+        UnreadableCalibrationError: When ``calibration.json`` cannot be understood.
+    """
+    stage = _set_up(run, scene, result, correction)
+    rasteriser = open_rasteriser()
+    tree, calibration = base_tree(episode), read_calibration(run)
+    places = {} if calibration is None else calibration.cameras
+    for camera_id in streams.camera_ids(episode):
+        info = streams.camera_info(episode, camera_id)
+        stamps = _stamps(episode, camera_id, result, start_ns, executed=executed)
+        seen = _Eye(tree=tree)
+        if camera_id in places:
+            seen = _calibrated(episode, camera_id, places[camera_id], stamps)
+        T_tcp_camera = _mounting(episode, seen.tree, info.frame_id, result) if planned else None
+        for stamp_ns in stamps:
+            if T_tcp_camera is None and stamp_ns in seen.lost_ns:
+                continue
+            index = int(np.abs(result.stamps_ns - (stamp_ns - start_ns)).argmin())
+            if T_tcp_camera is None:
+                T = seen.tree.T_root_frame(info.frame_id, stamp_ns)
+            else:
+                T = result.Ts_base_tcp[index] @ T_tcp_camera
+            view = rasteriser.view(stage.at(result, scene, index), info.camera, T)
+            yield (
+                camera_id,
+                CompressedColor(
+                    stamp_ns=stamp_ns,
+                    frame_id=info.frame_id,
+                    format="jpeg",
+                    data=encode_jpeg(view.image_u8()),
+                ),
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Eye:
+    """Where a camera was."""
+
+    tree: TransformTree
+    lost_ns: frozenset[int] = frozenset()
+    """Instants at which nobody knows."""
+
+
+def _calibrated(
+    episode: Episode, camera_id: str, place: CameraPlace, stamps: Sequence[int]
+) -> _Eye:
+    """A camera as it is mounted: objects were localised through it as it is."""
+    stamps_ns = np.array(stamps, dtype=np.int64)
+    return _Eye(
+        tree=calibrated_tree_at(episode, camera_id, place, stamps_ns),
+        lost_ns=without_joints(episode, place, stamps_ns),
+    )
+
+
+def _set_up(
+    run: RunFolder, scene: ReplayScene, result: ReplayResult, correction: Correction
+) -> _Stage:
+    rebuilt = read_scene(run)
+    objects = read_objects(run, rebuilt.record)
+    places = {name: correction.as_seen(T) for name, T in scene.containers().items()}
+    # What the task does not know stands where it was scanned; what it knows and nobody found is
+    # absent here too.
+    places |= {
+        name: item.T_base_object for name, item in objects.items() if name not in scene.task.objects
+    }
+    still = [moved_cloud(objects[name].cloud, T) for name, T in places.items() if name in objects]
+    movable = {name: item.cloud for name, item in objects.items() if name in scene.movable()}
+    soft = {name: body for name, body in soft_models(scene).items() if name in movable}
+    root = rebuilt.record.get("robot", {}).get("T_base_root")
+    T_base_root = np.eye(4) if root is None else read_pose(root, run.scene_dir / SCENE_FILE)
+    return _Stage(
+        still=concatenate([rebuilt.background, *still]),
+        objects=movable,
+        bindings={
+            name: bind(movable[name].means_m, body.nodes_m)
+            for name, body in soft.items()
+            if name in result.nodes_m and len(movable[name])
+        },
+        links=read_links(run, rebuilt.record),
+        T_root_base=se3.invert(T_base_root),
+        correction=correction,
+    )
+
+
+def _stamps(
+    episode: Episode, camera_id: str, result: ReplayResult, start_ns: int, *, executed: bool
+) -> list[int]:
+    """When images were recorded during the replayed time, or a grid where none could be."""
+    end_ns = start_ns + int(result.stamps_ns[-1])
+    topic = streams.find_camera_topic(episode, camera_id, "color/image")
+    if executed and topic is not None:
+        found = (
+            color_from_message(message.type_name, message.data).stamp_ns
+            for message in episode.messages([topic])
+        )
+        stamps = [stamp_ns for stamp_ns in found if start_ns <= stamp_ns <= end_ns]
+    else:
+        stamps = np.arange(start_ns, end_ns, round(1e9 / RATE_HZ)).tolist()
+    step = -(-len(stamps) // MAX_IMAGES) or 1
+    return stamps[::step]
+
+
+def _mounting(
+    episode: Episode, tree: TransformTree, frame_id: str, result: ReplayResult
+) -> Float[np.ndarray, "4 4"] | None:
+    """Where a camera sits in the hand; None for one that stands still."""
+    if tree.root_of(frame_id) != BASE_FRAME:
+        return None
+    T_base_camera = carried_camera(episode, frame_id, result.joints_rad[0], tree)
+    return None if T_base_camera is None else se3.invert(result.Ts_base_tcp[0]) @ T_base_camera

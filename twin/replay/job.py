@@ -1,0 +1,546 @@
+"""One replay of one trajectory: what decides it, what its file is called, its row in the table."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from bridge.episode import schema, streams
+from bridge.episode.cdr.messages import CompressedColor
+from bridge.episode.metadata import Derived
+from bridge.episode.provenance import hash_settings
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import EpisodeError, GstError
+from bridge.task.plan import Plan
+from bridge.task.predicate import evaluate_success
+from bridge.task.record import parse_record
+from bridge.task.task_file import load_task
+from bridge.task.verdict import Verdict
+from twin.physics.engine import ENGINE
+from twin.replay.config import ReplayConfig
+from twin.replay.divergence import Divergence, diverge
+from twin.replay.execution import (
+    check_covers,
+    check_length,
+    cut_track,
+    path_of_execution,
+    stages_as_executed,
+)
+from twin.replay.failure import NOT_EVALUATED
+from twin.replay.monte_carlo import replay_samples, with_probability
+from twin.replay.output import ReplayOrigin, write_replay
+from twin.replay.rebuilt_scene import Correction, RebuiltScene, read_rebuilt_scene
+from twin.replay.result import ReplayResult
+from twin.replay.scene import ReplayScene, StartState
+from twin.replay.trace import (
+    CONTACT_M,
+    Recording,
+    Trace,
+    rollout_of_recording,
+    states_of_recording,
+    trace_of_file,
+    trace_of_recording,
+    trace_of_result,
+)
+from twin.replay.verdict import KINEMATIC_ENGINE, engine_of, findings_of, replay_joints, replay_plan
+from twin.robot.collision import hulls_of
+from twin.robot.model import load_robot
+from twin.robot.posture import check_clock
+
+REPLAY_VERSION = 18
+"""Raise it when the same inputs give another replay, so that old files are redone."""
+
+MAY_STAY_OPEN = ("settled", "shape")
+"""Predicates that a recording without an answer to them may succeed without."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayJob:
+    """Everything that decides one replay; its content names the file."""
+
+    episode_path: Path
+    episode_sha256: str
+    plan_id: str
+    plan_index: int
+    """Position among the plans of the episode, because ids may repeat."""
+    trajectory: str
+    start_ns: int
+    end_ns: int | None
+    """Of the recorded execution, None for a plan that was never executed."""
+    task: str
+    start: StartState
+    scene_hash: str | None
+    config: ReplayConfig
+    folder: Path
+    duration_s: float = 0.0
+    """Of the plan; what takes longer is begun first."""
+    end: StartState = field(default_factory=StartState)
+    """Where the objects were localised after the execution."""
+    run_path: Path | None = None
+    """Whose scene folder is used; None: the task's shapes and the table plane."""
+    shapes: Mapping[str, str] = field(default_factory=dict)
+    """Hashes of the scene's files that a replay reads."""
+    calibration_id: str | None = None
+    render: bool = False
+    """Also draw what the recorded cameras would have seen."""
+    problem: str = ""
+    """Why the plan's execution, of which there was one, cannot be replayed."""
+
+    @property
+    def was_executed(self) -> bool:
+        """Whether the recording says so, also of one that cannot be replayed."""
+        return self.end_ns is not None or bool(self.problem)
+
+    @property
+    def needs_planned(self) -> bool:
+        """Whether it is compared with the planned replay, which must then be there before."""
+        return self.trajectory == "executed" and self.config.mode == "dynamic"
+
+    def planned(self) -> "ReplayJob":
+        """The planned replay of the same plan from the same start."""
+        return replace(self, trajectory="planned")
+
+    def cost(self) -> float:
+        """How long it takes, compared with others."""
+        if self.config.mode == "kinematic":
+            return 0.1 * self.duration_s
+        bodies = 1 + len(load_task(self.task).soft_objects)
+        return (1 + self.config.samples) * bodies * self.duration_s
+
+    def needed_paths(self) -> tuple[Path, ...]:
+        """What a process on another machine must see."""
+        scene = () if self.run_path is None else (self.run_path,)
+        return (self.episode_path, self.folder, *scene)
+
+    def path(self) -> Path:
+        """Where the derived episode goes."""
+        plan = re.sub(r"[^A-Za-z0-9_-]", "-", self.plan_id)[:60] or "plan"
+        engine = ENGINE if self.config.mode == "dynamic" else KINEMATIC_ENGINE
+        if self.config.mode == "dynamic" and self.config.grasp == "attach":
+            engine += "-attach"
+        parts = (
+            self.episode_path.stem,
+            "replay",
+            self.trajectory,
+            self.config.mode,
+            plan,
+            engine,
+            hash_settings(self.settings()),
+            "mcap",
+        )
+        return self.folder / ".".join(parts)
+
+    def length_ns(self) -> int:
+        """How long the recorded execution took; 0 for a plan that was never executed."""
+        return 0 if self.end_ns is None else self.end_ns - self.start_ns
+
+    def settings(self) -> dict[str, Any]:
+        """What the settings hash covers: settings, inputs, engine and code version."""
+        return {
+            "replay_version": REPLAY_VERSION,
+            "engine": engine_of(load_task(self.task), self.config),
+            "episode_sha256": self.episode_sha256,
+            "plan_index": self.plan_index,
+            "start_ns": self.start_ns,
+            "scene_hash": self.scene_hash,
+            "task": asdict(load_task(self.task)),
+            "Ts_base_object": {name: T.tolist() for name, T in self.start.Ts_base_object.items()},
+            "config": asdict(self.config),
+            "shapes": dict(self.shapes),
+            "calibration_id": self.calibration_id,
+            "render": self.render,
+            **self._sampled_from(),
+            **self._compared_with(),
+        }
+
+    def _sampled_from(self) -> dict[str, Any]:
+        if not self.config.samples:
+            return {}
+        spreads = self.start.covariances
+        return {"covariances": {name: spreads[name].tolist() for name in sorted(spreads)}}
+
+    def _compared_with(self) -> dict[str, Any]:
+        if self.trajectory != "executed":
+            return {}
+        return {"end": {name: T.tolist() for name, T in self.end.Ts_base_object.items()}}
+
+
+def row_of_existing(job: ReplayJob) -> dict[str, Any] | None:
+    """Return the row of a replay that is there already, None when it must be made."""
+    if not job.path().is_file():
+        return None
+    try:
+        episode = Episode.open(job.path())
+        verdicts = streams.verdicts(episode)
+        divergence = divergence_of(episode)
+    except GstError:
+        return None
+    if not verdicts:
+        return None
+    return judged(job, verdicts[-1][1], divergence, skipped=True)
+
+
+def divergence_of(episode: Episode) -> dict[str, Any] | None:
+    """The gst divergence record of a replay; None where it was compared with nothing."""
+    records = [
+        parse_record(message.data, name="divergence")
+        for message in episode.messages(episode.topics_of_type(schema.DIVERGENCE))
+    ]
+    return records[-1] if records else None
+
+
+def row_of_failure(job: ReplayJob, message: str) -> dict[str, Any]:
+    """Return the row of a trajectory that was not evaluated, with the reason."""
+    why = message.removeprefix(NOT_EVALUATED)
+    return {**_row(job), "error": f"{NOT_EVALUATED}{why}", "reason": f"{NOT_EVALUATED}{why}"}
+
+
+def _row(job: ReplayJob) -> dict[str, Any]:
+    return {
+        "episode": job.episode_path.stem,
+        "plan": job.plan_id,
+        "task": job.task,
+        "trajectory": job.trajectory,
+        "mode": job.config.mode,
+        "executed": job.was_executed,
+        "file": job.path().name,
+        "skipped": False,
+        "accepted": None,
+        "first_failing": None,
+        "reason": None,
+        "error": None,
+        "engine": None,
+        "warnings": [],
+        "predicates": None,
+        "divergence": None,
+    }
+
+
+def judged(
+    job: ReplayJob,
+    verdict: Verdict,
+    divergence: Mapping[str, Any] | None = None,
+    *,
+    skipped: bool = False,
+) -> dict[str, Any]:
+    """Return the row of a trajectory with its verdict, and where it parts from the others."""
+    return {
+        **_row(job),
+        "skipped": skipped,
+        "accepted": verdict.accepted,
+        "first_failing": verdict.first_failing,
+        "reason": verdict.reason,
+        "engine": verdict.engine,
+        "warnings": list(verdict.warnings),
+        "predicates": predicates_hold(verdict),
+        "p_success": verdict.p_success,
+        "divergence": None if divergence is None else dict(divergence),
+    }
+
+
+def predicates_hold(verdict: Verdict) -> bool | None:
+    """Whether the success predicates hold; None when what is known does not say.
+
+    One look afterwards seldom tells whether a thing lies still or kept its shape: those may stay
+    open. A thing that nobody found was not seen to be where it belongs.
+    """
+    values = [
+        item["value"]
+        for item in verdict.findings
+        if item["value"] is not None or item["kind"] not in MAY_STAY_OPEN
+    ]
+    if False in values:
+        return False
+    return None if None in values or not values else True
+
+
+# --- Compare a replayed execution with its plan in the twin and with the recording.
+
+Findings = dict[tuple[str, str], bool | None]
+
+
+def recorded_findings(recording: Recording, config: ReplayConfig) -> tuple[dict[str, Any], ...]:
+    """What the success predicates, and the one on contacts, say of the recording itself."""
+    robot = load_robot(recording.scene.urdf)
+    rollout = rollout_of_recording(recording, robot, hulls_of(robot), config)
+    task = recording.scene.task
+    return tuple(findings_of(task, rollout, "recorded", tolerance_m=CONTACT_M))
+
+
+def compare(job: ReplayJob, result: ReplayResult, recording: Recording, end_ns: int) -> Divergence:
+    """Lay the executed replay, the planned one if it is there, and the recording over each other.
+
+    Args:
+        job: The executed replay's; names the planned replay's file.
+        result: The executed replay.
+        recording: What was measured.
+        end_ns: When the execution ended, from its start.
+    """
+    robot = load_robot(recording.scene.urdf)
+    executed = trace_of_result(result, "executed", end_ns)
+    recorded = trace_of_recording(recording, robot, job.config.sample_rate_hz)
+    traces = [executed, recorded]
+    task = load_task(job.task)
+    findings = {
+        "executed": _findings(findings_of(task, result.rollout(), "replayed")),
+        "recorded": {
+            (finding.kind, finding.object_id): finding.value
+            for finding in evaluate_success(task, states_of_recording(recording, robot))
+        },
+    }
+    planned, said = _planned(job, recording)
+    if isinstance(planned, str):
+        missing = [planned]
+    else:
+        traces.append(planned)
+        findings["planned"] = said
+        missing = []
+    missing += [
+        f"{name} was not localised after the execution: {reason}"
+        for name, reason in recording.end.reasons.items()
+        if name in recording.scene.movable()
+    ]
+    return diverge(job.plan_id, traces, job.config.parting, findings=findings, not_compared=missing)
+
+
+def _planned(job: ReplayJob, recording: Recording) -> tuple[Trace | str, Findings]:
+    path = job.planned().path()
+    if not path.is_file():
+        return "the plan was not replayed: nothing planned to compare with", {}
+    try:
+        trace = trace_of_file(path, "planned", job.start_ns, recording.plan.tau[-1].t_ns)
+        verdict = streams.verdicts(Episode.open(path))[-1][1]
+    except (GstError, IndexError, StopIteration) as error:
+        return f"{path.name} cannot be read: {error}", {}
+    return trace, _findings([f for f in verdict.findings if f["side"] == "replayed"])
+
+
+def _findings(said: list[dict[str, Any]]) -> Findings:
+    return {(item["kind"], str(item.get("object", ""))): item["value"] for item in said}
+
+
+# --- Do one replay: read the episode, re-live the trajectory, compare it, write the file.
+
+JOINTS, GRIPPER_STATE = "/joint_states", "/gripper/state"
+
+
+def run_job(job: ReplayJob) -> dict[str, Any]:
+    """Replay and write; a failure the user can act on becomes a row, not an exception."""
+    if job.problem and job.trajectory == "executed":
+        return row_of_failure(job, job.problem)
+    try:
+        return judged(job, *_replay(job))
+    except GstError as error:
+        return row_of_failure(job, str(error))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Source:
+    """What one job works on."""
+
+    job: ReplayJob
+    episode: Episode
+    plan: Plan
+    """As it was sent."""
+    lived: Plan
+    """With the stages at the times at which they were lived through."""
+    events: list[dict[str, Any]]
+    scene: ReplayScene
+    correction: Correction
+    """Applied to the scene already, still to be to what was localised afterwards, and to be taken
+    back for pictures."""
+
+    @property
+    def executed(self) -> bool:
+        return self.job.trajectory == "executed" and self.job.end_ns is not None
+
+    @property
+    def end_ns(self) -> int:
+        """When the trajectory ended and settling began."""
+        return self.job.length_ns() if self.executed else self.plan.tau[-1].t_ns
+
+
+def _replay(job: ReplayJob) -> tuple[Verdict, dict[str, Any] | None]:
+    source = _open(job)
+    result = _with_samples(source, _run(source, source.scene, job))
+    divergence = None
+    if source.executed and job.config.mode == "kinematic":
+        found = recorded_findings(_recording(source), job.config)
+        result = replace(result, verdict=replace(result.verdict, findings=found))
+    elif source.executed:
+        divergence = compare(job, result, _recording(source), source.end_ns).to_record()
+    images = _images(source, result) if job.render else ()
+    path = job.path()
+    path.unlink(missing_ok=True)
+    write_replay(path, result, source.plan, _origin(source, result, divergence, images))
+    return result.verdict, divergence
+
+
+def _open(job: ReplayJob) -> _Source:
+    episode = Episode.open(job.episode_path)
+    urdf = streams.robot_description(episode)
+    if urdf is None:
+        raise EpisodeError(
+            path=job.episode_path,
+            found="no robot description",
+            hint="Record /robot_description, or attach the URDF as robot.urdf.",
+        )
+    plan = streams.plans(episode)[job.plan_index][1]
+    task = load_task(job.task)
+    place = (
+        RebuiltScene()
+        if job.run_path is None
+        else read_rebuilt_scene(RunFolder(job.run_path), task)
+    )
+    scene = replace(place, scene_hash=job.scene_hash).scene(
+        task,
+        urdf,
+        job.start.Ts_base_object,
+        reasons=job.start.reasons,
+        covariances=job.start.covariances,
+    )
+    executed = job.trajectory == "executed" and job.end_ns is not None
+    events = streams.events(episode) if executed else []
+    lived = replace(plan, stages=stages_as_executed(plan, events, job.start_ns))
+    return _Source(
+        job=job,
+        episode=episode,
+        plan=plan,
+        lived=lived,
+        events=events,
+        scene=scene,
+        correction=place.correction,
+    )
+
+
+def _run(source: _Source, scene: ReplayScene, job: ReplayJob) -> ReplayResult:
+    if not source.executed:
+        return replay_plan(source.lived, scene, job.config)
+    arm, widths = _tracks(source)
+    return replay_joints(arm, widths, scene, job.config, plan=source.lived)
+
+
+def _tracks(source: _Source) -> tuple[streams.JointTrack, streams.JointTrack]:
+    """Recorded joints and widths, cut to the execution."""
+    job, episode = source.job, source.episode
+    end_ns = job.start_ns + job.length_ns()
+    check_clock(episode, (JOINTS, GRIPPER_STATE), job.start_ns, end_ns, source.plan.id)
+    check_length(job.length_ns(), source.plan)
+    arm = cut_track(streams.joint_track(episode, JOINTS), job.start_ns, end_ns)
+    check_covers(arm, "joints", end_ns, source.plan)
+    widths = cut_track(streams.joint_track(episode, GRIPPER_STATE), job.start_ns, end_ns)
+    check_covers(widths, "gripper widths", end_ns, source.plan)
+    return arm, widths
+
+
+def _recording(source: _Source) -> Recording:
+    job = source.job
+    arm, widths = _tracks(source)
+    kinematic = replace(job.config, mode="kinematic")
+    seen_ns = job.end.seen_ns
+    return Recording(
+        plan=source.lived,
+        path=path_of_execution(arm, widths, source.lived, kinematic),
+        scene=source.scene,
+        end=source.correction.state(job.end),
+        end_seen_ns=job.length_ns() if seen_ns is None else seen_ns - job.start_ns,
+    )
+
+
+def _with_samples(source: _Source, result: ReplayResult) -> ReplayResult:
+    """Ask varied replays too; plans of one episode are tried against the same variations."""
+    job = source.job
+    if not job.config.samples or source.scene.missing():
+        return result
+    samples = replay_samples(
+        lambda there, config: _run(source, there, replace(job, config=config)).verdict,
+        source.scene,
+        job.config,
+        plan_id=source.plan.id,
+        identity=job.episode_sha256,
+    )
+    return replace(result, verdict=with_probability(result.verdict, samples), samples=samples)
+
+
+def _images(source: _Source, result: ReplayResult) -> tuple[tuple[str, CompressedColor], ...]:
+    from twin.replay.images import render_replay  # noqa: PLC0415  # only where it is asked for
+
+    if source.job.run_path is None:
+        return ()
+    return tuple(
+        render_replay(
+            RunFolder(source.job.run_path),
+            source.episode,
+            result,
+            source.scene,
+            start_ns=source.job.start_ns,
+            executed=source.job.end_ns is not None,
+            planned=source.job.trajectory == "planned",
+            correction=source.correction,
+        )
+    )
+
+
+def _origin(
+    source: _Source,
+    result: ReplayResult,
+    divergence: dict[str, Any] | None,
+    images: tuple[tuple[str, CompressedColor], ...],
+) -> ReplayOrigin:
+    job, episode, plan = source.job, source.episode, source.plan
+    derived = Derived(
+        kind="replay",
+        source_episode=episode.info.id,
+        source_sha256=job.episode_sha256,
+        plan_id=plan.id,
+        trajectory=job.trajectory,
+        mode=job.config.mode,
+        scene_hash=job.scene_hash,
+        engine=result.verdict.engine,
+        seed=job.config.seed,
+        calibration_id=source.scene.calibration_id,
+        settings={**job.settings(), "shape_sources": dict(source.scene.shape_sources)},
+    )
+    return ReplayOrigin(
+        info=episode.info,
+        derived=derived,
+        cell=cell_of(episode),
+        start_ns=job.start_ns,
+        urdf=source.scene.urdf,
+        stages=source.lived.stages,
+        gripper=_recorded_grips(plan, source.events, job.start_ns)
+        if source.executed
+        else _planned_grips(plan),
+        end_ns=source.end_ns,
+        divergence=divergence,
+        images=images,
+    )
+
+
+def _planned_grips(plan: Plan) -> tuple[tuple[int, str], ...]:
+    """When the plan changes its mind about the gripper; it starts open."""
+    before = [0, *(waypoint.g for waypoint in plan.tau)]
+    return tuple(
+        (waypoint.t_ns, "close" if waypoint.g else "open")
+        for waypoint, g in zip(plan.tau, before, strict=False)
+        if waypoint.g != g
+    )
+
+
+def _recorded_grips(
+    plan: Plan, events: list[dict[str, Any]], start_ns: int
+) -> tuple[tuple[int, str], ...]:
+    return tuple(
+        (int(event["stamp_ns"]) - start_ns, str(event.get("text") or ""))
+        for event in events
+        if event["type"] == "gripper" and event.get("plan_id") == plan.id
+    )
+
+
+def cell_of(episode: Episode) -> str:
+    """The first part of the plan's topic: the cell everything was recorded in."""
+    for topic in episode.topics_of_type(schema.PLAN):
+        return topic.split("/")[1]
+    return episode.info.cell or "cell"

@@ -1,0 +1,287 @@
+"""Success as a probability: replays of varied starts and settings, and what they add up to."""
+
+import hashlib
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.errors import GstError, UsageError
+from bridge.geometry import se3
+from bridge.task.record import check_record
+from bridge.task.task_file import ObjectModel
+from bridge.task.verdict import Verdict
+from twin.physics.config import PhysicsConfig
+from twin.replay.config import ReplayConfig, VariationConfig
+from twin.replay.scene import ReplayScene
+from twin.scene.shape.known import yaw_period_rad
+
+# --- What is not known exactly, drawn: poses, frictions, forces, masses, stiffnesses and delays.
+#
+# The same seed and the same start draw the same variations, whatever plan is replayed, on
+# whichever worker and in whatever order (common random numbers: Law, Simulation Modeling and
+# Analysis, ch. 11).
+
+UPRIGHT = 0.98
+"""Cosine of the tilt up to which an object stands."""
+STANDS_M = 1e-4
+"""Localisation puts what stands exactly onto the table; within this counts as exactly [m]."""
+STANDING = (0, 1, 5)
+"""What is unsure of an object that stands: x, y and the turn about the vertical."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variation:
+    """One draw of everything that is not known exactly."""
+
+    Ts_base_object: dict[str, Float[np.ndarray, "4 4"]]
+    physics: PhysicsConfig
+    grip_delay_s: float
+    """How much later than the arm the gripper acts."""
+    objects: dict[str, ObjectModel]
+    """The task's, with the drawn masses and stiffnesses."""
+
+    def scene(self, scene: ReplayScene) -> ReplayScene:
+        """The varied start."""
+        task = replace(scene.task, objects=self.objects)
+        return replace(scene, task=task, Ts_base_object=self.Ts_base_object)
+
+    def config(self, config: ReplayConfig) -> ReplayConfig:
+        """The varied settings; a varied replay has no samples of its own."""
+        return replace(config, physics=self.physics, grip_delay_s=self.grip_delay_s, samples=0)
+
+    def to_record(self, config: ReplayConfig) -> dict[str, Any]:
+        """What was drawn, as plain numbers."""
+        spreads = config.variation.physics_spreads()
+        soft = {key: model.soft for key, model in self.objects.items() if model.soft is not None}
+        return {
+            "T_base_object": {name: _pose(T) for name, T in sorted(self.Ts_base_object.items())},
+            "physics": {name: getattr(self.physics, name) for name in spreads},
+            "grip_delay_s": self.grip_delay_s,
+            "mass_kg": {
+                name: model.mass_kg for name, model in self.objects.items() if not model.fixed
+            },
+            "young_pa": {name: material.young_pa for name, material in soft.items()},
+        }
+
+
+def sample_rng(seed: int, identity: str, index: int) -> np.random.Generator:
+    """The generator of one sample: the same for the same seed, start and index, anywhere."""
+    digest = hashlib.sha256(f"{seed}/{identity}/{index}".encode()).digest()
+    return np.random.default_rng(np.frombuffer(digest, dtype="<u4").astype(np.uint32))
+
+
+def draw_variation(rng: np.random.Generator, scene: ReplayScene, config: ReplayConfig) -> Variation:
+    """Draw poses from the localisation's covariance and physics from the priors.
+
+    Poses of different objects are drawn independently, although they share the cameras' errors.
+    What stands on the table goes on standing: its height and tilt are known, so the rest is drawn
+    given those. Turns that look the same are the same.
+    """
+    settings = config.variation
+    factors = {
+        name: float(np.exp(spread * rng.standard_normal()))
+        for name, spread in settings.physics_spreads().items()
+    }
+    physics = replace(
+        config.physics, **{name: getattr(config.physics, name) * f for name, f in factors.items()}
+    )
+    delay_s = config.grip_delay_s + settings.grip_delay_s * float(rng.random())
+    poses: dict[str, Float[np.ndarray, "4 4"]] = {}
+    objects: dict[str, ObjectModel] = {}
+    for name in sorted(scene.task.objects):
+        model = scene.task.objects[name]
+        # Always eight numbers, so that an object's draw does not depend on what others are.
+        z = rng.standard_normal(8)
+        objects[name] = _varied_model(model, z[6:], settings)
+        if name in scene.Ts_base_object:
+            T = scene.Ts_base_object[name]
+            root = _root(T, model, scene, settings, name)
+            poses[name] = _moved(T, root @ z[:6], model)
+    return Variation(
+        Ts_base_object=poses,
+        physics=physics,
+        grip_delay_s=delay_s,
+        objects={name: objects[name] for name in scene.task.objects},
+    )
+
+
+def _varied_model(
+    model: ObjectModel, z: Float[np.ndarray, "2"], settings: VariationConfig
+) -> ObjectModel:
+    if model.fixed:
+        return model
+    soft = model.soft
+    if soft is not None:
+        soft = replace(soft, young_pa=soft.young_pa * float(np.exp(settings.young_log * z[1])))
+    mass_kg = model.mass_kg * float(np.exp(settings.mass_spread(soft=soft is not None) * z[0]))
+    return replace(model, mass_kg=mass_kg, soft=soft)
+
+
+def _root(
+    T: Float[np.ndarray, "4 4"],
+    model: ObjectModel,
+    scene: ReplayScene,
+    settings: VariationConfig,
+    name: str,
+) -> Float[np.ndarray, "6 6"]:
+    """Symmetric square root of what is unsure of a pose."""
+    covariance = scene.covariances.get(name)
+    if covariance is None:
+        m, rad = settings.unknown_pose_m**2, settings.unknown_pose_rad**2
+        covariance = np.diag([m, m, 0.0, 0.0, 0.0, rad])
+    rest_m = scene.table_height_m + model.rest_height_m
+    if T[2, 2] > UPRIGHT and abs(T[2, 3] - rest_m) < STANDS_M:
+        covariance = given_standing(covariance)
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    deviations = settings.pose_scale * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray((vectors * deviations) @ vectors.T)
+
+
+def given_standing(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
+    """Covariance of x, y and the turn once height and tilt are known; the others become zero.
+
+    The conditional of a normal distribution (Schur complement).
+    """
+    keep = list(STANDING)
+    known = [index for index in range(6) if index not in STANDING]
+    across = covariance[np.ix_(keep, known)]
+    inverse = np.linalg.pinv(covariance[np.ix_(known, known)], hermitian=True)
+    left = np.zeros((6, 6))
+    left[np.ix_(keep, keep)] = covariance[np.ix_(keep, keep)] - across @ inverse @ across.T
+    return left
+
+
+def _moved(
+    T: Float[np.ndarray, "4 4"], step: Float[np.ndarray, "6"], model: ObjectModel
+) -> Float[np.ndarray, "4 4"]:
+    """Shift and turn about the object's origin; turns by a symmetry count as none."""
+    turn = step[3:].copy()
+    period = 2 * np.pi if model.soft is not None else yaw_period_rad(model)
+    turn[2] = np.mod(turn[2] + period / 2, period) - period / 2
+    moved = T.copy()
+    moved[:3, :3] = se3.rotation_from_vector(turn) @ T[:3, :3]
+    moved[:3, 3] += step[:3]
+    return moved
+
+
+def _pose(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
+    q, p = se3.split(T)
+    return {"p_m": p.tolist(), "q_wxyz": q.tolist()}
+
+
+SCHEMA_VERSION = 1
+LEVEL = 0.95
+SLOWER = 1.5
+"""A sample may take this much longer than the longest replay so far."""
+
+Replay = Callable[[ReplayScene, ReplayConfig], Verdict]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """What one varied replay said."""
+
+    plan_id: str
+    index: int
+    variation: Mapping[str, Any]
+    accepted: bool | None
+    first_failing: str | None
+    reason: str | None
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the gst sample v1 record, checked against its schema."""
+        record = {
+            "schema_version": SCHEMA_VERSION,
+            "plan_id": self.plan_id,
+            "index": self.index,
+            "variation": dict(self.variation),
+            "accepted": self.accepted,
+            "first_failing": self.first_failing,
+            "reason": self.reason,
+        }
+        check_record(record, name="sample")
+        return record
+
+
+def replay_samples(
+    replay: Replay,
+    scene: ReplayScene,
+    config: ReplayConfig,
+    *,
+    plan_id: str,
+    identity: str,
+    ends_s: float | None = None,
+    expected_s: float = 0.0,
+    monotonic: Callable[[], float] = time.monotonic,
+) -> tuple[Sample, ...]:
+    """Run up to ``config.samples`` varied replays.
+
+    Args:
+        replay: Replays one varied start; its verdict counts.
+        scene: The nominal start, with covariances.
+        config: The nominal settings.
+        plan_id: Written into the records.
+        identity: Of the start; the same one draws the same variations.
+        ends_s: No sample is begun that would not be done by then, on the monotonic clock.
+        expected_s: How long one replay takes, from the nominal one.
+        monotonic: The clock.
+
+    Raises:
+        UsageError: For a kinematic replay, which moves no objects.
+    """
+    if config.samples and config.mode != "dynamic":
+        message = "a kinematic replay moves no objects: it has no success probability. Use dynamic."
+        raise UsageError(message)
+    samples: list[Sample] = []
+    longest_s = expected_s
+    for index in range(config.samples):
+        started_s = monotonic()
+        if ends_s is not None and started_s + SLOWER * longest_s > ends_s:
+            break
+        variation = draw_variation(sample_rng(config.seed, identity, index), scene, config)
+        samples.append(_sample(replay, scene, config, variation, plan_id, index))
+        longest_s = max(longest_s, monotonic() - started_s)
+    return tuple(samples)
+
+
+def _sample(
+    replay: Replay,
+    scene: ReplayScene,
+    config: ReplayConfig,
+    variation: Variation,
+    plan_id: str,
+    index: int,
+) -> Sample:
+    accepted, failing, reason = None, None, None
+    try:
+        verdict = replay(variation.scene(scene), variation.config(config))
+        accepted, failing, reason = verdict.accepted, verdict.first_failing, verdict.reason
+    except GstError as error:  # this variation cannot be replayed; the others can
+        reason = str(error)
+    return Sample(
+        plan_id=plan_id,
+        index=index,
+        variation=variation.to_record(config),
+        accepted=accepted,
+        first_failing=failing,
+        reason=reason,
+    )
+
+
+def with_probability(verdict: Verdict, samples: Sequence[Sample]) -> Verdict:
+    """Add the share of accepted samples with its Wilson interval; without samples nothing.
+
+    A sample that could not be decided counts among those that were not accepted.
+    """
+    if not samples:
+        return verdict
+    from scipy.stats import binomtest  # noqa: PLC0415  # half a second, and only with samples
+
+    k, n = sum(sample.accepted is True for sample in samples), len(samples)
+    interval = binomtest(k, n).proportion_ci(LEVEL, method="wilson")
+    low, high = float(interval.low), float(interval.high)
+    return replace(verdict, p_success={"value": k / n, "low": low, "high": high, "k": k, "n": n})

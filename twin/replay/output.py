@@ -1,0 +1,186 @@
+"""A replay as a derived episode, in the schema a recording has."""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from bridge.episode import schema
+from bridge.episode.cdr.batch import joint_messages, pose_messages
+from bridge.episode.cdr.messages import CompressedColor, PointCloudSample, string_to_cdr
+from bridge.episode.metadata import Derived, EpisodeInfo
+from bridge.episode.writer import EpisodeWriter
+from bridge.task.plan import Plan, Stage
+from bridge.task.robot import ARM_JOINTS, BASE_FRAME, GRIPPER
+from twin.replay.execution import GRIPPER_WIDTH
+from twin.replay.result import ReplayResult, stretches_ns
+
+MIN_CLEARANCE = "min_clearance_m"
+NODES_PERIOD_NS = 33_000_000
+"""Nodes of soft bodies are written at most this often: 30 Hz, about a camera's rate."""
+
+
+class _Message(NamedTuple):
+    stamp_ns: int
+    topic: str
+    type_name: str
+    data: bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayOrigin:
+    """Where a replay comes from and when its time 0 is."""
+
+    info: EpisodeInfo
+    """Of the recorded episode."""
+    derived: Derived
+    cell: str
+    start_ns: int
+    """Source time of the recorded execution's start, or of the plan when it was never executed."""
+    urdf: str
+    stages: tuple[Stage, ...]
+    """With the times at which they were lived through: the plan's, or the execution's."""
+    gripper: tuple[tuple[int, str], ...]
+    """When, from time 0, the gripper was told to close or open."""
+    end_ns: int
+    """When, from time 0, the trajectory ended and settling began."""
+    divergence: Mapping[str, Any] | None = None
+    """The gst divergence v1 record, where there was something to compare with."""
+    images: tuple[tuple[str, CompressedColor], ...] = ()
+    """Rendered images by camera id."""
+
+
+def write_replay(path: Path, result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Path:
+    """Write one replay; the writer replaces a part file that an interrupted run left.
+
+    Raises:
+        UsageError: When the file exists.
+    """
+    messages = [*_messages(result, plan, origin), *_events(result, plan, origin)]
+    with EpisodeWriter(path) as writer:
+        writer.describe(origin.info, derived=origin.derived)
+        for message in sorted(messages, key=itemgetter(0)):
+            writer.write(
+                message.topic,
+                message.data,
+                type_name=message.type_name,
+                log_time_ns=message.stamp_ns,
+            )
+    return path
+
+
+def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterator[_Message]:
+    prefix, start = f"/{origin.cell}", origin.start_ns
+    yield _Message(start, "/robot_description", schema.STRING, string_to_cdr(origin.urdf))
+    yield _Message(start, f"{prefix}/plan", schema.PLAN, plan.to_json())
+    stamps = start + result.stamps_ns
+    for topic, names, values in (
+        ("joint_states", ARM_JOINTS, result.joints_rad),
+        ("gripper/state", (GRIPPER_WIDTH,), result.width_m[:, None]),
+        ("replay/clearance", (MIN_CLEARANCE,), result.clearance_m[:, None]),
+    ):
+        rows = joint_messages(stamps, names, values)
+        yield from _stamped(stamps, f"{prefix}/{topic}", schema.JOINT_STATE, rows)
+    poses = {"tcp": result.Ts_base_tcp} | {
+        f"object/{name}": Ts for name, Ts in result.Ts_base_object.items()
+    }
+    for name, Ts in poses.items():
+        rows = pose_messages(stamps, BASE_FRAME, Ts)
+        yield from _stamped(stamps, f"{prefix}/{name}/pose", schema.POSE_STAMPED, rows)
+    yield from _nodes(result, prefix, start)
+    yield from _contacts(result, prefix, start)
+    for camera_id, image in origin.images:
+        topic = f"{prefix}/cam/{camera_id}/rendered/image"
+        yield _Message(image.stamp_ns, topic, schema.COMPRESSED_IMAGE, image.to_cdr())
+    end = start + int(result.stamps_ns[-1])
+    yield _Message(end, f"{prefix}/verdict", schema.VERDICT, result.verdict.to_json())
+    for sample in result.samples:
+        data = json.dumps(sample.to_record(), separators=(",", ":")).encode()
+        yield _Message(end, f"{prefix}/verdict/sample", schema.SAMPLE, data)
+    if origin.divergence is not None:
+        data = json.dumps(origin.divergence, separators=(",", ":")).encode()
+        yield _Message(end, f"{prefix}/replay/divergence", schema.DIVERGENCE, data)
+
+
+def _nodes(result: ReplayResult, prefix: str, start_ns: int) -> Iterator[_Message]:
+    for name, nodes in result.nodes_m.items():
+        due_ns = 0
+        for t_ns, points in zip(result.stamps_ns.tolist(), nodes, strict=True):
+            if t_ns < due_ns:
+                continue
+            due_ns = t_ns + NODES_PERIOD_NS
+            sample = PointCloudSample(
+                stamp_ns=start_ns + t_ns, frame_id=BASE_FRAME, points_m=points
+            )
+            topic = f"{prefix}/object/{name}/nodes"
+            yield _Message(sample.stamp_ns, topic, schema.POINT_CLOUD, sample.to_cdr())
+
+
+def _contacts(result: ReplayResult, prefix: str, start_ns: int) -> Iterator[_Message]:
+    """Measured distances below the margin, and what physics says of the fingers."""
+    topic = f"{prefix}/replay/contact"
+    for contact in result.contacts:
+        record = _contact_record(
+            start_ns, contact.start_ns, contact.end_ns, contact.bodies, source="distance"
+        ) | {"allowed": contact.allowed, "min_distance_m": contact.min_distance_m}
+        yield _json_message(topic, schema.CONTACT, record)
+    for name, touches in result.finger_contact.items():
+        for first_ns, last_ns in stretches_ns(result.stamps_ns, touches):
+            record = _contact_record(start_ns, first_ns, last_ns, (GRIPPER, name), source="physics")
+            yield _json_message(topic, schema.CONTACT, record)
+
+
+def _contact_record(
+    origin_ns: int, first_ns: int, last_ns: int, bodies: tuple[str, str], *, source: str
+) -> dict[str, Any]:
+    return {
+        "schema_version": 1,
+        "stamp_ns": origin_ns + first_ns,
+        "end_ns": origin_ns + last_ns,
+        "bodies": list(bodies),
+        "allowed": None,
+        "min_distance_m": None,
+        "source": source,
+    }
+
+
+def _json_message(topic: str, type_name: str, record: Mapping[str, Any]) -> _Message:
+    data = json.dumps(record, separators=(",", ":")).encode()
+    return _Message(int(record["stamp_ns"]), topic, type_name, data)
+
+
+def _stamped(
+    stamps_ns: Int[np.ndarray, " num_steps"], topic: str, type_name: str, rows: Iterator[bytes]
+) -> Iterator[_Message]:
+    for stamp_ns, data in zip(stamps_ns.tolist(), rows, strict=True):
+        yield _Message(stamp_ns, topic, type_name, data)
+
+
+def _events(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterator[_Message]:
+    """Events: execution, stages, gripper, contacts that were not allowed."""
+    topic = f"/{origin.cell}/event"
+    end_ns = int(result.stamps_ns[-1])
+    events: list[tuple[int, dict[str, object]]] = [(0, {"type": "execution_started"})]
+    for stage in origin.stages:
+        if stage.t_start_ns <= end_ns:
+            events.append((stage.t_start_ns, {"type": "stage_started", "stage_id": stage.id}))
+        if stage.t_end_ns <= end_ns:
+            events.append((stage.t_end_ns, {"type": "stage_ended", "stage_id": stage.id}))
+    for t_ns, text in origin.gripper:
+        if t_ns <= end_ns:
+            events.append((t_ns, {"type": "gripper", "text": text}))
+    for contact in result.contacts:
+        if not contact.allowed:
+            body, other = contact.bodies
+            text = f"{body} within {contact.min_distance_m * 1e3:.1f} mm of {other}"
+            events.append((contact.start_ns, {"type": "note", "text": text}))
+    events.append((min(end_ns, origin.end_ns), {"type": "execution_ended"}))
+    for t_ns, fields in sorted(events, key=lambda event: event[0]):
+        stamp = origin.start_ns + t_ns
+        record = {"schema_version": 1, "stamp_ns": stamp, "plan_id": plan.id, **fields}
+        yield _Message(stamp, topic, schema.EVENT, json.dumps(record).encode())

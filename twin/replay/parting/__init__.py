@@ -1,1 +1,0 @@
-"""Planned, executed and recorded laid over each other: where they part first."""

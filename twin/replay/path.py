@@ -1,0 +1,447 @@
+"""From waypoints to a dense joint path, and the IK factor of I(tau) (errata resolution 9).
+
+The IK indicator is 1 when joints exist within their limits that reach every pose within the
+tolerance, when no joint jumps along the interpolated path, and when no links meet.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from itertools import groupby, pairwise
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bridge.geometry import se3
+from bridge.geometry.trajectory import PoseTrajectory
+from bridge.task.plan import Plan, Waypoint
+from bridge.task.robot import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M
+from twin.errors import TwinError
+from twin.replay.clearance.bodies import own_links
+from twin.replay.config import ReplayConfig
+from twin.replay.failure import Failure
+from twin.robot.collision import RobotHulls
+from twin.robot.follow import Clearance, follow_poses
+from twin.robot.inverse import pose_error, solve_ik
+from twin.robot.model import RobotModel
+
+# --- Joint limits, jumps and excess speed of a path, each named with its joint and instant.
+
+_LIMIT_SLACK_RAD = 1e-3
+_SPEED_SLACK = 1.02
+"""Recorded and rounded joints may exceed a limit by as little as this."""
+
+
+def outside_limits(
+    robot: RobotModel, joints_rad: Float[np.ndarray, "num_steps num_joints"]
+) -> Bool[np.ndarray, "num_steps num_joints"]:
+    """Say which joints are beyond their limits by more than rounding."""
+    return (joints_rad < robot.lower_rad - _LIMIT_SLACK_RAD) | (
+        joints_rad > robot.upper_rad + _LIMIT_SLACK_RAD
+    )
+
+
+def limit_failure(
+    robot: RobotModel, t_ns: int, joints_rad: Float[np.ndarray, " num_joints"], joint: int
+) -> Failure:
+    """Name a joint that is beyond its limits."""
+    return Failure(
+        t_ns=t_ns,
+        cause="joint_limit",
+        bodies=(ARM_JOINTS[joint],),
+        detail=f"{ARM_JOINTS[joint]} is at {joints_rad[joint]:.3f} rad, its limits are "
+        f"{robot.lower_rad[joint]:.3f} to {robot.upper_rad[joint]:.3f} rad",
+    )
+
+
+def jumps(
+    times_ns: Int[np.ndarray, " num_times"],
+    joints_rad: Float[np.ndarray, "num_times num_joints"],
+    robot: RobotModel,
+    config: ReplayConfig,
+) -> list[Failure]:
+    """Find the first jump and the first excess of speed between neighbouring postures."""
+    if len(times_ns) < 2:
+        return []
+    steps = np.abs(np.diff(joints_rad, axis=0))
+    speeds = steps / (np.diff(times_ns)[:, None] * 1e-9)
+    failures = []
+    for cause, values, limit, unit in (
+        ("joint_jump", steps, np.full(len(ARM_JOINTS), config.max_joint_step_rad), "rad"),
+        ("joint_speed", speeds, robot.velocity_limit_rad_s * _SPEED_SLACK, "rad/s"),
+    ):
+        over = values > limit
+        if np.any(over):
+            index, joint = (int(i) for i in np.argwhere(over)[0])
+            failures.append(
+                Failure(
+                    t_ns=int(times_ns[index]),
+                    cause=cause,
+                    bodies=(ARM_JOINTS[joint],),
+                    detail=f"{ARM_JOINTS[joint]} changes by {values[index, joint]:.2f} {unit}, "
+                    f"the limit is {limit[joint]:.2f} {unit}",
+                )
+            )
+    return failures
+
+
+# --- Whether a plan can be replayed at all, before anything is computed from it.
+
+MAX_DURATION_S = 600.0
+"""Longest trajectory that is replayed [s]."""
+MAX_WAYPOINTS = 100_000
+"""Ten minutes at 125 Hz are fewer; all branches of one pose take a few kilobytes."""
+WIDTH_SLACK_M = 0.01
+"""A gripper may say that it is open or shut by this much more than it can be."""
+_FARTHEST_M = 1e4
+_SHORTEST, _LONGEST = 1e-6, 1e6
+"""A quaternion whose largest number is not between these is none."""
+
+
+class UnusablePlanError(TwinError):
+    """A plan, or what was recorded of its execution, cannot be replayed at all."""
+
+    def __init__(self, *, plan_id: str, found: str, hint: str) -> None:
+        """Remember the plan."""
+        self.plan_id = plan_id
+        super().__init__(f"plan {plan_id!r} {found}. {hint}")
+
+
+def check_usable(plan: Plan, robot: RobotModel) -> None:
+    """Refuse what no robot, or not this one, could follow.
+
+    Raises:
+        UnusablePlanError: Naming the first thing that is wrong.
+    """
+    wrong = _about_times(plan) or _about_numbers(plan) or _about_whose(plan, robot)
+    if wrong is not None:
+        found, hint = wrong
+        raise UnusablePlanError(plan_id=plan.id, found=found, hint=hint)
+
+
+_Wrong = tuple[str, str]
+"""What was found, and what to do."""
+
+
+def _about_times(plan: Plan) -> _Wrong | None:
+    count = len(plan.tau)
+    if count == 0:
+        return "has no waypoints", "Send tau."
+    if count > MAX_WAYPOINTS:
+        return f"has {count} waypoints", f"At most {MAX_WAYPOINTS} are replayed; send fewer."
+    times = [waypoint.t_ns for waypoint in plan.tau]  # of any size: JSON has no largest integer
+    if times[0] < 0 or any(b <= a for a, b in pairwise(times)):
+        found = "has waypoint times that do not increase from 0"
+        return found, "t_ns counts from the start of the trajectory."
+    if times[-1] > MAX_DURATION_S * 1e9:
+        found = f"lasts {times[-1] * 1e-9:.0f} s"
+        return found, f"At most {MAX_DURATION_S:.0f} s are replayed; split it."
+    return None
+
+
+def _about_numbers(plan: Plan) -> _Wrong | None:
+    try:
+        p, q = np.abs(plan.positions_m()), np.abs(plan.quaternions_wxyz()).max(axis=1)
+        widths = _floats(w.width_m for w in plan.tau if w.width_m is not None)
+        joints = _floats(value for w in plan.tau for value in w.joints_rad or ())
+    except OverflowError:  # an integer of hundreds of digits
+        return "has numbers that are too large", "Send metres, radians and unit quaternions."
+    # Comparisons that what is no number fails.
+    if not (np.all(p < _FARTHEST_M) and np.all((q > _SHORTEST) & (q < _LONGEST))):
+        found = "has poses that are not finite or out of this world, or quaternions that are none"
+        return found, "Send p_m in metres and q_wxyz of unit length."
+    if not (np.isfinite(widths).all() and np.isfinite(joints).all()):
+        found = "has joints or gripper widths that are not finite"
+        return found, "Send joints_rad and width_m as numbers, or leave them out."
+    low, high = (float(f(widths)) if len(widths) else 0.0 for f in (np.min, np.max))
+    if low < -WIDTH_SLACK_M or high > MAX_WIDTH_M + WIDTH_SLACK_M:
+        found = f"has gripper widths from {low:.3f} to {high:.3f}"
+        return found, f"width_m is the distance between the pads in metres, 0 to {MAX_WIDTH_M}."
+    return None
+
+
+def _floats(values: Iterable[float]) -> Float[np.ndarray, " num_values"]:
+    return np.array(list(values), dtype=np.float64)
+
+
+def _about_whose(plan: Plan, robot: RobotModel) -> _Wrong | None:
+    if plan.frame != BASE_FRAME:
+        return f"is in the frame {plan.frame!r}", f"Transform it to {BASE_FRAME!r}."
+    if plan.robot != robot.name:
+        hint = f"The robot that was described is {robot.name!r}."
+        return f"is for the robot {plan.robot!r}", hint
+    if plan.joint_names and set(plan.joint_names) != set(ARM_JOINTS):
+        hint = f"The robot has {', '.join(ARM_JOINTS)}."
+        return f"names the joints {', '.join(plan.joint_names)}", hint
+    return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointPath:
+    """Arm joints and commanded gripper width over time, straight lines between the knots."""
+
+    times_ns: Int[np.ndarray, " num_knots"]
+    joints_rad: Float[np.ndarray, "num_knots num_joints"]
+    width_times_ns: Int[np.ndarray, " num_widths"]
+    width_m: Float[np.ndarray, " num_widths"]
+    """Each width holds until the next one is commanded."""
+    first_close_ns: int | None
+    """When the gripper is first told to close."""
+
+    def joints_at(
+        self, times_ns: Int[np.ndarray, " num_queries"]
+    ) -> Float[np.ndarray, "num_queries num_joints"]:
+        """Interpolate linearly; after the end the last posture holds."""
+        columns = [np.interp(times_ns, self.times_ns, column) for column in self.joints_rad.T]
+        return np.stack(columns, axis=1)
+
+    def width_at(
+        self, times_ns: Int[np.ndarray, " num_queries"]
+    ) -> Float[np.ndarray, " num_queries"]:
+        """Commanded widths."""
+        index = np.searchsorted(self.width_times_ns, times_ns, side="right") - 1
+        return self.width_m[np.clip(index, 0, len(self.width_m) - 1)]
+
+    def with_late_gripper(self, delay_s: float) -> "JointPath":
+        """The same motion with every gripper command this much later."""
+        delay_ns = round(delay_s * 1e9)
+        if delay_ns == 0:
+            return self
+        first = self.first_close_ns
+        return replace(
+            self,
+            width_times_ns=self.width_times_ns + delay_ns,
+            first_close_ns=None if first is None else first + delay_ns,
+        )
+
+    def end_ns(self) -> int:
+        """Time of the last knot."""
+        return int(self.times_ns[-1])
+
+    def dense_times_ns(self, step_s: float) -> Int[np.ndarray, " num_times"]:
+        """Evenly spaced times from start to end, at most one step apart."""
+        count = int(np.ceil(self.end_ns() * 1e-9 / step_s)) + 1
+        return np.unique(np.linspace(0, self.end_ns(), count).round().astype(np.int64))
+
+
+def path_of_plan(
+    plan: Plan, robot: RobotModel, config: ReplayConfig, *, clearance: Clearance | None = None
+) -> tuple[JointPath, list[Failure], int | None]:
+    """Solve a plan's waypoints.
+
+    Joints given by the plan are the warm start and count only where their own forward kinematics
+    reaches the waypoint. Waypoints without joints are joined by straight tool motion.
+
+    Args:
+        plan: What is commanded.
+        robot: What is to follow it.
+        config: Spacing and tolerances.
+        clearance: Says which postures touch something, where the plan leaves the choice.
+
+    Returns:
+        The path up to the last pose that could be reached, what failed, and the time of the first
+        unreachable pose (None when all were reached).
+
+    Raises:
+        UnusablePlanError: What ``check_usable`` refuses, or another number of joints.
+    """
+    check_usable(plan, robot)
+    knots = _Knots()
+    for is_open, group in groupby(_targets(plan, config), key=lambda target: target.given is None):
+        run = list(group)
+        if is_open:
+            _follow(knots, run, robot, config, clearance)
+        else:
+            _take_given(knots, run, robot, config)
+        if knots.unreachable_ns is not None:
+            break
+    path = JointPath(
+        times_ns=np.array(knots.times_ns, dtype=np.int64),
+        joints_rad=np.stack(knots.joints),
+        width_times_ns=plan.times_ns(),
+        width_m=np.array([_width(waypoint) for waypoint in plan.tau]),
+        first_close_ns=next((w.t_ns for w in plan.tau if w.g == 1), None),
+    )
+    return path, knots.failures, knots.unreachable_ns
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Target:
+    """A pose to pass, with joints where the plan gives some."""
+
+    t_ns: int
+    T: Float[np.ndarray, "4 4"]
+    given: Float[np.ndarray, " num_joints"] | None = None
+
+
+@dataclass
+class _Knots:
+    """What has been solved so far."""
+
+    times_ns: list[int] = field(default_factory=list)
+    joints: list[Float[np.ndarray, " num_joints"]] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)
+    unreachable_ns: int | None = None
+
+    def add(self, t_ns: int, joints: Float[np.ndarray, " num_joints"]) -> None:
+        self.times_ns.append(t_ns)
+        self.joints.append(joints)
+
+    def stop(
+        self, robot: RobotModel, target: _Target, nearest: Float[np.ndarray, " num_joints"]
+    ) -> None:
+        """Note a pose that cannot be reached; a path needs at least one knot."""
+        self.unreachable_ns = target.t_ns
+        error_m, _ = pose_error(robot, nearest, target.T)
+        self.failures.append(_unreachable(target.t_ns, target.T, error_m))
+        if not self.joints:
+            self.add(target.t_ns, nearest)
+
+
+def _follow(
+    knots: _Knots,
+    run: list[_Target],
+    robot: RobotModel,
+    config: ReplayConfig,
+    clearance: Clearance | None,
+) -> None:
+    """Solve poses whose joints the plan leaves open."""
+    followed = follow_poses(
+        robot,
+        np.stack([target.T for target in run]),
+        start_rad=knots.joints[-1] if knots.joints else None,
+        config=config.ik,
+        clearance=clearance,
+    )
+    for target, joints, reached in zip(run, followed.joints_rad, followed.reached, strict=True):
+        if not reached:
+            knots.stop(robot, target, joints)
+            return
+        knots.add(target.t_ns, joints)
+
+
+def _take_given(knots: _Knots, run: list[_Target], robot: RobotModel, config: ReplayConfig) -> None:
+    """Take the plan's joints where they reach its own poses, and the nearest that do elsewhere."""
+    for target in run:
+        given = target.given
+        if given is None:
+            continue
+        failure = _check_given(robot, target.t_ns, given, target.T, config)
+        if failure is not None:
+            solution = solve_ik(robot, target.T, config.ik, warm_start_rad=given)
+            given = solution.joints_rad
+            if not solution.reached:
+                knots.stop(robot, target, given)
+                return
+            knots.failures.append(failure)
+        knots.add(target.t_ns, given)
+
+
+def _targets(plan: Plan, config: ReplayConfig) -> list[_Target]:
+    """Waypoints, and where joints are not given the poses on the straight line between them."""
+    times = plan.times_ns()
+    quats = plan.quaternions_wxyz()
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)  # slerp needs unit length
+    poses = PoseTrajectory(times, plan.positions_m(), quats)
+    order = (
+        [list(plan.joint_names).index(name) for name in ARM_JOINTS] if plan.joint_names else None
+    )
+    targets: list[_Target] = []
+    step_ns = round(config.path_step_s * 1e9)
+    for index, waypoint in enumerate(plan.tau):
+        given = _given_joints(plan.id, waypoint, order)
+        if given is None and index > 0:
+            count = int(np.ceil((times[index] - times[index - 1]) / step_ns))
+            between = np.linspace(times[index - 1], times[index], count + 1)[1:-1]
+            stamps = between.round().astype(np.int64)
+            Ts = poses.at(stamps).transforms()
+            targets += [_Target(t_ns=int(t), T=T) for t, T in zip(stamps, Ts, strict=True)]
+        q = np.array(waypoint.q_wxyz, dtype=np.float64)
+        T_waypoint = se3.transform_from(q, np.array(waypoint.p_m))
+        targets.append(_Target(t_ns=waypoint.t_ns, T=T_waypoint, given=given))
+    return targets
+
+
+def _given_joints(
+    plan_id: str, waypoint: Waypoint, order: list[int] | None
+) -> Float[np.ndarray, " num_joints"] | None:
+    if waypoint.joints_rad is None:
+        return None
+    joints = np.array(waypoint.joints_rad, dtype=np.float64)
+    if len(joints) != len(ARM_JOINTS):
+        raise UnusablePlanError(
+            plan_id=plan_id,
+            found=f"gives {len(joints)} joints at {waypoint.t_ns * 1e-9:.2f} s",
+            hint=f"Give {len(ARM_JOINTS)}, or none.",
+        )
+    return joints if order is None else joints[order]
+
+
+def _width(waypoint: Waypoint) -> float:
+    if waypoint.width_m is not None:
+        return float(waypoint.width_m)
+    return 0.0 if waypoint.g == 1 else MAX_WIDTH_M
+
+
+def _unreachable(t_ns: int, T: Float[np.ndarray, "4 4"], error_m: float) -> Failure:
+    x, y, z = T[:3, 3]
+    return Failure(
+        t_ns=t_ns,
+        cause="unreachable",
+        detail=f"no joints reach ({x:.3f}, {y:.3f}, {z:.3f}) m; "
+        f"the nearest miss it by {error_m * 1e3:.1f} mm",
+    )
+
+
+def _check_given(
+    robot: RobotModel,
+    t_ns: int,
+    given: Float[np.ndarray, " num_joints"],
+    T: Float[np.ndarray, "4 4"],
+    config: ReplayConfig,
+) -> Failure | None:
+    """Say why a plan's own joints are no solution for its pose; None when they are."""
+    outside = outside_limits(robot, given[None])[0]
+    if np.any(outside):
+        return limit_failure(robot, t_ns, given, int(np.argmax(outside)))
+    offset, angle = pose_error(robot, given, T)
+    if offset <= config.ik.position_tolerance_m and angle <= config.ik.rotation_tolerance_rad:
+        return None
+    return Failure(
+        t_ns=t_ns,
+        cause="joints_disagree",
+        detail=f"the plan's joints put the tool {offset * 1e3:.1f} mm and "
+        f"{np.degrees(angle):.2f} degrees from its own pose",
+    )
+
+
+def check_path(
+    path: JointPath, robot: RobotModel, hulls: RobotHulls, config: ReplayConfig
+) -> list[Failure]:
+    """Find joint limits, jumps, excess speed and self-collision along an interpolated path."""
+    failures = []
+    outside = outside_limits(robot, path.joints_rad)
+    if np.any(outside):
+        knot, joint = (int(i) for i in np.argwhere(outside)[0])
+        failures.append(
+            limit_failure(robot, int(path.times_ns[knot]), path.joints_rad[knot], joint)
+        )
+    times = path.dense_times_ns(config.path_step_s)
+    joints = path.joints_at(times)
+    failures += jumps(times, joints, robot, config)
+    widths = path.width_at(times)
+    links = own_links(hulls)
+    for t_ns, row, width in zip(times, joints, widths, strict=True):
+        hulls.place(row, float(width))
+        if links.touch():
+            closest = hulls.self_distance()
+            failures.append(
+                Failure(
+                    t_ns=int(t_ns),
+                    cause="self_collision",
+                    bodies=closest.links,
+                    detail=f"{closest.links[0]} is {-closest.distance_m * 1e3:.1f} mm inside "
+                    f"{closest.links[1]}",
+                )
+            )
+            break
+    return failures

@@ -1,1 +1,0 @@
-"""What a replay happens in: the task, its objects, the rebuilt scene, the calibration."""

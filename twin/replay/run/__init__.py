@@ -1,1 +1,0 @@
-"""All trajectories of a run: what is replayed, and the tables of what came out."""

@@ -1,0 +1,369 @@
+"""Replay every trajectory of a run: each plan as planned, each execution as recorded."""
+
+import contextlib
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from bridge.episode import streams
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.streams import execution_ns
+from bridge.errors import GstError, PathNotFoundError, UsageError
+from bridge.task.plan import Plan
+from bridge.task.task_file import load_task
+from bridge.terminal import Output
+from twin.crew.pool import Failed, Runner
+from twin.replay.config import ReplayRunConfig
+from twin.replay.job import ReplayJob, row_of_existing, row_of_failure, run_job
+from twin.replay.rebuilt_scene import calibrated, for_task, read_rebuilt_scene, shape_hashes
+from twin.replay.scene import localised_starts
+from twin.replay.summary import against_recorded, count_verdicts, executions_of, recorded_labels
+from twin.scene.store.calibration import read_calibration
+from twin.scene.store.folder import SCENE_FILE, read_record, scene_hash_of
+
+# --- When a plan was executed, and why what was recorded of it says nothing.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Execution:
+    """What the events of an episode say of one plan."""
+
+    interval_ns: tuple[int, int] | None
+    """Source times of start and end; None when it was not executed from beginning to end."""
+    problem: str = ""
+    """Why the execution cannot be replayed, although there was one."""
+
+
+def execution_of(events: Iterable[Mapping[str, Any]], plan_id: str) -> Execution:
+    """Find the execution of a plan.
+
+    Args:
+        events: All of an episode, in their order.
+        plan_id: Whose.
+    """
+    mine = [event for event in events if event.get("plan_id") == plan_id]
+    count = sum(event["type"] == "execution_started" for event in mine)
+    start, end = execution_ns(mine, plan_id)
+    interval = None if start is None or end is None else (start, end)
+    problem = ""
+    if count and interval is None:
+        problem = f"the execution of plan {plan_id!r} began, and nobody recorded that it ended"
+    elif count > 1:
+        problem = (
+            f"plan {plan_id!r} was executed {count} times, and which end belongs to which nobody "
+            "can tell; give each execution a plan with an id of its own"
+        )
+    return Execution(interval_ns=interval, problem=problem)
+
+
+# --- What is to be replayed of one episode: its objects localised, its plans and executions
+# listed.
+#
+# Each episode is a piece of work of its own, for a process of the pool as for this one.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preparation:
+    """Which episode, for which scene, with which settings."""
+
+    run_path: Path
+    episode_id: str
+    scene_hash: str | None
+    shapes: Mapping[str, str]
+    """Hashes of the scene's shapes, see ``twin.replay.rebuilt_scene.shape_hashes``."""
+    config: ReplayRunConfig
+
+    def episode_path(self) -> Path:
+        """Of the recorded episode."""
+        return RunFolder.open(self.run_path).episodes_dir / f"{self.episode_id}.mcap"
+
+    def needed_paths(self) -> tuple[Path, ...]:
+        """What a process on another machine must see."""
+        return (self.run_path, self.episode_path())
+
+    def cost(self) -> float:
+        """How long it takes, compared with others."""
+        return float(self.episode_path().stat().st_size)
+
+
+def jobs_of(item: Preparation) -> list[ReplayJob]:
+    """Localise the objects of an episode, where that is not there yet, and list its replays.
+
+    Returns:
+        One job per plan, two more where it was executed; none when the episode is not replayed.
+
+    Raises:
+        GstError: When the episode or its task cannot be read.
+    """
+    run, path, config = RunFolder.open(item.run_path), item.episode_path(), item.config
+    episode = Episode.open(path)
+    plans = streams.plans(episode)
+    task_name = replayed_task(episode, plans)
+    if task_name is None:
+        return []
+    task = load_task(task_name)
+    starts = localised_starts(
+        run, episode, task, scene_hash=item.scene_hash, force=config.relocalise
+    )
+    digest = episode.sha256()
+    calibration = read_calibration(run)
+    replay = for_task(calibrated(config.replay, calibration), task)
+    jobs, events = [], streams.events(episode)
+    for index, (stamp_ns, plan) in enumerate(plans):
+        execution = execution_of(events, plan.id)
+        interval = execution.interval_ns
+        start_ns = stamp_ns if interval is None else interval[0]
+        common = ReplayJob(
+            episode_path=path,
+            episode_sha256=digest,
+            plan_id=plan.id,
+            plan_index=index,
+            trajectory="planned",
+            start_ns=start_ns,
+            end_ns=None if interval is None else interval[1],
+            task=task_name,
+            start=starts.at(start_ns),
+            scene_hash=item.scene_hash,
+            config=replace(replay, mode="dynamic", samples=config.samples),
+            folder=run.derived_dir.resolve(),
+            duration_s=plan.tau[-1].t_ns * 1e-9 if plan.tau else 0.0,
+            run_path=run.path,
+            shapes=item.shapes,
+            calibration_id=None if calibration is None else calibration.calibration_id,
+            render=config.render,
+            problem=execution.problem,
+        )
+        jobs.append(common)
+        if common.was_executed:
+            executed = replace(common, trajectory="executed", end=starts.after(plan.id))
+            jobs.append(executed)
+            jobs.append(replace(executed, config=replace(replay, mode="kinematic")))
+    return jobs
+
+
+def replayed_task(episode: Episode, plans: list[tuple[int, Plan]]) -> str | None:
+    """Name the task an episode's plans are judged by; None when it is not one to replay."""
+    if episode.info.kind != "trial" or not plans:
+        return None
+    return episode.info.task or plans[0][1].task
+
+
+# --- Replays that were made before, and count again.
+
+
+def there_already(
+    jobs: Sequence[ReplayJob], *, force: bool
+) -> tuple[list[dict[str, Any]], list[ReplayJob]]:
+    """Rows of the replays that were made before, and the jobs that are still to do.
+
+    Args:
+        jobs: What is asked for.
+        force: All of it is to do.
+    """
+    rows, todo, kept = [], [], []
+    for job in jobs:
+        row = None if force else row_of_existing(job)
+        if row is None:
+            todo.append(job)
+        else:
+            rows.append(row)
+            kept.append(job.path())
+    _count_again(kept)
+    return rows, todo
+
+
+def _count_again(kept: Iterable[Path]) -> None:
+    """Make kept files the newest of their trajectory, for the newest is the one that counts.
+
+    What was replayed with other settings meanwhile would count otherwise, although these were
+    asked for last.
+    """
+    newest: dict[Path, dict[str, int]] = {}
+    for path in kept:
+        stamps = newest.get(path.parent)
+        if stamps is None:
+            stamps = newest[path.parent] = _stamps(path.parent)
+        with contextlib.suppress(OSError):  # a folder that is only read keeps its order
+            if path.stat().st_mtime_ns < stamps[_trajectory_of(path.name)]:
+                os.utime(path)
+
+
+def _stamps(folder: Path) -> dict[str, int]:
+    """When the newest replay of each trajectory was made."""
+    stamps: dict[str, int] = {}
+    for entry in os.scandir(folder):
+        if entry.name.endswith(".mcap"):
+            key = _trajectory_of(entry.name)
+            stamps[key] = max(stamps.get(key, 0), entry.stat().st_mtime_ns)
+    return stamps
+
+
+def _trajectory_of(name: str) -> str:
+    """Leave out engine and settings: the end of ``ReplayJob.path``."""
+    return name.rsplit(".", 3)[0]
+
+
+def replay_trajectories(
+    run: RunFolder, config: ReplayRunConfig, output: Output, runner: Runner
+) -> dict[str, Any]:
+    """Replay all trial episodes of a run; replays that are there already are kept.
+
+    Args:
+        run: Whose episodes are replayed, and whose ``derived`` folder gets the replays.
+        config: Settings.
+        output: How to talk.
+        runner: What does the work.
+
+    Returns:
+        ``rows`` (one per trajectory), ``counts`` per trajectory and mode, ``skipped_episodes``
+        with reasons, what was said ``against_recorded`` labels, and the scene hash.
+
+    Raises:
+        UsageError: When an episode named in the configuration is not in the run.
+        PathNotFoundError: When pictures are asked for and no scene was rebuilt.
+    """
+    scene_hash = _scene_hash(run, config, output)
+    jobs, skipped = _all_jobs(run, scene_hash, config, runner, output)
+    _say_what_is_missing(run, jobs, output)
+    if config.render:
+        tasks = sorted({job.task for job in jobs})
+        for remark in describe_undrawn(read_record(run) or {}, tasks):
+            output.say(remark)
+    rows, todo = there_already(jobs, force=config.force)
+    if todo:
+        run.derived_dir.mkdir(parents=True, exist_ok=True)  # each node is asked whether it is there
+    told: set[tuple[str, str, str]] = set()  # one cause spoils all replays of a plan
+    with output.progress("replay", len(todo)) as advance:
+        for done, row in enumerate(_replayed(todo, runner, output), start=1):
+            rows.append(row)
+            advance(done, f"{row['episode']} {row['trajectory']} {row['mode']}")
+            what = (row["episode"], row["plan"], row["error"])
+            if row["error"] and what not in told:
+                told.add(what)
+                output.say(f"{row['episode']} {row['plan']}: {row['error']}")
+    rows.sort(key=lambda row: (row["episode"], row["plan"], row["trajectory"], row["mode"]))
+    executions = executions_of(rows, recorded_labels(run, sorted({row["episode"] for row in rows})))
+    return {
+        "run": str(run.path),
+        "scene_hash": scene_hash,
+        "counts": count_verdicts(rows),
+        "executions": executions,
+        "against_recorded": against_recorded(executions),
+        "skipped_episodes": skipped,
+        "rows": rows,
+    }
+
+
+def _all_jobs(
+    run: RunFolder,
+    scene_hash: str | None,
+    config: ReplayRunConfig,
+    runner: Runner,
+    output: Output,
+) -> tuple[list[ReplayJob], dict[str, str]]:
+    """List what is to be replayed, and the episodes that cannot be, with the reason."""
+    names = _chosen(run, config)
+    shapes = shape_hashes(run)
+    items = [
+        Preparation(
+            run_path=run.path.resolve(),
+            episode_id=name,
+            scene_hash=scene_hash,
+            shapes=shapes,
+            config=config,
+        )
+        for name in names
+    ]
+    jobs: dict[str, list[ReplayJob]] = {}
+    skipped: dict[str, str] = {}
+    with output.progress("localise", len(names)) as advance:
+        answers = runner.run(jobs_of, items, Preparation.cost)
+        for done, (item, answer) in enumerate(answers, start=1):
+            if isinstance(answer, Failed):
+                skipped[item.episode_id] = answer.message
+                output.detail(answer.trace)
+            elif answer:
+                jobs[item.episode_id] = answer
+            else:
+                output.detail(f"{item.episode_id}: no trial with a plan, not replayed")
+            advance(done, item.episode_id)
+    for episode_id, reason in sorted(skipped.items()):
+        output.say(f"{episode_id}: {reason}")
+    return [job for name in names for job in jobs.get(name, ())], skipped
+
+
+def _scene_hash(run: RunFolder, config: ReplayRunConfig, output: Output) -> str | None:
+    scene_hash = scene_hash_of(run)
+    if scene_hash is None:
+        if config.render:
+            hint = "--render draws it. Make it: robot-gst rebuild RUN, or leave --render out."
+            raise PathNotFoundError(path=run.scene_dir / SCENE_FILE, what="scene", hint=hint)
+        output.say(
+            "No scene has been rebuilt (scene/scene.json is missing): replays use the task's "
+            "shapes and the table plane, and carry no scene hash."
+        )
+    return scene_hash
+
+
+def _say_what_is_missing(run: RunFolder, jobs: list[ReplayJob], output: Output) -> None:
+    """Tell what the task file stands in for, once for all replays of a task."""
+    for task in sorted({job.task for job in jobs}):
+        try:
+            remarks = read_rebuilt_scene(run, load_task(task)).remarks
+        except GstError:  # which each of its replays will say
+            continue
+        for remark in remarks:
+            output.say(f"{task}: {remark}")
+
+
+def _chosen(run: RunFolder, config: ReplayRunConfig) -> list[str]:
+    there = [path.stem for path in run.episodes()]
+    unknown = [name for name in config.episode if name not in there]
+    if unknown:
+        message = (
+            f"no episode named {', '.join(unknown)} in {run.episodes_dir}. "
+            f"There are: {', '.join(there) or 'none'}."
+        )
+        raise UsageError(message)
+    return list(dict.fromkeys(config.episode)) or there
+
+
+def _replayed(todo: list[ReplayJob], runner: Runner, output: Output) -> Iterator[dict[str, Any]]:
+    # An executed replay is compared with the planned one, which must be there before.
+    for late in (False, True):
+        batch = [job for job in todo if job.needs_planned is late]
+        if not batch:
+            continue
+        for job, answer in runner.run(run_job, batch, ReplayJob.cost):
+            if isinstance(answer, Failed):
+                output.detail(answer.trace)
+                yield row_of_failure(job, answer.message)
+            else:
+                yield answer
+
+
+# --- What pictures of replays will lack, said before they are drawn.
+
+
+def describe_undrawn(record: Mapping[str, Any], tasks: Iterable[str]) -> list[str]:
+    """Say in a sentence each what the rebuilt scene has no Gaussians of.
+
+    Args:
+        record: The content of ``scene.json``.
+        tasks: Tasks whose objects the replays move.
+    """
+    said = []
+    for name in tasks:
+        missing = [key for key in load_task(name).objects if key not in record.get("objects", {})]
+        if missing:
+            because = record.get("objects_remark")
+            reason = f" ({because})" if because else ""
+            said.append(f"{', '.join(missing)}: not in the scene, not in pictures{reason}")
+    robot = record.get("robot", {})
+    if not robot.get("links"):
+        reason = f" ({robot['remark']})" if robot.get("remark") else ""
+        said.append(f"robot: not in the scene, not in pictures{reason}")
+    return said

@@ -1,0 +1,335 @@
+"""Replay one trajectory, planned or executed, and judge it: I(tau) = ik x clearance x terminal."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bridge.episode.streams import JointTrack
+from bridge.task.plan import Plan
+from bridge.task.predicate import (
+    ALLOWED_CONTACTS,
+    PredicateResult,
+    Rollout,
+    all_hold,
+    already_true_at_start,
+    evaluate_contacts,
+    evaluate_success,
+)
+from bridge.task.task_file import Task
+from bridge.task.verdict import Factor, Verdict
+from twin.physics.engine import ENGINE_VERSION
+from twin.replay.clearance import ClearanceMonitor
+from twin.replay.clearance.surroundings import posture_clearance
+from twin.replay.config import ReplayConfig
+from twin.replay.dynamics import Burst, States, free_start, simulate, soft_models
+from twin.replay.execution import path_of_execution
+from twin.replay.failure import Failure, factor_from
+from twin.replay.path import JointPath, check_path, path_of_plan
+from twin.replay.result import ReplayResult
+from twin.replay.scene import ReplayScene
+from twin.replay.slip import grasped_objects, slips, unless_slipped
+from twin.robot.collision import hulls_of
+from twin.robot.model import load_robot
+
+# --- The terminal factor of I(tau), what each predicate found, and the reason a verdict gives.
+
+HELD_BEFORE = "the goal held before anything moved"
+MANY = 8
+"""Of more findings than this, those that hold are not worth reading one by one."""
+
+
+def terminal_factor(
+    result: ReplayResult,
+    scene: ReplayScene,
+    config: ReplayConfig,
+    *,
+    unreachable_ns: int | None,
+    burst: Burst | None,
+) -> Factor:
+    """Judge the settled state at the end.
+
+    A soft body that burst, or is turned inside out, makes it false whatever the task asks: the
+    middle of a burst body may well lie in the basket.
+    """
+    if config.mode == "kinematic":
+        return Factor(value=None, detail="a kinematic replay does not move objects")
+    if burst is not None:
+        detail = f"{burst.object_id}: {burst.found}"
+        bodies = (burst.object_id,)
+        failure = Failure(t_ns=burst.t_ns, cause="exploded", bodies=bodies, detail=detail)
+        return factor_from([failure])
+    if unreachable_ns is not None:
+        detail = f"the trajectory cannot be executed beyond {unreachable_ns * 1e-9:.2f} s"
+        return Factor(value=None, detail=detail)
+    end_ns = int(result.stamps_ns[-1])
+    for name, found in result.broken.items():
+        failure = Failure(t_ns=end_ns, cause="shape", bodies=(name,), detail=f"{name} {found}")
+        return factor_from([failure])
+    findings = evaluate_success(scene.task, result.rollout())
+    value = all_hold(findings)
+    if value is True:
+        return Factor(value=True, detail=_why_true(findings))
+    if value is None:
+        return Factor(value=None, detail=_why_open(findings, scene))
+    index = next(i for i, finding in enumerate(findings) if finding.value is False)
+    spec = scene.task.success[index]
+    return Factor(
+        value=False,
+        first_t_ns=end_ns,
+        cause=findings[index].kind,
+        bodies=tuple(spec[key] for key in ("object", "container") if key in spec),
+        detail=_once(finding.detail for finding in findings if finding.value is False),
+    )
+
+
+def _why_true(findings: list[PredicateResult]) -> str:
+    if len(findings) > MANY:
+        return "every object is where it belongs"
+    return _once(finding.detail for finding in findings)
+
+
+def _why_open(findings: list[PredicateResult], scene: ReplayScene) -> str:
+    """What was not localised is said in the words of the clearance, which is open for it too."""
+    if not findings:
+        return "the task asks for nothing"
+    lost = scene.missing()
+    told = []
+    for spec, finding in zip(scene.task.success, findings, strict=True):
+        if spec.get("object") in lost or spec.get("container") in lost:
+            told.append(scene.describe_missing())
+        elif finding.value is None:
+            told.append(finding.detail)
+    return _once(told)
+
+
+def _once(sentences: Iterable[str]) -> str:
+    return "; ".join(dict.fromkeys(sentences))
+
+
+def findings_of(task: Task, rollout: Rollout, side: str, *, tolerance_m: float = 0.0) -> list[Any]:
+    """What each predicate says of a recorded or replayed rollout, as the verdict keeps it.
+
+    The predicate on contacts is asked whether or not the task lists it.
+
+    Args:
+        task: Its predicates.
+        rollout: Recorded or replayed states.
+        side: ``recorded`` or ``replayed``.
+        tolerance_m: Depth up to which contacts do not count, where the task does not say.
+    """
+    findings = evaluate_success(task, rollout)
+    if not any(finding.kind == ALLOWED_CONTACTS for finding in findings):
+        findings.append(evaluate_contacts(task, rollout, tolerance_m=tolerance_m))
+    return [
+        {
+            "side": side,
+            "kind": finding.kind,
+            "object": finding.object_id,
+            "value": finding.value,
+            "detail": finding.detail,
+        }
+        for finding in findings
+    ]
+
+
+def warnings_of(scene: ReplayScene, result: ReplayResult) -> tuple[str, ...]:
+    """What does not change the verdict but should be known."""
+    warnings = []
+    if already_true_at_start(scene.task, result.rollout()):
+        warnings.append(HELD_BEFORE)
+    return tuple(warnings)
+
+
+def reason_of(verdict: Verdict) -> str | None:
+    """One sentence: the first factor that fails, or what is open, or the first warning."""
+    name = verdict.first_failing
+    if name is not None:
+        factor: Factor = getattr(verdict, name)
+        return f"{name}: {factor.cause}: {factor.detail}"
+    if verdict.accepted is None:
+        names: dict[str | None, list[str]] = {}
+        for name in ("ik", "clearance", "terminal"):
+            factor = getattr(verdict, name)
+            if factor.value is None:
+                names.setdefault(factor.detail, []).append(name)
+        undecided = [f"{' and '.join(open_for)}: {why}" for why, open_for in names.items()]
+        return "undecided: " + "; ".join(undecided)
+    return verdict.warnings[0] if verdict.warnings else None
+
+
+KINEMATIC_ENGINE = "pinocchio"
+SOFT_ENGINE = "xpbd"
+
+
+def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> ReplayResult:
+    """Replay what a plan commands: waypoints, inverse kinematics, motors, objects.
+
+    Raises:
+        UnusablePlanError: When the plan has no usable waypoints.
+    """
+    robot = load_robot(scene.urdf)
+    free = posture_clearance(scene, hulls_of(robot), config)
+    path, failures, unreachable_ns = path_of_plan(plan, robot, config, clearance=free)
+    path = path.with_late_gripper(config.grip_delay_s)
+    return _replay(path, failures, unreachable_ns, plan, scene, config, trajectory="planned")
+
+
+def replay_joints(
+    track: JointTrack,
+    widths: JointTrack,
+    scene: ReplayScene,
+    config: ReplayConfig,
+    *,
+    plan: Plan,
+) -> ReplayResult:
+    """Replay what the joint encoders and the gripper said during an execution.
+
+    Args:
+        track: Recorded arm joints, cut to the execution; its first stamp becomes time 0.
+        widths: Recorded distance between the finger pads over the same stamps.
+        scene: Where it happens.
+        config: How it is replayed.
+        plan: The plan that was executed: its stages and when it wanted the gripper closed.
+
+    Raises:
+        UnusablePlanError: When a track is empty or names other joints.
+    """
+    path = path_of_execution(track, widths, plan, config)
+    return _replay(path, [], None, plan, scene, config, trajectory="executed")
+
+
+def _replay(
+    path: JointPath,
+    failures: list[Failure],
+    unreachable_ns: int | None,
+    plan: Plan,
+    scene: ReplayScene,
+    config: ReplayConfig,
+    *,
+    trajectory: str,
+) -> ReplayResult:
+    robot = load_robot(scene.urdf)
+    hulls = hulls_of(robot)
+    failures = failures + check_path(path, robot, hulls, config)
+    dynamic = config.mode == "dynamic"
+    if dynamic:
+        scene = free_start(scene, soft_models(scene), config.start_overlap_m)
+    states = simulate(path, scene, hulls, config) if dynamic else follow(path, scene, config)
+    monitor = ClearanceMonitor(scene, plan, hulls, config)
+    _pre_grasp(monitor, path, config)
+    clearance_m = _clearance_m(monitor, states, list(scene.movable()))
+    result = ReplayResult(
+        verdict=_undecided(plan, trajectory, config, scene),
+        stamps_ns=states.stamps_ns,
+        joints_rad=states.joints_rad,
+        width_m=states.width_m,
+        Ts_base_tcp=robot.Ts_base_tcp(states.joints_rad),
+        Ts_base_object=states.Ts_base_object,
+        finger_contact=states.finger_contact,
+        clearance_m=clearance_m,
+        contacts=monitor.contacts(),
+        nodes_m=states.nodes_m,
+        extents_m=states.extents_m,
+        broken=states.broken,
+    )
+    # What was executed is judged by where things end: it is known whether they were dropped.
+    slipped: list[Failure] = []
+    if dynamic and trajectory == "planned" and config.max_slip_m is not None:
+        slipped = slips(grasped_objects(plan, path, result), config.max_slip_m)
+    terminal = terminal_factor(
+        result, scene, config, unreachable_ns=unreachable_ns, burst=states.burst
+    )
+    verdict = replace(
+        result.verdict,
+        ik=factor_from(failures),
+        clearance=factor_from(
+            monitor.failures, undecided=_clearance_undecided(scene, unreachable_ns, states)
+        ),
+        terminal=unless_slipped(terminal, slipped),
+        warnings=warnings_of(scene, result),
+        findings=tuple(findings_of(scene.task, result.rollout(), "replayed")) if dynamic else (),
+    )
+    return replace(result, verdict=replace(verdict, reason=reason_of(verdict)))
+
+
+def _clearance_m(
+    monitor: ClearanceMonitor, states: States, movable: list[str]
+) -> Float[np.ndarray, " num_steps"]:
+    known = {name: Ts for name, Ts in states.Ts_base_object.items() if name in movable}
+    return np.array(
+        [
+            monitor.measure(
+                int(t_ns),
+                states.joints_rad[index],
+                float(states.width_m[index]),
+                {name: Ts[index] for name, Ts in known.items()},
+                {name: nodes[index] for name, nodes in states.nodes_m.items()},
+            )
+            for index, t_ns in enumerate(states.stamps_ns)
+        ]
+    )
+
+
+def follow(path: JointPath, scene: ReplayScene, config: ReplayConfig) -> States:
+    """Follow the joints exactly; no physics, so nothing is known of objects that can move."""
+    count = int(np.ceil(path.end_ns() * 1e-9 * config.sample_rate_hz)) + 1
+    stamps: Int[np.ndarray, " num_steps"] = (
+        np.linspace(0, path.end_ns(), count).round().astype(np.int64)
+    )
+    still: dict[str, Float[np.ndarray, "num_steps 4 4"]] = {
+        name: np.repeat(T[None], count, axis=0) for name, T in scene.containers().items()
+    }
+    return States(
+        stamps_ns=stamps,
+        joints_rad=path.joints_at(stamps),
+        width_m=path.width_at(stamps),
+        Ts_base_object=still,
+        finger_contact={},
+    )
+
+
+def _pre_grasp(monitor: ClearanceMonitor, path: JointPath, config: ReplayConfig) -> None:
+    times = path.dense_times_ns(config.path_step_s)
+    if path.first_close_ns is not None:
+        times = times[times < path.first_close_ns]
+    for t_ns, joints, width in zip(times, path.joints_at(times), path.width_at(times), strict=True):
+        monitor.check_pre_grasp(int(t_ns), joints, float(width))
+
+
+def _undecided(plan: Plan, trajectory: str, config: ReplayConfig, scene: ReplayScene) -> Verdict:
+    open_factor = Factor(value=None)
+    return Verdict(
+        plan_id=plan.id,
+        trajectory=trajectory,
+        mode=config.mode,
+        ik=open_factor,
+        clearance=open_factor,
+        terminal=open_factor,
+        engine=engine_of(scene.task, config),
+        seed=config.seed,
+        scene_hash=scene.scene_hash,
+        calibration_id=scene.calibration_id,
+    )
+
+
+def engine_of(task: Task, config: ReplayConfig) -> str:
+    """Name what moved things: a grasp that is no friction grasp is part of the name."""
+    if config.mode == "kinematic":
+        return KINEMATIC_ENGINE
+    soft = f"+{SOFT_ENGINE}" if task.soft_objects else ""
+    return f"{ENGINE_VERSION}{soft}{'+attach' if config.grasp == 'attach' else ''}"
+
+
+def _clearance_undecided(
+    scene: ReplayScene, unreachable_ns: int | None, states: States
+) -> str | None:
+    if states.burst is not None:
+        return f"known only until {states.burst.object_id} burst"
+    if unreachable_ns is not None:
+        return f"known only up to the unreachable pose at {unreachable_ns * 1e-9:.2f} s"
+    if scene.missing():
+        return scene.describe_missing()
+    return None

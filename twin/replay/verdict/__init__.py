@@ -1,1 +1,0 @@
-"""One trajectory replayed and judged: I(tau)."""

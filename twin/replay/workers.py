@@ -1,0 +1,426 @@
+"""The same work on a Ray cluster, which is never spoken to without a token.
+
+Ray 2.60 without a token runs anybody's code, and its control service listens on every interface
+even where a loopback address was asked for (measured), so a cluster without one is refused.
+"""
+
+import ipaddress
+import os
+import secrets
+import socket
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any, Generic, Protocol, runtime_checkable
+
+from bridge.episode import provenance
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError, MissingDependencyError, UsageError
+from bridge.terminal import Output
+from twin.crew.pool import (
+    ATTEMPTS,
+    Alone,
+    Answer,
+    Crew,
+    Failed,
+    Function,
+    Item,
+    Runner,
+    default_size,
+    do,
+    lost,
+)
+from twin.errors import TwinError
+from twin.replay.config import ReplayRunConfig
+
+# --- Pieces of work put together into tasks, where each task costs something beside its work.
+#
+# A task of Ray costs processors some 10 ms (measured), which many short pieces together save;
+# single pieces at the end keep all processors busy (guided self-scheduling; Polychronopoulos and
+# Kuck 1987).
+
+TASK_S = 2.0
+"""About as long as a task may take; a piece that takes longer is a task of its own."""
+SHARE = 4
+"""A task takes so many times less than a processor's part of what is left."""
+
+
+class Batches(Generic[Item]):
+    """What is to be done, the longest first, by tasks whose length it learns from those before."""
+
+    def __init__(
+        self, items: Sequence[Item], cost: Callable[[Item], float], processors: int
+    ) -> None:
+        """Have everything to do.
+
+        Args:
+            items: The pieces.
+            cost: How long one takes, in any unit.
+            processors: Among which they are shared.
+        """
+        self._cost = cost
+        self._shares = SHARE * processors
+        self._todo = deque(sorted(items, key=cost, reverse=True))
+        self._alone: deque[Item] = deque()
+        self._spent_s = self._done_cost = 0.0
+
+    def __bool__(self) -> bool:
+        """Whether something is left to take."""
+        return bool(self._todo or self._alone)
+
+    def take(self) -> list[Item]:
+        """Take the next task; alone what was lost, and what comes before any length is known."""
+        if self._alone:
+            return [self._alone.popleft()]
+        most_pieces = len(self._todo) // self._shares
+        most_cost = TASK_S * self._done_cost / self._spent_s if self._spent_s > 0 else 0.0
+        batch = [self._todo.popleft()]
+        total = self._cost(batch[0])
+        while len(batch) < most_pieces:
+            total += self._cost(self._todo[0])
+            if total > most_cost:
+                break
+            batch.append(self._todo.popleft())
+        return batch
+
+    def learn(self, batch: Sequence[Item], seconds: float) -> None:
+        """Remember how long a task took where it was done."""
+        self._spent_s += seconds
+        self._done_cost += sum(self._cost(item) for item in batch)
+
+    def again(self, batch: Sequence[Item]) -> None:
+        """Take each piece of a lost task once more, alone: one of them may be to blame."""
+        self._alone.extend(batch)
+
+
+LOCAL = "local"
+LOOPBACK = "127.0.0.1"
+WINDOW = 2
+"""Tasks per processor that are handed over before the first are back: one waits while one runs."""
+MODE, TOKEN, TOKEN_PATH = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
+NICENESS = "RAY_worker_niceness"
+"""Ray gives way to everything else on a machine (15) unless told otherwise."""
+HIDDEN_LINES = "RAY_DEDUP_LOGS_SKIP_REGEX"
+"""Ray tells of each lost process on standard output, in the middle of what a program reads there;
+what was lost is in the answers."""
+ENVIRONMENT = (MODE, TOKEN, TOKEN_PATH, NICENESS, HIDDEN_LINES)
+ANSWER_S = 5.0
+"""How long the head of a cluster may take to accept a connection."""
+LOOK_S, EMPTY_LOOKS = 60.0, 5
+"""How often a cluster from which nothing comes is asked for its processors, and how often it may
+have none: one that makes nodes when they are asked for needs some minutes."""
+TOKEN_FILE = Path(".ray") / "auth_token"
+"""Below the home folder; where Ray itself looks last."""
+
+
+class RayClusterError(TwinError):
+    """The cluster cannot be reached or used."""
+
+
+@runtime_checkable
+class NeedsPaths(Protocol):
+    """Work that reads and writes files by their path."""
+
+    def needed_paths(self) -> tuple[Path, ...]:
+        """What must be there."""
+
+
+class RayRunner:
+    """Does pieces of work as Ray tasks; see ``twin.crew.pool.Runner``."""
+
+    def __init__(self, address: str, workers: int) -> None:
+        """Connect later.
+
+        Args:
+            address: HOST:PORT of a running cluster, or local.
+            workers: Processors of a cluster started here.
+        """
+        self._address, self._workers = address, workers
+        self._ray: Any = None
+        self._first: list[Any] = []
+        self._before: dict[str, str | None] = {}
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+
+    def __enter__(self) -> "RayRunner":
+        """Connect, or start a cluster on the loopback address.
+
+        Raises:
+            MissingDependencyError: Without ray.
+            UsageError: Without a token, or with an address that is none.
+            RayClusterError: When nobody answers there, or not to our token.
+        """
+        self._before = {name: os.environ.get(name) for name in ENVIRONMENT}
+        if self._address == LOCAL:
+            # Ray leaves its logs behind, a hundred files for each start.
+            self._folder = tempfile.TemporaryDirectory(
+                prefix="gst-ray-", ignore_cleanup_errors=True
+            )
+        try:
+            self._ray = _connect(
+                self._address, self._workers, None if self._folder is None else self._folder.name
+            )
+        except BaseException:
+            self._restore()
+            raise
+        # Ray starts processes with the first tasks: they import while this process does.
+        first = self._ray.remote(num_cpus=1)(code_version)
+        self._first = [first.remote() for _ in range(self._processors())]
+        return self
+
+    def run(
+        self, function: Function, items: Sequence[Item], cost: Callable[[Item], float]
+    ) -> Iterator[tuple[Item, Answer | Failed]]:
+        """See ``Runner``. What shared a task with work that lost its node is done again alone.
+
+        Alone it is tried once more by Ray itself.
+        """
+        ray = self._ray
+        processors = self._processors()
+        task = ray.remote(num_cpus=1)(_tasks)
+        todo = Batches(items, cost, processors)
+        running: dict[Any, list[Item]] = {}
+        while todo or running:
+            while todo and len(running) < WINDOW * processors:
+                batch = todo.take()
+                retries = ATTEMPTS - 1 if len(batch) == 1 else 0
+                one = task.options(max_retries=retries)
+                running[one.remote(function, batch, code_version())] = batch
+            for reference in self._done(list(running)):
+                batch = running.pop(reference)
+                try:
+                    answers, seconds = ray.get(reference)
+                    todo.learn(batch, seconds)
+                except ray.exceptions.RayError as error:
+                    if len(batch) > 1:
+                        todo.again(batch)
+                        continue
+                    answers = [lost(f"Ray lost it: {_first_line(error)}")]
+                yield from zip(batch, answers, strict=True)
+
+    def _done(self, running: list[Any]) -> list[Any]:
+        """Wait until something is done.
+
+        Raises:
+            RayClusterError: When the cluster has had no processor for minutes.
+        """
+        empty = 0
+        while empty < EMPTY_LOOKS:
+            done, _ = self._ray.wait(running, num_returns=1, timeout=LOOK_S)
+            if done:
+                return list(done)
+            empty = 0 if self._ray.cluster_resources().get("CPU", 0) else empty + 1
+        message = (
+            f"the Ray cluster at {self._address} has had no processor for "
+            f"{LOOK_S * EMPTY_LOOKS / 60:.0f} minutes: all its nodes ended, or none was started "
+            "beside its head. What was done is kept. Start a node, then run the command again."
+        )
+        raise RayClusterError(message)
+
+    def _processors(self) -> int:
+        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
+    def __exit__(self, *_: object) -> None:
+        """Leave; a cluster started here ends, any other one goes on."""
+        if self._ray is not None:
+            self._first.clear()
+            self._ray.shutdown()
+            self._ray = None
+        self._restore()
+
+    def _restore(self) -> None:
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
+        for name, value in self._before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _connect(address: str, workers: int, folder: str | None) -> Any:
+    settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address == LOCAL:
+        os.environ[TOKEN] = _own_token()
+        os.environ.pop(TOKEN_PATH, None)
+        os.environ.setdefault(NICENESS, "0")  # as processes without Ray have
+        settings |= {"num_cpus": workers, "include_dashboard": False, "_temp_dir": folder}
+    else:
+        _check_token()
+        _check_somebody_listens(address)
+    if address == LOCAL or is_loopback(address):
+        # Otherwise Ray replaces the loopback address by the machine's own, where nobody answers.
+        settings["_node_ip_address"] = LOOPBACK
+    os.environ[MODE] = "token"
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault(HIDDEN_LINES, ".*")
+    try:
+        import ray  # noqa: PLC0415  # seconds, and only with --ray
+    except ImportError as error:
+        raise MissingDependencyError(package="ray", extra="cluster", purpose="--ray") from error
+    try:
+        ray.init(address=address, **settings)
+    except (ConnectionError, RuntimeError, ValueError, OSError, ray.exceptions.RayError) as error:
+        ray.shutdown()
+        message = (
+            f"no Ray cluster to use at {address}: {_first_line(error)}. It must have been started "
+            f"with {MODE}=token and the same token as here; see docs/scale.md."
+        )
+        raise RayClusterError(message) from error
+    return ray
+
+
+@cache
+def _own_token() -> str:
+    """The token of clusters started here: one for each process, which Ray reads only once."""
+    return secrets.token_hex(32)
+
+
+def _check_token() -> None:
+    """Refuse to speak to a cluster that lets anybody in.
+
+    Raises:
+        UsageError: When authentication is switched off, or there is no token to show.
+    """
+    if os.environ.get(MODE, "token") != "token":
+        message = f"{MODE} is {os.environ[MODE]!r}: --ray only speaks to a cluster with tokens."
+        raise UsageError(message)
+    if os.environ.get(TOKEN) or os.environ.get(TOKEN_PATH):
+        return
+    if not (Path.home() / TOKEN_FILE).is_file():
+        message = (
+            f"--ray needs the cluster's token: set {TOKEN_PATH} to the file that holds it "
+            f"(or put it at ~/{TOKEN_FILE}). docs/scale.md says how to make one."
+        )
+        raise UsageError(message)
+
+
+def _check_somebody_listens(address: str) -> None:
+    """Ray itself tries for minutes, and tells its tries to the terminal.
+
+    Raises:
+        UsageError: When it is no HOST:PORT.
+        RayClusterError: When nothing can be reached there.
+    """
+    host, _, port = address.rpartition(":")
+    host = host.strip("[]")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        message = f"--ray {address!r} is no address: give HOST:PORT of the head, or {LOCAL}."
+        raise UsageError(message)
+    try:
+        socket.create_connection((host, int(port)), timeout=ANSWER_S).close()
+    except OSError as error:
+        message = (
+            f"no Ray cluster to use at {address}: {_first_line(error)}. Start its head there: "
+            "ray start --head, with a token; see docs/scale.md."
+        )
+        raise RayClusterError(message) from error
+
+
+def is_loopback(address: str) -> bool:
+    """Say whether HOST:PORT can only be this machine."""
+    host = address.rpartition(":")[0].strip("[]") or address
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def code_version() -> str:
+    """What decides the bytes of a replay, besides its job."""
+    # A second, while which processes of a cluster start.
+    from twin.physics.engine import ENGINE_VERSION  # noqa: PLC0415
+    from twin.replay.job import REPLAY_VERSION  # noqa: PLC0415
+
+    about = provenance.software()
+    return f"{about['version']}, replays {REPLAY_VERSION}, {ENGINE_VERSION}"
+
+
+def _tasks(
+    function: Function, items: Sequence[Any], version: str
+) -> tuple[list[Answer | Failed], float]:
+    """Do pieces of work on some node, one after another, and say how long all took [s]."""
+    before = time.monotonic()
+    answers = [_task(function, item, version) for item in items]
+    return answers, time.monotonic() - before
+
+
+def _task(function: Function, item: Any, version: str) -> Answer | Failed:
+    """One piece of work on some node."""
+    problem = _out_of_place(item, version)
+    return do(function, item) if problem is None else Failed(message=problem, known=True)
+
+
+def _out_of_place(item: Any, version: str) -> str | None:
+    """Say in a sentence why a node cannot do a piece of work; None when it can."""
+    node = socket.gethostname()
+    if version != code_version():
+        return (
+            f"node {node} runs robot-gst {code_version()}, not {version} as here: install the same "
+            "version on every node"
+        )
+    paths = item.needed_paths() if isinstance(item, NeedsPaths) else ()
+    for path in paths:
+        if not path.exists():
+            return (
+                f"node {node} does not see {path}: every node reads and writes the run folder "
+                "under the same path, so share it between them"
+            )
+    return None
+
+
+def _first_line(error: BaseException) -> str:
+    if isinstance(error, GstError):
+        return str(error)
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return (lines[0] if lines else type(error).__name__).rstrip(".")
+
+
+# --- Open what does the work, and import what the work needs while that starts.
+
+
+def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[str, Any]:
+    """Replay all trial episodes of a run on what the settings ask for.
+
+    See ``twin.replay.runner.replay_trajectories``, and what ``runner_for`` raises.
+
+    Raises:
+        UsageError: When the folder is no run.
+    """
+    if not run.episodes_dir.is_dir():
+        message = (
+            f"{run.path} is not a run: it holds no folder episodes. "
+            "Give the folder that episodes/ lies in."
+        )
+        raise UsageError(message)
+    with runner_for(config) as runner:
+        # A second, in which a cluster starts its processes.
+        from twin.replay.runner import replay_trajectories  # noqa: PLC0415
+
+        return replay_trajectories(run, config, output, runner)
+
+
+@contextmanager
+def runner_for(config: ReplayRunConfig) -> Iterator[Runner]:
+    """Open what does the work: this process, several, or a Ray cluster.
+
+    Raises:
+        UsageError: When Ray has no token to show.
+        TwinError: When the cluster cannot be reached.
+    """
+    workers = config.workers or default_size()
+    runner: Runner = Alone()
+    if config.ray:
+        # noqa: PLC0415  # an extra
+
+        runner = RayRunner(config.ray, workers)
+    elif workers > 1:
+        runner = Crew(workers)
+    with runner:
+        yield runner
