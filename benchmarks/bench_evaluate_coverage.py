@@ -22,18 +22,13 @@ CHOSEN = [name for name in os.environ.get("COVERAGE_METHODS", "").split(",") if 
 if DRAWS != FULL_DRAWS or CHOSEN:  # a number that proves nothing does not replace one that does
     os.environ.setdefault("GST_BENCH_RESULTS", str(ROOT / "build" / "quick_results"))
 
-from evaluator.statistics import (  # noqa: E402
-    bootstrap,
-    correlation,
-    paired,
-    proportion,
-    proxy,
-    sequential,
-    unpaired,
-)
-from evaluator.statistics.coverage import exact, lengths, simulate, stored  # noqa: E402
-from evaluator.statistics.coverage.population import CLUSTERED, POPULATIONS  # noqa: E402
-from evaluator.statistics.coverage.simulate_cells import (  # noqa: E402
+from evaluator.statistics import agreement as agreement_module
+from evaluator.statistics import bootstrap, intervals, prediction_powered, sequential
+from evaluator.statistics import differences as differences_module
+from evaluator.statistics.coverage import exact, simulate, stored
+from evaluator.statistics.coverage.simulate import (  # noqa: E402
+    CLUSTERED,
+    POPULATIONS,
     of_agreement,
     of_remeasurements,
 )
@@ -77,17 +72,19 @@ def exact_methods() -> dict[str, Callable[[], dict[str, Any]]]:
         return entry("exact", TWO_RATES, "pairs", points)
 
     def medians() -> dict[str, Any]:
-        points = [lengths.of_median(n) for n in ALL_N if n >= 6]
+        points = [exact.of_median(n) for n in ALL_N if n >= 6]
         return entry("exact", "any continuous distribution", "values", points)
 
     return {
-        "wilson": partial(rates, proportion.wilson),
-        "clopper-pearson": partial(rates, proportion.clopper_pearson),
-        "jeffreys": partial(rates, proportion.jeffreys),
+        "wilson": partial(rates, intervals.wilson),
+        "clopper-pearson": partial(rates, intervals.clopper_pearson),
+        "jeffreys": partial(rates, intervals.jeffreys),
         "betting": partial(rates, sequential.betting_interval),
-        "newcombe-10": partial(differences, unpaired.newcombe_difference),
-        "clopper-pearson-difference": partial(differences, unpaired.guaranteed_difference),
-        "tango": partial(pairs, paired.tango_difference),
+        "newcombe-10": partial(differences, differences_module.newcombe_difference),
+        "clopper-pearson-difference": partial(
+            differences, differences_module.guaranteed_difference
+        ),
+        "tango": partial(pairs, differences_module.tango_difference),
         "order-statistics": medians,
     }
 
@@ -114,8 +111,8 @@ def simulated_methods() -> dict[str, Callable[[], dict[str, Any]]]:
     def means() -> dict[str, Any]:
         rng = np.random.default_rng(SEED)
         make, draws = bootstrap.student_interval, 10 * DRAWS
-        points = [lengths.of_mean(make, n, draws=draws, rng=rng) for n in LENGTHS]
-        over = "; ".join(population.name for population in lengths.POPULATIONS)
+        points = [exact.of_mean(make, n, draws=draws, rng=rng) for n in LENGTHS]
+        over = "; ".join(population.name for population in exact.POPULATIONS)
         return entry(f"simulated, {draws} draws of each distribution", over, "values", points)
 
     return {
@@ -158,7 +155,7 @@ def families() -> dict[str, Callable[[], dict[str, dict[str, Any]]]]:
 
 
 def fisher(cells: simulate.Cells, per_cluster: int, rng: np.random.Generator) -> Any:
-    return correlation.fisher_interval(correlation.pearson(*cells), len(cells[0]))
+    return agreement_module.fisher_interval(agreement_module.pearson(*cells), len(cells[0]))
 
 
 def student(cells: simulate.Cells, per_cluster: int, rng: np.random.Generator) -> Any:
@@ -167,7 +164,7 @@ def student(cells: simulate.Cells, per_cluster: int, rng: np.random.Generator) -
 
 
 def post_stratified(pairs: Any, sim_k: int, sim_n: int) -> Any:
-    return proxy.post_stratified(pairs, sim_k, sim_n).interval
+    return prediction_powered.post_stratified(pairs, sim_k, sim_n).interval
 
 
 def ppi(pairs: Any, sim_k: int, sim_n: int) -> Any:
@@ -175,7 +172,7 @@ def ppi(pairs: Any, sim_k: int, sim_n: int) -> Any:
     real += [True] * pairs.false_negative + [False] * pairs.true_negative
     said = [1.0] * pairs.said_success + [0.0] * pairs.said_failure
     alone = [1.0] * sim_k + [0.0] * (sim_n - sim_k)
-    return proxy.ppi_plus_plus(real, said, alone).interval
+    return prediction_powered.ppi_plus_plus(real, said, alone).interval
 
 
 def everything() -> dict[str, Callable[[], dict[str, dict[str, Any]]]]:

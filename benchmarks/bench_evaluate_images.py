@@ -57,10 +57,10 @@ def ssim_row(pairs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[list[Target], 
     import torch
     from torchmetrics.functional.image import structural_similarity_index_measure as their_ssim
 
-    from evaluator.compare.parallel import spread
+    from evaluator.compare.images.scores import spread
     from evaluator.metrics.image import as_float
-    from evaluator.metrics.scores import score_image
-    from evaluator.metrics.similarity import ssim, ssim_maps
+    from evaluator.metrics.image_scores import score_image
+    from evaluator.metrics.ssim import ssim, ssim_maps
 
     def theirs(batch: int) -> list[float]:
         found = []
@@ -119,7 +119,7 @@ def effects() -> dict[str, dict[str, float]]:
     from record.frames import native_frames
     from scipy.ndimage import gaussian_filter
 
-    from evaluator.compare.variants import score_variants
+    from evaluator.compare.images.scores import score_variants
 
     image = native_frames(1)[0][0] / 255.0
     rng = np.random.default_rng(0)

@@ -113,9 +113,9 @@ def evaluate(run: RunFolder) -> Ran:
 
 def outcomes(run: RunFolder, processes: int | None = None) -> Spent:
     """Hash and read all outcomes, nothing kept; on all cores unless told otherwise."""
-    from evaluator.compare.cache import SummaryCache
-    from evaluator.compare.contents import read_contents
-    from evaluator.compare.workers import Workers
+    from evaluator.cache import SummaryCache
+    from evaluator.run_reader.contents import read_contents
+    from evaluator.workers import Workers
 
     def read() -> None:
         with Workers(processes) as workers:
@@ -126,10 +126,10 @@ def outcomes(run: RunFolder, processes: int | None = None) -> Spent:
 
 def motions(run: RunFolder) -> Spent:
     """Compare motions and final states of all trials in this process, nothing kept."""
-    from evaluator.compare.cache import SummaryCache
-    from evaluator.compare.contents import read_contents
+    from evaluator.cache import SummaryCache
     from evaluator.compare.run import trials_of
     from evaluator.compare.summaries import sum_up
+    from evaluator.run_reader.contents import read_contents
 
     cache = SummaryCache(None)
     trials, _ = trials_of(read_contents(run, cache, QUIET))

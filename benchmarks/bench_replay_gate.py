@@ -168,7 +168,7 @@ def said_of(verdict: dict[str, Any], name: str) -> bool | None:
 
 def tables(label: str, pairs: Sequence[tuple[bool | None, bool]]) -> tuple[list[Target], dict]:
     """Predictive values with intervals, and what they are compared with."""
-    from evaluator.statistics.proportion import wilson
+    from evaluator.statistics.intervals import wilson
 
     yes = [truth for said, truth in pairs if said is True]
     no = [truth for said, truth in pairs if said is False]

@@ -16,7 +16,6 @@ from starlette.staticfiles import StaticFiles
 
 from bridge.errors import GstError
 from dashboards import wording
-from dashboards.clock import PageClock
 from dashboards.comparison import judge
 from dashboards.episode_page import build_page
 from dashboards.errors import NotHereError
@@ -24,7 +23,7 @@ from dashboards.frames import read_frame
 from dashboards.guard import Admission, Guard
 from dashboards.library import Library, derived_path, episode_path
 from dashboards.overview_page import Selection, build_overview, neighbours
-from dashboards.recording import read_recording
+from dashboards.recording import PageClock, read_recording
 from dashboards.twin_page import build_twin, view_image
 
 HERE = Path(__file__).parent

@@ -7,8 +7,8 @@ from threading import Lock
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, PathNotFoundError
+from evaluator.cache import FOLDER, SummaryCache
 from evaluator.compare import Comparison, TrialRow, compare_run
-from evaluator.compare.cache import FOLDER, SummaryCache
 from evaluator.result import Measurement, Results, load_results
 
 _ASKING = Lock()

@@ -1,24 +1,345 @@
 """What the episode page shows, gathered from one recorded episode and its replays."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.metadata import Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.streams import JointTrack
 from bridge.task.plan import Plan
 from bridge.task.verdict import Factor, Verdict
-from dashboards import episode_plots
-from dashboards.clock import PageClock
 from dashboards.comparison import agrees
-from dashboards.figures import StageChart, TimePlot
+from dashboards.figures import Signal, Span, StageChart, TimePlot, stage_chart, time_plot
 from dashboards.frames import CameraTrack
 from dashboards.library import derived_paths, episode_path
-from dashboards.recording import Problems, Recording, read_recording
+from dashboards.recording import PageClock, Problems, Recording, read_recording
 from evaluator.compare import TrialRow
+
+# --- Signals of an episode and its replays, laid out over the page's time.
+
+RECORDED, PLANNED = "recorded", "planned"
+REPLAY_STYLES = {"planned": "twin-planned", "executed": "twin-executed"}
+LEAST_SPAN = {"m": 0.02, "mm": 5.0, "rad": 0.05}
+"""A value axis covers at least this much of its unit."""
+MARGIN_SETTING = "eps_col_m"
+"""The replay setting that holds the safety distance."""
+
+
+def episode_stages(
+    recording: Recording, clock: PageClock, failure_t_s: float | None
+) -> StageChart | None:
+    """Draw planned stages, recorded stages, and marks for failure, replanning and gripper."""
+    marks = [
+        (clock.seconds(event["stamp_ns"]), "replan", "replan")
+        for event in recording.events
+        if event["type"] == "replan"
+    ]
+    if failure_t_s is not None:
+        marks.append((failure_t_s, "first failure in the twin", "failure"))
+    return stage_chart(
+        [
+            ("planned", _planned_stages(recording, clock)),
+            ("recorded", _recorded_stages(recording, clock)),
+        ],
+        marks,
+        span_s=clock.span_s,
+    )
+
+
+def _planned_stages(recording: Recording, clock: PageClock) -> list[Span]:
+    spans = []
+    for _, plan in recording.plans:
+        for index, stage in enumerate(plan.stages):
+            start = clock.of_plan_time(plan.id, stage.t_start_ns)
+            end = clock.of_plan_time(plan.id, stage.t_end_ns)
+            if start is None or end is None:
+                continue
+            title = f"{stage.id}: {stage.text} ({start:.2f} s to {end:.2f} s, plan {plan.id})"
+            spans.append(
+                Span(
+                    start_s=start,
+                    end_s=end,
+                    label=stage.id,
+                    style=f"stage-{index % 4}",
+                    title=title,
+                )
+            )
+    return spans
+
+
+def _recorded_stages(recording: Recording, clock: PageClock) -> list[Span]:
+    order = {
+        stage.id: index for _, plan in recording.plans for index, stage in enumerate(plan.stages)
+    }
+    spans = []
+    begun: dict[str, float] = {}
+    for event in recording.events:
+        stage_id = str(event.get("stage_id"))
+        if event["type"] == "stage_started":
+            begun[stage_id] = clock.seconds(event["stamp_ns"])
+        elif event["type"] == "stage_ended" and stage_id in begun:
+            spans.append(
+                Span(
+                    start_s=begun.pop(stage_id),
+                    end_s=clock.seconds(event["stamp_ns"]),
+                    label=stage_id,
+                    style=f"stage-{order.get(stage_id, 0) % 4}",
+                )
+            )
+    return spans
+
+
+def main_plots(
+    recording: Recording,
+    replays: Sequence[Recording],
+    sent_plan: Plan | None,
+    row: TrialRow | None,
+    clock: PageClock,
+) -> tuple[TimePlot, ...]:
+    """Tool error, tool position, gripper, clearance and objects; only those that have data."""
+    shown = _shown_replays(replays, sent_plan)
+    plots = [_error_plot(row, clock)]
+    plots.append(_clearance_plot(shown, clock))
+    plots += [_tool_plot(recording, shown, axis, clock) for axis in range(3)]
+    plots.append(_width_plot(recording, shown, clock))
+    plots += _object_plots(shown, clock)
+    return tuple(plot for plot in plots if plot is not None)
+
+
+def _shown_replays(replays: Sequence[Recording], sent_plan: Plan | None) -> dict[str, Recording]:
+    """Pick one planned and one executed replay of the sent plan: dynamic, and the last made."""
+    chosen: dict[str, Recording] = {}
+    for replay in replays:
+        derived = replay.derived
+        if derived is None or derived.trajectory is None or sent_plan is None:
+            continue
+        if derived.plan_id not in (None, sent_plan.id):
+            continue
+        if derived.mode == "dynamic" or derived.trajectory not in chosen:
+            chosen[derived.trajectory] = replay
+    return dict(sorted(chosen.items(), reverse=True))
+
+
+def _error_plot(row: TrialRow | None, clock: PageClock) -> TimePlot | None:
+    if row is None or row.plan_id is None:
+        return None
+    start = clock.of_plan_time(row.plan_id, 0)
+    if start is None:
+        return None
+    signals = [
+        Signal(
+            name=f"to twin, {series.against}",
+            style=REPLAY_STYLES.get(series.against, "twin-executed"),
+            t_s=series.t_s + start,
+            values=1000 * series.position_m,
+        )
+        for series in row.tcp_errors
+    ]
+    return time_plot(
+        "Tool: recorded to replayed distance",
+        "mm",
+        signals,
+        span_s=clock.span_s,
+        level=0.0,
+        least_span=LEAST_SPAN["mm"],
+        note="computed by the evaluator",
+    )
+
+
+def _tool_plot(
+    recording: Recording, shown: dict[str, Recording], axis: int, clock: PageClock
+) -> TimePlot | None:
+    signals = [_plan_signal(recording, clock, lambda plan: plan.positions_m()[:, axis])]
+    for trajectory, replay in shown.items():
+        if replay.tcp is not None:
+            signals.append(
+                _replay_signal(
+                    trajectory, replay, replay.tcp.stamps_ns, replay.tcp.p_m[:, axis], clock
+                )
+            )
+    if recording.tcp is not None:
+        signals.append(
+            Signal(
+                name="recorded",
+                style=RECORDED,
+                t_s=clock.all_seconds(recording.tcp.stamps_ns),
+                values=recording.tcp.p_m[:, axis],
+            )
+        )
+    return _plot(f"Tool {'xyz'[axis]}", "m", signals, clock)
+
+
+def _width_plot(
+    recording: Recording, shown: dict[str, Recording], clock: PageClock
+) -> TimePlot | None:
+    def widths(plan: Plan) -> np.ndarray:
+        return np.array([np.nan if w.width_m is None else 1000 * w.width_m for w in plan.tau])
+
+    signals = [_plan_signal(recording, clock, widths)]
+    for trajectory, replay in shown.items():
+        if replay.widths is not None:
+            track = replay.widths
+            signals.append(
+                _replay_signal(
+                    trajectory, replay, track.stamps_ns, 1000 * track.position[:, 0], clock
+                )
+            )
+    if recording.widths is not None:
+        signals.append(_track_signal(recording.widths, 0, clock, scale=1000.0))
+    return _plot("Gripper opening", "mm", signals, clock)
+
+
+def _clearance_plot(shown: dict[str, Recording], clock: PageClock) -> TimePlot | None:
+    signals: list[Signal | None] = []
+    margin = None
+    for trajectory, replay in shown.items():
+        if replay.clearance is None:
+            continue
+        track = replay.clearance
+        signals.append(
+            _replay_signal(trajectory, replay, track.stamps_ns, 1000 * track.position[:, 0], clock)
+        )
+        margin = _margin_m(replay) if margin is None else margin
+    return _plot(
+        "Smallest clearance in the twin",
+        "mm",
+        signals,
+        clock,
+        level=0.0 if margin is None else 1000 * margin,
+        level_label="contact" if margin is None else "safety distance",
+    )
+
+
+def _margin_m(replay: Recording) -> float | None:
+    settings = replay.derived.settings if replay.derived else {}
+    nested = [value for value in settings.values() if isinstance(value, dict)]
+    for group in (settings, *nested):
+        value = group.get(MARGIN_SETTING)
+        if isinstance(value, int | float):
+            return float(value)
+    return None
+
+
+def _object_plots(shown: dict[str, Recording], clock: PageClock) -> list[TimePlot | None]:
+    names = dict.fromkeys(name for replay in shown.values() for name in replay.objects)
+    plots = []
+    for name in names:
+        signals = [
+            _replay_signal(
+                trajectory,
+                replay,
+                replay.objects[name].stamps_ns,
+                1000 * replay.objects[name].p_m[:, 2],
+                clock,
+            )
+            for trajectory, replay in shown.items()
+            if name in replay.objects
+        ]
+        moving = any(s is not None and np.ptp(s.values) > 1e-6 for s in signals)
+        if moving:
+            plots.append(_plot(f"Height of {name} in the twin", "mm", signals, clock))
+    return plots
+
+
+def plots_of_joints(recording: Recording, clock: PageClock) -> tuple[TimePlot, ...]:
+    """Draw one small plot per joint: planned and recorded."""
+    track = recording.joints
+    names = track.names if track is not None else _planned_joint_names(recording)
+    plots = []
+    for index, name in enumerate(names):
+        signals = [_plan_joint_signal(recording, clock, name)]
+        if track is not None:
+            signals.append(_track_signal(track, index, clock))
+        title = name.removesuffix("_joint").replace("_", " ")
+        plots.append(_plot(title, "rad", signals, clock, width=370, height=150))
+    return tuple(plot for plot in plots if plot is not None)
+
+
+def _planned_joint_names(recording: Recording) -> tuple[str, ...]:
+    return next((plan.joint_names for _, plan in recording.plans if plan.joint_names), ())
+
+
+def _plan_joint_signal(recording: Recording, clock: PageClock, name: str) -> Signal | None:
+    def joint(plan: Plan) -> np.ndarray:
+        if name not in plan.joint_names:
+            return np.full(len(plan.tau), np.nan)
+        column = plan.joint_names.index(name)
+        return np.array(
+            [np.nan if w.joints_rad is None else w.joints_rad[column] for w in plan.tau]
+        )
+
+    return _plan_signal(recording, clock, joint)
+
+
+def _plan_signal(
+    recording: Recording, clock: PageClock, values_of: Callable[[Plan], np.ndarray]
+) -> Signal | None:
+    """Join what every executed plan commanded, with a gap between two plans."""
+    times, values = [], []
+    for _, plan in recording.plans:
+        start = clock.of_plan_time(plan.id, 0)
+        if start is None or not plan.tau:
+            continue
+        times += [plan.times_ns() * 1e-9 + start, np.array([np.nan])]
+        values += [values_of(plan), np.array([np.nan])]
+    if not times:
+        return None
+    return Signal(
+        name="commanded", style=PLANNED, t_s=np.concatenate(times), values=np.concatenate(values)
+    )
+
+
+def _track_signal(track: JointTrack, column: int, clock: PageClock, scale: float = 1.0) -> Signal:
+    return Signal(
+        name="recorded",
+        style=RECORDED,
+        t_s=clock.all_seconds(track.stamps_ns),
+        values=scale * track.position[:, column],
+    )
+
+
+def _replay_signal(
+    trajectory: str,
+    replay: Recording,
+    stamps_ns: np.ndarray,
+    values: np.ndarray,
+    clock: PageClock,
+) -> Signal | None:
+    t_s = clock.replay_seconds(replay, stamps_ns)
+    if t_s is None:
+        return None
+    style = REPLAY_STYLES.get(trajectory, "twin-executed")
+    return Signal(name=f"twin, {trajectory}", style=style, t_s=t_s, values=values)
+
+
+def _plot(
+    title: str,
+    unit: str,
+    signals: Sequence[Signal | None],
+    clock: PageClock,
+    *,
+    level: float | None = None,
+    level_label: str = "",
+    width: int = 560,
+    height: int = 190,
+) -> TimePlot | None:
+    return time_plot(
+        title,
+        unit,
+        [signal for signal in signals if signal is not None],
+        span_s=clock.span_s,
+        level=level,
+        level_label=level_label,
+        least_span=LEAST_SPAN[unit],
+        width=width,
+        height=height,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,9 +445,9 @@ def build_page(
         agrees=None if row is None else agrees(row),
         verdicts=verdicts,
         gated=any(view.title == GATE_BEFORE and view.of_sent_plan for view in verdicts),
-        stages=episode_plots.stages(recording, clock, failure_t_s),
-        plots=episode_plots.main_plots(recording, replays, sent_plan, row, clock),
-        joint_plots=episode_plots.joint_plots(recording, clock),
+        stages=episode_stages(recording, clock, failure_t_s),
+        plots=main_plots(recording, replays, sent_plan, row, clock),
+        joint_plots=plots_of_joints(recording, clock),
         cameras=tuple(_camera(track, clock, cursor) for track in recording.cameras.values()),
         events=tuple(_event(event, clock) for event in recording.events),
         clock=clock,

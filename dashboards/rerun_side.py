@@ -12,8 +12,8 @@ from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from dashboards.recording import Recording
+from dashboards.rerun_entities import log_object, model_of
 from dashboards.rerun_file import RerunFile
-from dashboards.rerun_scene import log_object, model_of
 from dashboards.wording import factor_word, verdict_word
 
 GOOD, WARN = "INFO", "WARN"

@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Int32
 
-from evaluator.packed import Packed, packed
+from evaluator.memory import Packed, packed
 
 TEXT, WHOLE, NUMBER, ANSWER = pa.string(), pa.int64(), pa.float64(), pa.bool_()
 """Column types in which unknown is null, never "", 0, NaN or False."""

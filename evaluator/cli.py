@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from bridge.terminal import Output
-from evaluator.collecting import without_collecting
 from evaluator.live.config import LiveConfig
-from evaluator.metrics.options import ImageOptions
+from evaluator.memory import without_collecting
+from evaluator.metrics.image_protocol import ImageOptions
 
 if TYPE_CHECKING:
     from evaluator.compare import Comparison
@@ -107,8 +107,8 @@ def _compare(
 ) -> "tuple[Comparison, Path]":
     from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError
+    from evaluator.cache import FOLDER, SummaryCache
     from evaluator.compare import compare_csv, compare_run
-    from evaluator.compare.cache import FOLDER, SummaryCache
 
     beside = source.with_name(f"{source.stem}_results") if source.name else Path("results")
     is_table = not source.is_dir() and source.suffix.lower() in (".csv", ".json")
@@ -141,7 +141,7 @@ def _follow(source: Path | None, live: LiveConfig, goal: float | None, output: O
 
 def _compare_images(images: ImageOptions) -> "tuple[Comparison, Path]":
     """Compare renders with a folder of recorded images, without any run."""
-    from evaluator.compare.renders import compare_folders
+    from evaluator.compare.images.renders import compare_folders
 
     comparison = compare_folders(images)
     return comparison, Path(f"{comparison.run}_results")

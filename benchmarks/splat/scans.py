@@ -65,7 +65,7 @@ class HeldOut:
 
 def held_out(run: RunFolder, record: Mapping[str, Any]) -> dict[str, HeldOut]:
     """By variant (raw, gain, pose_gain, static), as the evaluator scores them."""
-    from evaluator.compare.view_images import images_of, score_views
+    from evaluator.compare.images.scores import images_of, score_views
 
     still = {item["id"] for item in record["cameras"] if item["still"]}
     found: dict[str, list[tuple[float, float]]] = {}

@@ -14,7 +14,7 @@ from side_by_side import GAP_PX, write_rows
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.media.color import decode_color
-from evaluator.compare.view_images import RECORDED, RENDERED, read_images
+from evaluator.compare.images.scores import RECORDED, RENDERED, read_images
 
 FIRST, LAST = 0.12, 0.98
 """Where in the replayed time the first and the last row are, as fractions."""

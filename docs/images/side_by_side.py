@@ -14,7 +14,7 @@ from PIL import Image
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.media.color import decode_color
-from evaluator.compare.view_images import RECORDED, RENDERED, images_of, score_views
+from evaluator.compare.images.scores import RECORDED, RENDERED, images_of, score_views
 
 MAX_BYTES = 150_000
 GAP_PX = 4

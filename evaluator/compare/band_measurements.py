@@ -10,8 +10,7 @@ import numpy as np
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.compare.measure import interval_or_reason, measured, slug
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.trajectory_align import without_rigid_motion
-from evaluator.metrics.trajectory_bands import (
+from evaluator.metrics.trajectory import (
     MOVING_THRESHOLD_M,
     BandDistance,
     Repeatability,
@@ -20,9 +19,10 @@ from evaluator.metrics.trajectory_bands import (
     moving_part,
     path_distance_m,
     repeatability,
+    without_rigid_motion,
 )
 from evaluator.result import Interval, Measurement
-from evaluator.statistics.lengths import median_interval
+from evaluator.statistics.intervals import median_interval
 
 NO_INTERVAL = "the runs' own spread is the repeatability beside it"
 WHOLE = "whole recordings, waiting at their ends included"

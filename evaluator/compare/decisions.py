@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 
-from evaluator.compare.cell_intervals import sides, usable_cells
+from evaluator.compare.agreement import sides, usable_cells
 from evaluator.compare.measure import measured, proportion
 from evaluator.compare.rows import RateCell
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Measurement, Table
-from evaluator.statistics import agreement, correlation
-from evaluator.statistics.decision import Decision, choose, over_tasks, without_each
+from evaluator.statistics import agreement
+from evaluator.statistics.agreement import Decision, choose, over_tasks, without_each
 
 NO_SAMPLE = "the tasks are these, not a sample of others"
 
@@ -133,7 +133,7 @@ def _leave_one_out(usable: Sequence[RateCell]) -> tuple[Table, ...]:
         recorded, sim = sides(kept)
         bias = 100 * agreement.bias(recorded=recorded, sim=sim)
         try:
-            r: float | str = round(correlation.pearson(recorded, sim), 3)
+            r: float | str = round(agreement.pearson(recorded, sim), 3)
         except UndefinedStatisticError as error:
             r = f"undefined: {error.reason}"
         rows.append((task, len(kept), r, round(bias, 1)))

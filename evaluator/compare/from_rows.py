@@ -3,13 +3,19 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from evaluator.compare.cells import agreement_intervals, cell_agreement
+from evaluator.compare.agreement import agreement_intervals, cell_agreement
 from evaluator.compare.decisions import decisions
-from evaluator.compare.fewer import assisted_rates, sequences, stopping_table
-from evaluator.compare.gains import gain_tests, replanning_gains
+from evaluator.compare.gains import (
+    gain_tests,
+    pair_starts,
+    paired_gain,
+    replanning_gains,
+    start_distances,
+)
+from evaluator.compare.gate import agreement, gate_scorecard, reliability
 from evaluator.compare.measure import refuse_alike
-from evaluator.compare.pairing import pair_starts, paired_gain, start_distances
-from evaluator.compare.remarks import remarks, remarks_table
+from evaluator.compare.notes import notes, notes_table
+from evaluator.compare.prediction_powered import assisted_rates, sequences, stopping_table
 from evaluator.compare.rows import Comparison, RateCell, TrialRow, is_streamed
 from evaluator.compare.stages import failures_table, stage_results
 from evaluator.compare.success import (
@@ -20,6 +26,7 @@ from evaluator.compare.success import (
     rate_cells,
     side_rates,
     trials_in,
+    varied_sim,
 )
 from evaluator.compare.tables import (
     confusion_table,
@@ -28,8 +35,6 @@ from evaluator.compare.tables import (
     success_table,
     trials_table,
 )
-from evaluator.compare.varied import varied_sim
-from evaluator.compare.verdicts import agreement, gate_worth, reliability
 from evaluator.result import Exclusion, Measurement, Table
 
 
@@ -92,7 +97,7 @@ def _measure(rows: Sequence[TrialRow], method: str) -> _Found:
     cells = rate_cells(rows, rates, method=method)
     gains = replanning_gains(cells, method=method)
     pairs, unpaired = pair_starts(rows)
-    worth, worth_tables = gate_worth(rows)
+    worth, worth_tables = gate_scorecard(rows)
     kept, kept_tables = reliability(rows)
     again, again_tables = varied_sim(rows)
     stages, stage_tables, other_stages = stage_results(rows)
@@ -138,7 +143,7 @@ def _tables(
         *layout_table(cells, measurements, word),
         *gains_table(found.gains, word),
         *found.again_tables,
-        *remarks_table(remarks(cells, measurements)),
+        *notes_table(notes(cells, measurements)),
         *agreement_intervals(cells),
         confusion_table(rows, word),
         *found.gate_tables,

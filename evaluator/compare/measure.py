@@ -3,11 +3,64 @@
 import math
 import re
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
 
 from evaluator.errors import AlikeNamesError, UndefinedStatisticError
-from evaluator.result import Interval, Measurement
+from evaluator.result import Exclusion, Interval, Measurement, Table
 from evaluator.statistics.coverage.stored import Size, vouch
-from evaluator.statistics.proportion import RATE_INTERVALS
+from evaluator.statistics.intervals import RATE_INTERVALS
+
+# --- Numbers as tables show them: millimetres, degrees and milliseconds with two decimals.
+
+Item = TypeVar("Item")
+DEGREES = math.degrees(1.0)
+
+
+def millimetres(value_m: float | None) -> float | None:
+    """Return a length [mm]; None stays None, and so does what is no number."""
+    return _rounded(value_m, 1e3)
+
+
+def degrees(value_rad: float | None) -> float | None:
+    """Return an angle [deg]; None stays None, and so does what is no number."""
+    return _rounded(value_rad, DEGREES)
+
+
+def milliseconds(value_s: float | None) -> float | None:
+    """Return a duration [ms]; None stays None, and so does what is no number."""
+    return _rounded(value_s, 1e3)
+
+
+def millimetre_ends(interval: Interval | None) -> str | None:
+    """Return both ends of an interval of a length [mm]."""
+    if interval is None:
+        return None
+    return f"[{1e3 * interval.low:.1f}, {1e3 * interval.high:.1f}]"
+
+
+def average(items: Sequence[Item], read: Callable[[Item], float | None]) -> float | None:
+    """Return the mean of what is known; None when nothing is."""
+    values = [value for item in items if (value := read(item)) is not None]
+    return sum(values) / len(values) if values else None
+
+
+def _rounded(value: float | None, factor: float) -> float | None:
+    return None if value is None or not math.isfinite(value) else round(factor * value, 2)
+
+
+# --- What one part of a comparison found.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """Numbers, tables, and what could not enter them."""
+
+    measurements: tuple[Measurement, ...] = ()
+    tables: tuple[Table, ...] = ()
+    exclusions: tuple[Exclusion, ...] = ()
+    missing: tuple[str, ...] = ()
+
 
 Statistic = Callable[[], float | tuple[float, Interval | None]]
 

@@ -5,8 +5,9 @@ Recorded against the executed replay: how well kinematics and base calibration f
 the planned replay: what the twin's own arm made of the difference.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,17 +16,21 @@ from bridge.clock import NS_PER_S
 from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack
 from bridge.geometry.trajectory import PoseTrajectory
-from evaluator.compare.tracks import Tracks, read_tracks
+from evaluator.compare.measure import Part, average, degrees, measured, millimetres, milliseconds
 from evaluator.errors import UndefinedStatisticError
+from evaluator.memory import Packed, packed
 from evaluator.metrics.trajectory import (
     NORMALISED_SAMPLES,
     PoseErrors,
+    find_lag_s,
+    joint_errors,
     pose_errors,
     position_errors,
+    relative_errors,
+    without_rigid_motion,
 )
-from evaluator.metrics.trajectory_align import find_lag_s, without_rigid_motion
-from evaluator.metrics.trajectory_steps import joint_errors, relative_errors
-from evaluator.packed import Packed, packed
+from evaluator.result import Cell, Measurement, Table
+from evaluator.run_reader.tracks import Tracks, read_tracks
 
 SAME_CLOCK_NS = 2 * NS_PER_S
 """A replay whose stamps start this close to the execution uses the cell's clock."""
@@ -264,3 +269,226 @@ def _or_none(compute: Callable[[], float]) -> float | None:
         return compute()
     except UndefinedStatisticError:
         return None
+
+
+# --- How far recorded and replayed motions of the arm lie apart, summed up over trials.
+
+# --- Motion errors as tables: per task, over time, and where they are largest.
+
+Groups = Mapping[str, Sequence[MotionSummary]]
+"""By what the motions are held against: planned, executed, or twin."""
+OVER_TIME = range(0, 101, 10)
+"""Places on the curves that the table shows, in percent of the duration."""
+NUM_WORST = 3
+
+
+def cell_table(groups: Groups) -> Table:
+    """Means of each task and condition."""
+    rows: list[tuple[Cell, ...]] = []
+    for name, motions in groups.items():
+        cells: dict[tuple[str, str], list[MotionSummary]] = {}
+        for motion in motions:
+            cells.setdefault((motion.task, motion.condition), []).append(motion)
+        for task, condition in sorted(cells):
+            cell = cells[task, condition]
+            rows.append(
+                (
+                    task,
+                    condition.replace("_", " "),
+                    name,
+                    len(cell),
+                    millimetres(average(cell, lambda m: m.position_mean_m)),
+                    millimetres(average(cell, lambda m: m.end_point_m)),
+                    degrees(average(cell, lambda m: m.rotation_mean_rad)),
+                    milliseconds(average(cell, lambda m: m.lag_s)),
+                    millimetres(average(cell, lambda m: m.without_lag_mean_m)),
+                    millimetres(average(cell, lambda m: m.without_offset_mean_m)),
+                    degrees(average(cell, lambda m: m.joint_rms_rad)),
+                )
+            )
+    return Table(
+        id="motion",
+        title="Recorded, planned and executed motions",
+        columns=(
+            "task",
+            "condition",
+            "against",
+            "trials",
+            "mean distance (mm)",
+            "end point (mm)",
+            "mean angle (deg)",
+            "delay (ms)",
+            "without delay (mm)",
+            "without offset (mm)",
+            "joints, RMS (deg)",
+        ),
+        rows=tuple(rows),
+        note="Tool centre point, means over trials. Planned, executed: recorded against that "
+        "replay. Twin: executed against planned replay. Without delay: the recorded motion shifted "
+        "in time; without offset: laid over by a rigid motion too.",
+    )
+
+
+def over_time_table(groups: Groups) -> Table:
+    """Errors at eleven places of the execution."""
+    rows: list[tuple[Cell, ...]] = []
+    for name, motions in groups.items():
+        if not motions:
+            continue
+        tool = _stacked([motion.curve_m for motion in motions])
+        joints = _stacked([m.joint_curve_rad for m in motions if m.joint_curve_rad])
+        for place in OVER_TIME:
+            arm = degrees(float(joints[:, place].mean())) if len(joints) else None
+            mean = millimetres(float(tool[:, place].mean()))
+            largest = millimetres(float(tool[:, place].max()))
+            rows.append((name, place, len(tool), mean, largest, arm))
+    return Table(
+        id="motion_over_time",
+        title="Motion errors over time",
+        columns=(
+            "against",
+            "time (% of the execution)",
+            "trials",
+            "mean distance (mm)",
+            "largest (mm)",
+            "joints, mean of RMS (deg)",
+        ),
+        rows=tuple(rows),
+        note="From the first to the last instant that both sides of a trial know.",
+    )
+
+
+def _stacked(curves: Sequence[Packed]) -> Float[np.ndarray, "num_curves num_places"]:
+    """Stack curves of one length."""
+    flat = np.frombuffer(b"".join(curves), dtype=np.float64)
+    return flat.reshape(len(curves), -1) if curves else flat.reshape(0, 0)
+
+
+def worst_table(groups: Groups) -> Table:
+    """The trials with the largest distances."""
+    rows: list[tuple[Cell, ...]] = []
+    for name, motions in groups.items():
+        far = sorted(motions, key=lambda motion: -motion.position_max_m)[:NUM_WORST]
+        rows += [
+            (
+                name,
+                motion.episode,
+                motion.aligned_by,
+                millimetres(motion.position_max_m),
+                millimetres(motion.position_mean_m),
+                motion.joint_worst,
+                degrees(motion.joint_max_rad),
+            )
+            for motion in far
+        ]
+    return Table(
+        id="motion_worst",
+        title="The largest motion errors",
+        columns=(
+            "against",
+            "episode",
+            "aligned by",
+            "largest distance (mm)",
+            "mean distance (mm)",
+            "worst joint",
+            "its error (deg)",
+        ),
+        rows=tuple(rows),
+        note="The three trials with the largest distance.",
+    )
+
+
+Read = Callable[[MotionSummary], float | None]
+
+TWIN = "twin"
+MEANING = {
+    PLANNED: "recorded against the planned replay (what was commanded; the controller's tracking "
+    "error and delay)",
+    EXECUTED: "recorded against the executed replay (the joints the robot reported; kinematics and "
+    "base calibration)",
+    TWIN: "executed against planned replay (what reached the twin's objects differently)",
+}
+TOOL = "tool centre point"
+QUANTITIES: tuple[tuple[str, str, str, str, Read], ...] = (
+    ("position_mean_m", "m", TOOL, "mean distance over time", lambda s: s.position_mean_m),
+    ("position_max_m", "m", TOOL, "largest distance over time", lambda s: s.position_max_m),
+    ("end_point_m", "m", TOOL, "distance at the last common instant", lambda s: s.end_point_m),
+    ("rotation_mean_rad", "rad", TOOL, "mean angle over time", lambda s: s.rotation_mean_rad),
+    ("rotation_max_rad", "rad", TOOL, "largest angle over time", lambda s: s.rotation_max_rad),
+    ("end_point_rad", "rad", TOOL, "angle at the last common instant", lambda s: s.end_point_rad),
+    (
+        "lag_s",
+        "s",
+        TOOL,
+        "delay of least distance, a rigid motion apart",
+        lambda s: s.lag_s,
+    ),
+    (
+        "without_lag_mean_m",
+        "m",
+        TOOL,
+        "mean distance after that delay is taken out",
+        lambda s: s.without_lag_mean_m,
+    ),
+    (
+        "without_offset_mean_m",
+        "m",
+        TOOL,
+        "mean distance after delay and best rigid motion are taken out",
+        lambda s: s.without_offset_mean_m,
+    ),
+    (
+        "relative_mean_m",
+        "m",
+        TOOL,
+        "mean difference of what both do within one second",
+        lambda s: s.relative_mean_m,
+    ),
+    ("joint_rms_rad", "rad", "joints", "root mean square error", lambda s: s.joint_rms_rad),
+    ("joint_max_rad", "rad", "joints", "largest error of any joint", lambda s: s.joint_max_rad),
+)
+SHARED = "not computed: trials share one calibration"
+
+
+def motion_results(motions: Sequence[MotionSummary]) -> Part:
+    """Measure recorded against replayed motions, mean over trials, and their errors over time."""
+    if not motions:
+        reason = "no trial has both a recorded tool pose and a dynamic replay's"
+        return Part(missing=(f"motion errors: no data ({reason})",))
+    groups: dict[str, list[MotionSummary]] = {name: [] for name in MEANING}
+    for motion in motions:
+        groups[motion.against if motion.side == RECORDED else TWIN].append(motion)
+    found = [m for name, members in groups.items() for m in _measure(name, members)]
+    return Part(
+        measurements=tuple(found),
+        tables=(cell_table(groups), over_time_table(groups), worst_table(groups)),
+    )
+
+
+def _measure(name: str, motions: Sequence[MotionSummary]) -> list[Measurement]:
+    how = sorted({motion.aligned_by for motion in motions})
+    measurements = []
+    for quantity, unit, what, words, read in QUANTITIES:
+        known = [(m.episode, value) for m in motions if (value := read(m)) is not None]
+        measurements.append(
+            measured(
+                f"motion.{name}.{quantity}",
+                partial(_mean, [value for _, value in known], name),
+                unit=unit,
+                definition=f"{what}, {MEANING[name]}: {words}, mean over trials; aligned by "
+                f"{' or '.join(how) or 'stamps'}",
+                n=len(known),
+                counted="trial",
+                reason_without_interval=SHARED,
+                episodes=[episode for episode, _ in known],
+            )
+        )
+    return measurements
+
+
+def _mean(values: Sequence[float], name: str) -> float:
+    if not values:
+        raise UndefinedStatisticError(
+            statistic="motion error", reason=f"no trial knows it of {MEANING[name].split(' (')[0]}"
+        )
+    return float(np.mean(values))

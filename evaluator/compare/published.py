@@ -23,16 +23,15 @@ from bridge.exchange.trials_rates import (
     printed_rate,
     read_rate,
 )
-from evaluator.compare.cell_intervals import sides, usable_cells
+from evaluator.compare.agreement import sides, usable_cells
+from evaluator.compare.notes import notes_table
 from evaluator.compare.rates import compare_records
-from evaluator.compare.remarks import remarks_table
 from evaluator.compare.rows import Comparison, RateCell
 from evaluator.compare.success import WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Table
-from evaluator.statistics.agreement import bias, mean_rate, mmrv
-from evaluator.statistics.correlation import pearson, spearman
-from evaluator.statistics.proportion import relative_gain
+from evaluator.statistics.agreement import bias, mean_rate, mmrv, pearson, spearman
+from evaluator.statistics.intervals import relative_gain
 
 EXTRA = ("statistic", "printed")
 STATISTICS = (
@@ -120,7 +119,7 @@ def check_published(path: Path, *, method: str = "wilson") -> PublishedCheck:
     shown = [t for t in comparison.tables if t.id != "remarks"]
     old = [t.rows for t in comparison.tables if t.id == "remarks"]
     about += [(str(a), str(b)) for rows in old for a, b in rows]
-    tables = (_table(findings), *shown, *remarks_table(about))
+    tables = (_table(findings), *shown, *notes_table(about))
     return PublishedCheck(comparison=replace(comparison, tables=tables), findings=tuple(findings))
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
 from bridge.exchange.trials_rates import RateRecord, read_rates
-from evaluator.compare.cells import agreement_intervals, cell_agreement
+from evaluator.compare.agreement import agreement_intervals, cell_agreement
 from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import gain_tests, replanning_gains
 from evaluator.compare.measure import refuse_alike, slug, vouched_rate
-from evaluator.compare.remarks import remarks, remarks_table
+from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.rows import Comparison, RateCell
 from evaluator.compare.success import WITH, averages
 from evaluator.compare.tables import gains_table, layout_table, success_table
@@ -63,7 +63,7 @@ def compare_records(
             *gains_table(gains, word),
             *agreement_intervals(cells),
             *decision_tables,
-            *remarks_table(remarks(cells, measurements)),
+            *notes_table(notes(cells, measurements)),
         ),
         exclusions=tuple(left_out),
         missing=("trial-level agreement: a table of rates does not say which trial succeeded",),

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from evaluator.compare.band_measurements import BandCurve
+from evaluator.compare.images.scores import ViewQuality
 from evaluator.compare.motion import MotionSummary
 from evaluator.compare.states import StateSummary
-from evaluator.compare.view_quality import ViewQuality
 from evaluator.result import Exclusion, Measurement, Results, Table
 
 RECORDED_WORDS = {True: "stand-in", False: "real", None: "recorded"}

@@ -9,28 +9,27 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.exchange.trials_csv import trials_path
 from bridge.terminal import Output
+from evaluator.cache import SummaryCache
 from evaluator.compare.bands import BandReport, compare_bands
-from evaluator.compare.cache import SummaryCache
-from evaluator.compare.contents import ODD, RunContents, broken, read_contents
-from evaluator.compare.final_states import state_results
 from evaluator.compare.from_rows import compare_rows
-from evaluator.compare.imported import imported_rows
-from evaluator.compare.label_results import label_results
-from evaluator.compare.made_alike import replay_remarks
-from evaluator.compare.pairing import START_LIMIT_M
-from evaluator.compare.part import Part
-from evaluator.compare.remarks import with_remarks
-from evaluator.compare.renders import compare_renders
-from evaluator.compare.replays import DerivedIndex
+from evaluator.compare.gains import START_LIMIT_M
+from evaluator.compare.images.renders import compare_renders
+from evaluator.compare.images.views import ViewReport, compare_views
+from evaluator.compare.labels import label_results
+from evaluator.compare.measure import Part
+from evaluator.compare.motion import motion_results
+from evaluator.compare.notes import check_settings, with_notes
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
+from evaluator.compare.spreadsheet import imported_rows
+from evaluator.compare.states import state_results
 from evaluator.compare.summaries import sum_up
-from evaluator.compare.tracking import motion_results
 from evaluator.compare.trial import Trial, lay_out
-from evaluator.compare.views import ViewReport, compare_views
-from evaluator.compare.workers import Workers
+from evaluator.metrics.image_protocol import ImageOptions
 from evaluator.metrics.lpips import open_nets
-from evaluator.metrics.options import ImageOptions
 from evaluator.result import Exclusion
+from evaluator.run_reader.contents import ODD, RunContents, broken, read_contents
+from evaluator.run_reader.episodes import DerivedIndex
+from evaluator.workers import Workers
 
 Item = TypeVar("Item")
 AnyPart = Part | ViewReport | BandReport
@@ -93,7 +92,7 @@ def compare_run(
     )
     base = replace(
         base,
-        tables=with_remarks(base.tables, replay_remarks(trials, contents.derived)),
+        tables=with_notes(base.tables, check_settings(trials, contents.derived)),
     )
     missing = [] if rows else ["trials: the run holds no recorded trial"]
     base = replace(

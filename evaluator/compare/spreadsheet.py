@@ -1,10 +1,11 @@
 """A trials CSV, or another benchmark's results, into a ``Comparison``; a run's trials out again."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.exchange.benchmark_results import (
     POLARIS_COLUMNS,
@@ -12,16 +13,63 @@ from bridge.exchange.benchmark_results import (
     read_polaris,
     read_simpler,
 )
-from bridge.exchange.trials_csv import TrialRecord, header_of, read_trials
+from bridge.exchange.trials_csv import TrialRecord, header_of, read_trials, trials_path
 from bridge.exchange.trials_stream import count_trials
 from evaluator.compare.from_rows import compare_rows
-from evaluator.compare.imported import row_from_record
+from evaluator.compare.notes import with_notes
 from evaluator.compare.published import check_published
 from evaluator.compare.rates import compare_rates
-from evaluator.compare.remarks import with_remarks
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.success import trials_in
 from evaluator.result import Exclusion
+
+# --- Trials that were kept in a spreadsheet and brought into the run (``import trials``).
+
+
+def row_from_record(record: TrialRecord) -> TrialRow:
+    """Turn one line of a trials CSV into a trial row."""
+    return TrialRow(
+        episode=record.trial_id,
+        task=record.task,
+        condition=record.condition,
+        policy=record.policy,
+        start_id=record.start_id,
+        cell=record.cell,
+        stand_in=record.stand_in,
+        recorded=record.recorded,
+        unit=record.unit,
+        k=record.k,
+        n=record.n,
+        sim_planned=record.sim_planned,
+        sim_executed=record.sim_executed,
+        verdict=record.verdict,
+        p_success=record.p_success,
+    )
+
+
+def imported_rows(
+    run: RunFolder, recorded_ids: Container[str]
+) -> tuple[list[TrialRow], list[Exclusion]]:
+    """Read the run's imported trials; one that was recorded too is left out and named.
+
+    Raises:
+        TableError: When somebody has changed the file so that a row cannot be believed.
+    """
+    path = trials_path(run)
+    if not path.is_file():
+        return [], []
+    rows = [row_from_record(record) for record in read_trials(path)]
+    doubled = [
+        Exclusion(
+            episode=row.episode,
+            scope="everything",
+            reason=f"notes/{path.name} has a row for it, but the recorded episode counts",
+        )
+        for row in rows
+        if row.episode in recorded_ids
+    ]
+    return [row for row in rows if row.episode not in recorded_ids], doubled
+
 
 STREAM_ABOVE_BYTES = 32 * 2**20
 """A larger trials CSV is read row by row and only counted: about 300,000 trials."""
@@ -115,7 +163,7 @@ def _from_benchmark(
         f"{name} results are rollouts of a policy in that simulator, entered on the sim side: no "
         "plan was sent and nothing was replayed. Add real trials of the same starts to compare"
     )
-    base = replace(base, tables=with_remarks(base.tables, [(name, remark)]))
+    base = replace(base, tables=with_notes(base.tables, [(name, remark)]))
     return _with_source(base, path, ())
 
 

@@ -13,7 +13,7 @@ from evaluator.statistics.funnel import (
     funnel,
     success_curve,
 )
-from evaluator.statistics.proportion import wilson
+from evaluator.statistics.intervals import wilson
 
 Trial = tuple[TrialRow, tuple[tuple[str, bool | None], ...]]
 

@@ -1,21 +1,36 @@
 """The predicted final state: where each stage was to leave its object, and where it lay."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from statistics import median
 
 import numpy as np
 
 from bridge.episode.reader import Episode
 from bridge.task.task_file import ObjectModel, Task
 from evaluator.compare.known_task import known_task
-from evaluator.compare.object_states import (
+from evaluator.compare.measure import (
+    Part,
+    degrees,
+    interval_or_reason,
+    measured,
+    millimetre_ends,
+    millimetres,
+    slug,
+)
+from evaluator.errors import UndefinedStatisticError
+from evaluator.metrics.state import extents_apart_m, turn_between_rad, turns_alike
+from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
+from evaluator.run_reader.object_states import (
     ObjectState,
     predicted_states,
     read_sent,
     recorded_states,
     replayed_states,
 )
-from evaluator.metrics.state import extents_apart_m, turn_between_rad, turns_alike
+from evaluator.statistics.bootstrap import student_interval
+from evaluator.statistics.intervals import cluster_means, median_interval
 
 PLAN, PLANNED, EXECUTED, RECORDED = "plan", "planned", "executed", "recorded"
 PAIRS = (
@@ -140,3 +155,227 @@ def _apart(
     if first.extents_m is not None and second.extents_m is not None:
         extents = extents_apart_m(first.extents_m, second.extents_m)
     return float(np.linalg.norm(middle_first - middle_second)), rotation, extents, None
+
+
+# --- How far objects end from where they were predicted to, per task, with and without replanning.
+
+# --- Final object states as tables: medians per task, and every stage.
+
+Group = tuple[str, str, str, str]
+"""Who predicts, what it is held against, task, condition."""
+
+
+def state_id(key: Group) -> str:
+    """Return the first part of a group's ids."""
+    predicted_by, against, task, condition = key
+    return f"state.{predicted_by}_to_{against}.{slug(task)}.{slug(condition)}"
+
+
+def final_table(keys: Sequence[Group], by_id: dict[str, Measurement]) -> Table:
+    """Medians of each group."""
+    rows = []
+    for key in keys:
+        position = by_id[f"{state_id(key)}.position_median_m"]
+        rotation = by_id.get(f"{state_id(key)}.rotation_median_rad")
+        extents = by_id.get(f"{state_id(key)}.extents_median_m")
+        rows.append(
+            (
+                key[2],
+                key[3].replace("_", " "),
+                key[0],
+                key[1],
+                position.n,
+                millimetres(position.value),
+                millimetre_ends(position.interval),
+                millimetres(by_id[f"{state_id(key)}.position_mean_m"].value),
+                None if rotation is None else degrees(rotation.value),
+                None if extents is None else millimetres(extents.value),
+            )
+        )
+    return Table(
+        id="final_states",
+        title="Predicted against final object states",
+        columns=(
+            "task",
+            "condition",
+            "predicted by",
+            "against",
+            "objects",
+            "median distance (mm)",
+            "interval (mm)",
+            "mean distance (mm)",
+            "median rotation (deg)",
+            "median extents (mm)",
+        ),
+        rows=tuple(rows),
+        note="After each object's last stage, when all has settled. plan: the poses the planner "
+        "wrote into it; planned, executed: the dynamic replays; recorded: localised after the "
+        "execution. Medians over episodes with 95 % intervals from order statistics; rotation is "
+        "modulo symmetry; distance of soft objects is that of their middles.",
+    )
+
+
+def stage_table(states: Sequence[StateSummary]) -> Table:
+    """Distances after each stage of each task and condition."""
+    groups: dict[tuple[str, str, str, str, str], list[StateSummary]] = {}
+    for state in states:
+        key = (state.task, state.condition, state.stage, state.predicted_by, state.against)
+        groups.setdefault(key, []).append(state)
+    rows: list[tuple[Cell, ...]] = []
+    for (task, condition, stage, predicted_by, against), members in groups.items():
+        positions = [s.position_m for s in members if s.position_m is not None]
+        turns = [s.rotation_rad for s in members if s.rotation_rad is not None]
+        rows.append(
+            (
+                task,
+                condition.replace("_", " "),
+                stage,
+                predicted_by,
+                against,
+                len(positions),
+                millimetres(median(positions) if positions else None),
+                millimetres(max(positions, default=None)),
+                degrees(median(turns) if turns else None),
+            )
+        )
+    return Table(
+        id="stage_states",
+        title="Object states after each stage",
+        columns=(
+            "task",
+            "condition",
+            "stage",
+            "predicted by",
+            "against",
+            "objects",
+            "median distance (mm)",
+            "largest (mm)",
+            "median rotation (deg)",
+        ),
+        rows=tuple(rows),
+        note="Objects are localised only while nothing moves, so the recording is asked about the "
+        "last stage of each object alone.",
+    )
+
+
+WHO = {
+    PLAN: "the plan's predicted pose",
+    PLANNED: "the planned replay's",
+    EXECUTED: "the executed replay's",
+    RECORDED: "the localised recording's",
+}
+QUANTITIES: tuple[tuple[str, str, str, Callable[[StateSummary], float | None]], ...] = (
+    ("position", "m", "distance of the object", lambda s: s.position_m),
+    ("rotation", "rad", "angle modulo the object's symmetry", lambda s: s.rotation_rad),
+    ("extents", "m", "largest difference of a soft object's extents", lambda s: s.extents_m),
+)
+UNKNOWN = {
+    "position": "no position is known",
+    "rotation": "the task file is not known, so neither is the symmetry",
+    "extents": "not both sides know the shape",
+}
+"""Why a quantity has no value although its position has."""
+MEAN_KEY = "student-t:length"
+"""Coverage of Student's interval for lengths with now and then a miss."""
+USE_MEDIAN = "the median with its interval"
+
+
+def state_results(states: Sequence[StateSummary]) -> Part:
+    """Measure final states per task and condition; each stage's goes into a table.
+
+    Objects of one episode share its calibration and its start, so an episode counts once: the mean
+    over its objects.
+    """
+    if not states:
+        reason = "no plan that was sent predicts where a stage leaves its objects"
+        return Part(missing=(f"final states: no data ({reason})",))
+    groups: dict[Group, list[StateSummary]] = {}
+    for state in states:
+        if state.is_last:
+            key = (state.predicted_by, state.against, state.task, state.condition)
+            groups.setdefault(key, []).append(state)
+    ordered = sorted(groups, key=lambda key: (key[2], key[3], PAIRS.index((key[0], key[1]))))
+    measurements = [m for key in ordered for m in _measure(key, groups[key])]
+    by_id = {measurement.id: measurement for measurement in measurements}
+    return Part(
+        measurements=tuple(measurements),
+        tables=(final_table(ordered, by_id), stage_table(states)),
+        exclusions=_left_out(states),
+    )
+
+
+def _measure(key: Group, states: Sequence[StateSummary]) -> list[Measurement]:
+    predicted_by, against, task, condition = key
+    found = []
+    for name, unit, words, read in QUANTITIES:
+        pairs = [(value, s.episode) for s in states if (value := read(s)) is not None]
+        if name == "extents" and (predicted_by == PLAN or not any(s.soft for s in states)):
+            continue  # a plan predicts a pose and no shape
+        values, episodes = [value for value, _ in pairs], [episode for _, episode in pairs]
+        of_episode = cluster_means(values, episodes)
+        about = f"{words} after its last stage, {WHO[predicted_by]} against {WHO[against]}, in "
+        about += f"{task}, {condition.replace('_', ' ')}"
+        make = partial(
+            measured,
+            unit=unit,
+            n=len(values),
+            counted="object",
+            episodes=list(dict.fromkeys(episodes)),
+            interval_n=len(of_episode),
+        )
+        found.append(
+            make(
+                f"{state_id(key)}.{name}_median_{unit}",
+                partial(_median, of_episode, states, name),
+                definition=f"{about}: median over {len(of_episode)} episodes of each one's mean "
+                "over its objects",
+                reason_without_interval=interval_or_reason(median_interval, of_episode)[1],
+            )
+        )
+        if name == "position":
+            found.append(
+                make(
+                    f"{state_id(key)}.{name}_mean_{unit}",
+                    partial(_mean, of_episode, states, name),
+                    definition=f"{about}: mean over {len(of_episode)} episodes of each one's mean "
+                    "over its objects",
+                    reason_without_interval=interval_or_reason(student_interval, of_episode)[1],
+                    coverage_key=MEAN_KEY,
+                    instead=USE_MEDIAN,
+                )
+            )
+    return found
+
+
+def _median(
+    values: Sequence[float], states: Sequence[StateSummary], quantity: str
+) -> float | tuple[float, Interval | None]:
+    _some(values, states, quantity)
+    return float(median(values)), interval_or_reason(median_interval, values)[0]
+
+
+def _mean(
+    values: Sequence[float], states: Sequence[StateSummary], quantity: str
+) -> float | tuple[float, Interval | None]:
+    _some(values, states, quantity)
+    return sum(values) / len(values), interval_or_reason(student_interval, values)[0]
+
+
+def _some(values: Sequence[float], states: Sequence[StateSummary], quantity: str) -> None:
+    if values:
+        return
+    reasons = {state.reason for state in states if state.reason}
+    raise UndefinedStatisticError(
+        statistic="final state", reason="; ".join(sorted(reasons)) or UNKNOWN[quantity]
+    )
+
+
+def _left_out(states: Sequence[StateSummary]) -> tuple[Exclusion, ...]:
+    found = {
+        (state.episode, f"{state.object_id}: {state.reason}"): None
+        for state in states
+        if state.reason is not None and state.is_last
+    }
+    return tuple(
+        Exclusion(episode=episode, scope="final states", reason=reason) for episode, reason in found
+    )

@@ -15,15 +15,15 @@ from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.task.data import dataset_file
 from bridge.terminal import Output
-from evaluator.compare.cache import SummaryCache
-from evaluator.compare.contents import ODD, broken
+from evaluator.cache import SummaryCache
 from evaluator.compare.known_task import known_task
-from evaluator.compare.label import Witness, summarise_witness
+from evaluator.compare.labels import PerceivedOutcome, perceive_outcome
 from evaluator.compare.motion import MotionSummary, summarise_motions
 from evaluator.compare.states import StateSummary, summarise_states
 from evaluator.compare.trial import TRAJECTORIES, Trial
-from evaluator.compare.workers import ALONE, Workers
 from evaluator.result import Exclusion
+from evaluator.run_reader.contents import ODD, broken
+from evaluator.workers import SERIAL, Workers
 
 COMPARE_S = 0.03
 """About what comparing one trial takes [s]."""
@@ -35,7 +35,7 @@ class Summaries:
 
     motions: tuple[MotionSummary, ...] = ()
     states: tuple[StateSummary, ...] = ()
-    witnesses: tuple[Witness, ...] = ()
+    witnesses: tuple[PerceivedOutcome, ...] = ()
     left_out: tuple[Exclusion, ...] = ()
     """Trials of which something could not be read."""
 
@@ -85,7 +85,7 @@ _Job = tuple[_Files, tuple[_Part, ...]]
 
 
 def sum_up(
-    trials: Sequence[Trial], cache: SummaryCache, output: Output, workers: Workers = ALONE
+    trials: Sequence[Trial], cache: SummaryCache, output: Output, workers: Workers = SERIAL
 ) -> Summaries:
     """Summarise motions, final states and localised success of every trial with a plan sent."""
     found: dict[type[Any], list[Any]] = {part.kind: [] for part in PARTS}
@@ -115,7 +115,7 @@ def sum_up(
     return Summaries(
         motions=_in_order(found[MotionSummary], trials),
         states=_in_order(found[StateSummary], trials),
-        witnesses=_in_order(found[Witness], trials),
+        witnesses=_in_order(found[PerceivedOutcome], trials),
         left_out=tuple(left_out),
     )
 
@@ -148,10 +148,10 @@ def _states(files: _Files) -> tuple[StateSummary, ...]:
     return summarise_states(files.recorded, files.replays, files.localised, plan_id=files.plan_id)
 
 
-def _witness(files: _Files) -> tuple[Witness, ...]:
+def _witness(files: _Files) -> tuple[PerceivedOutcome, ...]:
     if files.localised is None:
         return ()
-    found = summarise_witness(files.recorded, files.localised, plan_id=files.plan_id)
+    found = perceive_outcome(files.recorded, files.localised, plan_id=files.plan_id)
     return () if found is None else (found,)
 
 
@@ -177,5 +177,5 @@ def _task_sha256(name: str) -> str:
 PARTS = (
     _Part(kind=MotionSummary, scope="motion", make=_motions, key=_replays_key),
     _Part(kind=StateSummary, scope="final states", make=_states, key=_states_key),
-    _Part(kind=Witness, scope="label", make=_witness, key=_localised_key),
+    _Part(kind=PerceivedOutcome, scope="label", make=_witness, key=_localised_key),
 )

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
+from evaluator.compare.gate import confusion_of, heeded_verdict, unheeded_verdict
 from evaluator.compare.rows import RateCell, TrialRow
 from evaluator.compare.success import WITH, WITHOUT
-from evaluator.compare.verdicts import confusion_of, heeded_verdict, unheeded_verdict
 from evaluator.result import Measurement, Table
 
 

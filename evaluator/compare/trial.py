@@ -13,15 +13,20 @@ from bridge.episode.streams import pose_track
 from bridge.errors import BridgeError
 from bridge.exchange.trials_csv import MOST_IN_TRIAL
 from bridge.geometry.trajectory import PoseTrajectory
-from evaluator.compare.inventory import RunFile
 from evaluator.compare.motion import SAME_CLOCK_NS
-from evaluator.compare.recorded import RecordedFacts, positions_at_start
-from evaluator.compare.replays import DerivedFile, DerivedIndex, Replay
 from evaluator.compare.rows import TcpErrorSeries, TrialRow
-from evaluator.compare.tracks import Tracks, read_tracks
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.trajectory import pose_errors
 from evaluator.result import Exclusion
+from evaluator.run_reader.episodes import (
+    DerivedFile,
+    DerivedIndex,
+    RecordedFacts,
+    Replay,
+    positions_at_start,
+)
+from evaluator.run_reader.inventory import RunFile
+from evaluator.run_reader.tracks import Tracks, read_tracks
 
 TRAJECTORIES = ("planned", "executed")
 

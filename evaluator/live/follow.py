@@ -6,8 +6,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from bridge.episode import schema
 from bridge.episode.catalogue import Entry, list_episodes
@@ -20,10 +21,152 @@ from bridge.wire.errors import WireError
 from bridge.wire.qos import Qos
 from bridge.wire.session import Subscriber, WireSample, WireSession, open_session
 from evaluator.live.config import LiveConfig
-from evaluator.live.ledger import Change, Ledger, LiveTrial, trial_of
-from evaluator.live.next_start import NextStart, next_start
-from evaluator.live.standing import Standing, standing_of
-from evaluator.live.wording import change_line, record, state_lines
+from evaluator.live.session import (
+    Change,
+    GainSummary,
+    Ledger,
+    LiveTrial,
+    NextStart,
+    RateSummary,
+    SessionSummary,
+    next_start,
+    summarise_session,
+    trial_of,
+)
+from evaluator.statistics.sequential import Advice
+
+# --- One line for each trial, the state in a few lines, and the same as records for other
+# programs.
+
+SCHEMA_VERSION = 1
+
+
+def outcome_word(trial: LiveTrial) -> str:
+    """success, failure or unknown."""
+    return {True: "success", False: "failure", None: "unknown"}[trial.recorded]
+
+
+def label(task: str, condition: str, policy: str) -> str:
+    """Return a cell in a reader's words."""
+    return ", ".join(part.replace("_", " ") for part in (task, condition, policy) if part)
+
+
+def what_happened(change: Change) -> str:
+    """trial_0007: success; or what was corrected, or labelled late."""
+    trial, before = change.trial, change.before
+    text = f"{trial.episode}: {outcome_word(trial)}"
+    if before is None or before.recorded == trial.recorded:
+        return text
+    if before.recorded is None:
+        return f"{text} (labelled late)"
+    return f"{text} (corrected, was {outcome_word(before)})"
+
+
+def advice_words(advice: Advice | None, changed: str, stop: str) -> str:
+    """Stop, or continue: about n more."""
+    if changed:
+        return f"stop: {changed}"
+    if advice is None:
+        return "continue: no --goal to decide"
+    if advice.stop:
+        return f"stop: {stop}"
+    if advice.more_trials is None:
+        return "continue: no end in sight at these rates"
+    return f"continue: about {advice.more_trials} more"
+
+
+def rate_words(rate: RateSummary, goal: float | None) -> str:
+    """One cell's rate, its interval at any time, and what follows."""
+    percent = 0.0 if goal is None else 100 * goal
+    answer = rate.advice.answer if rate.advice else ""
+    words = advice_words(rate.advice, rate.changed, f"{answer} {percent:g} %")
+    return (
+        f"{label(rate.task, rate.condition, rate.policy)} {rate.k}/{rate.n} "
+        f"[{100 * rate.low:.1f}, {100 * rate.high:.1f}] %: {words}"
+    )
+
+
+def gain_words(gain: GainSummary) -> str:
+    """One paired gain, its interval at any time, and what follows."""
+    better = {"above": "replanning helps", "below": "replanning harms"}
+    words = advice_words(gain.advice, gain.changed, better.get(gain.advice.answer, ""))
+    value = 100 * (gain.improved - gain.worsened) / gain.n
+    return (
+        f"gain {label(gain.task, '', gain.policy)} {value:+.0f} pp "
+        f"[{100 * gain.low:+.1f}, {100 * gain.high:+.1f}] over {gain.n} pairs "
+        f"({gain.improved} improved, {gain.worsened} worsened): {words}"
+    )
+
+
+def next_words(proposal: NextStart | None) -> str:
+    """What to run next."""
+    if proposal is None:
+        return "next: nothing, every question is settled"
+    start = "a start not tried yet" if proposal.start_id is None else f"start {proposal.start_id}"
+    cell = label(proposal.task, proposal.condition, proposal.policy)
+    return f"next: {cell}, {start} ({proposal.reason})"
+
+
+def change_line(
+    change: Change, standing: SessionSummary, proposal: NextStart | None, goal: float | None
+) -> str:
+    """Return the line of one trial."""
+    trial = change.trial
+    rate, gain = standing.rate(trial.key), standing.gain(trial.task, trial.policy)
+    parts = [what_happened(change)]
+    parts += [rate_words(rate, goal)] if rate is not None else []
+    parts += [gain_words(gain)] if gain is not None else []
+    return "; ".join([*parts, next_words(proposal)])
+
+
+def state_lines(
+    standing: SessionSummary, proposal: NextStart | None, goal: float | None
+) -> list[str]:
+    """Everything that is known, one line for each cell and gain."""
+    if not standing.rates:
+        return [f"no trial with a known outcome yet ({standing.unknown} without)"]
+    lines = [rate_words(rate, goal) for rate in standing.rates]
+    lines += [gain_words(gain) for gain in standing.gains]
+    if standing.unknown:
+        lines.append(f"{standing.unknown} trials without a known outcome are part of nothing")
+    return [*lines, next_words(proposal)]
+
+
+def record(
+    *,
+    run: str,
+    stamp_ns: int,
+    text: str,
+    change: Change | None,
+    standing: SessionSummary,
+    proposal: NextStart | None,
+    goal: float | None,
+) -> dict[str, Any]:
+    """Return what is published, as ``advice.schema.json`` describes it.
+
+    Args:
+        run: Name of the run folder.
+        stamp_ns: When [ns].
+        text: The line that is printed.
+        change: The trial it is about; None for the state at the start and at the end.
+        standing: All cells and gains.
+        proposal: What to run next.
+        goal: The success rate asked about.
+    """
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "stamp_ns": stamp_ns,
+        "run": run,
+        "text": text,
+        "episode": None if change is None else change.trial.episode,
+        "outcome": None if change is None else outcome_word(change.trial),
+        "goal": goal,
+        "rates": [asdict(rate) for rate in standing.rates],
+        "gains": [asdict(gain) for gain in standing.gains],
+        "unknown": standing.unknown,
+        "next": None if proposal is None else asdict(proposal),
+    }
+
 
 LISTING_PERIOD_S = 2.0
 """How often the run folder is looked at: labels given by hand are heard of nowhere else."""
@@ -82,7 +225,7 @@ def _subscribe(session: WireSession, recorder: str, follower: "Follower") -> Sub
 
 
 @dataclass(frozen=True)
-class News:
+class Update:
     """What a recorder said of one episode."""
 
     run: str
@@ -138,7 +281,7 @@ class Follower:
         self._tell_state()
 
     def _take(self, sample: WireSample) -> None:
-        news = read_news(sample.data)
+        news = read_update(sample.data)
         if news is None:
             self._once(f"a message on {sample.topic} cannot be read; it is left out")
             return
@@ -182,13 +325,13 @@ class Follower:
         text = "\n".join(state_lines(standing, proposal, self._goal))
         self._show(text, None, standing, proposal)
 
-    def _now(self) -> tuple[Standing, NextStart | None]:
+    def _now(self) -> tuple[SessionSummary, NextStart | None]:
         trials = self._ledger.trials
-        standing = standing_of(trials, self._goal)
+        standing = summarise_session(trials, self._goal)
         return standing, next_start(trials, standing)
 
     def _show(
-        self, text: str, change: Change | None, standing: Standing, proposal: NextStart | None
+        self, text: str, change: Change | None, standing: SessionSummary, proposal: NextStart | None
     ) -> None:
         data = record(
             run=self._run.path.resolve().name,
@@ -216,13 +359,13 @@ class Follower:
             self._output.say(remark)
 
 
-def read_news(data: bytes) -> News | None:
+def read_update(data: bytes) -> Update | None:
     """Read what a recorder said of one episode; None when it is not that."""
     try:
         said = parse_record(data, name="entry", package="bridge.episode")
         known = {name: said[name] for name in Entry.__dataclass_fields__ if name in said}
         known["tags"] = tuple(said.get("tags", ()))
-        return News(str(said["run"]), trial_of(Entry(**known)))
+        return Update(str(said["run"]), trial_of(Entry(**known)))
     except (GstError, TypeError, KeyError):
         return None
 

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from evaluator.metrics.metric import ImageMetric
-from evaluator.metrics.options import NetName
+from evaluator.metrics.image_protocol import ImageMetric, NetName
 
 if TYPE_CHECKING:
     from evaluator.metrics.lpips_torch import LpipsNet

@@ -1,12 +1,210 @@
 """How far two poses of one body lie apart over a common clock."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from bridge.clock import NS_PER_S
+from bridge.episode.streams import JointTrack
+from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.errors import UndefinedStatisticError
+
+# --- What is left of a trajectory error without a constant delay, or without a constant rigid
+# motion.
+#
+# A delay is the controller's, a rigid motion the calibration's; what remains of an error when
+# either is taken out belongs to neither.
+
+LAGS_S = np.arange(-20, 61) / 100
+"""Delays that are tried: -0.2 s to 0.6 s in steps of 10 ms."""
+MAX_INSTANTS = 200
+"""Delays are compared at no more instants than this."""
+EQUAL_M = 1e-5
+"""Delays whose mean distances differ by less fit equally well."""
+NOT_FINITE = "the recorded or replayed data hold values that are not finite"
+FLAT = 1e-9
+"""A second singular value below this share of the first: positions on a line."""
+
+
+def find_lag_s(
+    stamps_ns: Int[np.ndarray, " num_samples"],
+    p_recorded_m: Float[np.ndarray, "num_samples 3"],
+    replayed: PoseTrajectory,
+) -> float:
+    """Find by how much the recorded motion comes later, whatever rigid motion lies between the two.
+
+    The delay of least root mean square distance after the best rigid motion: an offset is the
+    calibration's, and would else be bought off by a delay. Of delays that fit equally well the
+    smallest is taken, so a motion that hardly moves has none.
+    Range: -0.2 s to 0.6 s, known to 10 ms. Undefined when: positions are not finite.
+
+    Args:
+        stamps_ns: Instants on the common clock.
+        p_recorded_m: Where the recorded motion was.
+        replayed: The same motion; held at its ends where it is shorter.
+
+    Raises:
+        UndefinedStatisticError: When it is undefined.
+    """
+    choice = np.linspace(0, len(stamps_ns) - 1, min(len(stamps_ns), MAX_INSTANTS)).round()
+    ids = np.unique(choice.astype(np.int64))
+    asked = stamps_ns[ids][None, :] - (LAGS_S[:, None] * NS_PER_S).round().astype(np.int64)
+    other = np.stack(
+        [np.interp(asked, replayed.stamps_ns, replayed.p_m[:, axis]) for axis in range(3)], axis=-1
+    )
+    costs = _left_over_m(other, p_recorded_m[ids])
+    near = LAGS_S[costs <= costs.min() + EQUAL_M]
+    return float(near[np.argmin(np.abs(near))])
+
+
+def _left_over_m(
+    p_sources_m: Float[np.ndarray, "num_lags num_poses 3"],
+    p_target_m: Float[np.ndarray, "num_poses 3"],
+) -> Float[np.ndarray, " num_lags"]:
+    """Root mean square distance after the best rigid motion: Umeyama (1991), equation 43, c = 1."""
+    sources = p_sources_m - p_sources_m.mean(axis=1, keepdims=True)
+    target = p_target_m - p_target_m.mean(axis=0)
+    covariance = np.swapaxes(sources, 1, 2) @ target / len(target)
+    if not np.isfinite(covariance).all():
+        raise UndefinedStatisticError(statistic="delay", reason=NOT_FINITE)
+    sizes = np.linalg.svd(covariance, compute_uv=False)
+    sizes[:, 2] *= np.where(np.linalg.det(covariance) < 0, -1.0, 1.0)
+    spread = (sources**2).sum(axis=2).mean(axis=1) + (target**2).sum(axis=1).mean()
+    return np.asarray(np.sqrt(np.maximum(spread - 2 * sizes.sum(axis=1), 0.0)))
+
+
+def align_rigid(
+    p_source_m: Float[np.ndarray, "num_poses 3"], p_target_m: Float[np.ndarray, "num_poses 3"]
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """Find the rigid motion that best lays one list of positions over another.
+
+    Least squares without scale: Umeyama (1991), equations 40 and 41 with c = 1.
+
+    Args:
+        p_source_m: Positions in the source frame [m].
+        p_target_m: The same instants in the target frame [m].
+
+    Returns:
+        Rotation ``R_target_source`` and translation ``p_target_source`` [m].
+
+    Raises:
+        UndefinedStatisticError: When the source positions lie on a line, or are not finite.
+    """
+    middle_source, middle_target = p_source_m.mean(axis=0), p_target_m.mean(axis=0)
+    covariance = (p_target_m - middle_target).T @ (p_source_m - middle_source) / len(p_source_m)
+    if not np.isfinite(covariance).all():
+        raise UndefinedStatisticError(
+            statistic="rigid alignment",
+            reason=NOT_FINITE,
+        )
+    left, sizes, right = np.linalg.svd(covariance)
+    if sizes[1] <= FLAT * max(sizes[0], FLAT):
+        raise UndefinedStatisticError(
+            statistic="rigid alignment",
+            reason="the positions lie on a line, which any turn about it leaves as it is",
+        )
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
+    R = left @ mirror @ right
+    return R, middle_target - R @ middle_source
+
+
+def without_rigid_motion(
+    p_recorded_m: Float[np.ndarray, "num_poses 3"], p_replayed_m: Float[np.ndarray, "num_poses 3"]
+) -> Float[np.ndarray, " num_poses"]:
+    """Distance [m] of the same instants after the replay was laid over the recording.
+
+    Raises:
+        UndefinedStatisticError: When the replayed positions lie on a line, or are not finite.
+    """
+    R, shift = align_rigid(p_replayed_m, p_recorded_m)
+    return np.asarray(np.linalg.norm(p_recorded_m - (p_replayed_m @ R.T + shift), axis=1))
+
+
+# --- Errors of a motion that no constant offset explains: of its joints, and of its single steps.
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointErrors:
+    """Joint angles of two motions at the same instants."""
+
+    names: tuple[str, ...]
+    """Joints that both know, in the recorded order."""
+    stamps_ns: Int[np.ndarray, " num_samples"]
+    error_rad: Float[np.ndarray, "num_samples num_joints"]
+    """Recorded minus replayed, modulo a whole turn: -pi to pi."""
+
+    def over_time_rad(self) -> Float[np.ndarray, " num_samples"]:
+        """Root mean square over the joints at each instant."""
+        return np.asarray(np.sqrt((self.error_rad**2).mean(axis=1)))
+
+
+def joint_errors(recorded: JointTrack, replayed: JointTrack) -> JointErrors:
+    """Compare at the recorded stamps inside the time both cover; the replay is interpolated.
+
+    Angles that differ by a whole turn put the arm into the same place and count as equal.
+    Range: 0 rad to pi, 0 is perfect. Undefined when: no joint or no instant is shared.
+
+    Raises:
+        UndefinedStatisticError: When the two share no joint, or no instant.
+    """
+    names = tuple(name for name in recorded.names if name in replayed.names)
+    if not names:
+        raise UndefinedStatisticError(
+            statistic="joint error", reason="recorded and replayed joints have no name in common"
+        )
+    first = max(int(recorded.stamps_ns[0]), int(replayed.stamps_ns[0]))
+    last = min(int(recorded.stamps_ns[-1]), int(replayed.stamps_ns[-1]))
+    common = (recorded.stamps_ns >= first) & (recorded.stamps_ns <= last)
+    if not common.any():
+        raise UndefinedStatisticError(
+            statistic="joint error", reason="recorded and replayed stamps do not overlap"
+        )
+    stamps = recorded.stamps_ns[common]
+    mine = [recorded.names.index(name) for name in names]
+    theirs = [replayed.names.index(name) for name in names]
+    difference = recorded.position[common][:, mine] - replayed.at(stamps)[:, theirs]
+    wrapped = difference - 2 * np.pi * np.round(difference / (2 * np.pi))
+    return JointErrors(names=names, stamps_ns=stamps, error_rad=wrapped)
+
+
+def relative_errors(
+    recorded: PoseTrajectory, replayed: PoseTrajectory, step: int
+) -> tuple[Float[np.ndarray, " num_steps"], Float[np.ndarray, " num_steps"]]:
+    """Compare what each motion does within so many samples: relative pose error.
+
+    The difference of the two relative motions from sample i to i + step, for every i: Sturm et
+    al. (2012). A constant offset in front of either motion leaves it as it is.
+    Range: 0 and up, 0 is perfect. Undefined when: there are not more samples than ``step``.
+
+    Args:
+        recorded: Poses at some instants.
+        replayed: Poses at the same instants.
+        step: Samples, at least 1.
+
+    Returns:
+        Length [m] and angle [rad] of the difference, one for each i.
+
+    Raises:
+        UndefinedStatisticError: When the motions are not longer than one step.
+    """
+    if len(recorded) <= step:
+        raise UndefinedStatisticError(
+            statistic="relative pose error",
+            reason=f"{len(recorded)} samples; a step is {step} samples long",
+        )
+    moved = []
+    for track in (recorded, replayed):
+        Ts = track.transforms()
+        moved.append(se3.invert(Ts[:-step]) @ Ts[step:])
+    apart = se3.invert(moved[0]) @ moved[1]
+    return (
+        np.asarray(np.linalg.norm(apart[:, :3, 3], axis=1)),
+        se3.rotation_angle_rad(apart[:, :3, :3]),
+    )
+
 
 NORMALISED_SAMPLES = 101
 """Samples from start to end for runs without a common clock."""
@@ -80,3 +278,168 @@ def angles_rad(
     near = np.linalg.norm(q_first_wxyz - q_second_wxyz, axis=1)
     far = np.linalg.norm(q_first_wxyz + q_second_wxyz, axis=1)
     return np.asarray(4.0 * np.arctan2(np.minimum(near, far), np.maximum(near, far)))
+
+
+# --- How far two sets of runs of one motion lie apart over normalised time, and how each strays.
+
+MOVING_THRESHOLD_M = 0.01
+"""A run waits while it is closer than this to where it started, or will stay."""
+
+
+def moving_part(run: PoseTrajectory, *, threshold_m: float = MOVING_THRESHOLD_M) -> PoseTrajectory:
+    """Cut the waiting at both ends: from leaving the start to staying at the end.
+
+    A run that never leaves its start is returned whole.
+    """
+    away_from_start = np.linalg.norm(run.p_m - run.p_m[0], axis=1) > threshold_m
+    away_from_end = np.linalg.norm(run.p_m - run.p_m[-1], axis=1) > threshold_m
+    if not away_from_start.any() or not away_from_end.any():
+        return run
+    first = max(0, int(np.argmax(away_from_start)) - 1)
+    last = min(len(run) - 1, int(np.flatnonzero(away_from_end)[-1]) + 1)
+    if last <= first:
+        return run
+    keep = slice(first, last + 1)
+    return PoseTrajectory(run.stamps_ns[keep], run.p_m[keep], run.q_wxyz[keep])
+
+
+@dataclass(frozen=True, kw_only=True)
+class BandDistance:
+    """How far a band of replayed runs lies from a band of recorded ones, not run by run."""
+
+    mean_over_pairs_m: float
+    """Mean distance over all (recorded, replayed) pairs and all normalised instants."""
+    between_mean_curves_m: float
+    """Mean distance of the two mean curves: what is left when each band's spread averages out."""
+    max_between_mean_curves_m: float
+    end_point_over_pairs_m: float
+    """Mean distance of the end points over all pairs."""
+    end_point_between_means_m: float
+    turned_over_pairs_rad: float
+    """Mean angle over all pairs and instants between what both turned since they began."""
+    of_recorded_m: tuple[float, ...]
+    """Mean distance of each recorded run to all replayed ones."""
+    profile_m: Float[np.ndarray, " num_samples"]
+    """Distance of the mean curves over normalised time."""
+
+
+def band_distance(
+    recorded: Sequence[PoseTrajectory],
+    replayed: Sequence[PoseTrajectory],
+    num_samples: int = NORMALISED_SAMPLES,
+) -> BandDistance:
+    """Compare two unpaired sets of runs of the same motion over normalised time.
+
+    Range: 0 and up, 0 is perfect.
+
+    Raises:
+        UndefinedStatisticError: When one side has no run.
+    """
+    if not recorded or not replayed:
+        side = "recorded" if not recorded else "replayed"
+        raise UndefinedStatisticError(statistic="band distance", reason=f"no {side} run")
+    a, q_a = _curves(recorded, num_samples)
+    b, q_b = _curves(replayed, num_samples)
+    pairs = np.linalg.norm(a[:, None] - b[None, :], axis=-1)
+    turned = np.swapaxes(_turned(q_a), -1, -2)[:, None] @ _turned(q_b)[None, :]
+    profile = np.linalg.norm(a.mean(axis=0) - b.mean(axis=0), axis=-1)
+    return BandDistance(
+        mean_over_pairs_m=float(pairs.mean()),
+        between_mean_curves_m=float(profile.mean()),
+        max_between_mean_curves_m=float(profile.max()),
+        end_point_over_pairs_m=float(pairs[:, :, -1].mean()),
+        end_point_between_means_m=float(profile[-1]),
+        turned_over_pairs_rad=float(se3.rotation_angle_rad(turned).mean()),
+        of_recorded_m=tuple(pairs.mean(axis=(1, 2)).tolist()),
+        profile_m=profile,
+    )
+
+
+def _turned(
+    q_wxyz: Float[np.ndarray, "num_runs num_samples 4"],
+) -> Float[np.ndarray, "num_runs num_samples 3 3"]:
+    """Rotation since the first instant, in the fixed frame: whatever axes a body was given."""
+    R = se3.rotation_from_quaternion(q_wxyz)
+    return np.asarray(R @ np.swapaxes(R[:, :1], -1, -2))
+
+
+def path_distance_m(
+    recorded: Sequence[PoseTrajectory],
+    replayed: Sequence[PoseTrajectory],
+    num_samples: int = NORMALISED_SAMPLES,
+) -> float:
+    """Mean distance over all pairs at equal shares of the way: where they go, whatever the speed.
+
+    Range: 0 m and up, 0 is perfect. Undefined when: one side has no run, or a run does not move.
+
+    Raises:
+        UndefinedStatisticError: When it is undefined.
+    """
+    if not recorded or not replayed:
+        side = "recorded" if not recorded else "replayed"
+        raise UndefinedStatisticError(statistic="path distance", reason=f"no {side} run")
+    a, b = (np.stack([_by_way(run, num_samples) for run in side]) for side in (recorded, replayed))
+    return float(np.linalg.norm(a[:, None] - b[None, :], axis=-1).mean())
+
+
+def _by_way(run: PoseTrajectory, num_samples: int) -> Float[np.ndarray, "num_samples 3"]:
+    steps = np.linalg.norm(np.diff(run.p_m, axis=0), axis=1)
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    if not way[-1] > 0:
+        raise UndefinedStatisticError(statistic="path distance", reason="a run does not move")
+    asked = np.linspace(0.0, way[-1], num_samples)
+    return np.stack([np.interp(asked, way, run.p_m[:, axis]) for axis in range(3)], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repeatability:
+    """How far runs of the same motion spread around their own mean."""
+
+    mean_m: float
+    """Root mean square distance from the mean curve, averaged over normalised time."""
+    worst_m: float
+    """The same at its worst instant."""
+    end_point_m: float
+    """The same at the end point."""
+    profile_m: Float[np.ndarray, " num_samples"]
+
+
+def repeatability(
+    runs: Sequence[PoseTrajectory], num_samples: int = NORMALISED_SAMPLES
+) -> Repeatability:
+    """Measure the spread of one side; the scale against which a band distance is read.
+
+    The sum of squares is divided by (runs - 1), since the mean is estimated from the same runs.
+
+    Raises:
+        UndefinedStatisticError: Below 2 runs.
+    """
+    if len(runs) < 2:
+        raise UndefinedStatisticError(
+            statistic="repeatability", reason=f"{len(runs)} run; it needs at least 2"
+        )
+    curves, _ = _curves(runs, num_samples)
+    squared = ((curves - curves.mean(axis=0)) ** 2).sum(axis=-1)
+    profile = np.sqrt(squared.sum(axis=0) / (len(runs) - 1))
+    return Repeatability(
+        mean_m=float(profile.mean()),
+        worst_m=float(profile.max()),
+        end_point_m=float(profile[-1]),
+        profile_m=profile,
+    )
+
+
+def mean_curve_m(
+    runs: Sequence[PoseTrajectory], num_samples: int = NORMALISED_SAMPLES
+) -> Float[np.ndarray, "num_samples 3"]:
+    """Mean position of several runs at uniform instants of normalised time."""
+    return np.asarray(_curves(runs, num_samples)[0].mean(axis=0))
+
+
+def _curves(
+    runs: Sequence[PoseTrajectory], num_samples: int
+) -> tuple[
+    Float[np.ndarray, "num_runs num_samples 3"], Float[np.ndarray, "num_runs num_samples 4"]
+]:
+    resampled = [run.normalised_time(num_samples) for run in runs]
+    return np.stack([run.p_m for run in resampled]), np.stack([run.q_wxyz for run in resampled])

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 import shutil
 from functools import lru_cache
 
@@ -70,3 +71,165 @@ def as_text(table: Table, *, width: int | None = None) -> str:
     Console(file=stream, width=width, no_color=True, highlight=False).print(drawn)
     text = "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
     return f"{text.rstrip()}\n{table.note}\n" if table.note else f"{text.rstrip()}\n"
+
+
+# --- Tables for a paper: LaTeX with booktabs, its special characters escaped.
+
+_COMMANDS = {
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    '"': r"{''}",
+    "`": r"{`}",
+    # A bracket or star after the end of a line would be read as that line's argument.
+    "[": "{[}",
+    "]": "{]}",
+    "*": "{*}",
+    "–": "--",
+    "—": "---",
+    "−": "$-$",
+    "±": r"$\pm$",
+    "×": r"$\times$",
+    "≤": r"$\leq$",
+    "≥": r"$\geq$",
+    "≠": r"$\neq$",
+    "→": r"$\rightarrow$",
+    "°": r"$^\circ$",
+    "…": r"\ldots{}",
+    "’": "'",
+    "‘": "`",
+    "«": r"$\ll$",
+    "»": r"$\gg$",
+    "“": "``",
+    "”": "''",
+    "τ": r"$\tau$",
+    "ρ": r"$\rho$",
+    "φ": r"$\phi$",
+    "λ": r"$\lambda$",
+    "µ": r"$\mu$",
+    "✓": "yes",
+    "✗": "no",
+    "\u2060": "{}",
+}
+_TRANSLATION = str.maketrans(_COMMANDS)
+_NOT_SET = re.compile("[^\x20-\x7e\xa1-\u017f]|[ÐÞðþĄąĘęĮįŲųĐđĦħĸĿŀŉŊŋŦŧſ]")
+"""What LaTeX since 2020 does not set in its default font encoding is written as U+XXXX; of the
+letters up to U+017F that are those named here."""
+_NAME = re.compile(r"[^A-Za-z0-9:.-]+")
+_MINUS = re.compile(r"(?<![\w.-])-(?=\.?\d)")
+_HYPHENS = re.compile("-(?=-)")
+"""Two would become a dash: ``--goal``."""
+
+
+def as_latex(table: Table) -> str:
+    r"""Write a booktabs table: numbers to the right, no empty columns, the note below.
+
+    The document needs ``\usepackage{booktabs}``; a table wider than the page also ``graphicx``,
+    which shrinks it to the width of the text, and one longer than a page ``longtable``, which is
+    set in a smaller size where it is wide. Sentences are broken over lines.
+    """
+    used = used_columns(table)
+    align, characters = _columns(table, used)
+    head = " & ".join(latex(table.columns[index]) for index in used)
+    written = lru_cache(maxsize=None, typed=True)(_cell)  # tables say the same again and again
+    body = [" & ".join([written(row[i]) for i in used]) + r" \\" for row in table.rows]
+    columns = f"@{{}}{align}@{{}}"
+    caption = rf"\caption{{{latex(table.title)}}}"
+    label = rf"\label{{tab:{_NAME.sub('-', table.id)}}}"
+    note = [rf"\par\smallskip\footnotesize {latex(table.note)}"] if table.note else []
+    if len(body) > LONG_ROWS:
+        lines = [
+            rf"{{{_fitting(characters)}",
+            rf"\begin{{longtable}}{{{columns}}}",
+            rf"{caption}{label} \\",
+            *(r"\toprule", rf"{head} \\", r"\midrule", r"\endhead", r"\bottomrule", r"\endfoot"),
+            *body,
+            r"\end{longtable}",
+            *note,
+            "}",
+        ]
+        return "\n".join(lines) + "\n"
+    tabular = [
+        rf"\begin{{tabular}}{{{columns}}}",
+        *(r"\toprule", rf"{head} \\", r"\midrule"),
+        *body,
+        *(r"\bottomrule", r"\end{tabular}"),
+    ]
+    if characters > WIDE_CHARACTERS:
+        tabular = [r"\resizebox{\textwidth}{!}{%", *tabular, "}"]
+    lines = [
+        *(r"\begin{table}[t]", r"\centering", caption, label, r"\small"),
+        *tabular,
+        *note,
+        r"\end{table}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+LONG_ROWS = 45
+"""A table with more rows does not fit one page and is set over several (``longtable``)."""
+
+
+WIDE_CHARACTERS = 84
+"""A line of text in a usual article, in the small size of tables."""
+
+
+SENTENCE = 45
+"""Text longer than this is broken over lines, where it can be."""
+SENTENCES = 0.6
+"""Share of the width of the text that such columns have together."""
+LONGEST_WORD = 20
+
+
+def _columns(table: Table, used: list[int]) -> tuple[str, float]:
+    """Return how columns are set, and how many characters lie beside each other."""
+    lines = [table.columns, *(texts(row) for row in table.rows)]
+    longest = {index: max(len(line[index]) for line in lines) for index in used}
+    sentences = {
+        index
+        for index in used
+        if longest[index] > SENTENCE
+        and all(len(word) <= LONGEST_WORD for line in lines for word in line[index].split())
+    }
+    share = SENTENCES / max(1, len(sentences))
+    align, characters = "", 0.0
+    for index in used:
+        if index in sentences:
+            align += rf"p{{{share:.2f}\textwidth}}"
+            characters += share * WIDE_CHARACTERS + 2
+        else:
+            align += "r" if is_number(table, index) else "l"
+            characters += longest[index] + 2
+    return align, characters
+
+
+def _fitting(characters: float) -> str:
+    """Return the size in which a table of several pages, which cannot be shrunk, is as wide."""
+    if characters <= WIDE_CHARACTERS:
+        return r"\small"
+    size = "scriptsize" if characters <= 1.2 * WIDE_CHARACTERS else "tiny"
+    return rf"\{size}\setlength{{\tabcolsep}}{{2pt}}"
+
+
+def _cell(cell: Cell) -> str:
+    return latex(cell_text(cell))
+
+
+def latex(text: str) -> str:
+    """Escape what LaTeX would read as a command, and write what it cannot set as U+XXXX.
+
+    A minus before a number is set as one; hyphens in a row stay hyphens, where LaTeX makes dashes.
+    """
+    plain = _MINUS.sub("−", " ".join(text.split()))
+    plain = _HYPHENS.sub("-\u2060", plain).translate(_TRANSLATION)
+    return _NOT_SET.sub(lambda found: f"U+{ord(found[0]):04X}", plain)

@@ -10,13 +10,12 @@ from evaluator.compare.rows import Comparison
 from evaluator.compare.spreadsheet import record_from_row
 from evaluator.errors import EvaluatorError
 from evaluator.report.figures.beside import Beside
-from evaluator.report.figures.chosen import drawable, drawings_of
+from evaluator.report.figures.distributions import worst_pairs
 from evaluator.report.figures.drawing import Drawing, NotDrawn, Rendered
-from evaluator.report.figures.views import worst_pairs
-from evaluator.report.latex import as_latex
+from evaluator.report.figures.selection import drawable, drawings_of
 from evaluator.report.page import page
 from evaluator.report.sections import TRIALS
-from evaluator.report.tables import as_csv, as_markdown, as_text
+from evaluator.report.tables import as_csv, as_latex, as_markdown, as_text
 from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
 

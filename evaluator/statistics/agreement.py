@@ -5,12 +5,88 @@ Arguments are keyword-only throughout: bias changes its sign and MMRV its meanin
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
+import numpy as np
+from jaxtyping import Float64
+
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics.columns import MIN_CELLS, Number, exact, floats
+from evaluator.result import Interval
+from evaluator.statistics.intervals import LEVEL, normal_quantile
+
+# --- Recorded and simulated success rates side by side, checked before anything is computed.
+
+MIN_CELLS = 3
+"""Two points always lie on a line."""
+
+Number = Fraction | float | int
+"""Rates as exact fractions where counts are known, so that ties are ties."""
+
+
+def counted_cells(count: int) -> str:
+    """Write how many cells there are: "1 cell", "2 cells"."""
+    return "1 cell" if count == 1 else f"{count} cells"
+
+
+def exact(
+    statistic: str, recorded: Sequence[Number], sim: Sequence[Number], *, at_least: int = 1
+) -> tuple[list[Fraction], list[Fraction]]:
+    """Return both sides as exact fractions.
+
+    Raises:
+        UndefinedStatisticError: Below ``at_least`` cells.
+        ValueError: When the sides differ in length.
+    """
+    if len(recorded) != len(sim):
+        message = f"{len(recorded)} recorded rates but {len(sim)} of the twin"
+        raise ValueError(message)
+    count = len(recorded)
+    if count == 0:
+        raise UndefinedStatisticError(statistic=statistic, reason="there are no cells")
+    if count < at_least:
+        reason = f"{counted_cells(count)}; it needs at least {at_least}"
+        raise UndefinedStatisticError(statistic=statistic, reason=reason)
+    return [Fraction(v) for v in recorded], [Fraction(v) for v in sim]
+
+
+def varying(
+    statistic: str, recorded: Sequence[Number], sim: Sequence[Number]
+) -> tuple[list[Fraction], list[Fraction]]:
+    """Return both sides, at least 3 cells of which not all are the same on either side.
+
+    Raises:
+        UndefinedStatisticError: With the reason.
+    """
+    # No cells are too few cells here; exact() would word it as an absence.
+    if len(recorded) == len(sim) == 0:
+        raise UndefinedStatisticError(
+            statistic=statistic, reason=f"0 cells; it needs at least {MIN_CELLS}"
+        )
+    x, y = exact(statistic, recorded, sim, at_least=MIN_CELLS)
+    for name, side in (("recorded", x), ("twin", y)):
+        if len(set(side)) == 1:
+            raise UndefinedStatisticError(
+                statistic=statistic,
+                reason=f"the {name} side is constant ({float(side[0]):g} in all {len(side)} cells)",
+            )
+    return x, y
+
+
+def floats(values: Sequence[Number]) -> Float64[np.ndarray, " cells"]:
+    """Return rates as an array."""
+    return np.array([float(v) for v in values], dtype=np.float64)
+
+
+def ranks(values: Sequence[Number]) -> list[Fraction]:
+    """Return ranks from 1; equal values share their average rank."""
+    return [
+        Fraction(2 * sum(other < v for other in values) + sum(other == v for other in values) + 1)
+        / 2
+        for v in values
+    ]
+
 
 CONVENTIONS = ("recorded", "sim")
 
@@ -167,3 +243,172 @@ def mean_rate(rates: Sequence[Number]) -> float:
     if not rates:
         raise UndefinedStatisticError(statistic="mean rate", reason="there are no cells")
     return float(floats(rates).mean())
+
+
+# --- Do the twin's success rates move with the recorded ones? Pearson, Spearman, Kendall.
+
+MIN_CELLS_INTERVAL = 4
+"""Fisher's standard error is 1/sqrt(n - 3)."""
+
+
+def pearson(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
+    """Return Pearson's r over cells; exact on counts, so that rates on a line give 1 and not less.
+
+    Range: -1 to 1. Undefined when: fewer than 3 cells, or one side is constant.
+
+    Raises:
+        UndefinedStatisticError: With the reason.
+    """
+    x, y = varying("Pearson r", recorded, sim)
+    mean_x, mean_y = sum(x) / len(x), sum(y) / len(y)
+    from_mean = [(a - mean_x, b - mean_y) for a, b in zip(x, y, strict=True)]
+    shared = sum(a * b for a, b in from_mean)
+    spreads = sum(a * a for a, _ in from_mean) * sum(b * b for _, b in from_mean)
+    size = math.sqrt(shared * shared / spreads)
+    return -size if shared < 0 else size
+
+
+def spearman(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
+    """Return Spearman's rank correlation; ties share their average rank.
+
+    Range: -1 to 1. Undefined when: fewer than 3 cells, or one side is constant.
+
+    Raises:
+        UndefinedStatisticError: With the reason.
+    """
+    x, y = varying("Spearman rho", recorded, sim)
+    return pearson(ranks(x), ranks(y))
+
+
+def kendall(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
+    """Return Kendall's tau-b: concordant minus discordant pairs, corrected for ties (1945).
+
+    (C - D) / sqrt((pairs - pairs tied in recorded) (pairs - pairs tied in sim)).
+
+    Range: -1 to 1. Undefined when: fewer than 3 cells, or one side is constant.
+
+    Raises:
+        UndefinedStatisticError: With the reason.
+    """
+    x, y = varying("Kendall tau-b", recorded, sim)
+    pairs = [(i, j) for j in range(len(x)) for i in range(j)]
+    signs = [(_sign(x[i] - x[j]), _sign(y[i] - y[j])) for i, j in pairs]
+    concordance = sum(a * b for a, b in signs)
+    untied_x, untied_y = sum(a != 0 for a, _ in signs), sum(b != 0 for _, b in signs)
+    return concordance / math.sqrt(untied_x * untied_y)
+
+
+def fisher_interval(r: float, num_cells: int, *, level: float = LEVEL) -> Interval:
+    """Return Fisher's z interval of Pearson's r. The cells must be independent of each other.
+
+    Raises:
+        UndefinedStatisticError: Below 4 cells, or when r is exactly 1 or -1.
+    """
+    if num_cells < MIN_CELLS_INTERVAL:
+        raise UndefinedStatisticError(
+            statistic="Fisher interval of r",
+            reason=f"{num_cells} cells; it needs at least {MIN_CELLS_INTERVAL}",
+        )
+    if abs(r) >= 1:
+        raise UndefinedStatisticError(
+            statistic="Fisher interval of r", reason=f"r is {r:+.0f} exactly"
+        )
+    z = math.atanh(r)
+    half = normal_quantile(0.5 + level / 2) / math.sqrt(num_cells - 3)
+    return Interval(
+        low=math.tanh(z - half), high=math.tanh(z + half), level=level, method="fisher-z"
+    )
+
+
+def _sign(value: Number) -> int:
+    return (value > 0) - (value < 0)
+
+
+# --- Would the twin have chosen what is best on the robot? A high r does not say so.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decision:
+    """The candidates the twin calls best against those that are."""
+
+    sim_best: frozenset[str]
+    """Every candidate with the highest sim rate; several when they tie."""
+    recorded_best: frozenset[str]
+    possibly_right: bool
+    """One of the twin's best is among the recorded best."""
+    surely_right: bool
+    """Every one of the twin's best is."""
+    regret: Fraction
+    """Best recorded rate minus that of the twin's choice, the worst of a tie."""
+    regret_if_lucky: Fraction
+    """The same for the best of a tie."""
+
+
+def choose(*, recorded: Mapping[str, Number], sim: Mapping[str, Number]) -> Decision:
+    """Choose among candidates by the twin and judge the choice by the recorded rates.
+
+    Source: the decision audit of sim-to-real correlations (winner sets and selection regret,
+    with ties as sets). Exact on counts.
+
+    Args:
+        recorded: Recorded success rate of each candidate.
+        sim: The twin's, of the same candidates.
+
+    Raises:
+        UndefinedStatisticError: Below two candidates: there is nothing to choose.
+        ValueError: When the sides name different candidates.
+    """
+    if recorded.keys() != sim.keys():
+        message = f"different candidates: {sorted(recorded)} recorded, {sorted(sim)} in the twin"
+        raise ValueError(message)
+    if len(recorded) < 2:
+        raise UndefinedStatisticError(
+            statistic="decision",
+            reason=f"{len(recorded)} candidate{'s' if len(recorded) != 1 else ''}; a choice needs "
+            "two",
+        )
+    x = {name: Fraction(rate) for name, rate in recorded.items()}
+    y = {name: Fraction(rate) for name, rate in sim.items()}
+    sim_best = frozenset(name for name in y if y[name] == max(y.values()))
+    recorded_best = frozenset(name for name in x if x[name] == max(x.values()))
+    losses = [max(x.values()) - x[name] for name in sim_best]
+    return Decision(
+        sim_best=sim_best,
+        recorded_best=recorded_best,
+        possibly_right=bool(sim_best & recorded_best),
+        surely_right=sim_best <= recorded_best,
+        regret=max(losses),
+        regret_if_lucky=min(losses),
+    )
+
+
+def over_tasks(rates: Mapping[str, Mapping[str, Number]]) -> dict[str, Fraction]:
+    """Return each candidate's mean rate over tasks, from task -> candidate -> rate.
+
+    Only candidates that every task has: others would be judged by easier or harder tasks.
+
+    Raises:
+        UndefinedStatisticError: Without tasks.
+    """
+    if not rates:
+        raise UndefinedStatisticError(statistic="decision", reason="there are no tasks")
+    shared = set.intersection(*(set(by_candidate) for by_candidate in rates.values()))
+    return {
+        name: sum((Fraction(by_candidate[name]) for by_candidate in rates.values()), Fraction(0))
+        / len(rates)
+        for name in sorted(shared)
+    }
+
+
+def without_each(names: list[str]) -> dict[str, list[str]]:
+    """Return for each name the others: what is left when one task is left out.
+
+    Raises:
+        UndefinedStatisticError: Below two names: nothing would be left.
+    """
+    if len(names) < 2:
+        raise UndefinedStatisticError(
+            statistic="leave one task out",
+            reason=f"{len(names)} task{'s' if len(names) != 1 else ''}; nothing would be left",
+        )
+    return {name: [other for other in names if other != name] for name in names}

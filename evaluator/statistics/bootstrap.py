@@ -5,7 +5,7 @@ same cells would give when measured again is another question: ``remeasure``.
 """
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, combinations
@@ -16,10 +16,106 @@ from scipy.special import gammaln, ndtr, stdtrit
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
-from evaluator.statistics.columns import Number, exact, floats
-from evaluator.statistics.proportion import LEVEL
-from evaluator.statistics.scales import NEAR, SCALES
+from evaluator.statistics.agreement import Number, counted_cells, exact, floats
+from evaluator.statistics.intervals import LEVEL
 from evaluator.statistics.weighted import EPSILON, STATISTICS, Values, values_of
+
+# --- On which scale a statistic of agreement errs by as much upwards as downwards, and where it
+# ends.
+#
+# Fisher's z for correlations, the logarithm for errors; the others are taken as they are.
+
+NEAR = 1e-9
+"""A value this close to its limit is at it; Fisher's z is endless there."""
+EDGE = 1e-6
+"""A redrawn correlation is cut off here before Fisher's z."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """One scale."""
+
+    there: Callable[[float], float]
+    back: Callable[[float], float]
+    slope: Callable[[float], float]
+    """Derivative of ``there``."""
+    low: float = -math.inf
+    """The statistic is never below."""
+    high: float = math.inf
+    is_open: bool = False
+    """At its limits the scale is endless, and no interval can be given there."""
+
+    def around(self, statistic: str, value: float, error: float) -> tuple[float, float]:
+        """Go ``error`` to both sides of a value, on this scale by the delta method.
+
+        Raises:
+            UndefinedStatisticError: At a limit of the scale, or when the error is 0.
+        """
+        if error < NEAR:
+            raise UndefinedStatisticError(
+                statistic=statistic, reason="nothing varies: the interval would have no width"
+            )
+        self.refuse_limit(statistic, value)
+        middle, half = self.there(value), error * self.slope(value)
+        return self.clip(self.back(middle - half)), self.clip(self.back(middle + half))
+
+    def refuse_limit(self, statistic: str, value: float) -> None:
+        """Refuse a value at which the scale has no end.
+
+        Raises:
+            UndefinedStatisticError: Naming it.
+        """
+        if self.is_open and min(value - self.low, self.high - value) < NEAR:
+            raise UndefinedStatisticError(
+                statistic=statistic, reason=f"it is {value:g} exactly, the end of its range"
+            )
+
+    def clip(self, value: float) -> float:
+        """Keep an end where the statistic can be."""
+        return min(self.high, max(self.low, value))
+
+
+CORRELATION = Scale(
+    there=lambda r: math.atanh(max(-1 + EDGE, min(1 - EDGE, r))),
+    back=math.tanh,
+    slope=lambda r: 1 / (1 - r * r),
+    low=-1.0,
+    high=1.0,
+    is_open=True,
+)
+SHARE = Scale(
+    there=lambda p: CORRELATION.there(2 * p - 1),
+    back=lambda z: (math.tanh(z) + 1) / 2,
+    slope=lambda p: 1 / (2 * p * (1 - p)),
+    low=0.0,
+    high=1.0,
+    is_open=True,
+)
+ERROR = Scale(
+    there=lambda e: math.log(max(NEAR, e)),
+    back=math.exp,
+    slope=lambda e: 1 / e,
+    low=0.0,
+    is_open=True,
+)
+PLAIN = Scale(there=lambda v: v, back=lambda v: v, slope=lambda _: 1.0)
+RATE = Scale(there=PLAIN.there, back=PLAIN.back, slope=PLAIN.slope, low=0.0, high=1.0)
+
+SCALES: dict[str, Scale] = {
+    "pearson": CORRELATION,
+    "spearman": CORRELATION,
+    "kendall": CORRELATION,
+    "bias": PLAIN,
+    "mae": ERROR,
+    "rmse": ERROR,
+    "slope": PLAIN,
+    "intercept": PLAIN,
+    "order": SHARE,
+    "mmrv-recorded": RATE,
+    "mmrv-sim": RATE,
+}
+"""By the names of ``weighted.STATISTICS``."""
+
 
 MAX_EXACT = 30_000
 """Up to so many different resamples are all visited: 9 units."""
@@ -272,3 +368,106 @@ def refuse_no_width(interval: Interval) -> Interval:
             reason="nothing varies between resamples: the interval would have no width",
         )
     return interval
+
+
+# --- Where each statistic of agreement would fall if the same cells were measured again.
+#
+# A band of measurement noise, not an interval of a true value: the noise itself pulls a
+# correlation towards 0 and errors away from it.
+
+NUM_DRAWS = 4_000
+MIN_CELLS = 3
+WHAT = "remeasurement band"
+
+
+@dataclass(frozen=True)
+class Remeasured:
+    """Measured rates of each cell, and rates as they might have come out."""
+
+    recorded: Float64[np.ndarray, " cells"]
+    sim: Float64[np.ndarray, " cells"]
+    recorded_again: Float64[np.ndarray, "draws cells"]
+    sim_again: Float64[np.ndarray, "draws cells"]
+
+    @cached_property
+    def _every(self) -> Float64[np.ndarray, "draws cells"]:
+        return np.ones_like(self.recorded_again)
+
+    def band(self, statistic: str, *, level: float = LEVEL) -> Interval:
+        """Return where a statistic would fall.
+
+        Two measurements differ by sqrt(2) times the spread of one, around the value that was
+        found; on Fisher's scale for correlations and shares, on the logarithm for errors.
+
+        Raises:
+            UndefinedStatisticError: Below 3 cells, when the statistic is undefined or at the end
+                of its range, or when no redrawn rate changes it.
+        """
+        if len(self.recorded) < MIN_CELLS:
+            reason = f"{counted_cells(len(self.recorded))}; it needs at least {MIN_CELLS}"
+            raise UndefinedStatisticError(statistic=WHAT, reason=reason)
+        scale = SCALES[statistic]
+        (value,), (known,) = values_of(statistic, self._every[:1], self.recorded, self.sim)
+        if not known:
+            raise UndefinedStatisticError(statistic=WHAT, reason="the statistic is undefined")
+        scale.refuse_limit(WHAT, float(value))
+        values, defined = values_of(statistic, self._every, self.recorded_again, self.sim_again)
+        weights = np.full(len(values), 1 / len(values))
+        ends = weighted_ends(values, defined, weights, (1 - level) / 2, WHAT)
+        low, high = (scale.there(end) for end in ends)
+        centre, half = scale.there(float(value)), math.sqrt(2) * (high - low) / 2
+        if half < NEAR:
+            reason = "no other outcome of the trials changes it"
+            raise UndefinedStatisticError(statistic=WHAT, reason=reason)
+        return Interval(
+            low=scale.clip(scale.back(centre - half)),
+            high=scale.clip(scale.back(centre + half)),
+            level=level,
+            method="remeasurement",
+        )
+
+
+def remeasure_paired(
+    tables: Sequence[tuple[int, int, int, int]],
+    *,
+    rng: np.random.Generator,
+    num_draws: int = NUM_DRAWS,
+) -> Remeasured:
+    """Draw each cell's table of trials anew: both succeed, only sim, only recorded, neither.
+
+    From a multinomial with the observed shares, 1/4 added to each count.
+
+    Raises:
+        UndefinedStatisticError: When a cell has no trial.
+    """
+    if any(sum(table) == 0 for table in tables):
+        raise UndefinedStatisticError(statistic=WHAT, reason="a cell has no trial with both sides")
+    counts = np.array(tables, dtype=np.float64).reshape(-1, 4)
+    totals = counts.sum(axis=1)
+    recorded, sim = [], []
+    for table, total in zip(counts, totals.astype(int).tolist(), strict=True):
+        again = rng.multinomial(total, (table + 0.25) / (total + 1), size=num_draws)
+        recorded.append((again[:, 0] + again[:, 2]) / total)
+        sim.append((again[:, 0] + again[:, 1]) / total)
+    return Remeasured(
+        (counts[:, 0] + counts[:, 2]) / totals,
+        (counts[:, 0] + counts[:, 1]) / totals,
+        np.array(recorded).reshape(len(tables), num_draws).T,
+        np.array(sim).reshape(len(tables), num_draws).T,
+    )
+
+
+def remeasure_counts(
+    recorded: Sequence[tuple[int, int]],
+    sim: Sequence[tuple[int, int]],
+    *,
+    rng: np.random.Generator,
+    num_draws: int = NUM_DRAWS,
+) -> Remeasured:
+    """Draw counts (k, n) anew, of sides whose trials are not paired; 1/2 added to each count."""
+    found, drawn = [], []
+    for side in (recorded, sim):
+        found.append(np.array([k / n for k, n in side]))
+        again = [rng.binomial(n, (k + 0.5) / (n + 1), size=num_draws) / n for k, n in side]
+        drawn.append(np.array(again).reshape(len(side), num_draws).T)
+    return Remeasured(found[0], found[1], drawn[0], drawn[1])

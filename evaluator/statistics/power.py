@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics.proportion import normal_quantile
+from evaluator.statistics.intervals import normal_quantile
 
 ALPHA = 0.05
 """Two-sided."""

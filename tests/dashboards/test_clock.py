@@ -8,8 +8,7 @@ import pytest
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from dashboards.clock import PageClock
-from dashboards.recording import Recording, read_recording
+from dashboards.recording import PageClock, Recording, read_recording
 
 
 @pytest.fixture

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dashboards.figures import Signal, Span, axis, nice_ticks, stage_chart, time_plot
-from dashboards.scatter import Cell, scatter
+from dashboards.figures import Cell, Signal, Span, axis, nice_ticks, scatter, stage_chart, time_plot
 from evaluator.result import Interval, Measurement
 
 

@@ -21,9 +21,8 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.task.robot import ARM_JOINTS
 from dashboards.errors import DashboardError
+from dashboards.rerun_entities import drawable, read_splats
 from dashboards.rerun_file import RerunFile
-from dashboards.rerun_robot import drawable
-from dashboards.rerun_scene import read_splats
 from dashboards.rerun_view import Exported, export_rrd, run_of
 
 

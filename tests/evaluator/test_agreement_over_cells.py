@@ -10,10 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics import agreement, correlation
-from evaluator.statistics.bootstrap import bootstrap_interval, resamples, student_interval
-from evaluator.statistics.decision import choose, over_tasks, without_each
-from evaluator.statistics.remeasure import remeasure_counts, remeasure_paired
+from evaluator.statistics import agreement
+from evaluator.statistics.agreement import choose, over_tasks, without_each
+from evaluator.statistics.bootstrap import (
+    bootstrap_interval,
+    remeasure_counts,
+    remeasure_paired,
+    resamples,
+    student_interval,
+)
 
 rates = st.lists(st.fractions(0, 1, max_denominator=10), min_size=3, max_size=7)
 
@@ -54,8 +59,8 @@ def test_order_accuracy_counts_ties_of_the_twin_as_half() -> None:
 def test_a_reversed_twin_orders_nothing_right() -> None:
     recorded = [0.1, 0.4, 0.8]
     assert agreement.order_accuracy(recorded=recorded, sim=recorded[::-1]).value == 0
-    assert correlation.kendall(recorded, recorded[::-1]) == -1
-    assert correlation.kendall(recorded, recorded) == 1
+    assert agreement.kendall(recorded, recorded[::-1]) == -1
+    assert agreement.kendall(recorded, recorded) == 1
 
 
 def test_exact_counts_see_ties_that_floats_would_miss() -> None:
@@ -92,7 +97,7 @@ def test_many_units_are_drawn() -> None:
 def test_an_exact_bootstrap_is_the_bootstrap_of_all_ordered_draws(statistic: str) -> None:
     recorded, sim = [0.1, 0.5, 0.6, 0.9, 0.3], [0.2, 0.4, 0.9, 0.8, 0.35]
     plain = {
-        "pearson": correlation.pearson,
+        "pearson": agreement.pearson,
         "bias": lambda x, y: agreement.bias(recorded=x, sim=y),
         "mae": lambda x, y: agreement.mean_absolute_error(recorded=x, sim=y),
     }[statistic]
@@ -155,7 +160,7 @@ def test_the_remeasurement_band_shrinks_with_trials_and_is_reproducible() -> Non
 def test_a_high_r_may_choose_wrongly() -> None:
     recorded = {"a": Fraction(9, 10), "b": Fraction(8, 10), "c": Fraction(1, 10)}
     sim = {"a": Fraction(8, 10), "b": Fraction(9, 10), "c": Fraction(1, 10)}
-    assert correlation.pearson(list(recorded.values()), list(sim.values())) > 0.9
+    assert agreement.pearson(list(recorded.values()), list(sim.values())) > 0.9
     decision = choose(recorded=recorded, sim=sim)
     assert not decision.possibly_right
     assert decision.regret == Fraction(1, 10)

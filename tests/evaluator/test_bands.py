@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.compare import compare_run
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.trajectory_bands import band_distance, mean_curve_m, path_distance_m
+from evaluator.metrics.trajectory import band_distance, mean_curve_m, path_distance_m
 
 
 def arc(

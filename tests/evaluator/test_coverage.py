@@ -10,14 +10,22 @@ from evaluator.compare.measure import measured, proportion
 from evaluator.result import Interval
 from evaluator.statistics.bootstrap import METHODS
 from evaluator.statistics.coverage import exact, simulate, stored
-from evaluator.statistics.coverage.chosen import choose_method, holds_from
-from evaluator.statistics.coverage.population import POPULATIONS, Population
-from evaluator.statistics.coverage.simulate_cells import of_agreement, of_remeasurements, truth
-from evaluator.statistics.coverage.unequal import newcombe_coverage
-from evaluator.statistics.paired import tango_difference
-from evaluator.statistics.proportion import clopper_pearson, jeffreys, wilson
+from evaluator.statistics.coverage.exact import newcombe_coverage
+from evaluator.statistics.coverage.simulate import (
+    POPULATIONS,
+    Population,
+    of_agreement,
+    of_remeasurements,
+    truth,
+)
+from evaluator.statistics.coverage.stored import choose_method, holds_from
+from evaluator.statistics.differences import (
+    guaranteed_difference,
+    newcombe_difference,
+    tango_difference,
+)
+from evaluator.statistics.intervals import clopper_pearson, jeffreys, wilson
 from evaluator.statistics.sequential import betting_interval
-from evaluator.statistics.unpaired import guaranteed_difference, newcombe_difference
 from evaluator.statistics.weighted import STATISTICS
 
 REQUIRED = range(5, 101)
@@ -79,10 +87,10 @@ def test_coverage_counts_a_coin_by_hand() -> None:
 
 @pytest.mark.slow
 def test_simulated_coverage_of_fisher_is_the_stored_one() -> None:
-    from evaluator.statistics import correlation
+    from evaluator.statistics import agreement
 
     def make(cells: simulate.Cells, _: int, __: np.random.Generator) -> Interval:
-        return correlation.fisher_interval(correlation.pearson(*cells), len(cells[0]))
+        return agreement.fisher_interval(agreement.pearson(*cells), len(cells[0]))
 
     rng = np.random.default_rng(1)
     found = simulate.of_cells(make, "pearson", 10, POPULATIONS[:2], draws=100, rng=rng)

@@ -17,12 +17,13 @@ from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.terminal import Output
+from evaluator.cache import FOLDER, SummaryCache
 from evaluator.cli import evaluate
-from evaluator.compare import Comparison, compare_run, inventory
-from evaluator.compare.cache import FOLDER, SummaryCache
-from evaluator.compare.inventory import RunFile
-from evaluator.compare.replays import DerivedFacts, DerivedFile, DerivedIndex
+from evaluator.compare import Comparison, compare_run
 from evaluator.result import write_results
+from evaluator.run_reader import inventory
+from evaluator.run_reader.episodes import DerivedFacts, DerivedFile, DerivedIndex
+from evaluator.run_reader.inventory import RunFile
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # a first evaluation is checked elsewhere
 
@@ -291,8 +292,8 @@ def test_the_command_works_without_pyarrow_and_says_so(
     six_trials: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    monkeypatch.delitem(sys.modules, "evaluator.compare.summary_file", raising=False)
-    monkeypatch.delattr("evaluator.compare.summary_file", raising=False)
+    monkeypatch.delitem(sys.modules, "evaluator.cache_file", raising=False)
+    monkeypatch.delattr("evaluator.cache_file", raising=False)
     assert evaluate(six_trials.run.path) == 0
     assert "nothing is kept for the next evaluation" in capsys.readouterr().err
     assert not (six_trials.run.results_dir / FOLDER).exists()

@@ -9,19 +9,22 @@ from hypothesis import strategies as st
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics.funnel import failure_taxonomy, funnel, success_curve
-from evaluator.statistics.gate import Confusion, break_even, cost_curve, kappa
-from evaluator.statistics.proportion import wilson
-from evaluator.statistics.proxy import (
+from evaluator.statistics.gate import (
+    Confusion,
+    break_even,
+    brier,
+    brier_of_base_rate,
+    cost_curve,
+    expected_calibration_error,
+    kappa,
+    reliability_bins,
+)
+from evaluator.statistics.intervals import wilson
+from evaluator.statistics.prediction_powered import (
     applicability,
     post_stratified,
     ppi_plus_plus,
     trials_saved,
-)
-from evaluator.statistics.reliability import (
-    brier,
-    brier_of_base_rate,
-    expected_calibration_error,
-    reliability_bins,
 )
 from evaluator.statistics.sequential import (
     ConfidenceSequence,

@@ -8,9 +8,9 @@ from scipy.stats import quantile_test
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics.bootstrap import student_interval
-from evaluator.statistics.coverage import lengths as coverage
+from evaluator.statistics.coverage import exact as coverage
 from evaluator.statistics.coverage import stored
-from evaluator.statistics.lengths import cluster_means, median_interval, median_rank
+from evaluator.statistics.intervals import cluster_means, median_interval, median_rank
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from bridge.task.record import check_record
 from bridge.terminal import Output
 from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSample, open_session
-from evaluator.live.follow import Follower, read_news
+from evaluator.live.follow import Follower, read_update
 
 ROOT = Path(__file__).resolve().parents[2]
 WAIT_S = 150.0
@@ -232,8 +232,8 @@ def test_news_of_this_run_count_at_once_and_what_is_no_news_is_left_out(
 
 def test_what_a_broken_program_publishes_is_no_news() -> None:
     good = entry_record("t1", run="/run")
-    assert read_news(json.dumps(good).encode()) is not None
+    assert read_update(json.dumps(good).encode()) is not None
     for broken in (b"", b"[]", b"{", json.dumps({**good, "start_ns": "soon"}).encode()):
-        assert read_news(broken) is None
+        assert read_update(broken) is None
     without_run = {name: value for name, value in good.items() if name != "run"}
-    assert read_news(json.dumps(without_run).encode()) is None
+    assert read_update(json.dumps(without_run).encode()) is None

@@ -8,10 +8,9 @@ from hypothesis import strategies as st
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.image import ImageShapeError, psnr_db
-from evaluator.metrics.scores import score_image
-from evaluator.metrics.similarity import ssim
-from evaluator.metrics.trajectory import pose_errors
-from evaluator.metrics.trajectory_bands import band_distance, moving_part, repeatability
+from evaluator.metrics.image_scores import score_image
+from evaluator.metrics.ssim import ssim
+from evaluator.metrics.trajectory import band_distance, moving_part, pose_errors, repeatability
 
 
 def picture(seed: int = 0, size: tuple[int, int] = (24, 32)) -> np.ndarray:

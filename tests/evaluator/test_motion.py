@@ -19,14 +19,13 @@ from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.compare.motion import (
     MotionSummary,
     compare_tracks,
+    motion_results,
     summarise_motion,
     summarise_motions,
 )
-from evaluator.compare.tracking import motion_results
-from evaluator.compare.tracks import Tracks
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.trajectory_align import align_rigid, find_lag_s
-from evaluator.metrics.trajectory_steps import joint_errors, relative_errors
+from evaluator.metrics.trajectory import align_rigid, find_lag_s, joint_errors, relative_errors
+from evaluator.run_reader.tracks import Tracks
 
 START_NS = 10_000_000_000
 STEP_NS = 20_000_000

@@ -9,15 +9,20 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics.paired import sign_test, tango_difference
+from evaluator.statistics.differences import (
+    boschloo,
+    guaranteed_difference,
+    newcombe_difference,
+    sign_test,
+    tango_difference,
+)
+from evaluator.statistics.intervals import ImpossibleCountError, jeffreys, wilson
 from evaluator.statistics.power import (
     detectable_rate,
     power_paired,
     power_unpaired,
     trials_needed,
 )
-from evaluator.statistics.proportion import ImpossibleCountError, jeffreys, wilson
-from evaluator.statistics.unpaired import boschloo, guaranteed_difference, newcombe_difference
 
 pairs = st.integers(1, 40).flatmap(
     lambda n: st.tuples(st.integers(0, n), st.just(n)).flatmap(

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy import optimize
 
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics.paired import tango_difference
-from evaluator.statistics.proportion import ImpossibleCountError
-from evaluator.statistics.sequential_pairs import (
+from evaluator.statistics.differences import tango_difference
+from evaluator.statistics.intervals import ImpossibleCountError
+from evaluator.statistics.sequential import (
     pairs_advice,
     pairs_betting_interval,
     pairs_capital_log,

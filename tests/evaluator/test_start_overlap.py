@@ -5,11 +5,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from evaluator.compare.fewer import assisted_rates
+from evaluator.compare.prediction_powered import assisted_rates
 from evaluator.compare.rows import TrialRow
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Measurement
-from evaluator.statistics.overlap import starts_alike, starts_covered
+from evaluator.statistics.prediction_powered import starts_alike, starts_covered
 
 
 def energy(x: np.ndarray, y: np.ndarray) -> float:

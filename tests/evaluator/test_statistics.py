@@ -10,16 +10,15 @@ from hypothesis import strategies as st
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
-from evaluator.statistics import agreement, correlation
+from evaluator.statistics import agreement
+from evaluator.statistics.differences import mcnemar, newcombe_difference
 from evaluator.statistics.gate import Confusion, phi
-from evaluator.statistics.paired import mcnemar
-from evaluator.statistics.proportion import (
+from evaluator.statistics.intervals import (
     ImpossibleCountError,
     clopper_pearson,
     relative_gain,
     wilson,
 )
-from evaluator.statistics.unpaired import newcombe_difference
 
 counts = st.integers(1, 200).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 rates = st.lists(st.fractions(0, 1, max_denominator=20), min_size=3, max_size=8)
@@ -111,25 +110,25 @@ def test_r_does_not_care_about_order_or_scale(
 ) -> None:
     sim = data.draw(st.permutations(recorded))
     try:
-        r = correlation.pearson(recorded, sim)
+        r = agreement.pearson(recorded, sim)
     except UndefinedStatisticError:
         assert len(set(recorded)) == 1
         return
     assert -1 <= r <= 1
-    assert correlation.pearson(sim, recorded) == pytest.approx(r, abs=1e-9)
-    assert correlation.pearson(recorded, [v / 2 for v in sim]) == pytest.approx(r, abs=1e-9)
+    assert agreement.pearson(sim, recorded) == pytest.approx(r, abs=1e-9)
+    assert agreement.pearson(recorded, [v / 2 for v in sim]) == pytest.approx(r, abs=1e-9)
 
 
 def test_r_of_two_points_and_of_a_constant_side_is_refused() -> None:
     with pytest.raises(UndefinedStatisticError, match="2 cells; it needs at least 3"):
-        correlation.pearson([0.1, 0.2], [0.3, 0.4])
+        agreement.pearson([0.1, 0.2], [0.3, 0.4])
     with pytest.raises(UndefinedStatisticError, match=r"twin side is constant \(1 in all 3"):
-        correlation.pearson([0.1, 0.2, 0.3], [1, 1, 1])
+        agreement.pearson([0.1, 0.2, 0.3], [1, 1, 1])
 
 
 def test_r_of_three_cells_has_no_interval() -> None:
     with pytest.raises(UndefinedStatisticError, match="3 cells; it needs at least 4"):
-        correlation.fisher_interval(0.9, 3)
+        agreement.fisher_interval(0.9, 3)
 
 
 @settings(max_examples=40, deadline=None)
@@ -190,12 +189,12 @@ def test_rates_on_a_line_correlate_exactly_and_get_no_interval(
     sim = [slope * rate + Fraction(1, 3) for rate in recorded]
     if slope == 0:
         with pytest.raises(UndefinedStatisticError, match="twin side is constant"):
-            correlation.pearson(recorded, sim)
+            agreement.pearson(recorded, sim)
         return
-    r = correlation.pearson(recorded, sim)
+    r = agreement.pearson(recorded, sim)
     assert r == (1 if slope > 0 else -1)  # 0.9999999999999998 had an interval of no width
     with pytest.raises(UndefinedStatisticError, match="exactly"):
-        correlation.fisher_interval(r, len(counts))
+        agreement.fisher_interval(r, len(counts))
 
 
 @pytest.mark.parametrize("method", [wilson, clopper_pearson])

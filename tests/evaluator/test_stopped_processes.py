@@ -6,10 +6,9 @@ from multiprocessing.connection import wait
 
 import pytest
 
-from evaluator import child_process
-from evaluator.compare import workers
-from evaluator.compare.workers import Workers
+from evaluator import child_process, workers
 from evaluator.report.figures.beside import Beside
+from evaluator.workers import Workers
 
 LARGE = 3_000_000
 """Bytes; a pipe holds 65 536."""

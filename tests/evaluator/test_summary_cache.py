@@ -17,10 +17,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluator.compare import cache_folder
-from evaluator.compare.cache import MOST_FILES, SummaryCache
-from evaluator.compare.summary_file import UnusableFileError, read_summaries, write_summaries
-from evaluator.packed import Packed
+from evaluator import cache as cache_module
+from evaluator.cache import MOST_FILES, SummaryCache
+from evaluator.cache_file import UnusableFileError, read_summaries, write_summaries
+from evaluator.memory import Packed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +174,7 @@ def test_changed_code_forgets_everything(tmp_path: Path, monkeypatch: pytest.Mon
     with SummaryCache(tmp_path) as cache:
         cache.keep(Everything, "k", ())
         assert cache.find(Everything, "k") == ()
-    monkeypatch.setattr(cache_folder, "code_version", lambda: "tomorrow's")
+    monkeypatch.setattr(cache_module, "code_version", lambda: "tomorrow's")
     said: list[str] = []
     with SummaryCache(tmp_path, say=said.append) as cache:
         assert cache.find(Everything, "k") is None
@@ -222,8 +222,8 @@ def test_without_pyarrow_nothing_is_kept_and_somebody_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    monkeypatch.delitem(sys.modules, "evaluator.compare.summary_file", raising=False)
-    monkeypatch.delattr("evaluator.compare.summary_file", raising=False)
+    monkeypatch.delitem(sys.modules, "evaluator.cache_file", raising=False)
+    monkeypatch.delattr("evaluator.cache_file", raising=False)
     said: list[str] = []
     with SummaryCache(tmp_path / "cache", say=said.append) as cache:
         assert cache.kept_or_made(Other, "k", lambda: ()) == ()
@@ -242,7 +242,7 @@ def test_files_of_many_evaluations_are_folded_and_what_is_gone_is_dropped(tmp_pa
     with SummaryCache(tmp_path) as cache:
         assert cache.find(Other, "0") == (Other(text="0"),)
     (path,) = tmp_path.iterdir()
-    assert set(read_summaries(path, Other, cache_folder.code_version())) == {"0"}
+    assert set(read_summaries(path, Other, cache_module.code_version())) == {"0"}
 
 
 def test_an_interrupted_evaluation_drops_nothing(tmp_path: Path) -> None:
@@ -283,7 +283,7 @@ def test_files_folded_while_they_are_read_are_looked_for_again(
         cache = SummaryCache(tmp_path)
         cache.keep(Other, key, ())
         cache.save()
-    folder = cache_folder.CacheFolder(tmp_path, print)
+    folder = cache_module.CacheFolder(tmp_path, print)
     listed = folder.files_of(Other)
     seen: list[list[Path]] = [listed]
 
@@ -293,7 +293,7 @@ def test_files_folded_while_they_are_read_are_looked_for_again(
                 tmp_path / f"Other.{'0' * 16}.parquet",
                 Other,
                 {"a": (), "b": ()},
-                cache_folder.code_version(),
+                cache_module.code_version(),
             )
             for path in listed:
                 path.unlink()
@@ -309,8 +309,8 @@ KILLED = """
 import sys
 from pathlib import Path
 from bridge.episode.metadata import EpisodeInfo
-from evaluator.compare.cache import SummaryCache
-from evaluator.compare.recorded import RecordedFacts
+from evaluator.cache import SummaryCache
+from evaluator.run_reader.episodes import RecordedFacts
 
 cache = SummaryCache(Path(sys.argv[1]))
 for number in range(10**9):
@@ -324,7 +324,7 @@ for number in range(10**9):
 
 @pytest.mark.slow
 def test_a_killed_evaluation_leaves_what_it_had_saved(tmp_path: Path) -> None:
-    from evaluator.compare.recorded import RecordedFacts
+    from evaluator.run_reader.episodes import RecordedFacts
 
     with subprocess.Popen(
         [sys.executable, "-c", KILLED, str(tmp_path)], stdout=subprocess.PIPE, text=True

@@ -13,8 +13,7 @@ from bridge.errors import PathNotFoundError, UsageError
 from bridge.exchange.trials_csv import TableError, TrialRecord, read_trials, write_trials
 from bridge.exchange.trials_rates import read_rates
 from evaluator.compare import compare_csv, compare_run
-from evaluator.compare.imported import row_from_record
-from evaluator.compare.spreadsheet import compare_trials, record_from_row
+from evaluator.compare.spreadsheet import compare_trials, record_from_row, row_from_record
 
 PAPER = Path(__file__).resolve().parents[2] / "docs" / "examples" / "paper_table_rates.csv"
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from evaluator.compare import compare_run
-from evaluator.compare.varied import varied_sim
+from evaluator.compare.success import varied_sim
 from evaluator.result import Table
 
 

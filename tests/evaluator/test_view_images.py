@@ -14,10 +14,9 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from evaluator.compare.run import compare_run
 from evaluator.errors import EvaluatorError, UndefinedStatisticError
-from evaluator.metrics.depth import score_depth
-from evaluator.metrics.image import ImageShapeError, aligned
-from evaluator.metrics.options import ImageOptions
-from evaluator.metrics.scores import score_image
+from evaluator.metrics.image import ImageShapeError, aligned, score_depth
+from evaluator.metrics.image_protocol import ImageOptions
+from evaluator.metrics.image_scores import score_image
 
 STAMP = 5_000
 SIZE = (36, 44)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from bridge.episode.run_folder import RunFolder
-from evaluator.compare import Comparison, compare_run, view_summary
-from evaluator.compare.cache import FOLDER, SummaryCache
+from evaluator.cache import FOLDER, SummaryCache
+from evaluator.compare import Comparison, compare_run
+from evaluator.compare.images import views
 from evaluator.result import write_results
 
 
@@ -24,14 +25,14 @@ def run(tmp_path: Path, load_golden_script: Callable[[str], ModuleType]) -> RunF
 def scored(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many views were scored, each time."""
     counts: list[int] = []
-    really = view_summary.score_views
+    really = views.score_views
 
     def noted(images: object, **asked: object) -> object:
         found = really(images, **asked)  # type: ignore[arg-type]
         counts.append(len(found[0]))
         return found
 
-    monkeypatch.setattr(view_summary, "score_views", noted)
+    monkeypatch.setattr(views, "score_views", noted)
     return counts
 
 
@@ -64,9 +65,9 @@ def test_views_are_scored_once_and_again_when_they_change(
 
 def test_what_cannot_be_scored_keeps_its_reason(tmp_path: Path, scored: list[int]) -> None:
     with SummaryCache(tmp_path) as cache:
-        summary = view_summary.ViewSummary(reason="camera front at 1 ns: no picture", scores={})
-        cache.keep(view_summary.ViewSummary, "k", (summary,))
+        summary = views.ViewSummary(reason="camera front at 1 ns: no picture", scores={})
+        cache.keep(views.ViewSummary, "k", (summary,))
     with SummaryCache(tmp_path) as cache:
-        found = view_summary.scored_views(view_summary.Images(), "k", cache)
+        found = views.scored_views(views.Images(), "k", cache)
     assert found == ([], ["camera front at 1 ns: no picture"])
     assert scored == []

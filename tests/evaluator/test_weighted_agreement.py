@@ -9,16 +9,22 @@ import numpy as np
 import pytest
 
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics import agreement, correlation
-from evaluator.statistics.bootstrap import METHODS, CellSample, bootstrap_interval, expanded_tail
-from evaluator.statistics.remeasure import remeasure_counts, remeasure_paired
-from evaluator.statistics.scales import SCALES
+from evaluator.statistics import agreement
+from evaluator.statistics.bootstrap import (
+    METHODS,
+    SCALES,
+    CellSample,
+    bootstrap_interval,
+    expanded_tail,
+    remeasure_counts,
+    remeasure_paired,
+)
 from evaluator.statistics.weighted import STATISTICS, values_of
 
 PLAIN: dict[str, Callable[[Any, Any], float]] = {
-    "pearson": correlation.pearson,
-    "spearman": correlation.spearman,
-    "kendall": correlation.kendall,
+    "pearson": agreement.pearson,
+    "spearman": agreement.spearman,
+    "kendall": agreement.kendall,
     "bias": lambda x, y: agreement.bias(recorded=x, sim=y),
     "mae": lambda x, y: agreement.mean_absolute_error(recorded=x, sim=y),
     "rmse": lambda x, y: agreement.root_mean_square_error(recorded=x, sim=y),

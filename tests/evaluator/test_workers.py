@@ -17,11 +17,12 @@ import pytest
 from other_processes import ended_within
 
 from bridge.terminal import Output
-from evaluator.compare import compare_run, run, workers
-from evaluator.compare.cache import FOLDER, SummaryCache
-from evaluator.compare.contents import READ_S
-from evaluator.compare.workers import Workers
+from evaluator import workers
+from evaluator.cache import FOLDER, SummaryCache
+from evaluator.compare import compare_run, run
 from evaluator.result import write_results
+from evaluator.run_reader.contents import READ_S
+from evaluator.workers import Workers
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from evaluator.statistics import agreement, correlation
-from evaluator.statistics.paired import mcnemar, tango_difference
+from evaluator.statistics import agreement
+from evaluator.statistics.differences import (
+    boschloo,
+    mcnemar,
+    newcombe_difference,
+    tango_difference,
+)
+from evaluator.statistics.intervals import clopper_pearson, jeffreys, wilson
 from evaluator.statistics.power import power_unpaired
-from evaluator.statistics.proportion import clopper_pearson, jeffreys, wilson
-from evaluator.statistics.proxy import ppi_plus_plus
-from evaluator.statistics.unpaired import boschloo, newcombe_difference
+from evaluator.statistics.prediction_powered import ppi_plus_plus
 
 pytestmark = pytest.mark.parity
 
@@ -91,7 +95,7 @@ def test_boschloo_agrees_with_scipy(table: tuple[int, int, int, int]) -> None:
 def test_kendall_and_the_calibration_line_agree_with_scipy(seed: int) -> None:
     rng = np.random.default_rng(seed)
     x, y = (rng.integers(0, 6, 9) / 5).tolist(), (rng.integers(0, 6, 9) / 5).tolist()
-    assert correlation.kendall(x, y) == pytest.approx(stats.kendalltau(x, y).statistic, abs=EXACT)
+    assert agreement.kendall(x, y) == pytest.approx(stats.kendalltau(x, y).statistic, abs=EXACT)
     line = agreement.calibration_line(recorded=y, sim=x)
     theirs = stats.linregress(x, y)
     assert (line.slope, line.intercept) == pytest.approx(

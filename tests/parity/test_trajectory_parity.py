@@ -9,9 +9,13 @@ from scipy.spatial.transform import Rotation
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.task_file import ObjectModel
 from evaluator.metrics.state import turn_between_rad, turns_alike
-from evaluator.metrics.trajectory import angles_rad, pose_errors
-from evaluator.metrics.trajectory_align import align_rigid, without_rigid_motion
-from evaluator.metrics.trajectory_steps import relative_errors
+from evaluator.metrics.trajectory import (
+    align_rigid,
+    angles_rad,
+    pose_errors,
+    relative_errors,
+    without_rigid_motion,
+)
 
 pytestmark = pytest.mark.parity
 

@@ -15,7 +15,7 @@ from evaluator.child_process import ChildProcess
 from evaluator.report.figures.drawing import Drawing, Rendered
 
 if TYPE_CHECKING:
-    from evaluator.report.figures.chosen import Drawable
+    from evaluator.report.figures.selection import Drawable
 
 MIN_FILES = 2000
 """Recorded and derived files from which a second process is worth it.
@@ -85,8 +85,8 @@ def serve(receive: Callable[[], "Drawable"], outbox: BinaryIO) -> None:
         receive: Brings what the figures show.
         outbox: Takes a pickled dictionary: the forms of each figure by its id.
     """
-    from evaluator.report.figures.chosen import drawings_of  # noqa: PLC0415  # loads the numbers
     from evaluator.report.figures.render import render, warm_up  # noqa: PLC0415  # and matplotlib
+    from evaluator.report.figures.selection import drawings_of  # noqa: PLC0415  # loads the numbers
 
     warm_up()
     found: dict[str, Forms] = {}

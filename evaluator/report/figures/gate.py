@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from evaluator.compare.drawn import DrawnBin
+from evaluator.compare.plot_data import ReliabilityPoint
 from evaluator.report.figures.drawing import (
     COLUMN_IN,
     LIGHT,
@@ -98,7 +98,7 @@ def _matrix(axes: "Axes", row: Sequence[Cell], word: str) -> None:
     axes.set_title(str(row[0]).replace(" (", "\n("), fontsize=7.5, pad=4, color=LIGHT["ink"])
 
 
-def reliability(bins: Sequence[DrawnBin]) -> Drawing | NotDrawn:
+def reliability(bins: Sequence[ReliabilityPoint]) -> Drawing | NotDrawn:
     """Draw how often trials succeeded against the probability that was stated for them."""
     if not bins:
         return NotDrawn(id="reliability", reason="no trial has p_success and an outcome")

@@ -6,10 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.gradient import gmsd
-from evaluator.metrics.image import ImageShapeError, SwappedColourError, psnr_db, refuse_swapped
-from evaluator.metrics.scores import METRICS, PLAIN_METRICS, score_image
-from evaluator.metrics.similarity import MS_SSIM_MIN_PX, PADDINGS, ms_ssim, ssim, ssim_maps
+from evaluator.metrics.image import (
+    ImageShapeError,
+    SwappedColourError,
+    gmsd,
+    psnr_db,
+    refuse_swapped,
+)
+from evaluator.metrics.image_scores import METRICS, PLAIN_METRICS, score_image
+from evaluator.metrics.ssim import MS_SSIM_MIN_PX, PADDINGS, ms_ssim, ssim, ssim_maps
 
 
 def picture(seed: int = 0, size: tuple[int, int] = (40, 56)) -> np.ndarray:

@@ -12,11 +12,10 @@ import torch
 from own_process import printed
 
 from bridge.errors import MissingDependencyError
-from evaluator.compare.variants import score_variants
-from evaluator.metrics import lpips_weights
+from evaluator.compare.images.scores import score_variants
+from evaluator.metrics import lpips_torch
 from evaluator.metrics.lpips import LPIPS_METRICS, metric_id, open_nets
-from evaluator.metrics.lpips_torch import LpipsNet
-from evaluator.metrics.lpips_weights import LAYERS, LpipsWeightsError, read_heads
+from evaluator.metrics.lpips_torch import LAYERS, LpipsNet, LpipsWeightsError, read_heads
 
 
 @pytest.fixture(scope="session")
@@ -124,8 +123,8 @@ def test_the_stamp_says_whose_weights_they_are(backbones: dict[str, Path]) -> No
     assert digest[:16] in net.weights
     assert "not torchvision's published file" in net.weights
     assert "heads of" in net.weights
-    assert "torchvision's published file" in lpips_weights.describe_weights(
-        "vgg", lpips_weights.PUBLISHED["vgg"] + "0" * 56, "x"
+    assert "torchvision's published file" in lpips_torch.describe_weights(
+        "vgg", lpips_torch.PUBLISHED["vgg"] + "0" * 56, "x"
     )
 
 
@@ -215,7 +214,7 @@ def test_a_file_that_would_run_code_is_refused(tmp_path: Path) -> None:
 
 
 def test_without_heads_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lpips_weights, "HEADS", (("no_such_package", "weights"),))
+    monkeypatch.setattr(lpips_torch, "HEADS", (("no_such_package", "weights"),))
     with pytest.raises(MissingDependencyError, match=r"robot-gst\[lpips\]"):
         read_heads("vgg")
 
@@ -269,7 +268,7 @@ def test_images_are_scored_without_torch(tmp_path: Path) -> None:
             Image.fromarray(pixels).save(tmp_path / name / f"{index}.png")
     code = (
         "import sys; from pathlib import Path; from evaluator.cli import evaluate; "
-        "from evaluator.metrics.options import ImageOptions; "
+        "from evaluator.metrics.image_protocol import ImageOptions; "
         f"root = Path({str(tmp_path)!r}); "
         "images = ImageOptions(reference=root / 'recorded', renders=(f'ours={root}/ours',)); "
         "evaluate(images=images, out=root / 'out'); "

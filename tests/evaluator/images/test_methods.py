@@ -11,11 +11,11 @@ from skimage.metrics import peak_signal_noise_ratio
 
 from bridge.errors import PathNotFoundError, UsageError
 from evaluator.cli import evaluate
-from evaluator.compare.renders import compare_folders
+from evaluator.compare.images.renders import compare_folders
+from evaluator.compare.images.scores import PICTURE_WIDTH_PX, shrunk_u8
 from evaluator.compare.rows import Comparison
-from evaluator.compare.view_quality import PICTURE_WIDTH_PX, shrunk_u8
 from evaluator.errors import EvaluatorError
-from evaluator.metrics.options import ImageOptions
+from evaluator.metrics.image_protocol import ImageOptions
 
 SIZE = (48, 64)
 
@@ -289,7 +289,7 @@ def test_the_command_writes_a_report_of_images_alone(folders: Path) -> None:
 
 
 def test_views_of_a_run_may_be_called_as_export_tum_calls_them() -> None:
-    from evaluator.compare.renders import _other_names
+    from evaluator.compare.images.renders import _other_names
 
     names = _other_names(["wrist/1500000000", "side/1500000000", "side/2000000001"])
     assert names["wrist_1500000000"] == "wrist/1500000000"

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 
-from evaluator.compare.image_tables import StampedValue, stamped_table
-from evaluator.compare.method_tables import paper_table
-from evaluator.metrics.stamp import Stamp, common_text
+from evaluator.compare.images.renders import paper_table
+from evaluator.compare.images.tables import StampedValue, stamped_table
+from evaluator.metrics.image_protocol import Stamp, common_text
 
 STAMP = Stamp(
     metric="SSIM",
-    implementation="evaluator.metrics.similarity 1",
+    implementation="evaluator.metrics.ssim 1",
     window="gaussian 11 x 11 sigma 1.5",
     padding="zeros",
     resolution="640 x 480",

@@ -3,8 +3,17 @@
 import numpy as np
 import pytest
 
-from evaluator.metrics.similarity import PADDINGS, ssim, ssim_maps
-from evaluator.metrics.window import BORDER, C1, C2, SIGMA, WINDOW, SlidWindow
+from evaluator.metrics.ssim import (
+    BORDER,
+    C1,
+    C2,
+    PADDINGS,
+    SIGMA,
+    WINDOW,
+    SlidWindow,
+    ssim,
+    ssim_maps,
+)
 
 MODES = {"zero": "constant", "reflect": "reflect"}
 SIZES = [(11, 11), (11, 40), (43, 12), (26, 27), (37, 101), (64, 48)]

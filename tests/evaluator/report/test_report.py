@@ -17,9 +17,8 @@ from bridge.errors import UsageError
 from bridge.terminal import Output
 from evaluator.cli import evaluate
 from evaluator.compare import compare_csv, compare_run
-from evaluator.report.latex import as_latex
 from evaluator.report.page import page
-from evaluator.report.tables import as_csv, as_markdown, as_text
+from evaluator.report.tables import as_csv, as_latex, as_markdown, as_text
 from evaluator.report.write import write_report
 from evaluator.result import Measurement, Results, Table, load_results
 

@@ -16,7 +16,7 @@ import robot_gst
 from evaluator.compare import Comparison, compare_csv
 from evaluator.report.figures import beside as module
 from evaluator.report.figures.beside import MIN_FILES, Beside, beside
-from evaluator.report.figures.chosen import drawable, drawings
+from evaluator.report.figures.selection import drawable, drawings
 from evaluator.report.write import write_report
 
 ROOT = Path(__file__).resolve().parents[3]

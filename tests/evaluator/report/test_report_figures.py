@@ -8,10 +8,10 @@ import lean_checks
 import pytest
 
 from evaluator.compare import Comparison, compare_csv
-from evaluator.report.figures.agreement import scatter, success
-from evaluator.report.figures.chosen import drawings
 from evaluator.report.figures.drawing import DARK, LIGHT, Drawing, NotDrawn, Rendered
+from evaluator.report.figures.rates import scatter, success
 from evaluator.report.figures.render import render
+from evaluator.report.figures.selection import drawings
 from evaluator.report.sections import SECTIONS
 from evaluator.report.write import write_report
 

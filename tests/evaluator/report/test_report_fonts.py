@@ -9,7 +9,7 @@ import pytest
 from matplotlib.backends import _backend_pdf_ps as embedding
 from matplotlib.figure import Figure
 
-from evaluator.report.figures import fonts
+from evaluator.report.figures import render as render_module
 from evaluator.report.figures.drawing import Drawing
 from evaluator.report.figures.render import render
 from evaluator.result import Table
@@ -19,7 +19,7 @@ TABLE = Table(id="t", title="", columns=("a",), rows=((1,),))
 
 @pytest.fixture(autouse=True)
 def no_cut_yet(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fonts, "_CUTS", {})
+    monkeypatch.setattr(render_module, "_CUTS", {})
 
 
 def saying(text: str) -> Drawing:
@@ -63,7 +63,7 @@ def glyph_counts(pdf: bytes) -> list[int]:
 def test_figures_with_usual_characters_share_one_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     made = cuts_made(monkeypatch)
     pdfs = [render(saying(text)).pdf for text in ("success (%)", "Twin -3.5 mm", "±0.1 × 2 − 1")]
-    assert len(made) == 1, "matplotlib has changed inside: evaluator/report/figures/fonts.py"
+    assert len(made) == 1, "matplotlib has changed inside: evaluator/report/figures/render.py"
     counts = {count for pdf in pdfs for count in glyph_counts(pdf)}
     assert len(counts) == 1
     assert min(counts) >= made[0]
@@ -83,7 +83,7 @@ def test_an_unusual_character_is_cut_too_and_changes_no_other_file(
 def test_where_matplotlib_is_another_each_file_has_its_own_cut(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(fonts, "_WANTED", ("fontfile", "characters"))
+    monkeypatch.setattr(render_module, "_WANTED", ("fontfile", "characters"))
     made = cuts_made(monkeypatch)
     pdfs = [render(saying(text)).pdf for text in ("abc", "xyz")]
     assert made == [3, 3]
@@ -94,7 +94,7 @@ def test_nothing_of_it_stays_in_matplotlib() -> None:
     before = embedding.get_glyphs_subset, embedding.font_as_file
     render(saying("abc"))
     assert (embedding.get_glyphs_subset, embedding.font_as_file) == before
-    with pytest.raises(RuntimeError, match="spoilt"), fonts.shared_cuts():
+    with pytest.raises(RuntimeError, match="spoilt"), render_module.shared_cuts():
         raise RuntimeError("spoilt")
     assert (embedding.get_glyphs_subset, embedding.font_as_file) == before
     figure = Figure()

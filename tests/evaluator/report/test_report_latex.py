@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluator.compare import compare_csv
-from evaluator.report.latex import LONG_ROWS, as_latex, latex
+from evaluator.report.tables import LONG_ROWS, as_latex, latex
 from evaluator.result import Table
 
 PAPER = Path(__file__).resolve().parents[3] / "docs" / "examples" / "paper_table_rates.csv"

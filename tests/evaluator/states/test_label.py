@@ -15,8 +15,7 @@ from state_samples import (
     recorded_episode,
 )
 
-from evaluator.compare.label import Witness, summarise_witness
-from evaluator.compare.label_results import label_results
+from evaluator.compare.labels import PerceivedOutcome, label_results, perceive_outcome
 from evaluator.compare.rows import TrialRow
 
 CUBE_START = posed((0.45, -0.1, 0.02))
@@ -28,10 +27,10 @@ def witness(
     *,
     task: str = "cube_into_box",
     tool_m: tuple[float, float, float] | None = (0.4, 0.0, 0.4),
-) -> Witness:
+) -> PerceivedOutcome:
     plan = plan_of({"place": {"cube": posed(IN_BOX_M)}})
     recorded = recorded_episode(tmp_path / "t.mcap", plan, task=task, tool_m=tool_m)
-    found = summarise_witness(
+    found = perceive_outcome(
         recorded, localised_episode(tmp_path / "l.mcap", seen), plan_id=PLAN_ID
     )
     assert found is not None
@@ -106,10 +105,10 @@ def test_ducks_are_counted_one_by_one(tmp_path: Path) -> None:
 def test_without_localisation_or_task_there_is_no_witness(tmp_path: Path) -> None:
     plan = plan_of({"place": {"cube": posed(IN_BOX_M)}})
     recorded = recorded_episode(tmp_path / "a.mcap", plan)
-    assert summarise_witness(recorded, None, plan_id=PLAN_ID) is None
+    assert perceive_outcome(recorded, None, plan_id=PLAN_ID) is None
     unknown = recorded_episode(tmp_path / "b.mcap", plan, task="no_such_task")
     localised = localised_episode(tmp_path / "l.mcap", started())
-    assert summarise_witness(unknown, localised, plan_id=PLAN_ID) is None
+    assert perceive_outcome(unknown, localised, plan_id=PLAN_ID) is None
 
 
 def row(name: str, recorded: bool | None, *, unit: str = "trial", k: int = 0) -> TrialRow:
@@ -128,8 +127,8 @@ def row(name: str, recorded: bool | None, *, unit: str = "trial", k: int = 0) ->
     )
 
 
-def says(name: str, value: bool | None, done: int | None = None) -> Witness:
-    return Witness(
+def says(name: str, value: bool | None, done: int | None = None) -> PerceivedOutcome:
+    return PerceivedOutcome(
         episode=name,
         task="cube_into_box",
         condition="with_replanning",

@@ -22,8 +22,7 @@ from state_samples import (
 
 from bridge.episode.reader import Episode
 from bridge.task.task_file import ObjectModel, load_task
-from evaluator.compare.final_states import state_results
-from evaluator.compare.states import StateSummary, summarise_states
+from evaluator.compare.states import StateSummary, state_results, summarise_states
 from evaluator.metrics.state import soft_box, turn_between_rad, turns_alike
 
 LIFTED_M = (0.45, -0.1, 0.25)

@@ -1,0 +1,374 @@
+"""Camera images, depth and poses of an episode, as Rerun shows them."""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TypeVar
+
+import numpy as np
+import rerun as rr
+from jaxtyping import Float
+from rerun.urdf import UrdfTree
+
+from bridge.episode import streams
+from bridge.episode.cdr.messages import CameraInfo, DepthImage, color_file_from_message
+from bridge.episode.reader import Episode
+from bridge.episode.streams import JointTrack
+from bridge.episode.transforms import TransformTree
+from bridge.errors import GstError
+from bridge.geometry import se3
+from bridge.geometry.trajectory import PoseTrajectory
+from bridge.task.robot import BASE_FRAME, FINGER_JOINTS, resolve_mesh
+from bridge.task.task_file import ObjectModel, Task
+from dashboards.errors import DashboardError
+from dashboards.frames import media_type
+from dashboards.rerun_file import RerunFile
+
+# --- The rebuilt place as Gaussian splats, and task objects as boxes.
+
+BACKGROUND = "background.ply"
+MAX_SPLATS = 300_000
+"""More than this is slow in the web viewer (measured); the largest and most opaque are kept."""
+SH_DC = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+_COLUMNS = (
+    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+
+
+def read_splats(path: Path) -> Float[np.ndarray, "num_splats 14"]:
+    """Read a 3D Gaussian splatting PLY; higher harmonics are left out.
+
+    Returns:
+        Position [m], colour harmonic, opacity logit, log scales [m], rotation wxyz.
+
+    Raises:
+        DashboardError: When the file is another kind of PLY, or cut short.
+    """
+    data = path.read_bytes()
+    head, marker, body = data.partition(b"end_header\n")
+    lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    names = [words[-1] for words in lines if words[:2] == ["property", "float"]]
+    counts = [int(words[2]) for words in lines if words[:2] == ["element", "vertex"]]
+    properties = sum(words[:1] == ["property"] for words in lines)
+    plain = marker and ["format", "binary_little_endian", "1.0"] in lines
+    if not plain or len(counts) != 1 or properties != len(names) or not set(_COLUMNS) <= set(names):
+        message = f"{path} is not a Gaussian splat PLY. Make it again: robot-gst rebuild RUN."
+        raise DashboardError(message)
+    if len(body) != counts[0] * len(names) * 4:
+        message = f"{path} is cut short. Make it again: robot-gst rebuild RUN --force."
+        raise DashboardError(message)
+    table = np.frombuffer(body, dtype="<f4").reshape(counts[0], len(names))
+    return table[:, [names.index(name) for name in _COLUMNS]]
+
+
+def log_splats(file: RerunFile, scene_dir: Path) -> bool:
+    """Log the rebuilt place under ``scene/background``; return whether there is one."""
+    path = scene_dir / BACKGROUND
+    if not path.is_file():
+        file.note("no rebuilt place: the run has no scene (robot-gst rebuild RUN)")
+        return False
+    try:
+        table = read_splats(path)
+    except DashboardError as error:
+        file.note(f"the rebuilt place is not shown: {error}")
+        return False
+    opacity = 1 / (1 + np.exp(-table[:, 6].astype(np.float64)))
+    scales = np.exp(table[:, 7:10])
+    if len(table) > MAX_SPLATS:
+        weight = opacity * np.prod(scales, axis=1) ** (2 / 3)
+        kept = np.sort(np.argsort(weight)[-MAX_SPLATS:])
+        file.note(f"{len(table) - MAX_SPLATS} of {len(table)} splats are left out, the faintest")
+        table, opacity, scales = table[kept], opacity[kept], scales[kept]
+    rgba = np.concatenate([table[:, 3:6] * SH_DC + 0.5, opacity[:, None]], axis=1)
+    file.always(
+        "scene/background",
+        rr.GaussianSplats3D(
+            centers=table[:, 0:3],
+            scales=scales,
+            quaternions=np.roll(table[:, 10:14], -1, axis=1),
+            colors=(np.clip(rgba, 0, 1) * 255 + 0.5).astype(np.uint8),
+            spherical_harmonics_degree=0,
+        ),
+    )
+    return True
+
+
+def log_object(
+    file: RerunFile,
+    entity: str,
+    track: PoseTrajectory,
+    model: ObjectModel | None,
+    *,
+    solid: bool,
+) -> None:
+    """Log an object's poses and, where the task knows its shape, its boxes.
+
+    It appears with its first pose: before, nobody said where it is.
+    """
+    file.poses(entity, track)
+    first = track.stamps_ns[:1]
+    if model is None:
+        file.rows(entity, first, rr.TransformAxes3D.columns(axis_length=[0.05]))
+        return
+    panels = model.panels()
+    columns = rr.Boxes3D.columns(
+        centers=np.array([centre for centre, _ in panels]),
+        half_sizes=np.array([size / 2 for _, size in panels]),
+        colors=[model.color_srgb] * len(panels),
+    ).partition([len(panels)])
+    file.rows(entity, first, columns)
+    mode = rr.components.FillMode.Solid if solid else rr.components.FillMode.MajorWireframe
+    file.always(entity, rr.Boxes3D.from_fields(fill_mode=mode))
+
+
+def model_of(task: Task | None, object_id: str) -> ObjectModel | None:
+    """Return an object's shape if the task is known and has it."""
+    return None if task is None else task.objects.get(object_id)
+
+
+# --- The recorded robot, moved by its recorded joints: a URDF as Rerun loads it.
+
+ROOT_FRAME = "tf#/"
+"""Rerun's name for the frame of the entity ``/``, which is the robot's root frame here."""
+
+
+def log_robot(
+    file: RerunFile,
+    urdf: str | None,
+    prefix: str,
+    *,
+    joints: JointTrack | None,
+    widths: JointTrack | None,
+) -> bool:
+    """Log the robot under ``<prefix>/robot``; when it cannot be drawn, note why and return False.
+
+    Each finger joint is at half the gripper width.
+    """
+    if urdf is None:
+        file.note("the robot is not drawn: the episode holds no robot description")
+        return False
+    try:
+        text = drawable(urdf)
+    except GstError as error:
+        file.note(f"the robot is not drawn: {error}")
+        return False
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.urdf"
+        path.write_text(text, encoding="utf-8")
+        try:
+            tree = UrdfTree.from_file_path(
+                path,
+                entity_path_prefix=prefix,
+                frame_prefix=f"{prefix}/",
+                static_transform_entity_path=f"{prefix}/robot_links",
+            )
+            tree.log_urdf_to_recording(file.stream)
+        except (RuntimeError, ValueError) as error:
+            file.note(f"the robot is not drawn: Rerun refuses its description ({error})")
+            return False
+    root = f"{prefix}/{tree.root_link().name}"
+    file.always(f"{prefix}/robot_root", rr.Transform3D(parent_frame=ROOT_FRAME, child_frame=root))
+    if joints is None:
+        file.note("the robot stands still: no joint states")
+        return True
+    for index, name in enumerate(joints.names):
+        _move(file, tree, prefix, name, joints, joints.position[:, index])
+    if widths is not None:
+        for name in FINGER_JOINTS:
+            _move(file, tree, prefix, name, widths, widths.position[:, 0] / 2)
+    return True
+
+
+def _move(
+    file: RerunFile,
+    tree: UrdfTree,
+    prefix: str,
+    name: str,
+    track: JointTrack,
+    values: Float[np.ndarray, " num_samples"],
+) -> None:
+    joint = tree.get_joint_by_name(name)
+    if joint is None:
+        file.note(f"joint {name!r} is not in the robot description; it does not move the drawing")
+        return
+    columns = joint.compute_transform_columns(values.tolist(), clamp=False)
+    file.rows(f"{prefix}/robot_joints/{name}", track.stamps_ns, columns)
+
+
+def drawable(urdf: str) -> str:
+    """Return the URDF with only its visuals, absolute meshes, and ``base_link`` as its root.
+
+    Raises:
+        DashboardError: When the text is not a URDF.
+        GstError: When a mesh cannot be found.
+    """
+    try:
+        robot = ET.fromstring(urdf)
+    except ET.ParseError as error:
+        message = f"the robot description is not XML ({error})."
+        raise DashboardError(message) from error
+    if robot.tag != "robot":
+        message = f"the robot description has the root element <{robot.tag}>, not <robot>."
+        raise DashboardError(message)
+    robot.set("name", "robot")
+    for link in robot.findall("link"):
+        for collision in link.findall("collision"):
+            link.remove(collision)
+        for mesh in link.iter("mesh"):
+            mesh.set("filename", str(resolve_mesh(mesh.get("filename", ""))))
+    _drop_above(robot, BASE_FRAME)
+    return ET.tostring(robot, encoding="unicode")
+
+
+def _drop_above(robot: ET.Element, link_name: str) -> None:
+    """Remove the links that carry ``link_name``: an episode's poses are given in that frame."""
+    links = {link.get("name"): link for link in robot.findall("link")}
+    if link_name not in links:
+        return
+    kept = {link_name}
+    joints = list(robot.findall("joint"))
+    ends = [(_end(joint, "parent"), _end(joint, "child")) for joint in joints]
+    growing = True
+    while growing:
+        reached = {child for parent, child in ends if parent in kept} | kept
+        growing, kept = reached != kept, reached
+    for name, link in links.items():
+        if name not in kept:
+            robot.remove(link)
+    for joint, (parent, _) in zip(joints, ends, strict=True):
+        if parent not in kept:
+            robot.remove(joint)
+
+
+def _end(joint: ET.Element, which: str) -> str:
+    element = joint.find(which)
+    return "" if element is None else element.get("link", "")
+
+
+BATCH = 32
+"""Images held in memory at once."""
+FRUSTUM_M = 0.12
+"""How far from the camera its image is drawn."""
+MILLIMETRES_PER_METRE = 1000.0
+
+Item = TypeVar("Item")
+
+
+def log_cameras(file: RerunFile, episode: Episode, prefix: str, start_ns: int) -> list[str]:
+    """Log every camera under ``<prefix>/cameras/<id>/{color,depth}``; return the ids.
+
+    A camera has the pose of its first frame from ``start_ns`` on. What is missing (intrinsics,
+    transforms, images that are no JPEG or PNG) is noted and the rest is shown.
+    """
+    try:
+        tree = streams.transform_tree(episode)
+    except GstError as error:
+        file.note(f"transforms are not shown: {error}")
+        tree = TransformTree([])
+    ids = streams.camera_ids(episode)
+    for camera_id in ids:
+        for kind in ("color", "depth"):
+            topic = streams.find_camera_topic(episode, camera_id, f"{kind}/image")
+            if topic is None:
+                continue
+            entity = f"{prefix}/cameras/{camera_id}/{kind}"
+            send = _send_color if kind == "color" else _send_depth
+            try:
+                stamps = send(file, episode, topic, entity)
+            except GstError as error:
+                file.note(f"{entity} is not shown further: {error}")
+                continue
+            try:
+                info = streams.camera_info(episode, camera_id, kind)
+                _log_pinhole(file, info, entity)
+                _log_pose(file, tree, info.frame_id, entity, [start_ns, *stamps])
+            except GstError as error:
+                file.note(f"{entity} has no place in 3D: {error}")
+    return ids
+
+
+def _batches(items: Iterator[Item]) -> Iterator[list[Item]]:
+    while batch := list(islice(items, BATCH)):
+        yield batch
+
+
+def _send_color(file: RerunFile, episode: Episode, topic: str, entity: str) -> list[int]:
+    stamps = []
+    images = (
+        color_file_from_message(message.type_name, message.data)
+        for message in episode.messages([topic])
+    )
+    for batch in _batches(images):
+        kept = []
+        for image in batch:
+            try:
+                kept.append((image, media_type(image.data, episode.path)))
+            except GstError as error:
+                file.note(f"{entity}: {error}")
+        if not kept:
+            continue
+        times = [image.stamp_ns for image, _ in kept]
+        columns = rr.EncodedImage.columns(
+            blob=[image.data for image, _ in kept], media_type=[kind for _, kind in kept]
+        )
+        file.rows(entity, np.array(times), columns)
+        stamps += times
+    return stamps
+
+
+def _send_depth(file: RerunFile, episode: Episode, topic: str, entity: str) -> list[int]:
+    stamps: list[int] = []
+    images = (
+        DepthImage.from_message(message.type_name, message.data)
+        for message in episode.messages([topic])
+    )
+    for batch in _batches(images):
+        times = [image.stamp_ns for image in batch]
+        formats = []
+        for image in batch:
+            height, width = image.depth_mm.shape
+            formats.append(
+                rr.components.ImageFormat(
+                    width=width,
+                    height=height,
+                    color_model=rr.ColorModel.L,
+                    channel_datatype=rr.ChannelDatatype.U16,
+                )
+            )
+        columns = rr.DepthImage.columns(
+            buffer=[image.depth_mm.astype("<u2").tobytes() for image in batch], format=formats
+        )
+        file.rows(entity, np.array(times), columns)
+        stamps += times
+    file.always(entity, rr.DepthImage.from_fields(meter=MILLIMETRES_PER_METRE))
+    return stamps
+
+
+def _log_pinhole(file: RerunFile, info: CameraInfo, entity: str) -> None:
+    camera = info.camera
+    file.always(
+        entity,
+        rr.Pinhole(
+            focal_length=(camera.fx, camera.fy),
+            principal_point=(camera.cx, camera.cy),  # Rerun's pixels, too, have centres at +0.5
+            width=camera.width,
+            height=camera.height,
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=FRUSTUM_M,
+        ),
+    )
+
+
+def _log_pose(
+    file: RerunFile, tree: TransformTree, frame: str, entity: str, stamps_ns: list[int]
+) -> None:
+    stamps = np.unique(np.array(stamps_ns, dtype=np.int64))
+    Ts = np.stack([tree.T_root_frame(frame, int(stamp)) for stamp in stamps])
+    if np.array_equal(Ts, np.broadcast_to(Ts[0], Ts.shape)):  # a camera that stands still
+        stamps, Ts = stamps[:1], Ts[:1]
+    q, p = se3.split(Ts)
+    file.poses(entity, PoseTrajectory(stamps, p, q))

@@ -1,0 +1,470 @@
+"""Over cells: do the twin's success rates move with the recorded ones, and how far off are they?"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import partial
+
+import numpy as np
+
+from evaluator.compare.measure import measured, slug
+from evaluator.compare.rows import RateCell
+from evaluator.errors import UndefinedStatisticError
+from evaluator.result import Cell, Interval, Measurement, Table
+from evaluator.statistics import agreement
+from evaluator.statistics.agreement import Number, counted_cells, fisher_interval, pearson
+from evaluator.statistics.bootstrap import (
+    CellSample,
+    Remeasured,
+    refuse_no_width,
+    remeasure_counts,
+    remeasure_paired,
+    student_interval,
+)
+from evaluator.statistics.coverage.stored import Choice, choose_method, vouch
+
+# --- Over cells: which interval each statistic of agreement has, or why it has none.
+
+SEED = 0
+"""Resampling is seeded: the same cells give the same interval."""
+MIN_CLUSTERS = 4
+
+
+def usable_cells(cells: Sequence[RateCell]) -> list[RateCell]:
+    """Return the cells with both rates."""
+    return [c for c in cells if c.recorded_rate is not None and c.sim_rate is not None]
+
+
+def sides(cells: Sequence[RateCell]) -> tuple[list[Fraction], list[Fraction]]:
+    """Return recorded and sim rates of usable cells."""
+    recorded = [c.recorded_rate for c in cells if c.recorded_rate is not None]
+    return recorded, [c.sim_rate for c in cells if c.sim_rate is not None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """An interval, or the reason why there is none, with where its coverage is stored."""
+
+    interval: Interval | None
+    reason: str
+    choice: Choice
+    num_units: int
+    """Cells or clusters of cells: what coverage depends on."""
+
+
+class CellIntervals:
+    """The intervals of some cells: what belongs together is found once, resamples drawn once."""
+
+    def __init__(self, cells: Sequence[RateCell]) -> None:
+        """Prepare; nothing is drawn before the first interval.
+
+        Args:
+            cells: With both rates.
+        """
+        self._cells = list(cells)
+        self.num_cells = len(self._cells)
+        self._recorded, self._sim = sides(cells)
+        self._clusters, self.num_units, self.unit = clusters_of(cells)
+        self._sample: CellSample | None = None
+
+    @property
+    def kind(self) -> str:
+        """Points where cells are independent, else clusters."""
+        return "points" if self.unit == "cells" else "clusters"
+
+    def of(self, statistic: str) -> Found:
+        """Return the interval by the method whose stored coverage is best.
+
+        Args:
+            statistic: A name in ``weighted.STATISTICS``.
+        """
+        choice = choose_method(statistic, self.kind, self.num_units)
+        if choice.method == "student-t" and not self._means():
+            key = f"jackknife-{self.kind}:{statistic}"
+            choice = replace(choice, method="jackknife", key=key)
+        interval, reason = None, ""
+        try:
+            interval = self._make(statistic, choice)
+        except UndefinedStatisticError as error:
+            reason = f"{self.num_units} {self.unit}: {error.reason}"
+            if self.num_units < MIN_CLUSTERS:
+                reason = self._too_few(choice.method)
+        return Found(interval=interval, reason=reason, choice=choice, num_units=self.num_units)
+
+    def _make(self, statistic: str, choice: Choice) -> Interval:
+        if choice.method == "fisher-z":
+            return fisher_interval(pearson(self._recorded, self._sim), len(self._cells))
+        if choice.method == "student-t":
+            return student_interval(self._means())
+        if self._sample is None:
+            self._sample = CellSample(
+                recorded=self._recorded,
+                sim=self._sim,
+                rng=np.random.default_rng(SEED),
+                clusters=None if self.kind == "points" else self._clusters,
+            )
+        return refuse_no_width(self._sample.interval(statistic, choice.method))
+
+    def _means(self) -> list[Fraction]:
+        """Mean gap of each unit; none where the units differ in size, for then means do too."""
+        members: dict[str, list[Fraction]] = {}
+        for name, recorded, sim in zip(self._clusters, self._recorded, self._sim, strict=True):
+            members.setdefault(name, []).append(sim - recorded)
+        if len({len(gaps) for gaps in members.values()}) != 1:
+            return []
+        return [sum(gaps, Fraction(0)) / len(gaps) for gaps in members.values()]
+
+    def _too_few(self, method: str) -> str:
+        if self.unit == "cells":
+            name = "Fisher's interval" if method == "fisher-z" else "an interval over cells"
+            return f"{counted_cells(self.num_units)}; {name} needs {MIN_CLUSTERS}"
+        why = "cells share tasks across conditions" if _is_shared(self._cells) else ""
+        why = why or "cells share policies or tasks"
+        return (
+            f"{why}, and {self.num_units} {self.unit} are too few to resample ({MIN_CLUSTERS} are "
+            "needed); an interval of independent cells would claim too much"
+        )
+
+    def again(self) -> Remeasured:
+        """Draw the trials of every cell anew.
+
+        Raises:
+            UndefinedStatisticError: When the number of trials of a cell is not known.
+        """
+        rng = np.random.default_rng(SEED)
+        tables = [cell.trial_table for cell in self._cells if cell.trial_table is not None]
+        if self._cells and len(tables) == len(self._cells):
+            return remeasure_paired(tables, rng=rng)
+        pairs = [cell.pair for cell in self._cells]
+        sim = [(s.k, s.n) for s, _ in pairs if s.k is not None and s.n]
+        recorded = [(r.k, r.n) for _, r in pairs if r.k is not None and r.n]
+        if self._cells and len(sim) == len(recorded) == len(self._cells):
+            return remeasure_counts(recorded, sim, rng=rng)
+        raise UndefinedStatisticError(
+            statistic="remeasured", reason="the number of trials of a cell is not known"
+        )
+
+
+def _is_shared(cells: Sequence[RateCell]) -> bool:
+    return len({(c.task, c.policy) for c in cells}) < len(cells)
+
+
+def clusters_of(cells: Sequence[RateCell]) -> tuple[list[str], int, str]:
+    """Return what each cell belongs to, how many of those there are, and their name."""
+    policies, tasks = [c.policy for c in cells], [c.task for c in cells]
+    if not _is_shared(cells) and len(set(policies)) in (1, len(cells)):
+        return [str(i) for i in range(len(cells))], len(cells), "cells"
+    if len(set(policies)) >= MIN_CLUSTERS or len(set(policies)) > len(set(tasks)):
+        return policies, len(set(policies)), "policies"
+    return tasks, len(set(tasks)), "tasks"
+
+
+OTHERS, AGAIN = "other {} like these", "the same cells measured again"
+
+
+def interval_table(
+    intervals: CellIntervals, statistics: Sequence[tuple[str, str, float]]
+) -> tuple[Table, ...]:
+    """Lay out both intervals of every statistic; none without cells.
+
+    Args:
+        intervals: Of the cells.
+        statistics: Words, name and factor to the printed unit.
+    """
+    if intervals.num_units == 0:
+        return ()
+    try:
+        again: Remeasured | None = intervals.again()
+        unknown = ""
+    except UndefinedStatisticError as error:
+        again, unknown = None, error.reason
+    rows: list[tuple[Cell, ...]] = []
+    for words, statistic, factor in statistics:
+        found = intervals.of(statistic)
+        kept, refusal = _vouched(found)
+        others = OTHERS.format(intervals.unit)
+        rows.append((words, others, *_shown(kept, refusal or found.reason, factor)))
+        rows.append((words, AGAIN, *_band(again, statistic, factor, unknown, intervals)))
+    return (
+        Table(
+            id="agreement_intervals",
+            title="How certain is the agreement?",
+            columns=("statistic", "over", "low", "high", "method", "least coverage", "reason"),
+            rows=tuple(rows),
+            note="95 %. Two questions: where the number would be for other cells of the same "
+            "kind, and where it would fall if these were measured again with as many trials. "
+            "The method is the one with the best coverage in the stored map; least coverage is "
+            "its worst case there.",
+        ),
+    )
+
+
+def _vouched(found: Found) -> tuple[Interval | None, str]:
+    if found.interval is None:
+        return None, ""
+    return vouch(
+        found.interval, found.num_units, key=found.choice.key, instead=found.choice.instead
+    )
+
+
+def _band(
+    again: Remeasured | None,
+    statistic: str,
+    factor: float,
+    unknown: str,
+    intervals: CellIntervals,
+) -> tuple[Cell, ...]:
+    if again is None:
+        return _shown(None, unknown, factor)
+    try:
+        band = again.band(statistic)
+    except UndefinedStatisticError as error:
+        return _shown(None, error.reason, factor)
+    key = f"remeasurement:{statistic}".removesuffix(":pearson")
+    kept, refusal = vouch(band, intervals.num_cells, key=key)
+    return _shown(kept, refusal, factor)
+
+
+def _shown(interval: Interval | None, reason: str, factor: float) -> tuple[Cell, ...]:
+    if interval is None:
+        return None, None, None, None, reason
+    ends = (round(factor * interval.low, 4), round(factor * interval.high, 4))
+    return *ends, interval.method, interval.worst_coverage, None
+
+
+Statistic = Callable[[], float]
+TABLE: tuple[tuple[str, str, float], ...] = (
+    ("Pearson r", "pearson", 1.0),
+    ("Spearman rho", "spearman", 1.0),
+    ("Kendall tau-b", "kendall", 1.0),
+    ("bias (pp)", "bias", 100.0),
+    ("mean absolute error (pp)", "mae", 100.0),
+    ("root mean square error (pp)", "rmse", 100.0),
+    ("calibration slope", "slope", 1.0),
+    ("calibration intercept (pp)", "intercept", 100.0),
+    ("pairwise order accuracy", "order", 1.0),
+    ("MMRV, recorded gap", "mmrv-recorded", 1.0),
+    ("MMRV, sim gap", "mmrv-sim", 1.0),
+)
+"""Words, name of the statistic, and factor to the printed unit."""
+
+
+def cell_agreement(cells: Sequence[RateCell]) -> list[Measurement]:
+    """Measure over cells: r, ranks, bias, errors, calibration line, MMRV in both conventions."""
+    usable = usable_cells(cells)
+    intervals = CellIntervals(usable)
+    units = sorted({cell.unit for cell in usable})
+    what = f"over cells (task x condition x policy), n = {len(usable)}"
+    what += f", rates counted in different units ({', '.join(units)})" if len(units) > 1 else ""
+    make = partial(_measure, usable, intervals, what)
+    return [
+        _pearson(usable, "agreement.pearson_r", what),
+        *_pearson_by_condition(usable),
+        _remeasured(usable, intervals, what),
+        *_errors(usable, make),
+        *_line_and_ranks(usable, make),
+        measured(
+            "agreement.largest_gap_pp",
+            lambda: 100 * agreement.largest_gap(**_both(usable)),
+            unit="pp",
+            definition=f"largest |sim rate - recorded rate| {what}",
+            n=len(usable),
+            counted="cell",
+            reason_without_interval="a largest value grows with the number of cells",
+            episodes=_episodes(usable),
+        ),
+    ]
+
+
+def agreement_intervals(cells: Sequence[RateCell]) -> tuple[Table, ...]:
+    """Lay out the interval of every statistic, over other cells and over a new measurement."""
+    return interval_table(CellIntervals(usable_cells(cells)), TABLE)
+
+
+def _both(cells: Sequence[RateCell]) -> dict[str, list[Number]]:
+    recorded, sim = sides(cells)
+    return {"recorded": [*recorded], "sim": [*sim]}
+
+
+def _episodes(cells: Sequence[RateCell]) -> list[str]:
+    return [name for cell in cells for name in cell.episodes]
+
+
+def _measure(
+    cells: Sequence[RateCell],
+    intervals: CellIntervals,
+    what: str,
+    name: str,
+    statistic: str,
+    value: Statistic,
+    unit: str,
+    definition: str,
+) -> Measurement:
+    """Measure one statistic with the interval that the coverage map chooses for it."""
+    factor = 100.0 if unit == "pp" else 1.0
+    found = intervals.of(statistic)
+
+    def compute() -> tuple[float, Interval | None]:
+        interval = found.interval
+        if interval is not None and factor != 1:
+            interval = Interval(
+                low=factor * interval.low,
+                high=factor * interval.high,
+                level=interval.level,
+                method=interval.method,
+            )
+        return factor * value(), interval
+
+    resampled = f"; interval: {intervals.unit} resampled" if intervals.kind == "clusters" else ""
+    return measured(
+        name,
+        compute,
+        unit=unit,
+        definition=f"{definition.format(what)}{resampled}",
+        n=len(cells),
+        counted="cell",
+        reason_without_interval=found.reason,
+        episodes=_episodes(cells),
+        interval_n=found.num_units,
+        coverage_key=found.choice.key,
+        instead=found.choice.instead,
+    )
+
+
+def _errors(cells: Sequence[RateCell], make: "partial[Measurement]") -> list[Measurement]:
+    both = _both(cells)
+    return [
+        make(
+            "agreement.spearman_rho",
+            "spearman",
+            lambda: agreement.spearman(both["recorded"], both["sim"]),
+            "1",
+            "Spearman rank correlation of the same rates {}; average ranks",
+        ),
+        make(
+            "agreement.kendall_tau_b",
+            "kendall",
+            lambda: agreement.kendall(both["recorded"], both["sim"]),
+            "1",
+            "Kendall's tau-b of the same rates {}",
+        ),
+        make(
+            "agreement.bias_pp",
+            "bias",
+            lambda: agreement.bias(**both),
+            "pp",
+            "mean of sim rate - recorded rate {}; above 0 the twin is optimistic",
+        ),
+        make(
+            "agreement.mae_pp",
+            "mae",
+            lambda: agreement.mean_absolute_error(**both),
+            "pp",
+            "mean |sim rate - recorded rate| {}",
+        ),
+        make(
+            "agreement.rmse_pp",
+            "rmse",
+            lambda: agreement.root_mean_square_error(**both),
+            "pp",
+            "square root of the mean (sim rate - recorded rate)^2 {}",
+        ),
+    ]
+
+
+def _line_and_ranks(cells: Sequence[RateCell], make: "partial[Measurement]") -> list[Measurement]:
+    both = _both(cells)
+    return [
+        make(
+            "agreement.calibration_slope",
+            "slope",
+            lambda: agreement.calibration_line(**both).slope,
+            "1",
+            "slope of recorded = a + b x sim, least squares {}; 1 is calibrated, noise pulls it "
+            "towards 0",
+        ),
+        make(
+            "agreement.calibration_intercept_pp",
+            "intercept",
+            lambda: agreement.calibration_line(**both).intercept,
+            "pp",
+            "intercept of the same line {}",
+        ),
+        make(
+            "agreement.order_accuracy",
+            "order",
+            lambda: agreement.order_accuracy(**both).value,
+            "1",
+            "pairs of cells that the twin orders as the recorded rates do / pairs whose recorded "
+            "rates differ; a tie in the twin counts 1/2; {}",
+        ),
+        make(
+            "agreement.mmrv_recorded_gap",
+            "mmrv-recorded",
+            partial(agreement.mmrv, **both, gap="recorded"),
+            "1",
+            "mean maximum rank violation {}; convention: gap of recorded rates (SIMPLER equation "
+            "1); it grows with the number of cells",
+        ),
+        make(
+            "agreement.mmrv_sim_gap",
+            "mmrv-sim",
+            partial(agreement.mmrv, **both, gap="sim"),
+            "1",
+            "mean maximum rank violation {}; convention: gap of sim rates (arguments swapped, as "
+            "some published code does); it grows with the number of cells",
+        ),
+    ]
+
+
+def _pearson(cells: Sequence[RateCell], name: str, what: str) -> Measurement:
+    recorded, sim = sides(cells)
+    return _measure(
+        cells,
+        CellIntervals(cells),
+        what,
+        name,
+        "pearson",
+        lambda: agreement.pearson(recorded, sim),
+        "1",
+        "Pearson r of the twin's and the recorded success rates {}",
+    )
+
+
+def _pearson_by_condition(cells: Sequence[RateCell]) -> list[Measurement]:
+    conditions = list(dict.fromkeys(cell.condition for cell in cells))
+    if len(conditions) < 2:
+        return []
+    return [
+        _pearson(
+            [cell for cell in cells if cell.condition == condition],
+            f"agreement.pearson_r.{slug(condition)}",
+            f"over cells {condition} only",
+        )
+        for condition in conditions
+    ]
+
+
+def _remeasured(cells: Sequence[RateCell], intervals: CellIntervals, what: str) -> Measurement:
+    recorded, sim = sides(cells)
+
+    def compute() -> tuple[float, Interval | None]:
+        r = agreement.pearson(recorded, sim)
+        again = intervals.again()
+        try:
+            return r, again.band("pearson")
+        except UndefinedStatisticError:
+            return r, None
+
+    return measured(
+        "agreement.pearson_r_remeasured",
+        compute,
+        unit="1",
+        definition=f"the same r {what}; its band is where r would fall if the same cells were "
+        "measured again with as many trials",
+        n=len(cells),
+        counted="cell",
+        reason_without_interval="r is exactly 1 or -1, or no other outcome changes it",
+        episodes=_episodes(cells),
+        coverage_key="remeasurement",
+    )

@@ -1,0 +1,419 @@
+"""Trial by trial: does what the twin said agree with what happened, and what is the gate worth?"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+from evaluator.compare.measure import measured, proportion, slug, vouched_rate
+from evaluator.compare.rows import TrialRow
+from evaluator.compare.success import WITH, WITHOUT, Answer, names_of
+from evaluator.errors import UndefinedStatisticError
+from evaluator.result import Cell, Measurement, Table
+from evaluator.run_reader.episodes import FACTORS, Clauses
+from evaluator.statistics.gate import (
+    NUM_BINS,
+    Confusion,
+    break_even,
+    brier,
+    brier_of_base_rate,
+    cost_curve,
+    expected_calibration_error,
+    kappa,
+    phi,
+    reliability_bins,
+)
+
+# --- The gate's worth clause by clause: how often each refused, and how often it was right to.
+
+PLANNED, GATE = "planned in twin", "verdict before motion, not obeyed"
+PRICES = (0.1, 0.5, 1.0)
+"""Of refusing a good plan, in bad executions, at which each clause is priced."""
+
+
+def clause_scorecard(
+    rows: Sequence[TrialRow], not_obeyed: Sequence[TrialRow]
+) -> tuple[list[Measurement], tuple[Table, ...]]:
+    """Judge every clause of the replay's verdict, and of the gate's where it decided nothing.
+
+    Args:
+        rows: All trials; those with a known outcome and a planned replay count.
+        not_obeyed: Trials whose gate verdict was recorded and not obeyed, with known outcomes.
+    """
+    known = [row for row in rows if row.recorded is not None]
+    measurements: list[Measurement] = []
+    lines: list[tuple[Cell, ...]] = []
+    costs: list[tuple[Cell, ...]] = []
+    for side, name, members, said in (
+        (PLANNED, "planned", known, _of_replay),
+        (GATE, "verdict", list(not_obeyed), _of_gate),
+    ):
+        for clause in _clauses_in(members, said):
+            asked = [row for row in members if _answer(said(row), clause) is not None]
+            counts = _confusion(asked, said, clause)
+            measurements += _measure(name, side, clause, asked, counts, said)
+            lines.append((side, clause, *_line(counts)))
+            if name == "verdict":
+                costs.append((clause, *_costs(counts)))
+    return measurements, (*_table(lines), *_clause_cost_table(costs))
+
+
+def _of_replay(row: TrialRow) -> Clauses:
+    return row.clauses
+
+
+def _of_gate(row: TrialRow) -> Clauses:
+    return row.gate_clauses
+
+
+def _clauses_in(rows: Sequence[TrialRow], said: Callable[[TrialRow], Clauses]) -> list[str]:
+    """Clauses that were decided in some trial: the factors first, then predicates by name."""
+    found = {name for row in rows for name, _ in said(row)}
+    return [*(n for n in FACTORS if n in found), *sorted(found - set(FACTORS))]
+
+
+def _answer(clauses: Clauses, clause: str) -> bool | None:
+    return next((value for name, value in clauses if name == clause), None)
+
+
+def _confusion(
+    rows: Sequence[TrialRow], said: Callable[[TrialRow], Clauses], clause: str
+) -> Confusion:
+    return Confusion.weigh(
+        (bool(_answer(said(row), clause)), bool(row.recorded), row.count) for row in rows
+    )
+
+
+def _measure(
+    name: str,
+    side: str,
+    clause: str,
+    asked: Sequence[TrialRow],
+    counts: Confusion,
+    said: Callable[[TrialRow], Clauses],
+) -> list[Measurement]:
+    refused = [row for row in asked if _answer(said(row), clause) is False]
+    return [
+        proportion(
+            f"gate.clause.{name}.{slug(clause)}.{what}",
+            k,
+            n,
+            definition=words,
+            counted="trial",
+            reason_if_undefined=f"{clause} never said no ({side})",
+            episodes=names_of(episodes),
+        )
+        for what, k, n, words, episodes in (
+            (
+                "refused",
+                counts.said_failure,
+                counts.n,
+                f"trials in which {clause} said no / trials in which it was decided ({side})",
+                asked,
+            ),
+            (
+                "right",
+                counts.true_negative,
+                counts.said_failure,
+                f"trials that failed / trials in which {clause} said no ({side})",
+                refused,
+            ),
+        )
+    ]
+
+
+def _line(counts: Confusion) -> tuple[Cell, ...]:
+    failed = counts.false_positive + counts.true_negative
+    return (
+        counts.n,
+        counts.said_failure,
+        counts.true_negative,
+        _rate(counts.true_negative, counts.said_failure),
+        counts.false_negative,
+        _rate(counts.true_negative, failed),
+        _price(counts),
+    )
+
+
+def _rate(k: int, n: int) -> str | None:
+    """Write a share with its interval; None where it has no denominator."""
+    if not n:
+        return None
+    interval, _ = vouched_rate(k, n, "wilson")
+    text = f"{k}/{n} = {100 * k / n:.0f} %"
+    if interval is None:
+        return text
+    return f"{text} [{100 * interval.low:.0f}, {100 * interval.high:.0f}]"
+
+
+def _price(counts: Confusion) -> Cell:
+    try:
+        return round(break_even(counts), 3)
+    except UndefinedStatisticError:
+        return "any" if counts.true_negative else None
+
+
+def _costs(counts: Confusion) -> tuple[Cell, ...]:
+    points = cost_curve(counts, PRICES)
+    return (*(round(point.with_gate, 4) for point in points), round(points[0].without_gate, 4))
+
+
+def _table(lines: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
+    if not lines:
+        return ()
+    return (
+        Table(
+            id="gate_clauses",
+            title="What each clause of the verdict is worth",
+            columns=(
+                "said by",
+                "clause",
+                "trials",
+                "said no",
+                "of them failed",
+                "right to say no",
+                "good plans refused",
+                "failures it found",
+                "pays up to a price of",
+            ),
+            rows=tuple(lines),
+            note="Trials with a known outcome in which the clause was decided. A clause that says "
+            "no refuses the plan, except for terminal.allowed_contacts where the task does not "
+            "list it: it is asked of every rollout. Brackets: 95 % Wilson intervals in percent. "
+            "Price: of refusing a good plan, in bad executions; any: it refused no good plan. "
+            "In trials with replanning the gate had selected the plan, so there clauses of the "
+            "planned replay have little left to refuse.",
+        ),
+    )
+
+
+def _clause_cost_table(costs: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
+    if not costs:
+        return ()
+    prices = tuple(f"obeying it, price {price:g}" for price in PRICES)
+    return (
+        Table(
+            id="gate_clause_costs",
+            title="What obeying one clause alone would cost",
+            columns=("clause", *prices, "executing everything"),
+            rows=tuple(costs),
+            note="Mean cost per trial in bad executions, over the trials in which the gate was "
+            "asked and not obeyed; price: of refusing a good plan.",
+        ),
+    )
+
+
+CLAUSES = ("ik", "clearance", "terminal")
+WHOSE = (
+    "the probability is the planned replay's, where it has none the verdict's before motion; with "
+    "replanning the twin selected these plans"
+)
+REFUSAL_PRICES = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)
+"""What refusing a good plan costs, in bad executions."""
+
+
+def agreement(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Measurement]:
+    """Measure k/n agreement, phi, kappa and predictive values, of the replay and of the verdict."""
+    measurements = []
+    for name, said, words in (
+        ("sim_planned", lambda row: row.sim_planned, "planned-in-twin (dynamic, of the sent plan)"),
+        ("verdict", lambda row: row.verdict, "the verdict before motion"),
+        ("sim_executed", lambda row: row.sim_executed, "executed-in-twin (diagnosis only)"),
+    ):
+        measurements.extend(_agreement_of(rows, name, said, words, method))
+    if any(unheeded_verdict(row) is not None for row in rows):
+        words = "the verdict before motion, recorded and not obeyed (without replanning)"
+        measurements.extend(
+            _agreement_of(rows, "verdict_unheeded", unheeded_verdict, words, method)
+        )
+    return measurements
+
+
+def unheeded_verdict(row: TrialRow) -> bool | None:
+    """The gate's verdict where it decided nothing: a refused plan was executed all the same.
+
+    Only these trials can show a false refusal, and only they are not selected by the gate.
+    """
+    return row.verdict if row.condition == WITHOUT else None
+
+
+def heeded_verdict(row: TrialRow) -> bool | None:
+    """The gate's verdict where it selected the plan: refused plans were never executed."""
+    return row.verdict if row.condition == WITH else None
+
+
+def confusion_of(rows: Sequence[TrialRow], said: Answer) -> Confusion:
+    """Count what was said against what was labelled, over trials where both are known."""
+    return Confusion.weigh(
+        (answer, row.recorded, row.count)
+        for row in rows
+        if (answer := said(row)) is not None and row.recorded is not None
+    )
+
+
+def _agreement_of(
+    rows: Sequence[TrialRow], name: str, said: Answer, words: str, method: str
+) -> list[Measurement]:
+    seen = [row for row in rows if said(row) is not None and row.recorded is not None]
+    counts = confusion_of(seen, said)
+    nothing = f"no trial has both {words} and a known outcome"
+    make = partial(proportion, counted="trial", method=method)
+    coefficient = partial(
+        measured,
+        unit="1",
+        n=counts.n,
+        counted="trial",
+        episodes=names_of(seen),
+        reason_without_interval="the four counts are beside it",
+    )
+    return [
+        make(
+            f"agreement.{name}.rate",
+            counts.agreed,
+            counts.n,
+            definition=f"trials where {words} and the labelled outcome say the same / trials",
+            reason_if_undefined=nothing,
+            episodes=names_of(seen),
+        ),
+        coefficient(
+            f"agreement.{name}.phi",
+            lambda: phi(counts),
+            definition=f"phi coefficient of {words} and the labelled outcome over trials",
+        ),
+        coefficient(
+            f"agreement.{name}.kappa",
+            lambda: kappa(counts),
+            definition=f"Cohen's kappa of {words} and the labelled outcome over trials",
+        ),
+        make(
+            f"agreement.{name}.ppv",
+            counts.true_positive,
+            counts.said_success,
+            definition=f"positive predictive value: trials that succeeded / trials where {words} "
+            "said success",
+            reason_if_undefined=nothing if not counts.n else "it never said success",
+            episodes=names_of(row for row in seen if said(row)),
+        ),
+        make(
+            f"agreement.{name}.npv",
+            counts.true_negative,
+            counts.said_failure,
+            definition=f"negative predictive value: trials that failed / trials where {words} "
+            "said failure",
+            reason_if_undefined=nothing if not counts.n else "it never said failure",
+            episodes=names_of(row for row in seen if not said(row)),
+        ),
+    ]
+
+
+def gate_scorecard(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Table, ...]]:
+    """Price the gate on the trials in which it was asked and not obeyed, and judge its clauses."""
+    asked = [r for r in rows if unheeded_verdict(r) is not None and r.recorded is not None]
+    counts = confusion_of(asked, unheeded_verdict)
+    measurements = [
+        measured(
+            "gate.break_even_price",
+            lambda: break_even(counts),
+            unit="1",
+            definition="bad executions avoided / good plans refused, by verdicts that were not "
+            "obeyed: what refusing a good plan may cost, in bad executions, for the gate to pay",
+            n=counts.n,
+            counted="trial",
+            reason_without_interval="a ratio of two counts, both in the confusion table",
+            episodes=names_of(asked),
+        ),
+        *_clauses(rows),
+    ]
+    by_clause, clause_tables = clause_scorecard(rows, asked)
+    tables = _cost_table(counts) if counts.n else ()
+    return [*measurements, *by_clause], (*clause_tables, *tables)
+
+
+def _clauses(rows: Sequence[TrialRow]) -> list[Measurement]:
+    """How often the trials failed that the twin called a failure for this reason."""
+    measurements = []
+    for clause in CLAUSES:
+        blamed = [
+            row
+            for row in rows
+            if row.sim_planned is False and row.first_failing == clause and row.recorded is not None
+        ]
+        counts = confusion_of(blamed, lambda row: row.sim_planned)
+        measurements.append(
+            proportion(
+                f"gate.clause.{clause}.npv",
+                counts.true_negative,
+                counts.said_failure,
+                definition=f"trials that failed / trials where planned-in-twin failed first in "
+                f"{clause}",
+                counted="trial",
+                reason_if_undefined=f"no trial with a known outcome failed in {clause} first",
+                episodes=names_of(blamed),
+            )
+        )
+    return measurements
+
+
+def _cost_table(counts: Confusion) -> tuple[Table, ...]:
+    return (
+        Table(
+            id="gate_costs",
+            title="What the gate costs and avoids",
+            columns=("price of refusing a good plan", "obeying the gate", "executing everything"),
+            rows=tuple(
+                (cost.refusal_price, round(cost.with_gate, 4), round(cost.without_gate, 4))
+                for cost in cost_curve(counts, REFUSAL_PRICES)
+            ),
+            note=f"Mean cost per trial in bad executions, over {counts.n} trials in which the gate "
+            f"was asked and not obeyed: {counts.true_negative} bad executions avoided, "
+            f"{counts.false_negative} good plans refused, {counts.false_positive} bad plans let "
+            "through.",
+        ),
+    )
+
+
+def reliability(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Table, ...]]:
+    """Judge the sampled success probability against the outcomes; nothing where none was said."""
+    seen = [
+        (row.episode, row.p_success, row.recorded)
+        for row in rows
+        if row.p_success is not None and row.recorded is not None and row.count == 1
+    ]
+    if not seen:
+        return [], ()
+    said, happened = [p for _, p, _ in seen], [outcome for _, _, outcome in seen]
+    make = partial(
+        measured,
+        unit="1",
+        n=len(seen),
+        counted="trial",
+        episodes=[episode for episode, _, _ in seen],
+        reason_without_interval="the bins and their counts are in the reliability table",
+    )
+    measurements = [
+        make(
+            "reliability.brier",
+            lambda: brier(said, happened),
+            definition=f"Brier score: mean of (sampled success probability - outcome)^2; {WHOSE}",
+        ),
+        make(
+            "reliability.brier_of_base_rate",
+            lambda: brier_of_base_rate(happened),
+            definition="Brier score of always saying the observed success rate; above it the "
+            "probability is worth nothing",
+        ),
+        make(
+            "reliability.ece",
+            lambda: expected_calibration_error(said, happened),
+            definition=f"expected calibration error: {NUM_BINS} bins of equal width, sum of "
+            "n_bin / n x |mean probability - success rate|; biased upwards for few trials; "
+            f"{WHOSE}",
+        ),
+    ]
+    bins = reliability_bins(said, happened)
+    table = Table(
+        id="reliability",
+        title="Is the sampled success probability kept?",
+        columns=("from", "to", "trials", "mean probability", "succeeded"),
+        rows=tuple((b.low, b.high, b.n, round(b.mean_said, 4), b.succeeded) for b in bins),
+        note="Bins of equal width; empty ones are left out.",
+    )
+    return measurements, (table,)

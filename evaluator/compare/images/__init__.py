@@ -1,0 +1,1 @@
+"""Rendered against recorded images: pairs, scores, tables, and methods side by side."""

@@ -1,0 +1,488 @@
+"""Compare several methods on the same views: what one of them lacks counts for none.
+
+A mean over other images is another number. So the table is made over the views that every method
+has, and each view that is left out is named with its reason.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+
+from bridge.errors import BridgeError, GstError, PathNotFoundError
+from bridge.media.color import JPEG_MAGIC, MAX_PIXELS, decode_color, open_image
+from evaluator.compare.images.scores import (
+    NUM_WORST,
+    Variant,
+    ViewQuality,
+    score_variants,
+    shrunk_u8,
+    spread,
+    values_by_id,
+)
+from evaluator.compare.images.tables import (
+    Protocol,
+    StampedMeasurement,
+    resolution_words,
+    stamped_measurements,
+)
+from evaluator.compare.measure import slug
+from evaluator.errors import EvaluatorError
+from evaluator.metrics.image import ImageShapeError, as_float, refuse_swapped
+from evaluator.metrics.image_scores import ImageScore
+from evaluator.metrics.lpips import PerceptualNet
+from evaluator.result import Exclusion
+
+# --- Folders of images, read strictly: what cannot be compared is refused with what to do about
+# it.
+#
+# A view is named by its path inside the folder without the ending: ``wrist/0001``. What a decoder
+# would quietly change (16 bits to 8, transparency, grey to colour) is looked for in the file
+# itself.
+
+PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+READ = (".png", ".jpg", ".jpeg", ".npy")
+NOT_READ = {
+    ".exr": "high dynamic range",
+    ".hdr": "high dynamic range",
+    ".pfm": "high dynamic range",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".bmp": "BMP",
+    ".webp": "WebP",
+    ".npz": "an archive of arrays",
+}
+"""Images we do not read, named rather than passed over."""
+WANTED = "Wanted: 8-bit RGB as PNG or JPEG, or arrays (height, width, 3) of uint8 or 0..1 floats"
+
+
+class ImageRefusedError(EvaluatorError):
+    """An image cannot be compared as it is stored."""
+
+    def __init__(self, *, name: str, found: str) -> None:
+        """Remember what was found."""
+        self.found = found
+        super().__init__(f"{name} {found}. {WANTED}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageSet:
+    """Images by the names of their views, not loaded yet."""
+
+    name: str
+    """Of the method, or of the reference."""
+    where: str
+    """Folder or episode, for messages."""
+    load: Mapping[str, Callable[[], np.ndarray]]
+    """Gives (height, width, 3), uint8 or float in 0..1, or raises a ``GstError``."""
+    refused: Mapping[str, str] = field(default_factory=dict)
+    """Views whose image is there and cannot be read at all, with the reason."""
+    stored: str
+    """For the stamp."""
+
+
+def folder_set(name: str, folder: Path) -> ImageSet:
+    """List the images of a folder and its subfolders.
+
+    Raises:
+        PathNotFoundError: When there is no such folder.
+        EvaluatorError: When it holds no image.
+    """
+    if not folder.is_dir():
+        raise PathNotFoundError(path=folder, what="folder of images", hint="Name a folder.")
+    found = list_files(folder)
+    refused = {
+        view: str(ImageRefusedError(name=paths[0].name, found=f"is {NOT_READ[_ending(paths[0])]}"))
+        for view, paths in list_files(folder, tuple(NOT_READ)).items()
+        if view not in found
+    }
+    for view, paths in found.items():
+        if len(paths) > 1:
+            names = " and ".join(path.name for path in paths)
+            refused[view] = f"two images of one name ({names}); keep one of them"
+    load = {view: partial(read_image, paths[0]) for view, paths in found.items()}
+    load = {view: call for view, call in load.items() if view not in refused}
+    if not load and not refused:
+        message = f"{folder} holds no image. {WANTED}."
+        raise EvaluatorError(message)
+    endings = sorted({_ending(paths[0]).lstrip(".") for paths in found.values()})
+    return ImageSet(
+        name=name,
+        where=str(folder),
+        load=load,
+        refused={view: reason for view, reason in refused.items() if view not in load},
+        stored=f"stored as {', '.join(endings)}" if endings else "stored in no known way",
+    )
+
+
+def list_files(folder: Path, endings: tuple[str, ...] = READ) -> dict[str, list[Path]]:
+    """Return the files with certain endings by view; hidden ones are nobody's images."""
+    found: dict[str, list[Path]] = {}
+    for path in sorted(folder.rglob("*")):
+        relative = path.relative_to(folder)
+        hidden = any(part.startswith(".") for part in relative.parts)
+        if not hidden and _ending(path) in endings and path.is_file():
+            found.setdefault(relative.with_suffix("").as_posix(), []).append(path)
+    return found
+
+
+def _ending(path: Path) -> str:
+    return path.suffix.lower()
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Read one image of shape (height, width, 3), uint8 or float in 0..1.
+
+    Raises:
+        ImageRefusedError: When it is not what can be compared; the message says what it is.
+    """
+    try:
+        if path.suffix.lower() == ".npy":
+            return _read_array(path)
+        data = path.read_bytes()
+        if data.startswith(PNG_MAGIC):
+            return _read_png(path.name, data)
+        if data.startswith(JPEG_MAGIC):
+            return _read_jpeg(path.name, data)
+    except BridgeError as error:
+        raise ImageRefusedError(name=path.name, found=f"cannot be read ({error})") from error
+    except OSError as error:
+        found = f"cannot be read ({error.strerror or error})"
+        raise ImageRefusedError(name=path.name, found=found) from error
+    raise ImageRefusedError(name=path.name, found="is neither PNG nor JPEG inside")
+
+
+def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
+    """Read a mask: white is inside; grey or colour, PNG or JPEG.
+
+    Raises:
+        ImageRefusedError: When it cannot be read.
+    """
+    try:
+        return np.asarray(decode_color(path.read_bytes())[..., 0] > 127)
+    except (BridgeError, OSError) as error:
+        found = f"cannot be read as a mask ({error})"
+        raise ImageRefusedError(name=path.name, found=found) from error
+
+
+def _read_png(name: str, data: bytes) -> np.ndarray:
+    # Pillow reads 16-bit colour as 8 bits without a word; the header says which it is.
+    depth, kind = data[24:25], data[25:26]
+    if depth == b"\x10":
+        raise ImageRefusedError(name=name, found="has 16 bits for each channel")
+    if kind in (b"\x00", b"\x04"):
+        raise ImageRefusedError(name=name, found="is grey, without colours")
+    with open_image(data) as image:
+        if image.mode not in ("RGBA", "PA", "LA") and "transparency" not in image.info:
+            return np.asarray(image.convert("RGB"))
+        pixels = np.asarray(image.convert("RGBA"))
+    if (pixels[..., 3] < 255).any():
+        found = "has transparency; draw it over the background that the reference has"
+        raise ImageRefusedError(name=name, found=found)
+    return np.ascontiguousarray(pixels[..., :3])
+
+
+def _read_jpeg(name: str, data: bytes) -> np.ndarray:
+    with open_image(data) as image:
+        mode = image.mode
+    if mode != "RGB":
+        words = {"L": "is grey, without colours", "CMYK": "holds printing colours (CMYK)"}
+        raise ImageRefusedError(name=name, found=words.get(mode, f"holds {mode} and no RGB"))
+    return decode_color(data)
+
+
+def _read_array(path: Path) -> np.ndarray:
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ImageRefusedError(
+            name=path.name, found="is not an array of numbers in NumPy's format"
+        ) from error
+    if not isinstance(array, np.ndarray):
+        raise ImageRefusedError(name=path.name, found="is an archive of arrays")
+    found = _wrong_shape(array.shape)
+    if not found and array.size > 3 * MAX_PIXELS:
+        found = f"has {array.shape[0]} x {array.shape[1]} pixels, more than a camera"
+    if not found and array.dtype != np.uint8 and array.dtype.kind != "f":
+        bits = 8 * array.dtype.itemsize
+        found = f"holds {array.dtype} values of {bits} bits, whose white nobody has said"
+    if found:
+        raise ImageRefusedError(name=path.name, found=found)
+    if array.dtype == np.uint8:
+        return np.array(array)
+    values = np.array(array, dtype=np.float64)
+    if not np.isfinite(values).all():
+        count = int((~np.isfinite(values)).sum())
+        raise ImageRefusedError(name=path.name, found=f"holds {count} values that are not finite")
+    low, high = float(values.min()), float(values.max())
+    if low < 0 or high > 1:
+        found = (
+            f"holds values from {low:.3g} to {high:.3g}, outside 0..1 (high dynamic range, or not "
+            "clamped); clamp or tone-map it as the method's own evaluation does"
+        )
+        raise ImageRefusedError(name=path.name, found=found)
+    return values
+
+
+def _wrong_shape(shape: tuple[int, ...]) -> str:
+    if len(shape) == 3 and shape[2] == 3 and min(shape) > 0:
+        return ""
+    if len(shape) == 3 and shape[2] == 4:
+        return "has four channels; draw it over the background and drop the transparency"
+    if len(shape) == 3 and shape[0] == 3:
+        return f"has its channels first, as {shape}; transpose it to (height, width, 3)"
+    return f"has shape {shape}"
+
+
+SCOPE = "images"
+"""What exclusions are from."""
+EMPTY_MASK = "no pixel of the mask is above 127: write what is inside as 255; scored without it"
+Scored = dict[Variant, ImageScore]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """The recorded images that methods are compared with."""
+
+    images: ImageSet
+    masks: Mapping[str, ImageSet] = field(default_factory=dict)
+    """Boolean images by the name of the mask."""
+    asked: frozenset[str] = frozenset()
+    """Masks that somebody gave for these views: a view without one is named. An object that is not
+    seen has no mask in a run's own views, and that is no lack."""
+    split: str
+    """Which images were held out, as far as anyone said."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodReport:
+    """What was found about several methods."""
+
+    numbers: Mapping[str, Sequence[StampedMeasurement]]
+    """By method, over the views that all of them have."""
+    views: tuple[ViewQuality, ...]
+    exclusions: tuple[Exclusion, ...]
+    common: tuple[str, ...]
+    """The views in every mean."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _View:
+    """All methods on one view."""
+
+    size: tuple[int, int]
+    scores: Mapping[str, Scored]
+    reasons: Mapping[str, str]
+    """Why a method has no score, by method; by "" where the recorded image is unusable."""
+    unmasked: Mapping[str, str] = field(default_factory=dict)
+    """Why a mask that somebody gave does not count here, by its name."""
+
+
+def compare_methods(
+    reference: Reference, methods: Sequence[ImageSet], *, nets: Sequence[PerceptualNet] = ()
+) -> MethodReport:
+    """Score every method on every view of the reference.
+
+    Args:
+        reference: The recorded images.
+        methods: Their renders.
+        nets: For LPIPS; none leaves it out.
+
+    Raises:
+        EvaluatorError: When no method has a single view that can be scored, or no view is common.
+    """
+    left_out = [gone for method in methods for gone in _unpaired(reference.images, method)]
+    wanted = [
+        view
+        for view in sorted({*reference.images.load, *reference.images.refused})
+        if any(view in method.load for method in methods)
+    ]
+    found = spread(
+        partial(_score_view, reference, methods, nets), wanted, threads=1 if nets else None
+    )
+    views = dict(zip(wanted, found, strict=True))
+    left_out += [
+        Exclusion(episode=_name(method, view), scope=SCOPE, reason=reason)
+        for view, seen in views.items()
+        for method, reason in seen.reasons.items()
+    ]
+    scored = [method for method in methods if any(method.name in v.scores for v in views.values())]
+    left_out += [
+        Exclusion(episode=f"mask {name}: {view}", scope=SCOPE, reason=reason)
+        for view, seen in views.items()
+        for name, reason in seen.unmasked.items()
+    ]
+    left_out += _without_scores(methods, scored, left_out)
+    common = [v for v, seen in views.items() if all(m.name in seen.scores for m in scored)]
+    if not scored or not common:
+        raise EvaluatorError(_nothing(reference, methods, scored, left_out))
+    left_out += _not_common(views, common, scored)
+    sizes = resolution_words([views[view].size for view in common])
+    numbers = {
+        method.name: _numbers(
+            method,
+            [views[view].scores[method.name] for view in common],
+            Protocol(resolution=sizes, split=reference.split, stored=method.stored, nets=nets),
+        )
+        for method in scored
+    }
+    shown = [
+        quality
+        for method in scored
+        for quality in _qualities(reference.images, method, {v: views[v] for v in common})
+    ]
+    return MethodReport(
+        numbers=numbers, views=tuple(shown), exclusions=tuple(left_out), common=tuple(common)
+    )
+
+
+def _name(method: str, view: str) -> str:
+    return f"{method}: {view}" if method else view
+
+
+def _unpaired(reference: ImageSet, method: ImageSet) -> list[Exclusion]:
+    """Name images without a counterpart, on either side."""
+    theirs, ours = {*method.load, *method.refused}, {*reference.load, *reference.refused}
+    missing = [(view, f"no image of this name in {method.where}") for view in sorted(ours - theirs)]
+    extra = [
+        (view, f"the reference has no such image ({reference.where})")
+        for view in sorted(theirs - ours)
+    ]
+    refused = [(view, reason) for view, reason in sorted(method.refused.items()) if view in ours]
+    return [
+        Exclusion(episode=_name(method.name, view), scope=SCOPE, reason=reason)
+        for view, reason in (*missing, *extra, *refused)
+    ]
+
+
+def _score_view(
+    reference: Reference, methods: Sequence[ImageSet], nets: Sequence[PerceptualNet], view: str
+) -> _View:
+    scores: dict[str, Scored] = {}
+    reasons: dict[str, str] = {}
+    try:
+        if view in reference.images.refused:
+            raise EvaluatorError(reference.images.refused[view])
+        recorded = reference.images.load[view]()
+        masks, unmasked = _masks(reference, view, recorded)
+    except GstError as error:
+        return _View(size=(0, 0), scores={}, reasons={"": f"recorded image: {error}"})
+    for method in methods:
+        if view not in method.load:
+            continue
+        try:
+            rendered = method.load[view]()
+            refuse_swapped(as_float(recorded), as_float(rendered))
+            scores[method.name] = score_variants(recorded, rendered, masks, nets=nets)
+        except GstError as error:
+            reasons[method.name] = str(error)
+    size = (recorded.shape[0], recorded.shape[1])
+    return _View(size=size, scores=scores, reasons=reasons, unmasked=unmasked)
+
+
+def _masks(
+    reference: Reference, view: str, recorded: np.ndarray
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Load the masks of one view, and say which were asked for and lack; it is scored without."""
+    found, lacking = {}, {}
+    for name, masks in reference.masks.items():
+        if view not in masks.load:
+            lacking[name] = f"no mask of this name in {masks.where}; scored without it"
+            continue
+        mask = masks.load[view]()
+        if mask.shape != recorded.shape[:2]:
+            raise ImageShapeError(
+                found=f"the mask is {mask.shape}, the recorded image {recorded.shape[:2]}"
+            )
+        if mask.any():
+            found[name] = mask
+        else:
+            lacking[name] = EMPTY_MASK
+    return found, {name: why for name, why in lacking.items() if name in reference.asked}
+
+
+def _without_scores(
+    methods: Sequence[ImageSet], scored: Sequence[ImageSet], left_out: Sequence[Exclusion]
+) -> list[Exclusion]:
+    """Name methods that have not one usable image."""
+    found = []
+    for method in methods:
+        if method not in scored:
+            why = [e.reason for e in left_out if e.episode.startswith(f"{method.name}: ")]
+            reason = (
+                f"the whole method: none of its images can be scored ({why[0] if why else '-'})"
+            )
+            found.append(Exclusion(episode=method.name, scope=SCOPE, reason=reason))
+    return found
+
+
+def _not_common(
+    views: Mapping[str, _View], common: Sequence[str], scored: Sequence[ImageSet]
+) -> list[Exclusion]:
+    found = []
+    for view, seen in views.items():
+        lacking = [method.name for method in scored if method.name not in seen.scores]
+        if view not in common and lacking and seen.scores:
+            reason = f"left out for every method: no score of {', '.join(lacking)}"
+            found.append(Exclusion(episode=view, scope=SCOPE, reason=reason))
+    return found
+
+
+def _nothing(
+    reference: Reference,
+    methods: Sequence[ImageSet],
+    scored: Sequence[ImageSet],
+    left_out: Sequence[Exclusion],
+) -> str:
+    """Say why there is nothing to compare."""
+    if scored:
+        names = ", ".join(method.name for method in scored)
+        return f"no view can be scored for all of {names}. Compare fewer methods at once."
+    ours = next(iter(sorted(reference.images.load)), "none")
+    theirs = [f"{m.name} has {next(iter(sorted(m.load)), 'none')}" for m in methods]
+    why = left_out[0].reason if left_out else "no image"
+    return (
+        f"no rendered image can be compared with {reference.images.where} ({why}). The reference "
+        f"has {ours}; {'; '.join(theirs)}. Name renders as the recorded images are named."
+    )
+
+
+def _numbers(
+    method: ImageSet, scores: Sequence[Scored], protocol: Protocol
+) -> list[StampedMeasurement]:
+    variants: dict[Variant, None] = {}
+    for scored in scores:
+        variants |= dict.fromkeys(scored)
+    return [
+        number
+        for variant in variants
+        for number in stamped_measurements(
+            f"image.{slug(method.name)}",
+            variant,
+            [scored[variant] for scored in scores if variant in scored],
+            protocol,
+        )
+    ]
+
+
+def _qualities(
+    reference: ImageSet, method: ImageSet, views: Mapping[str, _View]
+) -> list[ViewQuality]:
+    """One record for each view, with pictures of those with the lowest PSNR."""
+    values = {view: values_by_id(seen.scores[method.name]) for view, seen in views.items()}
+    rated = sorted((found["psnr_db"], view) for view, found in values.items() if "psnr_db" in found)
+    worst = {view for _, view in rated[:NUM_WORST]}
+    return [
+        ViewQuality(
+            episode=reference.name,
+            view_id=view,
+            method=method.name,
+            values=found,
+            recorded_u8=shrunk_u8(reference.load[view]()) if view in worst else None,
+            rendered_u8=shrunk_u8(method.load[view]()) if view in worst else None,
+        )
+        for view, found in values.items()
+    ]

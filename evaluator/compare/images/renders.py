@@ -1,0 +1,377 @@
+"""``evaluate --renders``: whose folders are compared with what."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from bridge.episode.provenance import software
+from bridge.errors import GstError, PathNotFoundError, UsageError
+from bridge.exchange.csv_export import seconds_text
+from bridge.media.color import decode_color
+from evaluator.compare.images.methods import (
+    ImageSet,
+    MethodReport,
+    Reference,
+    compare_methods,
+    folder_set,
+    list_files,
+    read_mask,
+)
+from evaluator.compare.images.scores import RAW, RECORDED, RENDERED, Images, images_of
+from evaluator.compare.images.tables import (
+    StampedMeasurement,
+    StampedValue,
+    cell_of,
+    rounded,
+    stamp_table,
+    stamped_table,
+)
+from evaluator.compare.images.views import (
+    TWIN,
+    Source,
+    ViewReport,
+    agreed_setting,
+    newest_views,
+    opened,
+)
+from evaluator.compare.measure import slug
+from evaluator.compare.rows import Comparison
+from evaluator.errors import EvaluatorError
+from evaluator.metrics.image_protocol import UNSTATED, ImageOptions, Stamp
+from evaluator.metrics.image_scores import METRICS
+from evaluator.metrics.lpips import PerceptualNet, open_nets
+from evaluator.result import Table
+from evaluator.run_reader.episodes import DerivedFile
+
+# --- Tables of several methods on the same views, the first laid out as the paper's Table I.
+
+HEADLINE = ("psnr_db", "ssim_zero", "lpips_vgg_01")
+"""Metrics of the first table, by the conventions of 3D Gaussian splatting papers."""
+_NOTE = (
+    "Means over the views that every method has. SSIM with zeros beyond the border and LPIPS of "
+    "images in 0..1, as papers on 3D Gaussian splatting compute them; the next table has the other "
+    "conventions, which give other numbers. LPIPS is not computed without a backbone."
+)
+_PAPER_NOTE = (
+    "Printed in the paper, not measured here. Other scenes; resolution, split, masks, SSIM padding "
+    "and LPIPS input are not stated, and the rows may come from different papers. So no number "
+    "above can be called better or worse than one of these. A masked or plain background alone can "
+    "lift SSIM from 0.55 to 0.92."
+)
+
+
+def method_tables(report: MethodReport, origin: str) -> tuple[Table, ...]:
+    """Return the headline table, the paper's own beside it, every number, and the protocols.
+
+    Args:
+        report: What was found.
+        origin: Where the images came from, for the note.
+    """
+    everything = [number for numbers in report.numbers.values() for number in numbers]
+    return (
+        _headline(report.numbers, origin),
+        paper_table(),
+        _all_metrics(report.numbers),
+        _per_view(report),
+        stamp_table("image_protocol", "Protocols of the image numbers", everything),
+    )
+
+
+def _headline(numbers: Mapping[str, Sequence[StampedMeasurement]], origin: str) -> Table:
+    rows = []
+    for method, found in numbers.items():
+        raw = {number.metric.id: number for number in found if number.variant == RAW}
+        rows.append(((method,), [_cell(raw, metric) for metric in HEADLINE]))
+    return stamped_table(
+        "image_methods",
+        "Rendering quality on the same views",
+        ("method",),
+        ("PSNR (dB)", "SSIM", "LPIPS (vgg)"),
+        rows,
+        note=f"{_NOTE} Images: {origin}.",
+    )
+
+
+def _cell(found: Mapping[str, StampedMeasurement], metric: str) -> StampedValue:
+    if metric in found:
+        return cell_of(found[metric])
+    # Without a backbone there is no measurement; the protocol of the row's others still holds.
+    return StampedValue(value="not computed", stamp=found["psnr_db"].stamp)
+
+
+def paper_table() -> Table:
+    """Return Table I of the Robot-GST paper as printed, with the protocol it does not state."""
+    path = files("evaluator.compare").joinpath("robot_gst_table_1.json")
+    printed = json.loads(path.read_text(encoding="utf-8"))
+    rows = [
+        (
+            (name,),
+            [
+                StampedValue(value=value, stamp=_unstated(column))
+                for column, value in zip(printed["columns"], values, strict=True)
+            ],
+        )
+        for name, *values in printed["rows"]
+    ]
+    return stamped_table(
+        "image_paper", printed["title"], ("method",), printed["columns"], rows, note=_PAPER_NOTE
+    )
+
+
+def _unstated(column: str) -> Stamp:
+    return Stamp(
+        metric=column,
+        implementation=UNSTATED,
+        values=UNSTATED,
+        window=UNSTATED,
+        padding=UNSTATED,
+        mask=UNSTATED,
+        resolution=UNSTATED,
+        crop=UNSTATED,
+        alignment=UNSTATED,
+        clamp=UNSTATED,
+        split=UNSTATED,
+        stored=UNSTATED,
+        mean=UNSTATED,
+        n=0,
+    )
+
+
+def _all_metrics(numbers: Mapping[str, Sequence[StampedMeasurement]]) -> Table:
+    """Every metric of every method in every variant."""
+    rows, columns = [], [metric for metric in METRICS if _has(numbers, metric)]
+    for method, found in numbers.items():
+        for variant in dict.fromkeys(n.variant for n in found):
+            mine = {n.metric.id: n for n in found if n.variant == variant}
+            rows.append(((method, variant.name), [_or_none(mine, metric) for metric in columns]))
+    return stamped_table(
+        "image_all",
+        "Every image metric",
+        ("method", "variant"),
+        [METRICS[metric].column for metric in columns],
+        rows,
+        note="Empty: undefined, or not defined over single pixels of a mask. Gain and affine fit "
+        "brightness to the recorded image: an exposure offset costs PSNR and hardly SSIM.",
+    )
+
+
+def _has(numbers: Mapping[str, Sequence[StampedMeasurement]], metric: str) -> bool:
+    return any(number.metric.id == metric for found in numbers.values() for number in found)
+
+
+def _or_none(mine: Mapping[str, StampedMeasurement], metric: str) -> StampedValue:
+    if metric in mine:
+        return cell_of(mine[metric])
+    return StampedValue(value=None, stamp=next(iter(mine.values())).stamp)
+
+
+def _per_view(report: MethodReport) -> Table:
+    columns = [m for m in METRICS if any(m in view.values for view in report.views)]
+    shown = sorted(report.views, key=lambda v: (v.values.get("psnr_db", float("inf")), v.view_id))
+    return Table(
+        id="image_views",
+        title="Every view of every method, worst first",
+        columns=("view", "method", *(METRICS[metric].column for metric in columns)),
+        rows=tuple(
+            (view.view_id, view.method, *(rounded(view.values.get(m)) for m in columns))
+            for view in shown
+        ),
+        note=f"Raw. Protocols: the table of protocols, variant {RAW.name}. No PSNR: identical "
+        "images.",
+    )
+
+
+def compare_folders(options: ImageOptions) -> Comparison:
+    """Compare folders of renders with a folder of recorded images, without any run.
+
+    Raises:
+        UsageError: When the reference or the renders are not named.
+        PathNotFoundError: When a folder is not there.
+        EvaluatorError: When nothing in them can be compared.
+    """
+    if options.reference is None or not options.renders:
+        message = "images alone need --reference FOLDER and --renders METHOD=FOLDER."
+        raise UsageError(message)
+    nets = open_nets(options.backbones)
+    report = _beside_folder(options, options.reference, nets)
+    return Comparison(
+        run=options.reference.resolve().name,
+        source="images",
+        stand_in=None,
+        measurements=report.measurements,
+        tables=report.tables,
+        exclusions=report.exclusions,
+        missing=report.missing,
+        views=report.views,
+        provenance={
+            "software": software(),
+            "reference": str(options.reference),
+            "methods": {name: str(folder) for name, folder in options.methods().items()},
+            "weights": [net.weights for net in nets],
+        },
+    )
+
+
+def compare_renders(
+    options: ImageOptions,
+    files: Sequence[DerivedFile],
+    sources: Mapping[str, Source],
+    *,
+    nets: Sequence[PerceptualNet] = (),
+) -> ViewReport:
+    """Compare folders of renders with the twin's own on the held-out views of a run.
+
+    A view is called ``camera/stamp_ns``; ``camera_stamp_ns`` and the names of ``export tum`` are
+    understood too. With a reference of their own, the folders are compared with that instead.
+
+    Args:
+        options: Whose folders; without any the report is empty.
+        files: Every derived episode of the run.
+        sources: Every recorded episode by its id.
+        nets: For LPIPS; none leaves it out.
+
+    Raises:
+        PathNotFoundError: When a folder is not there.
+        EvaluatorError: When the run has no views, or nothing can be compared.
+    """
+    if not options.renders:
+        options.refuse_unused()
+        return ViewReport()
+    if options.reference is not None:
+        return _beside_folder(options, options.reference, nets)
+    found, _ = newest_views(files, sources)  # what is left out, compare_views says
+    recorded, twin, masks = _sets_of(found, sources)
+    if not twin.load:
+        message = (
+            "the run has no rendered views to compare others with. Make them with robot-gst "
+            "rebuild, or name a folder of recorded images with --reference."
+        )
+        raise EvaluatorError(message)
+    split = agreed_setting([file.derived.settings for file in found], "holdout") or options.split
+    names = _other_names(recorded.load)
+    given = {name: _renamed(mask, names) for name, mask in _given_masks(options).items()}
+    reference = Reference(
+        images=recorded, masks={**masks, **given}, asked=frozenset(given), split=split
+    )
+    others = [_renamed(method, names) for method in _methods(options, taken=(TWIN,))]
+    return _report(reference, [twin, *others], nets)
+
+
+def _beside_folder(
+    options: ImageOptions, folder: Path, nets: Sequence[PerceptualNet]
+) -> ViewReport:
+    images = folder_set(folder.resolve().name, folder)
+    masks = _given_masks(options)
+    reference = Reference(images=images, masks=masks, asked=frozenset(masks), split=options.split)
+    return _report(reference, _methods(options, taken=()), nets)
+
+
+def _report(
+    reference: Reference, methods: Sequence[ImageSet], nets: Sequence[PerceptualNet]
+) -> ViewReport:
+    report = compare_methods(reference, methods, nets=nets)
+    origin = ", ".join(f"{method.name} from {method.where}" for method in methods)
+    missing = []
+    if not nets:
+        missing.append("LPIPS of renders: no backbone (--lpips-vgg FILE, --lpips-alex FILE)")
+    if reference.split == UNSTATED:
+        missing.append("split of renders: nobody said which images were held out (--split TEXT)")
+    return ViewReport(
+        measurements=tuple(n.measurement for found in report.numbers.values() for n in found),
+        tables=method_tables(report, f"{origin}; recorded: {reference.images.where}"),
+        exclusions=report.exclusions,
+        missing=tuple(missing),
+        views=report.views,
+    )
+
+
+def _methods(options: ImageOptions, *, taken: Sequence[str]) -> list[ImageSet]:
+    seen = {slug(name): name for name in taken}
+    found = []
+    for name, folder in options.methods().items():
+        if slug(name) in seen:
+            message = (
+                f"--renders calls a method {name}, which ids cannot tell from {seen[slug(name)]}; "
+                "give it another name."
+            )
+            raise UsageError(message)
+        seen[slug(name)] = name
+        found.append(folder_set(name, folder))
+    return found
+
+
+def _given_masks(options: ImageOptions) -> dict[str, ImageSet]:
+    """Return the folder of masks under the name that ids give it; nothing without one."""
+    folder = options.masks
+    if folder is None:
+        return {}
+    if not folder.is_dir():
+        raise PathNotFoundError(path=folder, what="folder of masks", hint="Name a folder.")
+    masks = ImageSet(
+        name=folder.name,
+        where=str(folder),
+        load={view: partial(read_mask, paths[0]) for view, paths in list_files(folder).items()},
+        stored="masks",
+    )
+    return {slug(folder.resolve().name): masks}
+
+
+def _other_names(views: Iterable[str]) -> dict[str, str]:
+    """Return what else a view of the run may be called, where only one view is called so."""
+    found: dict[str, list[str]] = {}
+    for view in views:
+        camera, stamp = view.rsplit("/", 1)
+        seconds = seconds_text(int(stamp))
+        for name in (stamp, seconds, f"rgb/{seconds}"):
+            found.setdefault(name, []).append(view)
+        for name in (f"{camera}_{stamp}", f"{camera}/{seconds}", f"{camera}/rgb/{seconds}"):
+            found.setdefault(name, []).append(view)
+    return {name: of[0] for name, of in found.items() if len(of) == 1}
+
+
+def _renamed(method: ImageSet, names: Mapping[str, str]) -> ImageSet:
+    """Call the images of a method as the run calls its views."""
+    return replace(
+        method,
+        load={names.get(view, view): call for view, call in method.load.items()},
+        refused={names.get(view, view): reason for view, reason in method.refused.items()},
+    )
+
+
+def _sets_of(
+    files: Sequence[DerivedFile], sources: Mapping[str, Source]
+) -> tuple[ImageSet, ImageSet, dict[str, ImageSet]]:
+    """Return recorded images, the twin's renders, and masks of the views of a run."""
+    recorded, rendered = {}, {}
+    masks: dict[str, dict[str, partial[np.ndarray]]] = {}
+    refused = {}
+    for file in files:
+        try:
+            images = images_of(file.episode, opened(sources.get(file.derived.source_episode)))
+        except GstError as error:
+            refused[file.path.stem] = str(error)
+            continue
+        for key in images.color[RENDERED].keys() & images.color[RECORDED].keys():
+            view = f"{key[0]}/{key[1]}"
+            recorded[view] = partial(decode_color, images.color[RECORDED][key])
+            rendered[view] = partial(decode_color, images.color[RENDERED][key])
+            for name in images.masks_of(key):
+                masks.setdefault(name, {})[view] = partial(_mask, images, name, key)
+    where = "the run's views"
+    return (
+        ImageSet(name="recorded", where=where, load=recorded, refused=refused, stored="recorded"),
+        ImageSet(name=TWIN, where=where, load=rendered, stored="stored in the run's views"),
+        {
+            name: ImageSet(name=name, where=where, load=load, stored="masks")
+            for name, load in masks.items()
+        },
+    )
+
+
+def _mask(images: Images, name: str, key: tuple[str, int]) -> np.ndarray:
+    return images.masks_of(key)[name]

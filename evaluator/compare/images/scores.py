@@ -1,0 +1,358 @@
+"""Pair the images of a ``views`` episode, and score each pair in every way its topics allow.
+
+Topics end in ``/cam/<id>/`` and ``rendered/image``, ``recorded/image`` (or, in the source episode,
+``color/image``), ``pose_aligned/image``, ``mask/<name>/image`` or ``mask/<name>`` (white inside),
+``rendered/depth``, ``recorded/depth`` and ``recorded/depth_in_color``.
+"""
+
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from bridge.episode import schema
+from bridge.episode.cdr.messages import CompressedColor, DepthImage
+from bridge.episode.reader import Episode
+from bridge.errors import GstError
+from bridge.media.color import JPEG_MAGIC, decode_color
+from evaluator.errors import UndefinedStatisticError
+from evaluator.metrics.image import (
+    ALIGNMENTS,
+    Alignment,
+    DepthScore,
+    as_float,
+    refuse_swapped,
+    score_depth,
+)
+from evaluator.metrics.image_protocol import MASK_MODES, MaskMode
+from evaluator.metrics.image_scores import METRICS, ImageScore, score_image
+from evaluator.metrics.lpips import PerceptualNet
+
+# --- The ways one pair of images is scored: as it is, brightened, re-posed, and under each mask.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """One way to score a pair."""
+
+    name: str
+    """Part of the ids in ``results.json``."""
+    alignment: Alignment = "raw"
+    mode: MaskMode = "full"
+    mask: str = ""
+    """Name of the mask, where there is one."""
+    posed: bool = False
+    """Whether the image was rendered where pose and brightness fit the recorded one."""
+    learned: bool = False
+    """Whether LPIPS is computed for it too; a network takes seconds for each image."""
+
+    @property
+    def mask_words(self) -> str:
+        """What the mask does, for a stamp."""
+        words = MASK_MODES[self.mode]
+        return f"{words} {self.mask!r}" if self.mask else words
+
+    @property
+    def alignment_words(self) -> str:
+        """What was fitted to the recorded image, for a stamp."""
+        if self.posed:
+            return (
+                "camera pose and one gain per channel fitted to the recorded image: not strictly "
+                "held out"
+            )
+        return ALIGNMENTS[self.alignment]
+
+    @property
+    def clamp_words(self) -> str:
+        """What became of values outside 0..1."""
+        return "no value outside 0..1" if self.alignment == "raw" else "to 0..1 after alignment"
+
+
+RAW = Variant(name="raw", learned=True)
+GAIN = Variant(name="gain", alignment="gain", learned=True)
+AFFINE = Variant(name="affine", alignment="affine")
+POSE_GAIN = Variant(name="pose_gain", alignment="gain", posed=True)
+_TAKEN = {variant.name for variant in (RAW, GAIN, AFFINE, POSE_GAIN)}
+
+
+def masked(name: str) -> tuple[Variant, Variant]:
+    """Return both ways to use a mask: its pixels alone, and everything else black."""
+    own = f"mask_{name}" if name in _TAKEN or name.endswith("_black") else name
+    return (
+        Variant(name=own, mode="mask-pixels", mask=name),
+        Variant(name=f"{own}_black", mode="black-background", mask=name, learned=True),
+    )
+
+
+def score_variants(
+    recorded: UInt8[np.ndarray, "height width 3"] | Float[np.ndarray, "height width 3"],
+    rendered: (
+        UInt8[np.ndarray, "rendered_height rendered_width 3"]
+        | Float[np.ndarray, "rendered_height rendered_width 3"]
+    ),
+    masks: Mapping[str, Bool[np.ndarray, "height width"]],
+    *,
+    nets: Sequence[PerceptualNet] = (),
+) -> dict[Variant, ImageScore]:
+    """Score one pair in every way but re-posed.
+
+    Raises:
+        ImageShapeError: When the sizes differ.
+    """
+    ways: list[tuple[Variant, np.ndarray | None]] = [(RAW, None), (GAIN, None), (AFFINE, None)]
+    ways += [(variant, mask) for name, mask in masks.items() for variant in masked(name)]
+    return {
+        variant: score_image(
+            recorded,
+            rendered,
+            mask=mask,
+            mode=variant.mode,
+            alignment=variant.alignment,
+            nets=nets if variant.learned else (),
+        )
+        for variant, mask in ways
+    }
+
+
+def values_by_id(scores: Mapping[Variant, ImageScore]) -> dict[str, float]:
+    """Return every value by the last part of its id: ``psnr_db``, ``psnr_gain_db``, ``ssim`` ..."""
+    return {
+        METRICS[metric].named(variant.name): value
+        for variant, score in scores.items()
+        for metric, value in score.values.items()
+    }
+
+
+# --- One rendered view with all its scores, as figures and dashboards take it.
+
+NUM_WORST = 4
+"""Views of a method whose pictures are kept: those with the lowest raw PSNR."""
+PICTURE_WIDTH_PX = 320
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ViewQuality:
+    """Every number about one rendered view; pictures only of the worst few of its method."""
+
+    episode: str
+    """The recorded episode, or the name of the reference folder."""
+    view_id: str
+    """``camera/stamp_ns``, or the file name without its ending."""
+    method: str
+    """``twin``, or as the user named a folder of renders."""
+    values: Mapping[str, float]
+    """By the last part of the id in ``results.json``: ``psnr_db``, ``psnr_gain_db``, ``ssim``."""
+    recorded_u8: UInt8[np.ndarray, "height width 3"] | None = None
+    rendered_u8: UInt8[np.ndarray, "height width 3"] | None = None
+
+
+def shrunk_u8(
+    image: UInt8[np.ndarray, "height width 3"] | Float[np.ndarray, "height width 3"],
+) -> UInt8[np.ndarray, "small_height small_width 3"]:
+    """Average whole squares of pixels until the picture is at most ``PICTURE_WIDTH_PX`` wide.
+
+    Args:
+        image: 8 bits, or float in 0..1.
+    """
+    values = image * 255.0 if np.issubdtype(image.dtype, np.floating) else image
+    side = max(1, -(-image.shape[1] // PICTURE_WIDTH_PX))
+    side = min(side, image.shape[0])
+    rows, columns = image.shape[0] // side, image.shape[1] // side
+    squares = values[: rows * side, : columns * side].reshape(rows, side, columns, side, 3)
+    return np.asarray(np.rint(squares.mean(axis=(1, 3))), dtype=np.uint8)
+
+
+# --- Work on many images with a few threads; NumPy and the image decoders let go of the
+# interpreter.
+#
+# Episodes are read and compared by processes: ``workers``.
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+MAX_THREADS = 8
+"""More only cost memory: each holds the images it works on."""
+
+
+def spread(
+    work: Callable[[Item], Result], items: Iterable[Item], *, threads: int | None = None
+) -> list[Result]:
+    """Call ``work`` on each item and return the results in the order of the items.
+
+    Args:
+        work: Must not share anything that changes.
+        items: What to work on.
+        threads: How many at once; as many as there are cores without it.
+    """
+    count = min(MAX_THREADS, os.cpu_count() or 1) if threads is None else threads
+    if count <= 1:
+        return [work(item) for item in items]
+    with ThreadPoolExecutor(max_workers=count) as pool:
+        return list(pool.map(work, items))
+
+
+RENDERED, RECORDED, POSED = "rendered", "recorded", "pose_aligned"
+_COLOR_TOPICS = (
+    (RENDERED, re.compile(r"/cam/([^/]+)/(?:color/)?(?:rendered|replayed)(?:/image)?$")),
+    (RECORDED, re.compile(r"/cam/([^/]+)/(?:color|recorded)(?:/image)?$")),
+    (POSED, re.compile(r"/cam/([^/]+)/pose_aligned(?:/image)?$")),
+)
+_MASK_TOPIC = re.compile(r"/cam/([^/]+)/mask/([a-z_]+)(?:/image)?$")
+_DEPTH_TOPICS = (
+    (RENDERED, re.compile(r"/cam/([^/]+)/rendered/depth$")),
+    (RECORDED, re.compile(r"/cam/([^/]+)/recorded/depth(?:_in_color)?$")),
+)
+
+Key = tuple[str, int]
+"""Camera id and stamp [ns]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewScore:
+    """One held-out image."""
+
+    camera_id: str
+    stamp_ns: int
+    size: tuple[int, int]
+    """Height and width [px]."""
+    scores: Mapping[Variant, ImageScore]
+    """At least raw, gain and affine; pose_gain and both ways of each mask where there are any."""
+    depth: DepthScore | None
+    jpeg: bool
+    """The rendered image was stored lossily."""
+
+    def psnr_db(self, variant: Variant = RAW) -> float | None:
+        """None where the variant is not there or both images are identical."""
+        score = self.scores.get(variant)
+        return None if score is None else score.psnr_db
+
+
+@dataclass(kw_only=True)
+class Images:
+    """Undecoded images of one views episode."""
+
+    color: dict[str, dict[Key, bytes]] = field(
+        default_factory=lambda: {RENDERED: {}, RECORDED: {}, POSED: {}}
+    )
+    masks: dict[str, dict[Key, bytes]] = field(default_factory=dict)
+    depth: dict[str, dict[Key, bytes]] = field(default_factory=lambda: {RENDERED: {}, RECORDED: {}})
+
+    def masks_of(self, key: Key) -> dict[str, np.ndarray]:
+        """Decode the masks of one view; empty ones say nothing and are left out."""
+        found = {
+            name: decode_color(of[key])[..., 0] > 127
+            for name, of in sorted(self.masks.items())
+            if key in of
+        }
+        return {name: mask for name, mask in found.items() if mask.any()}
+
+
+def score_views(
+    images: Images, *, nets: Sequence[PerceptualNet] = ()
+) -> tuple[list[ViewScore], list[str]]:
+    """Score every rendered image of a views episode; what cannot be scored is a reason.
+
+    Args:
+        images: As ``images_of`` collects them.
+        nets: For LPIPS; none leaves it out.
+    """
+    rendered = sorted(images.color[RENDERED])
+    # A network uses all cores and much memory by itself.
+    done = spread(partial(_score, images, nets), rendered, threads=1 if nets else None)
+    scores = [found for found in done if isinstance(found, ViewScore)]
+    reasons = [found for found in done if isinstance(found, str)]
+    if not rendered:
+        reasons.append("no topic .../cam/<id>/rendered/image in it")
+    return scores, reasons
+
+
+def images_of(views: Episode, source: Episode | None) -> Images:
+    """Collect the images of a views episode.
+
+    Args:
+        views: The derived episode.
+        source: What it was made from; recorded images are looked for there if it has none.
+    """
+    images = read_images(views)
+    if source is not None and not images.color[RECORDED]:
+        wanted = {stamp for _, stamp in images.color[RENDERED]}
+        images.color[RECORDED] = {
+            key: data
+            for key, data in read_images(source).color[RECORDED].items()
+            if key[1] in wanted
+        }
+    return images
+
+
+def read_images(episode: Episode) -> Images:
+    """Collect the images of an episode by camera and stamp, still compressed."""
+    images = Images()
+    put: dict[str, Callable[[bytes], None]] = {}
+    for topic in episode.topics_of_type(schema.COMPRESSED_IMAGE):
+        for name, pattern in _COLOR_TOPICS:
+            if match := pattern.search(topic):
+                put[topic] = partial(_put_color, images.color[name], match.group(1))
+                break
+        else:
+            if match := _MASK_TOPIC.search(topic):
+                masks = images.masks.setdefault(match.group(2), {})
+                put[topic] = partial(_put_color, masks, match.group(1))
+    for topic in episode.topics_of_type(schema.IMAGE):
+        for name, pattern in _DEPTH_TOPICS:
+            if match := pattern.search(topic):
+                put[topic] = partial(_put_depth, images.depth[name], match.group(1))
+    for message in episode.messages(put):
+        put[message.topic](message.data)
+    return images
+
+
+def _put_color(into: dict[Key, bytes], camera_id: str, data: bytes) -> None:
+    image = CompressedColor.from_cdr(data)
+    into[camera_id, image.stamp_ns] = image.data
+
+
+def _put_depth(into: dict[Key, bytes], camera_id: str, data: bytes) -> None:
+    into[camera_id, DepthImage.from_cdr(data).stamp_ns] = data
+
+
+def _score(images: Images, nets: Sequence[PerceptualNet], key: Key) -> ViewScore | str:
+    where = f"camera {key[0]} at {key[1]} ns"
+    rendered, recorded = images.color[RENDERED][key], images.color[RECORDED].get(key)
+    if recorded is None:
+        return f"{where}: no recorded image with this stamp"
+    try:
+        recorded_u8, rendered_u8 = decode_color(recorded), decode_color(rendered)
+        refuse_swapped(as_float(recorded_u8), as_float(rendered_u8))
+        scores = score_variants(recorded_u8, rendered_u8, images.masks_of(key), nets=nets)
+        posed = images.color[POSED].get(key)
+        if posed is not None:
+            scores[POSE_GAIN] = score_image(recorded_u8, decode_color(posed), alignment="gain")
+        depth = _score_depth(images, key)
+    except GstError as error:
+        return f"{where}: {error}"
+    return ViewScore(
+        camera_id=key[0],
+        stamp_ns=key[1],
+        size=(recorded_u8.shape[0], recorded_u8.shape[1]),
+        scores=scores,
+        depth=depth,
+        jpeg=rendered.startswith(JPEG_MAGIC),
+    )
+
+
+def _score_depth(images: Images, key: Key) -> DepthScore | None:
+    pair = [images.depth[name].get(key) for name in (RECORDED, RENDERED)]
+    if pair[0] is None or pair[1] is None:
+        return None
+    try:
+        return score_depth(
+            DepthImage.from_cdr(pair[0]).depth_m(), DepthImage.from_cdr(pair[1]).depth_m()
+        )
+    except UndefinedStatisticError:
+        return None

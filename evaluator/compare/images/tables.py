@@ -1,0 +1,272 @@
+"""Tables of image numbers: no row without the protocol it was measured by."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from evaluator.compare.images.scores import AFFINE, GAIN, POSE_GAIN, RAW, Variant, ViewScore
+from evaluator.compare.measure import measured
+from evaluator.errors import UndefinedStatisticError
+from evaluator.metrics.image_protocol import ImageMetric, Stamp, common_text
+from evaluator.metrics.image_scores import METRICS, PLAIN_METRICS, ImageScore
+from evaluator.metrics.lpips import LPIPS_METRICS, LPIPS_NOT_COMPUTED, PerceptualNet, net_of
+from evaluator.result import Cell, Measurement, Table
+
+# --- Turn the scores of many images into measurements, each with its protocol stamp.
+
+NOT_A_SAMPLE = (
+    "views of one scene are no random sample of views; the per-image list is in the table"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protocol:
+    """What all numbers about one set of images have in common."""
+
+    resolution: str
+    split: str
+    stored: str
+    nets: Sequence[PerceptualNet] = ()
+    remark: str = ""
+    """Said at the end of each definition."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StampedMeasurement:
+    """A mean over images that cannot be had without its stamp."""
+
+    metric: ImageMetric
+    variant: Variant
+    measurement: Measurement
+    stamp: Stamp
+
+
+def resolution_words(sizes: Sequence[tuple[int, int]]) -> str:
+    """Write the sizes of images, given as (height, width) [px]."""
+    found = sorted(set(sizes))
+    if not found:
+        return "no image"
+    words = ", ".join(f"{width} x {height}" for height, width in found[:3])
+    return words if len(found) <= 3 else f"{words} and {len(found) - 3} other sizes"
+
+
+def stamped_measurements(
+    prefix: str,
+    variant: Variant,
+    scores: Sequence[ImageScore],
+    protocol: Protocol,
+    *,
+    episodes: Sequence[str] = (),
+) -> list[StampedMeasurement]:
+    """Measure the mean of every metric that a variant can have.
+
+    Args:
+        prefix: Of the ids: ``views.all`` or ``image.<method>``.
+        variant: How the images were scored.
+        scores: One for each image.
+        protocol: What goes onto every stamp.
+        episodes: The recorded episodes the numbers rest on.
+    """
+    metrics = [*PLAIN_METRICS, *(LPIPS_METRICS if protocol.nets and variant.learned else ())]
+    return [
+        _stamped(prefix, metric, variant, scores, protocol, episodes)
+        for metric in metrics
+        if variant.mode != "mask-pixels" or metric.by_pixel
+    ]
+
+
+def _stamped(
+    prefix: str,
+    metric: ImageMetric,
+    variant: Variant,
+    scores: Sequence[ImageScore],
+    protocol: Protocol,
+    episodes: Sequence[str],
+) -> StampedMeasurement:
+    values = [s.values[metric.id] for s in scores if metric.id in s.values]
+    net = net_of(metric, protocol.nets)
+    stamp = Stamp(
+        metric=metric.column,
+        implementation=metric.implementation,
+        values=metric.values,
+        window=metric.window,
+        padding=metric.padding,
+        weights=net.weights if net is not None else "none",
+        mask=variant.mask_words,
+        resolution=protocol.resolution,
+        alignment=variant.alignment_words,
+        clamp=variant.clamp_words,
+        split=protocol.split,
+        stored=protocol.stored,
+        n=len(values),
+    )
+    without = LPIPS_NOT_COMPUTED if metric in LPIPS_METRICS and net is None else ""
+    parts = (metric.definition, stamp.text(), _lacking(metric, scores), protocol.remark)
+    measurement = measured(
+        f"{prefix}.{metric.named(variant.name)}",
+        partial(_mean, metric.column, values, without or _first_reason(metric, scores)),
+        unit=metric.unit,
+        definition="; ".join(part for part in parts if part),
+        n=len(values),
+        counted="image",
+        reason_without_interval=NOT_A_SAMPLE,
+        episodes=episodes,
+    )
+    return StampedMeasurement(metric=metric, variant=variant, measurement=measurement, stamp=stamp)
+
+
+def _mean(statistic: str, values: Sequence[float], reason: str) -> float:
+    if not values:
+        raise UndefinedStatisticError(statistic=statistic, reason=reason)
+    return float(np.mean(values))
+
+
+def _first_reason(metric: ImageMetric, scores: Sequence[ImageScore]) -> str:
+    found = (score.reasons[metric.id] for score in scores if metric.id in score.reasons)
+    return next(found, "no pair of images has it")
+
+
+def _lacking(metric: ImageMetric, scores: Sequence[ImageScore]) -> str:
+    """Count the images that the mean leaves out, with the first reason."""
+    without = [score for score in scores if metric.id in score.reasons]
+    if not without or len(without) == len(scores):
+        return ""
+    reason = without[0].reasons[metric.id]
+    return f"not in the mean: {len(without)} of {len(scores)} images ({reason})"
+
+
+PROTOCOL_COLUMN = "protocol"
+MISSING = "not computed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StampedValue:
+    """One cell of a table of image numbers."""
+
+    value: float | str | None
+    """A word where there is no number; None is undefined."""
+    stamp: Stamp
+
+
+def stamped_table(
+    table_id: str,
+    title: str,
+    heads: Sequence[str],
+    columns: Sequence[str],
+    rows: Iterable[tuple[Sequence[Cell], Sequence[StampedValue]]],
+    *,
+    note: str,
+) -> Table:
+    """Lay out rows of stamped values, with n and protocol behind the values.
+
+    Args:
+        table_id: Its name in files.
+        title: Above it.
+        heads: Names of the columns before the values.
+        columns: Names of the columns of values.
+        rows: What stands in front, and the values.
+        note: Below it.
+
+    Raises:
+        ValueError: When a row has another number of cells than columns.
+    """
+    laid = []
+    for front, values in rows:
+        if len(front) != len(heads) or len(values) != len(columns):
+            message = f"a row of table {table_id} has {len(front)} + {len(values)} cells"
+            raise ValueError(message)
+        # What was not computed has no protocol; a row of nothing else still shows what it would be.
+        made = [value for value in values if not isinstance(value.value, str)] or values
+        stamps = [value.stamp for value in made]
+        numbers = [stamp.n for stamp in stamps if stamp.n]
+        views = max(numbers, default=None)
+        laid.append(
+            (*front, *(rounded(value.value) for value in values), views, common_text(stamps))
+        )
+    return Table(
+        id=table_id,
+        title=title,
+        columns=(*heads, *columns, "views", PROTOCOL_COLUMN),
+        rows=tuple(laid),
+        note=note,
+    )
+
+
+def cell_of(stamped: StampedMeasurement) -> StampedValue:
+    """Return what a table shows of a measurement."""
+    value: float | str | None = stamped.measurement.value
+    if stamped.measurement.reason_if_undefined == LPIPS_NOT_COMPUTED:
+        value = MISSING
+    return StampedValue(value=value, stamp=stamped.stamp)
+
+
+def stamp_table(table_id: str, title: str, stamped: Sequence[StampedMeasurement]) -> Table:
+    """List every number with its full stamp; the key tells numbers that may be compared."""
+    return Table(
+        id=table_id,
+        title=title,
+        columns=("id", "value", "key", PROTOCOL_COLUMN),
+        rows=tuple(
+            (
+                number.measurement.id,
+                rounded(number.measurement.value),
+                number.stamp.key,
+                number.stamp.text(),
+            )
+            for number in stamped
+        ),
+        note="Numbers may be compared where their keys are equal: then only the images and how "
+        "many there are can differ.",
+    )
+
+
+_ALIGNED = tuple(
+    (f"PSNR {words} (dB)", METRICS["psnr_db"], variant)
+    for words, variant in (("gain", GAIN), ("affine", AFFINE), ("pose and gain", POSE_GAIN))
+)
+
+
+def per_image_table(table_id: str, title: str, scores: Sequence[ViewScore]) -> Table:
+    """List every view with its raw scores, and PSNR after each alignment."""
+    others = [metric for metric in PLAIN_METRICS if metric.id not in ("psnr_db", "ssim")]
+    learned = [m for m in METRICS.values() if any(m.id in s.scores[RAW].values for s in scores)]
+    others += [metric for metric in learned if metric not in PLAIN_METRICS]
+    return Table(
+        id=table_id,
+        title=title,
+        columns=(
+            *("camera", "stamp_ns", "PSNR (dB)", "SSIM", "pixels"),
+            *(name for name, _, _ in _ALIGNED),
+            *("depth (mm)", *(metric.column for metric in others)),
+        ),
+        rows=tuple(
+            (
+                s.camera_id,
+                s.stamp_ns,
+                _rounded(s.scores[RAW].psnr_db, 3),
+                _rounded(s.scores[RAW].ssim, 4),
+                s.scores[RAW].num_pixels,
+                *(_rounded(s.psnr_db(variant), 3) for _, _, variant in _ALIGNED),
+                None if s.depth is None else round(1e3 * s.depth.mean_abs_m, 2),
+                *(_rounded(s.scores[RAW].values.get(metric.id), 4) for metric in others),
+            )
+            for s in scores
+        ),
+        note=_definitions((METRICS["psnr_db"], METRICS["ssim"], *others)),
+    )
+
+
+def _definitions(metrics: Iterable[ImageMetric]) -> str:
+    said = ". ".join(metric.definition for metric in metrics)
+    return f"{said}. LPIPS where a backbone is given. Full stamps: the table of protocols."
+
+
+def rounded(value: float | str | None) -> Cell:
+    """Return a cell with four digits behind the point; words stay as they are."""
+    return round(value, 4) if isinstance(value, float) else value
+
+
+def _rounded(value: float | None, digits: int) -> Cell:
+    return None if value is None else round(value, digits)

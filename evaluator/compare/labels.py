@@ -1,0 +1,283 @@
+"""The second witness: what the task's success predicate says of the poses localised afterwards."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.clock import NS_PER_S
+from bridge.episode import schema, streams
+from bridge.episode.cdr.codec import MalformedMessageError
+from bridge.episode.reader import Episode
+from bridge.geometry import se3
+from bridge.task.predicate import PredicateResult, Rollout, all_hold, evaluate_success, objects_done
+from bridge.task.task_file import Task
+from evaluator.compare.known_task import known_task
+from evaluator.compare.measure import Part, proportion, slug
+from evaluator.compare.rows import TrialRow
+from evaluator.result import Cell, Exclusion, Measurement, Table
+from evaluator.run_reader.tracks import TOOL
+
+AFTER = "end"
+DECIDED_BY_A_LOOK = ("inside", "shape")
+"""Clauses that one localisation decides. Whether something still moves, it cannot say."""
+AWAY_M = 0.12
+"""Fingers farther than this from an object's origin do not touch it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PerceivedOutcome:
+    """What the localised poses of one trial say of its success."""
+
+    episode: str
+    task: str
+    condition: str
+    plan_id: str
+    says: bool | None
+    """None when a clause about where or in which shape an object is stays open."""
+    objects_done: int | None
+    """Objects of which everything that one look decides holds; None when some stay open."""
+    num_objects: int
+    detail: str
+    """What is wrong or open, or that nothing is."""
+    not_asked: tuple[str, ...]
+    """Kinds of clauses that one look cannot decide."""
+
+
+def perceive_outcome(
+    recorded: Episode, localised: Episode | None, *, plan_id: str, task: Task | None = None
+) -> PerceivedOutcome | None:
+    """Ask the success predicate of a task about the poses localised after an execution.
+
+    The predicate is the one the twin's replays are judged by. None without a localisation, or
+    when the task file is not known.
+
+    Args:
+        recorded: The recorded episode.
+        localised: Its localisation by the twin.
+        plan_id: The plan that was sent.
+        task: With the success predicate; the one the episode names without it.
+
+    Raises:
+        EpisodeError: When a file turns out to be damaged.
+    """
+    info = recorded.info
+    task = known_task(info.task) if task is None else task
+    if localised is None or task is None:
+        return None
+    findings = evaluate_success(task, _rollout(recorded, localised, plan_id, task))
+    asked = [f for f in findings if f.kind in DECIDED_BY_A_LOOK or f.value is not None]
+    done = objects_done(asked, task.manipulated)
+    says = all_hold(asked)
+    counted = None if None in done.values() else sum(value is True for value in done.values())
+    return PerceivedOutcome(
+        episode=info.id,
+        task=info.task,
+        condition=info.condition,
+        plan_id=plan_id,
+        says=says,
+        objects_done=counted,
+        num_objects=len(task.manipulated),
+        detail=_told(asked),
+        not_asked=tuple(sorted({f.kind for f in findings} - {f.kind for f in asked})),
+    )
+
+
+def _told(findings: list[PredicateResult]) -> str:
+    wrong = [f.detail for f in findings if f.value is not True]
+    return "; ".join(wrong) or "; ".join(f.detail for f in findings if f.kind == "inside")
+
+
+def _rollout(recorded: Episode, localised: Episode, plan_id: str, task: Task) -> Rollout:
+    """Two instants: as localised before, and after; a container that was not seen again stays."""
+    before: dict[str, Float[np.ndarray, "4 4"]] = {}
+    after: dict[str, Float[np.ndarray, "4 4"]] = {}
+    extents: dict[str, Float[np.ndarray, "2 3"]] = {}
+    seen_ns = 0
+    for record in streams.localisations(localised):
+        name, pose = str(record["object"]), record.get("T_base_object")
+        if not record["found"] or pose is None:
+            continue
+        T = se3.transform_from(np.array(pose["q_wxyz"]), np.array(pose["p_m"]))
+        if (record.get("phase"), record.get("plan_id")) != (AFTER, plan_id):
+            before[name] = T if not after else before.get(name, T)
+            continue
+        after[name] = T
+        seen_ns = max(seen_ns, int(record["stamp_ns"]))
+        soft = record.get("soft_shape")
+        if soft is not None and name in task.objects:
+            rest = np.array(task.objects[name].size_m)
+            extents[name] = np.stack([rest, np.array(soft["extents_m"])])
+    still = {name: T for name, T in before.items() if name in task.containers}
+    places = still | after
+    return Rollout(
+        stamps_ns=np.array([seen_ns - 1, seen_ns]),
+        Ts_base_object={name: np.stack([before.get(name, T), T]) for name, T in places.items()},
+        finger_contact=_away(recorded, seen_ns, places),
+        extents_m=extents,
+    )
+
+
+def _away(
+    recorded: Episode, seen_ns: int, places: Mapping[str, Float[np.ndarray, "4 4"]]
+) -> dict[str, np.ndarray]:
+    """Objects that the fingers are too far from to touch; of the others nothing is known."""
+    p_tool_m = _tool_m(recorded, seen_ns)
+    if p_tool_m is None:
+        return {}
+    return {
+        name: np.zeros(2, dtype=bool)
+        for name, T in places.items()
+        if float(np.linalg.norm(T[:3, 3] - p_tool_m)) > AWAY_M
+    }
+
+
+def _tool_m(recorded: Episode, seen_ns: int) -> Float[np.ndarray, "3"] | None:
+    """Where the tool was when the objects were seen; it is asked for near that time first."""
+    topics = [t for t in recorded.topics_of_type(schema.POSE_STAMPED) if t.endswith(TOOL)][:1]
+    for around_ns in (NS_PER_S, None):
+        bounds = (None, None) if around_ns is None else (seen_ns - around_ns, seen_ns + around_ns)
+        found = recorded.messages(topics, start_ns=bounds[0], end_ns=bounds[1])
+        try:
+            track = streams.pose_track_of([message.data for message in found])
+        except MalformedMessageError:
+            return None
+        if track is not None:
+            return np.asarray(track.at(np.array([seen_ns])).p_m[0])
+    return None
+
+
+# --- Does the label agree with the predicate on localised poses? Headline numbers keep the label.
+
+NAMES = {True: "success", False: "failure", None: "open"}
+OPEN = "the localised poses leave it open"
+Pair = tuple[TrialRow, PerceivedOutcome]
+
+
+def label_results(
+    witnesses: Sequence[PerceivedOutcome], rows: Sequence[TrialRow], *, method: str = "wilson"
+) -> Part:
+    """Count the trials in which label and predicate say the same, and list the others.
+
+    Args:
+        witnesses: What the predicate says, of trials that were localised afterwards.
+        rows: The trials with their labels; these alone enter every other number.
+        method: Interval of rates.
+    """
+    if not witnesses:
+        reason = "no trial of a known task was localised after its execution"
+        return Part(missing=(f"label against localised predicate: no data ({reason})",))
+    of_episode: Mapping[str, PerceivedOutcome] = {witness.episode: witness for witness in witnesses}
+    pairs = [(row, of_episode[row.episode]) for row in rows if row.episode in of_episode]
+    tasks = sorted({row.task for row, _ in pairs})
+    measurements = [_rate("label.localised.rate", "", pairs, method)]
+    measurements += [
+        _rate(
+            f"label.localised.{slug(task)}.rate",
+            f" of {task}",
+            [pair for pair in pairs if pair[0].task == task],
+            method,
+        )
+        for task in tasks
+    ]
+    counted = [pair for pair in pairs if pair[0].unit == "object"]
+    if counted:
+        measurements.append(_counts(counted, method))
+    return Part(
+        measurements=tuple(measurements),
+        tables=(_cross_table(pairs), *_disagreements(pairs)),
+        exclusions=tuple(_left_out(pairs)),
+    )
+
+
+def _known(pairs: Sequence[Pair]) -> list[Pair]:
+    return [(r, w) for r, w in pairs if r.recorded is not None and w.says is not None]
+
+
+def _rate(measurement_id: str, where: str, pairs: Sequence[Pair], method: str) -> Measurement:
+    known = _known(pairs)
+    agreed = sum(row.recorded is witness.says for row, witness in known)
+    skipped = sorted({kind for _, witness in known for kind in witness.not_asked})
+    without = f"; clauses that one look leaves open are not asked: {', '.join(skipped)}"
+    return proportion(
+        measurement_id,
+        agreed,
+        len(known),
+        definition=f"trials{where} where the operator's label and the success predicate on the "
+        f"poses localised after the execution say the same / trials where both are known"
+        f"{without if skipped else ''}",
+        counted="trial",
+        reason_if_undefined="no trial has both a label and a decided predicate",
+        episodes=[row.episode for row, _ in known],
+        method=method,
+    )
+
+
+def _counts(pairs: Sequence[Pair], method: str) -> Measurement:
+    known = [(r, w) for r, w in pairs if r.k is not None and w.objects_done is not None]
+    return proportion(
+        "label.objects.rate",
+        sum(row.k == witness.objects_done for row, witness in known),
+        len(known),
+        definition="trials where the operator counted as many objects as the predicate on the "
+        "localised poses / trials labelled by object where both are known",
+        counted="trial",
+        reason_if_undefined="no trial labelled by object has a decided predicate of each object",
+        episodes=[row.episode for row, _ in known],
+        method=method,
+    )
+
+
+def _cross_table(pairs: Sequence[Pair]) -> Table:
+    counts = {(label, said): 0 for label in NAMES for said in NAMES}
+    for row, witness in pairs:
+        counts[row.recorded, witness.says] += 1
+    return Table(
+        id="label_predicate",
+        title="Operator's label against the predicate on localised poses",
+        columns=("label", "predicate: success", "predicate: failure", "predicate: open"),
+        rows=tuple(
+            ("unlabelled" if label is None else NAMES[label], *(counts[label, s] for s in NAMES))
+            for label in NAMES
+        ),
+        note="The same predicate that judges replays, asked of the poses localised after the "
+        "execution. A second witness: headline numbers use the label.",
+    )
+
+
+def _disagreements(pairs: Sequence[Pair]) -> tuple[Table, ...]:
+    rows: list[tuple[Cell, ...]] = [
+        (
+            row.episode,
+            row.task,
+            row.condition.replace("_", " "),
+            NAMES[row.recorded],
+            NAMES[witness.says],
+            witness.detail,
+        )
+        for row, witness in _known(pairs)
+        if row.recorded is not witness.says
+    ]
+    if not rows:
+        return ()
+    return (
+        Table(
+            id="label_disagreements",
+            title="Trials in which label and predicate disagree",
+            columns=("episode", "task", "condition", "label", "predicate", "what it found"),
+            rows=tuple(rows),
+            note="Look at these: a wrong label, a wrong localisation, or a predicate that does not "
+            "mean what people mean.",
+        ),
+    )
+
+
+def _left_out(pairs: Sequence[Pair]) -> list[Exclusion]:
+    return [
+        Exclusion(
+            episode=row.episode, scope="label against predicate", reason=f"{OPEN}: {witness.detail}"
+        )
+        for row, witness in pairs
+        if witness.says is None
+    ]

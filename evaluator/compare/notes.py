@@ -1,0 +1,257 @@
+"""What a reader should know before believing a number, said in sentences."""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain, groupby
+from typing import Any
+
+from evaluator.compare.rows import RateCell
+from evaluator.compare.trial import Trial
+from evaluator.result import Measurement, Table
+from evaluator.run_reader.episodes import DerivedFile
+
+SIGNIFICANT = 0.05
+LARGE_BIAS_PP = 5.0
+HIGH_R = 0.8
+FEW_CELLS = 4
+
+Note = tuple[str, str]
+"""About what, and the sentence."""
+
+
+def notes(cells: Sequence[RateCell], measurements: Sequence[Measurement]) -> list[Note]:
+    """Collect what follows from the cells and the numbers alone."""
+    by_id = {measurement.id: measurement for measurement in measurements}
+    return [
+        *_units(cells),
+        *_few_cells(by_id),
+        *_hidden_bias(by_id),
+        *_two_gains(by_id),
+        *_power(by_id),
+    ]
+
+
+def notes_table(found: Iterable[Note]) -> tuple[Table, ...]:
+    """Lay remarks out as a table; none without remarks."""
+    rows = tuple(dict.fromkeys(found))
+    if not rows:
+        return ()
+    return (Table(id="remarks", title="Remarks", columns=("about", "remark"), rows=rows),)
+
+
+def with_notes(tables: Iterable[Table], found: Iterable[Note]) -> tuple[Table, ...]:
+    """Put remarks before those that are among some tables already."""
+    kept, found = list(tables), list(found)
+    if not found:
+        return tuple(kept)
+    old = [(str(a), str(b)) for table in kept if table.id == "remarks" for a, b in table.rows]
+    others = [table for table in kept if table.id != "remarks"]
+    return (*others, *notes_table([*found, *old]))
+
+
+def _units(cells: Sequence[RateCell]) -> list[Note]:
+    found = {cell.task: cell for cell in cells if cell.unit != "trial"}
+    notes = []
+    for task, cell in found.items():
+        n = cell.recorded.n or cell.sim.n
+        count = f" (n = {n})" if n else ""
+        notes.append(
+            (
+                task,
+                f"counted in {cell.unit}s{count}, not in trials: {cell.unit}s of one trial are not "
+                "independent, so intervals and tests claim more than the trials justify",
+            )
+        )
+    units = sorted({cell.unit for cell in cells})
+    if len(units) > 1:
+        words = f"averages and r mix rates counted in {' and in '.join(f'{u}s' for u in units)}"
+        notes.append(("averages", words))
+    return notes
+
+
+def _few_cells(by_id: dict[str, Measurement]) -> list[Note]:
+    return [
+        (name, f"r over {m.n} cells has no interval: few points that rise together give a high r")
+        for name, m in by_id.items()
+        if name.startswith("agreement.pearson_r")
+        and not name.endswith("remeasured")
+        and m.value is not None
+        and (m.n or 0) < FEW_CELLS
+    ]
+
+
+def _hidden_bias(by_id: dict[str, Measurement]) -> list[Note]:
+    r, bias = by_id.get("agreement.pearson_r"), by_id.get("agreement.bias_pp")
+    if r is None or bias is None or r.value is None or bias.value is None:
+        return []
+    if r.value < HIGH_R or abs(bias.value) < LARGE_BIAS_PP:
+        return []
+    said = "optimistic" if bias.value > 0 else "pessimistic"
+    text = f"r = {r.value:.3f} does not show that the twin is {said} by {bias.value:+.1f} pp"
+    return [("agreement.pearson_r", text)]
+
+
+def _two_gains(by_id: dict[str, Measurement]) -> list[Note]:
+    points = by_id.get("gain.pp.recorded.average")
+    relative = by_id.get("gain.relative.recorded.average")
+    if points is None or relative is None or points.value is None or relative.value is None:
+        return []
+    text = (
+        f"{points.value:+.2f} percentage points and {100 * relative.value:+.2f} % relative are the "
+        "same recorded gain"
+    )
+    return [("gain", text)]
+
+
+def _power(by_id: dict[str, Measurement]) -> list[Note]:
+    found = []
+    for name, p in by_id.items():
+        if not name.startswith("unpaired.boschloo_p.recorded.") or name.endswith(".pooled"):
+            continue
+        cell = name.removeprefix("unpaired.boschloo_p.recorded.")
+        needed = by_id.get(f"power.trials_needed.recorded.{cell}")
+        gain = by_id.get(f"gain.pp.recorded.{cell}")
+        if p.value is None or p.value < SIGNIFICANT or gain is None or not gain.value:
+            continue  # no gain at all is nothing that more trials would show
+        change = "a gain" if gain.value > 0 else "a loss"
+        text = (
+            f"{p.n} {p.counted}s per condition do not show {change} of {gain.value:+.0f} pp "
+            f"(Boschloo p = {p.value:.2f})"
+        )
+        if needed is not None and needed.value is not None:
+            text += f"; {needed.value:.0f} per condition would, with 80 % power"
+        found.append((cell.removesuffix(".-"), f"underpowered: {text}"))
+    return found
+
+
+# --- Whether the replays that count were made alike: in one scene, with the same settings.
+
+ABOUT = "replays"
+CHANGES_NO_VERDICT = ("mode", "samples", "seed")
+"""Settings that one evaluation may well find in several values."""
+MADE_BY = ("replay_version", "calibration_id")
+NO_SCENE = "no scene"
+HASH_DIGITS = 12
+
+
+def check_settings(trials: Sequence[Trial], derived: Sequence[DerivedFile]) -> list[Note]:
+    """Say what a reader of one rate over all trials would not expect of the replays behind it.
+
+    Args:
+        trials: Each with the dynamic replays that count.
+        derived: All derived episodes of the run.
+    """
+    used = [file for trial in trials for file in trial.replays.values()]
+    if not used:
+        return []
+    found = chain(_scenes(used, derived), _settings(used), _tried(used, derived))
+    return [(ABOUT, text) for text in found]
+
+
+def _scenes(used: Sequence[DerivedFile], derived: Iterable[DerivedFile]) -> Iterable[str]:
+    scenes = Counter(_scene(file.derived.scene_hash) for file in used)
+    if len(scenes) > 1:
+        yield (
+            f"those that count were made in different scenes ({_counted(scenes)}), so trials are "
+            "judged by different twins; robot-gst replay RUN makes those of the scene there is now"
+        )
+        return
+    views = [each.derived.scene_hash for each in derived if each.derived.kind == "views"]
+    shown = {_scene(scene_hash) for scene_hash in views if scene_hash}
+    if shown and not shown & scenes.keys():
+        yield (
+            f"made in {next(iter(scenes))}, while the held-out views are of "
+            f"{' and '.join(sorted(shown))}: numbers of trials and of images are of different "
+            "twins; robot-gst replay RUN replays in the scene there is now"
+        )
+
+
+def _scene(scene_hash: str | None) -> str:
+    return f"scene {scene_hash[:HASH_DIGITS]}" if scene_hash else NO_SCENE
+
+
+def _counted(values: Counter[str]) -> str:
+    return ", ".join(f"{count} in {value}" for value, count in values.most_common())
+
+
+def _settings(used: Sequence[DerivedFile]) -> Iterable[str]:
+    """Name the first setting in which replays that count differ."""
+    # Nearly always all are equal: those in a row are laid flat once.
+    runs = [
+        (dict(_leaves(made)), sum(1 for _ in same))
+        for made, same in groupby(map(_made_with, used))
+        if made
+    ]
+    for name in dict.fromkeys(chain.from_iterable(settings for settings, _ in runs)):
+        values: Counter[str] = Counter()
+        for settings, count in runs:
+            values[str(settings.get(name))] += count
+        if len(values) > 1:
+            shown = ", ".join(f"{value} in {count}" for value, count in values.most_common())
+            yield (
+                f"those that count were made with different settings ({name} {shown}), so trials "
+                "are judged by different twins"
+            )
+            return
+
+
+def _tried(used: Sequence[DerivedFile], derived: Iterable[DerivedFile]) -> Iterable[str]:
+    """Say that a replay with other settings lies beside one that counts, and why it does not."""
+    beside: dict[tuple[str | None, ...], list[DerivedFile]] = {}
+    for file in derived:
+        if file.derived.kind == "replay" and file.derived.mode == "dynamic":
+            beside.setdefault(_trajectory(file), []).append(file)
+    differ = []
+    for file in used:
+        files = beside.get(_trajectory(file), ())
+        if len(files) > 1:
+            mine = _made_with(file)
+            other = _asked_otherwise(mine, files)
+            if other is not None:
+                differ.append((mine, other))
+    if differ:
+        mine, other = (dict(_leaves(made)) for made in differ[0])
+        name = next((name for name in mine if mine[name] != other.get(name)), "a newer setting")
+        yield (
+            f"{len(differ)} of the {len(used)} that count were also made with other settings "
+            f"({name} {mine.get(name)} in what counts, {other.get(name)} beside it): the newest "
+            "file of each trajectory counts"
+        )
+
+
+def _trajectory(file: DerivedFile) -> tuple[str | None, ...]:
+    """Whose replay it is, of which bytes and in which scene."""
+    made = file.derived
+    return made.source_episode, made.source_sha256, made.plan_id, made.trajectory, made.scene_hash
+
+
+def _asked_otherwise(
+    mine: Mapping[str, Any], files: Iterable[DerivedFile]
+) -> Mapping[str, Any] | None:
+    """What a replay was made with that only the user's wish sets apart, None where there is none.
+
+    A newer program or calibration leaves older files behind, which surprises nobody.
+    """
+    for made in map(_made_with, files):
+        same = all(mine.get(name) == made.get(name) for name in MADE_BY)
+        if made and same and made != mine:
+            return made
+    return None
+
+
+def _made_with(file: DerivedFile) -> dict[str, Any]:
+    """Settings that may change a verdict; none of a replay that another program made."""
+    config = file.derived.settings.get("config")
+    if not isinstance(config, dict):
+        return {}
+    kept = {name: config[name] for name in config if name not in CHANGES_NO_VERDICT}
+    return {name: file.derived.settings.get(name) for name in MADE_BY} | kept
+
+
+def _leaves(values: Mapping[str, Any], before: str = "") -> Iterable[tuple[str, Any]]:
+    """Settings by their dotted names."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{before}{name}.")
+        else:
+            yield f"{before}{name}", value

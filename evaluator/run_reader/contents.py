@@ -1,0 +1,191 @@
+"""What all episodes of a run say of themselves, each read once and then kept."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+from bridge.episode.catalogue_store import LABEL_SUFFIX
+from bridge.episode.provenance import hash_file
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError
+from bridge.terminal import Output
+from evaluator.cache import SummaryCache
+from evaluator.result import Exclusion
+from evaluator.run_reader.episodes import (
+    DerivedFacts,
+    DerivedFile,
+    RecordedFacts,
+    read_derived,
+    read_recorded,
+)
+from evaluator.run_reader.inventory import RunFile, take_inventory
+from evaluator.workers import SERIAL, Workers
+
+ODD = (GstError, OSError, TypeError, ValueError, KeyError, RecursionError)
+"""What one file of another program, or a failing disk, may raise; it costs that file only."""
+
+READ_S = 0.0015
+"""About what reading one file takes [s]."""
+
+Facts = TypeVar("Facts", RecordedFacts, DerivedFacts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedFile:
+    """One recorded episode and what it says of itself."""
+
+    file: RunFile
+    facts: RecordedFacts
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunContents:
+    """Everything an evaluation starts from."""
+
+    recorded: tuple[RecordedFile, ...]
+    derived: tuple[DerivedFile, ...]
+    left_out: tuple[Exclusion, ...]
+    """Files that could not be read, and why."""
+
+    @property
+    def sources(self) -> dict[str, tuple[Path, str]]:
+        """File and content hash of every recorded episode by its id."""
+        return {each.facts.info.id: (each.file.path, each.file.sha256) for each in self.recorded}
+
+
+def read_contents(
+    run: RunFolder, cache: SummaryCache, output: Output, workers: Workers = SERIAL
+) -> RunContents:
+    """Read what is new or has changed in a run; a broken file is left out and named."""
+    inventory = take_inventory(run, cache, output)
+    labels = _labels(run)
+    recorded, left_out = _read(
+        inventory.recorded,
+        RecordedFacts,
+        lambda file: f"{file.name} {file.sha256} {labels.get(file.stem, '')}",
+        partial(_recorded, run),
+        cache,
+        output,
+        workers,
+    )
+    derived, broken = _read(
+        inventory.derived,
+        DerivedFacts,
+        lambda file: f"{file.name} {file.sha256}",
+        _derived,
+        cache,
+        output,
+        workers,
+    )
+    found, doubled = _each_once(
+        [
+            RecordedFile(file=file, facts=recorded[file.name])
+            for file in inventory.recorded
+            if file.name in recorded
+        ]
+    )
+    return RunContents(
+        recorded=tuple(found),
+        derived=tuple(
+            DerivedFile(file=file, facts=derived[file.name])
+            for file in inventory.derived
+            if file.name in derived
+        ),
+        left_out=(*inventory.left_out, *left_out, *doubled, *broken),
+    )
+
+
+def _each_once(files: Sequence[RecordedFile]) -> tuple[list[RecordedFile], list[Exclusion]]:
+    """Keep one file of each episode; what a backup or a sync left beside it counts no trial twice.
+
+    One that can be judged goes before a broken one, one named as its episode before a copy.
+    """
+    best: dict[str, RecordedFile] = {}
+    for each in files:
+        name = each.facts.info.id
+        if name not in best or _rank(each) < _rank(best[name]):
+            best[name] = each
+    kept = [each for each in files if best[each.facts.info.id] is each]
+    doubled = [
+        Exclusion(
+            episode=each.file.path.name,
+            scope="everything",
+            reason=f"it is episode {each.facts.info.id} once more, which "
+            f"{best[each.facts.info.id].file.path.name} is; an episode counts once",
+        )
+        for each in files
+        if best[each.facts.info.id] is not each
+    ]
+    return kept, doubled
+
+
+def _rank(each: RecordedFile) -> tuple[bool, bool]:
+    return bool(each.facts.broken), each.file.stem != each.facts.info.id
+
+
+def _labels(run: RunFolder) -> dict[str, str]:
+    """Return the content hash of each label given after the fact, by the stem of its episode."""
+    found = {}
+    for path in run.notes_dir.glob(f"*{LABEL_SUFFIX}"):
+        try:
+            found[path.name.removesuffix(LABEL_SUFFIX)] = hash_file(path)
+        except OSError:  # whoever reads the label will say so
+            continue
+    return found
+
+
+def _recorded(run: RunFolder, file: RunFile) -> RecordedFacts | Exclusion:
+    try:
+        return read_recorded(run, Episode.open(file.path))
+    except ODD as error:
+        return broken(file.path.name, error)
+
+
+def _derived(file: RunFile) -> DerivedFacts | Exclusion:
+    try:
+        return read_derived(file.path)
+    except ODD as error:
+        return broken(file.path.name, error)
+
+
+def _read(
+    files: Sequence[RunFile],
+    kind: type[Facts],
+    key: Callable[[RunFile], str],
+    read: Callable[[RunFile], Facts | Exclusion],
+    cache: SummaryCache,
+    output: Output,
+    workers: Workers,
+) -> tuple[dict[str, Facts], list[Exclusion]]:
+    """Return what the files say of themselves, by name, and the files left out."""
+    facts: dict[str, Facts] = {}
+    unknown: list[RunFile] = []
+    left_out: list[Exclusion] = []
+    for file in files:
+        kept = cache.find(kind, key(file))
+        if kept:
+            facts[file.name] = kept[0]
+        else:
+            unknown.append(file)
+    if not unknown:
+        return facts, left_out
+    with output.progress("read episodes", len(unknown)) as advance:
+        all_made = zip(unknown, workers.map(read, unknown, each_s=READ_S), strict=True)
+        for done, (file, made) in enumerate(all_made, start=1):
+            if isinstance(made, Exclusion):
+                left_out.append(made)
+            else:
+                facts[file.name] = made
+                if not made.broken:  # a message names the folder, which may move
+                    cache.keep(kind, key(file), (made,))
+            advance(done, file.path.name)
+    return facts, left_out
+
+
+def broken(name: str, error: Exception, *, scope: str = "everything") -> Exclusion:
+    """Leave a file out of something, with what reading it raised."""
+    said = str(error) if isinstance(error, GstError) else f"{type(error).__name__}: {error}"
+    return Exclusion(episode=name, scope=scope, reason=said)

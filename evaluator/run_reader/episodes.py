@@ -1,0 +1,446 @@
+"""Read what one recorded episode says: which plan was sent, what the gate had said, how it ended.
+
+Only its metadata and its few messages about plans, events, verdicts and places are read; how the
+arm moved is left to ``motion``.
+"""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bridge.clock import NS_PER_S
+from bridge.episode import schema
+from bridge.episode.catalogue import outcome_of
+from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build
+from bridge.episode.reader import Episode, RawMessage
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.streams import verdicts
+from bridge.errors import GstError
+from bridge.task.plan import SCHEMA_VERSION, Plan
+from bridge.task.record import parse_record
+from bridge.task.verdict import Verdict
+from evaluator.errors import EvaluatorError
+from evaluator.run_reader.inventory import RunFile
+
+# --- What a verdict said, as far as an evaluation goes by it.
+
+# --- What each clause of a verdict said: the three factors, and every success predicate by its
+# kind.
+#
+# A clause of several objects says no as soon as one object fails it.
+
+FACTORS = ("ik", "clearance", "terminal")
+Clauses = tuple[tuple[str, bool], ...]
+"""Name and answer; undecided clauses are left out. Predicates are ``terminal.inside`` and so on."""
+
+
+def clauses_of(verdict: Verdict | None) -> Clauses:
+    """List the decided clauses of a verdict; predicates only of the replayed side."""
+    if verdict is None:
+        return ()
+    found: dict[str, bool | None] = {name: getattr(verdict, name).value for name in FACTORS}
+    for finding in verdict.findings:
+        if finding.get("side", "replayed") != "replayed":
+            continue
+        name = f"terminal.{finding.get('kind', 'unnamed')}"
+        found[name] = (
+            _both(found[name], finding.get("value")) if name in found else (finding.get("value"))
+        )
+    return tuple((name, value) for name, value in found.items() if isinstance(value, bool))
+
+
+def _both(first: bool | None, second: bool | None) -> bool | None:
+    """And, in three-valued logic."""
+    if first is False or second is False:
+        return False
+    return None if first is None or second is None else True
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerdictSummary:
+    """One verdict on one plan."""
+
+    accepted: bool | None
+    """None where the twin could not decide."""
+    why_undecided: str
+    p_success: float | None
+    first_failing: str | None
+    """ik, clearance or terminal; None where none is false."""
+    failing_cause: str | None
+    """The cause alone, to be counted: ``collision``, ``unreachable`` ..."""
+    failing_detail: str | None
+    """Cause, bodies and time, to be read."""
+    clauses: Clauses = ()
+
+
+def summarise_verdict(verdict: Verdict) -> VerdictSummary:
+    """Sum a verdict up."""
+    name = verdict.first_failing
+    probability = None if verdict.p_success is None else verdict.p_success.get("value")
+    return VerdictSummary(
+        accepted=verdict.accepted,
+        why_undecided=verdict.reason or _undecided(verdict),
+        p_success=None if probability is None else float(probability),
+        first_failing=name,
+        failing_cause=None if name is None else getattr(verdict, name).cause,
+        failing_detail=_detail(verdict),
+        clauses=clauses_of(verdict),
+    )
+
+
+def _undecided(verdict: Verdict) -> str:
+    names = [name for name in FACTORS if getattr(verdict, name).value is None]
+    return f"{' and '.join(names)} undecided"
+
+
+def _detail(verdict: Verdict) -> str | None:
+    if verdict.first_failing is None:
+        return None
+    factor = getattr(verdict, verdict.first_failing)
+    parts = [factor.cause, " and ".join(factor.bodies), factor.detail]
+    if factor.first_t_ns is not None:
+        parts.append(f"at {factor.first_t_ns / NS_PER_S:.2f} s")
+    return ", ".join(part for part in parts if part) or None
+
+
+Position = tuple[float, float, float]
+"""In the robot's base frame [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalisedPosition:
+    """Where an object was localised."""
+
+    object_id: str
+    stamp_ns: int
+    p_m: Position
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedFacts:
+    """What one recorded episode says of itself, with the label given to it afterwards."""
+
+    info: EpisodeInfo
+    began_ns: int = 0
+    """When its recording began; 0 without messages."""
+    outcome: Outcome | None = None
+    """As the operator labelled it; a label given after the fact wins."""
+    num_plans: int = 0
+    num_plans_sent: int = 0
+    plan_id: str | None = None
+    """The plan actually sent: the last one whose execution started."""
+    started_ns: int | None = None
+    """When its execution started and ended, on the cell's clock."""
+    ended_ns: int | None = None
+    verdict: VerdictSummary | None = None
+    """The last verdict on that plan made before its execution started."""
+    start_positions_m: dict[str, Position] = field(default_factory=dict)
+    """Where objects were last localised before the start."""
+    broken: str = ""
+    """Why the trial cannot be judged, empty where it can."""
+
+
+@dataclass(kw_only=True)
+class _Log:
+    """What happened with plans, in the order it was received."""
+
+    plan_ids: set[str] = field(default_factory=set)
+    sent: list[str] = field(default_factory=list)
+    started_ns: int | None = None
+    ended_ns: int | None = None
+    first_start_ns: dict[str, int] = field(default_factory=dict)
+    verdicts: dict[str, Verdict] = field(default_factory=dict)
+    label: Outcome | None = None
+    localised: list[bytes] = field(default_factory=list)
+
+
+def read_recorded(run: RunFolder, episode: Episode) -> RecordedFacts:
+    """Sum up a recorded episode; of one that is no trial, only who and what.
+
+    Raises:
+        EpisodeError: When its metadata was written by another program and cannot be read.
+    """
+    info, outcome = episode.info, episode.outcome
+    if info.kind != "trial":
+        return RecordedFacts(info=info, outcome=outcome)
+    try:
+        return _read_trial(run, episode, info)
+    except GstError as error:
+        broken = str(error)
+    except (OSError, TypeError, ValueError) as error:  # another program wrote it, or the disk
+        broken = f"its label or messages cannot be read ({error})"
+    return RecordedFacts(info=info, outcome=outcome, broken=broken)
+
+
+def _read_trial(run: RunFolder, episode: Episode, info: EpisodeInfo) -> RecordedFacts:
+    log = _read_log(episode)
+    plan_id = log.sent[-1] if log.sent else None
+    verdict = None if plan_id is None else log.verdicts.get(plan_id)
+    return RecordedFacts(
+        info=info,
+        began_ns=episode.start_ns,
+        outcome=outcome_of(run, episode) or log.label,
+        num_plans=len(log.plan_ids),
+        num_plans_sent=len(set(log.sent)),
+        plan_id=plan_id,
+        started_ns=log.started_ns,
+        ended_ns=log.ended_ns,
+        verdict=None if verdict is None else summarise_verdict(verdict),
+        start_positions_m=positions_at_start(localised_positions(log.localised), log.started_ns),
+    )
+
+
+def localised_positions(localisations: Iterable[bytes]) -> list[LocalisedPosition]:
+    """Return where objects were found, in log order.
+
+    Raises:
+        InvalidRecordError: When a record does not fit its schema.
+    """
+    places = []
+    for data in localisations:
+        record = parse_record(data, name="localisation")
+        pose = record.get("T_base_object")
+        if record["found"] and pose is not None:
+            x, y, z = pose["p_m"]
+            places.append(
+                LocalisedPosition(
+                    object_id=record["object"], stamp_ns=record["stamp_ns"], p_m=(x, y, z)
+                )
+            )
+    return places
+
+
+def positions_at_start(
+    places: Iterable[LocalisedPosition], started_ns: int | None
+) -> dict[str, Position]:
+    """Return the last place of each object that is not younger than the start."""
+    return {
+        place.object_id: place.p_m
+        for place in places
+        if started_ns is None or place.stamp_ns <= started_ns
+    }
+
+
+def _read_log(episode: Episode) -> _Log:
+    log = _Log()
+    topics = [
+        topic
+        for name in (schema.PLAN, schema.EVENT, schema.VERDICT, schema.LOCALISATION)
+        for topic in episode.topics_of_type(name)
+    ]
+    for message in episode.messages(topics):
+        if message.type_name == schema.PLAN:
+            log.plan_ids.add(_plan_id(message.data))
+        elif message.type_name == schema.VERDICT:
+            _note_verdict(log, message)
+        elif message.type_name == schema.LOCALISATION:
+            log.localised.append(message.data)
+        else:
+            _note_event(log, parse_record(message.data, name="event", package="bridge.episode"))
+    return log
+
+
+def _plan_id(data: bytes) -> str:
+    """Read a plan's id alone; checking hundreds of waypoints takes longer than all the rest."""
+    try:
+        record = json.loads(data)
+    except (ValueError, RecursionError):
+        record = None
+    if isinstance(record, dict) and record.get("schema_version") == SCHEMA_VERSION:
+        plan_id = record.get("id")
+        if isinstance(plan_id, str) and plan_id:
+            return plan_id
+    return Plan.from_json(data).id  # which says what is wrong
+
+
+def _note_verdict(log: _Log, message: RawMessage) -> None:
+    said = Verdict.from_json(message.data)
+    # It may arrive late over its own connection; its stamp is the cell's time.
+    started_ns = log.first_start_ns.get(said.plan_id)
+    in_time = started_ns is None or message.publish_time_ns < started_ns
+    if in_time and said.trajectory == "planned":
+        log.verdicts[said.plan_id] = said
+
+
+def _note_event(log: _Log, event: Mapping[str, Any]) -> None:
+    plan_id = event.get("plan_id")
+    if event["type"] == "execution_started" and isinstance(plan_id, str):
+        log.sent.append(plan_id)
+        log.started_ns, log.ended_ns = int(event["stamp_ns"]), None
+        log.first_start_ns.setdefault(plan_id, log.started_ns)
+    elif event["type"] == "execution_ended" and log.sent and plan_id == log.sent[-1]:
+        log.ended_ns = int(event["stamp_ns"])
+    elif event["type"] == "label":
+        outcome = event.get("outcome")
+        if isinstance(outcome, dict) and "result" in outcome:
+            names = {"result", "unit", "k", "n", "by", "detail"}
+            known = {key: outcome[key] for key in names & outcome.keys()}
+            stages = [s for s in outcome.get("stages") or () if isinstance(s, dict)]
+            log.label = build(Outcome, {**known, "stages": stages})
+
+
+# --- The derived episodes of a run, found by what they say of themselves and not by file name.
+
+
+@dataclass(frozen=True, kw_only=True)
+class DerivedFacts:
+    """What one derived episode says of itself."""
+
+    info: EpisodeInfo
+    derived: Derived
+    verdict: VerdictSummary | None = None
+    """Of a dynamic replay: the last verdict on the plan it replays."""
+    places: tuple[LocalisedPosition, ...] = ()
+    """Of a localisation: where objects were found."""
+    broken: str = ""
+    """Why verdict or places cannot be read, empty where they can."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DerivedFile:
+    """One derived episode and what it was made from."""
+
+    file: RunFile
+    facts: DerivedFacts
+
+    @property
+    def path(self) -> Path:
+        """Of its first part."""
+        return self.file.path
+
+    @property
+    def name(self) -> str:
+        """Relative to the run folder."""
+        return self.file.name
+
+    @property
+    def sha256(self) -> str:
+        """Of its bytes."""
+        return self.file.sha256
+
+    @property
+    def info(self) -> EpisodeInfo:
+        """Who, what and when."""
+        return self.facts.info
+
+    @property
+    def derived(self) -> Derived:
+        """What it was made from."""
+        return self.facts.derived
+
+    @property
+    def episode(self) -> Episode:
+        """Open it; nothing is held open, so whoever asks twice opens it twice.
+
+        Raises:
+            BridgeError: When it has gone or changed since.
+        """
+        return Episode.open(self.path)
+
+    @property
+    def age(self) -> tuple[int, str]:
+        """What the newest file has the largest of."""
+        return self.path.stat().st_mtime_ns, self.path.name
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """A dynamic replay of one plan with its verdict, or the reason there is none."""
+
+    file: DerivedFile | None = None
+    verdict: VerdictSummary | None = None
+    reason: str | None = None
+
+    @property
+    def accepted(self) -> bool | None:
+        """What the twin said; None without a decided verdict."""
+        return None if self.verdict is None else self.verdict.accepted
+
+
+def read_derived(path: Path) -> DerivedFacts:
+    """Sum up a derived episode from its metadata and its few messages about verdicts or places.
+
+    Raises:
+        GstError: When it cannot be opened, or does not say what it was made from.
+    """
+    episode = Episode.open(path)
+    derived = episode.derived
+    if derived is None:
+        raise EvaluatorError("no 'derived' metadata: it does not say what it was made from")
+    info = episode.info
+    try:
+        if _is_dynamic(derived):
+            mine = [said for _, said in verdicts(episode) if said.plan_id == derived.plan_id]
+            last = summarise_verdict(mine[-1]) if mine else None
+            return DerivedFacts(info=info, derived=derived, verdict=last)
+        if derived.kind == "localised":
+            topics = episode.topics_of_type(schema.LOCALISATION)
+            places = localised_positions(message.data for message in episode.messages(topics))
+            return DerivedFacts(info=info, derived=derived, places=tuple(places))
+    except GstError as error:
+        return DerivedFacts(info=info, derived=derived, broken=str(error))
+    return DerivedFacts(info=info, derived=derived)
+
+
+def _is_dynamic(derived: Derived) -> bool:
+    return derived.kind == "replay" and derived.mode == "dynamic"
+
+
+class DerivedIndex:
+    """Derived episodes by what they were made from, so that none is looked for twice."""
+
+    def __init__(self, files: Iterable[DerivedFile]) -> None:
+        """Sort the derived episodes of a run."""
+        self._replays: dict[tuple[str, str | None, str | None], list[DerivedFile]] = {}
+        self._localised: dict[str, list[DerivedFile]] = {}
+        for file in files:
+            made = file.derived
+            if _is_dynamic(made):
+                key = (made.source_episode, made.plan_id, made.trajectory)
+                self._replays.setdefault(key, []).append(file)
+            elif made.kind == "localised":
+                self._localised.setdefault(made.source_episode, []).append(file)
+
+    def replay(self, *, source: str, source_sha256: str, plan_id: str, trajectory: str) -> Replay:
+        """Find the dynamic replay of a recorded episode's plan, planned or executed.
+
+        The newest file wins where several settings were tried.
+        """
+        made = self._replays.get((source, plan_id, trajectory), [])
+        if not made:
+            reason = f"no dynamic replay of the {trajectory} trajectory of plan {plan_id}"
+            return Replay(reason=reason)
+        current = _current(made, source_sha256)
+        if not current:
+            reason = (
+                f"{made[0].path.name} was made from another version of the episode (its hash "
+                "differs); replay it again"
+            )
+            return Replay(reason=reason)
+        file = _newest(current)
+        said = file.facts.verdict
+        if file.facts.broken:
+            return Replay(file=file, reason=f"{file.path.name}: {file.facts.broken}")
+        if said is None:
+            return Replay(file=file, reason=f"{file.path.name} holds no verdict")
+        undecided: str | None = None
+        if said.accepted is None:
+            why = said.why_undecided
+            undecided = f"the twin could not decide the {trajectory} replay: {why}"
+        return Replay(file=file, verdict=said, reason=undecided)
+
+    def localised(self, *, source: str, source_sha256: str) -> DerivedFile | None:
+        """Find the newest localisation of a recorded episode."""
+        current = _current(self._localised.get(source, []), source_sha256)
+        return _newest(current) if current else None
+
+
+def _current(files: Iterable[DerivedFile], source_sha256: str) -> list[DerivedFile]:
+    """Leave out what was made from other bytes than the recorded episode holds now."""
+    return [file for file in files if file.derived.source_sha256 in ("", source_sha256)]
+
+
+def _newest(files: list[DerivedFile]) -> DerivedFile:
+    return files[0] if len(files) == 1 else max(files, key=lambda file: file.age)

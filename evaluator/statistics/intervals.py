@@ -1,0 +1,159 @@
+"""Intervals for success rates. Never Wald: it collapses at 0/n and n/n."""
+
+import math
+from collections.abc import Callable, Hashable, Sequence
+
+import numpy as np
+from scipy.special import bdtr, betaincinv, ndtri
+
+from evaluator.errors import EvaluatorError, UndefinedStatisticError
+from evaluator.result import Interval
+
+LEVEL = 0.95
+
+
+class ImpossibleCountError(EvaluatorError):
+    """A count that no experiment can give."""
+
+    def __init__(self, *, k: int, n: int) -> None:
+        """Remember the count."""
+        self.k = k
+        self.n = n
+        super().__init__(f"{k} successes of {n} is not a possible count. Check k and n.")
+
+
+def wilson(k: int, n: int, *, level: float = LEVEL) -> Interval:
+    """Return the score interval of a proportion k/n (Wilson 1927), the default for rates.
+
+    Raises:
+        UndefinedStatisticError: Without trials.
+        ImpossibleCountError: When k is not in 0..n.
+    """
+    check_count(k, n)
+    z = normal_quantile(0.5 + level / 2)
+    rate = k / n
+    centre = (rate + z * z / (2 * n)) / (1 + z * z / n)
+    half = z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n)) / (1 + z * z / n)
+    low = 0.0 if k == 0 else max(0.0, centre - half)
+    high = 1.0 if k == n else min(1.0, centre + half)
+    return Interval(low=low, high=high, level=level, method="wilson")
+
+
+def clopper_pearson(k: int, n: int, *, level: float = LEVEL) -> Interval:
+    """Return the interval that covers at least ``level`` for every true rate (1934).
+
+    Raises:
+        UndefinedStatisticError: Without trials.
+        ImpossibleCountError: When k is not in 0..n.
+    """
+    check_count(k, n)
+    tail = (1 - level) / 2
+    low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
+    high = 1.0 if k == n else float(betaincinv(k + 1, n - k, 1 - tail))
+    return Interval(low=low, high=high, level=level, method="clopper-pearson")
+
+
+def jeffreys(k: int, n: int, *, level: float = LEVEL) -> Interval:
+    """Return the equal-tailed interval of the posterior Beta(k + 1/2, n - k + 1/2).
+
+    With the ends 0 at k = 0 and 1 at k = n (Brown, Cai and DasGupta 2001, section 4.1): without
+    that change it never covers rates near 0 and 1.
+
+    Raises:
+        UndefinedStatisticError: Without trials.
+        ImpossibleCountError: When k is not in 0..n.
+    """
+    check_count(k, n)
+    tail = (1 - level) / 2
+    low = 0.0 if k == 0 else float(betaincinv(k + 0.5, n - k + 0.5, tail))
+    high = 1.0 if k == n else float(betaincinv(k + 0.5, n - k + 0.5, 1 - tail))
+    return Interval(low=low, high=high, level=level, method="jeffreys")
+
+
+RATE_INTERVALS: dict[str, Callable[..., Interval]] = {
+    "wilson": wilson,
+    "clopper-pearson": clopper_pearson,
+    "jeffreys": jeffreys,
+}
+"""What ``evaluate --interval`` chooses from."""
+
+
+def relative_gain(before: float, after: float) -> float:
+    """Return (after - before) / before; 1.0 means doubled. Not a gain in percentage points.
+
+    Raises:
+        UndefinedStatisticError: When there is nothing to be relative to.
+    """
+    if before == 0:
+        raise UndefinedStatisticError(
+            statistic="relative gain", reason="the rate before is 0, nothing to be relative to"
+        )
+    return (after - before) / before
+
+
+def check_count(k: int, n: int) -> None:
+    """Refuse what cannot be counted.
+
+    Raises:
+        UndefinedStatisticError: Without trials.
+        ImpossibleCountError: When k is not in 0..n.
+    """
+    if n == 0:
+        raise UndefinedStatisticError(statistic="rate", reason="there are no trials")
+    if not 0 <= k <= n:
+        raise ImpossibleCountError(k=k, n=n)
+
+
+def normal_quantile(probability: float) -> float:
+    """Return the standard normal's quantile, 1.96 at 0.975."""
+    return float(ndtri(probability))
+
+
+# --- Intervals of lengths that are mostly small and now and then large, as the miss of a dropped
+# cube.
+#
+# Student's interval of their mean needs many of them; the median has an interval that holds for
+# any distribution, from six values on.
+
+ORDER_STATISTICS = "order-statistics"
+
+
+def median_interval(values: Sequence[float], *, level: float = LEVEL) -> Interval:
+    """Return two of the values between which the median lies, whatever the distribution is.
+
+    The l-th smallest and the l-th largest hold it with probability 1 - 2 P(B < l), where B is
+    binomial(n, 1/2); the largest l that keeps the level (Thompson 1936).
+
+    Raises:
+        UndefinedStatisticError: Below 6 values at 95 %: even the smallest and the largest may miss.
+    """
+    place = median_rank(len(values), level)
+    if place == 0:
+        raise UndefinedStatisticError(
+            statistic="median interval",
+            reason=f"{len(values)} values; at {100 * level:g} % it needs at least "
+            f"{math.ceil(1 - math.log2(1 - level))}",
+        )
+    ordered = np.sort(np.asarray(values, dtype=np.float64))
+    return Interval(
+        low=float(ordered[place - 1]),
+        high=float(ordered[-place]),
+        level=level,
+        method=ORDER_STATISTICS,
+    )
+
+
+def median_rank(n: int, level: float = LEVEL) -> int:
+    """Return l, counted from 1; 0 where no two values keep the level."""
+    if not n:
+        return 0
+    below = bdtr(np.arange(n // 2 + 1), n, 0.5)  # P(B <= l - 1) for l = 1, 2 ..
+    return int((1 - 2 * below >= level).sum())
+
+
+def cluster_means(values: Sequence[float], clusters: Sequence[Hashable]) -> list[float]:
+    """Return the mean of each cluster, in the order in which clusters first appear."""
+    of_cluster: dict[Hashable, list[float]] = {}
+    for value, cluster in zip(values, clusters, strict=True):
+        of_cluster.setdefault(cluster, []).append(value)
+    return [float(np.mean(members)) for members in of_cluster.values()]
