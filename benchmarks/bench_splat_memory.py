@@ -33,9 +33,8 @@ def work() -> None:
     from splat.quality import MAX_DEPTH_M, MAX_POINTS
 
     from twin.scene.fit.initialise import fuse
-    from twin.scene.fit.run import fit
-    from twin.scene.frames.points import DepthLimits, FrameSurface
-    from twin.scene.frames.training_view import training_view
+    from twin.scene.fit.optimise import fit
+    from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
     from twin.scene.settings import FitConfig, InitialiseConfig
 
     limits = DepthLimits(max_depth_m=MAX_DEPTH_M, flying_fraction=0.03)

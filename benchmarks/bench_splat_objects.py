@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from measure import ROOT, Target, report_targets
 
-from twin.scene.objects.owners import owners
+from twin.scene.objects.assignment import assign_splats
 
 NUM_VIEWS, NOISE = 20, 0.004
 BASKET_INNER_M = (0.26, 0.20, 0.08)
@@ -63,8 +63,7 @@ def known_meshes() -> dict[str, tuple[np.ndarray, np.ndarray, float]]:
 def measure(name: str, vertices: np.ndarray, faces: np.ndarray, volume: float) -> list[Target]:
     import cast_views
 
-    from twin.scene.shape.collision import collision_parts
-    from twin.scene.shape.convex import hull_of_points
+    from twin.scene.shape.collision import collision_parts, hull_of_points
     from twin.scene.shape.reconstruct import reconstruct
 
     reach = float(np.ptp(vertices, axis=0).max())
@@ -114,7 +113,7 @@ def scanned(task_names: Sequence[str], seeds: Sequence[int]) -> list[Target]:
     for task_name, seed in product(task_names, seeds):
         scan = scan_objects.take_scan(task_name, seed)
         owner = scan_objects.true_owners(scan)
-        given = owners(scan.cloud, scan.poses, scan.start.task, shapes_in(scan.shapes))
+        given = assign_splats(scan.cloud, scan.poses, scan.start.task, shapes_in(scan.shapes))
         for key in scan.start.task.objects:
             name = key.split("_")[0]
             scores.setdefault(name, []).append(scan_objects.score_shape(scan, key))

@@ -7,8 +7,8 @@ import numpy as np
 from measure import ROOT, Target, cpu_seconds, report_targets
 
 from bridge.geometry.camera import Camera
-from twin.scene.frames.training_view import Target as Seen
-from twin.scene.gaussians.cloud import GaussianCloud, arrays, as_float32, morton_order
+from twin.scene.frames.rgbd import Target as Seen
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32, morton_order
 from twin.scene.raster.rasteriser import FitSession, RasterConfig, Rasteriser, available_isas
 
 VGA = Camera(width=640, height=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)

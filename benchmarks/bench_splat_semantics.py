@@ -29,10 +29,9 @@ from noisy_masks import spoil
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.associate import AssociateConfig
 from twin.scene.semantics.describe import scene_from_masks
-from twin.scene.semantics.from_view import points_of
 from twin.scene.semantics.lift import lift_features, mask_iou, render_labels
 from twin.scene.semantics.result import FeatureMap, MaskSet, SemanticScene
-from twin.scene.semantics.segment import SegmentConfig, segment_points
+from twin.scene.semantics.segment import SegmentConfig, points_of, segment_points
 
 NUM_TRAIN = 20
 SEEDS = (0, 1, 2)

@@ -9,15 +9,13 @@ from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.task.meshes.catalogue import object_mesh
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.run import fit
-from twin.scene.frames.points import DepthLimits, FrameSurface
-from twin.scene.frames.training_view import TrainingView, training_view
-from twin.scene.gaussians.cloud import GaussianCloud
-from twin.scene.gaussians.moved import moved_cloud
+from twin.scene.fit.optimise import fit
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
+from twin.scene.gaussians import GaussianCloud, moved_cloud
 from twin.scene.localise.objects import LocaliseConfig, localise_objects
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.objects.owners import object_poses
-from twin.scene.objects.split import SceneParts, shape_mesh, split_objects
+from twin.scene.objects.assignment import object_poses
+from twin.scene.objects.decompose import SceneParts, shape_mesh, split_objects
 from twin.scene.settings import FitConfig, InitialiseConfig
 from twin.scene.shape.from_training import shapes_of
 from twin.scene.shape.mesh import volume_m3

@@ -22,8 +22,8 @@ from twin.replay.config import ReplayConfig
 from twin.replay.path import JointPath, path_of_plan
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
-from twin.scene.shape.from_mesh import shape_of_mesh
 from twin.scene.shape.lattice import lattice
+from twin.scene.shape.reconstruct import shape_of_mesh
 
 SETTLE_S = 1.0
 LIFTED_M = 0.08

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from bridge.geometry.camera import Camera
-from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.gaussians import GaussianCloud
 
 TILE = 16
 ALPHA_CUT, MAX_ALPHA, STOP = np.float32(1 / 255), np.float32(0.999), np.float32(1e-4)

@@ -104,8 +104,8 @@ def render(
         output: How to talk.
     """
     from bridge.episode.run_folder import RunFolder
-    from twin.scene.draw.compose import describe_drawn
-    from twin.scene.draw.render import render as render_scene
+    from twin.scene.render import describe_drawn
+    from twin.scene.render import render as render_scene
 
     drawn = render_scene(RunFolder.open(run), config)
     output.result(drawn, describe_drawn(drawn))
@@ -131,7 +131,7 @@ def import_splats(
         output: How to talk.
     """
     from bridge.episode.run_folder import RunFolder
-    from twin.scene.store.edited import describe_edit, take_back
+    from twin.scene.store.folder import describe_edit, take_back
 
     about = take_back(RunFolder.open(run), file, object)
     output.result(about, describe_edit(about))

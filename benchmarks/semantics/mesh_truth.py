@@ -9,7 +9,7 @@ from bridge.task.meshes import solids
 from bridge.task.meshes.catalogue import basket_mesh, toy_mesh
 from bridge.task.meshes.solids import mesh_of
 from bridge.task.meshes.toys import DESIGNS, RIM_M
-from twin.scene.semantics.part_names import PartsConfig, find_parts
+from twin.scene.semantics.part_segmentation import PartsConfig, find_parts
 
 INNER_M, WALL_M = (0.24, 0.19, 0.085), 0.008
 SIDES = (-1.0, 1.0)

@@ -11,10 +11,10 @@ from bridge.geometry import se3
 from bridge.task.meshes.solids import mesh_of
 from bridge.task.meshes.toys import DESIGNS
 from bridge.task.task_file import ObjectModel
-from twin.scene.gaussians.cloud import concatenate
+from twin.scene.gaussians import concatenate
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default
-from twin.scene.semantics.query import query
+from twin.scene.semantics.language import query
 from twin.scene.semantics.result import Instance, SemanticScene
 from twin.scene.shape.reconstruct import ObjectShape
 

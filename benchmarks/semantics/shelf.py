@@ -13,8 +13,8 @@ from scipy import ndimage
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry.camera import Camera
 from twin.scene.fit.initialise import fuse
-from twin.scene.frames.points import DepthLimits, FrameSurface
-from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface
+from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.semantics.describe import scene_by_default, scene_from_masks
 from twin.scene.semantics.lift import Viewpoint, mask_iou, render_labels

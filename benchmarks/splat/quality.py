@@ -11,12 +11,10 @@ import numpy as np
 from bridge.episode.streams import RgbdFrame
 from twin.scene.fit.camera_correction import align_view
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.run import FitResult, fit
-from twin.scene.frames.points import DepthLimits, FrameSurface
-from twin.scene.frames.training_view import training_view
-from twin.scene.gaussians.cloud import GaussianCloud
-from twin.scene.raster.losses import psnr_db
-from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.fit.optimise import FitResult, fit
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
+from twin.scene.gaussians import GaussianCloud
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, psnr_db
 from twin.scene.settings import FitConfig, InitialiseConfig
 
 MAX_DEPTH_M = 5.0

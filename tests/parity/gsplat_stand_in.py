@@ -1,6 +1,6 @@
 """What ``gsplat.rasterization`` documents, slow and plain in torch; stands in where it cannot run.
 
-Every pixel meets every Gaussian. Only the arguments that ``twin.scene.raster.cuda`` passes.
+Every pixel meets every Gaussian. Only the arguments that ``twin.scene.raster.backend`` passes.
 """
 
 from typing import Any

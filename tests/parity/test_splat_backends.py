@@ -15,13 +15,12 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from twin.scene.draw.render import render
-from twin.scene.gaussians.cloud import GaussianCloud, arrays, as_float32
-from twin.scene.raster import backend
-from twin.scene.raster import cuda as raster_cuda
-from twin.scene.raster.backend import open_rasteriser
-from twin.scene.raster.cuda import CudaMissingError, CudaRasteriser
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32
+from twin.scene.raster import backend as cuda_module
+from twin.scene.raster import backend as raster_cuda
+from twin.scene.raster.backend import CudaMissingError, CudaRasteriser, open_rasteriser
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.render import render
 from twin.scene.settings import RenderConfig
 
 torch = pytest.importorskip("torch")
@@ -187,10 +186,10 @@ def test_wrong_use_is_refused(cuda: CudaRasteriser) -> None:
 
 def test_the_configuration_chooses_the_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(open_rasteriser(), Rasteriser)
-    monkeypatch.setattr(backend, "has_cuda", lambda: False)
+    monkeypatch.setattr(cuda_module, "has_cuda", lambda: False)
     assert isinstance(open_rasteriser(RasterConfig(backend="auto")), Rasteriser)
     monkeypatch.setitem(sys.modules, "gsplat", load_stand_in())
-    monkeypatch.setattr(backend, "has_cuda", lambda: True)
+    monkeypatch.setattr(cuda_module, "has_cuda", lambda: True)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch, "device", lambda name: name)
     assert isinstance(open_rasteriser(RasterConfig(backend="auto")), CudaRasteriser)

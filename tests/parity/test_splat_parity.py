@@ -10,7 +10,7 @@ from scipy.linalg import expm
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from twin.scene.gaussians.cloud import GaussianCloud, arrays, as_float32
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, available_isas
 
 torch = pytest.importorskip("torch")

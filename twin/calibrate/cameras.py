@@ -22,8 +22,7 @@ from twin.robot.model import load_robot
 from twin.robot.posture import Posture, PostureTrack, far_apart, posture_track
 from twin.scene.align.align import AlignConfig, Alignment, RobotNotAlignedError, align_robot
 from twin.scene.align.view import RobotView
-from twin.scene.frames.base import base_tree
-from twin.scene.frames.still import same_pose
+from twin.scene.frames.camera_poses import base_tree, same_pose
 from twin.scene.store.calibration import CALIBRATION_FILE, write_calibration
 
 # --- Which cameras of a run stand still, which the robot carries, as far as its transforms say.

@@ -58,14 +58,13 @@ def get_ready(_: None) -> None:
     """Import what takes seconds, so that the first plan does not wait for it."""
     import twin.replay.rebuilt_scene  # noqa: PLC0415
     import twin.replay.verdict  # noqa: PLC0415
-    import twin.scene.localise.objects  # noqa: PLC0415
-    import twin.scene.localise.scanned  # noqa: F401, PLC0415
+    import twin.scene.localise.mesh_fit  # noqa: F401, PLC0415
 
 
 def look(item: Look) -> dict[str, Any]:
     """Find the objects."""
+    from twin.scene.localise.mesh_fit import scanned_surfaces  # noqa: PLC0415
     from twin.scene.localise.objects import LocaliseConfig, localise_objects  # noqa: PLC0415
-    from twin.scene.localise.scanned import scanned_surfaces  # noqa: PLC0415
 
     config = LocaliseConfig()
     scanned = scanned_surfaces(RunFolder.open(item.run_path), item.task, config.mesh.num_samples)

@@ -26,16 +26,14 @@ from twin.replay.dynamics import soft_models
 from twin.replay.rebuilt_scene import Correction
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
-from twin.scene.draw.compose import carried_camera
-from twin.scene.frames.base import base_tree
-from twin.scene.frames.camera_poses import calibrated_tree_at
-from twin.scene.gaussians.cloud import GaussianCloud, concatenate
-from twin.scene.gaussians.moved import moved_cloud
-from twin.scene.gaussians.skin import Binding, bind, pose_cloud
-from twin.scene.objects.parts import read_objects, read_pose
+from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at
+from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
+from twin.scene.objects.decompose import read_objects, read_pose
 from twin.scene.raster.backend import open_rasteriser
+from twin.scene.render import carried_camera
 from twin.scene.robot.splats import posed, read_links
-from twin.scene.store.calibration import CameraPlace, read_calibration, without_joints
+from twin.scene.skinning import Binding, bind, pose_cloud
+from twin.scene.store.calibration import MountedCamera, read_calibration, without_joints
 from twin.scene.store.folder import SCENE_FILE, read_scene
 
 RATE_HZ = 5.0
@@ -148,7 +146,7 @@ class _Eye:
 
 
 def _calibrated(
-    episode: Episode, camera_id: str, place: CameraPlace, stamps: Sequence[int]
+    episode: Episode, camera_id: str, place: MountedCamera, stamps: Sequence[int]
 ) -> _Eye:
     """A camera as it is mounted: objects were localised through it as it is."""
     stamps_ns = np.array(stamps, dtype=np.int64)

@@ -24,10 +24,10 @@ from twin.physics.config import PhysicsConfig
 from twin.replay.config import RIGID_MASSES, ReplayConfig
 from twin.replay.scene import ReplayScene, StartState
 from twin.scene.shape.lattice import Lattice
-from twin.scene.shape.npz import UnreadableArraysError
 from twin.scene.shape.static import StaticSdf
 from twin.scene.store.calibration import Calibration, read_calibration
 from twin.scene.store.folder import read_record
+from twin.scene.store.npz import UnreadableArraysError
 
 # --- What a calibration changes about replays: physics, where objects start, how heavy they are.
 

@@ -31,7 +31,7 @@ from twin.gate import service
 from twin.gate.config import GateConfig
 from twin.robot.model import load_robot
 from twin.scene.localise.live import LiveView
-from twin.scene.localise.still_frames import calibrated_cameras, still_frames
+from twin.scene.localise.stationary_frames import calibrated_cameras, stationary_frames
 from twin.scene.store.calibration import Calibration, read_calibration, write_calibration
 
 URDF = ur5_with_gripper_urdf()
@@ -111,7 +111,7 @@ def show(view: LiveView, *, world: bool = False) -> None:
 
 def as_recorded(view: Recorder, calibration: Calibration | None) -> list[RgbdFrame]:
     episode = view.episode()
-    return still_frames(episode, 3, poses=calibrated_cameras(episode, calibration))
+    return stationary_frames(episode, 3, poses=calibrated_cameras(episode, calibration))
 
 
 @pytest.mark.parametrize("stream", ["color", "depth"])

@@ -8,8 +8,7 @@ from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.images import depth_to_compact
 from bridge.episode.cdr.messages import CompressedColor, DepthImage, PoseSample, string_to_cdr
-from twin.scene.localise.live import LiveView
-from twin.scene.localise.live_frames import KEPT_IMAGES
+from twin.scene.localise.live import KEPT_IMAGES, LiveView
 
 
 def ready() -> LiveView:

@@ -11,8 +11,8 @@ from bridge.task.meshes.lattice import volumes_m3
 from bridge.task.task_file import ObjectModel, load_task
 from twin.physics.soft import SoftModel, bind_points, coarse_lattice, health_of
 from twin.physics.soft_solver import SoftSolver, add_body, box_piece
-from twin.scene.shape.from_mesh import shape_of_mesh
 from twin.scene.shape.lattice import lattice
+from twin.scene.shape.reconstruct import shape_of_mesh
 
 Boxes = Callable[..., SoftModel]
 PERIOD_S, SUBSTEPS = 1 / 240, 10

@@ -29,23 +29,23 @@ BLOCK_M = 0.06
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stage:
+class AnnealingStep:
     """One annealing step of Tukey's loss."""
 
     gate_m: float
     iterations: int
 
 
-COARSE = (Stage(gate_m=0.08, iterations=10), Stage(gate_m=0.03, iterations=6))
+COARSE = (AnnealingStep(gate_m=0.08, iterations=10), AnnealingStep(gate_m=0.03, iterations=6))
 FINE = (
-    Stage(gate_m=0.03, iterations=6),
-    Stage(gate_m=0.02, iterations=6),
-    Stage(gate_m=0.012, iterations=12),
+    AnnealingStep(gate_m=0.03, iterations=6),
+    AnnealingStep(gate_m=0.02, iterations=6),
+    AnnealingStep(gate_m=0.012, iterations=12),
 )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place:
+class ScenePose:
     """Where the scene lies in the robot's base frame."""
 
     T_base_source: Float[np.ndarray, "4 4"]
@@ -71,13 +71,13 @@ class Equations:
 def refine(
     views: Sequence[RobotView],
     surfaces: Sequence[PosedSurface],
-    start: Place,
+    start: ScenePose,
     *,
-    stages: Sequence[Stage],
+    stages: Sequence[AnnealingStep],
     num_points: int,
     with_scale: bool = True,
     seed: int = 0,
-) -> tuple[Place, Equations]:
+) -> tuple[ScenePose, Equations]:
     """Lay measured points on the posed surface: Gauss-Newton with Tukey's weights.
 
     Args:
@@ -114,7 +114,7 @@ def refine(
 def _choose(
     view: RobotView,
     surface: PosedSurface,
-    place: Place,
+    place: ScenePose,
     gate_m: float,
     count: int,
     rng: np.random.Generator,
@@ -140,7 +140,7 @@ def _equations(
     views: Sequence[RobotView],
     clouds: Sequence[ViewCloud],
     surfaces: Sequence[PosedSurface],
-    place: Place,
+    place: ScenePose,
     gate_m: float,
 ) -> Equations:
     rows = [
@@ -168,7 +168,7 @@ def _equations(
 
 
 def _rows(
-    view: RobotView, cloud: ViewCloud, surface: PosedSurface, place: Place, gate_m: float
+    view: RobotView, cloud: ViewCloud, surface: PosedSurface, place: ScenePose, gate_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Int64[np.ndarray, " num_points"]]:
     """Jacobian (shift, turn, scale), distance, weight and block of each point."""
     T = place.T_base_source @ view.T_source_camera
@@ -187,8 +187,8 @@ def _rows(
 
 
 def _stepped(
-    place: Place, equations: Equations, with_scale: bool
-) -> tuple[Place, Float[np.ndarray, "7"]]:
+    place: ScenePose, equations: Equations, with_scale: bool
+) -> tuple[ScenePose, Float[np.ndarray, "7"]]:
     H, g = equations.H.sum(axis=0), equations.g.sum(axis=0)
     if with_scale:
         prior = max(equations.residual_m(), 1e-4) ** 2 / SCALE_SIGMA**2
@@ -200,7 +200,7 @@ def _stepped(
     T = np.eye(4)
     T[:3, :3] = se3.rotation_from_vector(step[3:6])
     T[:3, 3] = step[:3]
-    moved = Place(
+    moved = ScenePose(
         T_base_source=T @ place.T_base_source, depth_scale=float(place.depth_scale + step[6])
     )
     return moved, step

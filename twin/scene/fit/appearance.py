@@ -5,21 +5,41 @@ product transmittance). All views together make a least-squares problem that a f
 conjugate gradients solve; A is never stored, only drawn (A c) and lifted (A^T image).
 """
 
+import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
-from twin.scene.fit.allowance import UNLIMITED, Allowance
-from twin.scene.frames.training_view import Target
-from twin.scene.gaussians.cloud import (
-    NUM_FIRST,
-    GaussianCloud,
-    as_float32,
-    harmonic_basis,
-)
+from bridge.geometry.camera import Camera
+from twin.scene.frames.rgbd import Target
+from twin.scene.gaussians import NUM_FIRST, GaussianCloud, as_float32, harmonic_basis
 from twin.scene.raster.rasteriser import Rasteriser
+
+# --- How long one stage of a fit may take, so that the budget holds however many views there are.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Allowance:
+    """Time until which a stage may run, by the clock of the fit."""
+
+    clock: Callable[[], float] = time.monotonic
+    until_s: float = math.inf
+    """On that clock; infinite when images are counted instead of time."""
+
+    def left_s(self) -> float:
+        """Seconds that are left; negative when it is over."""
+        return self.until_s - self.clock()
+
+    def is_over(self) -> bool:
+        """Say whether nothing more should be begun."""
+        return self.left_s() <= 0
+
+
+UNLIMITED = Allowance()
+
 
 RIDGE_COLOR = 0.05
 """Pull of a colour towards its start, in squared weights of a pixel."""
@@ -34,7 +54,7 @@ GAIN_PRIOR = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Observation:
+class ImageObservation:
     """One image at one size, where it was seen from, and how bright it came out."""
 
     target: Target
@@ -57,7 +77,7 @@ class Appearance:
 
 def solve_appearance(
     cloud: GaussianCloud,
-    observations: Sequence[Observation],
+    observations: Sequence[ImageObservation],
     rasteriser: Rasteriser,
     *,
     steps: int,
@@ -94,7 +114,7 @@ def solve_appearance(
 
 def solve_gains(
     cloud: GaussianCloud,
-    observations: Sequence[Observation],
+    observations: Sequence[ImageObservation],
     rasteriser: Rasteriser,
     allowance: Allowance = UNLIMITED,
 ) -> Float[np.ndarray, "num_views 3"]:
@@ -169,7 +189,7 @@ class _ImageModel:
     def __init__(
         self,
         cloud: GaussianCloud,
-        observations: Sequence[Observation],
+        observations: Sequence[ImageObservation],
         rasteriser: Rasteriser,
         allowance: Allowance,
     ) -> None:
@@ -225,14 +245,14 @@ class _ImageModel:
             total += self._lifted(x, item)
         return np.asarray(total)
 
-    def _lifted(self, x: np.ndarray, item: Observation) -> np.ndarray:
+    def _lifted(self, x: np.ndarray, item: ImageObservation) -> np.ndarray:
         """A change of colours carried into one image and back."""
         squared = np.square(item.gain).astype(np.float32)[:, None, None]
         drawn = self._draw(x, item)[:3]
         lifted = self._rasteriser.lift(squared * drawn * item.target.static_mask)
         return np.asarray(self._basis(item)[:, :, None] * lifted[:, None, :])
 
-    def _basis(self, item: Observation) -> Float32[np.ndarray, "num_splats num_terms"]:
+    def _basis(self, item: ImageObservation) -> Float32[np.ndarray, "num_splats num_terms"]:
         """Value of each unknown's harmonic along the ray to each Gaussian; 1 for the colour."""
         basis = np.ones((len(self._cloud), self._ridge.shape[1]), dtype=np.float32)
         if basis.shape[1] > 1:
@@ -241,6 +261,89 @@ class _ImageModel:
             basis[:, 1:] = harmonic_basis(ray)
         return basis
 
-    def _draw(self, x: np.ndarray, item: Observation) -> np.ndarray:
+    def _draw(self, x: np.ndarray, item: ImageObservation) -> np.ndarray:
         cloud = replace(self._cloud, colors=as_float32(x[:, 0]), harmonics=as_float32(x[:, 1:]))
         return self._rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)
+
+
+# --- The feature term of the paper's Eq. 3, minimised in closed form.
+#
+# lambda_f sum |A f - F|^2 is quadratic in the features f of the Gaussians and meets the other
+# terms only through the geometry in A. With the geometry that colour and depth gave, its minimum
+# is a linear solve like that of the colours and does not depend on lambda_f.
+
+RIDGE = 0.05
+"""Pull of a feature towards its start, in squared weights of a pixel."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureObservation:
+    """One map of image features, at whatever size the network gave it."""
+
+    camera: Camera
+    """Of the map: ``camera.scaled(1 / stride)``."""
+    T_base_camera: Float[np.ndarray, "4 4"]
+    values: Float32[np.ndarray, "num_features height width"]
+    valid_mask: Bool[np.ndarray, "height width"]
+
+
+def solve_features(
+    cloud: GaussianCloud,
+    observations: Sequence[FeatureObservation],
+    rasteriser: Rasteriser,
+    *,
+    steps: int,
+    start: Float32[np.ndarray, "num_splats num_features"] | None = None,
+) -> Float32[np.ndarray, "num_splats num_features"]:
+    """Features of the Gaussians that explain all maps best; the start where nothing is seen.
+
+    Args:
+        cloud: Geometry and opacity, fixed.
+        observations: Maps of the same features.
+        rasteriser: Draws and lifts.
+        steps: Conjugate gradient steps, at most.
+        start: Where to begin, and what features are pulled to; zero if not given.
+    """
+    num_features = observations[0].values.shape[0]
+    begin = np.zeros((len(cloud), num_features), dtype=np.float32) if start is None else start
+    right = np.zeros((len(cloud), 1, num_features), dtype=np.float32)
+    diagonal = np.full((len(cloud), 1, 1), RIDGE, dtype=np.float32)
+    for item in observations:
+        alpha = rasteriser.draw_planes(cloud, item.camera, item.T_base_camera)[4:]
+        missing = item.values - rasteriser.draw_features(np.ascontiguousarray(begin))
+        right[:, 0] += rasteriser.lift(np.where(item.valid_mask, missing, np.float32(0.0)))
+        diagonal[:, 0] += rasteriser.lift(alpha * item.valid_mask)
+
+    def normal(x: np.ndarray) -> np.ndarray:
+        total = np.float32(RIDGE) * x
+        for item in observations:
+            drawn = _draw(cloud, x[:, 0], item, rasteriser)
+            total[:, 0] += rasteriser.lift(drawn * item.valid_mask)
+        return np.asarray(total)
+
+    whole = np.broadcast_to(diagonal, right.shape)
+    change, _ = conjugate_gradients(normal, right, np.ascontiguousarray(whole), steps=steps)
+    return np.asarray(begin + change[:, 0])
+
+
+def feature_loss(
+    cloud: GaussianCloud,
+    features: Float32[np.ndarray, "num_splats num_features"],
+    observations: Sequence[FeatureObservation],
+    rasteriser: Rasteriser,
+) -> float:
+    """Mean squared difference of drawn and given features where they are valid (Eq. 3)."""
+    total, count = 0.0, 0
+    for item in observations:
+        drawn = _draw(cloud, features, item, rasteriser)
+        wrong = (drawn - item.values)[:, item.valid_mask]
+        total += float(np.square(wrong, dtype=np.float64).sum())
+        count += wrong.size
+    return total / max(count, 1)
+
+
+def _draw(
+    cloud: GaussianCloud, features: np.ndarray, item: FeatureObservation, rasteriser: Rasteriser
+) -> np.ndarray:
+    rasteriser.draw_planes(cloud, item.camera, item.T_base_camera)
+    return rasteriser.draw_features(np.ascontiguousarray(features))

@@ -7,8 +7,8 @@ from jaxtyping import Float, Float32, Int64
 
 from bridge.geometry import se3
 from twin.scene.fit.appearance import gain_between
-from twin.scene.frames.training_view import Target
-from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.frames.rgbd import Target
+from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import Rasteriser
 
 TURN_RATE_RAD = 5e-4

@@ -12,14 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from bridge.geometry import se3
-from twin.scene.fit.allowance import UNLIMITED, Allowance
-from twin.scene.fit.appearance import Observation
-from twin.scene.gaussians.cloud import (
-    GaussianCloud,
-    as_float32,
-    concatenate,
-    morton_order,
-)
+from twin.scene.fit.appearance import UNLIMITED, Allowance, ImageObservation
+from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, morton_order
 from twin.scene.raster.rasteriser import Rasteriser
 
 MAX_SCORED_VIEWS = 20
@@ -67,7 +61,7 @@ class Densified:
 
 def score(
     cloud: GaussianCloud,
-    observations: Sequence[Observation],
+    observations: Sequence[ImageObservation],
     rasteriser: Rasteriser,
     allowance: Allowance = UNLIMITED,
 ) -> Scores:

@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int8
 
 from twin.errors import TwinError
-from twin.scene.frames.points import PointSet
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32, morton_order
+from twin.scene.frames.rgbd import PointSet
+from twin.scene.gaussians import GaussianCloud, as_float32, morton_order
 from twin.scene.settings import InitialiseConfig
 
 MAX_LEVEL = 6

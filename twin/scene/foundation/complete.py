@@ -16,16 +16,17 @@ from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
 from bridge.terminal import Output
 from twin.errors import TwinError
-from twin.scene.foundation.generated import GeneratedObject, generate_object
-from twin.scene.foundation.sam3d import GeneratorConfig, GeneratorInput
-from twin.scene.frames.training_view import TrainingView
+from twin.scene.foundation.sam3d import (
+    GeneratedObject,
+    GeneratorConfig,
+    GeneratorInput,
+    generate_object,
+)
+from twin.scene.frames.rgbd import TrainingView
 from twin.scene.settings import ModelConfig
-from twin.scene.shape.carve import gather
-from twin.scene.shape.from_mesh import shape_of_mesh
+from twin.scene.shape.carve import MaskedView, VoxelBox, gather
 from twin.scene.shape.from_training import Poses, masked_view, support_z_m
-from twin.scene.shape.masked_view import MaskedView
-from twin.scene.shape.reconstruct import ObjectShape, ShapeConfig
-from twin.scene.shape.voxels import VoxelBox
+from twin.scene.shape.reconstruct import ObjectShape, ShapeConfig, shape_of_mesh
 
 MAX_POINTS = 20_000
 """Measured points that both shapes are compared with."""

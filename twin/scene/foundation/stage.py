@@ -12,21 +12,26 @@ from bridge.episode.streams import RgbdFrame
 from bridge.errors import UsageError
 from bridge.task.task_file import Task
 from bridge.terminal import Advance
-from twin.scene.foundation import clip, dinov3, sam3
-from twin.scene.foundation.clip import ClipEmbedder
+from twin.scene.foundation import models
 from twin.scene.foundation.complete import generator_command
-from twin.scene.foundation.loading import Placement, import_transformers
-from twin.scene.foundation.open import (
+from twin.scene.foundation.loading import (
+    Placement,
+    WeightsKind,
+    check_folder,
+    import_transformers,
+    weights_hash,
+)
+from twin.scene.foundation.models import (
     FEATURES,
     SEGMENTERS,
+    ClipEmbedder,
+    Sam3Segmenter,
     open_clip,
     open_features,
     open_segmenter,
     split_spec,
 )
-from twin.scene.foundation.sam3 import Sam3Segmenter
-from twin.scene.foundation.weights import WeightsKind, check_folder, weights_hash
-from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.features import (
     FeatureBasis,
@@ -35,7 +40,7 @@ from twin.scene.semantics.features import (
     lift_reduced,
     save_features,
 )
-from twin.scene.semantics.lexicon import spoken_name
+from twin.scene.semantics.language import spoken_name
 from twin.scene.semantics.lift import Viewpoint, render_labels
 from twin.scene.semantics.result import MaskSet, SemanticScene
 from twin.scene.settings import ModelConfig
@@ -70,12 +75,12 @@ def check_models(config: ModelConfig, task: Task | None) -> dict[str, str]:
     if config.segmenter:
         prompts_of(config, task)
         _, folder = split_spec(config.segmenter, "--segmenter", SEGMENTERS)
-        named.append(("segmenter", folder, sam3.KIND))
+        named.append(("segmenter", folder, models.SAM3_KIND))
     if config.features:
         _, folder = split_spec(config.features, "--features", FEATURES)
-        named.append(("features", folder, dinov3.KIND))
+        named.append(("features", folder, models.DINOV3_KIND))
     if config.clip:
-        named.append(("clip", Path(config.clip).expanduser(), clip.KIND))
+        named.append(("clip", Path(config.clip).expanduser(), models.CLIP_KIND))
     if config.generator:
         generator_command(config.generator)
     hashes = {}

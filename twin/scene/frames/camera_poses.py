@@ -1,26 +1,167 @@
 """Where a camera was at each of its images: from ``/tf``, or from the images themselves."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 
-from bridge.episode import streams
-from bridge.episode.cdr.messages import FrameTransform
+from bridge.episode import schema, streams
+from bridge.episode.cdr.messages import FrameTransform, transforms_from_cdr
 from bridge.episode.reader import Episode
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
+from bridge.task.robot import BASE_FRAME
 from bridge.terminal import Output
-from twin.scene.frames.aligner import TrackConfig
-from twin.scene.frames.base import base_tree
-from twin.scene.frames.odometry import CameraPath, follow_camera
-from twin.scene.frames.pairs import paired_stamps_ns
-from twin.scene.frames.stated import FAR_NS, apart_s, unknown_mask
-from twin.scene.frames.usable import UnusableCameraError, name_of
+from twin.scene.frames.odometry import CameraPath, TrackConfig, follow_camera
+from twin.scene.frames.pairing import UnusableCameraError, name_of, paired_stamps_ns
 from twin.scene.settings import FrameConfig
-from twin.scene.store.calibration import Calibration, CameraPlace, calibrated_tree, without_joints
+from twin.scene.store.calibration import Calibration, MountedCamera, calibrated_tree, without_joints
+
+# --- At which instants a recording says where a camera was, and at which it only seems to.
+#
+# A transform tree answers at any instant: between two poses it interpolates, before the first and
+# after the last it gives the nearest. Far from any pose that is a guess, and it may be a bad one:
+# images stamped by another clock than /tf all get the first pose, or all the last.
+
+# --- When two poses of a camera count as one.
+
+
+def same_pose(
+    T_base_a: Float[np.ndarray, "4 4"],
+    T_base_b: Float[np.ndarray, "4 4"],
+    *,
+    distance_m: float,
+    angle_rad: float,
+) -> bool:
+    """Say whether two poses lie nearer to each other than both limits."""
+    near = np.linalg.norm(T_base_a[:3, 3] - T_base_b[:3, 3]) < distance_m
+    return bool(near and se3.rotation_angle_rad(T_base_a[:3, :3].T @ T_base_b[:3, :3]) < angle_rad)
+
+
+FAR_NS = 500_000_000
+"""A pose stated farther away in time says nothing of a camera that moves."""
+STILL_M, STILL_RAD = 0.002, 0.0035
+"""A camera whose pose varies less than these stands still."""
+LOOKS = 40
+"""Poses that are compared to see whether a camera ever moves."""
+
+
+def unknown_mask(
+    tree: TransformTree, frames: Iterable[str], stamps_ns: Int[np.ndarray, " num_stamps"]
+) -> Bool[np.ndarray, " num_stamps"]:
+    """Mark instants at which the pose of a frame is no number, or was stated by nobody around.
+
+    Args:
+        tree: Knows the frames.
+        frames: All of them have to be known.
+        stamps_ns: Source times.
+    """
+    unknown = np.zeros(len(stamps_ns), dtype=bool)
+    for frame in frames:
+        with np.errstate(invalid="ignore"):
+            unknown |= ~np.isfinite(tree.Ts_root_frame(frame, stamps_ns)).all(axis=(1, 2))
+        unknown |= _far_from_any(tree, frame, stamps_ns)
+    return unknown
+
+
+def apart_s(
+    tree: TransformTree, frame: str, stamps_ns: Int[np.ndarray, " num_stamps"]
+) -> float | None:
+    """Least time between an instant and a stated pose [s]; None without either."""
+    stated = tree.stamps_ns(frame)
+    if len(stated) == 0 or len(stamps_ns) == 0:
+        return None
+    return float(np.min(_gaps_ns(stated, stamps_ns))) * 1e-9
+
+
+def _far_from_any(
+    tree: TransformTree, frame: str, stamps_ns: Int[np.ndarray, " num_stamps"]
+) -> Bool[np.ndarray, " num_stamps"]:
+    stated = tree.stamps_ns(frame)
+    none = np.zeros(len(stamps_ns), dtype=bool)
+    if len(stated) < 2:  # static
+        return none
+    far = _gaps_ns(stated, stamps_ns) > FAR_NS
+    if not far.any() or _never_moves(tree, frame, stated):
+        return none
+    for index in np.flatnonzero(far):
+        after = int(np.searchsorted(stated, stamps_ns[index]))
+        if 0 < after < len(stated):  # whoever stands still may say so once
+            before, behind = (tree.T_root_frame(frame, int(stated[k])) for k in (after - 1, after))
+            far[index] = not same_pose(before, behind, distance_m=STILL_M, angle_rad=STILL_RAD)
+    return np.asarray(far)
+
+
+def _gaps_ns(
+    stated: Int[np.ndarray, " num_stated"], stamps_ns: Int[np.ndarray, " num_stamps"]
+) -> Int[np.ndarray, " num_stamps"]:
+    """Time from each instant to the nearest stated one."""
+    after = np.clip(np.searchsorted(stated, stamps_ns), 0, len(stated) - 1)
+    before = np.maximum(after - 1, 0)
+    gaps = np.minimum(np.abs(stated[after] - stamps_ns), np.abs(stated[before] - stamps_ns))
+    return np.asarray(gaps)
+
+
+def _never_moves(tree: TransformTree, frame: str, stated: Int[np.ndarray, " num_stated"]) -> bool:
+    some = stated[np.unique(np.linspace(0, len(stated) - 1, LOOKS).round().astype(int))]
+    Ts = tree.Ts_root_frame(frame, some)
+    return all(same_pose(Ts[0], T, distance_m=STILL_M, angle_rad=STILL_RAD) for T in Ts)
+
+
+# --- The frames of an episode with the robot's base as their root, wherever /tf says where it is.
+
+SAME = 1e-6
+"""A base whose pose varies by more, in metres or in a rotation's entries, drives about."""
+
+
+def base_tree(episode: Episode) -> TransformTree:
+    """Collect ``/tf`` and ``/tf_static``; see ``rooted_in_base``."""
+    transforms: list[FrameTransform] = []
+    for message in episode.messages(episode.topics_of_type(schema.TF_MESSAGE)):
+        transforms.extend(transforms_from_cdr(message.data))
+    return TransformTree(rooted_in_base(transforms))
+
+
+def rooted_in_base(transforms: Sequence[FrameTransform]) -> list[FrameTransform]:
+    """Turn round what lies between the robot's base and the root above it.
+
+    Drivers often hang the base on a frame ``world``. Joints, plans and objects are given in the
+    base, so the scene has to be, too. A base that moves in its root keeps it: it is the room that
+    stands still then.
+    """
+    parents = {item.child: item.parent for item in transforms}
+    above: list[str] = []
+    frame = BASE_FRAME
+    while frame in parents and frame not in above:
+        above.append(frame)
+        frame = parents[frame]
+    if not above or not all(_stands(transforms, child) for child in above):
+        return list(transforms)
+    return [
+        FrameTransform(
+            stamp_ns=item.stamp_ns,
+            parent=item.child,
+            child=item.parent,
+            T_parent_child=se3.invert(item.T_parent_child),
+        )
+        if item.child in above
+        else item
+        for item in transforms
+    ]
+
+
+def _stands(transforms: Sequence[FrameTransform], child: str) -> bool:
+    """Whether one frame always has the same place in the same parent."""
+    own = [item for item in transforms if item.child == child]
+    first = own[0]
+    return all(
+        item.parent == first.parent
+        and np.allclose(item.T_parent_child, first.T_parent_child, rtol=0.0, atol=SAME)
+        for item in own
+    )
+
 
 ODOMETRY_FRAME = "odometry"
 """Begin of the name of the root frame of a scan without poses: the depth camera at the first frame
@@ -121,7 +262,7 @@ def check_connected(tree: TransformTree, episode: Episode, camera_id: str) -> No
 def calibrated_poses(
     episode: Episode,
     camera_id: str,
-    place: CameraPlace,
+    place: MountedCamera,
     stamps_ns: Int[np.ndarray, " num_frames"],
 ) -> CameraPoses:
     """Pose a camera's images as ``robot-gst calibrate`` says it is mounted.
@@ -141,7 +282,7 @@ def calibrated_poses(
 def calibrated_tree_at(
     episode: Episode,
     camera_id: str,
-    place: CameraPlace,
+    place: MountedCamera,
     stamps_ns: Int[np.ndarray, " num_stamps"],
 ) -> TransformTree:
     """Pose a calibrated camera at its images and at some more instants, where joints are known.

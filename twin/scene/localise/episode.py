@@ -17,12 +17,16 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError
 from bridge.task.robot import BASE_FRAME
 from bridge.task.task_file import Task
-from twin.scene.frames.choice import rgbd_camera_ids
+from twin.scene.frames.selection import rgbd_camera_ids
+from twin.scene.localise.mesh_fit import MeshSurface, ScannedSurfaces, scanned_surfaces
 from twin.scene.localise.objects import LocaliseConfig, localise_objects
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.localise.scanned import ScannedSurfaces, scanned_surfaces
-from twin.scene.localise.still_frames import HeldOut, Poses, calibrated_cameras, still_frames
-from twin.scene.localise.surface import Surface
+from twin.scene.localise.stationary_frames import (
+    HeldOut,
+    Poses,
+    calibrated_cameras,
+    stationary_frames,
+)
 from twin.scene.store.calibration import Calibration, read_calibration
 
 NO_SCENE = "noscene"
@@ -48,7 +52,7 @@ def localise_episode(
     before_ns: int | None = None,
     held_out_ns: HeldOut | None = None,
     last_seen_m: Mapping[str, Float[np.ndarray, "3"]] | None = None,
-    surfaces: Mapping[str, Surface] | None = None,
+    surfaces: Mapping[str, MeshSurface] | None = None,
     poses: Poses | None = None,
 ) -> dict[str, LocalisedObject]:
     """Localise from the last still frames before the first execution started.
@@ -74,11 +78,11 @@ def localise_episode(
     if after_ns is None and before_ns is None:
         before_ns = first_execution_ns(episode)
     if after_ns is None and before_ns is None:
-        frames = still_frames(
+        frames = stationary_frames(
             episode, config.max_views, evenly=True, held_out_ns=held_out_ns, poses=poses
         )
     else:
-        frames = still_frames(
+        frames = stationary_frames(
             episode, config.max_frames, after_ns, before_ns, held_out_ns=held_out_ns, poses=poses
         )
     return localise_objects(frames, task, config, last_seen_m, surfaces)

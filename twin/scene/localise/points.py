@@ -4,15 +4,65 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.task_file import ObjectModel, Task
-from twin.scene.frames.still import same_pose
-from twin.scene.localise.colour import ColourConfig, likeness, linear_from_srgb
+from twin.scene.frames.camera_poses import same_pose
+
+# --- How much a pixel has an object's colour, whatever the shading.
+#
+# Diffuse shading scales linear light by one factor, so the share of each channel in the sum is a
+# property of the surface alone. The likeness is 1 on the object's colour, 0 on grey.
+
+_SRGB = np.arange(256) / 255.0
+_LINEAR = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4).astype(
+    np.float32
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColourConfig:
+    """Which pixels have an object's colour."""
+
+    max_hue_difference_rad: float = 0.4
+    """Between a pixel's hue and the object's, around the grey axis."""
+    min_luminance: float = 0.003
+    """Darker pixels, in linear light of 0 to 1, have no dependable hue."""
+
+
+def linear_from_srgb(
+    image_u8: UInt8[np.ndarray, "height width 3"],
+) -> Float[np.ndarray, "height width 3"]:
+    """Undo the sRGB curve (IEC 61966-2-1): linear light of 0 to 1."""
+    return np.asarray(_LINEAR[image_u8])
+
+
+def likeness(
+    image_linear: Float[np.ndarray, "*batch 3"],
+    color_srgb: tuple[int, int, int],
+    config: ColourConfig,
+) -> Float[np.ndarray, "*batch"]:
+    """Tell how much each pixel has a colour: 1 the object's chroma, 0 grey or another hue.
+
+    An edge pixel that mixes object and grey lies between, which places edges between pixels.
+
+    Range: 0 and up, about 1 on the object.
+    """
+    total = image_linear.sum(axis=-1)
+    dark = total < 3 * config.min_luminance
+    chroma = image_linear / np.where(dark, 1.0, total)[..., None] - 1 / 3
+    wanted = _LINEAR[np.array(color_srgb)]
+    wanted = wanted / wanted.sum() - 1 / 3
+    strength = float(np.linalg.norm(wanted))
+    along = chroma @ (wanted / strength)
+    across = np.sqrt(np.maximum((chroma * chroma).sum(axis=-1) - along * along, 0.0))
+    other_hue = across > along * np.tan(config.max_hue_difference_rad)
+    return np.where(dark | other_hue | (along <= 0), 0.0, along / strength)
+
 
 STILL_DISTANCE_M = 5e-4
 STILL_ANGLE_RAD = 1e-3
@@ -39,7 +89,7 @@ class PointConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
+class CameraView:
     """One camera pose: the mean of its still frames, with the points it sees."""
 
     camera_id: str
@@ -59,7 +109,7 @@ class View:
 
 def fuse_stills(
     frames: Sequence[RgbdFrame], max_frames: int, max_views: int, task: Task, config: PointConfig
-) -> list[View]:
+) -> list[CameraView]:
     """Average the last frames of each camera that were taken from one pose.
 
     Frames of a camera that moved in between make separate views, the newest are kept. Depth is
@@ -73,7 +123,7 @@ def fuse_stills(
                 break
         else:
             groups.append([frame])
-    views: list[View] = []
+    views: list[CameraView] = []
     for group in groups:
         if sum(view.camera_id == group[0].camera_id for view in views) < max_views:
             views.append(_view(group[:max_frames], task, config))
@@ -88,7 +138,7 @@ def _same_pose(a: RgbdFrame, b: RgbdFrame) -> bool:
     )
 
 
-def _view(frames: Sequence[RgbdFrame], task: Task, config: PointConfig) -> View:
+def _view(frames: Sequence[RgbdFrame], task: Task, config: PointConfig) -> CameraView:
     newest = frames[0]
     depths = np.stack([frame.depth_m for frame in frames]).astype(np.float64)
     measured = np.isfinite(depths) & (depths > 0)
@@ -98,7 +148,7 @@ def _view(frames: Sequence[RgbdFrame], task: Task, config: PointConfig) -> View:
     image = np.mean([linear_from_srgb(frame.image_u8) for frame in frames], axis=0)
     p_base = se3.apply(newest.T_base_depth, newest.depth_camera.unproject(depth)[depth > 0])
     p_base = p_base[_in_search_area(p_base, task, config)]
-    return View(
+    return CameraView(
         camera_id=newest.camera_id,
         stamp_ns=newest.stamp_ns,
         num_frames=len(frames),
@@ -129,7 +179,7 @@ def _sample(
     return np.where(inside[:, None], image[column_row[:, 1], column_row[:, 0]], 0.0)
 
 
-def moved(view: View, T_new_old: Float[np.ndarray, "4 4"], depth_factor: float) -> View:
+def moved(view: CameraView, T_new_old: Float[np.ndarray, "4 4"], depth_factor: float) -> CameraView:
     """The same view with its cameras moved in the base frame and its depth scaled."""
     T_base_depth = T_new_old @ view.T_base_depth
     p_depth = se3.apply(se3.invert(view.T_base_depth), view.p_base) * depth_factor
@@ -178,7 +228,7 @@ class Cluster:
 
 
 def object_points(
-    views: Sequence[View], model: ObjectModel, config: PointConfig, colour: ColourConfig
+    views: Sequence[CameraView], model: ObjectModel, config: PointConfig, colour: ColourConfig
 ) -> list[Cluster]:
     """Clusters of voxel-averaged points of an object's colour, largest first."""
     parts = []

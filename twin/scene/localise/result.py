@@ -10,8 +10,8 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.task.record import check_record
 from bridge.task.task_file import ObjectModel
-from twin.scene.localise.fit import ShapeFit
-from twin.scene.localise.mesh import MeshFit
+from twin.scene.localise.mesh_fit import MeshFit
+from twin.scene.localise.shape_fit import ShapeFit
 from twin.scene.shape.known import (
     pose_of,
     rectangle_yaw_rad,

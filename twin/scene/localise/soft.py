@@ -9,18 +9,231 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.cluster.vq import kmeans2
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
 
+from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
-from twin.scene.localise.candidates import candidates
-from twin.scene.localise.colour import ColourConfig
-from twin.scene.localise.fit import FitConfig
-from twin.scene.localise.mesh import MeshFit, MeshFitConfig, fit_mesh
-from twin.scene.localise.points import Cluster, PointConfig, View
-from twin.scene.localise.soft_config import SoftConfig
-from twin.scene.localise.soft_shape import SoftShape, soft_shape
-from twin.scene.localise.surface import Surface, agreeing, known_surface
+from twin.scene.localise.mesh_fit import (
+    MeshFit,
+    MeshFitConfig,
+    MeshSurface,
+    agreeing,
+    facing,
+    fit_mesh,
+    known_surface,
+)
+from twin.scene.localise.points import (
+    CameraView,
+    Cluster,
+    ColourConfig,
+    PointConfig,
+    clusters,
+    likeness,
+    voxel_mean,
+)
+from twin.scene.localise.shape_fit import ShapeFitConfig
+from twin.scene.shape.known import surface_distances
+
+# --- Clusters of points that may be one soft toy each.
+
+# --- How far a soft toy is deformed: its extents along the axes of its pose.
+
+# --- When points count as a soft toy, and when two toys count as told apart.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoftConfig:
+    """How soft toys are found."""
+
+    min_height_m: float = 0.006
+    """Lower points may be table."""
+    clear_m: float = 0.009
+    """Points nearer than this to a rigid object that was found belong to it."""
+    growth: float = 1.2
+    """A cluster with a longer diagonal than the toy's times this holds more than one thing."""
+    shrink: float = 0.35
+    """One shorter than the toy's shortest extent times this is not the toy."""
+    fill: float = 0.7
+    """A toy covers this share of the rectangle around it, seen from above."""
+    stretch_m: float = 0.012
+    """Points nearer than this to the fitted surface show how the toy is deformed."""
+    tilt_sigma_rad: float = 0.1
+    """Prior of roll and pitch of a toy that stands."""
+    well_explained: float = 0.9
+    """With less it may lie on another side: more starts are tried."""
+    well_seen_through: float = 0.12
+    """So they are with more of its surface seen through."""
+    hopeless: float = 0.5
+    """With less it is no such toy on any side: one on a wrong side explains two thirds."""
+    turned_share: float = 0.1
+    """Clusters with fewer points than this share of the largest show too little of a toy to tell
+    its sides apart."""
+    max_seen_through: float = 0.3
+    """With more of its surface seen through it is something else."""
+    min_agreeing: float = 0.35
+    """Some camera must measure this share of the surface that faces it where the toy is."""
+    moved_m: float = 0.05
+    """Equal toys farther from where they are expected were moved, no matter how far: those that
+    stayed keep their names."""
+    score_m: float = 0.2
+    """In the assignment, a point of score counts like this distance."""
+    min_margin_m: float = 0.02
+    """Equal toys whose exchange would cost less are reported as hardly told apart."""
+
+
+STANDS = 0.9
+"""Cosine of the tilt up to which the underside of a toy is taken to be level."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoftShape:
+    """Coarse shape: a box with its middle, axes and extents."""
+
+    centroid_m: Float[np.ndarray, "3"]
+    R_base_axes: Float[np.ndarray, "3 3"]
+    extents_m: Float[np.ndarray, "3"]
+    extents_sigma_m: Float[np.ndarray, "3"]
+
+    def to_record(self) -> dict[str, list[float] | list[list[float]]]:
+        """Return the entry ``soft_shape`` of a localisation record."""
+        return {
+            "centroid_m": self.centroid_m.tolist(),
+            "axes": self.R_base_axes.T.tolist(),
+            "extents_m": self.extents_m.tolist(),
+            "extents_sigma_m": self.extents_sigma_m.tolist(),
+        }
+
+
+def soft_shape(
+    views: Sequence[CameraView],
+    surface: MeshSurface,
+    model: ObjectModel,
+    fit: MeshFit,
+    points: PointConfig,
+    soft: SoftConfig,
+) -> SoftShape:
+    """Extents along the axes of the fitted pose: those at rest, plus how far the seen ends moved.
+
+    All points near the fitted surface count, whatever their colour.
+
+    Args:
+        views: What the cameras saw.
+        surface: Its mesh at rest.
+        model: Its extents at rest.
+        fit: Where it was found.
+        points: Size of the voxels.
+        soft: How far the surface may be off.
+    """
+    T = fit.T_base_object
+    T_object_base = se3.invert(T)
+    above = [view.p_base[view.p_base[:, 2] > soft.min_height_m] for view in views]
+    local = se3.apply(T_object_base, np.concatenate(above))
+    reach = np.array(model.size_m) / 2 + soft.stretch_m
+    local = voxel_mean(local[np.all(np.abs(local) < reach, axis=1)], points.voxel_m)
+    distance, _ = cKDTree(surface.p_m).query(local)
+    local = local[distance < soft.stretch_m]
+    # An end that every camera looks at from behind was not seen; it is taken as at rest.
+    eyes = se3.apply(T_object_base, np.array([view.T_base_depth[:3, 3] for view in views]))
+    towards = eyes / np.linalg.norm(eyes, axis=1, keepdims=True)
+    faced = np.any([facing(T_object_base, view, surface) for view in views], axis=0)
+    half, ends = np.array(model.size_m) / 2, np.zeros((2, 3))
+    for row, sign in enumerate((1.0, -1.0)):
+        seen = (sign * towards).max(axis=0) > -0.2
+        reached = np.percentile(sign * local, 98, axis=0)
+        rest = np.percentile(sign * surface.p_m[faced], 98, axis=0)
+        ends[row] = sign * np.maximum(half + np.where(seen, reached - rest, 0.0), 0.1 * half)
+    if T[2, 2] > STANDS and T[2, 3] + ends[1, 2] < 0:
+        ends[1, 2] = -T[2, 3]  # it cannot reach below the table
+    sigma = np.hypot(0.005, fit.residual_m) * np.ones(3)
+    return SoftShape(
+        centroid_m=se3.apply(T, ends.mean(axis=0)[None])[0],
+        R_base_axes=T[:3, :3].copy(),
+        extents_m=ends[0] - ends[1],
+        extents_sigma_m=sigma,
+    )
+
+
+DENSE_SAMPLES = 20_000
+CELL_M = 0.004
+
+
+def candidates(
+    model: ObjectModel,
+    count: int,
+    views: Sequence[CameraView],
+    blocked: Mapping[ObjectModel, Float[np.ndarray, "4 4"]],
+    points: PointConfig,
+    colour: ColourConfig,
+    soft: SoftConfig,
+) -> list[Cluster]:
+    """Clusters that may be one toy each; what touches is cut apart.
+
+    Args:
+        model: The toy.
+        count: How many equal ones there are at most.
+        views: What the cameras saw.
+        blocked: Rigid objects with their poses; their points do not count.
+        points: Which points count.
+        colour: Which pixels have the toy's colour.
+        soft: Heights and sizes.
+    """
+    parts = []
+    for view in views:
+        p = view.p_base
+        alike = p[:, 2] > soft.min_height_m
+        alike[alike] = likeness(view.color_linear[alike], model.color_srgb, colour) >= (
+            points.min_likeness
+        )
+        p = voxel_mean(p[alike], points.voxel_m)
+        parts.append(p[~_on_others(p, blocked, soft.clear_m)])
+    ids = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    everything = np.concatenate(parts) if parts else np.zeros((0, 3))
+    single = []
+    for group in clusters(everything, ids, points.cluster_gap_m):
+        if len(group) < points.min_points:
+            continue
+        for piece in _cut(group, model, count, soft):
+            extent = np.ptp(np.percentile(piece.p_base, [2, 98], axis=0), axis=0).max()
+            if len(piece) >= points.min_points and extent > soft.shrink * min(model.size_m):
+                single.append(piece)
+    return single
+
+
+def _on_others(
+    p: Float[np.ndarray, "num_points 3"],
+    blocked: Mapping[ObjectModel, Float[np.ndarray, "4 4"]],
+    clear_m: float,
+) -> Bool[np.ndarray, " num_points"]:
+    mask = np.zeros(len(p), dtype=bool)
+    for model, T in blocked.items():
+        if model.mesh is None:
+            distance, _ = surface_distances(p, model, T)
+            mask |= np.abs(distance) < clear_m
+        elif len(p):
+            surface = se3.apply(T, known_surface(model, DENSE_SAMPLES).p_m)
+            distance, _ = cKDTree(surface).query(p, distance_upper_bound=clear_m)
+            mask |= np.isfinite(distance)
+    return mask
+
+
+def _cut(group: Cluster, model: ObjectModel, count: int, soft: SoftConfig) -> list[Cluster]:
+    """Cut a cluster that is too large for one toy into as many as would cover its area."""
+    low, high = np.percentile(group.p_base[:, :2], [1, 99], axis=0)
+    if float(np.linalg.norm(high - low)) <= soft.growth * float(np.linalg.norm(model.size_m[:2])):
+        return [group]
+    cells = np.unique(np.floor(group.p_base[:, :2] / CELL_M).astype(np.int64), axis=0)
+    one = soft.fill * model.size_m[0] * model.size_m[1]
+    number = round(len(cells) * CELL_M**2 / one)
+    if not 2 <= number <= count:
+        return []
+    _, labels = kmeans2(group.p_base, number, minit="++", seed=0)
+    return [
+        Cluster(p_base=group.p_base[labels == label], view_ids=group.view_ids[labels == label])
+        for label in range(number)
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,13 +250,13 @@ class SoftFit:
 
 def fit_toys(
     models: Sequence[ObjectModel],
-    views: Sequence[View],
+    views: Sequence[CameraView],
     blocked: Mapping[ObjectModel, Float[np.ndarray, "4 4"]],
     expected_m: Mapping[str, Float[np.ndarray, "3"]],
     *,
     points: PointConfig,
     colour: ColourConfig,
-    fit: FitConfig,
+    fit: ShapeFitConfig,
     mesh: MeshFitConfig,
     soft: SoftConfig,
     min_explained: float,
@@ -106,9 +319,9 @@ def fit_toys(
 
 def fit_toy(
     group: Cluster,
-    views: Sequence[View],
-    surface: Surface,
-    fit: FitConfig,
+    views: Sequence[CameraView],
+    surface: MeshSurface,
+    fit: ShapeFitConfig,
     mesh: MeshFitConfig,
     soft: SoftConfig,
     *,

@@ -1,7 +1,276 @@
-"""Choose what draws Gaussians: our own code on the CPU, or gsplat on a CUDA device."""
+"""The rasteriser's second backend: the same calls answered by ``gsplat`` on a CUDA device.
 
-from twin.scene.raster.cuda import CudaRasteriser, has_cuda
-from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+Only its documented function ``gsplat.rasterization`` is used, in the mode ``antialiased`` with
+``eps2d = 0.1``, which is our mip compensation. Known differences: its Jacobian is held at 15 % of
+the image beyond the border where ours is at 30 %, and its cuts are fixed.
+"""
+
+import importlib
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt16
+
+from bridge.errors import GstError, MissingDependencyError, UsageError
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from twin.scene.gaussians import SH_FIRST, GaussianCloud, arrays
+from twin.scene.raster.rasteriser import (
+    CloudGradient,
+    RasterConfig,
+    Rasteriser,
+    View,
+    view_of_planes,
+)
+
+MIP_VARIANCE_PX2 = 0.1
+NEAR_M = 0.02
+FIXED_ALPHA_CUT, FIXED_TRANSMITTANCE_STOP = 1.0 / 255.0, 1e-4
+"""Constants inside gsplat's kernels."""
+CHANNEL_BLOCK = 32
+"""Channels that go through one call; memory grows with them."""
+
+
+class CudaMissingError(MissingDependencyError):
+    """There is no CUDA device that torch can use."""
+
+    def __init__(self, *, found: str) -> None:
+        """Remember what was found."""
+        self.package, self.extra = "CUDA", "gpu"
+        GstError.__init__(
+            self,
+            f"the backend cuda needs an NVIDIA GPU and a torch built for CUDA; found {found}. "
+            "Use the backend cpu, or install a CUDA build of torch and 'robot-gst[gpu]'.",
+        )
+
+
+def has_cuda() -> bool:
+    """Whether the backend can run here; torch is only imported where gsplat is installed."""
+    return find_spec("gsplat") is not None and bool(_torch().cuda.is_available())
+
+
+def _torch() -> Any:
+    try:
+        return importlib.import_module("torch")
+    except ImportError as error:
+        purpose = "the backend cuda"
+        raise MissingDependencyError(package="torch", extra="twin", purpose=purpose) from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Drawn:
+    """The last image and what it was made of, for gradients and further channels."""
+
+    leaves: dict[str, Any]
+    T_camera_base: Any
+    planes: Any
+    visible: np.ndarray
+    camera: Camera
+
+
+class CudaRasteriser:
+    """Draws one camera after another on a GPU; the interface of ``rasteriser.Rasteriser``.
+
+    Sums on the GPU are in no fixed order: results repeat to about 1e-6, not bit by bit.
+    """
+
+    isa = "cuda"
+
+    def __init__(self, config: RasterConfig | None = None, *, device: str = "cuda") -> None:
+        """Look for the device and for gsplat.
+
+        Raises:
+            CudaMissingError: When torch finds no device.
+            MissingDependencyError: When gsplat or torch is not installed.
+            UsageError: When the configuration asks for other cuts than gsplat has.
+        """
+        self.config = config or RasterConfig()
+        cuts = (self.config.alpha_cut, self.config.transmittance_stop)
+        if not np.allclose(cuts, (FIXED_ALPHA_CUT, FIXED_TRANSMITTANCE_STOP), rtol=1e-3, atol=0):
+            message = (
+                f"the backend cuda drops alpha below 1/255 and stops at 1e-4; {cuts[0]:g} and "
+                f"{cuts[1]:g} were asked for. Use the backend cpu for other values."
+            )
+            raise UsageError(message)
+        torch = _torch()
+        if device == "cuda" and not torch.cuda.is_available():
+            raise CudaMissingError(found=f"torch {torch.__version__} without a usable device")
+        try:
+            self._gsplat = importlib.import_module("gsplat")
+        except ImportError as error:
+            raise MissingDependencyError(
+                package="gsplat", extra="gpu", purpose="the backend cuda"
+            ) from error
+        self._torch = torch
+        self._device = torch.device(device)
+        self._drawn: _Drawn | None = None
+
+    def draw_planes(
+        self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
+    ) -> Float32[np.ndarray, "5 height width"]:
+        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black."""
+        torch = self._torch
+        leaves = {
+            name: torch.tensor(rows, device=self._device, requires_grad=True)
+            for name, rows in arrays(cloud)
+        }
+        T = se3.invert(T_base_camera).astype(np.float32)
+        T_camera_base = torch.tensor(T, device=self._device, requires_grad=True)
+        centre = -T_camera_base[:3, :3].T @ T_camera_base[:3, 3]
+        colors = self._colors(leaves, centre)
+        image, alpha, about = self._rasterise(leaves, colors, T_camera_base, camera, "RGB+D")
+        planes = torch.cat([image[0], alpha[0]], dim=-1).permute(2, 0, 1)
+        radii = about["radii"].reshape(len(cloud), -1)
+        self._drawn = _Drawn(
+            leaves=leaves,
+            T_camera_base=T_camera_base,
+            planes=planes,
+            visible=(radii > 0).all(dim=1).cpu().numpy(),
+            camera=camera,
+        )
+        return self._numpy(planes)
+
+    def pull_back(
+        self,
+        planes: Float32[np.ndarray, "5 height width"],
+        plane_gradients: Float32[np.ndarray, "5 height width"],
+    ) -> CloudGradient:
+        """Carry a gradient on the planes of the last ``draw_planes`` back to its cloud.
+
+        Args:
+            planes: What ``draw_planes`` returned; its size is checked.
+            plane_gradients: Of a scalar with respect to them.
+        """
+        drawn = self._last()
+        if planes.shape != tuple(drawn.planes.shape):
+            message = f"planes of shape {planes.shape} are not those drawn last."
+            raise UsageError(message)
+        inputs = [*drawn.leaves.values(), drawn.T_camera_base]
+        upstream = self._torch.tensor(plane_gradients, device=self._device)
+        gradients = self._torch.autograd.grad(
+            drawn.planes, inputs, upstream, retain_graph=True, allow_unused=True
+        )
+        filled = [
+            self._torch.zeros_like(leaf) if gradient is None else gradient
+            for leaf, gradient in zip(inputs, gradients, strict=True)
+        ]
+        named = dict(zip(drawn.leaves, (self._numpy(item) for item in filled[:-1]), strict=True))
+        named.setdefault("harmonics", np.zeros((len(named["means_m"]), 0, 3), dtype=np.float32))
+        return CloudGradient(**named, T_camera_base=self._numpy(filled[-1][:3]))
+
+    def visible_mask(self) -> Bool[np.ndarray, " num_splats"]:
+        """Say which Gaussians could touch the last image."""
+        return self._last().visible
+
+    def view(
+        self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
+    ) -> View:
+        """Draw what one camera sees."""
+        return view_of_planes(self.draw_planes(cloud, camera, T_base_camera))
+
+    def draw_features(
+        self, features: Float32[np.ndarray, "num_splats num_channels"]
+    ) -> Float32[np.ndarray, "num_channels height width"]:
+        """Draw any channels with the weights of the last ``draw_planes``: A F."""
+        size = (self._last().camera.height, self._last().camera.width)
+        blocks = [np.zeros((0, *size), dtype=np.float32)]
+        for start in range(0, features.shape[1], CHANNEL_BLOCK):
+            block = features[:, start : start + CHANNEL_BLOCK]
+            with self._torch.no_grad():
+                image = self._draw_channels(self._torch.tensor(block, device=self._device))
+            blocks.append(self._numpy(image))
+        return np.concatenate(blocks)
+
+    def lift(
+        self, maps: Float32[np.ndarray, "num_channels height width"]
+    ) -> Float32[np.ndarray, "num_splats num_channels"]:
+        """Gather maps with the weights of the last ``draw_planes``: A^T M, not normalised."""
+        torch, count = self._torch, len(self._last().visible)
+        blocks = [np.zeros((count, 0), dtype=np.float32)]
+        for start in range(0, len(maps), CHANNEL_BLOCK):
+            block = torch.tensor(maps[start : start + CHANNEL_BLOCK], device=self._device)
+            channels = torch.zeros((count, len(block)), device=self._device, requires_grad=True)
+            # The image is linear in its channels, so their gradient under M is A^T M.
+            (gathered,) = torch.autograd.grad(self._draw_channels(channels), channels, block)
+            blocks.append(self._numpy(gathered))
+        return np.concatenate(blocks, axis=1)
+
+    def label_map(
+        self, labels: UInt16[np.ndarray, " num_splats"]
+    ) -> tuple[UInt16[np.ndarray, "height width"], Float32[np.ndarray, "height width"]]:
+        """Which label has most weight at each pixel of the last image, and how much.
+
+        Of equal weights the smaller label wins; 0 where nothing was drawn.
+        """
+        camera = self._last().camera
+        ids = np.zeros((camera.height, camera.width), dtype=np.uint16)
+        weight = np.zeros((camera.height, camera.width), dtype=np.float32)
+        known = np.unique(labels)
+        for start in range(0, len(known), CHANNEL_BLOCK):
+            block = known[start : start + CHANNEL_BLOCK]
+            weights = self.draw_features((labels[:, None] == block).astype(np.float32))
+            best = weights.argmax(axis=0)
+            most = np.take_along_axis(weights, best[None], axis=0)[0]
+            wins = most > weight
+            ids[wins], weight[wins] = block[best[wins]], most[wins]
+        return ids, weight
+
+    def _draw_channels(self, channels: Any) -> Any:
+        drawn = self._last()
+        held = {name: leaf.detach() for name, leaf in drawn.leaves.items()}
+        image, _, _ = self._rasterise(
+            held, channels, drawn.T_camera_base.detach(), drawn.camera, "RGB"
+        )
+        return image[0].permute(2, 0, 1)
+
+    def _rasterise(
+        self, leaves: dict[str, Any], colors: Any, T_camera_base: Any, camera: Camera, mode: str
+    ) -> Any:
+        """Call gsplat with activated values; ``D`` is the sum of weighted depth, not its mean."""
+        torch = self._torch
+        K = torch.tensor(
+            [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]],
+            device=self._device,
+        )
+        return self._gsplat.rasterization(
+            means=leaves["means_m"],
+            quats=leaves["quats_wxyz"],
+            scales=torch.exp(leaves["scales_log"]),
+            opacities=torch.sigmoid(leaves["opacities_logit"]),
+            colors=colors,
+            viewmats=T_camera_base[None],
+            Ks=K[None],
+            width=camera.width,
+            height=camera.height,
+            near_plane=NEAR_M,
+            eps2d=MIP_VARIANCE_PX2,
+            packed=False,
+            render_mode=mode,
+            rasterize_mode="antialiased",
+        )
+
+    def _colors(self, leaves: dict[str, Any], centre: Any) -> Any:
+        """Colours as seen from the camera; their gradient reaches the means through direction."""
+        if "harmonics" not in leaves:
+            return leaves["colors"]
+        ray = leaves["means_m"] - centre
+        x, y, z = (ray / ray.norm(dim=1, keepdim=True).clamp(min=1e-12)).unbind(dim=1)
+        basis = self._torch.stack([-y, z, -x], dim=1) * SH_FIRST
+        return leaves["colors"] + (basis[:, :, None] * leaves["harmonics"]).sum(dim=1)
+
+    def _last(self) -> _Drawn:
+        if self._drawn is None:
+            message = "nothing was drawn yet; call draw_planes first."
+            raise UsageError(message)
+        return self._drawn
+
+    def _numpy(self, values: Any) -> np.ndarray:
+        return np.ascontiguousarray(values.detach().cpu().numpy(), dtype=np.float32)
+
+
+# --- Choose what draws Gaussians: our own code on the CPU, or gsplat on a CUDA device.
 
 
 def open_rasteriser(config: RasterConfig | None = None) -> Rasteriser | CudaRasteriser:

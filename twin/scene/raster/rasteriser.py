@@ -3,23 +3,266 @@
 The slow readable twin of this module is ``tests/parity/splat_reference.py``.
 """
 
+import importlib
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import ModuleType
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt16
+from jaxtyping import Bool, Float, Float32, Int64, UInt16
 
+from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32
-from twin.scene.raster.config import (
-    NUM_PLANES,
-    CloudGradient,
-    RasterConfig,
-    SplatExtensionMissingError,
-    available_isas,
-    load_native,
-    native_camera,
-)
-from twin.scene.raster.session import FitSession, StepReport
+from twin.errors import TwinError
+from twin.scene.frames.rgbd import Target
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32
+
+# --- One step of fitting in native code: draw, compare, pull back, Adam; nothing goes through
+# Python.
+#
+# The separate steps are ``rasteriser.Rasteriser``, ``losses.Loss`` and Adam; a test holds them
+# equal.
+
+# --- What all users of the native rasteriser share: its settings, its loading, its gradients.
+
+NUM_PLANES = 5
+"""Red, green, blue, sum of weighted depth, sum of weights."""
+
+
+class SplatExtensionMissingError(TwinError):
+    """The compiled part of ``twin.scene`` is not there."""
+
+    def __init__(self, *, reason: str) -> None:
+        """Remember why the import failed."""
+        self.reason = reason
+        super().__init__(
+            f"the splat rasteriser is not built ({reason}). Build it with a C++17 compiler: "
+            "pip install --no-build-isolation -e . (or pip install .) in the checkout."
+        )
+
+
+def load_native() -> ModuleType:
+    """Import the extension; idle OpenMP threads sleep instead of spinning.
+
+    Raises:
+        SplatExtensionMissingError: When it was never built.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read once, when libgomp is loaded
+    try:
+        return importlib.import_module("twin.scene._splat")
+    except ImportError as error:
+        raise SplatExtensionMissingError(reason=str(error)[:160]) from error
+
+
+def available_isas() -> list[str]:
+    """Instruction sets that this processor and this build have, the plainest first."""
+    return [str(name) for name in load_native().available_isas()]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RasterConfig:
+    """How precisely to draw."""
+
+    alpha_cut: float = 1.0 / 255.0
+    """Contributions with less alpha are dropped."""
+    transmittance_stop: float = 1e-4
+    """A tile ends once no pixel of it lets more light through."""
+    threads: int = 0
+    """0: all that OpenMP offers. The result has the same bits for any number."""
+    isa: str = "auto"
+    """Instruction set: auto, base (x86-64-v2, or what the compiler takes for another processor),
+    v3 (AVX2 and FMA) or v4 (AVX-512)."""
+    backend: Literal["auto", "cpu", "cuda"] = "cpu"
+    """What ``backend.open_rasteriser`` opens; ``Rasteriser`` itself is the CPU."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloudGradient:
+    """Gradient of a scalar with respect to each array of a ``GaussianCloud``."""
+
+    means_m: Float32[np.ndarray, "num_splats 3"]
+    quats_wxyz: Float32[np.ndarray, "num_splats 4"]
+    scales_log: Float32[np.ndarray, "num_splats 3"]
+    opacities_logit: Float32[np.ndarray, " num_splats"]
+    colors: Float32[np.ndarray, "num_splats 3"]
+    harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"]
+    T_camera_base: Float[np.ndarray, "3 4"]
+    """With respect to the twelve entries of the upper part of that matrix, the camera centre of
+    the viewing directions being -R^T t of them."""
+
+
+def native_camera(
+    camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
+) -> tuple[Float32[np.ndarray, "3 4"], tuple[int, int, float, float, float, float]]:
+    """Pose and intrinsics as the extension takes them."""
+    intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return as_float32(se3.invert(T_base_camera)[:3]), intrinsics
+
+
+NAMES = ("means_m", "quats_wxyz", "scales_log", "opacities_logit", "colors", "harmonics")
+STAGES = ("draw", "compare", "pull", "learn")
+UNIT_GAIN = (1.0, 1.0, 1.0)
+
+Moments = Mapping[str, tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepReport:
+    """What one step found, before it changed the cloud."""
+
+    loss: float
+    mse: float | None
+    """Mean squared colour error over the static pixels; None when there are none."""
+    gain: Float[np.ndarray, "3"]
+    """Gradient of the loss on the gain."""
+    T_camera_base: Float[np.ndarray, "3 4"]
+    """Gradient of the loss on the camera's pose, as in ``CloudGradient``."""
+    seconds: Mapping[str, float]
+    """Wall time of each stage: draw, compare, pull, learn."""
+    serial_s: float
+    """How much of it one thread spent alone: by Amdahl's law it bounds what more threads gain."""
+
+
+class FitSession:
+    """A cloud being fitted, with the moments of Adam (Kingma and Ba 2015).
+
+    Loss as in ``losses.Loss``: ``3dgs`` is 0.8 L1 + 0.2 (1 - SSIM), ``paper`` the squared error
+    (Eq. 3), both with ``depth_weight`` times the L1 depth error relative to depth. Same bits for
+    any number of threads.
+    """
+
+    def __init__(
+        self,
+        cloud: GaussianCloud,
+        config: RasterConfig | None = None,
+        *,
+        loss: Literal["3dgs", "paper"] = "3dgs",
+        depth_weight: float = 0.1,
+        l1_share: float = 0.8,
+    ) -> None:
+        """Copy the cloud; moments start at zero."""
+        self.config = config or RasterConfig()
+        self.steps = 0
+        self._loss = (loss == "3dgs", l1_share, depth_weight)
+        self._native = load_native().FitSession(self.config.threads, self.config.isa)
+        self._cloud = _own_copy(cloud)
+        self._first = {name: np.zeros_like(rows) for name, rows in arrays(cloud)}
+        self._second = {name: np.zeros_like(rows) for name, rows in arrays(cloud)}
+
+    @property
+    def moments(self) -> Moments:
+        """Adam's running means of the gradient and of its square, by array; they change too."""
+        return {name: (self._first[name], self._second[name]) for name in self._first}
+
+    def resume(self, moments: Moments, steps: int) -> None:
+        """Take up a fit where another session of the same cloud left it.
+
+        Args:
+            moments: Copied.
+            steps: How many steps that session had made.
+        """
+        self._first = {name: as_float32(first).copy() for name, (first, _) in moments.items()}
+        self._second = {name: as_float32(second).copy() for name, (_, second) in moments.items()}
+        self.steps = steps
+
+    @property
+    def cloud(self) -> GaussianCloud:
+        """The cloud as it is now. Its arrays change with each step, and may be written to."""
+        return self._cloud
+
+    def step(
+        self,
+        target: Target,
+        T_base_camera: Float[np.ndarray, "4 4"],
+        rates: Mapping[str, float],
+        gain: Float[np.ndarray, "3"] | tuple[float, float, float] = UNIT_GAIN,
+    ) -> StepReport:
+        """Draw one view, compare it with what was seen, and follow the gradient.
+
+        Args:
+            target: Image, depth and static mask at the camera's size.
+            T_base_camera: Where it was seen from.
+            rates: Adam's step size for each array by name; arrays without one stay as they are,
+                and so do their moments.
+            gain: The drawn colours times these are compared with the image.
+        """
+        self.steps += 1
+        red, green, blue = (float(value) for value in gain)
+        loss, squared, num_static, d_gain, d_pose, seconds, serial_s = self._native.step(
+            self._tables(dict(arrays(self._cloud))),
+            self._tables(self._first),
+            self._tables(self._second),
+            *native_camera(target.camera, T_base_camera),
+            self.config.alpha_cut,
+            self.config.transmittance_stop,
+            target.planes_u8,
+            target.depth_m,
+            target.static_mask,
+            (red, green, blue),
+            self._loss,
+            tuple(float(rates.get(name, 0.0)) for name in NAMES),
+            self.steps,
+        )
+        return StepReport(
+            loss=loss,
+            mse=squared / (3 * num_static) if num_static else None,
+            gain=np.array(d_gain),
+            T_camera_base=d_pose,
+            seconds=dict(zip(STAGES, seconds, strict=True)),
+            serial_s=serial_s,
+        )
+
+    def planes(self) -> Float32[np.ndarray, "5 height width"]:
+        """A copy of what the last step drew, before gain."""
+        drawn: np.ndarray = self._native.planes()
+        return drawn
+
+    def gradient(self, report: StepReport) -> CloudGradient:
+        """A copy of the last step's gradient; ``report`` is that step's."""
+        named = dict(zip(NAMES, self._native.gradients(), strict=True))
+        return CloudGradient(**named, T_camera_base=report.T_camera_base)
+
+    def visible_mask(self) -> Bool[np.ndarray, " num_splats"]:
+        """Say which Gaussians could touch the last image."""
+        mask: np.ndarray = self._native.visible()
+        return mask
+
+    def rearrange(
+        self, cloud: GaussianCloud, parents: Int64[np.ndarray, " num_splats"] | None = None
+    ) -> None:
+        """Go on with another cloud.
+
+        Args:
+            cloud: Copied.
+            parents: For each of its Gaussians the row of the present cloud whose moments it goes
+                on with, or -1 for none; nothing given: none for all.
+        """
+        rows_from = np.full(len(cloud), -1) if parents is None else parents
+        self._first = _carried(self._first, cloud, rows_from)
+        self._second = _carried(self._second, cloud, rows_from)
+        self._cloud = _own_copy(cloud)
+
+    @staticmethod
+    def _tables(named: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, ...]:
+        return tuple(named.get(name) for name in NAMES)
+
+
+def _own_copy(cloud: GaussianCloud) -> GaussianCloud:
+    return GaussianCloud(**{name: as_float32(rows).copy() for name, rows in arrays(cloud)})
+
+
+def _carried(
+    moments: Mapping[str, np.ndarray], cloud: GaussianCloud, parents: np.ndarray
+) -> dict[str, np.ndarray]:
+    carried = {name: np.zeros_like(rows) for name, rows in arrays(cloud)}
+    known = parents >= 0
+    for name, rows in carried.items():
+        if name in moments:
+            rows[known] = moments[name][parents[known]]
+    return carried
+
 
 __all__ = [
     "NUM_PLANES",
@@ -160,3 +403,68 @@ def view_of_planes(planes: Float32[np.ndarray, "5 height width"]) -> View:
         depth_m=depth.astype(np.float32),
         alpha=alpha,
     )
+
+
+# --- What the fit minimises, with its gradient on the drawn planes.
+
+L1_SHARE = 0.8
+"""0.8 L1 + 0.2 (1 - SSIM), as in 3D Gaussian splatting (Kerbl et al. 2023, Eq. 7)."""
+
+
+class Loss:
+    """Photometric and depth loss of one drawn image.
+
+    ``paper`` is the paper's Eq. 3 without the feature term: mean squared error plus
+    ``depth_weight`` times the L1 depth error. ``3dgs`` replaces the squared error.
+    Depth counts only where it was measured, relative to the depth itself because a sensor's
+    error grows with distance: |sum w z - alpha d| / d.
+    """
+
+    def __init__(
+        self, kind: Literal["3dgs", "paper"], *, depth_weight: float, threads: int = 0
+    ) -> None:
+        """Choose the photometric term."""
+        self.kind = kind
+        self.depth_weight = depth_weight
+        self._similarity = load_native().Similarity(threads, "auto")
+
+    def __call__(
+        self,
+        planes: Float32[np.ndarray, "5 height width"],
+        target: Float32[np.ndarray, "3 height width"],
+        depth_m: Float32[np.ndarray, "height width"],
+    ) -> tuple[float, float, Float32[np.ndarray, "5 height width"]]:
+        """Return the loss, the mean squared colour error, and the gradient on the planes."""
+        gradient = np.empty_like(planes)
+        difference = planes[:3] - target
+        mse = float(np.square(difference).mean())
+        if self.kind == "paper":
+            value = mse
+            np.multiply(difference, 2.0 / difference.size, out=gradient[:3])
+        else:
+            similarity, d_similarity = self._similarity.mean(planes[:3], target)
+            value = L1_SHARE * float(np.abs(difference).mean())
+            value += (1 - L1_SHARE) * (1 - similarity)
+            np.sign(difference, out=gradient[:3])
+            gradient[:3] *= L1_SHARE / difference.size
+            gradient[:3] -= (1 - L1_SHARE) * d_similarity
+        value += self._depth(planes, depth_m, gradient)
+        return value, mse, gradient
+
+    def _depth(self, planes: np.ndarray, depth_m: np.ndarray, gradient: np.ndarray) -> float:
+        gradient[3:NUM_PLANES] = 0.0
+        valid = depth_m > 0
+        count = int(valid.sum())
+        if self.depth_weight == 0 or count == 0:
+            return 0.0
+        inverse = np.divide(1.0, depth_m, out=np.zeros_like(depth_m), where=valid)
+        residual = planes[3] * inverse - planes[4] * valid
+        sign = np.sign(residual) * np.float32(self.depth_weight / count)
+        gradient[3] = sign * inverse
+        gradient[4] = -sign * valid
+        return self.depth_weight * float(np.abs(residual).sum()) / count
+
+
+def psnr_db(mse: float) -> float:
+    """Peak signal-to-noise ratio for images in 0..1 [dB]; infinite for identical images."""
+    return float("inf") if mse == 0 else -10.0 * float(np.log10(mse))

@@ -7,11 +7,11 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from bridge.episode import provenance, streams
-from twin.scene.fit.run import FitResult
+from twin.scene.dataset.training_set import TrainingSet
+from twin.scene.fit.optimise import FitResult
 from twin.scene.frames.camera_poses import SAYS
-from twin.scene.frames.choice import FrameChoice, Sources, root_frame
-from twin.scene.learn.read import Learnt
-from twin.scene.rebuild.view_numbers import MOST_DB
+from twin.scene.frames.selection import FrameChoice, Sources, root_frame
+from twin.scene.rebuild.views import MOST_DB
 from twin.scene.settings import FrameConfig, RebuildConfig
 from twin.scene.store.folder import BACKGROUND, SCENE_VERSION
 
@@ -49,7 +49,7 @@ def make_record(
     scene_hash: str,
     sources: Sources,
     left_out: Sequence[str],
-    learnt: Learnt,
+    learnt: TrainingSet,
     config: RebuildConfig,
     fitted: FitResult,
     views: Mapping[str, Any],

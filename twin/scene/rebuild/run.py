@@ -19,22 +19,26 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import BridgeError, UsageError
 from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output
+from twin.scene.dataset.training_set import TrainingSet, learn, limits_of, with_fitted_poses
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.run import FitResult, fit
-from twin.scene.fit.state import FIT_STATE, Checkpoint
+from twin.scene.fit.optimise import FIT_STATE, Checkpoint, FitResult, fit
 from twin.scene.foundation.complete import complete_shapes
 from twin.scene.foundation.stage import check_models
-from twin.scene.frames.choice import FrameChoice, Sources, choose_with_reasons, find_sources
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32, concatenate, with_harmonics
-from twin.scene.gaussians.moved import moved_cloud
-from twin.scene.learn.read import Learnt, learn, limits_of, with_fitted_poses
-from twin.scene.objects.parts import TakenApart, episode_of_task, take_apart
+from twin.scene.frames.selection import FrameChoice, Sources, choose_with_reasons, find_sources
+from twin.scene.gaussians import (
+    GaussianCloud,
+    as_float32,
+    concatenate,
+    moved_cloud,
+    with_harmonics,
+    write_ply,
+)
+from twin.scene.objects.decompose import Decomposition, decompose, episode_of_task
 from twin.scene.raster.rasteriser import RasterConfig, load_native
 from twin.scene.rebuild.record import Cost, make_record, protocol_of
 from twin.scene.rebuild.semantics import write_scene_semantics
-from twin.scene.rebuild.view_numbers import summarise_views
-from twin.scene.rebuild.views import ENGINE, ViewsJob, views_path, write_views
-from twin.scene.robot.stage import DrivenRobot, write_robot
+from twin.scene.rebuild.views import ENGINE, ViewsJob, summarise_views, views_path, write_views
+from twin.scene.robot.extraction import DrivenRobot, write_robot
 from twin.scene.settings import RebuildConfig
 from twin.scene.store.calibration import Calibration, read_calibration
 from twin.scene.store.folder import (
@@ -44,7 +48,6 @@ from twin.scene.store.folder import (
     read_record,
     write_record,
 )
-from twin.scene.store.ply import write_ply
 
 METHOD_VERSION = 20
 """Counts changes of method that make older scenes out of date."""
@@ -110,7 +113,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     learnt = with_fitted_poses(learnt, fitted.Ts_base_color)
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
-    apart = take_apart(sources, fitted.cloud, learnt.choices, learnt.views, complete, output)
+    apart = decompose(sources, fitted.cloud, learnt.choices, learnt.views, complete, output)
     if apart.remark:
         output.say(apart.remark)
     write_ply(run.scene_dir / BACKGROUND, apart.background)
@@ -149,7 +152,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     return record
 
 
-def _fit(learnt: Learnt, config: RebuildConfig, kept: Checkpoint, output: Output) -> FitResult:
+def _fit(learnt: TrainingSet, config: RebuildConfig, kept: Checkpoint, output: Output) -> FitResult:
     began_s = time.monotonic()
     first = fuse(learnt.points, config.initialise)
     output.say(f"{len(first)} Gaussians from {len(learnt.views)} training frames")
@@ -167,9 +170,9 @@ def _fit(learnt: Learnt, config: RebuildConfig, kept: Checkpoint, output: Output
 
 def _hold_out(
     run: RunFolder,
-    learnt: Learnt,
+    learnt: TrainingSet,
     fitted: FitResult,
-    apart: TakenApart,
+    apart: Decomposition,
     links: Mapping[str, GaussianCloud],
     config: RebuildConfig,
     clock: _Clock,
@@ -198,7 +201,7 @@ def _hold_out(
     return summarise_views(numbers, _remove_stale_views(run, choices, job.scene_hash))
 
 
-def _marked_objects(apart: TakenApart) -> GaussianCloud | None:
+def _marked_objects(apart: Decomposition) -> GaussianCloud | None:
     """The scene with its objects white and all else black: where they show in a view."""
     objects = {} if apart.parts is None else apart.parts.objects
     if not objects:

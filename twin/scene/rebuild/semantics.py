@@ -1,26 +1,218 @@
 """Semantics as a stage of ``rebuild``."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bridge.episode.streams import RgbdFrame
 from bridge.task.task_file import Task
-from bridge.terminal import Output
-from twin.scene.foundation.consult import consult
-from twin.scene.frames.choice import FrameChoice
-from twin.scene.frames.training_view import TrainingView
-from twin.scene.gaussians.cloud import concatenate
-from twin.scene.gaussians.moved import moved_cloud
-from twin.scene.objects.parts import TakenApart
-from twin.scene.semantics.add import add_semantics
+from bridge.terminal import Advance, Output
+from twin.scene.foundation.stage import ModelFindings, ask_models, embed_things, spread
+from twin.scene.frames.rgbd import TrainingView
+from twin.scene.frames.selection import FrameChoice, load
+from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
+from twin.scene.objects.decompose import Decomposition
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.semantics.describe import scene_by_default, scene_from_masks
+from twin.scene.semantics.features import FEATURES_FILE, SceneFeatures, save_features
 from twin.scene.semantics.lift import Viewpoint
-from twin.scene.semantics.store import BACKGROUND_KEY
+from twin.scene.semantics.result import MaskSet, SemanticScene, SemanticsError
+from twin.scene.semantics.segment import SOURCE
+from twin.scene.semantics.store import (
+    BACKGROUND_KEY,
+    SEMANTICS_FILE,
+    read_semantics,
+    write_semantics,
+)
 from twin.scene.settings import ModelConfig
+
+# --- The one call of ``rebuild``: say what is what, and write it beside the splats.
+
+MAX_VIEWPOINTS = 24
+"""Frames that count support; more are thinned out evenly."""
+
+
+def add_semantics(
+    folder: Path,
+    background: GaussianCloud,
+    objects: Mapping[str, GaussianCloud],
+    viewpoints: Sequence[Viewpoint],
+    *,
+    masks: Sequence[tuple[Viewpoint, MaskSet]] = (),
+    features: SceneFeatures | None = None,
+    robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
+    surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
+    threads: int = 0,
+    advance: Advance = lambda done, note: None,
+) -> dict[str, Any]:
+    """Segment a scene and write ``semantics.npz`` (and ``features.npz``) into its folder.
+
+    Nothing found, or masks that do not fit, is a remark, not an error: the scene is good without.
+
+    Args:
+        folder: The scene folder.
+        background: What ``background.ply`` holds.
+        objects: What ``objects/<id>/gaussians.ply`` hold, moved to where they were scanned; without
+            masks each is an instance of that name.
+        viewpoints: Training frames, to count in how many an instance shows.
+        masks: Masks of a 2D segmenter; without any the default segmenter looks at the Gaussians.
+        features: Features of the same Gaussians, background first.
+        robot_m: Points on the robot where it stood, to leave it out.
+        surfaces_m: Points of the objects' reconstructed surfaces where they stand: their parts are
+            told apart on these.
+        threads: For drawing; 0: all cores.
+        advance: Told the percentage done.
+
+    Returns:
+        What ``scene.json`` says under ``semantics``.
+    """
+    cloud = concatenate([background, *objects.values()])
+    rows = {BACKGROUND_KEY: len(background)} | {key: len(part) for key, part in objects.items()}
+    rasteriser = Rasteriser(RasterConfig(threads=threads))
+    try:
+        if masks:
+            scene = scene_from_masks(cloud, masks, rasteriser, advance=advance)
+        else:
+            step = -(-len(viewpoints) // MAX_VIEWPOINTS) or 1
+            known = {key: _rows(rows, key) for key in objects}
+            scene = scene_by_default(
+                cloud,
+                viewpoints[::step],
+                rasteriser,
+                robot_m=robot_m,
+                known=known,
+                surfaces_m=surfaces_m,
+                advance=advance,
+            )
+    except SemanticsError as error:
+        nothing = np.zeros(len(cloud), dtype=np.uint16)
+        source = masks[0][1].source if masks else SOURCE
+        scene = SemanticScene(instances=(), labels=nothing, source=source, remark=str(error))
+    for name in (SEMANTICS_FILE, FEATURES_FILE):
+        (folder / name).unlink(missing_ok=True)
+    record = write_semantics(folder, scene, rows)
+    if features is not None:
+        if len(features.features) != len(cloud):
+            told = f"features of {len(features.features)} Gaussians for {len(cloud)}: left out"
+            return record | {"features": None, "features_remark": told}
+        record["features"] = {
+            "file": save_features(folder, features).name,
+            "source": features.source,
+            "num_kept": len(features.basis.components),
+            "explained_fraction": round(features.basis.explained_fraction, 4),
+        }
+    return record
+
+
+def _rows(rows: Mapping[str, int], key: str) -> Bool[np.ndarray, " num_splats"]:
+    """Which Gaussians of the whole scene are one part's."""
+    return np.repeat([name == key for name in rows], list(rows.values()))
+
+
+# --- The calls of ``rebuild``: ask the models before semantics is written, give vectors after.
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelAnswers:
+    """What the models said, and what they will be asked again."""
+
+    config: ModelConfig
+    frames: list[RgbdFrame]
+    """Training frames that were looked at; empty when no model is named."""
+    findings: ModelFindings
+
+    def give_vectors(
+        self,
+        folder: Path,
+        rows: Mapping[str, int],
+        cloud: GaussianCloud,
+        output: Output,
+        *,
+        threads: int = 0,
+    ) -> dict[str, Any]:
+        """Write the CLIP vectors of the things that ``semantics.npz`` holds.
+
+        Args:
+            folder: The scene folder, its semantics written.
+            rows: Gaussians of the background and of each object, as they were written.
+            cloud: All of them, in that order.
+            output: Shows how far it is.
+            threads: For drawing; 0: all cores.
+
+        Returns:
+            What ``scene.json`` says about it, under ``vectors``; nothing without CLIP.
+        """
+        if not self.config.clip:
+            return {}
+        scene = read_semantics(folder, rows)
+        features = self.findings.features
+        with output.progress("give things vectors", len(scene.instances)) as advance:
+            about = embed_things(
+                folder,
+                scene,
+                cloud,
+                self.frames,
+                features,
+                self.config,
+                threads=threads,
+                advance=advance,
+            )
+        return {"vectors": about}
+
+
+def ask_models_about(
+    config: ModelConfig,
+    choices: Sequence[FrameChoice],
+    cloud: GaussianCloud,
+    task: Task | None,
+    output: Output,
+    *,
+    threads: int = 0,
+) -> ModelAnswers:
+    """Ask segmenter and feature model about training frames; nothing when none is named.
+
+    Args:
+        config: Which models.
+        choices: The training frames, with the poses the fit ended with.
+        cloud: All Gaussians of the scene.
+        task: Names what to look for when no prompts are given.
+        output: Shows how far it is.
+        threads: For lifting; 0: all cores.
+
+    Raises:
+        UsageError: When a folder, prompt or device cannot be used.
+        MissingDependencyError: When the extra ``foundation`` is not installed.
+    """
+    num_models = bool(config.segmenter) + bool(config.features)
+    if not num_models and not config.clip:
+        nothing = ModelFindings(masks=[], features=None)
+        return ModelAnswers(config=config, frames=[], findings=nothing)
+    frames = training_frames(choices, config.model_frames)
+    with output.progress("ask the models", num_models * len(frames)) as advance:
+        findings = ask_models(config, frames, cloud, task, threads=threads, advance=advance)
+    num_masks = sum(len(masks.masks) for _, masks in findings.masks)
+    if config.segmenter:
+        output.say(f"{num_masks} masks in {len(frames)} frames")
+    return ModelAnswers(config=config, frames=frames, findings=findings)
+
+
+def training_frames(choices: Sequence[FrameChoice], count: int) -> list[RgbdFrame]:
+    """Read at most ``count`` training frames, spread evenly over episodes, cameras and time."""
+    numbered = [(index, ns) for index, each in enumerate(choices) for ns in sorted(each.train_ns)]
+    chosen = {numbered[place] for place in spread(range(len(numbered)), count)}
+    frames: list[RgbdFrame] = []
+    for index, each in enumerate(choices):
+        frames += load(each, frozenset(ns for owner, ns in chosen if owner == index))
+    return frames
 
 
 def write_scene_semantics(
     folder: Path,
-    apart: TakenApart,
+    apart: Decomposition,
     views: Sequence[TrainingView],
     threads: int,
     output: Output,
@@ -51,7 +243,7 @@ def write_scene_semantics(
     placed = {key: moved_cloud(item.cloud, item.T_base_object) for key, item in objects.items()}
     cloud = concatenate([apart.background, *placed.values()])
     output.say(f"name what is in the scene: {len(cloud)} Gaussians, {len(objects)} objects known")
-    asked = consult(models or ModelConfig(), choices, cloud, task, output, threads=threads)
+    asked = ask_models_about(models or ModelConfig(), choices, cloud, task, output, threads=threads)
     with output.progress("name things", 100) as advance:
         record = add_semantics(
             folder,

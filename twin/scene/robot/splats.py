@@ -17,9 +17,7 @@ from bridge.geometry import se3
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import Posture
 from twin.robot.surface import PosedSurface, fixed_links, link_poses
-from twin.scene.gaussians.cloud import GaussianCloud, concatenate
-from twin.scene.gaussians.moved import moved_cloud
-from twin.scene.store.ply import read_ply, write_ply
+from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud, read_ply, write_ply
 
 FOLDER = "robot"
 BOUND_M = 0.015
@@ -51,7 +49,7 @@ def bind(
     """
     robot, posture = load_robot(urdf), Posture(joints_rad=joints_rad, width_m=width_m)
     surface = PosedSurface(robot, posture)
-    owner = owners(surface, cloud.means_m.astype(np.float64))
+    owner = splat_links(surface, cloud.means_m.astype(np.float64))
     poses = link_poses(robot, posture)
     links = sorted({surface.links[index] for index in owner[owner >= 0]})
     numbers = np.array(surface.links)
@@ -93,7 +91,7 @@ def posed(
     return concatenate(placed) if placed else _empty()
 
 
-def owners(
+def splat_links(
     surface: PosedSurface, p_base: Float[np.ndarray, "num_points 3"]
 ) -> Int64[np.ndarray, " num_points"]:
     """Index in ``surface.links`` of the nearest shape within 15 mm, or -1."""
@@ -104,13 +102,13 @@ def owners(
     return owner
 
 
-def surface_owners(
+def surface_links(
     robot: RobotModel,
     surface: PosedSurface,
     p_base: Float[np.ndarray, "num_points 3"],
     normals: Float[np.ndarray, "num_points 3"],
 ) -> Int64[np.ndarray, " num_points"]:
-    """Like ``owners``, but the table around a link that never moves is not taken for the link.
+    """Like ``splat_links``, but the table around a link that never moves is not taken for the link.
 
     Everything beside a moving link will be seen by itself in another posture. Beside the base it
     never will, so there a point must lie along its own normal from the link.

@@ -1,14 +1,17 @@
 """Points in voxels, and voxels that hang together."""
 
+import heapq
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from twin.scene.semantics.colour import lab_from_srgb
+from twin.scene.semantics.colour import lab_from_srgb, without_shading
+from twin.scene.semantics.shape_descriptors import find_height_map_cavity, height_map, measure_form
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,3 +125,302 @@ def make_patches(
     normals = means_of(voxels.normals, patch, num)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return patch, means_of(voxels.p_m, patch, num), normals / np.maximum(length, 1e-9)
+
+
+# --- Cut things that touch along valleys where both sides stand on their own, and join what is
+# one.
+#
+# ``split_colour`` cuts them by colour before.
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValleySplitConfig:
+    """When one connected group is several things."""
+
+    max_colours: int = 4
+    """Colours to look for in one group."""
+    lightness_weight: float = 0.3
+    """Shading changes lightness, not the ratios of a and b to it."""
+    colour_noise: float = 5.0
+    """Spread of one colour, in Lab units; groups tighter than this gain nothing by a cut."""
+    min_colour_gap: float = 20.0
+    """Distance between two colours that may be two things."""
+    samples_per_voxel: float = 0.05
+    """Neighbouring voxels are alike: so many independent samples each counts for."""
+    min_piece_fraction: float = 0.25
+    """Of the larger neighbour; smaller pieces are its markings, unless they lie in its cavity."""
+    valley: float = 0.3
+    """(n_j - n_i) . d below minus this is a valley: 0.3 is an edge of about 17 degrees."""
+    patch_voxels: float = 3.0
+    """Size of the patches between which valleys are looked for."""
+    min_valley_fraction: float = 0.15
+    """Smallest share of a piece that is cut off along a valley."""
+    touch_m: float = 0.015
+    """A piece whose lowest points are below this stands on the plane."""
+    max_overlap_fraction: float = 0.35
+    """Of a piece's outline seen from above, within the other's."""
+
+
+def split_by_valleys(
+    voxels: Voxels,
+    height_m: Float[np.ndarray, " num_voxels"],
+    pairs: Int[np.ndarray, "num_pairs 2"],
+    voxel_m: float,
+    config: ValleySplitConfig,
+) -> Int[np.ndarray, " num_voxels"]:
+    """Number the pieces of one connected group that valleys separate.
+
+    Local convexity as in Stein et al. 2014 (LCCP) between small patches. A neck or an armpit is
+    a valley too, so a cut counts only between pieces that each stand on the plane and whose
+    outlines seen from above hardly overlap: heads, handles and the floor of a box stay.
+    """
+    patch, p, normals = make_patches(voxels, config.patch_voxels * voxel_m)
+    links = np.sort(patch[pairs], axis=1)
+    links = np.unique(links[links[:, 0] != links[:, 1]], axis=0)
+    away = p[links[:, 1]] - p[links[:, 0]]
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    bend = ((normals[links[:, 1]] - normals[links[:, 0]]) * away).sum(axis=1)
+    pieces = _merged(len(p), links, bend, -config.valley)[patch]
+    while True:
+        merge = _first_dependent(pieces, voxels.p_m, height_m, pairs, config)
+        if merge is None:
+            return numbered(pieces)
+        pieces = np.where(pieces == merge[0], merge[1], pieces)
+
+
+def _merged(
+    num_patches: int,
+    links: Int[np.ndarray, "num_links 2"],
+    bend: Float[np.ndarray, " num_links"],
+    least: float,
+) -> Int[np.ndarray, " num_patches"]:
+    """Join neighbours, the most convex border first, until every border is a valley.
+
+    A border counts by the mean of its links: one convex link, where noise bridges a valley, does
+    not join what the rest of the border tells apart.
+    """
+    borders: list[dict[int, tuple[float, int]]] = [{} for _ in range(num_patches)]
+    for (a, b), value in zip(links.tolist(), bend.tolist(), strict=True):
+        borders[a][b] = borders[b][a] = (value, 1)
+    queue = [(-value, a, b) for (a, b), value in zip(links.tolist(), bend.tolist(), strict=True)]
+    heapq.heapify(queue)
+    owner = list(range(num_patches))
+    while queue and -queue[0][0] > least:
+        cost, a, b = heapq.heappop(queue)
+        total, count = borders[a].get(b, (np.nan, 1))
+        if -cost != total / count:
+            continue  # an older state of this border
+        if len(borders[a]) < len(borders[b]):
+            a, b = b, a
+        owner[b] = a
+        for other, (value, number) in borders[b].items():
+            del borders[other][b]
+            if other != a:
+                old = borders[a].get(other, (0.0, 0))
+                new = (old[0] + value, old[1] + number)
+                borders[a][other] = borders[other][a] = new
+                heapq.heappush(queue, (-new[0] / new[1], a, other))
+        borders[b] = {}
+    for patch in range(num_patches):
+        root = patch
+        while owner[root] != root:
+            root = owner[root]
+        owner[patch] = root
+    return numbered(np.array(owner, dtype=np.int64))
+
+
+def joined_by_outline(
+    pieces: Sequence[Int[np.ndarray, " _"]],
+    voxels: Voxels,
+    height_m: Float[np.ndarray, " num_voxels"],
+    voxel_m: float,
+    config: ValleySplitConfig,
+) -> list[Int[np.ndarray, " _"]]:
+    """Join pieces of one colour of which one lies over the other, or that make a container.
+
+    What one camera sees of a thing may fall into pieces: the far wall of a box behind the near
+    one, a head in front of its body.
+    """
+    xyh = np.concatenate([voxels.p_m[:, :2], height_m[:, None]], axis=1)
+    left = sorted(pieces, key=len)
+    colours = [
+        np.median(without_shading(voxels.lab[ids], config.lightness_weight), axis=0) for ids in left
+    ]
+    joined: list[np.ndarray] = []
+    for index, ids in enumerate(left):
+        for other in range(index + 1, len(left)):
+            alike = np.linalg.norm(colours[index] - colours[other]) < config.min_colour_gap
+            if alike and _belong_together(xyh[ids], xyh[left[other]], voxel_m, config):
+                left[other] = np.concatenate([left[other], ids])
+                break
+        else:
+            joined.append(ids)
+    return joined
+
+
+def _belong_together(
+    a: np.ndarray, b: np.ndarray, voxel_m: float, config: ValleySplitConfig
+) -> bool:
+    """Whether one lies over the other, or both are beside each other and hold a cavity."""
+    if _overlap(a, b) > config.max_overlap_fraction:
+        return True
+    gap = np.maximum(a.min(axis=0), b.min(axis=0)) - np.minimum(a.max(axis=0), b.max(axis=0))
+    if max(gap[:2]) > 2 * voxel_m:
+        return False
+    return measure_form(np.concatenate([a, b]), voxel_m).cavity is not None
+
+
+def _first_dependent(
+    pieces: np.ndarray,
+    p_m: np.ndarray,
+    height_m: np.ndarray,
+    pairs: np.ndarray,
+    config: ValleySplitConfig,
+) -> tuple[int, int] | None:
+    """The smallest piece that is not a thing of its own, and the neighbour it belongs to."""
+    counts = np.bincount(pieces)
+    touch = max(config.touch_m, 0.25 * float(height_m.max()))
+    for piece in np.argsort(counts, kind="stable"):
+        if counts[piece] == 0:
+            continue
+        links = pieces[pairs]
+        links = links[(links == piece).sum(axis=1) == 1]
+        if not len(links):
+            continue
+        others, strength = np.unique(links[links != piece], return_counts=True)
+        strongest = int(others[np.argmax(strength)])
+        own = pieces == piece
+        small = counts[piece] < config.min_valley_fraction * len(pieces)
+        if small or np.quantile(height_m[own], 0.03) > touch:
+            return int(piece), strongest
+        for other in others:
+            if _overlap(p_m[own], p_m[pieces == other]) > config.max_overlap_fraction:
+                return int(piece), int(other)
+    return None
+
+
+def _overlap(a_m: np.ndarray, b_m: np.ndarray) -> float:
+    """Share of one set of points within the other's outline seen from above, the larger."""
+    return max(float(_within(a_m, b_m).mean()), float(_within(b_m, a_m).mean()))
+
+
+def _within(points: np.ndarray, outline: np.ndarray) -> Bool[np.ndarray, " num_points"]:
+    try:
+        hull = Delaunay(outline[:, :2])
+    except (QhullError, ValueError):
+        return np.zeros(len(points), dtype=bool)
+    return np.asarray(hull.find_simplex(points[:, :2]) >= 0)
+
+
+# --- Cut things that touch where their colours differ.
+
+
+def split_by_colour(
+    voxels: Voxels,
+    height_m: Float[np.ndarray, " num_voxels"],
+    pairs: Int[np.ndarray, "num_pairs 2"],
+    config: ValleySplitConfig,
+) -> Int[np.ndarray, " num_voxels"]:
+    """Number the pieces of one connected group that differ in colour.
+
+    k-means in Lab for k = 1.. with a Schwarz criterion whose noise has a floor; then connected
+    pieces of one colour. A piece much smaller than its neighbour is a marking (a beak, a label)
+    and joins it, unless it lies in the neighbour's cavity.
+    """
+    colour = without_shading(voxels.lab, config.lightness_weight)
+    classes = _colour_classes(colour, config)
+    if classes.max(initial=0) == 0:
+        return classes
+    same = classes[pairs[:, 0]] == classes[pairs[:, 1]]
+    pieces = components(len(voxels), pairs[same])
+    while True:
+        small = _smallest_marking(pieces, voxels, height_m, pairs, colour, config)
+        if small is None:
+            return numbered(pieces)
+        pieces = np.where(pieces == small[0], small[1], pieces)
+
+
+def _colour_classes(colour: np.ndarray, config: ValleySplitConfig) -> np.ndarray:
+    samples = max(config.samples_per_voxel * len(colour), 2.0)
+    best, best_cost = np.zeros(len(colour), dtype=np.int64), np.inf
+    for num in range(1, config.max_colours + 1):
+        classes, centres = _k_means(colour, num)
+        if num > 1 and _closest(centres) < config.min_colour_gap:
+            continue
+        spread = np.square(colour - centres[classes]).sum(axis=1).mean() / 3
+        variance = max(float(spread), config.colour_noise**2)
+        cost = 3 * samples * np.log(variance) + 4 * num * np.log(samples)
+        if cost < best_cost - 1e-9:
+            best, best_cost = classes, float(cost)
+    return best
+
+
+def _closest(centres: np.ndarray) -> float:
+    gaps = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    return float(gaps[np.triu_indices(len(centres), 1)].min())
+
+
+def _k_means(values: np.ndarray, num: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lloyd's iteration from the farthest points, so that the result needs no seed."""
+    centres = [np.median(values, axis=0)]
+    for _ in range(1, num):
+        gap = np.min([np.square(values - c).sum(axis=1) for c in centres], axis=0)
+        # Not the very farthest: a few mixed voxels at an edge should not seed a colour.
+        centres.append(values[np.argsort(gap, kind="stable")[int(0.98 * (len(gap) - 1))]])
+    middle = np.array(centres)
+    classes = np.zeros(len(values), dtype=np.int64)
+    for _ in range(20):
+        classes = np.square(values[:, None] - middle[None]).sum(axis=2).argmin(axis=1)
+        filled = np.bincount(classes, minlength=num) > 0
+        moved = np.where(filled[:, None], means_of(values, classes, num), middle)
+        if np.allclose(moved, middle, atol=1e-3):
+            break
+        middle = moved
+    return classes, middle
+
+
+def _smallest_marking(
+    pieces: np.ndarray,
+    voxels: Voxels,
+    height_m: np.ndarray,
+    pairs: np.ndarray,
+    colour: np.ndarray,
+    config: ValleySplitConfig,
+) -> tuple[int, int] | None:
+    """The smallest piece that is no thing of its own, and the neighbour it belongs to."""
+    counts = np.bincount(pieces)
+    for piece in np.argsort(counts, kind="stable"):
+        if counts[piece] == 0:
+            continue
+        neighbours = _neighbours(pieces, pairs, int(piece))
+        if not len(neighbours):
+            continue
+        own = colour[pieces == piece].mean(axis=0)
+        gaps = [np.linalg.norm(own - colour[pieces == other].mean(axis=0)) for other in neighbours]
+        largest = int(neighbours[np.argmax(counts[neighbours])])
+        if min(gaps) < config.min_colour_gap:
+            return int(piece), int(neighbours[int(np.argmin(gaps))])
+        if counts[piece] >= config.min_piece_fraction * counts[largest]:
+            continue
+        if counts[piece] >= 20 and _lies_in(pieces == piece, pieces == largest, voxels, height_m):
+            continue
+        return int(piece), largest
+    return None
+
+
+def _neighbours(pieces: np.ndarray, pairs: np.ndarray, piece: int) -> np.ndarray:
+    a, b = pieces[pairs[:, 0]], pieces[pairs[:, 1]]
+    return np.unique(
+        np.concatenate([b[(a == piece) & (b != piece)], a[(b == piece) & (a != piece)]])
+    )
+
+
+def _lies_in(inner: np.ndarray, outer: np.ndarray, voxels: Voxels, height_m: np.ndarray) -> bool:
+    """Whether most of one piece is over the cavity of the other."""
+    xyh = np.concatenate([voxels.p_m[:, :2], height_m[:, None]], axis=1)
+    span = float((xyh[outer].max(axis=0) - xyh[outer].min(axis=0)).max())
+    heights = height_map(xyh[outer], max(span / 32, 1e-4))
+    cavity = find_height_map_cavity(heights)
+    if cavity is None:
+        return False
+    return bool(cavity.mask[heights.cells(xyh[inner])].mean() > 0.7)

@@ -8,24 +8,29 @@ from jaxtyping import Bool, Float, Float32, UInt16
 from scipy.spatial import cKDTree
 
 from bridge.terminal import Advance
-from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import Rasteriser
-from twin.scene.semantics.associate import AssociateConfig, associate
+from twin.scene.semantics.associate import AssociateConfig, SmoothConfig, associate, smooth_shares
 from twin.scene.semantics.colour import colour_name
-from twin.scene.semantics.form import CONTAINER, measure_form
-from twin.scene.semantics.from_view import points_of, solid_splats
-from twin.scene.semantics.known import NAMED, label_of, numbered
-from twin.scene.semantics.lexicon import kind_of
+from twin.scene.semantics.language import NAMED, kind_of, label_of, numbered
 from twin.scene.semantics.lift import Viewpoint, observe, visible_weight
-from twin.scene.semantics.part_names import Parts, PartsConfig, find_parts
+from twin.scene.semantics.part_segmentation import Parts, PartsConfig, find_parts
 from twin.scene.semantics.result import Instance, MaskSet, SemanticScene
-from twin.scene.semantics.segment import SOURCE, SegmentConfig, Thing, segment_points
-from twin.scene.semantics.smooth import SmoothConfig, smooth_shares
-from twin.scene.semantics.support import (
+from twin.scene.semantics.segment import (
+    SOURCE,
+    SegmentConfig,
+    Thing,
+    points_of,
+    segment_points,
+    solid_splats,
+)
+from twin.scene.semantics.shape_descriptors import (
+    CONTAINER,
     NoSupportError,
     SupportConfig,
     SupportPlane,
     find_support,
+    measure_form,
 )
 
 CELL_M = 0.004

@@ -11,8 +11,8 @@ from jaxtyping import Float32, Int32
 
 from bridge.errors import PathNotFoundError
 from bridge.whole_file import write_whole
-from twin.scene.fit.feature_term import FeatureObservation, solve_features
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.fit.appearance import FeatureObservation, solve_features
+from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.semantics.lift import Viewpoint, camera_of_cells, lift_features
 from twin.scene.semantics.result import FeatureMap, SemanticsError

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt16
 
 from bridge.geometry.camera import Camera
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.semantics.result import FeatureMap, MaskSet, SemanticsError
 

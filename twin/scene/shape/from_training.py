@@ -20,11 +20,16 @@ from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import SCANNED, ObjectModel, Task
 from bridge.terminal import Advance
 from twin.errors import TwinError
-from twin.scene.frames.training_view import TrainingView
-from twin.scene.shape.from_mesh import shape_of_mesh
+from twin.scene.frames.rgbd import TrainingView
+from twin.scene.shape.carve import MaskedView
 from twin.scene.shape.known import surface_distances
-from twin.scene.shape.masked_view import MaskedView
-from twin.scene.shape.reconstruct import ObjectShape, ShapeConfig, moved_views, reconstruct
+from twin.scene.shape.reconstruct import (
+    ObjectShape,
+    ShapeConfig,
+    moved_views,
+    reconstruct,
+    shape_of_mesh,
+)
 from twin.scene.shape.static import StaticConfig, static_sdf
 
 STATIC_FILE = "sdf.npz"

@@ -13,10 +13,10 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from bridge.errors import refuse_outside
-from twin.scene.shape.masked_view import ShapeError
-from twin.scene.shape.npz import UnreadableArraysError, read_npz, write_npz
+from twin.scene.shape.carve import ShapeError
 from twin.scene.shape.reconstruct import ObjectShape
 from twin.scene.shape.sdf import SdfGrid
+from twin.scene.store.npz import UnreadableArraysError, read_npz, write_npz
 
 MAX_BYTES = 64_000_000
 _NAMES = ("nodes_m", "springs", "rest_lengths_m", "tets", "mass_fraction", "spacing_m")

@@ -15,12 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from bridge.errors import refuse_outside
-from twin.scene.frames.training_view import TrainingView
-from twin.scene.shape.carve import Evidence, gather
-from twin.scene.shape.masked_view import MaskedView, ShapeError
-from twin.scene.shape.npz import UnreadableArraysError, read_npz, write_npz
+from twin.scene.frames.rgbd import TrainingView
+from twin.scene.shape.carve import Evidence, MaskedView, ShapeError, VoxelBox, gather
 from twin.scene.shape.sdf import MAX_VOXELS, SdfGrid, distances_of_solid
-from twin.scene.shape.voxels import VoxelBox
+from twin.scene.store.npz import UnreadableArraysError, read_npz, write_npz
 
 FREE, SURFACE, UNSEEN = 0, 1, 2
 MIN_POINTS = 100

@@ -44,7 +44,7 @@ class UnreadableCalibrationError(TwinError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraPlace:
+class MountedCamera:
     """Where one camera is mounted."""
 
     link: str
@@ -75,7 +75,7 @@ class Calibration:
     """The content of ``calibration.json``."""
 
     record: Mapping[str, Any]
-    cameras: Mapping[str, CameraPlace]
+    cameras: Mapping[str, MountedCamera]
 
     @property
     def calibration_id(self) -> str:
@@ -104,13 +104,13 @@ def read_calibration(run: RunFolder) -> Calibration | None:
     return Calibration(record=record, cameras=cameras)
 
 
-def _place(record: Mapping[str, Any]) -> CameraPlace:
+def _place(record: Mapping[str, Any]) -> MountedCamera:
     pose = record["T_link_camera"]
     q, p = np.array(pose["q_wxyz"], dtype=np.float64), np.array(pose["p_m"], dtype=np.float64)
     if q.shape != (4,) or p.shape != (3,) or not np.isfinite([*q, *p]).all() or not q.any():
         message = f"a pose that is none: {pose}"
         raise ValueError(message)
-    return CameraPlace(
+    return MountedCamera(
         link=str(record["link"]),
         stream=str(record["stream"]),
         T_link_camera=se3.transform_from(q, p),
@@ -185,7 +185,7 @@ def _store(run: RunFolder, content: Mapping[str, Any]) -> dict[str, Any]:
 def calibrated_tree(
     episode: Episode,
     camera_id: str,
-    place: CameraPlace,
+    place: MountedCamera,
     stamps_ns: Int[np.ndarray, " num_frames"],
 ) -> TransformTree:
     """Pose a camera's colour and depth frames in the robot's base at some instants.
@@ -205,7 +205,7 @@ def calibrated_tree(
 
 
 def mounted_tree(
-    place: CameraPlace,
+    place: MountedCamera,
     frames: tuple[str, str],
     tree: TransformTree,
     stamps_ns: Int[np.ndarray, " num_frames"],
@@ -237,7 +237,7 @@ def mounted_tree(
 
 
 def _links(
-    place: CameraPlace, stamps_ns: Int[np.ndarray, " num_frames"], track: PostureTrack | None
+    place: MountedCamera, stamps_ns: Int[np.ndarray, " num_frames"], track: PostureTrack | None
 ) -> list[np.ndarray]:
     if track is None:
         return [np.eye(4)] * len(stamps_ns)
@@ -246,7 +246,7 @@ def _links(
 
 
 def without_joints(
-    episode: Episode, place: CameraPlace, stamps_ns: Int[np.ndarray, " num_frames"]
+    episode: Episode, place: MountedCamera, stamps_ns: Int[np.ndarray, " num_frames"]
 ) -> frozenset[int]:
     """Those of some instants at which nobody recorded where the hand that carries a camera was.
 

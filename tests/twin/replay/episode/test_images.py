@@ -33,11 +33,10 @@ from twin.replay.rebuilt_scene import Correction
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
 from twin.robot.model import load_robot
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.gaussians import GaussianCloud, as_float32, write_ply
 from twin.scene.robot.splats import write_links
 from twin.scene.store.calibration import write_calibration
 from twin.scene.store.folder import background_hash, write_record
-from twin.scene.store.ply import write_ply
 
 T0 = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000

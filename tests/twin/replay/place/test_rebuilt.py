@@ -13,10 +13,10 @@ from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
 from twin.replay.rebuilt_scene import TASK_SHAPE, physics_for, read_rebuilt_scene, shape_hashes
 from twin.scene.shape.lattice import Lattice
-from twin.scene.shape.npz import UnreadableArraysError
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import StaticSdf
 from twin.scene.store.calibration import Calibration
+from twin.scene.store.npz import UnreadableArraysError
 
 TASK = load_task("sloth_into_basket")
 

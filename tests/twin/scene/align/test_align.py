@@ -9,12 +9,15 @@ import pytest
 from bridge.geometry import se3
 from twin.robot.posture import Posture
 from twin.robot.surface import PosedSurface, sample_surface
-from twin.scene.align.align import AlignConfig, RobotNotAlignedError, align_robot
-from twin.scene.align.judge import look
-from twin.scene.align.plane import find_planes
-from twin.scene.align.refine import Place, Stage, refine
-from twin.scene.align.search import search
-from twin.scene.align.view import RobotView
+from twin.scene.align.align import (
+    AlignConfig,
+    RobotNotAlignedError,
+    align_robot,
+    depth_errors,
+    search,
+)
+from twin.scene.align.refine import AnnealingStep, ScenePose, refine
+from twin.scene.align.view import RobotView, find_planes
 
 TWO = cell_views.POSTURES[:2]
 BIASED = cell_views.CellErrors(depth_scale=1.01)
@@ -180,10 +183,10 @@ def test_two_places_that_fit_alike_are_refused(
 
 def test_a_place_that_shows_little_does_not_win(exact: list[RobotView]) -> None:
     surfaces = [PosedSurface(cell_views.robot(), view.posture) for view in exact]
-    right = look(exact, surfaces, Place(T_base_source=np.eye(4)))
+    right = depth_errors(exact, surfaces, ScenePose(T_base_source=np.eye(4)))
     away = np.eye(4)
     away[:3, 3] = (0.0, 0.0, 30.0)
-    wrong = look(exact, surfaces, Place(T_base_source=away))
+    wrong = depth_errors(exact, surfaces, ScenePose(T_base_source=away))
     least = len(right.errors_m) // 2
     assert right.fitness > 0.95
     assert wrong.fitness == 0.0
@@ -193,8 +196,8 @@ def test_a_place_that_shows_little_does_not_win(exact: list[RobotView]) -> None:
 def test_the_equations_are_the_derivative_of_the_residual(exact: list[RobotView]) -> None:
     """Broken derivatives converge slowly: one narrow stage must reach the optimum in few steps."""
     surfaces = [PosedSurface(cell_views.robot(), view.posture) for view in exact]
-    start = Place(T_base_source=nearby(9, metres=0.004, radians=0.004), depth_scale=1.003)
-    stages = (Stage(gate_m=0.02, iterations=5),)
+    start = ScenePose(T_base_source=nearby(9, metres=0.004, radians=0.004), depth_scale=1.003)
+    stages = (AnnealingStep(gate_m=0.02, iterations=5),)
     place, _ = refine(exact, surfaces, start, stages=stages, num_points=3000)
     again, _ = refine(exact, surfaces, place, stages=stages, num_points=3000)
     change = se3.invert(place.T_base_source) @ again.T_base_source

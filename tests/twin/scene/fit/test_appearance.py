@@ -8,16 +8,15 @@ from scipy.linalg import lstsq
 from twin.scene.fit.appearance import (
     RIDGE_COLOR,
     RIDGE_HARMONICS,
-    Observation,
+    ImageObservation,
     conjugate_gradients,
     gain_between,
     solve_appearance,
     solve_gains,
 )
 from twin.scene.fit.initialise import fuse
-from twin.scene.frames.points import DepthLimits, FrameSurface
-from twin.scene.frames.training_view import training_view
-from twin.scene.gaussians.cloud import (
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
+from twin.scene.gaussians import (
     GaussianCloud,
     as_float32,
     harmonic_basis,
@@ -32,7 +31,7 @@ GAINS = np.array([[1.1, 0.9, 1.0], [0.8, 1.2, 1.05], [1.1, 0.9, 0.95]])
 
 
 @pytest.fixture(scope="module")
-def room() -> tuple[GaussianCloud, list[Observation]]:
+def room() -> tuple[GaussianCloud, list[ImageObservation]]:
     """Sixty Gaussians and three half-size images, each with a hole and a brightness of its own."""
     surfaces = [FrameSurface(textured_room.frame(i, 3), LIMITS) for i in range(3)]
     cloud = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=80))
@@ -42,7 +41,7 @@ def room() -> tuple[GaussianCloud, list[Observation]]:
         mask = view.half.static_mask.copy()
         mask[5:12, 6 + 4 * index : 14 + 4 * index] = False
         observations.append(
-            Observation(
+            ImageObservation(
                 target=replace(view.half, static_mask=mask),
                 T_base_camera=view.T_base_color,
                 gain=GAINS[index],
@@ -55,7 +54,7 @@ def rasteriser() -> Rasteriser:
     return Rasteriser(RasterConfig(threads=1))
 
 
-def weights(cloud: GaussianCloud, item: Observation) -> np.ndarray:
+def weights(cloud: GaussianCloud, item: ImageObservation) -> np.ndarray:
     """The matrix A of one view, (pixels, Gaussians): each column drawn by itself in white."""
     draw = rasteriser()
     columns = []
@@ -70,7 +69,7 @@ def weights(cloud: GaussianCloud, item: Observation) -> np.ndarray:
 
 @pytest.mark.parametrize("num_harmonics", [0, 3])
 def test_the_solution_is_that_of_a_dense_least_squares(
-    room: tuple[GaussianCloud, list[Observation]], num_harmonics: int
+    room: tuple[GaussianCloud, list[ImageObservation]], num_harmonics: int
 ) -> None:
     cloud, observations = room
     start = with_harmonics(cloud, num_harmonics)
@@ -97,7 +96,7 @@ def test_the_solution_is_that_of_a_dense_least_squares(
 
 
 def test_a_few_steps_already_explain_the_images_much_better(
-    room: tuple[GaussianCloud, list[Observation]],
+    room: tuple[GaussianCloud, list[ImageObservation]],
 ) -> None:
     cloud, observations = room
     grey = replace(cloud, colors=np.full_like(cloud.colors, 0.5))
@@ -112,7 +111,7 @@ def test_a_few_steps_already_explain_the_images_much_better(
 
 
 def test_what_a_mask_hides_does_not_matter(
-    room: tuple[GaussianCloud, list[Observation]],
+    room: tuple[GaussianCloud, list[ImageObservation]],
 ) -> None:
     cloud, observations = room
     spoilt = []
@@ -131,7 +130,7 @@ def test_what_a_mask_hides_does_not_matter(
 
 
 def test_a_gaussian_that_no_pixel_shows_keeps_its_colour(
-    room: tuple[GaussianCloud, list[Observation]],
+    room: tuple[GaussianCloud, list[ImageObservation]],
 ) -> None:
     cloud, observations = room
     means = cloud.means_m.copy()
@@ -143,7 +142,7 @@ def test_a_gaussian_that_no_pixel_shows_keeps_its_colour(
 
 
 def test_gains_are_found_up_to_their_mean(
-    room: tuple[GaussianCloud, list[Observation]],
+    room: tuple[GaussianCloud, list[ImageObservation]],
 ) -> None:
     cloud, observations = room
     true = np.array([[0.8, 1.0, 0.9], [0.9, 0.7, 0.6], [0.7, 0.8, 0.9]])
@@ -159,7 +158,7 @@ def test_gains_are_found_up_to_their_mean(
 
 
 def test_a_saturated_pixel_says_nothing_about_the_gain(
-    room: tuple[GaussianCloud, list[Observation]],
+    room: tuple[GaussianCloud, list[ImageObservation]],
 ) -> None:
     cloud, observations = room
     item = observations[0]
@@ -171,7 +170,7 @@ def test_a_saturated_pixel_says_nothing_about_the_gain(
 
 
 def test_an_image_that_is_masked_everywhere_has_gain_one(
-    room: tuple[GaussianCloud, list[Observation]],
+    room: tuple[GaussianCloud, list[ImageObservation]],
 ) -> None:
     cloud, observations = room
     item = observations[0]

@@ -9,10 +9,9 @@ import pytest
 import textured_room
 
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.run import FitResult, fit
-from twin.scene.frames.points import DepthLimits, FrameSurface
-from twin.scene.frames.training_view import TrainingView, training_view
-from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.fit.optimise import FitResult, fit
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
+from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import FitSession, Rasteriser
 from twin.scene.settings import FitConfig, InitialiseConfig
 

@@ -10,9 +10,8 @@ from twin.scene.fit.camera_correction import (
     correction_gradient,
 )
 from twin.scene.fit.initialise import fuse
-from twin.scene.frames.points import DepthLimits, FrameSurface
-from twin.scene.frames.training_view import Target, training_view
-from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface, Target, training_view
+from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import InitialiseConfig
 

@@ -5,12 +5,11 @@ import pytest
 import textured_room
 
 from bridge.geometry import se3
-from twin.scene.fit.appearance import Observation
+from twin.scene.fit.appearance import ImageObservation
 from twin.scene.fit.densify import Scores, densify, score
 from twin.scene.fit.initialise import fuse
-from twin.scene.frames.points import DepthLimits, FrameSurface
-from twin.scene.frames.training_view import training_view
-from twin.scene.gaussians.cloud import GaussianCloud, arrays, as_float32
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import InitialiseConfig
 
@@ -18,12 +17,12 @@ LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 
 
 @pytest.fixture(scope="module")
-def room() -> tuple[GaussianCloud, list[Observation]]:
+def room() -> tuple[GaussianCloud, list[ImageObservation]]:
     surfaces = [FrameSurface(textured_room.frame(i, 3), LIMITS) for i in range(3)]
     cloud = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=400))
     views = [training_view(surface) for surface in surfaces]
     return cloud, [
-        Observation(target=view.full, T_base_camera=view.T_base_color, gain=np.ones(3))
+        ImageObservation(target=view.full, T_base_camera=view.T_base_color, gain=np.ones(3))
         for view in views
     ]
 
@@ -35,7 +34,7 @@ def even_scores(cloud: GaussianCloud) -> Scores:
 
 
 def test_the_error_of_a_pixel_goes_to_the_gaussians_that_made_it(
-    room: tuple[GaussianCloud, list[Observation]],
+    room: tuple[GaussianCloud, list[ImageObservation]],
 ) -> None:
     cloud, observations = room
     rasteriser = Rasteriser(RasterConfig(threads=1))
@@ -51,7 +50,7 @@ def test_the_error_of_a_pixel_goes_to_the_gaussians_that_made_it(
 
 
 def test_the_worst_are_split_and_the_budget_holds(
-    room: tuple[GaussianCloud, list[Observation]],
+    room: tuple[GaussianCloud, list[ImageObservation]],
 ) -> None:
     cloud = room[0]
     scores = even_scores(cloud)
@@ -67,7 +66,7 @@ def test_the_worst_are_split_and_the_budget_holds(
 
 
 def test_two_halves_have_the_mean_and_the_covariance_of_the_whole(
-    room: tuple[GaussianCloud, list[Observation]],
+    room: tuple[GaussianCloud, list[ImageObservation]],
 ) -> None:
     cloud = room[0].take(np.array([11]))
     cloud = replace(cloud, scales_log=as_float32(np.log([[0.02, 0.05, 0.004]])))
@@ -87,7 +86,7 @@ def test_two_halves_have_the_mean_and_the_covariance_of_the_whole(
 
 
 def test_what_is_transparent_unseen_or_huge_goes(
-    room: tuple[GaussianCloud, list[Observation]],
+    room: tuple[GaussianCloud, list[ImageObservation]],
 ) -> None:
     cloud = room[0]
     opacities = cloud.opacities_logit.copy()
@@ -103,7 +102,7 @@ def test_what_is_transparent_unseen_or_huge_goes(
 
 
 def test_what_no_image_can_resolve_is_not_split(
-    room: tuple[GaussianCloud, list[Observation]],
+    room: tuple[GaussianCloud, list[ImageObservation]],
 ) -> None:
     cloud = room[0]
     scores = replace(even_scores(cloud), size_px=np.full(len(cloud), 0.2, dtype=np.float32))
@@ -111,7 +110,7 @@ def test_what_no_image_can_resolve_is_not_split(
 
 
 def test_nothing_is_lost_when_nothing_is_seen(
-    room: tuple[GaussianCloud, list[Observation]],
+    room: tuple[GaussianCloud, list[ImageObservation]],
 ) -> None:
     cloud = room[0]
     scores = replace(even_scores(cloud), pixels=np.zeros(len(cloud), dtype=np.float32))
@@ -119,7 +118,7 @@ def test_nothing_is_lost_when_nothing_is_seen(
 
 
 def test_the_same_again_gives_the_same(
-    room: tuple[GaussianCloud, list[Observation]],
+    room: tuple[GaussianCloud, list[ImageObservation]],
 ) -> None:
     cloud, observations = room
     results = []

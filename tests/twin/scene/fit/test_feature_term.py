@@ -1,10 +1,10 @@
 import numpy as np
 import textured_room
 
-from twin.scene.fit.feature_term import FeatureObservation, feature_loss, solve_features
+from twin.scene.fit.appearance import FeatureObservation, feature_loss, solve_features
 from twin.scene.fit.initialise import fuse
-from twin.scene.frames.points import DepthLimits, FrameSurface
-from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface
+from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import InitialiseConfig
 

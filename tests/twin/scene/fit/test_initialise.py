@@ -6,8 +6,8 @@ import textured_room
 
 from bridge.geometry import se3
 from twin.scene.fit.initialise import NoSurfaceError, fuse
-from twin.scene.frames.points import DepthLimits, FrameSurface, trusted_depth_mask
-from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface, trusted_depth_mask
+from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import InitialiseConfig
 

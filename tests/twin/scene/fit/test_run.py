@@ -10,13 +10,10 @@ import textured_room
 from bridge.geometry import se3
 from twin.scene.fit.camera_correction import corrected_pose
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.run import fit
-from twin.scene.fit.state import Checkpoint
-from twin.scene.frames.points import DepthLimits, FrameSurface
-from twin.scene.frames.training_view import TrainingView, training_view
-from twin.scene.gaussians.cloud import GaussianCloud, arrays
-from twin.scene.raster.losses import psnr_db
-from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.fit.optimise import Checkpoint, fit
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
+from twin.scene.gaussians import GaussianCloud, arrays
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, psnr_db
 from twin.scene.settings import FitConfig, InitialiseConfig
 
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)

@@ -5,11 +5,9 @@ import pytest
 import textured_room
 
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.run import fit
-from twin.scene.fit.surface_prior import SurfacePrior
-from twin.scene.frames.points import DepthLimits, FrameSurface
-from twin.scene.frames.training_view import TrainingView, training_view
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.fit.optimise import SurfacePrior, fit
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
+from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.settings import FitConfig, InitialiseConfig
 
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from small_files import glb_bytes, mesh_content
 
 from bridge.geometry import se3
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32
-from twin.scene.store.ply import write_ply
+from twin.scene.gaussians import GaussianCloud, as_float32, write_ply
 
 SCALE = 0.1
 PYTORCH3D = np.diag([-1.0, -1.0, 1.0])

@@ -3,7 +3,7 @@
 import numpy as np
 
 from twin.scene.foundation.loading import Placement
-from twin.scene.foundation.sam3 import Sam3Config
+from twin.scene.foundation.models import Sam3Config
 
 ALL_QUERIES = Sam3Config(min_score=0.0, min_pixels=0)
 CPU = Placement(device="cpu")

@@ -8,8 +8,7 @@ import pytest
 from model_inputs import CPU, picture
 
 from bridge.errors import UsageError
-from twin.scene.foundation.clip import ClipEmbedder, masked_crop
-from twin.scene.foundation.open import open_clip
+from twin.scene.foundation.models import ClipEmbedder, masked_crop, open_clip
 
 pytest.importorskip("transformers", reason="the extra [foundation] is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_network")]

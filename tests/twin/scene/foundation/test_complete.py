@@ -14,11 +14,10 @@ from bridge.task.task_file import SCANNED, ObjectModel
 from bridge.terminal import Output
 from twin.scene.foundation.complete import Completed, Shapes, complete_shapes, generator_command
 from twin.scene.foundation.stage import check_models
-from twin.scene.frames.training_view import Target, TrainingView
+from twin.scene.frames.rgbd import Target, TrainingView
 from twin.scene.settings import ModelConfig
-from twin.scene.shape.from_mesh import shape_of_mesh
-from twin.scene.shape.masked_view import ShapeError
-from twin.scene.shape.reconstruct import ObjectShape
+from twin.scene.shape.carve import ShapeError
+from twin.scene.shape.reconstruct import ObjectShape, shape_of_mesh
 
 WORKER = Path(__file__).with_name("generator_worker.py")
 THING = ObjectModel(id="thing", shape=SCANNED, size_m=(0.10, 0.06, 0.09), color_srgb=(200, 60, 40))

@@ -8,8 +8,7 @@ import pytest
 from model_inputs import CPU, picture
 
 from bridge.errors import UsageError
-from twin.scene.foundation.dinov3 import DinoFeatures
-from twin.scene.foundation.open import open_features
+from twin.scene.foundation.models import DinoFeatures, open_features
 
 pytest.importorskip("transformers", reason="the extra [foundation] is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_network")]

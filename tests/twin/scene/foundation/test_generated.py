@@ -15,16 +15,17 @@ from small_files import glb_bytes, mesh_content
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from twin.scene.foundation.generated import generate_object, read_pose, scaled_cloud
-from twin.scene.foundation.metric_fit import MetricFitConfig
+from twin.scene.foundation.metric_fit import MetricFitConfig, MetricFitError
 from twin.scene.foundation.sam3d import (
     GeneratorConfig,
     GeneratorError,
     GeneratorInput,
+    generate_object,
     pointmap,
+    read_pose,
     run_generator,
+    scaled_cloud,
 )
-from twin.scene.foundation.surface import MetricFitError
 
 WORKER = Path(__file__).with_name("generator_worker.py")
 

@@ -6,8 +6,14 @@ from block_shape import CAMERA, block_depth, block_mesh, camera_pose, placed
 from scipy.spatial.transform import Rotation
 
 from bridge.geometry import se3
-from twin.scene.foundation.metric_fit import MetricFit, MetricFitConfig, fit_metric
-from twin.scene.foundation.surface import MetricFitError, sample_surface, visible_mask
+from twin.scene.foundation.metric_fit import (
+    MetricFit,
+    MetricFitConfig,
+    MetricFitError,
+    fit_metric,
+    sample_surface,
+    visible_mask,
+)
 
 SCALE = 0.1
 """Metres per unit: the thing is about 10 x 6 x 9 cm."""

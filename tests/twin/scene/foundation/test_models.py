@@ -14,12 +14,15 @@ from model_inputs import ALL_QUERIES, CPU, picture
 
 from bridge.errors import MissingDependencyError, UsageError
 from twin.scene.foundation import loading
-from twin.scene.foundation.clip import ClipEmbedder
-from twin.scene.foundation.dinov3 import DinoFeatures
-from twin.scene.foundation.loading import Placement
-from twin.scene.foundation.open import open_clip, open_features, open_segmenter
-from twin.scene.foundation.sam3 import Sam3Segmenter
-from twin.scene.foundation.weights import WeightsError
+from twin.scene.foundation.loading import Placement, WeightsError
+from twin.scene.foundation.models import (
+    ClipEmbedder,
+    DinoFeatures,
+    Sam3Segmenter,
+    open_clip,
+    open_features,
+    open_segmenter,
+)
 
 pytest.importorskip("transformers", reason="the extra [foundation] is not installed")
 pytestmark = [

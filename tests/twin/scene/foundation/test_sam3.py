@@ -8,8 +8,7 @@ import pytest
 from model_inputs import ALL_QUERIES, CPU, picture
 
 from bridge.errors import UsageError
-from twin.scene.foundation.open import open_segmenter
-from twin.scene.foundation.sam3 import Sam3Config, Sam3Segmenter
+from twin.scene.foundation.models import Sam3Config, Sam3Segmenter, open_segmenter
 
 pytest.importorskip("transformers", reason="the extra [foundation] is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_network")]

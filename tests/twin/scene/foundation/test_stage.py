@@ -16,8 +16,8 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
-from twin.scene.foundation.clip import ClipEmbedder
-from twin.scene.foundation.consult import consult, training_frames
+from twin.scene.foundation.loading import WeightsError
+from twin.scene.foundation.models import ClipEmbedder
 from twin.scene.foundation.stage import (
     ask_models,
     check_models,
@@ -27,13 +27,13 @@ from twin.scene.foundation.stage import (
     thing_vectors,
     viewpoint_of,
 )
-from twin.scene.foundation.weights import WeightsError
-from twin.scene.frames.choice import choose_frames, find_sources
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.frames.selection import choose_frames, find_sources
+from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.rebuild.run import rebuild
+from twin.scene.rebuild.semantics import ask_models_about, training_frames
 from twin.scene.semantics.features import load_features
-from twin.scene.semantics.query import query
+from twin.scene.semantics.language import query
 from twin.scene.semantics.result import Instance, SemanticScene
 from twin.scene.settings import FitConfig, FrameConfig, InitialiseConfig, ModelConfig, RebuildConfig
 
@@ -224,7 +224,7 @@ def test_all_three_models_are_asked_and_what_they_say_is_kept(
 
 
 def test_without_any_model_nothing_is_read_or_asked() -> None:
-    consulted = consult(ModelConfig(), [], heaps()[0], None, Output(quiet=True))
+    consulted = ask_models_about(ModelConfig(), [], heaps()[0], None, Output(quiet=True))
     assert (consulted.frames, consulted.findings.masks) == ([], [])
     assert consulted.findings.features is None
     assert consulted.give_vectors(Path("nowhere"), {}, heaps()[0], Output(quiet=True)) == {}

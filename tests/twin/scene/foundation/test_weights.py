@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from small_files import write_safetensors
 
-from twin.scene.foundation.images import IMAGENET
-from twin.scene.foundation.weights import (
+from twin.scene.foundation.loading import (
+    IMAGENET,
     WeightsError,
     WeightsKind,
     check_folder,

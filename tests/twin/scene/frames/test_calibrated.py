@@ -14,7 +14,7 @@ from bridge.errors import GstError
 from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
 from bridge.terminal import Output
 from twin.robot.posture import PostureTrack
-from twin.scene.frames.choice import choose_frames, find_sources
+from twin.scene.frames.selection import choose_frames, find_sources
 from twin.scene.settings import FrameConfig
 from twin.scene.store import calibration as calibration_module
 from twin.scene.store.calibration import read_calibration, write_calibration

@@ -12,7 +12,7 @@ from bridge.exchange.rgbd import write_scan
 from bridge.geometry import se3
 from bridge.sources.folder.config import FolderConfig
 from bridge.sources.folder.messages import folder_messages, read_index
-from twin.scene.frames.choice import choose_frames, find_sources
+from twin.scene.frames.selection import choose_frames, find_sources
 from twin.scene.settings import FrameConfig
 
 SHARED = Path(os.environ.get("GST_SHARED_DATA", Path(__file__).parents[5] / "shared" / "data"))

@@ -11,8 +11,14 @@ from hypothesis import strategies as st
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
-from twin.scene.frames.choice import choose_frames, find_sources
-from twin.scene.frames.select import path_length_m, pick, sharpness, smear_px
+from twin.scene.frames.selection import (
+    choose_frames,
+    find_sources,
+    path_length_m,
+    pick,
+    sharpness,
+    smear_px,
+)
 from twin.scene.settings import FrameConfig
 
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import textured_room
 
-from twin.scene.frames.points import DepthLimits, FrameSurface
-from twin.scene.frames.training_view import training_view
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
 
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 

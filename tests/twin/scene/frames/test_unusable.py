@@ -18,7 +18,7 @@ from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.terminal import Output
-from twin.scene.frames.choice import choose_frames, find_sources, load, root_frame
+from twin.scene.frames.selection import choose_frames, find_sources, load, root_frame
 from twin.scene.settings import FrameConfig
 
 SECOND = 1_000_000_000

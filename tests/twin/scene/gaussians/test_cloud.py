@@ -7,18 +7,19 @@ from scipy.special import sph_harm_y
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.errors import TwinError
-from twin.scene.gaussians.cloud import (
+from twin.scene.gaussians import (
     GaussianCloud,
     arrays,
     as_float32,
     concatenate,
     effective_colors,
     harmonic_basis,
+    moved_cloud,
+    read_ply,
     with_harmonics,
+    write_ply,
 )
-from twin.scene.gaussians.moved import moved_cloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
-from twin.scene.store.ply import read_ply, write_ply
 
 CAMERA = Camera(width=40, height=33, fx=60.0, fy=60.0, cx=20.0, cy=16.5)
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from twin.scene.gaussians.cloud import GaussianCloud, effective_colors
-from twin.scene.gaussians.moved import moved_cloud
-from twin.scene.gaussians.skin import SkinError, bind, node_rotations, pose_cloud
+from twin.scene.gaussians import GaussianCloud, effective_colors, moved_cloud
+from twin.scene.skinning import SkinError, bind, node_rotations, pose_cloud
 
 
 @pytest.fixture

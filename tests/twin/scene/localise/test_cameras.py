@@ -26,7 +26,7 @@ from bridge.geometry import se3
 from bridge.media.color import encode_jpeg
 from bridge.task.task_file import Task
 from twin.scene.localise.episode import localise_episode, write_localised
-from twin.scene.localise.still_frames import still_frames
+from twin.scene.localise.stationary_frames import stationary_frames
 from twin.scene.shape.known import pose_of
 from twin.scene.store.calibration import write_calibration
 
@@ -121,7 +121,7 @@ def test_a_long_scan_is_not_decoded_for_a_few_of_its_frames(
     episode = write(run, (frame, "base_link"), num=20)
     decode, count = CompressedColor.image_u8, []
     monkeypatch.setattr(CompressedColor, "image_u8", lambda self: count.append(1) or decode(self))
-    found = still_frames(episode, 3, evenly=True)
+    found = stationary_frames(episode, 3, evenly=True)
     assert [item.stamp_ns for item in found] == [1 * S, 11 * S, 20 * S]
     assert len(count) == 4  # these, and one to see how large images are
 

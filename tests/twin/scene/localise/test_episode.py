@@ -25,13 +25,13 @@ from bridge.episode.streams import RgbdFrame
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.color import encode_jpeg
 from bridge.task.task_file import Task
-from twin.scene.frames.choice import rgbd_camera_ids
+from twin.scene.frames.selection import rgbd_camera_ids
 from twin.scene.localise.episode import (
     localise_episode,
     quiet_phases,
     write_localised,
 )
-from twin.scene.localise.still_frames import still_frames
+from twin.scene.localise.stationary_frames import stationary_frames
 from twin.scene.shape.known import pose_of
 
 S = 1_000_000_000
@@ -158,7 +158,7 @@ def test_truth_cameras_and_truth_poses_are_never_read(episode: Episode) -> None:
     assert "/standin/truth/cam/spy/color/image" in episode.topics()
     assert rgbd_camera_ids(episode) == ["side"]
     assert streams.object_pose_topics(episode) == {}
-    assert {frame.camera_id for frame in still_frames(episode, 3, None, None)} == {"side"}
+    assert {frame.camera_id for frame in stationary_frames(episode, 3, None, None)} == {"side"}
 
 
 def test_phases_are_the_start_and_what_follows_each_execution(episode: Episode) -> None:

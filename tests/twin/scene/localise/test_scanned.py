@@ -15,10 +15,9 @@ from bridge.geometry import se3
 from bridge.task.meshes.catalogue import ToyMesh, toy_mesh
 from bridge.task.task_file import SCANNED, ObjectModel, Task, load_task
 from twin.gate.twin_process import Look, look
+from twin.scene.localise.mesh_fit import mesh_surface, scanned_surfaces
 from twin.scene.localise.objects import localise_objects
 from twin.scene.localise.result import BOX_METHOD, MESH_METHOD
-from twin.scene.localise.scanned import scanned_surfaces
-from twin.scene.localise.surface import surface_of
 from twin.scene.shape.known import pose_of
 from twin.scene.shape.mesh import UnreadableMeshError, mesh_ply
 from twin.scene.store.folder import UnreadableSceneError
@@ -67,7 +66,7 @@ def test_a_thing_of_unknown_shape_is_boxed_in_and_says_so(
 def test_with_the_scene_s_mesh_it_is_laid_out_front_and_back_told_apart(
     scanned_task: Task, frames: list[Any], known: ToyMesh
 ) -> None:
-    surfaces = {"thing": surface_of(known.vertices_m, known.triangles, 2500)}
+    surfaces = {"thing": mesh_surface(known.vertices_m, known.triangles, 2500)}
     found = localise_objects(frames, scanned_task, surfaces=surfaces)["thing"]
     assert found.found, found.reason
     assert found.method == MESH_METHOD

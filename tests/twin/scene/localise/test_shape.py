@@ -7,9 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.task.task_file import load_task
-from twin.scene.localise.colour import ColourConfig, likeness, linear_from_srgb
-from twin.scene.localise.points import clusters, voxel_mean
-from twin.scene.localise.table import TableConfig, fit_table
+from twin.scene.localise.objects import TableConfig, fit_table
+from twin.scene.localise.points import (
+    ColourConfig,
+    clusters,
+    likeness,
+    linear_from_srgb,
+    voxel_mean,
+)
 from twin.scene.shape.known import pose_of, rectangle_yaw_rad, surface_distances
 
 TASK = load_task("cube_into_box")

@@ -8,14 +8,20 @@ import open3d as o3d
 from toy_frames import AT, DUCK, DUCKS, only, shoot, table_with
 
 from bridge.task.meshes.catalogue import object_mesh
+from twin.scene.localise.mesh_fit import (
+    agreeing,
+    known_surface,
+    lengths,
+    mesh_surface,
+    seen_through,
+)
 from twin.scene.localise.objects import LocaliseConfig
 from twin.scene.localise.points import fuse_stills
-from twin.scene.localise.surface import agreeing, known_surface, lengths, seen_through, surface_of
 
 
 def test_samples_lie_on_the_mesh_evenly_and_face_outwards() -> None:
     mesh = object_mesh(DUCK)
-    surface = surface_of(mesh.vertices_m, mesh.triangles, 2000)
+    surface = mesh_surface(mesh.vertices_m, mesh.triangles, 2000)
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(
         o3d.core.Tensor(mesh.vertices_m.astype(np.float32)),

@@ -4,8 +4,7 @@ import pytest
 
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import load_task
-from twin.scene.shape.from_mesh import shape_of_mesh
-from twin.scene.shape.reconstruct import ObjectShape
+from twin.scene.shape.reconstruct import ObjectShape, shape_of_mesh
 
 
 @pytest.fixture(scope="session")

@@ -6,9 +6,9 @@ import pytest
 from bridge.geometry import se3
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import load_task
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32
-from twin.scene.localise.surface import surface_of
-from twin.scene.objects.owners import owners
+from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.localise.mesh_fit import mesh_surface
+from twin.scene.objects.assignment import assign_splats
 from twin.scene.shape.known import pose_of
 from twin.scene.shape.reconstruct import ObjectShape
 
@@ -23,7 +23,7 @@ WOOD = (150, 116, 84)
 def scene(shape: ObjectShape) -> tuple[GaussianCloud, np.ndarray]:
     """The toy and the table around it as cameras see them, and which is which."""
     mesh = object_mesh(SLOTH)
-    toy = se3.apply(T, surface_of(mesh.vertices_m, mesh.triangles, 3000).p_m)
+    toy = se3.apply(T, mesh_surface(mesh.vertices_m, mesh.triangles, 3000).p_m)
     toy = toy[toy[:, 2] > 0.004]
     rng = np.random.default_rng(0)
     table = np.column_stack([rng.uniform([0.36, -0.29], [0.60, -0.05], (6000, 2)), np.zeros(6000)])
@@ -54,8 +54,8 @@ def test_the_table_beside_a_toy_stays_with_the_table(
 ) -> None:
     cloud, is_toy = scene
     poses = {"sloth": T}
-    boxed = wrong(owners(cloud, poses, TASK), is_toy)
-    shaped = wrong(owners(cloud, poses, TASK, {"sloth": shape}), is_toy)
+    boxed = wrong(assign_splats(cloud, poses, TASK), is_toy)
+    shaped = wrong(assign_splats(cloud, poses, TASK, {"sloth": shape}), is_toy)
     assert boxed[0] > 0.2  # the box around it holds the table between its legs
     assert shaped[0] < 0.07
     assert shaped[1] < 0.01
@@ -67,6 +67,6 @@ def test_with_a_table_of_another_colour_next_to_nothing_is_wrong(
     cloud, is_toy = scene
     colors = np.where(is_toy[:, None], cloud.colors, np.array([0.3, 0.3, 0.32]))
     grey = GaussianCloud(**{**vars(cloud), "colors": as_float32(colors)})
-    foreign, missed = wrong(owners(grey, {"sloth": T}, TASK, {"sloth": shape}), is_toy)
+    foreign, missed = wrong(assign_splats(grey, {"sloth": T}, TASK, {"sloth": shape}), is_toy)
     assert foreign < 0.005
     assert missed < 0.01

@@ -8,10 +8,9 @@ import pytest
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.objects.parts import put_together, read_objects
-from twin.scene.objects.split import split_objects, write_objects
+from twin.scene.objects.decompose import compose_parts, read_objects, split_objects, write_objects
 
 
 def cube_on_table(T_base_cube: np.ndarray) -> GaussianCloud:
@@ -70,11 +69,11 @@ def test_putting_together_gives_every_gaussian_back(
 ) -> None:
     run, record, background, _ = written
     objects = read_objects(run, record)
-    whole = put_together(background, objects)
+    whole = compose_parts(background, objects)
     assert len(whole) == len(background) + len(objects["cube"].cloud)
     moved_to = np.eye(4)
     moved_to[:3, 3] = [0.3, 0.3, 0.02]
-    moved = put_together(background, objects, {"cube": moved_to})
+    moved = compose_parts(background, objects, {"cube": moved_to})
     centre = moved.means_m[len(background) :].mean(axis=0)
     np.testing.assert_allclose(centre, [0.3, 0.3, 0.02], atol=2e-3)
 

@@ -5,12 +5,11 @@ import numpy as np
 from bridge.geometry import se3
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import load_task
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.localise.mesh_fit import mesh_surface
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.localise.surface import surface_of
-from twin.scene.objects.owners import owners
-from twin.scene.objects.remains import hidden_table
-from twin.scene.objects.split import split_objects
+from twin.scene.objects.assignment import assign_splats, hidden_table
+from twin.scene.objects.decompose import split_objects
 from twin.scene.shape.known import pose_of
 from twin.scene.shape.reconstruct import ObjectShape
 
@@ -34,7 +33,7 @@ def cloud_of(points_m: np.ndarray, color: tuple[float, float, float] = WHITE) ->
 def toy_shifted(by_m: float) -> np.ndarray:
     """Points of the toy well above the table, where a camera with a wrong pose showed them."""
     mesh = object_mesh(SLOTH)
-    points = se3.apply(T, surface_of(mesh.vertices_m, mesh.triangles, 3000).p_m)
+    points = se3.apply(T, mesh_surface(mesh.vertices_m, mesh.triangles, 3000).p_m)
     return points[points[:, 2] > 0.012] + np.array([by_m, 0.0, 0.0])
 
 
@@ -43,7 +42,9 @@ def test_what_a_wrong_camera_pose_shifted_by_a_centimetre_still_goes_with_the_to
 ) -> None:
     """White on purpose: a face has not the colour of its toy."""
     right, shifted = toy_shifted(0.0), toy_shifted(0.010)
-    given = owners(cloud_of(np.concatenate([right, shifted])), {"sloth": T}, TASK, {"sloth": shape})
+    given = assign_splats(
+        cloud_of(np.concatenate([right, shifted])), {"sloth": T}, TASK, {"sloth": shape}
+    )
     assert (given[: len(right)] == 0).mean() > 0.99
     assert (given[len(right) :] == 0).mean() > 0.99
 
@@ -55,7 +56,9 @@ def test_a_mug_beside_the_toy_keeps_its_near_side(shape: ObjectShape) -> None:
     # A wall of Gaussians from 11 mm beside the toy's outermost point to 60 mm.
     mug = side + rng.uniform([0.011, -0.03, -0.005], [0.06, 0.03, 0.05], (2000, 3))
     mug = mug[mug[:, 2] > 0.012]
-    given = owners(cloud_of(np.concatenate([toy, mug])), {"sloth": T}, TASK, {"sloth": shape})
+    given = assign_splats(
+        cloud_of(np.concatenate([toy, mug])), {"sloth": T}, TASK, {"sloth": shape}
+    )
     assert (given[: len(toy)] == 0).all()
     assert (given[len(toy) :] == -1).mean() > 0.98
 
@@ -70,7 +73,7 @@ def test_table_under_a_toy_is_dropped_and_filled_and_table_beside_it_is_kept(
     distance = shape.sdf.distance(se3.apply(se3.invert(T), on_top))
     toy = toy_shifted(0.0)
     cloud = cloud_of(np.concatenate([toy, table]))
-    given = owners(cloud, {"sloth": T}, TASK, {"sloth": shape})
+    given = assign_splats(cloud, {"sloth": T}, TASK, {"sloth": shape})
     hidden = hidden_table(cloud, given, {"sloth": T}, {"sloth": shape}, TASK)[len(toy) :]
     stayed = given[len(toy) :] < 0
     assert hidden[stayed & (distance < 0.002)].all()

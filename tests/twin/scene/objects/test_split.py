@@ -10,14 +10,24 @@ import pytest
 from bridge.episode.provenance import hash_file
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from twin.scene.gaussians.cloud import GaussianCloud, arrays, as_float32, concatenate
-from twin.scene.gaussians.moved import moved_cloud
+from twin.scene.gaussians import (
+    GaussianCloud,
+    arrays,
+    as_float32,
+    concatenate,
+    moved_cloud,
+    read_ply,
+)
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.objects.fill import fill_footprint
-from twin.scene.objects.parts import put_together
-from twin.scene.objects.split import SplitConfig, shape_mesh, split_objects, write_objects
+from twin.scene.objects.decompose import (
+    SplitConfig,
+    compose_parts,
+    fill_footprint,
+    shape_mesh,
+    split_objects,
+    write_objects,
+)
 from twin.scene.shape.known import pose_of
-from twin.scene.store.ply import read_ply
 
 TASK = load_task("cube_into_box")
 POSES = {
@@ -99,7 +109,7 @@ def test_objects_come_in_their_own_frame_and_compose_back(
     parts = split_objects(cloud, localised(**POSES), TASK)
     half = np.array(TASK.objects["cube"].size_m) / 2
     assert np.all(np.abs(parts.objects["cube"].cloud.means_m) < half + 0.002)
-    again = put_together(parts.background, parts.objects)
+    again = compose_parts(parts.background, parts.objects)
     for rows in (cloud.means_m, again.means_m):
         assert rows.shape == (len(cloud), 3)
     ours = again.means_m[np.lexsort(again.means_m.round(4).T)]

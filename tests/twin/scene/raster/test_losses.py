@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from twin.scene.raster.losses import Loss, psnr_db
+from twin.scene.raster.rasteriser import Loss, psnr_db
 
 Kind = Literal["3dgs", "paper"]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bridge.geometry.camera import Camera
-from twin.scene.gaussians.cloud import GaussianCloud, arrays, as_float32
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 
 NATIVE = Path(__file__).parents[4] / "twin" / "scene" / "native"

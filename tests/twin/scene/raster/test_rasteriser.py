@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from bridge.geometry.camera import Camera
-from twin.scene.gaussians.cloud import GaussianCloud, arrays, as_float32
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32
 from twin.scene.raster import rasteriser as raster
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, SplatExtensionMissingError
 

@@ -7,11 +7,11 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from twin.scene.frames.training_view import Target
-from twin.scene.gaussians.cloud import GaussianCloud, arrays, as_float32
-from twin.scene.raster.losses import Loss
+from twin.scene.frames.rgbd import Target
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32
 from twin.scene.raster.rasteriser import (
     FitSession,
+    Loss,
     RasterConfig,
     Rasteriser,
     available_isas,

@@ -20,11 +20,11 @@ from bridge.errors import UsageError
 from twin.replay.config import ReplayRunConfig
 from twin.replay.workers import replay_run
 from twin.scene.fit.initialise import fuse
-from twin.scene.frames.choice import choose_frames, find_sources
-from twin.scene.frames.points import DepthLimits, FrameSurface
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface
+from twin.scene.frames.selection import choose_frames, find_sources
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.objects import parts as parts_module
-from twin.scene.objects.parts import read_objects, take_apart
+from twin.scene.objects import decompose as parts_module
+from twin.scene.objects.decompose import decompose, read_objects
 from twin.scene.rebuild.record import describe_scene
 from twin.scene.rebuild.run import rebuild
 from twin.scene.settings import (
@@ -172,7 +172,7 @@ def test_objects_are_not_looked_for_in_held_out_frames(
     cloud = fuse(
         [FrameSurface(textured_room.frame(0, 9), LIMITS).points()], InitialiseConfig(max_splats=50)
     )
-    take_apart(sources, cloud, choices)
+    decompose(sources, cloud, choices)
     assert len(choices[0].holdout_ns) == 3
     assert asked["held_out_ns"] == {"wrist": choices[0].holdout_ns}
 
@@ -189,7 +189,7 @@ def test_objects_are_not_cut_out_of_a_scene_in_a_frame_of_its_own(
     cloud = fuse(
         [FrameSurface(textured_room.frame(0, 9), LIMITS).points()], InitialiseConfig(max_splats=50)
     )
-    apart = take_apart(sources, cloud, [followed])
+    apart = decompose(sources, cloud, [followed])
     assert "followed by its images" in apart.remark
     assert apart.background is cloud
 

@@ -13,10 +13,10 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import PathNotFoundError, UsageError
 from bridge.media.color import decode_color
 from bridge.terminal import Output
-from twin.scene.draw.render import render
-from twin.scene.frames.choice import NoFramesError, choose_frames, find_sources
+from twin.scene.frames.selection import NoFramesError, choose_frames, find_sources
 from twin.scene.rebuild.record import describe_scene
 from twin.scene.rebuild.run import rebuild
+from twin.scene.render import render
 from twin.scene.settings import (
     FitConfig,
     FrameConfig,

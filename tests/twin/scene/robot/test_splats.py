@@ -19,10 +19,9 @@ from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
 from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture, posture_track
 from twin.robot.surface import PosedSurface, sample_surface
-from twin.scene.frames.points import DepthLimits, FrameSurface
-from twin.scene.frames.training_view import training_view
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32, concatenate
-from twin.scene.robot.frames import RobotFrames, robot_mask
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
+from twin.scene.gaussians import GaussianCloud, as_float32, concatenate
+from twin.scene.robot.extraction import RobotFrames, robot_mask
 from twin.scene.robot.splats import bind, posed, read_links, write_links
 from twin.scene.settings import InitialiseConfig
 

@@ -23,9 +23,9 @@ from bridge.geometry import se3
 from bridge.media.color import encode_png
 from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
 from bridge.terminal import Output
-from twin.scene.frames.choice import choose_frames, find_sources
-from twin.scene.learn.read import learn
-from twin.scene.robot.stage import find_robot, write_robot
+from twin.scene.dataset.training_set import learn
+from twin.scene.frames.selection import choose_frames, find_sources
+from twin.scene.robot.extraction import find_robot, write_robot
 from twin.scene.settings import FrameConfig, InitialiseConfig, RebuildConfig
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "align"))

@@ -15,8 +15,8 @@ from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.scene.fit.initialise import fuse
-from twin.scene.frames.points import DepthLimits, FrameSurface
-from twin.scene.gaussians.cloud import GaussianCloud
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface
+from twin.scene.gaussians import GaussianCloud
 from twin.scene.semantics.lift import Viewpoint
 from twin.scene.semantics.result import Mask, MaskSet
 from twin.scene.settings import InitialiseConfig

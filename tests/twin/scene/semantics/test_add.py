@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from table_scene import World, make_world, table
 
-from twin.scene.semantics.add import add_semantics
+from twin.scene.rebuild.semantics import add_semantics
 from twin.scene.semantics.features import FeatureBasis, SceneFeatures, load_features
-from twin.scene.semantics.query import query
+from twin.scene.semantics.language import query
 from twin.scene.semantics.result import Mask, MaskSet
 from twin.scene.semantics.store import UnreadableSemanticsError, read_semantics
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from twin.scene.semantics.form import find_cavity, height_map, measure_form
+from twin.scene.semantics.shape_descriptors import find_height_map_cavity, height_map, measure_form
 
 CELL_M = 0.003
 
@@ -100,4 +100,4 @@ def test_the_height_map_keeps_the_highest_and_fills_what_is_enclosed() -> None:
     assert heights.top_m.max() == pytest.approx(0.09)
     middle = heights.cells(np.array([[0.025, 0.025, 0.0]]))
     assert heights.footprint[middle].all()
-    assert find_cavity(height_map(p, 0.004)) is None
+    assert find_height_map_cavity(height_map(p, 0.004)) is None

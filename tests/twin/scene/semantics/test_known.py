@@ -7,12 +7,18 @@ import pytest
 from table_scene import World
 
 from bridge.task.meshes.catalogue import toy_mesh
-from twin.scene.gaussians.cloud import as_float32
+from twin.scene.gaussians import as_float32
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default
-from twin.scene.semantics.known import MIN_SPLATS, NAMED, label_of, numbered
-from twin.scene.semantics.lexicon import kind_of, names_of
-from twin.scene.semantics.query import query
+from twin.scene.semantics.language import (
+    MIN_SPLATS,
+    NAMED,
+    kind_of,
+    label_of,
+    names_of,
+    numbered,
+    query,
+)
 from twin.scene.semantics.result import SemanticScene
 
 

@@ -6,7 +6,7 @@ import table_scene
 from table_scene import World, iou
 
 from bridge.geometry.camera import Camera
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_from_masks
 from twin.scene.semantics.lift import (

@@ -3,9 +3,15 @@ import pytest
 import table_scene
 from table_scene import Piece, iou, make_world, table
 
-from twin.scene.semantics.limbs import MARGIN_CELLS, _label_cells, thickness_of
-from twin.scene.semantics.part_names import Parts, PartsConfig, find_parts
-from twin.scene.semantics.solid import fill_solid
+from twin.scene.semantics.part_segmentation import (
+    MARGIN_CELLS,
+    Parts,
+    PartsConfig,
+    _label_cells,
+    fill_solid,
+    find_parts,
+    thickness_of,
+)
 
 
 def parts_of(pieces: list[Piece], label: str) -> tuple[np.ndarray, np.ndarray, Parts]:

@@ -3,8 +3,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from twin.scene.semantics.lexicon import kind_of, words_of
-from twin.scene.semantics.query import Query, query
+from twin.scene.semantics.language import Query, kind_of, query, words_of
 from twin.scene.semantics.result import Instance, SemanticScene, SemanticsError
 
 SIZES_M = {

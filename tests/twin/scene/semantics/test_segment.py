@@ -5,9 +5,15 @@ from table_scene import BLUE, GREEN, RED, World, box, duck, ellipsoid, iou, make
 
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default
-from twin.scene.semantics.from_view import masks_from_labels, points_of, segment_frame
-from twin.scene.semantics.segment import Segmentation, SegmentConfig, segment_points
-from twin.scene.semantics.support import NoSupportError
+from twin.scene.semantics.segment import (
+    Segmentation,
+    SegmentConfig,
+    masks_from_labels,
+    points_of,
+    segment_frame,
+    segment_points,
+)
+from twin.scene.semantics.shape_descriptors import NoSupportError
 
 
 def segmented(pieces: list[table_scene.Piece], num: int = 8) -> tuple[World, Segmentation]:

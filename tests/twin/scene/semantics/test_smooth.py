@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32
-from twin.scene.semantics.smooth import SmoothConfig, smooth_shares
+from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.semantics.associate import SmoothConfig, smooth_shares
 
 
 def sheet(side: int = 24) -> tuple[GaussianCloud, np.ndarray]:

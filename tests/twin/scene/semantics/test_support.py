@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from twin.scene.semantics.support import NoSupportError, SupportConfig, find_support
+from twin.scene.semantics.shape_descriptors import NoSupportError, SupportConfig, find_support
 
 UP = np.array([0.0, 0.0, 1.0])
 

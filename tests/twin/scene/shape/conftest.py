@@ -9,7 +9,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import cast_views
 
-from twin.scene.frames.training_view import TrainingView
+from twin.scene.frames.rgbd import TrainingView
 
 
 @pytest.fixture(scope="session")

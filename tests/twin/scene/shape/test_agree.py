@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from twin.scene.shape.agree import laid_together, slope_by_sensor
-from twin.scene.shape.masked_view import MaskedView
+from twin.scene.shape.carve import MaskedView
+from twin.scene.shape.registration import laid_together, slope_by_sensor
 
 MOUNT = se3.transform_from(np.array([1.0, 0.002, -0.0015, 0.0025]), np.array([2e-3, -1e-3, 1e-3]))
 """Some millimetres and 7 milliradians that a camera is off on what carries it."""

@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from twin.scene.shape.between_voxels import signed_distances
-from twin.scene.shape.carve import Evidence
+from twin.scene.shape.carve import Evidence, VoxelBox, signed_distances
 from twin.scene.shape.isosurface import isosurface
 from twin.scene.shape.mesh import volume_m3
 from twin.scene.shape.sdf import distances_of_solid, smoothed
-from twin.scene.shape.voxels import VoxelBox
 
 VOXEL, TRUNCATION = 0.002, 0.008
 COUNTS = (24, 20, 20)

@@ -8,16 +8,20 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from twin.scene.shape.cavity import find_cavity
-from twin.scene.shape.collision import CollisionConfig, CollisionParts, collision_parts
-from twin.scene.shape.convex import hull_of_points, thinned, voxel_corners
+from twin.scene.shape.carve import ShapeError, VoxelBox
+from twin.scene.shape.collision import (
+    CollisionConfig,
+    CollisionParts,
+    collision_parts,
+    hull_of_points,
+    thinned,
+    voxel_corners,
+)
 from twin.scene.shape.files import read_parts, write_shape
 from twin.scene.shape.isosurface import isosurface
-from twin.scene.shape.masked_view import ShapeError
 from twin.scene.shape.mesh import is_watertight, volume_m3
-from twin.scene.shape.reconstruct import ObjectShape
+from twin.scene.shape.reconstruct import ObjectShape, find_cavity
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid, smoothed
-from twin.scene.shape.voxels import VoxelBox
 
 
 def shape_of(solid: np.ndarray, voxel_m: float) -> ObjectShape:

@@ -9,10 +9,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from test_collision import ball_shape, grid, shape_of
 
+from twin.scene.shape.carve import ShapeError
 from twin.scene.shape.lattice import Lattice, LatticeConfig, lattice, tet_volumes_m3
-from twin.scene.shape.masked_view import ShapeError
-from twin.scene.shape.npz import UnreadableArraysError, write_npz
 from twin.scene.shape.reconstruct import ObjectShape
+from twin.scene.store.npz import UnreadableArraysError, write_npz
 
 
 @pytest.fixture(scope="module")

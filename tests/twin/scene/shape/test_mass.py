@@ -2,8 +2,8 @@
 
 import pytest
 
-from twin.scene.shape.masked_view import ShapeError
-from twin.scene.shape.mass import mass_prior
+from twin.scene.shape.carve import ShapeError
+from twin.scene.shape.files import mass_prior
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from twin.scene.shape.agree import laid_together
-from twin.scene.shape.masked_view import MaskedView, ShapeError
+from twin.scene.shape.carve import MaskedView, ShapeError
 from twin.scene.shape.mesh import is_watertight, volume_m3
 from twin.scene.shape.reconstruct import ObjectShape, ShapeConfig, moved_views, reconstruct
+from twin.scene.shape.registration import laid_together
 from twin.scene.shape.sdf import SdfGrid
 
 NOISE = 0.004

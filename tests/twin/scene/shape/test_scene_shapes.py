@@ -10,10 +10,10 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from twin.scene.frames.training_view import TrainingView
-from twin.scene.gaussians.cloud import GaussianCloud, as_float32
+from twin.scene.frames.rgbd import TrainingView
+from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.objects.split import ObjectSplats, SceneParts, write_objects
+from twin.scene.objects.decompose import ObjectSplats, SceneParts, write_objects
 from twin.scene.shape.from_training import (
     masked_view,
     shapes_of,

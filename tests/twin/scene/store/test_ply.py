@@ -5,8 +5,16 @@ import numpy as np
 import pytest
 
 from bridge.errors import PathNotFoundError
-from twin.scene.gaussians.cloud import SH_DC, GaussianCloud, arrays, as_float32
-from twin.scene.store.ply import COLUMNS, UnreadablePlyError, read_ply, write_ply
+from twin.scene.gaussians import (
+    COLUMNS,
+    SH_DC,
+    GaussianCloud,
+    UnreadablePlyError,
+    arrays,
+    as_float32,
+    read_ply,
+    write_ply,
+)
 
 
 def some_cloud(count: int = 7) -> GaussianCloud:

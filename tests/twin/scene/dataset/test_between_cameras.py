@@ -1,0 +1,99 @@
+"""A camera that stands still is judged by what moving cameras measured."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import textured_room
+
+from bridge.episode.run_folder import RunFolder
+from bridge.geometry import se3
+from twin.scene.dataset.scan_check import (
+    BODY_AXES,
+    FLIP_YZ,
+    CameraCheck,
+    PoseConventionError,
+    check_between,
+    check_scan,
+)
+from twin.scene.frames.downscaled import DownscaledDepth, downscaled_depth
+from twin.scene.frames.selection import choose_frames, find_sources
+from twin.scene.settings import FrameConfig
+
+NUM = 10
+CONFIG = FrameConfig()
+
+
+def thumbs() -> list[DownscaledDepth]:
+    return [downscaled_depth(textured_room.frame(k, NUM), 72) for k in range(NUM)]
+
+
+def side(change: Callable[[np.ndarray], np.ndarray] = lambda T: T) -> list[DownscaledDepth]:
+    thumb = thumbs()[4]
+    return [replace(thumb, T_base_depth=change(thumb.T_base_depth))] * 3
+
+
+def shifted(T: np.ndarray) -> np.ndarray:
+    T = T.copy()
+    T[2, 3] += 0.15
+    return T
+
+
+def reordered(T: np.ndarray) -> np.ndarray:
+    q, p = se3.split(T)
+    return se3.transform_from(q[[3, 0, 1, 2]], p)
+
+
+def test_a_camera_where_it_is_said_to_be_agrees() -> None:
+    report = check_between(side(), thumbs())
+    assert report.agreement is not None
+    assert report.agreement > 0.9
+    assert report.better is None
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (se3.invert, "world-to-camera"),
+        (lambda T: T @ FLIP_YZ, "OpenGL"),
+        (lambda T: T @ se3.invert(BODY_AXES), "body frame"),
+        (reordered, "w x y z were read as x y z w"),
+    ],
+)
+def test_a_pose_in_another_convention_is_named(
+    change: Callable[[np.ndarray], np.ndarray], found: str
+) -> None:
+    report = check_between(side(change), thumbs())
+    assert report.better is not None
+    assert found in report.better.describe()
+
+
+def test_without_anything_to_compare_with_nothing_is_said() -> None:
+    assert check_between(side(), []).agreement is None
+    blind = [replace(t, depth_m=np.zeros_like(t.depth_m)) for t in side()]
+    assert check_between(blind, thumbs()).agreement is None
+    away = side(lambda T: T + np.array([[0, 0, 0, 50.0], *[[0] * 4] * 3]))
+    report = check_between(away, thumbs())
+    assert (report.agreement, report.better) == (None, None)
+
+
+def test_a_fixed_camera_elsewhere_is_said_and_one_read_wrongly_is_refused(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    run = RunFolder.create(tmp_path_factory.mktemp("run"))
+    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=8)
+    choice = choose_frames(find_sources(run), CONFIG)[0]
+    wrist = CameraCheck(choice=choice, thumbs=thumbs(), trusted=[1.0] * NUM)
+    still = replace(choice, camera_id="side", still=True)
+
+    def judged(change: Callable[[np.ndarray], np.ndarray]) -> list[str]:
+        fixed = CameraCheck(choice=still, thumbs=side(change), trusted=[1.0] * 3)
+        return check_scan([wrist, fixed], CONFIG).remarks()
+
+    assert judged(lambda T: T) == []
+    about, advice = judged(shifted)
+    assert about.startswith("camera side of episode scan: only")
+    assert "robot-gst calibrate RUN --cameras" in advice
+    with pytest.raises(PoseConventionError, match=r"camera side .*OpenGL axes"):
+        judged(lambda T: T @ FLIP_YZ)

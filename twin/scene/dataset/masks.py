@@ -1,0 +1,335 @@
+"""What moves with the camera: a gripper before a wrist camera whose joints nobody recorded.
+
+While a camera scans, the scene runs through its image and what is fixed to the camera stays. Such
+pixels have edges that point the same way in all frames and brightness that follows the exposure
+only. An edge along the camera's path, or the point that a camera circles around, does so too: where
+depth was measured, other frames say whether the place stood still in the scene, and then it counts
+as scene. Nothing here needs a model of the gripper, and no held-out frame is looked at.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int64
+from scipy import ndimage
+
+from bridge.geometry import se3
+from twin.scene.frames.camera_poses import same_pose
+from twin.scene.frames.rgbd import PointSet, Target, TrainingView
+
+# --- What moved during the recording: surfaces that other frames look through.
+#
+# The scene folder holds the static place. A robot, a hand or an object that was carried shows up
+# as a surface in a few frames, while other frames measure something farther behind it. No model
+# of the robot is needed. A thing that never moves, such as the robot's base, is static and stays.
+
+VOXEL_M = 0.02
+"""Points are judged in groups of this size."""
+MARGIN_M = 0.03
+MARGIN_FRACTION = 0.02
+"""A measurement must lie this much behind a point to have passed it."""
+MAX_REFERENCE_VIEWS = 40
+"""Frames that are asked; more only cost time."""
+MIN_THROUGH = 2
+OUTLINE_PX = 3
+"""Poses and depth are noisy: closer to a nearer surface than this, at half size, nobody knows."""
+MOVING_GROW_PX = 2
+"""Masks grow by this much at half size, because depth fails along outlines."""
+INDEX_BITS = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class MovingVoxels:
+    """Where something was that is not part of the static place."""
+
+    keys: Int64[np.ndarray, " num_voxels"]
+
+    def contains(self, p_m: Float32[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
+        """Say which points (root frame, metres) belong to something that moved."""
+        return np.isin(_keys(p_m), self.keys)
+
+    def drop_from(self, points: PointSet) -> PointSet:
+        """Return the static points only."""
+        return points.take(~self.contains(points.p_m))
+
+    def mask_in(self, view: TrainingView) -> TrainingView:
+        """Mark the pixels that show something moving, so that the fit passes them over."""
+        if not len(self.keys):
+            return view
+        half = view.half
+        known = half.depth_m > 0
+        p_camera = half.camera.unproject(half.depth_m)[known]
+        hit = np.zeros_like(known)
+        hit[known] = self.contains(se3.apply(view.T_base_color, p_camera).astype(np.float32))
+        return view.without(_grown(hit))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceView:
+    """What one training frame can say about other frames' points."""
+
+    view: TrainingView
+    nearest_m: Float32[np.ndarray, "height width"]
+
+    def testify(
+        self, p_base: Float[np.ndarray, "num_points 3"]
+    ) -> tuple[Bool[np.ndarray, " num_points"], Bool[np.ndarray, " num_points"]]:
+        """Say which points it looks through, and which it sees where they should be."""
+        target = self.view.half
+        camera = target.camera
+        p_camera = se3.apply(se3.invert(self.view.T_base_color), p_base)
+        front = p_camera[:, 2] > MARGIN_M
+        uv, z = camera.project(np.where(front[:, None], p_camera, 1.0))
+        column, row = np.floor(uv[:, 0]).astype(int), np.floor(uv[:, 1]).astype(int)
+        inside = front & (column >= 0) & (column < camera.width)
+        inside &= (row >= 0) & (row < camera.height)
+        measured, nearest = np.zeros(len(p_base)), np.zeros(len(p_base))
+        measured[inside] = target.depth_m[row[inside], column[inside]]
+        nearest[inside] = self.nearest_m[row[inside], column[inside]]
+        margin = MARGIN_M + MARGIN_FRACTION * z
+        known = measured > 0
+        return known & (nearest > z + margin), known & (np.abs(measured - z) <= margin)
+
+
+def choose_reference_views(views: Sequence[TrainingView]) -> list[ReferenceView]:
+    """Take training frames spread evenly; their depth images are the witnesses."""
+    step = max(1, -(-len(views) // MAX_REFERENCE_VIEWS))
+    return [
+        ReferenceView(view=view, nearest_m=nearest_around(view.half.depth_m))
+        for view in views[::step]
+    ]
+
+
+def find_moving(points: Sequence[PointSet], witnesses: Sequence[ReferenceView]) -> MovingVoxels:
+    """Find voxels that more frames look through than confirm.
+
+    Args:
+        points: Surface points of all training frames, or of one held-out frame.
+        witnesses: Training frames.
+    """
+    p = np.concatenate([item.p_m for item in points])
+    keys, inverse, counts = np.unique(_keys(p), return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(inverse, weights=c) / counts for c in p.T], axis=1)
+    through = np.zeros(len(keys), dtype=np.int32)
+    confirmed = np.zeros(len(keys), dtype=np.int32)
+    for witness in witnesses:
+        passed, met = witness.testify(means)
+        through += passed
+        confirmed += met
+    return MovingVoxels(keys=keys[(through >= MIN_THROUGH) & (through > confirmed)])
+
+
+def nearest_around(depth_m: np.ndarray) -> np.ndarray:
+    """Smallest measurement within a few pixels: beside an outline nothing counts as passed."""
+    nearest = np.where(depth_m > 0, depth_m, np.float32(np.inf))
+    for axis in (0, 1):
+        once = nearest.copy()
+        for shift in range(1, OUTLINE_PX + 1):
+            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
+            ahead[axis], behind[axis] = slice(shift, None), slice(None, -shift)
+            for to, source in ((tuple(ahead), tuple(behind)), (tuple(behind), tuple(ahead))):
+                nearest[to] = np.minimum(nearest[to], once[source])
+    return np.asarray(nearest)
+
+
+def _keys(p_m: np.ndarray) -> np.ndarray:
+    cell = np.floor(p_m / VOXEL_M).astype(np.int64) + (1 << (INDEX_BITS - 1))
+    cell = np.clip(cell, 0, (1 << INDEX_BITS) - 1)
+    packed = (cell[:, 0] << (2 * INDEX_BITS)) | (cell[:, 1] << INDEX_BITS) | cell[:, 2]
+    return np.asarray(packed)
+
+
+def _grown(mask: np.ndarray) -> np.ndarray:
+    grown: np.ndarray = mask.copy()
+    for axis in (0, 1):
+        once = grown.copy()
+        for shift in range(1, MOVING_GROW_PX + 1):
+            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
+            ahead[axis], behind[axis] = slice(shift, None), slice(None, -shift)
+            grown[tuple(ahead)] |= once[tuple(behind)]
+            grown[tuple(behind)] |= once[tuple(ahead)]
+    return grown
+
+
+MIN_VIEWS, MAX_VIEWS = 6, 24
+"""Views from different places that can tell, and how many are asked."""
+APART_M, APART_RAD = 0.02, 0.03
+"""Views less far apart than both show the scene at the same place of the image."""
+BLUR_PX = 1.0
+WINDOW_PX = 5
+EDGE_LEVELS = 2.5
+"""Mean gradient, in 8-bit levels per pixel at half size, from which there is an edge to judge."""
+STRONG_LEVELS = 12.0
+"""Stronger gradients count as this: one bright edge that passes by outweighs no other frames."""
+PERSISTENT = 0.8
+"""Length of the sum of all frames' gradients over the sum of their lengths: 1 for an edge that
+stays, about one over the root of the number of frames for one that comes and goes."""
+CALM_LEVELS, CALM_SHARE = 6.0, 0.12
+"""Spread of brightness that noise explains, fixed and relative."""
+REACH = 0.08
+"""Even surfaces count as fixed up to this far from an edge that stays, in image heights."""
+EVIDENCE_PX, EVIDENCE_STRIDE, EVIDENCE_VIEWS = 5, 2, 12
+"""Depth is judged over neighbourhoods of this size, at every second pixel, in so many views."""
+MIN_SHARE, MAX_SHARE = 0.002, 0.5
+"""Of the image: smaller is chance, larger is a camera that hardly moved."""
+EDGE_SHARE = 0.2
+"""Of a piece must be edges that stay: an even surface alone could be anything."""
+STEADY_VIEWS, STEADY_FRACTION = 3, 0.05
+"""A depth that so many views or more measure, and that varies by less, stays."""
+REACH_PERCENTILE = 95.0
+"""Of the depths that stay in what was found: as far as that it may have more."""
+EGO_GROW_PX = 3
+"""Masks grow by this much at half size: what is so near is out of focus and shadows its edge."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EgoMask:
+    """The pixels of one camera that show what moves with it."""
+
+    half: Bool[np.ndarray, "height width"]
+
+    @property
+    def share(self) -> float:
+        """Of the image."""
+        return float(self.half.mean())
+
+    def drop_from(self, points: PointSet, view: TrainingView) -> PointSet:
+        """Return a frame's points without those that lie in these pixels."""
+        camera = view.half.camera
+        p_camera = se3.apply(se3.invert(view.T_base_color), points.p_m.astype(np.float64))
+        uv, _ = camera.project(np.where(p_camera[:, 2:] > 0, p_camera, 1.0))
+        column = np.clip(np.floor(uv[:, 0]).astype(int), 0, camera.width - 1)
+        row = np.clip(np.floor(uv[:, 1]).astype(int), 0, camera.height - 1)
+        return points.take(~self.half[row, column])
+
+    def mask_in(self, view: TrainingView) -> TrainingView:
+        """Return a view with these pixels passed over."""
+        return view.without(self.half)
+
+
+def find_ego_mask(views: Sequence[TrainingView]) -> EgoMask | None:
+    """Find what moves with a camera in the views it took; None when nothing can be said to.
+
+    Args:
+        views: Of one camera; the robot need not be masked in them.
+    """
+    chosen = _apart(views)
+    if len(chosen) < MIN_VIEWS:
+        return None
+    images = np.stack([_blurred(view.half) for view in chosen])
+    stays = _edges_that_stay(images)
+    if stays.mean() < MIN_SHARE / 10:
+        return None
+    near = ndimage.distance_transform_edt(~stays) <= REACH * len(stays)
+    found = (stays | (_calm(images, stays) & near)) & ~_stands_in_scene(chosen)
+    mask = _solid(found, stays)
+    if not MIN_SHARE <= mask.mean() <= MAX_SHARE:
+        return None
+    mask = mask | _more_of_it(mask, np.stack([view.half.depth_m for view in chosen]))
+    return EgoMask(half=mask) if mask.mean() <= MAX_SHARE else None
+
+
+def _apart(views: Sequence[TrainingView]) -> list[TrainingView]:
+    """Views from places that differ, spread evenly when there are many."""
+    kept: list[TrainingView] = []
+    for view in views:
+        pose = view.T_base_color
+        if not any(
+            same_pose(pose, other.T_base_color, distance_m=APART_M, angle_rad=APART_RAD)
+            for other in kept
+        ):
+            kept.append(view)
+    places = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), MAX_VIEWS)).round())
+    return [kept[int(place)] for place in places]
+
+
+def _blurred(target: Target) -> Float32[np.ndarray, "3 height width"]:
+    planes = target.planes_u8.astype(np.float32)
+    return np.asarray(ndimage.gaussian_filter(planes, (0.0, BLUR_PX, BLUR_PX)), dtype=np.float32)
+
+
+def _edges_that_stay(
+    images: Float32[np.ndarray, "num_views 3 height width"],
+) -> Bool[np.ndarray, "height width"]:
+    """Places with edges that point the same way in all frames, whatever the exposure."""
+    down, right = np.gradient(images, axis=(2, 3))
+    strength = np.hypot(down, right)
+    shorter = np.minimum(1.0, STRONG_LEVELS / np.maximum(strength, 1e-6))
+    down, right, strength = down * shorter, right * shorter, strength * shorter
+    length = strength.mean(axis=(0, 1))
+    together = np.hypot(down.mean(axis=0), right.mean(axis=0)).mean(axis=0)
+    length, together = (ndimage.uniform_filter(item, WINDOW_PX) for item in (length, together))
+    return np.asarray((length > EDGE_LEVELS) & (together > PERSISTENT * length))
+
+
+def _calm(
+    images: Float32[np.ndarray, "num_views 3 height width"], stays: Bool[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """Places whose brightness follows the exposure of the frame and nothing else."""
+    grey = images.mean(axis=1)
+    middle = np.median(grey, axis=0)
+    exposure = [float(np.median(item[stays] / np.maximum(middle[stays], 1.0))) for item in grey]
+    levelled = grey / np.maximum(np.array(exposure, dtype=np.float32), 0.1)[:, None, None]
+    middle = np.median(levelled, axis=0)
+    spread = 1.48 * np.median(np.abs(levelled - middle), axis=0)
+    return np.asarray(spread < CALM_LEVELS + CALM_SHARE * middle)
+
+
+def _stands_in_scene(views: Sequence[TrainingView]) -> Bool[np.ndarray, "height width"]:
+    """Pixels whose measured places more of the other frames confirm than look through."""
+    through = np.zeros(views[0].half.depth_m.shape, dtype=np.float32)
+    confirmed, grid = np.zeros_like(through), np.zeros(through.shape, dtype=bool)
+    grid[::EVIDENCE_STRIDE, ::EVIDENCE_STRIDE] = True
+    asked = views[:: -(-len(views) // EVIDENCE_VIEWS)]
+    witnesses = [ReferenceView(view=v, nearest_m=nearest_around(v.half.depth_m)) for v in asked]
+    for view in asked:
+        known = (view.half.depth_m > 0) & grid
+        p_camera = view.half.camera.unproject(view.half.depth_m)[known]
+        p_base = se3.apply(view.T_base_color, p_camera)
+        for witness in witnesses:
+            if witness.view is view:
+                continue
+            passed, met = witness.testify(p_base)
+            through[known] += passed
+            confirmed[known] += met
+    window = EVIDENCE_PX
+    return np.asarray(
+        ndimage.uniform_filter(confirmed, window) > ndimage.uniform_filter(through, window) + 1e-3
+    )
+
+
+def _more_of_it(
+    mask: Bool[np.ndarray, "height width"], depth_m: Float32[np.ndarray, "num_views height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """What wobbles has no edge that stays, but a depth: that of what is carried, or less.
+
+    The scene does not come so near, and where it does, not by the same depth in every view.
+    """
+    known = depth_m > 0
+    measured = np.where(known | ~known.any(axis=0), depth_m, np.nan)
+    middle = np.nanmedian(measured, axis=0)
+    spread = np.nanmedian(np.abs(measured - middle), axis=0)
+    steady = (known.sum(axis=0) >= STEADY_VIEWS) & (spread < STEADY_FRACTION * middle)
+    if not (steady & mask).any():
+        return np.zeros_like(mask)
+    farthest_m = np.percentile(middle[steady & mask], REACH_PERCENTILE)
+    like_it = ndimage.binary_closing(mask | (steady & (middle <= farthest_m)), iterations=2)
+    pieces, _ = ndimage.label(like_it | mask)
+    more = np.isin(pieces, np.unique(pieces[mask])) & ~mask
+    return np.asarray(ndimage.binary_dilation(more, iterations=EGO_GROW_PX), dtype=bool)
+
+
+def _solid(
+    found: Bool[np.ndarray, "height width"], stays: Bool[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """Pieces that are large enough and hold edges that stay, without holes, grown a little."""
+    pieces, count = ndimage.label(ndimage.binary_opening(found, iterations=1))
+    if count == 0:
+        return np.zeros_like(found)
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+    edges = np.bincount(pieces[stays], minlength=count + 1)
+    large = (sizes >= MIN_SHARE * found.size) & (edges >= EDGE_SHARE * sizes)
+    large[0] = False
+    whole = ndimage.binary_fill_holes(large[pieces])
+    return np.asarray(ndimage.binary_dilation(whole, iterations=EGO_GROW_PX), dtype=bool)

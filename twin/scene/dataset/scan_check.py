@@ -1,0 +1,485 @@
+"""What can be wrong with a scan, each in one sentence, before time goes into a fit."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations, product
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry import se3
+from twin.errors import TwinError
+from twin.scene.frames.downscaled import DownscaledDepth, Meeting, meet
+from twin.scene.frames.rgbd import NEAR_M
+from twin.scene.frames.selection import FrameChoice
+from twin.scene.settings import FrameConfig
+
+# --- Whether recorded poses and depth fit together, and if not, which reading of the poses would.
+#
+# Points of one depth image are carried into another by the recorded poses. Where both cameras see
+# the same surface the depths must be equal; with a pose read in the wrong convention they are not.
+
+# --- What depth says about the poses of one camera, whatever it was compared with.
+
+# --- The ways in which poses and depth can be meant: ours, and those others are known to write.
+
+FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
+BODY_AXES = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""``T_body_optical`` of ROS: body x forward, y left, z up; optical z forward, x right, y down."""
+ORDERS = {
+    "": (0, 1, 2, 3),
+    "quaternions written as w x y z were read as x y z w": (1, 2, 3, 0),
+    "quaternions written as x y z w were read as w x y z": (3, 0, 1, 2),
+}
+"""Where the true w, x, y, z are found in the w, x, y, z that were read."""
+AXES = {
+    "": np.eye(4),
+    "the camera looks along -z with y up (OpenGL axes)": FLIP_YZ,
+    "the camera frame is a body frame (x forward, y left, z up)": BODY_AXES,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convention:
+    """One way of reading poses and depth."""
+
+    order: str = ""
+    inverse: bool = False
+    axes: str = ""
+    depth_scale: float = 1.0
+
+    def describe(self) -> str:
+        """Say what differs from our own reading."""
+        parts = [self.order, self.axes]
+        if self.inverse:
+            parts.append("they are world-to-camera, not camera-to-world")
+        if self.depth_scale != 1.0:
+            parts.append(
+                f"depth is to be multiplied by {self.depth_scale:g} "
+                f"(or positions by {1 / self.depth_scale:g})"
+            )
+        return " and ".join(part for part in parts if part) or "as recorded"
+
+    def read(self, T_as_read: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+        """Turn a pose as we read it into ``T_base_camera`` as this convention means it."""
+        q, p = se3.split(T_as_read)
+        T = se3.transform_from(q[list(ORDERS[self.order])], p)
+        return np.asarray((se3.invert(T) if self.inverse else T) @ AXES[self.axes])
+
+
+OTHER_POSES = tuple(
+    Convention(order=order, inverse=inverse, axes=axes)
+    for order, inverse, axes in product(ORDERS, (False, True), AXES)
+)[1:]
+"""Every other way of reading poses; the first of all is our own."""
+
+
+GOOD = 0.5
+"""With this share of the overlap agreeing, poses and depth belong together."""
+CLEARLY_BETTER = 0.2
+MIN_OVERLAP = 0.05
+"""With less, depth says nothing about the poses."""
+SOLID_OVERLAP = 0.2
+"""Frames near in time overlap at least by this much if their poses are read rightly."""
+
+
+class Score(NamedTuple):
+    """How well depth fits under one reading of the poses."""
+
+    agreement: float
+    """Share of the overlapping depth that agrees."""
+    overlap: float
+    """Share of a frame's measurements that another frame sees too; mean over what was compared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseReport:
+    """What the depth says about the poses of one camera."""
+
+    num_pairs: int
+    """Pairs of frames between which the camera visibly moved; 0: nothing could be checked."""
+    agreement: float | None
+    """Share of the overlapping depth that agrees under the recorded poses."""
+    overlap: float
+    """Share of a frame's measurements that another frame sees too; mean over pairs."""
+    better: Convention | None = None
+    better_agreement: float | None = None
+    """A convention under which they clearly fit, where the recorded one does not."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether the recorded poses can be believed as far as the depth tells."""
+        return self.agreement is None or self.agreement >= GOOD
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether depth was there to judge them by, and they fit."""
+        return self.agreement is not None and self.fits
+
+    def remark(self) -> str:
+        """One sentence about what is wrong; empty when nothing is."""
+        if self.better is not None and self.better_agreement is not None:
+            return (
+                f"only {100 * (self.agreement or 0.0):.0f} % of the depth agrees between views, "
+                f"but {100 * self.better_agreement:.0f} % would under another reading: "
+                f"{self.better.describe()}"
+            )
+        if self.agreement is not None and not self.fits:
+            return (
+                f"only {100 * self.agreement:.0f} % of the depth agrees between views, and no "
+                "known convention makes it better: wrong poses, clocks that differ, or a scene "
+                "that moved"
+            )
+        if self.num_pairs and self.overlap < MIN_OVERLAP:
+            return "its views hardly overlap: poses cannot be checked, and edges will not meet"
+        return ""
+
+
+def score_of(met: Sequence[Meeting]) -> Score:
+    """Agreement and overlap of all that was compared, at least one; it counts by its overlap."""
+    total = sum(item.overlap for item in met)
+    agreed = sum(item.agreement * item.overlap for item in met)
+    return Score(agreement=agreed / total if total > 0 else 0.0, overlap=total / len(met))
+
+
+def plain_report(num_pairs: int, recorded: Score) -> PoseReport:
+    """Report on poses as they were recorded; no agreement where views hardly overlap."""
+    return PoseReport(
+        num_pairs=num_pairs,
+        agreement=recorded.agreement if recorded.overlap >= MIN_OVERLAP else None,
+        overlap=recorded.overlap,
+    )
+
+
+def best_of(
+    conventions: Iterable[Convention], score: Callable[[Convention], Score]
+) -> tuple[Convention, float]:
+    """The convention under which most depth agrees, and how much; 0 without solid overlap."""
+    scored = []
+    for convention in conventions:
+        agreement, overlap = score(convention)
+        scored.append((convention, agreement if overlap >= SOLID_OVERLAP else 0.0))
+    return max(scored, key=lambda item: item[1])
+
+
+def is_clearly_better(agreement: float, recorded: PoseReport) -> bool:
+    """Whether poses fit with this agreement, and clearly better than as they were recorded."""
+    return agreement >= GOOD and agreement >= (recorded.agreement or 0.0) + CLEARLY_BETTER
+
+
+MAX_PAIRS = 10
+GAPS = (1, 2, 4, 8, 16)
+"""Pairs are this many training frames apart."""
+STILL_AGREEMENT = 0.7
+"""Where this much agrees without any motion, the camera hardly moved and poses say nothing."""
+SHIFT_MATTERS = 0.05
+"""A unit under which cameras move less must fit better than cameras that only turn."""
+OTHER_SCALES = (0.1, 10.0, 0.2, 5.0, 0.001, 1000.0)
+"""Depth times this; also positions in millimetres, and TUM's depth of 1/5000 m."""
+
+
+class PoseConventionError(TwinError):
+    """Poses fit the depth only when they are read in another way."""
+
+
+class MovedCameraError(TwinError):
+    """A camera moved while its poses say that it stood still."""
+
+
+def check_poses(thumbs: Sequence[DownscaledDepth]) -> PoseReport:
+    """Carry depth between frames of one camera under every convention.
+
+    Args:
+        thumbs: Small depth images in time order, with poses as recorded.
+    """
+    pairs = list(_informative(thumbs))
+    if not pairs:
+        return PoseReport(num_pairs=0, agreement=None, overlap=0.0)
+    recorded = _score(pairs, Convention())
+    plain = plain_report(len(pairs), recorded)
+    better, score = _best(pairs)
+    if not is_clearly_better(score, plain):
+        return plain
+    if better.depth_scale > 1.0:
+        turned_only = _score(pairs, replace(better, depth_scale=1e9)).agreement
+        if score < turned_only + SHIFT_MATTERS:
+            return plain
+    return replace(plain, agreement=recorded.agreement, better=better, better_agreement=score)
+
+
+def still_agreement(thumbs: Sequence[DownscaledDepth]) -> float | None:
+    """Share of the depth that stays the same in the images of a camera said to stand still.
+
+    The median over all pairs: a robot that passes by once does not count. None when no two images
+    measured the same place.
+    """
+    found = []
+    for first, second in combinations(thumbs, 2):
+        met = meet(first, second, se3.invert(second.T_base_depth) @ first.T_base_depth)
+        if met.overlap >= MIN_OVERLAP:
+            found.append(met.agreement)
+    return float(np.median(found)) if found else None
+
+
+def _best(pairs: list[tuple[DownscaledDepth, DownscaledDepth]]) -> tuple[Convention, float]:
+    """The best other convention: one thing wrong if that explains it, else a wrong unit too."""
+    units = [Convention(depth_scale=scale) for scale in OTHER_SCALES]
+    best = best_of([*OTHER_POSES, *units], lambda convention: _score(pairs, convention))
+    if best[1] >= GOOD:
+        return best
+    both = [replace(r, depth_scale=scale) for r, scale in product(OTHER_POSES, OTHER_SCALES)]
+    some = pairs[:: max(1, len(pairs) // 4)]
+    also = best_of(both, lambda convention: _score(some, convention))
+    return max(best, also, key=lambda item: item[1])
+
+
+def _score(pairs: list[tuple[DownscaledDepth, DownscaledDepth]], convention: Convention) -> Score:
+    return score_of([_met(first, second, convention) for first, second in pairs])
+
+
+def _met(first: DownscaledDepth, second: DownscaledDepth, convention: Convention) -> Meeting:
+    T_second_first = se3.invert(convention.read(second.T_base_depth)) @ convention.read(
+        first.T_base_depth
+    )
+    if convention.depth_scale != 1.0:  # the same as moving by the inverse, up to the tolerance
+        T_second_first[:3, 3] /= convention.depth_scale
+    return meet(first, second, T_second_first)
+
+
+def _informative(
+    thumbs: Sequence[DownscaledDepth],
+) -> Iterator[tuple[DownscaledDepth, DownscaledDepth]]:
+    """Pairs of frames whose images show that the camera moved; both directions of time alike."""
+    found = 0
+    for gap in GAPS:
+        starts = range(0, len(thumbs) - gap, max(1, (len(thumbs) - gap) // MAX_PAIRS))
+        for start in starts:
+            first, second = thumbs[start], thumbs[start + gap]
+            met = meet(first, second, np.eye(4))
+            if not first.depth_m.any() or not second.depth_m.any():
+                continue
+            if met.agreement < STILL_AGREEMENT:
+                yield first, second
+                found += 1
+        if found >= MAX_PAIRS:
+            return
+
+
+# --- Whether a camera that stands still sees things where cameras that move see them.
+#
+# Its own images say nothing of its pose: they agree wherever it is believed to be. What a moving
+# camera measured is carried into them instead.
+
+MAX_OTHERS = 12
+"""Images of other cameras that are carried over."""
+
+
+def check_between(own: Sequence[DownscaledDepth], others: Sequence[DownscaledDepth]) -> PoseReport:
+    """Carry the depth of moving cameras into one that stands still, however its pose is read.
+
+    Args:
+        own: Of the camera that stands still.
+        others: Of moving cameras whose poses fit their own depth.
+
+    Returns:
+        No agreement when there is nothing to compare with, or when no reading of its pose lets the
+        camera see what the others saw: it may look at another place.
+    """
+    first = next((thumb for thumb in own if thumb.depth_m.any()), None)
+    places = np.unique(np.linspace(0, len(others) - 1, min(len(others), MAX_OTHERS)).round())
+    chosen = [others[int(place)] for place in places]
+    if first is None or not chosen:
+        return PoseReport(num_pairs=0, agreement=None, overlap=0.0)
+    T_base_first = first.T_base_depth
+    recorded = _seen_alike(first, chosen, T_base_first)
+    plain = plain_report(len(chosen), recorded)
+    if plain.is_sure:
+        return plain
+    better, score = best_of(
+        OTHER_POSES, lambda reading: _seen_alike(first, chosen, reading.read(T_base_first))
+    )
+    if not is_clearly_better(score, plain):
+        return plain
+    return replace(plain, agreement=recorded.agreement, better=better, better_agreement=score)
+
+
+def _seen_alike(
+    own: DownscaledDepth, others: Sequence[DownscaledDepth], T_base_own: Float[np.ndarray, "4 4"]
+) -> Score:
+    T_own_base = se3.invert(T_base_own)
+    return score_of([meet(other, own, T_own_base @ other.T_base_depth) for other in others])
+
+
+FEW_FRAMES = 5
+"""With fewer training frames of all cameras together, much was seen once or never."""
+SPARSE = 0.02
+"""With a smaller share of trusted pixels a camera contributes next to nothing."""
+MUCH_MOVED = 0.3
+"""More of the surface than this is rarely only a robot's arm."""
+
+
+class NoDepthError(TwinError):
+    """No depth image holds anything usable."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraCheck:
+    """What one camera's training frames showed."""
+
+    choice: FrameChoice
+    thumbs: Sequence[DownscaledDepth]
+    trusted: Sequence[float]
+    """Share of trusted depth pixels of each frame."""
+
+    @property
+    def name(self) -> str:
+        """The camera, as a sentence begins with it."""
+        return f"camera {self.choice.camera_id} of episode {self.choice.episode.info.id}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanReport:
+    """What is to be said about a scan; ``scene.json`` keeps it."""
+
+    poses: Mapping[str, PoseReport]
+    """By camera; one that stands still is compared with those that move, where there are any."""
+    found: tuple[str, ...]
+    """Sentences about what is wrong."""
+    moving_fraction: float = 0.0
+    """Share of the measured surface that other frames look through."""
+    carried: Mapping[str, float] = field(default_factory=dict)
+    """By camera without joints: share of its image that moves with it."""
+
+    def remarks(self) -> list[str]:
+        """All sentences, that about motion included."""
+        found = list(self.found)
+        for name, share in self.carried.items():
+            found.append(
+                f"{100 * share:.0f} % of the image of {name} moves with the camera, as a gripper "
+                "before it does, and was left out"
+            )
+        if self.moving_fraction < MUCH_MOVED:
+            return found
+        return [
+            *found,
+            f"{100 * self.moving_fraction:.0f} % of the measured surface moved during the scan and "
+            "was left out; scan while nothing but the camera moves, or check the poses",
+        ]
+
+    def to_record(self) -> dict[str, Any]:
+        """What ``scene.json`` says."""
+        return {
+            "remarks": self.remarks(),
+            "moving_fraction": self.moving_fraction,
+            "carried_fraction": {name: round(share, 4) for name, share in self.carried.items()},
+            "pose_agreement": {
+                name: None if report.agreement is None else round(report.agreement, 4)
+                for name, report in self.poses.items()
+            },
+        }
+
+
+def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanReport:
+    """Look for what makes a scan useless, or worth less than it seems.
+
+    Raises:
+        NoDepthError: When no camera has depth images that can be used.
+        PoseConventionError: When a camera's poses fit only if read in another convention.
+        MovedCameraError: When a camera moved that is said to stand still.
+    """
+    seen = [camera for camera in cameras if camera.thumbs]
+    blind = [camera for camera in seen if max(camera.trusted) < SPARSE]
+    usable = [camera for camera in seen if max(camera.trusted) >= SPARSE]
+    if blind and not usable:
+        raise NoDepthError(_no_depth(blind[0], config))
+    moved = _still_cameras(usable, refuse=config.check_poses)
+    poses = _pose_reports(usable)
+    for name, report in poses.items():
+        if report.better is not None and config.check_poses:
+            message = (
+                f"the poses of {name} are wrong: {report.remark()}. Record or import it again, or "
+                "rebuild with --no-check-poses."
+            )
+            raise PoseConventionError(message)
+    found = [_no_depth(camera, config) for camera in blind] + moved
+    found += [f"{name}: {report.remark()}" for name, report in poses.items() if report.remark()]
+    still = [camera.name for camera in usable if camera.choice.still]
+    if any(name in poses and not poses[name].fits for name in still):
+        found.append("robot-gst calibrate RUN --cameras finds where cameras are that stand still")
+    total = sum(len(camera.thumbs) for camera in seen)
+    if total < FEW_FRAMES:
+        found.append(
+            f"only {total} training frame{'s' if total > 1 else ''}: the scene holds what "
+            f"{'they' if total > 1 else 'it'} saw and is likely to be wrong from elsewhere; scan "
+            "longer"
+        )
+    return ScanReport(poses=poses, found=tuple(found))
+
+
+def _pose_reports(usable: Sequence[CameraCheck]) -> dict[str, PoseReport]:
+    """Judge moving cameras by themselves, and the others by moving ones that can be believed."""
+    poses = {
+        camera.name: check_poses(camera.thumbs) for camera in usable if not camera.choice.still
+    }
+    sure = [camera for camera in usable if camera.name in poses and poses[camera.name].is_sure]
+    others = [thumb for camera in sure for thumb in camera.thumbs]
+    for camera in usable:
+        if camera.choice.still:
+            report = check_between(camera.thumbs, others)
+            if report.agreement is not None:  # else it looks at another place
+                poses[camera.name] = report
+    return poses
+
+
+def _still_cameras(usable: Sequence[CameraCheck], *, refuse: bool) -> list[str]:
+    """Say which cameras moved although their poses do not.
+
+    Raises:
+        MovedCameraError: When one did beyond doubt, and that is to be refused.
+    """
+    found = []
+    for camera in usable:
+        agreement = still_agreement(camera.thumbs) if camera.choice.still else None
+        if agreement is None or agreement >= STILL_AGREEMENT:
+            continue
+        about = (
+            f"{camera.name} stands still by its poses, but only {100 * agreement:.0f} % of its "
+            "depth is the same from image to image: "
+        )
+        if agreement >= GOOD:
+            about += "much moved before it, or it moved itself and nobody recorded how"
+        else:
+            about += (
+                "it was moved, or nobody recorded how it moves. Rebuild with --poses odometry, "
+                "record its poses, or insist with --no-check-poses"
+            )
+            if refuse:
+                raise MovedCameraError(f"{about}.")
+        found.append(about)
+    return found
+
+
+def _no_depth(camera: CameraCheck, config: FrameConfig) -> str:
+    """Say why a camera's depth is not usable."""
+    values = np.concatenate([thumb.depth_m[thumb.depth_m > 0] for thumb in camera.thumbs])
+    if len(values) == 0:
+        return f"{camera.name} measured no depth at all: every pixel is 0 or not a number"
+    median = float(np.median(values))
+    if median > config.max_depth_m:
+        return (
+            f"{camera.name} measured depth around {median:.3g} m, beyond --max-depth-m "
+            f"{config.max_depth_m:g}: check the unit of depth, or raise the limit"
+        )
+    if median < NEAR_M:
+        return (
+            f"{camera.name} measured depth around {1e3 * median:.3g} mm, nearer than any surface "
+            f"can be ({1e3 * NEAR_M:.0f} mm): check the unit of depth"
+        )
+    share = 100 * max(camera.trusted)
+    return (
+        f"at most {share:.2g} % of the depth pixels of {camera.name} are usable: measurements "
+        "without measured neighbours, or that jump, are not trusted"
+    )

@@ -1,0 +1,176 @@
+"""Read the training frames once: points, views, what moved, and whether the scan makes sense."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry import se3
+from bridge.terminal import Output
+from twin.scene.dataset.masks import (
+    EgoMask,
+    MovingVoxels,
+    ReferenceView,
+    choose_reference_views,
+    find_ego_mask,
+    find_moving,
+)
+from twin.scene.dataset.refine_poses import refine_poses, with_corrections
+from twin.scene.dataset.scan_check import CameraCheck, ScanReport, check_scan
+from twin.scene.frames.downscaled import DownscaledDepth, downscaled_depth
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView, training_view
+from twin.scene.frames.selection import FrameChoice, NoFramesError, load
+from twin.scene.robot.extraction import MAX_POSTURES, FoundRobot, find_robot, look_closer
+from twin.scene.settings import RebuildConfig
+
+MAX_POINTS = 3_000_000
+"""Depth points to fuse; more change nothing but the time."""
+THUMB_PX = 120
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingSet:
+    """What the training frames gave; nothing in it has seen a held-out frame."""
+
+    choices: list[FrameChoice]
+    """With the poses the views have now."""
+    points: list[PointSet]
+    """Static surface points of each training frame."""
+    views: list[TrainingView]
+    owners: list[int]
+    """Index of each view's choice."""
+    moving: MovingVoxels
+    carried: dict[int, EgoMask]
+    """By index of the choice: what moves with a camera whose robot is not known by joints."""
+    witnesses: list[ReferenceView]
+    report: ScanReport
+    robot: FoundRobot
+
+
+def limits_of(config: RebuildConfig) -> DepthLimits:
+    """Which depth is trusted."""
+    return DepthLimits(
+        max_depth_m=config.frames.max_depth_m, flying_fraction=config.initialise.flying_fraction
+    )
+
+
+@dataclass(kw_only=True)
+class _Read:
+    """What reading the training frames gave, frame by frame."""
+
+    points: list[PointSet] = field(default_factory=list)
+    views: list[TrainingView] = field(default_factory=list)
+    owners: list[int] = field(default_factory=list)
+    cameras: list[CameraCheck] = field(default_factory=list)
+
+
+def learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output) -> TrainingSet:
+    """Read every training frame, check the scan, and set aside what moved.
+
+    Raises:
+        NoFramesError: When no frame has colour, depth and a pose together.
+        NoDepthError: When no depth image holds anything usable.
+        PoseConventionError: When the poses fit only if read in another convention.
+    """
+    robot = find_robot(choices, output)
+    read = _read(choices, config, robot, output)
+    if not read.views:
+        message = "no frame of this run has colour, depth and a pose together. Record it again."
+        raise NoFramesError(message)
+    still_stride = _stride(MAX_POSTURES, read.views[0].full.depth_m.size)
+    look_closer(robot, choices, limits_of(config), still_stride)
+    report = check_scan(read.cameras, config.frames)
+    carried = _set_carried_aside(choices, read, robot)
+    shares = {read.cameras[index].name: item.share for index, item in carried.items()}
+    points, views, owners = read.points, read.views, read.owners
+    moved = list(choices)
+    if config.frames.align_poses:
+        refined = refine_poses(points, views, output)
+        points, views = refined.points, refined.views
+        moved = with_corrections(choices, owners, views, refined.corrections)
+    witnesses = choose_reference_views(views)
+    moving = find_moving(points, witnesses)
+    static = [moving.drop_from(item) for item in points]
+    total_points = max(sum(len(p.p_m) for p in points), 1)
+    gone = sum(len(p.p_m) - len(s.p_m) for p, s in zip(points, static, strict=True)) / total_points
+    report = replace(report, moving_fraction=round(gone, 4), carried=shares)
+    for remark in report.remarks():
+        output.say(remark)
+    return TrainingSet(
+        choices=moved,
+        points=static,
+        views=[moving.mask_in(view) for view in views],
+        owners=owners,
+        moving=moving,
+        carried=carried,
+        witnesses=witnesses,
+        report=report,
+        robot=robot,
+    )
+
+
+def _read(
+    choices: Sequence[FrameChoice], config: RebuildConfig, robot: FoundRobot, output: Output
+) -> _Read:
+    """Read every training frame once, the robot set aside where its joints are known."""
+    total = sum(len(choice.train_ns) for choice in choices)
+    read = _Read()
+    with output.progress("read frames", total) as advance:
+        for index, choice in enumerate(choices):
+            thumbs: list[DownscaledDepth] = []
+            trusted = []
+            for frame in load(choice, choice.train_ns):
+                surface = FrameSurface(frame, limits_of(config))
+                seen = surface.points(_stride(total, frame.depth_m.size))
+                view = training_view(surface)
+                seen, view = robot.frames.take_out(choice.episode, frame, seen, view)
+                read.points.append(seen)
+                read.views.append(view)
+                read.owners.append(index)
+                thumbs.append(downscaled_depth(frame, THUMB_PX))
+                trusted.append(float(surface.trusted.mean()))
+                advance(len(read.views), f"camera {frame.camera_id}")
+            read.cameras.append(CameraCheck(choice=choice, thumbs=thumbs, trusted=trusted))
+    return read
+
+
+def _set_carried_aside(
+    choices: Sequence[FrameChoice], read: _Read, robot: FoundRobot
+) -> dict[int, EgoMask]:
+    """Take out of points and views what moves with a camera, where no joints tell the robot."""
+    found: dict[int, EgoMask] = {}
+    for index, choice in enumerate(choices):
+        if choice.still or robot.frames.knows(choice.episode):
+            continue
+        mine = [place for place, owner in enumerate(read.owners) if owner == index]
+        carried = find_ego_mask([read.views[place] for place in mine])
+        if carried is None:
+            continue
+        found[index] = carried
+        for place in mine:
+            read.points[place] = carried.drop_from(read.points[place], read.views[place])
+            read.views[place] = carried.mask_in(read.views[place])
+    return found
+
+
+def with_fitted_poses(
+    learnt: TrainingSet, Ts_base_color: Float[np.ndarray, "num_views 4 4"]
+) -> TrainingSet:
+    """Carry the poses the fit ended with into views and choices, for all that comes after."""
+    found: list[dict[int, np.ndarray]] = [dict(choice.corrections) for choice in learnt.choices]
+    views = list(learnt.views)
+    for index, (owner, T) in enumerate(zip(learnt.owners, Ts_base_color, strict=True)):
+        view = views[index]
+        if np.allclose(T, view.T_base_color, atol=1e-9):
+            continue
+        before = found[owner].get(view.stamp_ns, np.eye(4))
+        found[owner][view.stamp_ns] = T @ se3.invert(view.T_base_color) @ before
+        views[index] = replace(view, T_base_color=T)
+    choices = [replace(c, corrections=T) for c, T in zip(learnt.choices, found, strict=True)]
+    return replace(learnt, views=views, choices=choices)
+
+
+def _stride(num_frames: int, num_pixels: int) -> int:
+    """Use every n-th pixel of every n-th row so that all frames together stay within bounds."""
+    return max(1, round(float(np.sqrt(num_frames * num_pixels / MAX_POINTS))))

@@ -1,1 +1,0 @@
-"""Pictures of a scene, in the state it was scanned in or another."""

@@ -1,0 +1,495 @@
+"""Fit Gaussians to images: half size first, then full size, for a time or a number of images.
+
+Adam moves everything; what happens between its steps is in ``events``.
+"""
+
+import io
+import math
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32, Int64
+
+from bridge.geometry import se3
+from bridge.terminal import Advance
+from bridge.whole_file import write_whole
+from twin.scene.fit.appearance import Allowance, ImageObservation, solve_appearance, solve_gains
+from twin.scene.fit.camera_correction import CameraCorrections, correction_gradient
+from twin.scene.fit.densify import densify, score
+from twin.scene.frames.rgbd import TrainingView
+from twin.scene.gaussians import NUM_FIRST, GaussianCloud, arrays, as_float32, with_harmonics
+from twin.scene.raster.rasteriser import FitSession, RasterConfig, Rasteriser, psnr_db
+from twin.scene.settings import FitConfig
+
+# --- What happens between the steps of a fit, each at its share of the budget and within its time.
+#
+# Gains and colours are solved in closed form (``appearance``), Gaussians are split where the
+# error is large (``densify``). Each of these looks at many images at once, so with many images it
+# could take longer than the fit itself: none may take more than its share of the budget.
+
+# --- Everything a fit has reached, and the file it is kept in so that it can go on.
+
+# --- Gaussians stay near the surface that depth fused.
+#
+# Images alone let a Gaussian slide along its rays as long as the training views agree; the depth
+# term sees only the mean depth of a pixel, so Gaussians before and behind the surface cancel in
+# it. From other viewpoints they come apart as a haze of millimetres. The fused surface is where
+# many depth images agree, so each Gaussian is held within a slab around the piece of it that it
+# began on.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfacePrior:
+    """The plane each Gaussian began on."""
+
+    normals: Float32[np.ndarray, "num_splats 3"]
+    heights_m: Float32[np.ndarray, " num_splats"]
+    """Of the plane along its normal: normal . p for each of its points."""
+    sizes_m: Float32[np.ndarray, " num_splats"]
+    """Standard deviation in the plane at the start."""
+
+    @classmethod
+    def of(cls, cloud: GaussianCloud) -> "SurfacePrior":
+        """Planes through the Gaussians' centres across their thinnest axis."""
+        row = np.arange(len(cloud))
+        R = se3.rotation_from_quaternion(cloud.quats_wxyz.astype(np.float64))
+        normals = R[row, :, cloud.scales_log.argmin(axis=1)].reshape(-1, 3)
+        return cls(
+            normals=as_float32(normals),
+            heights_m=as_float32(np.einsum("ni,ni->n", normals, cloud.means_m)),
+            sizes_m=np.exp(cloud.scales_log.max(axis=1, initial=-np.inf)).astype(np.float32),
+        )
+
+    def take(self, parents: Int64[np.ndarray, " num_rows"]) -> "SurfacePrior":
+        """The planes of Gaussians that come from some of these."""
+        return SurfacePrior(
+            normals=self.normals[parents],
+            heights_m=self.heights_m[parents],
+            sizes_m=self.sizes_m[parents],
+        )
+
+    def hold(self, cloud: GaussianCloud, slab: float) -> None:
+        """Move centres that left the slab back to its border, in place.
+
+        Args:
+            cloud: As many Gaussians as there are planes.
+            slab: Half its thickness, in the Gaussian's size at the start.
+        """
+        off_m = np.einsum("ni,ni->n", self.normals, cloud.means_m) - self.heights_m
+        limit_m = np.float32(slab) * self.sizes_m
+        beyond_m = off_m - np.clip(off_m, -limit_m, limit_m)
+        cloud.means_m[:] -= beyond_m[:, None] * self.normals
+
+
+FIT_STATE = "fit.npz"
+"""In the scene folder while a fit runs, or after one that was interrupted."""
+STATE_VERSION = 2
+SCALARS = ("coarse_steps", "events_done", "num_split", "num_pruned", "colour_steps")
+CAMERA_ARRAYS = ("values", "first", "second", "counts")
+SURFACE_ARRAYS = ("normals", "heights_m", "sizes_m")
+
+
+@dataclass(kw_only=True)
+class FitState:
+    """A fit between two steps; the only thing that changes while fitting."""
+
+    session: FitSession
+    """The cloud, the moments of Adam and the number of images seen."""
+    size_m: float
+    """Median size of the first Gaussians; positions move in units of it."""
+    gains: Float[np.ndarray, "num_views 3"]
+    cameras: CameraCorrections
+    surface: SurfacePrior
+    """Where the Gaussians began."""
+    seconds: float = 0.0
+    """Time spent so far."""
+    coarse_steps: int = 0
+    events_done: int = 0
+    """How much of the schedule of colour solutions and splits is behind."""
+    num_split: int = 0
+    num_pruned: int = 0
+    colour_steps: int = 0
+    errors: list[float] = field(default_factory=list)
+    """Mean squared errors of the last images."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint:
+    """Where an interrupted fit goes on from."""
+
+    path: Path
+    key: str
+    """Names the inputs and settings; a file of others is not used."""
+    period_s: float = 10.0
+    """At most this much is lost."""
+
+
+def first_state(session: FitSession, num_views: int) -> FitState:
+    """Before the first image."""
+    return FitState(
+        session=session,
+        size_m=float(np.median(np.exp(session.cloud.scales_log.max(axis=1)))),
+        gains=np.ones((num_views, 3)),
+        cameras=CameraCorrections.none(num_views),
+        surface=SurfacePrior.of(session.cloud),
+    )
+
+
+def save_state(checkpoint: Checkpoint, state: FitState) -> None:
+    """Write the state whole; plain arrays, nothing that runs when read."""
+    content: dict[str, np.ndarray] = {
+        "key": np.array(checkpoint.key),
+        "version": np.array(STATE_VERSION),
+        "seconds": np.array(state.seconds),
+        "size_m": np.array(state.size_m),
+        "steps": np.array(state.session.steps),
+        "errors": np.array(state.errors, dtype=np.float64),
+        "gains": state.gains,
+    }
+    content |= {name: np.array(getattr(state, name)) for name in SCALARS}
+    content |= {f"cameras.{name}": getattr(state.cameras, name) for name in CAMERA_ARRAYS}
+    content |= {f"surface.{name}": getattr(state.surface, name) for name in SURFACE_ARRAYS}
+    moments = state.session.moments
+    for name, rows in arrays(state.session.cloud):
+        content[f"cloud.{name}"] = rows
+        content[f"first.{name}"], content[f"second.{name}"] = moments[name]
+    buffer = io.BytesIO()
+    np.savez(buffer, **content)  # type: ignore[arg-type]  # numpy's stub takes the names for options
+    write_whole(checkpoint.path, buffer.getvalue())
+
+
+def load_state(
+    checkpoint: Checkpoint, make_session: Callable[[GaussianCloud], FitSession]
+) -> FitState | None:
+    """Read the state of an interrupted fit of the same inputs and settings; None if there is none.
+
+    A damaged file, or one of another version, is none.
+    """
+    try:
+        whole = io.BytesIO(checkpoint.path.read_bytes())
+        with np.load(whole, allow_pickle=False) as stored:
+            content = {name: stored[name] for name in stored.files}
+        if str(content["key"]) != checkpoint.key or int(content["version"]) != STATE_VERSION:
+            return None
+        return _state_from(content, make_session)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _state_from(
+    content: dict[str, np.ndarray], make_session: Callable[[GaussianCloud], FitSession]
+) -> FitState:
+    def part(prefix: str) -> dict[str, np.ndarray]:
+        begin = len(prefix)
+        return {name[begin:]: rows for name, rows in content.items() if name.startswith(prefix)}
+
+    session = make_session(GaussianCloud(**part("cloud.")))
+    second = part("second.")
+    moments = {name: (rows, second[name]) for name, rows in part("first.").items()}
+    session.resume(moments, int(content["steps"]))
+    return FitState(
+        session=session,
+        size_m=float(content["size_m"]),
+        gains=content["gains"],
+        cameras=CameraCorrections(**part("cameras.")),
+        surface=SurfacePrior(**part("surface.")),
+        seconds=float(content["seconds"]),
+        errors=content["errors"].tolist(),
+        **{name: int(content[name]) for name in SCALARS},
+    )
+
+
+SOLVE_AT = (0.9,)
+"""Shares of the budget at which colours are solved. Not at the start: a sharp solution for blurred
+Gaussians leads Adam astray (0.4 dB of 34 on the clean tabletop); near the end it adds 0.2 dB."""
+GAINS_AT = (0.1, 0.3, 0.6)
+"""Shares of the budget at which gains are solved, besides with the colours."""
+SPLIT_AT = (0.1, 0.2, 0.3)
+"""Shares of the budget at which Gaussians are split and dropped."""
+SOLVE_SHARE, GAINS_SHARE, SPLIT_SHARE = 0.08, 0.02, 0.04
+"""At most this much of the budget for each of them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far along the fit is, 0..1 by time or by images."""
+
+    fraction: float
+    seconds: float
+    clock: Callable[[], float]
+    """What the budget is counted in."""
+    end_s: float
+    """When the budget is used up, on that clock; infinite when images are counted."""
+
+    def allowance(self, share: float) -> Allowance:
+        """Time for a stage that may take this share of the budget, and no more than is left."""
+        if math.isinf(self.end_s):
+            return Allowance(clock=self.clock)
+        now_s = self.clock()
+        budget_s = self.seconds / self.fraction if self.fraction > 0 else self.end_s - now_s
+        return Allowance(clock=self.clock, until_s=min(now_s + share * budget_s, self.end_s))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """One entry of the schedule."""
+
+    at: float
+    share: float
+    act: Callable[[FitState, bool, Allowance], None]
+
+
+class Events:
+    """The schedule of a fit, and what it says to do."""
+
+    def __init__(
+        self,
+        views: list[TrainingView],
+        config: FitConfig,
+        max_splats: int,
+        rasteriser: Rasteriser,
+    ) -> None:
+        """Plan; nothing is done yet."""
+        self._views = views
+        self._config = config
+        self._max_splats = max_splats
+        self._rasteriser = rasteriser
+
+    @cached_property
+    def _schedule(self) -> list[Event]:
+        config, events = self._config, []
+        if config.densify:
+            events += [Event(at=at, share=SPLIT_SHARE, act=self._densify) for at in SPLIT_AT]
+        if config.gain:
+            events += [Event(at=at, share=GAINS_SHARE, act=self._solve_gains) for at in GAINS_AT]
+        if config.appearance_steps:
+            events += [Event(at=at, share=SOLVE_SHARE, act=self._solve_colours) for at in SOLVE_AT]
+        return sorted(events, key=lambda event: event.at)
+
+    def keep(self, state: FitState, at: Progress) -> None:
+        """Do what is due; what is already behind is not done again."""
+        coarse = at.fraction < self._config.coarse_fraction
+        while (
+            state.events_done < len(self._schedule)
+            and self._schedule[state.events_done].at <= at.fraction
+        ):
+            due = self._schedule[state.events_done]
+            due.act(state, coarse, at.allowance(due.share))
+            state.events_done += 1
+
+    def _observations(self, state: FitState, coarse: bool) -> list[ImageObservation]:
+        return [
+            ImageObservation(
+                target=view.half if coarse else view.full,
+                T_base_camera=state.cameras.pose(index, view.T_base_color),
+                gain=state.gains[index],
+            )
+            for index, view in enumerate(self._views)
+        ]
+
+    def _solve_gains(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
+        observations = self._observations(state, coarse)
+        state.gains = solve_gains(state.session.cloud, observations, self._rasteriser, allowance)
+
+    def _solve_colours(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
+        if self._config.gain:
+            self._solve_gains(state, coarse, allowance)
+        solved = solve_appearance(
+            state.session.cloud,
+            self._observations(state, coarse),
+            self._rasteriser,
+            steps=self._config.appearance_steps,
+            allowance=allowance,
+        )
+        state.colour_steps += solved.steps
+        state.session.cloud.colors[:] = solved.cloud.colors
+        state.session.cloud.harmonics[:] = solved.cloud.harmonics
+
+    def _densify(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
+        cloud = state.session.cloud
+        scores = score(cloud, self._observations(state, coarse), self._rasteriser, allowance)
+        left = sum(event.act == self._densify for event in self._schedule[state.events_done :])
+        room = max(self._max_splats - len(cloud), 0)
+        done = densify(cloud, scores, max_splats=self._max_splats, most=-(-room // left))
+        state.session.rearrange(done.cloud, done.parents)
+        state.surface = state.surface.take(done.parents)
+        state.num_split += done.num_split
+        state.num_pruned += done.num_pruned
+
+
+def order_of_views(seed: int, epoch: int, num_views: int) -> np.ndarray:
+    """The order in which one pass shows the views; the same whenever it is asked for."""
+    return np.random.default_rng([seed, epoch]).permutation(num_views)
+
+
+RATES = {
+    "means_m": 0.18,  # in units of the median Gaussian's size
+    "quats_wxyz": 1.2e-2,
+    "scales_log": 4.5e-2,
+    "opacities_logit": 0.12,
+    "colors": 2.4e-2,
+    "harmonics": 3e-3,
+}
+"""Adam's step sizes at the start."""
+DECAY = 0.05
+"""What is left of them at the end."""
+HOLD_EVERY = 5
+"""Images between two looks at whether Gaussians left the surface."""
+SPENT_AT_MOST = 0.5
+"""Initialisation uses up this share of the budget at most, so that there always is a fit."""
+POSES_FROM = 0.15
+"""Cameras are moved only once the scene is good enough to say where to."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitResult:
+    """The fitted cloud and what it took."""
+
+    cloud: GaussianCloud
+    iterations: int
+    coarse_iterations: int
+    seconds: float
+    """Wall time, initialisation and that of an interrupted fit before included."""
+    cpu_seconds: float
+    """Of this process, this time."""
+    train_psnr_db: float | None
+    """Over the static pixels of the last images seen, at the size they were fitted at; None when
+    there were none."""
+    gains: Float[np.ndarray, "num_views 3"]
+    """Brightness of each training image over that of the scene, per channel; their mean is 1."""
+    Ts_base_color: Float[np.ndarray, "num_views 4 4"]
+    """Where the training views were in the end; as given unless poses were refined."""
+    num_split: int
+    num_pruned: int
+    colour_steps: int
+    """Conjugate gradient steps that solved colours; 0 when there was no time for them."""
+
+
+def fit(
+    cloud: GaussianCloud,
+    views: list[TrainingView],
+    config: FitConfig,
+    advance: Advance,
+    *,
+    max_splats: int | None = None,
+    checkpoint: Checkpoint | None = None,
+    clock: Callable[[], float] = time.monotonic,
+    spent_s: float = 0.0,
+) -> FitResult:
+    """Minimise the loss over the views with Adam; each step draws one image.
+
+    The time budget covers everything in here, the solutions in closed form included: it is
+    exceeded by one image at most.
+
+    Args:
+        cloud: Where to start.
+        views: Training images; never the held-out ones.
+        config: Budget, loss and seed.
+        advance: Told the percentage done, the recent PSNR and the time left.
+        max_splats: Budget of Gaussians; none: as many as there are at the start.
+        checkpoint: Where to keep the state; a state of the same key is gone on with.
+        clock: Seconds that the budget is counted in.
+        spent_s: How much of the budget initialisation has used up; up to half of it counts.
+    """
+    learner = _Learner(views, config)
+    events = Events(views, config, max_splats or len(cloud), learner.rasteriser)
+    state = None if checkpoint is None else load_state(checkpoint, learner.session)
+    if state is None or len(state.gains) != len(views):
+        harmonics = NUM_FIRST if config.harmonics else cloud.num_harmonics
+        state = first_state(learner.session(with_harmonics(cloud, harmonics)), len(views))
+        state.seconds = min(spent_s, SPENT_AT_MOST * config.budget_s)
+    cpu_start, last_saved = time.process_time(), state.seconds
+    for at in _steps(config, state, clock):
+        events.keep(state, at)
+        learner.step(state, at)
+        advance(round(100 * at.fraction), _note(state, at, len(views)))
+        if checkpoint is not None and at.seconds - last_saved >= checkpoint.period_s:
+            state.seconds = last_saved = at.seconds
+            save_state(checkpoint, state)
+    if config.slab:
+        state.surface.hold(state.session.cloud, config.slab)
+    return FitResult(
+        cloud=state.session.cloud,
+        iterations=state.session.steps,
+        coarse_iterations=state.coarse_steps,
+        seconds=state.seconds,
+        cpu_seconds=time.process_time() - cpu_start,
+        train_psnr_db=_recent_psnr_db(state, len(views)),
+        gains=state.gains,
+        Ts_base_color=np.stack([learner.pose(state, index) for index in range(len(views))]),
+        num_split=state.num_split,
+        num_pruned=state.num_pruned,
+        colour_steps=state.colour_steps,
+    )
+
+
+def _steps(config: FitConfig, state: FitState, clock: Callable[[], float]) -> Iterator[Progress]:
+    begin_s = clock() - state.seconds
+    by_images = config.iterations > 0
+    end_s = math.inf if by_images else begin_s + config.budget_s
+    while True:
+        state.seconds = clock() - begin_s
+        seen = state.session.steps
+        fraction = seen / config.iterations if by_images else state.seconds / config.budget_s
+        if fraction >= 1.0:
+            return
+        yield Progress(fraction=fraction, seconds=state.seconds, clock=clock, end_s=end_s)
+
+
+def _recent_psnr_db(state: FitState, num_views: int) -> float | None:
+    return psnr_db(float(np.mean(state.errors[-num_views:]))) if state.errors else None
+
+
+def _note(state: FitState, at: Progress, num_views: int) -> str:
+    recent = _recent_psnr_db(state, num_views)
+    said = "" if recent is None else f", training PSNR {recent:.2f} dB"
+    left = at.seconds / at.fraction - at.seconds if at.fraction > 0 else None
+    return f"image {state.session.steps}{said}" + ("" if left is None else f", {left:.0f} s left")
+
+
+class _Learner:
+    """One step of the fit."""
+
+    def __init__(self, views: list[TrainingView], config: FitConfig) -> None:
+        self._views = views
+        self._config = config
+        self.rasteriser = Rasteriser(RasterConfig(threads=config.threads))
+
+    def session(self, cloud: GaussianCloud) -> FitSession:
+        """What draws, compares and learns, from a cloud on."""
+        return FitSession(
+            cloud,
+            self.rasteriser.config,
+            loss=self._config.loss,
+            depth_weight=self._config.depth_weight,
+        )
+
+    def pose(self, state: FitState, index: int) -> np.ndarray:
+        """Where a view is now thought to be."""
+        return state.cameras.pose(index, self._views[index].T_base_color)
+
+    def step(self, state: FitState, at: Progress) -> None:
+        """Draw one image and follow its gradient."""
+        epoch, place = divmod(state.session.steps, len(self._views))
+        index = int(order_of_views(self._config.seed, epoch, len(self._views))[place])
+        coarse = at.fraction < self._config.coarse_fraction
+        state.coarse_steps += coarse
+        view, pose = self._views[index], self.pose(state, index)
+        decay = DECAY**at.fraction
+        rates = {name: rate * decay for name, rate in RATES.items()}
+        rates["means_m"] *= state.size_m
+        report = state.session.step(
+            view.half if coarse else view.full, pose, rates, state.gains[index]
+        )
+        if self._config.slab and state.session.steps % HOLD_EVERY == 0:
+            state.surface.hold(state.session.cloud, self._config.slab)
+        if self._config.refine_poses and at.fraction >= POSES_FROM:
+            pulled = correction_gradient(report.T_camera_base, pose)
+            state.cameras.update(index, pulled, decay)
+        if report.mse is not None:
+            state.errors = [*state.errors[-len(self._views) :], report.mse]

@@ -1,0 +1,457 @@
+"""Choose posed RGB-D frames of a run: some to learn from, some held out."""
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from bridge.episode import schema, streams
+from bridge.episode.cdr.messages import color_from_message
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.streams import RgbdFrame
+from bridge.episode.transforms import TransformTree
+from bridge.errors import BridgeError, EpisodeError
+from bridge.geometry import se3
+from bridge.terminal import Output
+from twin.errors import TwinError
+from twin.scene.frames.camera_poses import STILL_M, STILL_RAD, CameraPoses, find_poses, same_pose
+from twin.scene.frames.pairing import (
+    UnusableCameraError,
+    check_camera,
+    frames_at,
+    name_of,
+    paired_stamps_ns,
+)
+from twin.scene.settings import FrameConfig
+from twin.scene.store.calibration import Calibration
+
+# --- Pick training frames: one for each stretch of the camera's path, the stillest and sharpest.
+#
+# A scan holds far more frames than a fit can use. Frames a camera took while it moved fast are
+# smeared, and their pose is as wrong as the clocks of camera and robot differ.
+
+TURN_M_PER_RAD = 0.5
+"""How much path a turn counts for: what a camera sees at this distance moves by as much."""
+MOTION_WINDOW_NS = 20_000_000
+"""Motion is the difference of poses this long before and after an image."""
+TYPICAL_DEPTH_M = 0.7
+EXPOSURE_S = 0.01
+SMEAR_PX = 0.5
+"""Smear in one exposure below this cannot be seen."""
+UNKNOWN_PX = 1e6
+"""Instead of a smear that cannot be known."""
+MOTION_SLACK = 1.5
+"""Frames this many times as fast as the slowest of a stretch are still considered."""
+MAX_LOOKS = 3
+"""Images decoded per stretch."""
+BLURRED = 0.25
+"""A frame with less than this share of its neighbours' sharpness is left out."""
+MIN_KEPT = 5
+
+Sharpness = Callable[[Collection[int]], Mapping[int, float]]
+"""Stamps [ns] in, sharpness of each image out."""
+
+
+def pick(
+    stamps_ns: Int[np.ndarray, " num_frames"],
+    path_m: Float[np.ndarray, " num_frames"],
+    smear_px: Float[np.ndarray, " num_frames"],
+    count: int,
+    sharpness_of: Sharpness,
+) -> Int[np.ndarray, " num_picked"]:
+    """Return the stamps of at most ``count`` frames, in order; the same input picks the same.
+
+    The path is cut into stretches of equal length, as many as give at most ``count`` that hold
+    a frame. Of the frames of a stretch that smear least, the sharpest is taken: seen from nearly
+    the same place, texture does not decide. Frames far blurrier than their neighbours are left
+    out, unless hardly any would remain.
+
+    Args:
+        stamps_ns: Source stamps in order.
+        path_m: Distance the camera has come since the first frame, see ``path_length_m``.
+        smear_px: How far the image moves during one exposure.
+        count: How many are wanted.
+        sharpness_of: Asked once, for the frames that come into question.
+    """
+    if len(stamps_ns) == 0 or count < 1:
+        return stamps_ns[:0]
+    stretch = _stretches(path_m, count)
+    looks = [_shortlist(np.flatnonzero(stretch == k), smear_px) for k in np.unique(stretch)]
+    sharpness = sharpness_of([int(stamps_ns[i]) for look in looks for i in look])
+    best = [max(look, key=lambda i: (sharpness[int(stamps_ns[i])], -i)) for look in looks]
+    values = np.array([sharpness[int(stamps_ns[i])] for i in best])
+    sharp = np.asarray(values >= BLURRED * _around(values))
+    kept = np.array(best)[sharp if sharp.sum() >= min(MIN_KEPT, len(best)) else slice(None)]
+    return np.asarray(stamps_ns[kept])
+
+
+def path_length_m(
+    Ts_base_camera: Float[np.ndarray, "num_frames 4 4"],
+) -> Float[np.ndarray, " num_frames"]:
+    """How far the camera has come, turns included; grows a little even while it stands still."""
+    if len(Ts_base_camera) < 2:
+        return np.zeros(len(Ts_base_camera))
+    steps = _steps_m(Ts_base_camera[:-1], Ts_base_camera[1:])
+    return np.concatenate([[0.0], np.cumsum(steps + max(1e-6, 1e-3 * float(steps.mean())))])
+
+
+def smear_px(
+    tree: TransformTree, frame_id: str, stamps_ns: Int[np.ndarray, " num_frames"], focal_px: float
+) -> Float[np.ndarray, " num_frames"]:
+    """How far the image of something at a typical distance moves during one exposure [px]."""
+    with np.errstate(invalid="ignore"):  # a pose beside one that is not finite: motion unknown
+        before = tree.Ts_root_frame(frame_id, stamps_ns - MOTION_WINDOW_NS)
+        after = tree.Ts_root_frame(frame_id, stamps_ns + MOTION_WINDOW_NS)
+        turn = se3.rotation_angle_rad(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+        shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1) / TYPICAL_DEPTH_M
+    found = focal_px * (turn + shift) * EXPOSURE_S / (2e-9 * MOTION_WINDOW_NS)
+    return np.asarray(np.nan_to_num(found, nan=UNKNOWN_PX, posinf=UNKNOWN_PX))
+
+
+def robot_smear_px(
+    episode: Episode, stamps_ns: Int[np.ndarray, " num_frames"], focal_px: float
+) -> Float[np.ndarray, " num_frames"]:
+    """The same for a robot in front of a camera that stands still, by its fastest joint.
+
+    0 where no joints were recorded.
+    """
+    try:
+        track = streams.joint_track(episode)
+    except EpisodeError:
+        return np.zeros(len(stamps_ns))
+    change = track.at(stamps_ns + MOTION_WINDOW_NS) - track.at(stamps_ns - MOTION_WINDOW_NS)
+    fastest = np.abs(change).max(axis=1, initial=0.0)
+    return np.asarray(focal_px * fastest * EXPOSURE_S / (2e-9 * MOTION_WINDOW_NS))
+
+
+def sharpness_at(episode: Episode, camera_id: str, stamps_ns: Collection[int]) -> dict[int, float]:
+    """Decode the colour images with these stamps and rate each."""
+    topic = streams.find_camera_topic(episode, camera_id, "color/image")
+    wanted = set(stamps_ns)
+    found: dict[int, float] = {}
+    for message in episode.messages([topic] if topic else []):
+        image = color_from_message(message.type_name, message.data)
+        if image.stamp_ns in wanted:
+            found[image.stamp_ns] = sharpness(image.image_u8())
+    return found
+
+
+def sharpness(image_u8: UInt8[np.ndarray, "height width 3"]) -> float:
+    """Variance of the Laplacian at half size, where noise and compression count less."""
+    height, width = (side // 2 * 2 for side in image_u8.shape[:2])
+    grey = image_u8[:height, :width].astype(np.float32).mean(axis=2)
+    grey = grey.reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3))
+    inner = 4 * grey[1:-1, 1:-1]
+    laplacian = inner - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]
+    return float(laplacian.var()) if laplacian.size else 0.0
+
+
+def _steps_m(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    turn = se3.rotation_angle_rad(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+    shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+    return np.asarray(shift + TURN_M_PER_RAD * turn)
+
+
+def _stretches(path_m: np.ndarray, count: int) -> np.ndarray:
+    """Number the stretch of each frame, so that at most ``count`` stretches hold any."""
+    total = max(float(path_m[-1]), 1e-12)
+    if len(path_m) <= count:
+        return np.arange(len(path_m))
+    best = np.zeros(len(path_m), dtype=np.int64)
+    for parts in range(count, 4 * count + 1, max(1, count // 16)):
+        stretch = np.minimum((path_m / total * parts).astype(np.int64), parts - 1)
+        if len(np.unique(stretch)) > count:
+            break
+        best = stretch
+    return best
+
+
+def _shortlist(members: np.ndarray, smear_px: np.ndarray) -> Sequence[int]:
+    """Frames of one stretch that are still enough, a few of them."""
+    limit = max(SMEAR_PX, MOTION_SLACK * float(smear_px[members].min()))
+    calm = members[smear_px[members] <= limit]
+    places = np.unique(np.linspace(0, len(calm) - 1, min(MAX_LOOKS, len(calm))).round())
+    return [int(calm[int(place)]) for place in places]
+
+
+def _around(values: np.ndarray) -> np.ndarray:
+    """Median of each value and its two neighbours to each side."""
+    padded = np.pad(values, 2, mode="edge")
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
+
+
+STILL_TRAIN_FRAMES = 4
+STILL_HOLDOUT_FRAMES = 2
+"""A camera that stands still shows the same again and again; this many frames are enough."""
+QUIET = Output(quiet=True)
+
+
+class NoFramesError(TwinError):
+    """There is nothing to rebuild from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameChoice:
+    """Stamps of one camera of one episode: what to learn from and what to hold out."""
+
+    episode: Episode
+    camera_id: str
+    still: bool
+    train_ns: frozenset[int]
+    holdout_ns: frozenset[int]
+    """Nothing is learnt from these, the objects' places included."""
+    poses: CameraPoses
+    spare_ns: frozenset[int] = frozenset()
+    """Neither chosen nor held out: the background does not need them, the robot may."""
+    corrections: Mapping[int, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
+    """``T_new_old`` in the root frame for frames whose pose was improved, by stamp."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chosen:
+    """What is used of a run's cameras, and why others are not."""
+
+    choices: list[FrameChoice]
+    left_out: tuple[str, ...]
+    """A sentence about each camera that is not used."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sources:
+    """The episodes a scene is made from."""
+
+    episodes: tuple[Episode, ...]
+    remark: str
+    """That there is no scan, and what could not be read; empty when there is nothing to say."""
+
+
+def find_sources(run: RunFolder) -> Sources:
+    """Take all scans; without a scan, every episode that has posed RGB-D frames.
+
+    An episode that cannot be read is passed over, with a remark.
+
+    Raises:
+        NoFramesError: When no episode has a camera with colour, depth and intrinsics.
+        EpisodeError: When there is none that can be read, but one that cannot.
+    """
+    usable: list[Episode] = []
+    broken: list[BridgeError] = []
+    for path in run.episodes():
+        try:
+            episode = Episode.open(path)
+            if rgbd_camera_ids(episode):
+                usable.append(episode)
+        except BridgeError as error:
+            broken.append(error)
+    remarks = [f"passed over: {error}" for error in broken]
+    scans = [episode for episode in usable if episode.info.kind == "scan"]
+    if scans:
+        return Sources(episodes=tuple(scans), remark="; ".join(remarks))
+    if broken and not usable:
+        raise broken[0]
+    if not usable:
+        message = (
+            f"no episode in {run.episodes_dir} has colour and depth images with intrinsics. "
+            "Record a scan, or import an RGB-D folder: robot-gst import rgbd FOLDER RUN."
+        )
+        raise NoFramesError(message)
+    kinds = sorted({episode.info.kind for episode in usable})
+    remarks.insert(
+        0, f"no scan in this run: using {len(usable)} episode(s) of kind {', '.join(kinds)}"
+    )
+    return Sources(episodes=tuple(usable), remark="; ".join(remarks))
+
+
+def rgbd_camera_ids(episode: Episode) -> list[str]:
+    """Cameras with colour and depth, both with intrinsics; never those of stand-in truth."""
+    topics = {topic for topic in episode.topics() if not schema.is_truth(topic)}
+    tails = ("color/image", "color/info", "depth/image", "depth/info")
+    stems = {topic.removesuffix(tails[0]) for topic in topics if topic.endswith("/" + tails[0])}
+    return sorted(
+        stem.split("/")[-2] for stem in stems if all(stem + tail in topics for tail in tails)
+    )
+
+
+def choose_frames(
+    sources: Sources,
+    config: FrameConfig,
+    output: Output = QUIET,
+    calibration: Calibration | None = None,
+) -> list[FrameChoice]:
+    """The choices of ``choose_with_reasons``; raises as it does."""
+    return choose_with_reasons(sources, config, output, calibration).choices
+
+
+def choose_with_reasons(
+    sources: Sources, config: FrameConfig, output: Output, calibration: Calibration | None
+) -> Chosen:
+    """Hold out every n-th frame of each camera, then choose training frames from the others.
+
+    Which frames are held out depends on their number alone, never on what they show.
+
+    Raises:
+        NoFramesError: When nothing is left to learn from.
+        UnusableCameraError: When no camera can be used: the first one's reason.
+    """
+    found = [
+        (episode, camera_id)
+        for episode in sources.episodes
+        for camera_id in rgbd_camera_ids(episode)
+    ]
+    shared = replace(
+        config,
+        max_train_frames=max(1, config.max_train_frames // max(len(found), 1)),
+        max_holdout_frames=max(1, config.max_holdout_frames // max(len(found), 1)),
+    )
+    choices: list[FrameChoice] = []
+    lost: list[UnusableCameraError] = []
+    for episode, camera_id in found:
+        try:
+            check_camera(episode, camera_id)
+            choices.append(_choose(episode, camera_id, shared, output, calibration))
+        except UnusableCameraError as error:
+            lost.append(error)
+    if lost and not choices:
+        raise lost[0]
+    kept, apart = _in_one_frame(choices)
+    left_out = (*(f"left out: {reason}" for reason in lost), *apart)
+    for sentence in left_out:
+        output.say(sentence)
+    if not any(choice.train_ns for choice in kept):
+        message = "the cameras of this run have no frames to learn from. Record a longer scan."
+        raise NoFramesError(message)
+    return Chosen(choices=kept, left_out=left_out)
+
+
+def _in_one_frame(choices: list[FrameChoice]) -> tuple[list[FrameChoice], list[str]]:
+    """Keep the cameras whose poses share a root frame with the first, recorded poses first.
+
+    And say of each of the others where it is.
+    """
+    ordered = sorted(choices, key=lambda choice: choice.poses.source == "odometry")
+    if not ordered:
+        return choices, []
+    root = root_frame(ordered[0])
+    kept = [choice for choice in choices if root_frame(choice) == root]
+    apart = [
+        f"camera {choice.camera_id} of {choice.episode.info.id} is left out: its poses are in "
+        f"frame {root_frame(choice)!r}, and nothing says where that is in {root!r}"
+        for choice in choices
+        if root_frame(choice) != root
+    ]
+    return kept, apart
+
+
+def root_frame(choice: FrameChoice) -> str:
+    """Name of the frame a choice's poses are in.
+
+    Odometry of every recording starts anew, so its frames carry the recording's name.
+    """
+    frame_id = streams.camera_info(choice.episode, choice.camera_id).frame_id
+    return choice.poses.tree.root_of(frame_id)
+
+
+def _choose(
+    episode: Episode,
+    camera_id: str,
+    config: FrameConfig,
+    output: Output,
+    calibration: Calibration | None,
+) -> FrameChoice:
+    stamps = paired_stamps_ns(episode, camera_id)
+    if len(stamps) == 0:
+        message = (
+            f"no colour image of {name_of(episode, camera_id)} has a depth image within "
+            f"{streams.PAIRING_TOLERANCE_NS * 1e-6:g} ms: clocks that differ, or one of the two "
+            "was not recorded. Record them synchronised."
+        )
+        raise UnusableCameraError(message)
+    held = stamps[config.first_holdout :: config.holdout_every]
+    poses = find_poses(
+        episode, camera_id, stamps, frozenset(held.tolist()), config, output, calibration
+    )
+    unposed = np.array(sorted(poses.unposed_ns), dtype=np.int64)
+    still = _stands_still(episode, camera_id, poses, np.setdiff1d(stamps, unposed))
+    train_count, holdout_count = config.max_train_frames, config.max_holdout_frames
+    if still:
+        train_count = min(train_count, STILL_TRAIN_FRAMES)
+        holdout_count = min(holdout_count, STILL_HOLDOUT_FRAMES)
+    held = np.setdiff1d(held, unposed)
+    if config.train_every:
+        rest = np.setdiff1d(stamps[:: config.train_every], np.concatenate([held, unposed]))
+        train = spread(rest, train_count)
+    else:
+        rest = np.setdiff1d(stamps, np.concatenate([held, unposed]))
+        train = _pick(episode, camera_id, poses, rest, train_count, still=still)
+    return FrameChoice(
+        episode=episode,
+        camera_id=camera_id,
+        still=still,
+        train_ns=frozenset(train.tolist()),
+        holdout_ns=frozenset(spread(held, holdout_count).tolist()),
+        poses=poses,
+        spare_ns=frozenset(np.setdiff1d(rest, train).tolist()),
+    )
+
+
+def _pick(
+    episode: Episode,
+    camera_id: str,
+    poses: CameraPoses,
+    stamps: Int[np.ndarray, " num_frames"],
+    count: int,
+    *,
+    still: bool,
+) -> Int[np.ndarray, " num_picked"]:
+    if len(stamps) == 0:
+        return stamps
+    info = streams.camera_info(episode, camera_id)
+    if still:
+        smear = robot_smear_px(episode, stamps, info.camera.fx)
+    else:
+        smear = smear_px(poses.tree, info.frame_id, stamps, info.camera.fx)
+    path = path_length_m(poses.tree.Ts_root_frame(info.frame_id, stamps))
+    return pick(
+        stamps,
+        path,
+        smear,
+        count,
+        lambda wanted: sharpness_at(episode, camera_id, wanted),
+    )
+
+
+def spread(values: np.ndarray, count: int) -> np.ndarray:
+    """Pick at most ``count`` values at even distances, both ends included."""
+    if len(values) <= count:
+        return values
+    return np.asarray(values[np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))])
+
+
+def _stands_still(
+    episode: Episode, camera_id: str, poses: CameraPoses, stamps: Int[np.ndarray, " num_frames"]
+) -> bool:
+    frame_id = streams.camera_info(episode, camera_id).frame_id
+    Ts = poses.tree.Ts_root_frame(frame_id, spread(stamps, 40))
+    still = all(same_pose(Ts[0], T, distance_m=STILL_M, angle_rad=STILL_RAD) for T in Ts)
+    return still and len(stamps) > 1
+
+
+def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:
+    """Yield the frames of a choice that carry one of the stamps, with the poses it chose."""
+    for frame in frames_at(choice.episode, choice.camera_id, choice.poses.tree, stamps_ns):
+        yield _corrected(frame, choice)
+
+
+def _corrected(frame: RgbdFrame, choice: FrameChoice) -> RgbdFrame:
+    if choice.poses.depth_scale != 1.0:
+        frame = replace(frame, depth_m=frame.depth_m * choice.poses.depth_scale)
+    T_new_old = choice.corrections.get(frame.stamp_ns)
+    if T_new_old is None:
+        return frame
+    return replace(
+        frame,
+        T_base_color=T_new_old @ frame.T_base_color,
+        T_base_depth=T_new_old @ frame.T_base_depth,
+    )

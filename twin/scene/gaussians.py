@@ -1,0 +1,330 @@
+"""A cloud of Gaussians: what is stored, what is fitted, what is drawn."""
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from bridge.errors import PathNotFoundError
+from bridge.geometry import se3
+from bridge.whole_file import write_whole
+from twin.errors import TwinError
+
+SH_DC = 0.28209479177387814
+"""Value of the constant spherical harmonic, 1 / (2 sqrt(pi)); PLY files store (c - 0.5) / SH_DC."""
+
+SH_FIRST = 0.4886025119029199
+"""Factor of the three real spherical harmonics of degree 1, sqrt(3 / (4 pi))."""
+
+NUM_FIRST = 3
+"""Spherical harmonics of degree 1."""
+
+
+def _no_harmonics() -> np.ndarray:
+    return np.zeros((0, 0, 3), dtype=np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussianCloud:
+    """Anisotropic Gaussians with one colour each, in the run's root frame.
+
+    The paper's Eq. 1 as resolved by the errata: covariance = R S S^T R^T with S = exp(scales_log)
+    and R from the quaternion. Arrays are contiguous float32.
+    """
+
+    means_m: Float32[np.ndarray, "num_splats 3"]
+    quats_wxyz: Float32[np.ndarray, "num_splats 4"]
+    """Orientation; any length but zero, normalised where it is used."""
+    scales_log: Float32[np.ndarray, "num_splats 3"]
+    """Natural logarithm of the standard deviations in metres."""
+    opacities_logit: Float32[np.ndarray, " num_splats"]
+    colors: Float32[np.ndarray, "num_splats 3"]
+    """sRGB, nominally 0..1; may leave that range, the drawn image is clipped."""
+    harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"] = field(
+        default_factory=_no_harmonics
+    )
+    """How colour changes with the direction it is seen along: coefficients of the real spherical
+    harmonics of degree 1, none or three of them (``harmonic_basis``) for each colour."""
+
+    def __post_init__(self) -> None:
+        """A cloud made without harmonics has rows of none.
+
+        Raises:
+            TwinError: When there are neither none nor all three of degree 1.
+        """
+        if self.harmonics.shape[1] not in (0, NUM_FIRST):
+            message = (
+                f"a cloud with {self.harmonics.shape[1]} harmonics per colour: give none or the "
+                f"{NUM_FIRST} of degree 1."
+            )
+            raise TwinError(message)
+        if len(self.harmonics) == 0 and len(self.means_m) > 0:
+            none = np.zeros((len(self.means_m), 0, 3), dtype=np.float32)
+            object.__setattr__(self, "harmonics", none)
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians."""
+        return len(self.means_m)
+
+    @property
+    def num_harmonics(self) -> int:
+        """Coefficients of each colour beside the constant: 0 or 3."""
+        return int(self.harmonics.shape[1])
+
+    def take(self, index: np.ndarray) -> "GaussianCloud":
+        """Select and order Gaussians by a mask or a list of ids."""
+        return GaussianCloud(**{name: as_float32(rows[index]) for name, rows in arrays(self)})
+
+    def opacities(self) -> Float32[np.ndarray, " num_splats"]:
+        """Opacity of each Gaussian at its centre, 0..1."""
+        return as_float32(1.0 / (1.0 + np.exp(-self.opacities_logit)))
+
+
+def arrays(cloud: GaussianCloud) -> list[tuple[str, np.ndarray]]:
+    """Return the arrays of a cloud with their names, in the order of the fields.
+
+    ``harmonics`` is left out where there are none.
+    """
+    named = [(item.name, getattr(cloud, item.name)) for item in fields(cloud)]
+    return named if cloud.num_harmonics else named[:-1]
+
+
+def as_float32(values: np.ndarray) -> np.ndarray:
+    """Return contiguous float32, copying only where needed."""
+    return np.ascontiguousarray(values, dtype=np.float32)
+
+
+def concatenate(clouds: list[GaussianCloud]) -> GaussianCloud:
+    """Put clouds one after another; those without harmonics get zeros where others have some."""
+    most = max(cloud.num_harmonics for cloud in clouds)
+    padded = [with_harmonics(cloud, most) for cloud in clouds]
+    names = [item.name for item in fields(GaussianCloud)]
+    return GaussianCloud(
+        **{name: as_float32(np.concatenate([getattr(c, name) for c in padded])) for name in names}
+    )
+
+
+def with_harmonics(cloud: GaussianCloud, num_harmonics: int = NUM_FIRST) -> GaussianCloud:
+    """The same Gaussians with this many harmonics: zeros added, or those beyond cut off."""
+    kept = min(num_harmonics, cloud.num_harmonics)
+    harmonics = np.zeros((len(cloud), num_harmonics, 3), dtype=np.float32)
+    harmonics[:, :kept] = cloud.harmonics[:, :kept]
+    return GaussianCloud(**(dict(arrays(cloud)) | {"harmonics": harmonics}))
+
+
+def harmonic_basis(
+    directions: Float[np.ndarray, "*shape 3"],
+) -> Float[np.ndarray, "*shape 3"]:
+    """Values of the three real spherical harmonics of degree 1 along unit directions.
+
+    In the order and with the signs of 3D Gaussian splatting files: sqrt(3 / (4 pi)) (-y, z, -x).
+    """
+    x, y, z = np.moveaxis(directions, -1, 0)
+    return np.asarray(np.stack([-y, z, -x], axis=-1) * directions.dtype.type(SH_FIRST))
+
+
+def effective_colors(
+    cloud: GaussianCloud, camera_centre_m: Float[np.ndarray, "3"]
+) -> Float32[np.ndarray, "num_splats 3"]:
+    """Colour of each Gaussian as seen from a point of the cloud's frame, not clipped."""
+    if cloud.num_harmonics == 0:
+        return cloud.colors
+    basis = harmonic_basis(view_directions(cloud.means_m, camera_centre_m))
+    return as_float32(cloud.colors + np.einsum("nk,nkc->nc", basis, cloud.harmonics))
+
+
+def view_directions(
+    means_m: Float32[np.ndarray, "num_splats 3"], camera_centre_m: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "num_splats 3"]:
+    """Unit vectors from the camera centre to each mean."""
+    ray = means_m.astype(np.float64) - camera_centre_m
+    return np.asarray(ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12))
+
+
+def turned_harmonics(
+    harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"],
+    R_new_old: Float[np.ndarray, "*splats 3 3"],
+) -> Float32[np.ndarray, "num_splats num_harmonics 3"]:
+    """The harmonics of Gaussians that were turned with all that shines on them.
+
+    One rotation for all of them, or one for each. Degree 1 is a vector for each colour,
+    sqrt(3 / (4 pi)) v . d with v = (-h_2, -h_0, h_1), and turns like one.
+    """
+    if harmonics.shape[1] == 0:
+        return harmonics
+    v = np.stack([-harmonics[:, 2], -harmonics[:, 0], harmonics[:, 1]], axis=1)
+    x, y, z = np.moveaxis(R_new_old @ v, 1, 0)
+    return as_float32(np.stack([-y, z, -x], axis=1))
+
+
+def morton_order(
+    means_m: Float32[np.ndarray, "num_splats 3"],
+) -> np.ndarray:
+    """Order that keeps neighbours in space near each other in memory (Morton 1966), ids.
+
+    Drawing walks Gaussians by depth and tile; neighbours in memory are then neighbours in cache.
+    """
+    low = means_m.min(axis=0)
+    extent = float((means_m.max(axis=0) - low).max())
+    cells = ((means_m - low) / max(extent, 1e-9) * 1023.0).astype(np.uint64)
+    code = np.zeros(len(means_m), dtype=np.uint64)
+    for axis in range(3):
+        code |= _spread_bits(cells[:, axis]) << np.uint64(axis)
+    return np.argsort(code, kind="stable")
+
+
+def _spread_bits(values: np.ndarray) -> np.ndarray:
+    for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
+        values = (values | (values << np.uint64(shift))) & np.uint64(mask)
+    return values
+
+
+# --- A cloud of Gaussians after a rigid motion.
+
+
+def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> GaussianCloud:
+    """The same Gaussians after a rigid motion; what their colour owes to direction turns along."""
+    q, _ = se3.split(T_new_old)
+    w, x, y, z = q
+    w2, x2, y2, z2 = cloud.quats_wxyz.astype(np.float64).T
+    quats = np.stack(
+        [
+            w * w2 - x * x2 - y * y2 - z * z2,
+            w * x2 + x * w2 + y * z2 - z * y2,
+            w * y2 - x * z2 + y * w2 + z * x2,
+            w * z2 + x * y2 - y * x2 + z * w2,
+        ],
+        axis=1,
+    )
+    return GaussianCloud(
+        means_m=as_float32(se3.apply(T_new_old, cloud.means_m.astype(np.float64))),
+        quats_wxyz=as_float32(quats),
+        scales_log=cloud.scales_log,
+        opacities_logit=cloud.opacities_logit,
+        colors=cloud.colors,
+        harmonics=turned_harmonics(cloud.harmonics, T_new_old[:3, :3]),
+    )
+
+
+# --- Gaussians as the PLY file that other splat viewers read (SuperSplat, Rerun).
+
+COLUMNS = (
+    *("x", "y", "z", "nx", "ny", "nz"),
+    *("f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2"),
+    *("rot_0", "rot_1", "rot_2", "rot_3"),
+)
+REST_COLUMNS = tuple(f"f_rest_{index}" for index in range(3 * NUM_FIRST))
+"""Harmonics of degree 1: all of red, then green, then blue. Written only where there are any."""
+REST_COUNTS = (9, 24, 45)
+MAX_SPLATS = 50_000_000
+
+
+class UnreadablePlyError(TwinError):
+    """The file is not a splat PLY of the kind we write."""
+
+    def __init__(self, *, path: Path, found: str) -> None:
+        """Remember the file."""
+        self.path = path
+        super().__init__(
+            f"{path}: {found}. Expected a binary little-endian PLY with float columns "
+            f"{', '.join(COLUMNS)}."
+        )
+
+
+def write_ply(path: Path, cloud: GaussianCloud) -> None:
+    """Write a cloud; the file appears under its name only when it is complete.
+
+    Scales are natural logarithms, opacities logits, rotations wxyz, colours the constant
+    spherical harmonic with those of degree 1 as ``f_rest_0..8`` where the cloud has them.
+    Metres, in the frame that ``scene.json`` names.
+    """
+    quats = cloud.quats_wxyz / np.linalg.norm(cloud.quats_wxyz, axis=1, keepdims=True)
+    table = np.concatenate(
+        [
+            cloud.means_m,
+            np.zeros_like(cloud.means_m),
+            (cloud.colors - 0.5) / SH_DC,
+            np.swapaxes(cloud.harmonics, 1, 2).reshape(len(cloud), 3 * cloud.num_harmonics),
+            cloud.opacities_logit[:, None],
+            cloud.scales_log,
+            quats,
+        ],
+        axis=1,
+    ).astype("<f4")
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
+    header += [f"property float {name}" for name in _columns_of(cloud)]
+    write_whole(path, "\n".join([*header, "end_header", ""]).encode() + table.tobytes())
+
+
+def read_ply(path: Path) -> GaussianCloud:
+    """Read a splat PLY. Harmonics above degree 1 and unknown columns are ignored.
+
+    Raises:
+        PathNotFoundError: When the file is not there.
+        UnreadablePlyError: When it is another kind of file, or cut short.
+    """
+    if not path.is_file():
+        hint = "robot-gst rebuild RUN makes it."
+        raise PathNotFoundError(path=path, what="splat file", hint=hint)
+    data = path.read_bytes()
+    end = data.find(b"end_header\n")
+    if not data.startswith(b"ply\n") or end < 0:
+        raise UnreadablePlyError(path=path, found="no PLY header")
+    names, count = _header(path, data[:end].decode("ascii", "replace").splitlines())
+    body = data[end + len(b"end_header\n") :]
+    if len(body) != count * len(names) * 4:
+        found = f"{len(body)} bytes of data for {count} rows of {len(names)} floats"
+        raise UnreadablePlyError(path=path, found=found)
+    table = np.frombuffer(body, dtype="<f4").reshape(count, len(names))
+    if not np.isfinite(table).all():
+        raise UnreadablePlyError(path=path, found="values that are not finite")
+    if not table[:, [names.index(f"rot_{i}") for i in range(4)]].any(axis=1).all():
+        raise UnreadablePlyError(path=path, found="rotations of length zero")
+
+    def columns(*wanted: str) -> np.ndarray:
+        return as_float32(table[:, [names.index(name) for name in wanted]])
+
+    return GaussianCloud(
+        means_m=columns("x", "y", "z"),
+        quats_wxyz=columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        scales_log=columns("scale_0", "scale_1", "scale_2"),
+        opacities_logit=columns("opacity")[:, 0].copy(),
+        colors=as_float32(columns("f_dc_0", "f_dc_1", "f_dc_2") * np.float32(SH_DC) + 0.5),
+        harmonics=_harmonics(names, table),
+    )
+
+
+def _columns_of(cloud: GaussianCloud) -> tuple[str, ...]:
+    after_color = COLUMNS.index("f_dc_2") + 1
+    rest = REST_COLUMNS[: 3 * cloud.num_harmonics]
+    return (*COLUMNS[:after_color], *rest, *COLUMNS[after_color:])
+
+
+def _harmonics(names: list[str], table: np.ndarray) -> np.ndarray:
+    """Degree 1 of files with degree 1, 2 or 3 (9, 24 or 45 columns); none from others."""
+    total = sum(name.startswith("f_rest_") for name in names)
+    wanted = [
+        [f"f_rest_{color * (total // 3) + index}" for color in range(3)]
+        for index in range(NUM_FIRST)
+    ]
+    if total not in REST_COUNTS or any(name not in names for row in wanted for name in row):
+        return np.zeros((len(table), 0, 3), dtype=np.float32)
+    return as_float32(table[:, [[names.index(name) for name in row] for row in wanted]])
+
+
+def _header(path: Path, lines: list[str]) -> tuple[list[str], int]:
+    if "format binary_little_endian 1.0" not in lines:
+        raise UnreadablePlyError(path=path, found="another PLY format")
+    counts = [line.split()[2] for line in lines if line.startswith("element vertex ")]
+    properties = [line.split() for line in lines if line.startswith("property ")]
+    if len(counts) != 1 or not counts[0].isdigit() or int(counts[0]) > MAX_SPLATS:
+        raise UnreadablePlyError(path=path, found="no usable 'element vertex' line")
+    if any(len(words) != 3 or words[1] != "float" for words in properties):
+        raise UnreadablePlyError(path=path, found="a column that is not float")
+    names = [words[2] for words in properties]
+    missing = [name for name in COLUMNS if name not in names and not name.startswith("n")]
+    if missing:
+        raise UnreadablePlyError(path=path, found=f"without {', '.join(missing)}")
+    return names, int(counts[0])

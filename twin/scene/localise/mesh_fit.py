@@ -1,0 +1,452 @@
+"""Lay a known mesh onto points: multi-start ICP with one camera error per view.
+
+Point to plane (Chen and Medioni 1992) with Tukey weights against those parts of the mesh that face
+the camera of each point. Of several starts the one wins that explains the points and does not
+claim surface where a camera saw through.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from bridge.episode import provenance
+from bridge.episode.run_folder import RunFolder
+from bridge.geometry import se3
+from bridge.task.meshes.catalogue import object_mesh
+from bridge.task.task_file import SCANNED, ObjectModel, Task
+from twin.scene.localise.points import CameraView, Cluster
+from twin.scene.localise.shape_fit import ShapeFitConfig
+from twin.scene.shape.files import MESH, TASK_SHAPE
+from twin.scene.shape.known import pose_of
+from twin.scene.shape.mesh import read_mesh
+from twin.scene.store.folder import UnreadableSceneError
+
+# --- The surface of a mesh as points, and what cameras see of it.
+
+FACING = 0.15
+"""Cosine below which a camera hardly sees a surface."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshSurface:
+    """Points spread evenly over a mesh, in the object frame."""
+
+    p_m: Float[np.ndarray, "num_samples 3"]
+    normals: Float[np.ndarray, "num_samples 3"]
+
+
+def mesh_surface(
+    vertices_m: Float[np.ndarray, "num_vertices 3"],
+    triangles: Int[np.ndarray, "num_faces 3"],
+    num_samples: int,
+) -> MeshSurface:
+    """Spread points over a mesh, each triangle by its area; the same each time.
+
+    Args:
+        vertices_m: Of the known or a reconstructed mesh, in the object frame.
+        triangles: Counter-clockwise seen from outside.
+        num_samples: How many.
+    """
+    a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    double_area = np.linalg.norm(cross, axis=1)
+    edges = np.cumsum(double_area) / double_area.sum()
+    chosen = np.searchsorted(edges, (np.arange(num_samples) + 0.5) / num_samples)
+    u, v = np.random.default_rng(0).random((2, num_samples, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    p = a[chosen] * (1 - u - v) + b[chosen] * u + c[chosen] * v
+    return MeshSurface(p_m=p, normals=cross[chosen] / double_area[chosen, None])
+
+
+@cache
+def known_surface(model: ObjectModel, num_samples: int) -> MeshSurface:
+    """Surface of the mesh that the task file names."""
+    mesh = object_mesh(model)
+    return mesh_surface(mesh.vertices_m, mesh.triangles, num_samples)
+
+
+def facing(
+    T_object_base: Float[np.ndarray, "4 4"], view: CameraView, surface: MeshSurface
+) -> Bool[np.ndarray, " num_samples"]:
+    """Tell which samples turn their outside to a view's camera."""
+    ray = se3.apply(T_object_base, view.T_base_depth[None, :3, 3])[0] - surface.p_m
+    along = np.einsum("ij,ij->i", ray, surface.normals)
+    return np.asarray(along > FACING * lengths(ray))
+
+
+def lengths(rows: Float[np.ndarray, "num_rows 3"]) -> Float[np.ndarray, " num_rows"]:
+    """Norms; five times as fast as a sum along so short an axis, and the same bits."""
+    square = rows * rows
+    return np.asarray(np.sqrt(square[:, 0] + square[:, 1] + square[:, 2]))
+
+
+def seen_through(
+    T: Float[np.ndarray, "4 4"], surface: MeshSurface, views: Sequence[CameraView], margin_m: float
+) -> float:
+    """Share of the mesh's facing surface behind which cameras measured something.
+
+    Args:
+        T: ``T_base_object``.
+        surface: The mesh.
+        views: With their depth.
+        margin_m: How far behind.
+    """
+    T_object_base = se3.invert(T)
+    looked = [_looked_at(T, T_object_base, surface, view) for view in views]
+    through = sum(int((measured > z + margin_m).sum()) for measured, z in looked)
+    return _share(through, sum(int((measured > 0).sum()) for measured, _ in looked))
+
+
+def agreeing(
+    T: Float[np.ndarray, "4 4"], surface: MeshSurface, views: Sequence[CameraView], margin_m: float
+) -> float:
+    """Share of the mesh's facing surface that the camera which sees most of it measured there.
+
+    Args:
+        T: ``T_base_object``.
+        surface: The mesh.
+        views: With their depth.
+        margin_m: How far off a measurement may be.
+    """
+    T_object_base = se3.invert(T)
+    share = 0.0
+    for view in views:
+        measured, z = _looked_at(T, T_object_base, surface, view)
+        looked = int((measured > 0).sum())
+        # Behind the nearer bound, but not behind the farther one.
+        near, far = (int((measured > z + bound).sum()) for bound in (-margin_m, margin_m))
+        share = max(share, _share(near, looked) - _share(far, looked))
+    return share
+
+
+def _looked_at(
+    T: Float[np.ndarray, "4 4"],
+    T_object_base: Float[np.ndarray, "4 4"],
+    surface: MeshSurface,
+    view: CameraView,
+) -> tuple[Float[np.ndarray, " num_seen"], Float[np.ndarray, " num_seen"]]:
+    """Depth that a camera measured (0: none) and has, where it looks at the facing surface [m]."""
+    p = se3.apply(T, surface.p_m[facing(T_object_base, view, surface)])
+    p = se3.apply(se3.invert(view.T_base_depth), p)
+    p = p[p[:, 2] > 0.05]
+    uv, _ = view.depth_camera.project(p)
+    size = (view.depth_camera.width, view.depth_camera.height)
+    inside = np.all((uv >= 0) & (uv < size), axis=1)
+    column, row = uv[inside].astype(np.int64).T
+    return view.depth_m[row, column], p[inside, 2]
+
+
+def _share(part: int, whole: int) -> float:
+    return part / whole if whole else 0.0
+
+
+# --- Shapes that only a scan knows: the reconstructed meshes of a scene, to localise with.
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScannedSurfaces:
+    """What the scene adds to a task's shapes."""
+
+    surfaces: dict[str, MeshSurface] = field(default_factory=dict)
+    """By object, in its own frame."""
+    hashes: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the mesh each was read from."""
+
+
+def scanned_surfaces(run: RunFolder, task: Task, num_samples: int) -> ScannedSurfaces:
+    """Read the meshes of a task's scanned objects, as far as the scene has reconstructed them.
+
+    Args:
+        run: Whose scene is read.
+        task: Other objects have a shape of their own there.
+        num_samples: Points spread over each mesh.
+
+    Raises:
+        UnreadableSceneError: When ``object.json`` cannot be understood.
+        UnreadableMeshError: When a mesh is damaged.
+    """
+    found = ScannedSurfaces()
+    for key, model in task.objects.items():
+        folder = run.scene_dir / "objects" / key
+        about = folder / "object.json"
+        if model.shape != SCANNED or not about.is_file():
+            continue
+        try:
+            source = json.loads(about.read_text())["shape_source"]
+        except (ValueError, KeyError, TypeError) as error:
+            found_ = f"does not say where its shape comes from ({error!r})"
+            raise UnreadableSceneError(path=about, found=found_) from error
+        if source == TASK_SHAPE:
+            continue
+        found.surfaces[key] = mesh_surface(*read_mesh(folder / MESH), num_samples)
+        found.hashes[key] = provenance.hash_file(folder / MESH)
+    return found
+
+
+_POSE = 6
+_PER_VIEW = 2
+_SIDES = [
+    Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+    for angles in ((0, 0, 0), (90, 0, 0), (-90, 0, 0), (180, 0, 0), (0, 90, 0), (0, -90, 0))
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshFitConfig:
+    """How a known mesh is laid onto points; what is not here is as in ``ShapeFitConfig``."""
+
+    num_starts: int = 12
+    """Turns about the vertical that are tried."""
+    num_refined: int = 3
+    """Of them, the best are followed to the end."""
+    coarse_points: int = 150
+    """Points of the first steps."""
+    num_samples: int = 2500
+    """Points on the surface of the mesh."""
+    see_through_m: float = 0.012
+    """A camera that measures this much behind the mesh sees through it."""
+    ambiguous: float = 1.2
+    """A second pose whose score is within this factor of the best is as good: the covariance then
+    covers both."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshFit:
+    """A mesh laid onto points."""
+
+    T_base_object: Float[np.ndarray, "4 4"]
+    covariance: Float[np.ndarray, "6 6"]
+    """Of (x, y, z, rotation about x, y, z), base frame [m^2, m rad, rad^2]."""
+    residual_m: float
+    explained: float
+    """Share of points within the Tukey bound."""
+    seen_through: float
+    """Share of the mesh's facing surface that cameras saw through."""
+    score: float
+    """Lower is better."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Problem:
+    surface: MeshSurface
+    cluster: Cluster
+    points: Sequence[Float[np.ndarray, "_ 3"]]
+    """Those of the cluster that each view saw."""
+    views: Sequence[CameraView]
+    fit: ShapeFitConfig
+    tilt_sigma_rad: float
+    prior: Float[np.ndarray, " num_shifts"]
+    """Information of each view's shift in x and y."""
+
+
+def fit_mesh(
+    cluster: Cluster,
+    views: Sequence[CameraView],
+    surface: MeshSurface,
+    fit: ShapeFitConfig,
+    config: MeshFitConfig,
+    *,
+    tilt_sigma_rad: float,
+    yaw_period_rad: float = 2 * np.pi,
+    lying: bool = False,
+) -> MeshFit:
+    """Find the pose at which a mesh best agrees with what was seen.
+
+    It starts upright in turns about the vertical, the middle over that of the points, the tops at
+    one height.
+
+    Args:
+        cluster: Points of the object.
+        views: What the cameras saw, in the order of the cluster's ``view_ids``.
+        surface: The mesh, see ``surface_of``.
+        fit: Standard errors and bounds.
+        config: Starts and scores.
+        tilt_sigma_rad: Prior of roll and pitch: small for what stands, large for what may lie.
+        yaw_period_rad: Turn about its own vertical after which the object looks the same.
+        lying: Start on each of the other five sides, too.
+    """
+    cluster = cluster.thinned(fit.max_points)
+    centre = cluster.p_base.mean(axis=0)
+    prior = []
+    for view in views:
+        distance = float(np.linalg.norm(view.T_base_depth[:3, 3] - centre))
+        sigma = np.hypot(fit.camera_sigma_m, fit.camera_sigma_rad * distance)
+        prior += [1 / sigma**2] * _PER_VIEW
+    few = cluster.thinned(config.coarse_points)
+    problem = _Problem(
+        surface=surface,
+        cluster=cluster,
+        points=cluster.by_view(len(views)),
+        views=views,
+        fit=fit,
+        tilt_sigma_rad=tilt_sigma_rad,
+        prior=np.array(prior),
+    )
+    coarse = replace(
+        problem,
+        surface=MeshSurface(p_m=surface.p_m[::3], normals=surface.normals[::3]),
+        cluster=few,
+        points=few.by_view(len(views)),
+    )
+    sides = _SIDES if lying else _SIDES[:1]
+    first = [T for side in sides for T in _starts(problem, config.num_starts, side, yaw_period_rad)]
+    tried = [_icp(T, coarse, iterations=6, wide=4.0)[0] for T in first]
+    scores = [_score(T, coarse, config)[0] for T in tried]
+    best = [tried[index] for index in np.argsort(scores)[: config.num_refined]]
+    ends = [_icp(T, problem, iterations=fit.iterations, wide=2.0) for T in best]
+    return _choose(ends, problem, config, yaw_period_rad)
+
+
+def _starts(
+    problem: _Problem, count: int, side: Float[np.ndarray, "3 3"], period_rad: float
+) -> list[Float[np.ndarray, "4 4"]]:
+    """Standing on one side, turned about the vertical, the middle over that of the points."""
+    p = problem.cluster.p_base
+    low, high = np.percentile(p, [2, 98], axis=0)
+    top = float((problem.surface.p_m @ side[2]).max())
+    standing = np.eye(4)
+    standing[:3, :3] = side
+    state = np.array([*(low + high)[:2] / 2, high[2] - top, 0.0])
+    return [
+        pose_of(state + np.array([0, 0, 0, yaw])) @ standing
+        for yaw in np.arange(count) * period_rad / count
+    ]
+
+
+def _residuals(
+    T: Float[np.ndarray, "4 4"], shifts: Float[np.ndarray, "num_views 2"], problem: _Problem
+) -> tuple[Float[np.ndarray, " num_points"], Float[np.ndarray, "num_points 8"], np.ndarray]:
+    """Signed distances, derivatives by pose and by the own view's shift, and view ids."""
+    rows, jacobians, ids = [], [], []
+    T_object_base = se3.invert(T)
+    for view_id, (view, p) in enumerate(zip(problem.views, problem.points, strict=True)):
+        seen = facing(T_object_base, view, problem.surface)
+        if len(p) == 0 or seen.sum() < 10:
+            continue
+        moved = T.copy()
+        moved[:2, 3] += shifts[view_id]
+        q, n = problem.surface.p_m[seen], problem.surface.normals[seen]
+        local = se3.apply(se3.invert(moved), p)
+        # Each tree is asked once: one that is made quickly beats one that answers quickly.
+        _, nearest = cKDTree(q, balanced_tree=False, compact_nodes=False).query(local)
+        n = n[nearest]
+        gap = local - q[nearest]
+        r = np.einsum("ij,ij->i", gap, n)
+        # Beside the mesh the plane is no surface: the plain distance counts there.
+        far = lengths(gap)
+        r = np.where(far > 2 * np.abs(r) + problem.fit.tukey_m, far, r)
+        rows.append(r)
+        jacobians.append(_derivatives(p - moved[:3, 3], n @ T[:3, :3].T))
+        ids.append(np.full(len(r), view_id))
+    if not rows:
+        return np.zeros(0), np.zeros((0, _POSE + _PER_VIEW)), np.zeros(0, dtype=np.int64)
+    return np.concatenate(rows), np.concatenate(jacobians), np.concatenate(ids)
+
+
+def _derivatives(
+    arm_m: Float[np.ndarray, "num_points 3"], normal: Float[np.ndarray, "num_points 3"]
+) -> Float[np.ndarray, "num_points 8"]:
+    """Of the distances along the normals, by the pose and by the own view's shift."""
+    x, y, z = arm_m.T
+    a, b, c = normal.T
+    columns = [a, b, c, y * c - z * b, z * a - x * c, x * b - y * a, a, b]
+    return np.asarray(-np.stack(columns, axis=1))
+
+
+def _normal_equations(
+    T: Float[np.ndarray, "4 4"],
+    shifts: Float[np.ndarray, "num_views 2"],
+    problem: _Problem,
+    bound_m: float,
+    damping: Float[np.ndarray, "6"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return H, the gradient and the residuals."""
+    r, J8, ids = _residuals(T, shifts, problem)
+    J = np.zeros((len(r), _POSE + shifts.size))
+    J[:, :_POSE] = J8[:, :_POSE]
+    for axis in range(_PER_VIEW):
+        J[np.arange(len(r)), _POSE + _PER_VIEW * ids + axis] = J8[:, _POSE + axis]
+    ratio = r / bound_m
+    weight = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
+    weight = weight / problem.fit.point_sigma_m**2 / problem.fit.shared_error
+    H = (J * weight[:, None]).T @ J + np.diag(np.concatenate([damping, problem.prior]))
+    gradient = (J * weight[:, None]).T @ r
+    gradient[_POSE:] += problem.prior * shifts.ravel()
+    # Roll and pitch: the vertical of the object should stay near the base's.
+    information = 1 / problem.tilt_sigma_rad**2
+    up = T[:3, 2]
+    H[[3, 4], [3, 4]] += information
+    gradient[3:5] += information * np.array([-up[1], up[0]])
+    return H, gradient, r
+
+
+def _icp(
+    T: Float[np.ndarray, "4 4"], problem: _Problem, *, iterations: int, wide: float
+) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "num_views 2"]]:
+    """Gauss-Newton with correspondences anew in each step and a bound that shrinks."""
+    shifts = np.zeros((len(problem.views), _PER_VIEW))
+    damping = 1 / np.array([0.03, 0.03, 0.03, 0.3, 0.3, 0.3]) ** 2
+    for iteration in range(iterations):
+        bound = problem.fit.tukey_m * max(1.0, wide * (1 - iteration / max(iterations - 2, 1)))
+        H, gradient, _ = _normal_equations(T, shifts, problem, bound, damping)
+        step = np.clip(-np.linalg.solve(H, gradient), -0.3, 0.3)
+        T = T.copy()
+        T[:3, :3] = Rotation.from_rotvec(step[3:6]).as_matrix() @ T[:3, :3]
+        T[:3, 3] += np.clip(step[:3], -0.03, 0.03)
+        shifts = shifts + step[_POSE:].reshape(shifts.shape)
+        if np.abs(step).max() < 1e-5:
+            break
+    return T, shifts
+
+
+def _score(
+    T: Float[np.ndarray, "4 4"], problem: _Problem, config: MeshFitConfig
+) -> tuple[float, float]:
+    """Return the mean bounded distance in bounds plus the share seen through, and that share."""
+    bound = problem.fit.tukey_m
+    r, _, _ = _residuals(T, np.zeros((len(problem.views), _PER_VIEW)), problem)
+    misfit = float(np.minimum(np.abs(r) / bound, 1.0).mean()) if len(r) else 1.0
+    through = seen_through(T, problem.surface, problem.views, config.see_through_m)
+    return misfit + through, through
+
+
+def _choose(
+    ends: Sequence[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "num_views 2"]]],
+    problem: _Problem,
+    config: MeshFitConfig,
+    period_rad: float,
+) -> MeshFit:
+    scored = [(*_score(T, problem, config), T, shifts) for T, shifts in ends]
+    scored.sort(key=lambda item: item[0])
+    score, through, T, shifts = scored[0]
+    others = [(other[0], _turn(T[:3, :3].T @ other[2][:3, :3], period_rad)) for other in scored[1:]]
+    rivals = [(value, angle) for value, angle in others if angle > np.radians(30)]
+    weak = 1 / np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0]) ** 2
+    H, _, r = _normal_equations(T, shifts, problem, problem.fit.tukey_m, weak)
+    covariance = np.linalg.inv(H)[:_POSE, :_POSE].copy()
+    covariance[2, 2] += problem.fit.camera_sigma_m**2
+    for value, angle in rivals:
+        if value < config.ambiguous * score:
+            covariance[5, 5] += (angle / 2) ** 2
+    near = np.abs(r) < problem.fit.tukey_m
+    return MeshFit(
+        T_base_object=T,
+        covariance=(covariance + covariance.T) / 2,
+        residual_m=float(np.sqrt(np.mean(r[near] ** 2))) if near.any() else 0.0,
+        explained=float(near.mean()) if len(near) else 0.0,
+        seen_through=through,
+        score=score,
+    )
+
+
+def _turn(R: Float[np.ndarray, "3 3"], period_rad: float) -> float:
+    """Smallest angle of a rotation among those that differ by the symmetry about z [rad]."""
+    turns = np.arange(0.0, 2 * np.pi - 1e-9, period_rad)
+    spun = [R @ Rotation.from_euler("z", turn).as_matrix() for turn in turns]
+    return min(float(se3.rotation_angle_rad(rotation)) for rotation in spun)

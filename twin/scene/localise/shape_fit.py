@@ -1,0 +1,397 @@
+"""Lay a known shape onto points and outlines by Gauss-Newton: x, y, z and yaw.
+
+Each view also gets a shift and a turn of its own, with a prior: cameras disagree by more than
+their pixels' noise, and a nearby camera is the better witness. Objects stand upright: roll and
+pitch are not estimated, and their share of the covariance is a stated prior.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import ConvexHull
+
+from bridge.geometry import se3
+from bridge.task.task_file import ObjectModel
+from twin.scene.localise.points import CameraView, Cluster, ColourConfig, likeness
+from twin.scene.shape.known import pose_of, starts, surface_distances
+
+# --- The outline of an object in an image: where its colour ends, and where its shape would end.
+#
+# Seen from outside, the outline of a box, open or not, is the convex hull of its eight projected
+# corners. Outlines do not depend on the depth scale, and cover the edges that depth blurs.
+
+EDGE_LIKENESS = 0.5
+"""Half object, half background."""
+OCCLUDER_M = 0.012
+"""Something this much nearer than the edge hides the object's true outline."""
+BESIDE_PX = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outline:
+    """Edge points of an object's colour in one view."""
+
+    view_id: int
+    view: CameraView
+    edge_px: Float[np.ndarray, "num_edges 2"]
+    sigma_m: float
+    """Standard error of one edge point, at the object's distance."""
+    px_m: float
+    """Size of a pixel at the object's distance."""
+
+
+def corners(model: ObjectModel) -> Float[np.ndarray, "8 3"]:
+    """Outer corners in the object frame [m]."""
+    half = np.array(model.size_m) / 2
+    centre = np.array([0.0, 0.0, 0.0 if model.origin_at_centre else half[2]])
+    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    return centre + signs * half
+
+
+def find_outlines(
+    views: Sequence[CameraView],
+    model: ObjectModel,
+    T_base_object: Float[np.ndarray, "4 4"],
+    colour: ColourConfig,
+    *,
+    window_m: float,
+    sigma_px: float,
+) -> list[Outline]:
+    """Collect the edge points near where the object is believed to be.
+
+    Points at the image border and points beside something nearer are left out: there the object
+    goes on.
+    """
+    outlines = []
+    for view_id, view in enumerate(views):
+        p_camera = se3.apply(se3.invert(view.T_base_color) @ T_base_object, corners(model))
+        if np.any(p_camera[:, 2] < 0.05):
+            continue
+        uv, z = view.color_camera.project(p_camera)
+        px_m = float(z.mean()) / view.color_camera.fx
+        window = _window(uv, view.image_linear.shape, window_m / px_m)
+        if window is None:
+            continue
+        rows, columns = window
+        score = likeness(view.image_linear[rows, columns], model.color_srgb, colour)
+        edge, outward = _crossings(np.minimum(score, 1.0))
+        edge = edge + np.array([columns.start, rows.start])
+        free = ~_occluded(view, edge + BESIDE_PX * outward, float(z.min()))
+        if free.any():
+            outlines.append(
+                Outline(
+                    view_id=view_id,
+                    view=view,
+                    edge_px=edge[free],
+                    sigma_m=sigma_px * px_m,
+                    px_m=px_m,
+                )
+            )
+    return outlines
+
+
+def _window(
+    uv: Float[np.ndarray, "8 2"], shape: tuple[int, ...], margin_px: float
+) -> tuple[slice, slice] | None:
+    low = np.maximum(np.floor(uv.min(axis=0) - margin_px).astype(int), 0)
+    high = np.minimum(np.ceil(uv.max(axis=0) + margin_px).astype(int), (shape[1], shape[0]))
+    if np.any(high - low < 3):
+        return None
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def _crossings(
+    score: Float[np.ndarray, "height width"],
+) -> tuple[Float[np.ndarray, "num_edges 2"], Float[np.ndarray, "num_edges 2"]]:
+    """Sub-pixel places (x, y) where neighbouring pixels pass the edge level, and the way out."""
+    edges, outwards = [], []
+    for axis in (0, 1):
+        first = score[:-1] if axis == 0 else score[:, :-1]
+        second = score[1:] if axis == 0 else score[:, 1:]
+        row, column = np.nonzero((first >= EDGE_LIKENESS) != (second >= EDGE_LIKENESS))
+        a, b = first[row, column], second[row, column]
+        fraction = (EDGE_LIKENESS - a) / (b - a)
+        step = np.array([0.0, 1.0]) if axis == 0 else np.array([1.0, 0.0])
+        centre = np.stack([column, row], axis=1) + 0.5
+        edges.append(centre + fraction[:, None] * step)
+        outwards.append(np.where((a > b)[:, None], step, -step))
+    return np.concatenate(edges), np.concatenate(outwards)
+
+
+def _occluded(
+    view: CameraView, beside_px: Float[np.ndarray, "num_edges 2"], nearest_m: float
+) -> Bool[np.ndarray, " num_edges"]:
+    """Whether what lies just outside an edge is nearer than the object; True off the image."""
+    camera = view.color_camera
+    ray = np.column_stack(
+        [
+            (beside_px[:, 0] - camera.cx) / camera.fx,
+            (beside_px[:, 1] - camera.cy) / camera.fy,
+            np.ones(len(beside_px)),
+        ]
+    )
+    T_depth_color = se3.invert(view.T_base_depth) @ view.T_base_color
+    uv, _ = view.depth_camera.project(se3.apply(T_depth_color, ray * nearest_m))
+    height, width = view.depth_m.shape
+    inside = np.all((uv >= 0) & (uv < (width, height)), axis=1)
+    inside &= np.all((beside_px >= 0) & (beside_px < (camera.width, camera.height)), axis=1)
+    column_row = np.where(inside[:, None], uv, 0.0).astype(np.int64)
+    depth = view.depth_m[column_row[:, 1], column_row[:, 0]]
+    return np.asarray(~inside | ((depth > 0) & (depth < nearest_m - OCCLUDER_M)))
+
+
+def outline_distances(
+    outline: Outline, model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, " num_edges"]:
+    """Signed distance of each edge point to the predicted outline, positive outside [m]."""
+    T_camera_object = se3.invert(outline.view.T_base_color) @ T_base_object
+    uv, _ = outline.view.color_camera.project(se3.apply(T_camera_object, corners(model)))
+    hull = ConvexHull(uv)
+    normals, offsets = hull.equations[:, :2], hull.equations[:, 2]
+    beyond = outline.edge_px @ normals.T + offsets
+    # Outside, beyond a corner, the largest half-plane distance is a lower bound; close enough.
+    return np.asarray(beyond.max(axis=1)) * outline.px_m
+
+
+_POSE = 4
+_PER_VIEW = 3
+_STEPS = (1e-4, 1e-4, 1e-4, 1e-3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapeFitConfig:
+    """How a known shape is laid onto points and outlines."""
+
+    point_sigma_m: float = 0.002
+    """Standard error of one voxel-averaged point."""
+    outline_sigma_px: float = 0.7
+    """Standard error of one edge point."""
+    outline_window_m: float = 0.012
+    """Edges farther than this from the believed outline belong to something else."""
+    tukey_m: float = 0.008
+    """Residuals beyond this have no say."""
+    iterations: int = 12
+    shared_error: float = 9.0
+    """Neighbouring pixels share their error: this many count as one."""
+    camera_sigma_m: float = 0.002
+    """Prior of a camera's position error, per axis."""
+    camera_sigma_rad: float = 0.004
+    """Prior of a camera's rotation error, per axis; it acts through the distance."""
+    upright_sigma_rad: float = 0.02
+    """Prior of roll and pitch, which are not estimated."""
+    max_points: int = 1500
+    """Enough for the fit; more are thinned out evenly."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapeFit:
+    """A shape laid onto what was seen."""
+
+    T_base_object: Float[np.ndarray, "4 4"]
+    covariance: Float[np.ndarray, "6 6"]
+    residual_m: float
+    """Root mean square distance of the explained points to the surface."""
+    explained: float
+    """Share of points within the Tukey bound."""
+    outline_residual_m: float | None
+    """Root mean square distance of the explained edges, None without any."""
+    num_edges: int
+    camera_shift_m: tuple[float, ...]
+    """Per view: how far its own shift moves the object sideways."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Problem:
+    """What the residuals are made of."""
+
+    cluster: Cluster
+    outlines: Sequence[Outline]
+    model: ObjectModel
+    config: ShapeFitConfig
+    prior_sigma: Float[np.ndarray, "num_views 3"]
+    """Of each view's shift in x and y and of its turn."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _System:
+    """Residuals at one state, with derivatives and standard errors; points come first."""
+
+    r: Float[np.ndarray, " num_residuals"]
+    J: Float[np.ndarray, "num_residuals num_unknowns"]
+    sigma: Float[np.ndarray, " num_residuals"]
+    num_points: int
+
+
+def fit_shape(
+    cluster: Cluster,
+    views: Sequence[CameraView],
+    model: ObjectModel,
+    colour: ColourConfig,
+    config: ShapeFitConfig,
+) -> ShapeFit:
+    """Find the pose whose surface and outline best agree with what was seen.
+
+    Several starts (yaw from the smallest rectangle, centre from each visible side) are fitted to
+    the points; the best one is refined with the outlines, looked for in a shrinking window.
+    """
+    cluster = cluster.thinned(config.max_points)
+    centre = cluster.p_base.mean(axis=0)
+    distances = [float(np.linalg.norm(view.T_base_depth[:3, 3] - centre)) for view in views]
+    sideways = [np.hypot(config.camera_sigma_m, config.camera_sigma_rad * d) for d in distances]
+    prior = np.array([[s, s, config.camera_sigma_rad] for s in sideways])
+    problem = _Problem(cluster=cluster, outlines=(), model=model, config=config, prior_sigma=prior)
+    free = np.zeros(_PER_VIEW * len(views))
+    candidates = [
+        _solve(np.concatenate([state, free]), problem) for state in starts(cluster.p_base, model)
+    ]
+    best = min(candidates, key=lambda state: _cost(state, problem))
+    for window_m in (2 * config.outline_window_m, config.outline_window_m):
+        outlines = find_outlines(
+            views,
+            model,
+            pose_of(best[:_POSE]),
+            colour,
+            window_m=window_m,
+            sigma_px=config.outline_sigma_px,
+        )
+        problem = _Problem(
+            cluster=cluster, outlines=outlines, model=model, config=config, prior_sigma=prior
+        )
+        best = _solve(best, problem)
+    return _summary(best, problem)
+
+
+def refine_on_points(
+    points: Float[np.ndarray, "num_points 3"],
+    model: ObjectModel,
+    T_base_object: Float[np.ndarray, "4 4"],
+    config: ShapeFitConfig,
+) -> Float[np.ndarray, "4 4"]:
+    """Lay a shape onto points that all come from one source, starting from a pose nearby."""
+    cluster = Cluster(p_base=points, view_ids=np.zeros(len(points), dtype=np.int64))
+    problem = _Problem(
+        cluster=cluster.thinned(config.max_points),
+        outlines=(),
+        model=model,
+        config=config,
+        prior_sigma=np.full((1, _PER_VIEW), 1e-6),  # the source has no shift of its own
+    )
+    yaw = np.arctan2(T_base_object[1, 0], T_base_object[0, 0])
+    state = np.array([*T_base_object[:3, 3], yaw, 0.0, 0.0, 0.0])
+    return pose_of(_solve(state, problem)[:_POSE])
+
+
+def _in_view(state: Float[np.ndarray, " num_unknowns"], view_id: int) -> Float[np.ndarray, "4"]:
+    """(x, y, z, yaw) as one view sees it."""
+    first = _POSE + _PER_VIEW * view_id
+    dx, dy, turn = state[first : first + _PER_VIEW]
+    return np.asarray(state[:_POSE] + np.array([dx, dy, 0.0, turn]))
+
+
+def _system(state: Float[np.ndarray, " num_unknowns"], problem: _Problem) -> _System:
+    config, model, cluster = problem.config, problem.model, problem.cluster
+    blocks = []
+    for view_id in range(len(problem.prior_sigma)):
+        points = cluster.p_base[cluster.view_ids == view_id]
+        own = _in_view(state, view_id)
+        r, gradient = surface_distances(points, model, pose_of(own))
+        offset = points - own[:3]
+        # Moving the shape by d changes the distance by -gradient . d; yaw moves by z x offset.
+        yaw = gradient[:, 0] * offset[:, 1] - gradient[:, 1] * offset[:, 0]
+        J = np.column_stack([-gradient, yaw])
+        blocks.append((view_id, r, J, config.point_sigma_m))
+    num_points = sum(len(block[1]) for block in blocks)
+    for outline in problem.outlines:
+        own = _in_view(state, outline.view_id)
+        r = outline_distances(outline, model, pose_of(own))
+        columns = [
+            (outline_distances(outline, model, pose_of(own + step)) - r) / step.sum()
+            for step in np.diag(_STEPS)
+        ]
+        blocks.append((outline.view_id, r, np.column_stack(columns), outline.sigma_m))
+    J = np.zeros((sum(len(block[1]) for block in blocks), len(state)))
+    row = 0
+    for view_id, r, J_block, _ in blocks:
+        rows = slice(row, row + len(r))
+        J[rows, :_POSE] = J_block
+        first = _POSE + _PER_VIEW * view_id
+        J[rows, first : first + _PER_VIEW] = J_block[:, [0, 1, 3]]
+        row += len(r)
+    return _System(
+        r=np.concatenate([block[1] for block in blocks]),
+        J=J,
+        sigma=np.concatenate([np.full(len(block[1]), block[3]) for block in blocks]),
+        num_points=num_points,
+    )
+
+
+def _normal_equations(
+    state: Float[np.ndarray, " num_unknowns"],
+    system: _System,
+    weight: Float[np.ndarray, " num_residuals"],
+    problem: _Problem,
+    damping: Float[np.ndarray, "4"],
+) -> tuple[Float[np.ndarray, "num_unknowns num_unknowns"], Float[np.ndarray, " num_unknowns"]]:
+    """Return H and the gradient, with the views' priors and damping on the pose."""
+    information = weight / system.sigma**2 / problem.config.shared_error
+    prior = 1 / problem.prior_sigma.ravel() ** 2
+    H = (system.J * information[:, None]).T @ system.J
+    H += np.diag(np.concatenate([damping, prior]))
+    gradient = (system.J * information[:, None]).T @ system.r
+    gradient[_POSE:] += prior * state[_POSE:]
+    return H, gradient
+
+
+def _solve(
+    state: Float[np.ndarray, " num_unknowns"], problem: _Problem
+) -> Float[np.ndarray, " num_unknowns"]:
+    """Gauss-Newton with Tukey weights whose bound shrinks to ``tukey_m``."""
+    damping = 1 / np.array([0.05, 0.05, 0.05, 0.5]) ** 2
+    for iteration in range(problem.config.iterations):
+        bound = problem.config.tukey_m * max(1.0, 3.0 - 0.5 * iteration)
+        system = _system(state, problem)
+        ratio = system.r / bound
+        weight = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
+        H, gradient = _normal_equations(state, system, weight, problem, damping)
+        step = -np.linalg.solve(H, gradient)
+        state = state + np.clip(step, -0.05, 0.05)
+        if np.linalg.norm(step) < 1e-6:
+            break
+    return state
+
+
+def _cost(state: Float[np.ndarray, " num_unknowns"], problem: _Problem) -> float:
+    r = _system(state, problem).r
+    return float(np.mean(np.minimum(np.abs(r), problem.config.tukey_m)))
+
+
+def _summary(state: Float[np.ndarray, " num_unknowns"], problem: _Problem) -> ShapeFit:
+    config = problem.config
+    system = _system(state, problem)
+    near = np.abs(system.r) < config.tukey_m
+    on_points, on_edges = near[: system.num_points], near[system.num_points :]
+    weak = 1 / np.array([0.05, 0.05, 0.05, 1.0]) ** 2
+    H, _ = _normal_equations(state, system, near.astype(np.float64), problem, weak)
+    covariance = np.zeros((6, 6))
+    pose_ids = [0, 1, 2, 5]
+    covariance[np.ix_(pose_ids, pose_ids)] = np.linalg.inv(H)[:_POSE, :_POSE]
+    covariance[2, 2] += config.camera_sigma_m**2
+    covariance[[3, 4], [3, 4]] = config.upright_sigma_rad**2
+    points_r = system.r[: system.num_points][on_points]
+    edges_r = system.r[system.num_points :][on_edges]
+    shifts = state[_POSE:].reshape(-1, _PER_VIEW)[:, :2]
+    return ShapeFit(
+        T_base_object=pose_of(state[:_POSE]),
+        covariance=covariance,
+        residual_m=_rms(points_r) or 0.0,
+        explained=float(on_points.mean()),
+        outline_residual_m=_rms(edges_r),
+        num_edges=int(on_edges.sum()),
+        camera_shift_m=tuple(np.linalg.norm(shifts, axis=1).tolist()),
+    )
+
+
+def _rms(r: Float[np.ndarray, " num_residuals"]) -> float | None:
+    return float(np.sqrt(np.mean(r**2))) if len(r) else None

@@ -1,0 +1,181 @@
+"""Frames taken while their camera stood still, posed in the robot's base."""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Int
+
+from bridge.episode import streams
+from bridge.episode.reader import Episode
+from bridge.episode.streams import RgbdFrame
+from bridge.episode.transforms import TransformTree
+from bridge.errors import GstError
+from bridge.task.robot import BASE_FRAME
+from twin.scene.frames.camera_poses import (
+    CameraPoses,
+    base_tree,
+    calibrated_poses,
+    check_connected,
+    same_pose,
+)
+from twin.scene.frames.pairing import check_camera, frames_at, paired_stamps_ns
+from twin.scene.frames.selection import rgbd_camera_ids, spread
+from twin.scene.store.calibration import Calibration
+
+STILL_WINDOW_NS = 40_000_000
+"""A camera is still when its pose is the same this long before and after an image."""
+STILL_DISTANCE_M = 1e-3
+STILL_ANGLE_RAD = 3e-3
+
+HeldOut = Mapping[str, Collection[int]]
+"""Stamps of frames to leave out, by camera id."""
+Poses = Mapping[str, CameraPoses]
+"""Of cameras that were calibrated, by id; all others are where ``/tf`` says."""
+
+
+def stationary_frames(
+    episode: Episode,
+    max_per_camera: int,
+    after_ns: int | None = None,
+    before_ns: int | None = None,
+    *,
+    evenly: bool = False,
+    held_out_ns: HeldOut | None = None,
+    poses: Poses | None = None,
+) -> list[RgbdFrame]:
+    """Frames of each camera taken in an interval while that camera did not move.
+
+    Only the frames that are returned are ever in memory. A camera that cannot be used, or whose
+    place in the robot's base nobody knows, is passed over as long as another one can.
+
+    Args:
+        episode: Recorded, with posed colour and depth.
+        max_per_camera: At most so many.
+        after_ns: Only frames later than this source time.
+        before_ns: Only frames earlier than this source time.
+        evenly: Spread them evenly over the interval instead of taking the last ones.
+        held_out_ns: Frames that must not be looked at.
+        poses: Where calibrated cameras are.
+
+    Raises:
+        GstError: When no camera can be used; what is wrong with the first.
+    """
+    tree = base_tree(episode)
+    failed: list[GstError] = []
+    usable: dict[str, _Still] = {}
+    camera_ids = rgbd_camera_ids(episode)
+    for camera_id in camera_ids:
+        known = (poses or {}).get(camera_id) or CameraPoses(tree=tree, source="tf")
+        hidden = known.unposed_ns.union((held_out_ns or {}).get(camera_id, ()))
+        try:
+            usable[camera_id] = _still(
+                episode, camera_id, replace(known, unposed_ns=hidden), after_ns, before_ns
+            )
+        except GstError as error:
+            failed.append(error)
+    if failed and not usable:
+        raise failed[0]
+    root = common_root([item.root for item in usable.values()])
+    frames: list[RgbdFrame] = []
+    for camera_id, item in usable.items():
+        if item.root != root:
+            continue
+        stamps = np.array(item.stamps_ns, dtype=np.int64)
+        chosen = spread(stamps, max_per_camera) if evenly else stamps[-max_per_camera:]
+        frames.extend(_frames_at(episode, camera_id, item.poses, chosen.tolist()))
+    return frames
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Still:
+    """When one camera stood still, and where."""
+
+    poses: CameraPoses
+    root: str
+    """Frame that the poses are in."""
+    stamps_ns: list[int]
+
+
+def _still(
+    episode: Episode,
+    camera_id: str,
+    poses: CameraPoses,
+    after_ns: int | None,
+    before_ns: int | None,
+) -> _Still:
+    check_camera(episode, camera_id)
+    frame_id = streams.camera_info(episode, camera_id, "color").frame_id
+    check_connected(poses.tree, episode, camera_id)
+    stamps = _between(paired_stamps_ns(episode, camera_id), after_ns, before_ns)
+    return _Still(
+        poses=poses,
+        root=poses.tree.root_of(frame_id),
+        stamps_ns=[
+            stamp
+            for stamp in stamps
+            if stamp not in poses.unposed_ns
+            and is_stationary(poses.tree, frame_id, stamp, before_ns)
+        ],
+    )
+
+
+def _between(
+    stamps_ns: Int[np.ndarray, " num_frames"], after_ns: int | None, before_ns: int | None
+) -> list[int]:
+    wanted = np.ones(len(stamps_ns), dtype=bool)
+    if after_ns is not None:
+        wanted &= stamps_ns > after_ns
+    if before_ns is not None:
+        wanted &= stamps_ns < before_ns
+    return [int(stamp) for stamp in stamps_ns[wanted]]
+
+
+def _frames_at(
+    episode: Episode, camera_id: str, poses: CameraPoses, stamps_ns: Collection[int]
+) -> Iterator[RgbdFrame]:
+    for frame in frames_at(episode, camera_id, poses.tree, stamps_ns):
+        yield with_true_depth(frame, poses)
+
+
+def common_root(roots: Sequence[str]) -> str | None:
+    """The frame in which objects are looked for: the robot's base where a camera is posed in it."""
+    return BASE_FRAME if BASE_FRAME in roots else next(iter(roots), None)
+
+
+def with_true_depth(frame: RgbdFrame, poses: CameraPoses) -> RgbdFrame:
+    """A frame whose depth is what a calibration makes of what was measured."""
+    if poses.depth_scale == 1.0:
+        return frame
+    return replace(frame, depth_m=frame.depth_m * np.float32(poses.depth_scale))
+
+
+def is_stationary(
+    tree: TransformTree, frame_id: str, stamp_ns: int, until_ns: int | None = None
+) -> bool:
+    """Say whether a frame's pose is the same shortly before and after an instant."""
+    last_ns = (
+        stamp_ns + STILL_WINDOW_NS
+        if until_ns is None
+        else min(stamp_ns + STILL_WINDOW_NS, until_ns)
+    )
+    before = tree.T_root_frame(frame_id, stamp_ns - STILL_WINDOW_NS)
+    after = tree.T_root_frame(frame_id, last_ns)
+    return same_pose(before, after, distance_m=STILL_DISTANCE_M, angle_rad=STILL_ANGLE_RAD)
+
+
+def calibrated_cameras(episode: Episode, calibration: Calibration | None) -> Poses:
+    """Where the cameras of an episode are, as far as they were calibrated.
+
+    Raises:
+        EpisodeError: A camera in the hand, and no joint states.
+        RobotDescriptionError: A camera in the hand, and no usable robot description.
+    """
+    places = {} if calibration is None else calibration.cameras
+    return {
+        camera_id: calibrated_poses(
+            episode, camera_id, places[camera_id], paired_stamps_ns(episode, camera_id)
+        )
+        for camera_id in rgbd_camera_ids(episode)
+        if camera_id in places
+    }

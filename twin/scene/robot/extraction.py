@@ -1,0 +1,303 @@
+"""The robot's part of a rebuild: found in the frames, kept out of the background, kept as links."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+from scipy.ndimage import binary_dilation
+
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.streams import RgbdFrame
+from bridge.errors import GstError
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.task.robot import BASE_FRAME
+from bridge.terminal import Output
+from twin.robot.model import RobotModel, load_robot
+from twin.robot.posture import PostureTrack, far_apart, posture_track
+from twin.robot.surface import PosedSurface, link_poses, link_surfaces
+from twin.scene.align.align import Alignment, align_robot
+from twin.scene.align.view import RobotView
+from twin.scene.fit.initialise import NoSurfaceError, fuse
+from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView
+from twin.scene.frames.selection import FrameChoice, load, root_frame, spread
+from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
+from twin.scene.robot.splats import posed, surface_links, write_links
+from twin.scene.settings import InitialiseConfig
+
+# --- The robot in a scan's frames: known from its joints, it is kept out of the background.
+#
+# Pixels that show it are masked, its points go to its links. What it hid in one frame is filled
+# by the frames in which it stood elsewhere; nothing is invented.
+
+IN_FRONT_M = 0.03
+"""A measurement this much nearer than the robot shows something in front of it."""
+GROW_PX = 2
+"""Masks grow by this much at half size: cameras and joints are never quite where they say."""
+MIN_POINTS = 60
+"""A link seen by fewer points is not kept."""
+ROBOT_SHARE = 0.25
+"""Of the budget of Gaussians, for the robot's links."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Tracked:
+    robot: RobotModel
+    track: PostureTrack
+
+
+class RobotFrames:
+    """Tells robot from background in the frames of some episodes, and collects its surface."""
+
+    def __init__(
+        self,
+        episodes: Sequence[Episode],
+        T_base_root: Float[np.ndarray, "4 4"] | None = None,
+    ) -> None:
+        """Read joints and descriptions; an episode without them is passed over, with a remark.
+
+        Args:
+            episodes: Whose frames will be given.
+            T_base_root: Where the frames' root lies in the robot's base; None: it is the base.
+        """
+        self.T_base_root = np.eye(4) if T_base_root is None else T_base_root
+        self._tracked: dict[str, _Tracked] = {}
+        remarks = []
+        for episode in episodes:
+            try:
+                track = posture_track(episode)
+                robot = load_robot(track.urdf)
+                link_surfaces(robot)
+            except GstError as error:
+                remarks.append(f"{episode.info.id}: {error}")
+                continue
+            self._tracked[str(episode.path)] = _Tracked(robot=robot, track=track)
+        self.remark = "; ".join(remarks)
+        """Why the robot is not told apart in some episodes; empty when it is in all."""
+        self._points: dict[str, list[PointSet]] = {}
+
+    def knows(self, episode: Episode) -> bool:
+        """Say whether joints tell where the robot is in the frames of an episode."""
+        return str(episode.path) in self._tracked
+
+    def take_out(
+        self, episode: Episode, frame: RgbdFrame, points: PointSet, view: TrainingView
+    ) -> tuple[PointSet, TrainingView]:
+        """Return a frame's points without the robot's, and its view with the robot masked.
+
+        The robot's points are kept for its links when it stood still.
+        """
+        surface = self._surface(episode, frame.stamp_ns)
+        if surface is None:
+            return points, view
+        owner = self._keep(episode, frame.stamp_ns, surface, points)
+        masked = _masked(view, surface, self.T_base_root @ view.T_base_color)
+        return points.take(owner < 0), masked
+
+    def collect(self, episode: Episode, stamp_ns: int, points: PointSet) -> None:
+        """Keep the robot's points of a frame that the background does not need."""
+        surface = self._surface(episode, stamp_ns)
+        if surface is not None:
+            self._keep(episode, stamp_ns, surface, points)
+
+    def still_postures(
+        self, episode: Episode, stamps_ns: Iterable[int]
+    ) -> dict[int, Float[np.ndarray, " num_joints"]]:
+        """Joints at those of some instants at which the robot of an episode stood still [rad]."""
+        tracked = self._tracked.get(str(episode.path))
+        if tracked is None:
+            return {}
+        track = tracked.track
+        return {t: track.at(t).joints_rad for t in sorted(stamps_ns) if track.is_still(t)}
+
+    def _surface(self, episode: Episode, stamp_ns: int) -> PosedSurface | None:
+        tracked = self._tracked.get(str(episode.path))
+        if tracked is None or not tracked.track.covers(stamp_ns):
+            return None
+        return PosedSurface(tracked.robot, tracked.track.at(stamp_ns))
+
+    def _keep(
+        self, episode: Episode, stamp_ns: int, surface: PosedSurface, points: PointSet
+    ) -> Int64[np.ndarray, " num_points"]:
+        """Keep the robot's points if it stood still; return which shape owns each point, or -1."""
+        tracked, T = self._tracked[str(episode.path)], self.T_base_root
+        owner = surface_links(
+            tracked.robot,
+            surface,
+            se3.apply(T, points.p_m.astype(np.float64)),
+            points.normals.astype(np.float64) @ T[:3, :3].T,
+        )
+        if tracked.track.is_still(stamp_ns):
+            poses = link_poses(tracked.robot, tracked.track.at(stamp_ns))
+            for link in {surface.links[index] for index in np.unique(owner[owner >= 0])}:
+                mine = np.isin(owner, [i for i, name in enumerate(surface.links) if name == link])
+                moved = _moved(points.take(mine), se3.invert(poses[link]) @ T)
+                self._points.setdefault(link, []).append(moved)
+        return owner
+
+    def links(self, config: InitialiseConfig) -> dict[str, GaussianCloud]:
+        """Fuse what was collected of each link, in the link's frame."""
+        total = sum(len(item.p_m) for sets in self._points.values() for item in sets)
+        clouds = {}
+        for link, sets in sorted(self._points.items()):
+            count = sum(len(item.p_m) for item in sets)
+            if count < MIN_POINTS:
+                continue
+            budget = max(int(ROBOT_SHARE * config.max_splats * count / total), 1)
+            try:
+                clouds[link] = fuse(sets, replace(config, max_splats=budget))
+            except NoSurfaceError:
+                continue
+        return clouds
+
+    def joined(
+        self,
+        cloud: GaussianCloud,
+        links: Mapping[str, GaussianCloud],
+        episode: Episode,
+        stamp_ns: int,
+    ) -> GaussianCloud:
+        """Put the robot into a scene as it stood at an instant of an episode.
+
+        Args:
+            cloud: The scene, in the frames' root.
+            links: Per link its Gaussians, in the link's frame.
+            episode: Whose joints count.
+            stamp_ns: When.
+        """
+        tracked = self._tracked.get(str(episode.path))
+        if tracked is None or not links or not tracked.track.covers(stamp_ns):
+            return cloud
+        posture = tracked.track.at(stamp_ns)
+        robot = posed(links, posture.joints_rad, tracked.track.urdf, width_m=posture.width_m)
+        return concatenate([cloud, moved_cloud(robot, se3.invert(self.T_base_root))])
+
+
+def _moved(points: PointSet, T_link_base: Float[np.ndarray, "4 4"]) -> PointSet:
+    return replace(
+        points,
+        p_m=as_float32(se3.apply(T_link_base, points.p_m.astype(np.float64))),
+        normals=as_float32(points.normals @ T_link_base[:3, :3].T),
+    )
+
+
+def _masked(
+    view: TrainingView, surface: PosedSurface, T_base_camera: Float[np.ndarray, "4 4"]
+) -> TrainingView:
+    """Mark the pixels that show the robot as not static, at both sizes."""
+    return view.without(robot_mask(surface, view.half.camera, T_base_camera, view.half.depth_m))
+
+
+def robot_mask(
+    surface: PosedSurface,
+    camera: Camera,
+    T_base_camera: Float[np.ndarray, "4 4"],
+    depth_m: Float[np.ndarray, "height width"],
+) -> Bool[np.ndarray, "height width"]:
+    """Pixels that show the posed robot, grown by two; not those with something in front of it."""
+    expected = surface.depth_along(camera.rays(), T_base_camera)
+    hidden = (depth_m > 0) & (depth_m < expected - IN_FRONT_M)
+    around = np.ones((2 * GROW_PX + 1, 2 * GROW_PX + 1), dtype=bool)
+    return np.asarray(binary_dilation(np.isfinite(expected) & ~hidden, around))
+
+
+MAX_POSTURES = 24
+ALIGN_FRAMES = 12
+"""Training frames of one camera that are looked at to find the robot in a foreign root frame."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoundRobot:
+    """The robot of a rebuild; it may be known in no frame at all, which ``remark`` explains."""
+
+    frames: RobotFrames
+    remark: str
+    alignment: Alignment | None = None
+    """Where the scene's root is not the robot's base: how the two were laid onto each other."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrivenRobot:
+    """Links that stand where the joints of an episode put them."""
+
+    frames: RobotFrames
+    links: Mapping[str, GaussianCloud] = field(default_factory=dict)
+
+    def joined(self, cloud: GaussianCloud, episode: Episode, stamp_ns: int) -> GaussianCloud:
+        """The scene with the robot in it as it stood at an instant."""
+        return self.frames.joined(cloud, self.links, episode, stamp_ns)
+
+
+def find_robot(choices: Sequence[FrameChoice], output: Output) -> FoundRobot:
+    """Say where the robot is in the frames of a rebuild, if that can be said.
+
+    Where the frames' root is the robot's base, the joints say it. In another root frame (poses
+    from odometry, another world) scene and robot are aligned by what the training frames show.
+    """
+    root = root_frame(choices[0])
+    episodes = list({choice.episode.path: choice.episode for choice in choices}.values())
+    if root == BASE_FRAME:
+        frames = RobotFrames(episodes)
+        return FoundRobot(frames=frames, remark=frames.remark)
+    try:
+        alignment = _aligned(choices)
+    except GstError as error:
+        remark = f"the scene's root is {root!r}, not the robot's base: {error}"
+        return FoundRobot(frames=RobotFrames([]), remark=remark)
+    output.say(
+        f"robot found in frame {root!r}: residual {alignment.residual_m * 1e3:.1f} mm, "
+        f"yaw margin {alignment.margin:.1f}"
+    )
+    frames = RobotFrames(episodes, alignment.T_base_source)
+    return FoundRobot(frames=frames, remark=frames.remark, alignment=alignment)
+
+
+def look_closer(
+    found: FoundRobot, choices: Sequence[FrameChoice], limits: DepthLimits, stride: int
+) -> None:
+    """Collect the robot's surface from frames that cameras standing still have to spare.
+
+    A few of their frames are enough for the background. The robot shows another side in each
+    posture, so up to two dozen postures far from each other are read for its links.
+    """
+    for choice in choices:
+        postures = found.frames.still_postures(choice.episode, choice.spare_ns)
+        if not choice.still or not postures:
+            continue
+        stamps, joints = np.array(list(postures)), np.array(list(postures.values()))
+        wanted = frozenset(stamps[far_apart(joints, MAX_POSTURES)].tolist())
+        for frame in load(choice, wanted):
+            points = FrameSurface(frame, limits).points(stride)
+            found.frames.collect(choice.episode, frame.stamp_ns, points)
+
+
+def _aligned(choices: Sequence[FrameChoice]) -> Alignment:
+    """Align by the camera that has joints; errors say what is missing."""
+    choice = choices[0]
+    track = posture_track(choice.episode)
+    stamps = spread(np.array(sorted(choice.train_ns), dtype=np.int64), ALIGN_FRAMES)
+    wanted = frozenset(stamp for stamp in stamps.tolist() if track.is_still(stamp))
+    views = [
+        RobotView.from_frame(frame, track.at(frame.stamp_ns), frame.T_base_depth)
+        for frame in load(choice, wanted)
+    ]
+    return align_robot(views, load_robot(track.urdf))
+
+
+def write_robot(
+    run: RunFolder, found: FoundRobot, links: Mapping[str, GaussianCloud]
+) -> dict[str, Any]:
+    """Write ``robot/<link>.ply`` and return what ``scene.json`` says about the robot."""
+    record: dict[str, Any] = {"remark": found.remark, "links": write_links(run, links)}
+    if found.alignment is not None:
+        record["T_base_root"] = _pose(found.frames.T_base_root)
+        record["alignment"] = found.alignment.to_record()
+    return {"robot": record}
+
+
+def _pose(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
+    q, p = se3.split(T)
+    return {"p_m": p.tolist(), "q_wxyz": q.tolist()}

@@ -1,0 +1,368 @@
+"""From words to things: which instances and parts a text means, and who says so."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt16
+
+from twin.scene.semantics.colour import COLOUR_NAMES
+from twin.scene.semantics.result import Instance, SemanticScene, SemanticsError
+
+# --- Words for things: which mean the same, what they look like, what parts they have.
+
+FORMS = {
+    "open container": (
+        "container", "basket", "box", "bin", "tray", "bowl", "bucket", "crate", "cup", "mug",
+        "pot",
+    ),
+    "cube": ("cube", "block", "brick", "box", "dice"),
+    "box": ("box", "block", "brick", "carton", "package", "case"),
+    "flat box": ("box", "book", "card", "plate", "board", "tablet"),
+    "cylinder": ("cylinder", "can", "cup", "mug", "bottle", "tube", "jar"),
+    "ball": ("ball", "sphere", "orange", "apple"),
+    "toy": ("toy", "animal", "plush", "figure", "duck", "sloth", "teddy", "bear", "doll"),
+}  # fmt: skip
+"""What a form may be called."""
+ANY_THING = ("object", "thing", "item", "stuff")
+ANIMALS = ("toy", "animal", "plush", "figure", "duck", "sloth", "teddy", "bear", "doll")
+KIND_NAMES = {"container": ("container",), "animal": ("toy", "animal"), "other": ()}
+"""What every thing of a kind may be called, see ``kind_of``."""
+TYPICAL_COLOURS = {
+    "duck": ("yellow", "orange"),
+    "sloth": ("brown", "beige", "grey"),
+    "teddy": ("brown", "beige"),
+    "orange": ("orange",),
+    "apple": ("red", "green"),
+}
+"""A form alone does not tell a duck from a sloth; its colour may."""
+PART_WORDS = {
+    "rim": ("rim", "edge", "lip"),
+    "floor": ("floor", "bottom", "inside", "cavity"),
+    "walls": ("wall", "side"),
+    "handle": ("handle", "grip", "ear"),
+    "body": ("body", "torso", "belly", "trunk"),
+    "head": ("head", "face", "beak"),
+    "limbs": ("limb", "leg", "arm", "foot", "hand", "paw", "wing"),
+}
+SAME_COLOURS = {"gray": "grey", "violet": "purple", "tan": "beige", "turquoise": "cyan"}
+SMALL_WORDS = ("the", "a", "an", "all", "of", "on", "in", "any", "every", "my", "this", "that")
+SIZES = ("small", "little", "tiny", "large", "big", "open", "flat", "tall")
+
+
+def words_of(text: str) -> list[str]:
+    """Lower-case words, plurals made singular, possessives cut, articles left out."""
+    cleaned = "".join(c if c.isalnum() else " " for c in text.lower().replace("'s", " "))
+    return [singular(word) for word in cleaned.split() if word not in SMALL_WORDS]
+
+
+def singular(word: str) -> str:
+    """Cut a plural ending: ducks, boxes, berries; glass stays."""
+    irregular = {"feet": "foot", "dice": "dice", "teddies": "teddy"}
+    if word in irregular:
+        return irregular[word]
+    if word.endswith("ies") and len(word) > 4:
+        return word[:-3] + "y"
+    if word.endswith(("xes", "ches", "shes", "sses")):
+        return word[:-2]
+    if word.endswith("s") and not word.endswith(("ss", "us")) and len(word) > 3:
+        return word[:-1]
+    return word
+
+
+def colour_of(word: str) -> str | None:
+    """The colour a word names, or None."""
+    word = SAME_COLOURS.get(word, word)
+    return word if word in COLOUR_NAMES else None
+
+
+def part_of(word: str) -> str | None:
+    """The part a word names, or None."""
+    return next((part for part, names in PART_WORDS.items() if word in names), None)
+
+
+def spoken_name(key: str) -> str:
+    """An id of a task file as a person would say it: ``duck_1`` is a duck."""
+    return re.sub(r"[_\d]+", " ", key).strip()
+
+
+def form_in(label: str) -> str | None:
+    """The longest form whose name ends a label of the default segmenter, or None.
+
+    What is called open, and may be a container, is one.
+    """
+    words = words_of(label)
+    if "open" in words and words[-1] in FORMS["open container"]:
+        return "open container"
+    ends = [form for form in FORMS if label == form or label.endswith(" " + form)]
+    return max(ends, key=len, default=None)
+
+
+def names_of(label: str) -> set[str]:
+    """Nouns that a label answers to: its own words, its kind, what its form may be called."""
+    names = set(words_of(label)) | set(ANY_THING) | set(KIND_NAMES[kind_of(label)])
+    form = form_in(label)
+    if form is not None:
+        colours = {colour_of(word) for word in words_of(label)} - {None}
+        names |= {
+            name
+            for name in FORMS[form]
+            if name not in TYPICAL_COLOURS or not colours or colours & set(TYPICAL_COLOURS[name])
+        }
+    return names
+
+
+def known_words() -> set[str]:
+    """Every noun the lexicon has."""
+    nouns: Iterable[tuple[str, ...]] = (*FORMS.values(), ANY_THING, ANIMALS)
+    return {name for group in nouns for name in group}
+
+
+def kind_of(label: str) -> str:
+    """Which parts to look for: "container", "animal" or "other"."""
+    form, words = form_in(label), words_of(label)
+    if form == "open container" or (form is None and _any_of(words, FORMS["open container"])):
+        return "container"
+    if form == "toy" or (form is None and _any_of(words, ANIMALS)):
+        return "animal"
+    return "other"
+
+
+def _any_of(words: list[str], names: tuple[str, ...]) -> bool:
+    return any(word in names for word in words)
+
+
+# --- Things that a task names: their Gaussians were taken out already, so nobody has to guess
+# them.
+
+NAMED = "task"
+"""Source of an instance that is an object of the task."""
+MIN_SPLATS = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Numbered:
+    """Things in their final numbers."""
+
+    labels: UInt16[np.ndarray, " num_splats"]
+    """Known objects first, then what the segmenter found besides; 0 is the background."""
+    keys: tuple[str, ...]
+    """Of the known objects, in order: the first has the label 1."""
+    others: tuple[int, ...]
+    """Numbers that the segmenter gave the rest, in order."""
+
+
+def numbered(
+    labels: UInt16[np.ndarray, " num_splats"],
+    known: Mapping[str, Bool[np.ndarray, " num_splats"]],
+) -> Numbered:
+    """Let the known objects have their Gaussians, and what the segmenter joined with them.
+
+    A thing of which at least half belongs to one known object is that object: its rest is what
+    was left in the background when the object was cut out. Objects with next to no Gaussians get
+    no number: nothing can be said of them.
+
+    Args:
+        labels: From the segmenter; 0 is the background.
+        known: The Gaussians of each object; no two share one.
+    """
+    keys = tuple(key for key, mask in known.items() if int(mask.sum()) >= MIN_SPLATS)
+    num_things = int(labels.max(initial=0))
+    sizes = np.bincount(labels, minlength=num_things + 1)
+    new_number = np.zeros(num_things + 1, dtype=np.uint16)
+    most = np.zeros(num_things + 1, dtype=np.int64)
+    for number, key in enumerate(keys, start=1):
+        held = np.bincount(labels[known[key]], minlength=num_things + 1)
+        mine = (2 * held >= sizes) & (held > most)
+        new_number[mine], most[mine] = number, held[mine]
+    new_number[0] = 0
+    others = tuple(n for n in range(1, num_things + 1) if not new_number[n] and sizes[n])
+    for number, other in enumerate(others, start=len(keys) + 1):
+        new_number[other] = number
+    joined = new_number[labels]
+    for number, key in enumerate(keys, start=1):
+        joined[known[key]] = number
+    return Numbered(labels=joined, keys=keys, others=others)
+
+
+def label_of(key: str, colour: str, *, is_open: bool) -> str:
+    """What a known object is called: its name in the task, with its colour.
+
+    A box that is open says so, because "box" alone may be either.
+
+    Args:
+        key: Its id in the task file.
+        colour: Name of its colour.
+        is_open: Whether it has a cavity that opens upwards.
+    """
+    name = spoken_name(key)
+    words = words_of(name)
+    either = bool(words) and words[-1] in FORMS["box"] and words[-1] in FORMS["open container"]
+    if is_open and either and "open" not in words:
+        name = f"open {name}"
+    if any(colour_of(word) is not None for word in words):
+        return name
+    return f"{colour} {name}"
+
+
+CANONICAL = ("object", "thing", "stuff", "texture")
+"""What a text has to beat (LERF, Kerr et al. 2023)."""
+LOGIT_SCALE = 100.0
+"""CLIP's trained temperature: cosines differ by hundredths."""
+LEXICON = "lexicon"
+
+
+@runtime_checkable
+class TextEncoder(Protocol):
+    """Turns texts into vectors comparable with the scene's instance embeddings."""
+
+    @property
+    def source(self) -> str:
+        """Which model it is."""
+
+    def encode(self, texts: Sequence[str]) -> Float32[np.ndarray, "num_texts num_dims"]:
+        """One vector for each text, of any length but zero."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Query:
+    """How much each thing and each part is what a text means."""
+
+    text: str
+    objects: Mapping[int, float]
+    """Activation of each instance, 0..1, by its id."""
+    parts: Mapping[tuple[int, str], float]
+    """Activation of each part, by instance and part; empty when the text names no part."""
+    source: str
+    """Who says so: "lexicon" gives 0 or 1, a model something between."""
+    remark: str = ""
+    """Words that were not understood."""
+
+    def best(self) -> int | None:
+        """The instance with the highest activation; None when none has any."""
+        top = max(self.objects, key=lambda number: (self.objects[number], -number), default=None)
+        return top if top is not None and self.objects[top] > 0 else None
+
+
+def query(
+    scene: SemanticScene,
+    text: str,
+    *,
+    embeddings: Float[np.ndarray, "num_instances num_dims"] | None = None,
+    encoder: TextEncoder | None = None,
+) -> Query:
+    """Tell which instances and parts a text means.
+
+    Without embeddings and encoder the lexicon answers: 1 where colour, size and noun fit the
+    instance's label, else 0. With both, the model answers for objects: the softmax of the text
+    against each canonical phrase, the smallest of them. Parts go by name in either case, each
+    with its object's activation ("handle of the basket", "the duck's head").
+
+    Args:
+        scene: What there is.
+        text: An object, optionally with a part of it.
+        embeddings: One vector for each instance, in the order of ``scene.instances``.
+        encoder: The model that made them.
+
+    Raises:
+        SemanticsError: When the text says nothing, or the embeddings do not fit.
+    """
+    words = words_of(text)
+    if not words:
+        message = f"{text!r} names nothing to look for."
+        raise SemanticsError(message)
+    wanted_parts, noun_words = _split_parts(scene, words)
+    if embeddings is None or encoder is None:
+        objects, remark = _by_lexicon(scene, noun_words)
+        source = LEXICON
+    else:
+        phrase = " ".join(noun_words) or text
+        objects, remark = _by_model(scene, phrase, embeddings, encoder), ""
+        source = encoder.source
+    parts = {
+        (item.id, part): objects[item.id]
+        for item in scene.instances
+        for part in item.parts
+        if part in wanted_parts
+    }
+    return Query(text=text, objects=objects, parts=parts, source=source, remark=remark)
+
+
+def _split_parts(scene: SemanticScene, words: list[str]) -> tuple[set[str], list[str]]:
+    """Parts that are named, and the words about the object."""
+    parts = {part for word in words if (part := part_of(word)) is not None}
+    own = {word for item in scene.instances for word in words_of(item.label)}
+    rest = [word for word in words if part_of(word) is None or word in own]
+    return parts, rest
+
+
+def _by_lexicon(scene: SemanticScene, words: list[str]) -> tuple[dict[int, float], str]:
+    own = {word for item in scene.instances for word in words_of(item.label)}
+    known = known_words() | own | set(SIZES)
+    unknown = [word for word in words if word not in known and colour_of(word) is None]
+    objects = {item.id: float(_fits(item, words, scene)) for item in scene.instances}
+    nouns = {word for word in words if word not in SIZES and colour_of(word) is None}
+    named = {
+        item.id
+        for item in scene.instances
+        if item.source == NAMED and objects[item.id] and nouns <= set(words_of(item.label))
+    }
+    if nouns and named:  # a task says which thing is the sloth; others only look like one
+        objects = {key: value if key in named else 0.0 for key, value in objects.items()}
+    remark = f"not in the lexicon: {', '.join(unknown)}" if unknown else ""
+    return objects, remark
+
+
+def _fits(item: Instance, words: list[str], scene: SemanticScene) -> bool:
+    names = names_of(item.label)
+    colours = {colour_of(word) for word in words_of(item.label)} - {None}
+    for word in words:
+        colour = colour_of(word)
+        if word in SIZES:
+            if not _has_size(item, word, scene):
+                return False
+        elif colour is not None and word not in names:
+            if colour not in colours:
+                return False
+        elif colour is None and word not in names:
+            return False
+    return True
+
+
+def _has_size(item: Instance, word: str, scene: SemanticScene) -> bool:
+    """Sizes compare a thing with the median of the scene; "open" and "flat" with its label."""
+    if word in ("open", "flat"):
+        return word in words_of(item.label)
+    if word == "tall":
+        return item.size_m[2] > 1.2 * max(item.size_m[:2])
+    volumes = [float(np.prod(other.size_m)) for other in scene.instances]
+    volume, middle = float(np.prod(item.size_m)), float(np.median(volumes))
+    return volume < 0.8 * middle if word in ("small", "little", "tiny") else volume > 1.25 * middle
+
+
+def _by_model(
+    scene: SemanticScene,
+    phrase: str,
+    embeddings: Float[np.ndarray, "num_instances num_dims"],
+    encoder: TextEncoder,
+) -> dict[int, float]:
+    vectors = encoder.encode([phrase, *CANONICAL])
+    if embeddings.shape != (len(scene.instances), vectors.shape[1]):
+        message = (
+            f"the scene has {len(scene.instances)} instances and embeddings of shape "
+            f"{embeddings.shape}; {encoder.source} encodes text in {vectors.shape[1]} dimensions. "
+            "Make the embeddings with the same model."
+        )
+        raise SemanticsError(message)
+    cosine = _unit(np.asarray(embeddings, dtype=np.float64)) @ _unit(vectors.astype(np.float64)).T
+    # Two-way softmax of the text against each canonical phrase, the least favourable counts.
+    against = LOGIT_SCALE * (cosine[:, 1:].max(axis=1) - cosine[:, 0])
+    activation = 1.0 / (1.0 + np.exp(np.clip(against, -60.0, 60.0)))
+    return {item.id: float(value) for item, value in zip(scene.instances, activation, strict=True)}
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, 1e-12))

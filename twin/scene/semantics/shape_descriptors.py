@@ -1,0 +1,376 @@
+"""The form of a thing that stands on a plane: height map, cavity, box, and a word for it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
+
+from twin.scene.semantics.result import SemanticsError
+
+# --- The plane that things stand on: nearly level, found by RANSAC, refined by least squares.
+
+UP = np.array([0.0, 0.0, 1.0])
+"""Against gravity in the root frame of a robot cell."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SupportConfig:
+    """What counts as the supporting plane."""
+
+    max_tilt_rad: float = 0.14
+    """From level: poses may be wrong by a few degrees, a ramp is no table."""
+    tolerance_m: float = 0.006
+    """Points this near belong to the plane."""
+    num_trials: int = 500
+    """Triples of points to try."""
+    max_points: int = 6000
+    """Points that vote; more are thinned out evenly."""
+    min_points: int = 100
+    """A plane with fewer points carries nothing."""
+    num_candidates: int = 3
+    """Planes among which the one that carries most is chosen (table and floor)."""
+    separation_m: float = 0.04
+    """Level planes nearer than this are one surface that is not quite flat."""
+    cell_m: float = 0.02
+    """Size of the cells that say where the plane extends."""
+    seed: int = 0
+    """Of the random triples."""
+
+
+class NoSupportError(SemanticsError):
+    """No level plane was found."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SupportPlane:
+    """Points p of the plane fulfil ``normal . p = offset_m``."""
+
+    normal: Float[np.ndarray, "3"]
+    """Unit vector, upwards."""
+    offset_m: float
+    num_points: int
+    """Points that voted for it."""
+    footprint: Bool[np.ndarray, "num_x num_y"]
+    """Where it extends, seen along z: cells with support and the holes between them."""
+    corner_m: tuple[float, float]
+    """Lower x and y of the first cell."""
+    cell_m: float
+
+    def height_m(self, p_m: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
+        """Distance above the plane; negative below [m]."""
+        return np.asarray(p_m @ self.normal - self.offset_m)
+
+    def under(self, p_m: Float[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
+        """Say which points lie above or below where the plane extends."""
+        cells = np.floor((p_m[:, :2] - self.corner_m) / self.cell_m).astype(np.int64)
+        inside = np.all((cells >= 0) & (cells < self.footprint.shape), axis=1)
+        cells[~inside] = 0
+        return np.asarray(inside & self.footprint[cells[:, 0], cells[:, 1]])
+
+
+def find_support(
+    p_m: Float[np.ndarray, "num_points 3"],
+    normals: Float[np.ndarray, "num_points 3"],
+    config: SupportConfig,
+) -> SupportPlane:
+    """Find the level plane that carries most of what is near it.
+
+    Fischler and Bolles 1981 on the points whose normal is upright, with the tilt bounded. Of the
+    largest few planes the one with most points on it and just above it wins: a floor may be
+    larger than the table, but less stands on the part of it that is seen.
+
+    Raises:
+        NoSupportError: When no level plane has enough points.
+    """
+    upright = np.abs(normals @ UP) > np.cos(3 * config.max_tilt_rad)
+    left = p_m[upright]
+    planes: list[tuple[int, SupportPlane]] = []
+    for _ in range(config.num_candidates):
+        found = _largest_plane(left, config)
+        if found is None:
+            break
+        plane = found
+        height = plane.height_m(p_m)
+        carried = (height > 2 * config.tolerance_m) & (height < 0.3)
+        carried[carried] = plane.under(p_m[carried])
+        planes.append((plane.num_points + int(carried.sum()), plane))
+        left = left[np.abs(plane.height_m(left)) > config.separation_m]
+    if not planes:
+        message = (
+            f"no level plane among {len(p_m)} points, {int(upright.sum())} of them upright. The "
+            "default segmenter needs a table in view and z up in the root frame."
+        )
+        raise NoSupportError(message)
+    return max(planes, key=lambda item: item[0])[1]
+
+
+def _largest_plane(p_m: np.ndarray, config: SupportConfig) -> SupportPlane | None:
+    if len(p_m) < config.min_points:
+        return None
+    rng = np.random.default_rng(config.seed)
+    some = p_m[:: max(1, len(p_m) // config.max_points)]
+    triples = some[rng.integers(0, len(some), (config.num_trials, 3))]
+    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    normals /= np.maximum(length, 1e-12)[:, None]
+    normals *= np.sign(normals[:, 2:] + 1e-12)
+    level = (length > 1e-9) & (normals @ UP > np.cos(config.max_tilt_rad))
+    # The exactly level plane through one point is always among the trials.
+    normals[~level] = UP
+    offsets = (normals * triples[:, 0]).sum(axis=1)
+    votes = (np.abs(normals @ some.T - offsets[:, None]) < config.tolerance_m).sum(axis=1)
+    best = int(np.argmax(votes))
+    normal, offset = normals[best], float(offsets[best])
+    for _ in range(3):
+        inside = np.abs(p_m @ normal - offset) < config.tolerance_m
+        if inside.sum() < config.min_points:
+            return None
+        normal, offset = _refined(p_m[inside], config)
+    inside = np.abs(p_m @ normal - offset) < config.tolerance_m
+    if inside.sum() < config.min_points:
+        return None
+    footprint, corner = _footprint(p_m[inside], config.cell_m)
+    return SupportPlane(
+        normal=normal,
+        offset_m=offset,
+        num_points=int(inside.sum()),
+        footprint=footprint,
+        corner_m=corner,
+        cell_m=config.cell_m,
+    )
+
+
+def _refined(p_m: np.ndarray, config: SupportConfig) -> tuple[np.ndarray, float]:
+    """Least squares for z over x and y, the tilt bounded."""
+    centre = p_m.mean(axis=0)
+    away = p_m - centre
+    scatter = away[:, :2].T @ away[:, :2] + 1e-9 * len(p_m) * np.eye(2)
+    slope = np.linalg.solve(scatter, away[:, :2].T @ away[:, 2])
+    steepness = float(np.linalg.norm(slope))
+    slope *= min(1.0, np.tan(config.max_tilt_rad) / max(steepness, 1e-12))
+    normal = np.array([-slope[0], -slope[1], 1.0])
+    normal /= np.linalg.norm(normal)
+    return normal, float(normal @ centre)
+
+
+def _footprint(p_m: np.ndarray, cell_m: float) -> tuple[np.ndarray, tuple[float, float]]:
+    """Cells with points, small gaps closed, and the holes where things stand."""
+    cells = np.floor(p_m[:, :2] / cell_m).astype(np.int64)
+    low = cells.min(axis=0) - 3
+    grid = np.zeros(cells.max(axis=0) - low + 4, dtype=bool)
+    grid[tuple((cells - low).T)] = True
+    closed = ndimage.binary_closing(grid, iterations=3)
+    filled = np.asarray(ndimage.binary_fill_holes(closed | grid))
+    return filled, (float(low[0] * cell_m), float(low[1] * cell_m))
+
+
+CONTAINER_RATIO = 1.8
+"""Convex hull over filled volume; more, with a cavity that opens upwards, is a container."""
+CONTAINER = "open container"
+NUM_LEVELS = 48
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeightMap:
+    """The highest point over each cell of the plane."""
+
+    top_m: Float[np.ndarray, "num_x num_y"]
+    """Above the plane; 0 outside the footprint."""
+    footprint: Bool[np.ndarray, "num_x num_y"]
+    corner_m: tuple[float, float]
+    cell_m: float
+
+    def cells(self, xyh_m: Float[np.ndarray, "num_points 3"]) -> tuple[np.ndarray, np.ndarray]:
+        """Cell of each point; points beyond the map go to its edge, which is outside."""
+        index = np.floor((xyh_m[:, :2] - self.corner_m) / self.cell_m).astype(np.int64)
+        index = np.clip(index, 0, np.array(self.top_m.shape) - 1)
+        return index[:, 0], index[:, 1]
+
+    def centre_m(self, mask: Bool[np.ndarray, "num_x num_y"]) -> Float[np.ndarray, "2"]:
+        """Mean place of the marked cells."""
+        return np.asarray((np.argwhere(mask).mean(axis=0) + 0.5) * self.cell_m + self.corner_m)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeightMapCavity:
+    """Where water would stand."""
+
+    mask: Bool[np.ndarray, "num_x num_y"]
+    """Cells of the height map."""
+    rim_m: float
+    """Height at which it would overflow."""
+    floor_m: float
+    volume_m3: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapeDescriptors:
+    """What a thing looks like, in numbers and in a word."""
+
+    word: str
+    """cube, box, flat box, cylinder, ball, open container or toy."""
+    centre_m: Float[np.ndarray, "3"]
+    """Of the box around it: x, y, height above the plane."""
+    size_m: tuple[float, float, float]
+    """Longer side, shorter side, height."""
+    yaw_rad: float
+    """Direction of the longer side."""
+    hull_ratio: float
+    """Volume of the convex hull over the volume filled from the plane to the highest points."""
+    cavity: HeightMapCavity | None
+
+
+def height_map(xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float) -> HeightMap:
+    """Highest point per cell; cells within the outline that show none take their neighbour's."""
+    cells = np.floor(xyh_m[:, :2] / cell_m).astype(np.int64)
+    low = cells.min(axis=0) - 3
+    shape = cells.max(axis=0) - low + 4
+    top = np.full(shape, -np.inf)
+    np.maximum.at(top, tuple((cells - low).T), xyh_m[:, 2])
+    known = np.isfinite(top)
+    footprint = ndimage.binary_fill_holes(ndimage.binary_closing(known, iterations=2) | known)
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    top = np.where(footprint, np.maximum(top[tuple(nearest)], 0.0), 0.0)
+    return HeightMap(
+        top_m=top,
+        footprint=np.asarray(footprint),
+        corner_m=(float(low[0] * cell_m), float(low[1] * cell_m)),
+        cell_m=cell_m,
+    )
+
+
+def find_height_map_cavity(
+    heights: HeightMap, min_depth_fraction: float = 0.2
+) -> HeightMapCavity | None:
+    """Flood the height map; None when hardly any water would stand.
+
+    Each level is closed by three cells first, so that a gap in a noisy rim does not drain it.
+    The rim is the highest level that still holds half the area of the widest.
+
+    Args:
+        heights: What the thing looks like from above.
+        min_depth_fraction: A cavity is at least this deep, in heights of the thing.
+    """
+    height = float(heights.top_m.max())
+    levels = np.linspace(0.0, height, NUM_LEVELS + 1)[1:]
+    pools = []
+    for level in levels:
+        dry = heights.top_m >= level
+        dam = ndimage.binary_closing(dry, iterations=1) | dry
+        pools.append(ndimage.binary_fill_holes(dam) & ~dam)
+    areas = np.array([int(pool.sum()) for pool in pools])
+    if not areas.any():
+        return None
+    last = int(np.flatnonzero(areas >= 0.5 * areas.max())[-1])
+    rim = float(levels[last])
+    # A handle or a gap may drain a part of it just below the rim: look from half its depth on.
+    lowest = float(heights.top_m[pools[last]].min())
+    pool = np.any([pools[k] for k in range(last + 1) if levels[k] >= (rim + lowest) / 2], axis=0)
+    floor = float(np.quantile(heights.top_m[pool], 0.3))
+    deep = rim - floor > max(min_depth_fraction * height, 0.006)
+    wide = pool.sum() > 0.15 * heights.footprint.sum()
+    if not (deep and wide):
+        return None
+    volume = float(np.maximum(rim - heights.top_m[pool], 0.0).sum()) * heights.cell_m**2
+    return HeightMapCavity(mask=pool, rim_m=rim, floor_m=floor, volume_m3=volume)
+
+
+def measure_form(xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float) -> ShapeDescriptors:
+    """Measure a thing from the points of its visible surface.
+
+    Args:
+        xyh_m: x, y and height above the plane it stands on.
+        cell_m: Spacing of the points or more.
+    """
+    low, high = np.quantile(xyh_m, [0.005, 0.995], axis=0)
+    extent = float((high - low).max())
+    heights = height_map(xyh_m, max(cell_m, extent / 48))
+    centre_xy, sides, yaw, fill = _rectangle(xyh_m[:, :2])
+    top = float(high[2])
+    solid = float(heights.top_m.sum()) * heights.cell_m**2
+    ratio = _hull_volume(xyh_m) / max(solid, 1e-12)
+    cavity = find_height_map_cavity(heights)
+    size = (float(sides[0]), float(sides[1]), top)
+    return ShapeDescriptors(
+        word=_word(xyh_m, heights, size, fill, ratio, cavity),
+        centre_m=np.array([*centre_xy, top / 2]),
+        size_m=size,
+        yaw_rad=float(yaw),
+        hull_ratio=ratio,
+        cavity=cavity,
+    )
+
+
+def _hull_volume(points: np.ndarray) -> float:
+    try:
+        return float(ConvexHull(points).volume)
+    except (QhullError, ValueError):  # fewer than four points, or all in one plane
+        return 0.0
+
+
+def _rectangle(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Smallest rectangle around points: centre, sides (longer first), yaw, share that is hull.
+
+    One side of it lies along a side of the convex hull (Freeman and Shapira 1975).
+    """
+    try:
+        hull = ConvexHull(xy)
+    except (QhullError, ValueError):
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        sides = np.maximum(high - low, 1e-6)
+        return (low + high) / 2, np.sort(sides)[::-1], float(np.pi / 2 * (sides[1] > sides[0])), 1.0
+    corners = xy[hull.vertices]
+    edges = np.roll(corners, -1, axis=0) - corners
+    yaws = np.arctan2(edges[:, 1], edges[:, 0])
+    along = np.stack([np.cos(yaws), np.sin(yaws)], axis=1)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    spans = []
+    for axis in (along, across):
+        shadow = corners @ axis.T
+        spans.append((shadow.min(axis=0), shadow.max(axis=0)))
+    areas = (spans[0][1] - spans[0][0]) * (spans[1][1] - spans[1][0])
+    best = int(np.argmin(areas))
+    middle = [(span[0][best] + span[1][best]) / 2 for span in spans]
+    sides = np.array([span[1][best] - span[0][best] for span in spans])
+    centre = middle[0] * along[best] + middle[1] * across[best]
+    yaw = float(yaws[best])
+    if sides[1] > sides[0]:
+        sides, yaw = sides[::-1], yaw + np.pi / 2
+    yaw = float((yaw + np.pi / 2) % np.pi - np.pi / 2)
+    return centre, sides, yaw, float(hull.volume / max(areas[best], 1e-12))
+
+
+def _word(
+    xyh_m: np.ndarray,
+    heights: HeightMap,
+    size_m: tuple[float, float, float],
+    fill: float,
+    ratio: float,
+    cavity: HeightMapCavity | None,
+) -> str:
+    if cavity is not None and ratio > CONTAINER_RATIO:
+        return CONTAINER
+    long, short, height = size_m
+    plateau = float((heights.top_m[heights.footprint] > 0.85 * height).mean())
+    if plateau > 0.68:
+        if fill > 0.88 or long > 1.25 * short:
+            if height < 0.35 * short:
+                return "flat box"
+            return "cube" if max(size_m) < 1.3 * min(size_m) else "box"
+        return "cylinder"
+    return "ball" if _is_ball(xyh_m, long) else "toy"
+
+
+def _is_ball(points: np.ndarray, diameter_m: float) -> bool:
+    """Fit a sphere by linear least squares (|p|^2 = 2 c.p + k) and look at what is left."""
+    p = points - points.mean(axis=0)
+    system = np.concatenate([2 * p, np.ones((len(p), 1))], axis=1)
+    solution, *_ = np.linalg.lstsq(system, np.square(p).sum(axis=1), rcond=None)
+    squared = float(solution[3] + solution[:3] @ solution[:3])
+    if squared <= 0:
+        return False
+    radius = float(np.sqrt(squared))
+    left = np.linalg.norm(p - solution[:3], axis=1) - radius
+    return bool(np.sqrt(np.mean(left**2)) < 0.08 * radius and 0.7 < 2 * radius / diameter_m < 1.4)
