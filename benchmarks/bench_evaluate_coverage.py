@@ -22,10 +22,10 @@ CHOSEN = [name for name in os.environ.get("COVERAGE_METHODS", "").split(",") if 
 if DRAWS != FULL_DRAWS or CHOSEN:  # a number that proves nothing does not replace one that does
     os.environ.setdefault("GST_BENCH_RESULTS", str(ROOT / "build" / "quick_results"))
 
-from evaluator.statistics import agreement as agreement_module
-from evaluator.statistics import bootstrap, intervals, prediction_powered, sequential
-from evaluator.statistics import differences as differences_module
-from evaluator.statistics.coverage import exact, simulate, stored
+from evaluator.statistics import agreement as agreement_module  # noqa: E402
+from evaluator.statistics import bootstrap, intervals, prediction_powered, sequential  # noqa: E402
+from evaluator.statistics import differences as differences_module  # noqa: E402
+from evaluator.statistics.coverage import exact, simulate, stored  # noqa: E402
 from evaluator.statistics.coverage.simulate import (  # noqa: E402
     CLUSTERED,
     POPULATIONS,

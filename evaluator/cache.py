@@ -38,7 +38,7 @@ TRIES = 3
 ABANDONED_S = 3600.0
 """A half-written file this old has lost its writer."""
 SUMMING_UP = {
-    evaluator: ("compare", "metrics"),
+    evaluator: ("cache_file.py", "compare", "metrics", "run_reader"),
     bridge: ("clock.py", "episode", "geometry", "media", "task"),
 }
 """The code that reads episodes and sums them up."""

@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, Writer
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from bridge.episode import schema
+from bridge.episode import schema  # noqa: E402
 from bridge.episode.cdr import codec  # noqa: E402
 from bridge.wire.config import WireConfig  # noqa: E402
 from bridge.wire.session import WireSample, open_session  # noqa: E402

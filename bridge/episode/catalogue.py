@@ -117,8 +117,6 @@ def _refresh(
         _change(store, [], gone)
     if not stale:
         return
-    # noqa: PLC0415  # half of the time
-
     for start in range(0, len(stale), BATCH):
         rows = []
         for found in stale[start : start + BATCH]:

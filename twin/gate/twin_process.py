@@ -81,7 +81,7 @@ def answer(question: Question) -> Verdict:
     from twin.replay.rebuilt_scene import (  # noqa: PLC0415
         calibrated,
         for_task,
-        read_rebuilt_scene,  # noqa: PLC0415
+        read_rebuilt_scene,
     )
     from twin.replay.scene import ReplayScene  # noqa: PLC0415
     from twin.replay.verdict import replay_plan  # noqa: PLC0415

@@ -417,8 +417,6 @@ def runner_for(config: ReplayRunConfig) -> Iterator[Runner]:
     workers = config.workers or default_size()
     runner: Runner = Alone()
     if config.ray:
-        # noqa: PLC0415  # an extra
-
         runner = RayRunner(config.ray, workers)
     elif workers > 1:
         runner = Crew(workers)

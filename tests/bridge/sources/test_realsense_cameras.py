@@ -25,10 +25,10 @@ from bridge.episode.reader import Episode  # noqa: E402
 from bridge.media.color import decode_color  # noqa: E402
 from bridge.sources import device_samples  # noqa: E402
 from bridge.sources.realsense import publish  # noqa: E402
-from bridge.sources.realsense.config import (
+from bridge.sources.realsense.config import (  # noqa: E402
     CameraNotFoundError,
     CameraStreamError,
-    RealSenseConfig,  # noqa: E402
+    RealSenseConfig,
 )
 from bridge.sources.realsense.device import CameraDevice  # noqa: E402
 from bridge.sources.realsense.messages import ColorFrame, DepthFrame  # noqa: E402

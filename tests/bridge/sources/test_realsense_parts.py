@@ -12,12 +12,12 @@ rs = pytest.importorskip("pyrealsense2", reason="the extra [realsense] is not in
 from software_camera import intrinsics  # noqa: E402
 
 from bridge.errors import UsageError  # noqa: E402
-from bridge.sources.realsense.config import (
-    MountsError,  # noqa: E402
-    RealSenseConfig,  # noqa: E402
+from bridge.sources.realsense.config import (  # noqa: E402
+    MountsError,
+    RealSenseConfig,
 )
 from bridge.sources.realsense.device import (  # noqa: E402
-    FrameStamps,  # noqa: E402
+    FrameStamps,
     Rectifier,
     is_distorted,
 )
