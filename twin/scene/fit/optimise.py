@@ -224,7 +224,8 @@ class Progress:
     clock: Callable[[], float]
     """What the budget is counted in."""
     end_s: float
-    """When the budget is used up, on that clock; infinite when images are counted."""
+    """When the budget is used up, on that clock; infinite when images are counted, so that what
+    is done does not depend on time."""
 
     def allowance(self, share: float) -> Allowance:
         """Time for a stage that may take this share of the budget, and no more than is left."""
@@ -352,6 +353,8 @@ class FitResult:
 
     cloud: GaussianCloud
     iterations: int
+    iterations_asked: int | None
+    """None: as many as the time allowed."""
     coarse_iterations: int
     seconds: float
     """Wall time, initialisation and that of an interrupted fit before included."""
@@ -369,6 +372,11 @@ class FitResult:
     colour_steps: int
     """Conjugate gradient steps that solved colours; 0 when there was no time for them."""
 
+    @property
+    def underfitted(self) -> bool:
+        """Whether the time limit struck before all the images asked for were done."""
+        return self.iterations < (self.iterations_asked or 0)
+
 
 def fit(
     cloud: GaussianCloud,
@@ -384,7 +392,8 @@ def fit(
     """Minimise the loss over the views with Adam; each step draws one image.
 
     The time budget covers everything in here, the solutions in closed form included: it is
-    exceeded by one image at most.
+    exceeded by one image at most. Where images are counted, the time is only a limit, looked at
+    between two images: nothing that decides the result depends on it until it strikes.
 
     Args:
         cloud: Where to start.
@@ -402,7 +411,7 @@ def fit(
     if state is None or len(state.gains) != len(views):
         harmonics = NUM_FIRST if config.harmonics else cloud.num_harmonics
         state = first_state(learner.session(with_harmonics(cloud, harmonics)), len(views))
-        state.seconds = min(spent_s, SPENT_AT_MOST * config.budget_s)
+        state.seconds = min(spent_s, SPENT_AT_MOST * config.limit_s)
     cpu_start, last_saved = time.process_time(), state.seconds
     for at in _steps(config, state, clock):
         events.keep(state, at)
@@ -416,6 +425,7 @@ def fit(
     return FitResult(
         cloud=state.session.cloud,
         iterations=state.session.steps,
+        iterations_asked=config.iterations or None,
         coarse_iterations=state.coarse_steps,
         seconds=state.seconds,
         cpu_seconds=time.process_time() - cpu_start,
@@ -431,12 +441,12 @@ def fit(
 def _steps(config: FitConfig, state: FitState, clock: Callable[[], float]) -> Iterator[Progress]:
     begin_s = clock() - state.seconds
     by_images = config.iterations > 0
-    end_s = math.inf if by_images else begin_s + config.budget_s
+    end_s = math.inf if by_images else begin_s + config.limit_s
     while True:
         state.seconds = clock() - begin_s
         seen = state.session.steps
-        fraction = seen / config.iterations if by_images else state.seconds / config.budget_s
-        if fraction >= 1.0:
+        fraction = seen / config.iterations if by_images else state.seconds / config.limit_s
+        if fraction >= 1.0 or state.seconds >= config.limit_s:
             return
         yield Progress(fraction=fraction, seconds=state.seconds, clock=clock, end_s=end_s)
 

@@ -1,5 +1,6 @@
 """What ``scene.json`` says: where the scene came from, how it was made, how good it is."""
 
+import math
 import resource
 import sys
 from collections.abc import Mapping, Sequence
@@ -59,6 +60,7 @@ def make_record(
     """Put together the content of ``scene.json``."""
     settings = asdict(config)
     settings.pop("force")
+    settings["fit"]["budget_s"] = None if math.isinf(config.fit.limit_s) else config.fit.limit_s
     scan = learnt.report.to_record()
     return {
         "schema_version": SCENE_VERSION,
@@ -78,6 +80,8 @@ def make_record(
         "fit": {
             "num_splats": len(fitted.cloud),
             "iterations": fitted.iterations,
+            "iterations_asked": fitted.iterations_asked,
+            "underfitted": fitted.underfitted,
             "coarse_iterations": fitted.coarse_iterations,
             "seconds": round(fitted.seconds, 2),
             "cpu_seconds": round(fitted.cpu_seconds, 2),
@@ -105,6 +109,8 @@ def protocol_of(
         "cameras_from": sorted({SAYS[choice.poses.source] for choice in choices}),
         "poses_refined": frames.align_poses or config.fit.refine_poses,
         "num_splats": len(fitted.cloud),
+        "fit_iterations": fitted.iterations,
+        "underfitted": fitted.underfitted,
         "fit_seconds": round(fitted.seconds, 2),
         "fit_cpu_seconds": round(fitted.cpu_seconds, 2),
         "rebuild_seconds": round(cost.seconds, 2),
@@ -151,7 +157,7 @@ def describe_scene(record: Mapping[str, Any]) -> str:
     lines = [
         f"scene {record['scene_hash']}: {record['background']['num_splats']} Gaussians"
         + (" (stand-in)" if record["stand_in"] else ""),
-        f"fit: {fitted['iterations']} images in {fitted['seconds']:.1f} s"
+        f"fit: {_images_done(fitted)} in {fitted['seconds']:.1f} s"
         + (
             ""
             if fitted["train_psnr_db"] is None
@@ -165,11 +171,22 @@ def describe_scene(record: Mapping[str, Any]) -> str:
         f"{item['holdout_frames']} held out; poses from {SAYS[item['poses_from']]}"
         for item in record["cameras"]
     ]
+    if fitted.get("underfitted"):
+        lines.insert(2, "underfitted: the time limit struck first; give --budget more time")
     lines += _view_lines(record["views"])
     lines += record["scan"]["remarks"]
     if record["remark"]:
         lines.append(record["remark"])
     return "\n".join(lines)
+
+
+def _images_done(fitted: Mapping[str, Any]) -> str:
+    asked = fitted.get("iterations_asked")  # not in scenes of older versions
+    return (
+        f"{fitted['iterations']} images"
+        if asked is None
+        else f"{fitted['iterations']} of {asked} images"
+    )
 
 
 def _view_lines(views: Mapping[str, Any]) -> list[str]:

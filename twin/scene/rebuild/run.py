@@ -39,7 +39,7 @@ from twin.scene.rebuild.record import Cost, make_record, protocol_of
 from twin.scene.rebuild.semantics import write_scene_semantics
 from twin.scene.rebuild.views import ENGINE, ViewsJob, summarise_views, views_path, write_views
 from twin.scene.robot.extraction import DrivenRobot, write_robot
-from twin.scene.settings import RebuildConfig
+from twin.scene.settings import DEFAULT_BUDGET_S, RebuildConfig
 from twin.scene.store.calibration import Calibration, read_calibration
 from twin.scene.store.folder import (
     BACKGROUND,
@@ -223,6 +223,7 @@ def _key(sources: Sources, config: RebuildConfig, calibration: Calibration | Non
     settings = asdict(config)
     settings.pop("force")
     settings["fit"].pop("threads")
+    settings["fit"]["budget_s"] = config.fit.budget_s or DEFAULT_BUDGET_S  # keys of older scenes
     settings["models"].pop("device")
     hashes = {str(e.path.name): e.sha256() for e in sources.episodes}
     task = _task(sources)
