@@ -1,6 +1,13 @@
 """Fit Gaussians to images: half size first, then full size, for a time or a number of images.
 
-Adam moves everything; what happens between its steps is in ``events``.
+Adam moves everything. Between its steps gains and colours are solved in closed form
+(``appearance``) and Gaussians are split where the error is large (``densify``). Each of these looks
+at many images at once, so none may take more than its share of the budget.
+
+Images alone let a Gaussian slide along its rays as long as the training views agree; the depth term
+sees only the mean depth of a pixel, so Gaussians before and behind the surface cancel in it. From
+other viewpoints they come apart as a haze of millimetres. With ``slab`` each Gaussian is held
+within a slab around the piece of the fused surface that it began on.
 """
 
 import io
@@ -25,22 +32,6 @@ from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import NUM_FIRST, GaussianCloud, arrays, as_float32, with_harmonics
 from twin.scene.raster.rasteriser import FitSession, RasterConfig, Rasteriser, psnr_db
 from twin.scene.settings import FitConfig
-
-# --- What happens between the steps of a fit, each at its share of the budget and within its time.
-#
-# Gains and colours are solved in closed form (``appearance``), Gaussians are split where the
-# error is large (``densify``). Each of these looks at many images at once, so with many images it
-# could take longer than the fit itself: none may take more than its share of the budget.
-
-# --- Everything a fit has reached, and the file it is kept in so that it can go on.
-
-# --- Gaussians stay near the surface that depth fused.
-#
-# Images alone let a Gaussian slide along its rays as long as the training views agree; the depth
-# term sees only the mean depth of a pixel, so Gaussians before and behind the surface cancel in
-# it. From other viewpoints they come apart as a haze of millimetres. The fused surface is where
-# many depth images agree, so each Gaussian is held within a slab around the piece of it that it
-# began on.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -315,8 +306,8 @@ class Events:
         cloud = state.session.cloud
         scores = score(cloud, self._observations(state, coarse), self._rasteriser, allowance)
         left = sum(event.act == self._densify for event in self._schedule[state.events_done :])
-        room = max(self._max_splats - len(cloud), 0)
-        done = densify(cloud, scores, max_splats=self._max_splats, most=-(-room // left))
+        left_over = max(self._max_splats - len(cloud), 0)
+        done = densify(cloud, scores, max_splats=self._max_splats, most=-(-left_over // left))
         state.session.rearrange(done.cloud, done.parents)
         state.surface = state.surface.take(done.parents)
         state.num_split += done.num_split
@@ -457,9 +448,11 @@ def _recent_psnr_db(state: FitState, num_views: int) -> float | None:
 
 def _note(state: FitState, at: Progress, num_views: int) -> str:
     recent = _recent_psnr_db(state, num_views)
-    said = "" if recent is None else f", training PSNR {recent:.2f} dB"
+    quality = "" if recent is None else f", training PSNR {recent:.2f} dB"
     left = at.seconds / at.fraction - at.seconds if at.fraction > 0 else None
-    return f"image {state.session.steps}{said}" + ("" if left is None else f", {left:.0f} s left")
+    return f"image {state.session.steps}{quality}" + (
+        "" if left is None else f", {left:.0f} s left"
+    )
 
 
 class _Learner:

@@ -50,7 +50,7 @@ def make_record(
     scene_hash: str,
     sources: Sources,
     left_out: Sequence[str],
-    learnt: TrainingSet,
+    training: TrainingSet,
     config: RebuildConfig,
     fitted: FitResult,
     views: Mapping[str, Any],
@@ -61,19 +61,19 @@ def make_record(
     settings = asdict(config)
     settings.pop("force")
     settings["fit"]["budget_s"] = None if math.isinf(config.fit.limit_s) else config.fit.limit_s
-    scan = learnt.report.to_record()
+    scan = training.report.to_record()
     return {
         "schema_version": SCENE_VERSION,
         "key": key,
         "scene_hash": scene_hash,
-        "frame": root_frame(learnt.choices[0]),
+        "frame": root_frame(training.choices[0]),
         "units": {"length": "m", "colour": "sRGB", "quaternion": "wxyz"},
         "remark": sources.remark,
         "stand_in": any(episode.info.stand_in for episode in sources.episodes),
         "sources": [
             {"id": e.info.id, "kind": e.info.kind, "sha256": e.sha256()} for e in sources.episodes
         ],
-        "cameras": [camera_record(choice) for choice in learnt.choices],
+        "cameras": [camera_record(choice) for choice in training.choices],
         "scan": scan | {"remarks": [*left_out, *scan["remarks"]]},
         "settings": settings,
         "background": {"file": BACKGROUND, "num_splats": num_background},
@@ -128,7 +128,7 @@ def holdout_text(frames: FrameConfig) -> str:
 
 
 def training_text(frames: FrameConfig) -> str:
-    """Which frames were learnt from, in words."""
+    """Which frames were trained on, in words."""
     if frames.train_every:
         return f"frame 0 and every {frames.train_every}th after it, but no held-out one"
     return "of the others the stillest and sharpest of each stretch of the camera's path"
@@ -140,7 +140,7 @@ def camera_record(choice: FrameChoice) -> dict[str, Any]:
     return {
         "episode": choice.episode.info.id,
         "id": choice.camera_id,
-        "still": choice.still,
+        "stationary": choice.stationary,
         "poses_from": choice.poses.source,
         "poses_quality": dict(choice.poses.quality),
         "poses_corrected": len(choice.corrections),
@@ -167,7 +167,7 @@ def describe_scene(record: Mapping[str, Any]) -> str:
         f"{cost['peak_memory_mb']} MB at most",
     ]
     lines += [
-        f"camera {item['id']} of {item['episode']}: {item['train_frames']} frames learnt, "
+        f"camera {item['id']} of {item['episode']}: {item['train_frames']} training frames, "
         f"{item['holdout_frames']} held out; poses from {SAYS[item['poses_from']]}"
         for item in record["cameras"]
     ]
