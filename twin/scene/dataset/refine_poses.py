@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
@@ -17,7 +17,7 @@ from bridge.terminal import Output
 from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import PointSet, TrainingView
 from twin.scene.frames.selection import FrameChoice
-from twin.scene.gaussians import GaussianCloud
+from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.settings import InitialiseConfig
 
 ROUNDS = 3
@@ -245,10 +245,6 @@ def _frame_points(T_base_camera: np.ndarray) -> Float[np.ndarray, "4 3"]:
 def _moved_points(points: PointSet, T: np.ndarray) -> PointSet:
     return replace(
         points,
-        p_m=_float32(se3.apply(T, points.p_m.astype(np.float64))),
-        normals=_float32(points.normals.astype(np.float64) @ T[:3, :3].T),
+        p_m=as_float32(se3.apply(T, points.p_m.astype(np.float64))),
+        normals=as_float32(points.normals.astype(np.float64) @ T[:3, :3].T),
     )
-
-
-def _float32(values: np.ndarray) -> Float32[np.ndarray, "num_points 3"]:
-    return np.ascontiguousarray(values, dtype=np.float32)

@@ -285,13 +285,6 @@ def choose_frames(
     config: FrameConfig,
     output: Output = QUIET,
     calibration: Calibration | None = None,
-) -> list[FrameChoice]:
-    """The choices of ``choose_with_reasons``; raises as it does."""
-    return choose_with_reasons(sources, config, output, calibration).choices
-
-
-def choose_with_reasons(
-    sources: Sources, config: FrameConfig, output: Output, calibration: Calibration | None
 ) -> Chosen:
     """Hold out every n-th frame of each camera, then choose training frames from the others.
 

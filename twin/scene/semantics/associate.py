@@ -112,8 +112,6 @@ class Association:
     """Largest first."""
     labels: UInt16[np.ndarray, " num_splats"]
     """Index of the track plus one; 0 is the background."""
-    num_dropped: int
-    """Candidates with too little support."""
 
 
 def associate(
@@ -262,7 +260,7 @@ def _association(
     final = np.zeros(len(labels), dtype=np.uint16)
     for number, item in enumerate(tracks):
         final[item.mask] = number + 1
-    return Association(tracks=tuple(tracks), labels=final, num_dropped=len(hits) - len(tracks))
+    return Association(tracks=tuple(tracks), labels=final)
 
 
 def _names(
