@@ -24,10 +24,6 @@ NUM_FIRST = 3
 """Spherical harmonics of degree 1."""
 
 
-def _no_harmonics() -> np.ndarray:
-    return np.zeros((0, 0, 3), dtype=np.float32)
-
-
 @dataclass(frozen=True, kw_only=True)
 class GaussianCloud:
     """Anisotropic Gaussians with one colour each, in the run's root frame.
@@ -45,7 +41,7 @@ class GaussianCloud:
     colors: Float32[np.ndarray, "num_splats 3"]
     """sRGB, nominally 0..1; may leave that range, the drawn image is clipped."""
     harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"] = field(
-        default_factory=_no_harmonics
+        default_factory=lambda: np.zeros((0, 0, 3), dtype=np.float32)
     )
     """How colour changes with the direction it is seen along: coefficients of the real spherical
     harmonics of degree 1, none or three of them (``harmonic_basis``) for each colour."""

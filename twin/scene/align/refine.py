@@ -14,6 +14,7 @@ from jaxtyping import Float, Int64
 from bridge.geometry import se3
 from twin.robot.surface import PosedSurface
 from twin.scene.align.view import RobotView, ViewCloud
+from twin.scene.least_squares import tukey_weights
 
 FACING = 0.5
 """Cosine between the measured normal and the description's, below which a match is none."""
@@ -177,7 +178,7 @@ def _rows(
     n = found.normals
     r = np.einsum("ij,ij->i", n, p - found.p_m)
     facing = np.abs(np.einsum("ij,ij->i", n, cloud.normals @ T[:3, :3].T))
-    w = np.where(found.distance_m < gate_m, (1 - (found.distance_m / gate_m) ** 2) ** 2, 0.0)
+    w = tukey_weights(found.distance_m, gate_m)
     w[(facing < FACING) | (np.abs(p[:, 2]) < TABLE_M)] = 0.0
     stretch = np.einsum("ij,ij->i", n, cloud.p_m @ T[:3, :3].T)
     J = np.concatenate([n, np.cross(p, n), stretch[:, None]], axis=1)

@@ -18,6 +18,7 @@ from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import PointSet, TrainingView
 from twin.scene.frames.selection import FrameChoice
 from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.least_squares import normal_equations, tukey_weights
 from twin.scene.settings import InitialiseConfig
 
 ROUNDS = 3
@@ -213,16 +214,14 @@ def _solve(
     """One Gauss-Newton step, turning about the camera; returns the motion in the root frame."""
     centre = (T_new_old @ view.T_base_color)[:3, 3]
     residual = ((p - q) * normals).sum(axis=1)
-    weight = np.clip(1.0 - np.square(residual / tukey_m), 0.0, None) ** 2
-    weight *= INDEPENDENT / DEPTH_SIGMA_M**2
+    weight = tukey_weights(residual, tukey_m) * (INDEPENDENT / DEPTH_SIGMA_M**2)
     J = np.concatenate([np.cross(p - centre, normals), normals], axis=1)
     prior = np.repeat([1 / PRIOR_RAD**2, 1 / PRIOR_M**2], 3)
     so_far = np.concatenate(
         [se3.vector_from_rotation(T_new_old[:3, :3]), _camera_shift(T_new_old, view)]
     )
-    A = (J * weight[:, None]).T @ J + np.diag(prior)
-    b = (J * weight[:, None]).T @ residual + prior * so_far
-    x = -np.linalg.solve(A, b)
+    H, gradient = normal_equations(J, residual, weight)
+    x = -np.linalg.solve(H + np.diag(prior), gradient + prior * so_far)
     step = np.eye(4)
     step[:3, :3] = se3.rotation_from_vector(x[:3])
     step[:3, 3] = centre + x[3:] - step[:3, :3] @ centre

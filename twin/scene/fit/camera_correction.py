@@ -23,10 +23,6 @@ ALIGN_COARSE_STEPS, ALIGN_FINE_STEPS = 40, 20
 ALIGN_DECAY = 0.03
 
 
-def _rates() -> np.ndarray:
-    return np.array([TURN_RATE_RAD] * 3 + [SHIFT_RATE_M] * 3)
-
-
 def corrected_pose(
     T_base_camera: Float[np.ndarray, "4 4"], correction: Float[np.ndarray, "6"]
 ) -> Float[np.ndarray, "4 4"]:
@@ -97,7 +93,8 @@ def _adam(gradient: np.ndarray, first: np.ndarray, second: np.ndarray, count: in
     first += (1 - BETA_1) * (gradient - first)
     second += (1 - BETA_2) * (np.square(gradient) - second)
     mean, square = first / (1 - BETA_1**count), second / (1 - BETA_2**count)
-    return np.asarray(_rates() * mean / (np.sqrt(square) + 1e-15))
+    rates = np.array([TURN_RATE_RAD] * 3 + [SHIFT_RATE_M] * 3)
+    return np.asarray(rates * mean / (np.sqrt(square) + 1e-15))
 
 
 @dataclass(frozen=True, kw_only=True)

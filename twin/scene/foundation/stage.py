@@ -1,6 +1,6 @@
 """What ``rebuild`` asks the models: masks and features of training frames, vectors of things."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,6 @@ from twin.scene.foundation.models import (
     FEATURES,
     SEGMENTERS,
     ClipEmbedder,
-    Sam3Segmenter,
     open_clip,
     open_features,
     open_segmenter,
@@ -125,7 +124,7 @@ def ask_models(
 
     Args:
         config: Which models.
-        frames: Training frames, see ``spread``.
+        frames: Training frames.
         cloud: The Gaussians that features are lifted to, in the frames' root frame.
         task: Names what to look for when no prompts are given.
         threads: For lifting; 0: all cores.
@@ -139,8 +138,12 @@ def ask_models(
     masks: list[tuple[Viewpoint, MaskSet]] = []
     if config.segmenter:
         segmenter = open_segmenter(config.segmenter, placement)
-        for done, item in enumerate(_segmented(segmenter, frames, prompts_of(config, task)), 1):
-            masks.append(item)
+        prompts = prompts_of(config, task)
+        for done, frame in enumerate(frames, 1):
+            found = segmenter.segment(
+                frame.image_u8, prompts, camera_id=frame.camera_id, stamp_ns=frame.stamp_ns
+            )
+            masks.append((viewpoint_of(frame), found))
             advance(done, segmenter.source)
         del segmenter
     features = None
@@ -155,16 +158,6 @@ def ask_models(
         rasteriser = Rasteriser(RasterConfig(threads=threads))
         features = lift_reduced(rasteriser, cloud, pairs, basis, source=source.source)
     return ModelFindings(masks=masks, features=features)
-
-
-def _segmented(
-    segmenter: Sam3Segmenter, frames: Sequence[RgbdFrame], prompts: Sequence[str]
-) -> Iterable[tuple[Viewpoint, MaskSet]]:
-    for frame in frames:
-        found = segmenter.segment(
-            frame.image_u8, prompts, camera_id=frame.camera_id, stamp_ns=frame.stamp_ns
-        )
-        yield viewpoint_of(frame), found
 
 
 def embed_things(
@@ -258,12 +251,6 @@ def thing_vectors(
 def viewpoint_of(frame: RgbdFrame) -> Viewpoint:
     """Where a frame's colour camera stood."""
     return Viewpoint(camera=frame.color_camera, T_base_camera=frame.T_base_color)
-
-
-def spread(stamps_ns: Sequence[int], count: int) -> list[int]:
-    """At most ``count`` of some stamps, evenly, first and last included."""
-    chosen = np.linspace(0, len(stamps_ns) - 1, min(count, len(stamps_ns))).round().astype(int)
-    return [stamps_ns[index] for index in dict.fromkeys(chosen.tolist())]
 
 
 def _no_features(num_splats: int) -> SceneFeatures:

@@ -1,6 +1,6 @@
 """Frames taken while their camera stood still, posed in the robot's base."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -83,7 +83,8 @@ def stationary_frames(
             continue
         stamps = np.array(item.stamps_ns, dtype=np.int64)
         chosen = spread(stamps, max_per_camera) if evenly else stamps[-max_per_camera:]
-        frames.extend(_frames_at(episode, camera_id, item.poses, chosen.tolist()))
+        found = frames_at(episode, camera_id, item.poses.tree, chosen.tolist())
+        frames.extend(with_true_depth(frame, item.poses) for frame in found)
     return frames
 
 
@@ -129,13 +130,6 @@ def _between(
     if before_ns is not None:
         wanted &= stamps_ns < before_ns
     return [int(stamp) for stamp in stamps_ns[wanted]]
-
-
-def _frames_at(
-    episode: Episode, camera_id: str, poses: CameraPoses, stamps_ns: Collection[int]
-) -> Iterator[RgbdFrame]:
-    for frame in frames_at(episode, camera_id, poses.tree, stamps_ns):
-        yield with_true_depth(frame, poses)
 
 
 def common_root(roots: Sequence[str]) -> str | None:

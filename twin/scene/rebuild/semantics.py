@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from bridge.episode.streams import RgbdFrame
 from bridge.task.task_file import Task
 from bridge.terminal import Advance, Output
-from twin.scene.foundation.stage import ModelFindings, ask_models, embed_things, spread
+from twin.scene.foundation.stage import ModelFindings, ask_models, embed_things
 from twin.scene.frames.rgbd import TrainingView
-from twin.scene.frames.selection import FrameChoice, load
+from twin.scene.frames.selection import FrameChoice, load, spread
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
 from twin.scene.objects.decompose import Decomposition
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
@@ -76,7 +76,8 @@ def add_semantics(
             scene = scene_from_masks(cloud, masks, rasteriser, advance=advance)
         else:
             step = -(-len(viewpoints) // MAX_VIEWPOINTS) or 1
-            known = {key: _rows(rows, key) for key in objects}
+            sizes = list(rows.values())
+            known = {key: np.repeat([name == key for name in rows], sizes) for key in objects}
             scene = scene_by_default(
                 cloud,
                 viewpoints[::step],
@@ -104,11 +105,6 @@ def add_semantics(
             "explained_fraction": round(features.basis.explained_fraction, 4),
         }
     return record
-
-
-def _rows(rows: Mapping[str, int], key: str) -> Bool[np.ndarray, " num_splats"]:
-    """Which Gaussians of the whole scene are one part's."""
-    return np.repeat([name == key for name in rows], list(rows.values()))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,7 +194,7 @@ def ask_models_about(
 def training_frames(choices: Sequence[FrameChoice], count: int) -> list[RgbdFrame]:
     """Read at most ``count`` training frames, spread evenly over episodes, cameras and time."""
     numbered = [(index, ns) for index, each in enumerate(choices) for ns in sorted(each.train_ns)]
-    chosen = {numbered[place] for place in spread(range(len(numbered)), count)}
+    chosen = {numbered[index] for index in spread(np.arange(len(numbered)), count)}
     frames: list[RgbdFrame] = []
     for index, each in enumerate(choices):
         frames += load(each, frozenset(ns for owner, ns in chosen if owner == index))

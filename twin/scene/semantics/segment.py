@@ -124,15 +124,15 @@ def segment_points(
         _thing(points.take(labels == number), height[labels == number], voxel_m, config)
         for number in range(1, int(labels.max(initial=0)) + 1)
     )
-    remark = "" if things else _nothing(plane, len(above))
-    return Segmentation(labels=labels, things=things, plane=plane, remark=remark)
-
-
-def _nothing(plane: SupportPlane, num_above: int) -> str:
-    return (
-        f"nothing stands on the level plane at z = {plane.offset_m / plane.normal[2]:.3f} m "
-        f"({num_above} points above it, none hang together as a thing of 1 to 45 cm)"
+    remark = (
+        ""
+        if things
+        else (
+            f"nothing stands on the level plane at z = {plane.offset_m / plane.normal[2]:.3f} m "
+            f"({len(above)} points above it, none hang together as a thing of 1 to 45 cm)"
+        )
     )
+    return Segmentation(labels=labels, things=things, plane=plane, remark=remark)
 
 
 def _spacing(p_m: np.ndarray) -> float:

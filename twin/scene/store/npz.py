@@ -20,8 +20,8 @@ class UnreadableArraysError(TwinError):
     """An npz file is damaged, too large, or not what was expected."""
 
     def __init__(self, *, path: Path, found: str) -> None:
-        """Remember the file."""
-        self.path = path
+        """Remember the file and what is wrong with it."""
+        self.path, self.found = path, found
         super().__init__(f"{path}: {found}. Make it again: robot-gst rebuild RUN --force.")
 
 

@@ -1,5 +1,8 @@
+from collections.abc import Sequence
+
 import numpy as np
 import textured_room
+from jaxtyping import Float32
 
 from twin.scene.fit.appearance import FeatureObservation, solve_features
 from twin.scene.fit.initialise import fuse

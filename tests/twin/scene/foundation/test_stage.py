@@ -23,11 +23,10 @@ from twin.scene.foundation.stage import (
     check_models,
     embed_things,
     prompts_of,
-    spread,
     thing_vectors,
     viewpoint_of,
 )
-from twin.scene.frames.selection import choose_frames, find_sources
+from twin.scene.frames.selection import choose_frames, find_sources, spread
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.rebuild.run import rebuild
@@ -142,10 +141,10 @@ def test_prompts_are_those_given_or_the_names_of_the_task_s_objects() -> None:
 
 
 def test_frames_are_spread_evenly() -> None:
-    assert spread(list(range(100)), 5) == [0, 25, 50, 74, 99]
-    assert spread([7, 8], 5) == [7, 8]
-    assert spread([], 5) == []
-    assert spread([3], 1) == [3]
+    assert spread(np.arange(100), 5).tolist() == [0, 25, 50, 74, 99]
+    assert spread(np.array([7, 8]), 5).tolist() == [7, 8]
+    assert spread(np.zeros(0), 5).tolist() == []
+    assert spread(np.array([3]), 1).tolist() == [3]
 
 
 def test_bad_options_are_refused_before_anything_slow(tmp_path: Path) -> None:
