@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32
 from bridge.errors import PathNotFoundError
 from bridge.geometry import se3
 from bridge.whole_file import write_whole
-from twin.errors import TwinError
+from twin.errors import TwinError, UnreadableFileError
 
 SH_DC = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi)); PLY files store (c - 0.5) / SH_DC."""
@@ -215,16 +215,10 @@ REST_COUNTS = (9, 24, 45)
 MAX_SPLATS = 50_000_000
 
 
-class UnreadablePlyError(TwinError):
+class UnreadablePlyError(UnreadableFileError):
     """The file is not a splat PLY of the kind we write."""
 
-    def __init__(self, *, path: Path, found: str) -> None:
-        """Remember the file."""
-        self.path = path
-        super().__init__(
-            f"{path}: {found}. Expected a binary little-endian PLY with float columns "
-            f"{', '.join(COLUMNS)}."
-        )
+    hint = f"Expected a binary little-endian PLY with float columns {', '.join(COLUMNS)}."
 
 
 def write_ply(path: Path, cloud: GaussianCloud) -> None:

@@ -1,6 +1,6 @@
 """Small corrections of camera poses by what the images say, with the gauge fixed."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32, Int64
@@ -107,20 +107,6 @@ class AlignedView:
     """Drawn from there, with the gain, not clipped."""
 
 
-@dataclass(kw_only=True)
-class _Search:
-    """The pose of one image on the way to its best."""
-
-    T_base_camera: np.ndarray
-    value: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    first: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    second: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    count: int = 0
-
-    def pose(self) -> np.ndarray:
-        return corrected_pose(self.T_base_camera, self.value)
-
-
 def align_view(
     cloud: GaussianCloud,
     half: Target,
@@ -133,21 +119,21 @@ def align_view(
     Numbers made after this are not strictly held out: they tell how good the scene is where pose
     and exposure are known, and must be named as aligned.
     """
-    search = _Search(T_base_camera=T_base_camera)
+    value, first, second = np.zeros((3, 6))
     total = ALIGN_COARSE_STEPS + ALIGN_FINE_STEPS
     for step in range(total):
+        T = corrected_pose(T_base_camera, value)
         target = half if step < ALIGN_COARSE_STEPS else full
-        planes = rasteriser.draw_planes(cloud, target.camera, search.pose())
+        planes = rasteriser.draw_planes(cloud, target.camera, T)
         gain = gain_between(planes[:3], target).astype(np.float32)[:, None, None]
         difference = (gain * planes[:3] - target.image()) * target.static_mask
         gradients = np.zeros_like(planes)
         gradients[:3] = gain * difference * np.float32(2 / difference.size)
         pulled = rasteriser.pull_back(planes, gradients).T_camera_base
-        search.count += 1
-        gradient = correction_gradient(pulled, search.pose())
-        change = _adam(gradient, search.first, search.second, search.count)
-        search.value = search.value - 2 * ALIGN_DECAY ** (step / total) * change
-    planes = rasteriser.draw_planes(cloud, full.camera, search.pose())
+        change = _adam(correction_gradient(pulled, T), first, second, step + 1)
+        value = value - 2 * ALIGN_DECAY ** (step / total) * change
+    T = corrected_pose(T_base_camera, value)
+    planes = rasteriser.draw_planes(cloud, full.camera, T)
     fitted = gain_between(planes[:3], full)
     image = fitted.astype(np.float32)[:, None, None] * planes[:3]
-    return AlignedView(T_base_camera=search.pose(), gain=fitted, image=image)
+    return AlignedView(T_base_camera=T, gain=fitted, image=image)

@@ -25,9 +25,8 @@ from twin.scene.foundation.models import (
     FEATURES,
     SEGMENTERS,
     ClipEmbedder,
-    open_clip,
-    open_features,
-    open_segmenter,
+    DinoFeatures,
+    Sam3Segmenter,
     split_spec,
 )
 from twin.scene.gaussians import GaussianCloud
@@ -137,7 +136,8 @@ def ask_models(
     placement = Placement(device=config.device)
     masks: list[tuple[Viewpoint, MaskSet]] = []
     if config.segmenter:
-        segmenter = open_segmenter(config.segmenter, placement)
+        _, folder = split_spec(config.segmenter, "--segmenter", SEGMENTERS)
+        segmenter = Sam3Segmenter.load(folder, placement)
         prompts = prompts_of(config, task)
         for done, frame in enumerate(frames, 1):
             found = segmenter.segment(
@@ -148,7 +148,8 @@ def ask_models(
         del segmenter
     features = None
     if config.features and frames:
-        source = open_features(config.features, placement)
+        _, folder = split_spec(config.features, "--features", FEATURES)
+        source = DinoFeatures.load(folder, placement)
         maps = []
         for done, frame in enumerate(frames, 1):
             maps += source.features([frame.image_u8], stride=config.feature_stride)
@@ -192,7 +193,8 @@ def embed_things(
     if not config.clip:
         message = "no folder of CLIP is named; give --clip FOLDER."
         raise UsageError(message)
-    embedder = open_clip(Path(config.clip), Placement(device=config.device))
+    placement = Placement(device=config.device)
+    embedder = ClipEmbedder.load(Path(config.clip).expanduser(), placement)
     rasteriser = Rasteriser(RasterConfig(threads=threads))
     vectors, shown = thing_vectors(embedder, scene, cloud, frames, rasteriser, advance)
     held = features or _no_features(len(cloud))

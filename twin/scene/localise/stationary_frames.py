@@ -167,11 +167,11 @@ def calibrated_cameras(episode: Episode, calibration: Calibration | None) -> Pos
         EpisodeError: A camera in the hand, and no joint states.
         RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
-    places = {} if calibration is None else calibration.cameras
+    mounts = {} if calibration is None else calibration.cameras
     return {
         camera_id: calibrated_poses(
-            episode, camera_id, places[camera_id], paired_stamps_ns(episode, camera_id)
+            episode, camera_id, mounts[camera_id], paired_stamps_ns(episode, camera_id)
         )
         for camera_id in rgbd_camera_ids(episode)
-        if camera_id in places
+        if camera_id in mounts
     }

@@ -13,6 +13,7 @@ from bridge.episode import provenance
 from bridge.errors import PathNotFoundError
 from bridge.geometry import se3
 from bridge.whole_file import write_whole
+from twin.errors import UnreadableFileError
 from twin.scene.semantics.result import Instance, SemanticScene, SemanticsError
 from twin.scene.store.npz import UnreadableArraysError, read_npz
 
@@ -23,13 +24,8 @@ MAX_BYTES = 8 << 30
 BACKGROUND_KEY = "background"
 
 
-class UnreadableSemanticsError(SemanticsError):
+class UnreadableSemanticsError(UnreadableFileError, SemanticsError):
     """``semantics.npz`` is damaged, or was made for another scene."""
-
-    def __init__(self, *, path: Path, found: str) -> None:
-        """Remember the file."""
-        self.path = path
-        super().__init__(f"{path}: {found}. Make it again: robot-gst rebuild RUN --force.")
 
 
 def write_semantics(folder: Path, scene: SemanticScene, rows: Mapping[str, int]) -> dict[str, Any]:

@@ -224,13 +224,11 @@ def test_all_three_models_are_asked_and_what_they_say_is_kept(
 
 
 def test_without_any_model_nothing_is_read_or_asked() -> None:
-    consulted = ask_models_about(ModelConfig(), [], heaps()[0], None, Output(quiet=True))
-    assert (consulted.frames, consulted.findings.masks) == ([], [])
-    assert consulted.findings.features is None
-    assert consulted.give_vectors(Path("nowhere"), {}, heaps()[0], Output(quiet=True)) == {}
+    frames, found = ask_models_about(ModelConfig(), [], heaps()[0], None, Output(quiet=True))
+    assert (frames, found.masks, found.features) == ([], [], None)
 
 
-def test_training_frames_are_spread_over_what_is_learnt_from(tmp_path: Path) -> None:
+def test_training_frames_are_spread_over_those_of_the_fit(tmp_path: Path) -> None:
     import textured_room  # beside the tests one folder up, see conftest there
 
     run = RunFolder.create(tmp_path)
