@@ -23,7 +23,7 @@ help:
 
 setup: $(READY)
 
-$(READY): pyproject.toml constraints.txt CMakeLists.txt $(NATIVE)
+$(READY): pyproject.toml constraints.txt CMakeLists.txt $(wildcard cmake/*) $(NATIVE)
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: apt-get install python3.11 python3.11-venv" >&2; exit 1; }
 	@.ci/system-packages $(PYTHON)
 	@test -x $(BIN)/python || { echo "Making .venv with $(PYTHON)"; $(PYTHON) -m venv .venv; }
