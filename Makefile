@@ -2,6 +2,7 @@
 # make test    all tests that need no device   make check   lint, types, import contracts
 # make soak    kills, cuts, fuzzing, endurance at full size (minutes), smaller in make test
 # make bench   benchmarks against named references; BENCH=record picks those of the recorder
+# make sanitize  C++ under ASan and UBSan   make tidy  clang-tidy   make cross  C++ for aarch64
 # Everything lives in .venv; the first target run makes it (about 5 GB, a few minutes).
 
 .DEFAULT_GOAL := help
@@ -15,14 +16,14 @@ BENCH ?=
 export OMP_WAIT_POLICY ?= passive
 unexport PYTHONDONTWRITEBYTECODE # else every process a test starts would compile the rooms again
 
-.PHONY: help setup demo test soak fast check format bench clean
+.PHONY: help setup demo test soak fast check format bench sanitize tidy cross clean
 
 help:
-	@sed -n '1,6s/^# //p' Makefile
+	@sed -n '1,7s/^# //p' Makefile
 
 setup: $(READY)
 
-$(READY): pyproject.toml constraints.txt CMakeLists.txt $(NATIVE)
+$(READY): pyproject.toml constraints.txt CMakeLists.txt $(wildcard cmake/*) $(NATIVE)
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: apt-get install python3.11 python3.11-venv" >&2; exit 1; }
 	@.ci/system-packages $(PYTHON)
 	@test -x $(BIN)/python || { echo "Making .venv with $(PYTHON)"; $(PYTHON) -m venv .venv; }
@@ -66,6 +67,9 @@ format: $(READY)
 bench: $(READY)
 	@for file in benchmarks/bench_$(BENCH)*.py; do $(BIN)/python $$file || exit 1; done
 	@$(BIN)/python benchmarks/table.py $(BENCH)
+
+sanitize tidy cross: $(READY)
+	@PYTHON=$(BIN)/python .ci/$@
 
 clean:
 	rm -rf build .venv .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
