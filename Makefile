@@ -3,7 +3,7 @@
 # make soak    kills, cuts, fuzzing, endurance at full size (minutes), smaller in make test
 # make bench   benchmarks against named references; BENCH=record picks those of the recorder
 # make wheel-test  sdist and wheel, the wheel installed and its demo run outside the checkout
-# Everything lives in .venv. make demo installs what the demo needs (about 3 GB); the others add the
+# Everything lives in .venv. make demo installs what the demo needs (3.3 GB); the others add the
 # rest, torch among it, and say first how large it is. make test TORCH=no leaves torch out.
 
 .DEFAULT_GOAL := help
@@ -12,7 +12,9 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
 BIN := .venv/bin
 TORCH ?= yes
 DEMO_READY := .venv/.demo
-READY := .venv/.ready$(if $(filter no,$(TORCH)),-no-torch)
+WITHOUT := $(filter no,$(TORCH))
+READY := .venv/.ready$(if $(WITHOUT),-no-torch)
+PYTEST := $(if $(WITHOUT),PYTHONPATH=.ci )$(BIN)/python -m pytest $(if $(WITHOUT),-p no_torch )-q
 NATIVE := $(wildcard twin/scene/native/* bridge/media/native/* bridge/episode/native/* twin/physics/native/* twin/replay/native/*)
 RUN ?= runs/demo
 BENCH ?=
@@ -34,7 +36,7 @@ $(DEMO_READY): pyproject.toml constraints.txt CMakeLists.txt .ci/install.py $(NA
 	@touch $@
 
 $(READY): $(DEMO_READY)
-	@$(BIN)/python .ci/install.py test $(if $(filter no,$(TORCH)),no-torch)
+	@$(BIN)/python .ci/install.py test $(if $(WITHOUT),no-torch)
 	@touch $@
 
 demo: $(DEMO_READY)
@@ -42,7 +44,7 @@ demo: $(DEMO_READY)
 
 test: $(READY)
 	@.ci/browser
-	@$(BIN)/python -m pytest -q -n 2 --max-worker-restart=1 --dist loadfile --no-loadscope-reorder -m "not gpu and not hardware and not network" $(TEST)
+	@$(PYTEST) -n 2 --max-worker-restart=1 --dist loadfile --no-loadscope-reorder -m "not gpu and not hardware and not network" $(TEST)
 
 soak: $(READY)
 	@GST_KILLS=100 GST_RECORDER_KILLS=12 GST_KILL_NUMBERS=1,2,3,5 GST_EPISODES=1000 GST_WARM_UP_S=15 \
@@ -53,7 +55,7 @@ soak: $(READY)
 		tests/bridge/record/faults/test_killed_recorders.py tests/bridge/record/faults/test_endurance.py
 
 fast: $(READY)
-	@$(BIN)/python -m pytest -q -n 2 --max-worker-restart=1 --dist loadfile $(TEST)
+	@$(PYTEST) -n 2 --max-worker-restart=1 --dist loadfile $(TEST)
 
 check: $(READY)
 	@$(BIN)/ruff check .
