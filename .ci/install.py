@@ -233,7 +233,7 @@ class Progress:
         elif words[:1] == ["Downloading"]:
             self.enter(f"fetching {Path(words[1]).name.split('-')[0]} {' '.join(words[2:])}")
         elif words[:1] in (["Building"], ["Preparing"]) and words[-1] == "started":
-            self.enter(f"{words[0].lower()} {' '.join(words[1:-1])}")
+            self.enter(f"{words[0].lower()} {line.split(' for ')[-1].split()[0]}")
         elif line.startswith("Installing collected packages:"):
             self._wanted, self._before = line.count(",") + 1, finished()
             self.enter("installing")
