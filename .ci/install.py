@@ -196,6 +196,7 @@ def run(command: list[str], progress: "Progress", log: TextIO) -> int:
     environment = {**os.environ, "TMPDIR": str(TEMPORARY), "PYTHONUNBUFFERED": "1"}
     if "--no-build-isolation" in command:
         environment["PYTHONPATH"] = str(TOOLS)
+        environment["PATH"] = os.pathsep.join([str(TOOLS / "bin"), os.environ["PATH"]])
     with subprocess.Popen(
         command,
         cwd=ROOT,
