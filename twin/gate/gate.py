@@ -16,6 +16,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from bridge.episode.topics import ROBOT_DESCRIPTION
 from bridge.errors import GstError
 from bridge.task.plan import Plan
 from bridge.task.robot import BASE_FRAME
@@ -248,7 +249,7 @@ class Gate:
             )
         urdf = self._eyes.urdf()
         if urdf is None:
-            raise UndecidedError("no robot description has arrived on /robot_description")
+            raise UndecidedError(f"no robot description has arrived on {ROBOT_DESCRIPTION}")
         robot = robot_name(urdf)
         if plan.robot != robot:
             raise UndecidedError(
