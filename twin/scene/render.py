@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32, UInt16
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import ROBOT_DESCRIPTION
 from bridge.episode.transforms import TransformTree
 from bridge.errors import BridgeError, GstError, UsageError
 from bridge.geometry import se3
@@ -108,7 +109,7 @@ def _posture(episode: Episode, stamp_ns: int, config: RenderConfig) -> tuple[str
     if urdf is None:
         raise RobotDescriptionError(
             found=f"is missing in episode {episode.info.id}",
-            hint="Choose an --episode that has /robot_description.",
+            hint=f"Choose an --episode that has {ROBOT_DESCRIPTION}.",
         )
     return urdf, Posture(joints_rad=joints, width_m=config.width_m or 0.0)
 

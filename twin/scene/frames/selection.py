@@ -11,11 +11,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from bridge.episode import schema, streams
+from bridge.episode import streams
 from bridge.episode.cdr.messages import color_from_message
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
+from bridge.episode.topics import COLOR_IMAGE, COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO, is_truth
 from bridge.episode.transforms import TransformTree
 from bridge.errors import BridgeError, EpisodeError
 from bridge.geometry import se3
@@ -271,11 +272,11 @@ def find_sources(run: RunFolder) -> Sources:
 
 def rgbd_camera_ids(episode: Episode) -> list[str]:
     """Cameras with colour and depth, both with intrinsics; never those of stand-in truth."""
-    topics = {topic for topic in episode.topics() if not schema.is_truth(topic)}
-    tails = ("color/image", "color/info", "depth/image", "depth/info")
-    stems = {topic.removesuffix(tails[0]) for topic in topics if topic.endswith("/" + tails[0])}
+    topics = {topic for topic in episode.topics() if not is_truth(topic)}
+    others = (COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO)
+    stems = {topic.removesuffix(COLOR_IMAGE) for topic in topics if topic.endswith(COLOR_IMAGE)}
     return sorted(
-        stem.split("/")[-2] for stem in stems if all(stem + tail in topics for tail in tails)
+        stem.split("/")[-1] for stem in stems if all(stem + ending in topics for ending in others)
     )
 
 

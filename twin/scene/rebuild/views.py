@@ -22,6 +22,7 @@ from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
+from bridge.episode.topics import camera_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.color import encode_png
 from bridge.terminal import Advance
@@ -289,7 +290,7 @@ def one_camera(frame: RgbdFrame) -> bool:
 def _write_view(writer: EpisodeWriter, item: HeldOutViews) -> None:
     choice, frame = item.choice, item.frame
     cell = choice.episode.info.cell or "cell"
-    topic = f"/{cell}/views/cam/{frame.camera_id}"
+    topic = camera_topic(f"{cell}/views", frame.camera_id)
     frame_id = streams.camera_info(choice.episode, frame.camera_id).frame_id
     stamp = frame.stamp_ns
 

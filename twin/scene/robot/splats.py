@@ -1,7 +1,7 @@
 """Gaussians bound to the robot's links: forward kinematics drives them.
 
 They lie in ``scene`` and not in ``robot``, because they are Gaussians and ``robot`` stands below
-``scene``: see docs/decisions/0026-calibration-and-robot.md.
+``scene``: see docs/decisions/0015-calibration.md.
 """
 
 from collections.abc import Mapping
