@@ -364,14 +364,20 @@ def align_robot(
             found="there is no depth image", hint="Record the camera while the robot stands still."
         )
     surfaces = [PosedSurface(robot, view.posture) for view in views]
-    starts = _starts(views, robot) if start is None else _near(views, robot, start)
+    if start is None:
+        starts = _starts(views, robot)
+    else:  # nearest points alone get stuck beside the start: the best of what lies around it, too
+        around = search_near(views, robot, start)
+        starts = [ScenePose(T_base_source=T) for T in (start, around.T_base_source)]
     coarse = [_refined(views, surfaces, pose, config, fine=False) for pose in starts]
     best, others = _ranked(coarse)
     finals = [_refined(views, surfaces, item.pose, config, fine=True) for item in (best, *others)]
     best, others = _ranked(finals)
     margin = None
     if start is None:
-        margin = _costs(finals)[1] / max(_costs(finals)[0], 1e-9) if others else float("inf")
+        least = max(len(item.looked.errors_m) for item in finals) // 2
+        costs = sorted(item.looked.cost_m(least) for item in finals)
+        margin = costs[1] / max(costs[0], 1e-9) if others else float("inf")
     _accept(best, margin, len(views), config)
     surface_m = np.concatenate(
         [sample_surface(robot, view.posture, NUM_SURFACE, seed=config.seed) for view in views]
@@ -399,14 +405,6 @@ def _starts(views: Sequence[RobotView], robot: RobotModel) -> list[ScenePose]:
     return [ScenePose(T_base_source=item.T_base_source) for item in found[:MAX_COARSE]]
 
 
-def _near(
-    views: Sequence[RobotView], robot: RobotModel, start: Float[np.ndarray, "4 4"]
-) -> list[ScenePose]:
-    """The start, and the best of what lies around it: nearest points alone get stuck beside it."""
-    polished = search_near(views, robot, start)
-    return [ScenePose(T_base_source=T) for T in (start, polished.T_base_source)]
-
-
 def _refined(
     views: Sequence[RobotView],
     surfaces: Sequence[PosedSurface],
@@ -428,12 +426,6 @@ def _refined(
     return _Candidate(
         pose=refined, looked=depth_errors(views, surfaces, refined), equations=equations
     )
-
-
-def _costs(candidates: Sequence[_Candidate]) -> list[float]:
-    """Ascending; see ``DepthErrors.cost_m``."""
-    least = max(len(item.looked.errors_m) for item in candidates) // 2
-    return sorted(item.looked.cost_m(least) for item in candidates)
 
 
 def _ranked(candidates: Sequence[_Candidate]) -> tuple[_Candidate, list[_Candidate]]:

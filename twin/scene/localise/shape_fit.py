@@ -245,7 +245,10 @@ def fit_shape(
     candidates = [
         _solve(np.concatenate([state, free]), problem) for state in starts(cluster.p_base, model)
     ]
-    best = min(candidates, key=lambda state: _cost(state, problem))
+    best = min(
+        candidates,
+        key=lambda state: np.minimum(np.abs(_system(state, problem).r), config.tukey_m).mean(),
+    )
     for window_m in (2 * config.outline_window_m, config.outline_window_m):
         outlines = find_outlines(
             views,
@@ -357,11 +360,6 @@ def _solve(
         if np.linalg.norm(step) < 1e-6:
             break
     return state
-
-
-def _cost(state: Float[np.ndarray, " num_unknowns"], problem: _Problem) -> float:
-    r = _system(state, problem).r
-    return float(np.mean(np.minimum(np.abs(r), problem.config.tukey_m)))
 
 
 def _summary(state: Float[np.ndarray, " num_unknowns"], problem: _Problem) -> ShapeFit:

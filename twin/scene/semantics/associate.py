@@ -57,7 +57,7 @@ def smooth_shares(
     spread = csr_matrix((weight.ravel(), (rows, near.ravel())), shape=(len(told), len(p)))
     state = share.astype(np.float64).T
     first = state[told].copy()
-    # Frames that agree are believed; where they do not, the neighbours decide.
+    # Frames that agree decide; where they do not, the neighbours decide.
     agreed = np.abs(2.0 * first.max(axis=1, keepdims=True) - 1.0) ** 2
     keep = np.maximum(config.keep, agreed)
     for _ in range(config.num_steps):

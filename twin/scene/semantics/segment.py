@@ -29,7 +29,7 @@ from twin.scene.semantics.shape_descriptors import (
     SupportConfig,
     SupportPlane,
     find_support,
-    measure_form,
+    measure_shape,
 )
 
 SOURCE = "default segmenter"
@@ -71,8 +71,8 @@ class Thing:
     """One thing the default segmenter found."""
 
     label: str
-    """Colour and form, for example "red cube"."""
-    form: ShapeDescriptors
+    """Colour and shape, for example "red cube"."""
+    shape: ShapeDescriptors
     score: float
     """Share of its points that are firmly above the plane, 0..1."""
 
@@ -256,10 +256,10 @@ def _thing(
     points: SurfacePoints, height_m: np.ndarray, voxel_m: float, config: SegmentConfig
 ) -> Thing:
     xyh = np.concatenate([points.p_m[:, :2], height_m[:, None]], axis=1)
-    form = measure_form(xyh, voxel_m)
+    shape = measure_shape(xyh, voxel_m)
     color = np.median(points.colors, axis=0).astype(np.float64)
     firm = float((height_m > 2 * config.min_height_m).mean())
-    return Thing(label=f"{colour_name(color)} {form.word}", form=form, score=firm)
+    return Thing(label=f"{colour_name(color)} {shape.word}", shape=shape, score=firm)
 
 
 MIN_OPACITY = 0.3
