@@ -106,7 +106,7 @@ class CameraView:
     """Linear light of each point; 0 where the colour camera does not see it."""
 
 
-def fuse_stills(
+def fuse_stationary(
     frames: Sequence[RgbdFrame], max_frames: int, max_views: int, task: Task, config: PointConfig
 ) -> list[CameraView]:
     """Average the last frames of each camera that were taken from one pose.
