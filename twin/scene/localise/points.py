@@ -63,8 +63,8 @@ def likeness(
     return np.where(dark | other_hue | (along <= 0), 0.0, along / strength)
 
 
-STATIONARY_DISTANCE_M = 5e-4
-STATIONARY_ANGLE_RAD = 1e-3
+SAME_POSE_M = 5e-4
+SAME_POSE_RAD = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,8 +135,8 @@ def _same_pose(a: RgbdFrame, b: RgbdFrame) -> bool:
     return same_pose(
         a.T_base_depth,
         b.T_base_depth,
-        distance_m=STATIONARY_DISTANCE_M,
-        angle_rad=STATIONARY_ANGLE_RAD,
+        distance_m=SAME_POSE_M,
+        angle_rad=SAME_POSE_RAD,
     )
 
 

@@ -18,10 +18,10 @@ from twin.scene.gaussians import GaussianCloud
 from twin.scene.localise.points import ColourConfig, likeness, linear_from_srgb
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.localise.shape_fit import ShapeFitConfig, refine_on_points
+from twin.scene.shape.from_training import Poses
 from twin.scene.shape.known import surface_distances
 from twin.scene.shape.reconstruct import ObjectShape
 
-Poses = Mapping[str, Float[np.ndarray, "4 4"]]
 Shapes = Mapping[str, ObjectShape]
 
 HALO_M = 0.015

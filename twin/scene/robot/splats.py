@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Int64
 
 from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder, check_episode_id
@@ -65,7 +65,8 @@ def surface_links(
     link will be seen by itself in another posture. Beside the base it never will, so there a point
     must lie along its own normal from the link.
     """
-    found, near = _nearest(surface, p_base)
+    near = surface.near_box(p_base, BOUND_M)
+    found = surface.nearest(p_base[near])
     close = found.distance_m < BOUND_M
     gap = p_base[near] - found.p_m
     along = np.einsum("ij,ij->i", gap, normals[near])
@@ -76,11 +77,6 @@ def surface_links(
     owner = np.full(len(p_base), -1, dtype=np.int64)
     owner[near[close]] = found.link_ids[close]
     return owner
-
-
-def _nearest(surface: PosedSurface, p_base: Float64[np.ndarray, "num_points 3"]) -> tuple[Any, Any]:
-    near = surface.near_box(p_base, BOUND_M)
-    return surface.nearest(p_base[near]), near
 
 
 def write_links(run: RunFolder, links: Mapping[str, GaussianCloud]) -> dict[str, Any]:
