@@ -14,7 +14,7 @@ from bridge.episode.streams import RgbdFrame
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.task.robot import BASE_FRAME
+from bridge.robots.default import BASE_FRAME
 from bridge.terminal import Output
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import PostureTrack, far_apart, posture_track

@@ -37,7 +37,7 @@ def bind(
 
     Args:
         cloud: Gaussians in the robot's base frame.
-        joints_rad: Where the arm was, in the order of ``bridge.task.robot.ARM_JOINTS``.
+        joints_rad: Where the arm was, in the order of ``bridge.robots.default.ARM_JOINTS``.
         urdf: The robot's description.
         width_m: Opening of the gripper.
 
