@@ -196,7 +196,7 @@ def test_a_replay_that_hangs_or_raises_is_null_on_the_wire_and_in_the_log(
     hung = ask(cell)
     assert time.monotonic() - started < 3.0
     assert hung.accepted is None
-    assert "not done at the deadline of 0.4 s" in str(hung.reason)
+    assert "not done at the wall-clock limit of 0.4 s" in str(hung.reason)
     behind = ask(cell)
     assert behind.accepted is None
     assert "an earlier plan was still being judged" in str(behind.reason)

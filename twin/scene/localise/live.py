@@ -1,7 +1,7 @@
-"""The latest still frames of a live cell, in bounded memory.
+"""The latest frames of stationary cameras of a live cell, in bounded memory.
 
-Takes messages as they arrive and turns them into posed frames when asked. Says in a sentence why
-there are none. Knows nothing of the network: whoever is connected hands the messages over.
+Takes messages as they arrive and turns them into frames, posed as recorded ones are, when asked;
+says why there are none. Knows nothing of the network: whoever is connected hands the messages over.
 """
 
 import threading
@@ -44,14 +44,12 @@ from twin.errors import TwinError
 from twin.robot.posture import PostureTrack, check_joints
 from twin.scene.frames.camera_poses import CameraPoses, rooted_in_base
 from twin.scene.localise.stationary_frames import (
-    STILL_WINDOW_NS,
+    STATIONARY_WINDOW_NS,
     common_root,
     is_stationary,
     with_true_depth,
 )
 from twin.scene.store.calibration import Calibration, MountedCamera, mounted_tree, unknown_postures
-
-# --- Frames of one camera of a live cell, posed as recorded ones are.
 
 KEPT_IMAGES = 6
 MAX_SPAN_NS = 1_000_000_000
@@ -114,7 +112,7 @@ class LiveCell:
             return CameraPoses(tree=self.tree, source="tf")
         track = None if place.fixed else self.track
         # Around each image too: between far images a motion of the hand would not show.
-        window = np.array([-STILL_WINDOW_NS, 0, STILL_WINDOW_NS])
+        window = np.array([-STATIONARY_WINDOW_NS, 0, STATIONARY_WINDOW_NS])
         instants = np.unique(stamps_ns[:, None] + window)
         lost = unknown_postures(track, instants)
         if lost.issuperset(stamps_ns.tolist()) and len(stamps_ns):
@@ -144,7 +142,7 @@ def frames_of(
     pairs = [
         (color, depth)
         for color, depth in _pairs(camera)
-        if color.stamp_ns - STILL_WINDOW_NS >= quiet_since_ns
+        if color.stamp_ns - STATIONARY_WINDOW_NS >= quiet_since_ns
     ]
     stamps_ns = np.array([color.stamp_ns for color, _ in pairs], dtype=np.int64)
     poses = cell.poses(camera_id, frame_id, camera.infos["depth"].frame_id, stamps_ns)
