@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from bridge.episode.catalogue_store import CatalogueQuery
+from bridge.episode.catalogue_store import UNLABELLED, CatalogueQuery
 from bridge.terminal import Advance, Output
 
 if TYPE_CHECKING:
     from bridge.episode.catalogue_store import Entry
+    from bridge.episode.metadata import Outcome
     from bridge.episode.recover import RecoveryReport
 
 OUTPUT = Output()
@@ -51,7 +52,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         f"{opened.duration_s:.1f} s, {sum(item.count for item in topics.values())} messages, "
         f"{sum(path.stat().st_size for path in opened.parts) / 1e6:.1f} MB"
         + (f" in {len(opened.parts)} parts" if len(opened.parts) > 1 else ""),
-        f"  outcome: {outcome.result if outcome else 'not labelled'}",
+        f"  outcome: {_outcome(about.kind, outcome)}",
     ]
     if opened.derived:
         derived = opened.derived
@@ -71,6 +72,14 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
     ]
     output.result(data, "\n".join(lines))
     return 0
+
+
+def _outcome(kind: str, outcome: "Outcome | None") -> str:
+    """How it ended, and why nobody knows where nobody does."""
+    if outcome is None:
+        return f"unknown ({UNLABELLED})" if kind == "trial" else f"none (a {kind} has none)"
+    unknown = outcome.result == "unknown" and outcome.detail
+    return f"{outcome.result} ({outcome.detail})" if unknown else outcome.result
 
 
 def check(episodes: list[Path], /, *, rerun: bool = False, output: Output = OUTPUT) -> int:
@@ -239,6 +248,9 @@ WIDEST = 26
 """Of an episode's name beside the other columns; a longer one has a line of its own."""
 
 
+WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}
+
+
 def _table(entries: "list[Entry]") -> list[str]:
     """A header, a row for each episode within 80 columns, and below it what is special about it."""
     rows = [COLUMNS, *(_row(entry) for entry in entries)]
@@ -257,19 +269,20 @@ def _table(entries: "list[Entry]") -> list[str]:
         cells += [text.rjust(width) for text, width in zip(row[4:], widths[4:], strict=True)]
         lines.append("  ".join(cells).rstrip())
         if entry is not None:
-            notes = _notes(entry, is_named=not all_stand_in)
-            indents = {"initial_indent": "    ", "subsequent_indent": "    "}
-            lines += textwrap.wrap(notes, 80, break_long_words=False, **indents)
+            notes = textwrap.wrap(_notes(entry, is_named=not all_stand_in), 76, **WHOLE_WORDS)
+            lines += [f"    {note}" for note in notes]
     return lines
 
 
 def _row(entry: "Entry") -> tuple[str, ...]:
-    no_outcome = entry.outcome == "unknown" and not entry.cause
+    outcome = _shown(entry.outcome)
+    if entry.outcome == "unknown" and entry.cause in ("", UNLABELLED):
+        outcome = "unlabelled" if entry.cause else "-"
     return (
         _shown(entry.id),
         _shown(entry.kind) or "-",
         _shown(entry.condition) or "-",
-        "-" if no_outcome else _shown(entry.outcome),
+        outcome,
         f"{entry.duration_s:.1f}",
         f"{entry.size_bytes / 1e6:.1f}",
     )
@@ -281,7 +294,8 @@ def _notes(entry: "Entry", *, is_named: bool) -> str:
     notes += [f"{entry.lost} messages lost"] if entry.lost else []
     notes += ["recovered, its end is missing"] if entry.recovered else []
     notes += ["from the stand-in cell"] if entry.stand_in and is_named else []
-    notes += [f"unknown: {_shown(entry.cause)}"] if entry.cause else []
+    if entry.cause and entry.cause != UNLABELLED:
+        notes.append(f"unknown: {_shown(entry.cause)}")
     return "; ".join(notes + ([_shown(entry.error)] if entry.error else []))
 
 

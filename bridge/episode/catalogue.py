@@ -15,6 +15,7 @@ from typing import Any
 from bridge.episode.catalogue_store import (
     FILE_NAME,
     LABEL_SUFFIX,
+    UNLABELLED,
     CatalogueQuery,
     CatalogueStore,
     Trace,
@@ -219,7 +220,7 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
 def _cause(kind: str, outcome: Outcome | None) -> str:
     """Why an outcome is unknown; a scan has none, and needs none."""
     if outcome is None:
-        return "nobody labelled it" if kind == "trial" else ""
+        return UNLABELLED if kind == "trial" else ""
     return outcome.detail or "" if outcome.result == "unknown" else ""
 
 

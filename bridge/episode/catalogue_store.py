@@ -23,6 +23,8 @@ from bridge.errors import UsageError, refuse_outside
 #
 # Opens no file, so that listing what is known costs no more than a look at the folder.
 
+UNLABELLED = "nobody labelled it"
+"""Why the outcome of a trial is unknown that has no label."""
 LABEL_SUFFIX = ".outcome.json"
 """Of the sidecar under ``notes/`` that holds a label given after the fact."""
 UNSETTLED_NS = 2_000_000_000
