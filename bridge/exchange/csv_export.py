@@ -261,11 +261,8 @@ def episode_files(source: Path, *, derived: bool) -> tuple[list[Path], Path]:
     if not source.is_dir():
         return [source], source.parent
     run = RunFolder.open(source)
-    files = run.episodes() + (run.derived() if derived else [])
-    if not files:
-        message = f"no episodes in {source}. Record some: robot-gst record {source}."
-        raise UsageError(message)
-    return files, source
+    run.refuse_empty()
+    return run.episodes() + (run.derived() if derived else []), source
 
 
 def export_csv(
