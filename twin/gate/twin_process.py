@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.run_folder import RunFolder
+from bridge.process_pool import Failed, Function, TimeIsUpError, Worker, WorkerDiedError
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from bridge.terminal import Output
-from twin.crew.pool import Failed, Function, TimeIsUpError, Worker, WorkerDiedError
 from twin.gate.config import GateConfig
 from twin.gate.gate import UndecidedError
 from twin.replay.config import ReplayConfig

@@ -12,10 +12,10 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import execution_ns
 from bridge.errors import GstError, PathNotFoundError, UsageError
+from bridge.process_pool import Failed, Runner
 from bridge.task.plan import Plan
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
-from twin.crew.pool import Failed, Runner
 from twin.replay.config import ReplayRunConfig
 from twin.replay.job import ReplayJob, row_of_existing, row_of_failure, run_job
 from twin.replay.rebuilt_scene import calibrated, for_task, read_rebuilt_scene, shape_hashes

@@ -20,20 +20,20 @@ from typing import Any, Generic, Protocol, runtime_checkable
 from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, MissingDependencyError, UsageError
-from bridge.terminal import Output
-from twin.crew.pool import (
+from bridge.process_pool import (
     ATTEMPTS,
-    Alone,
     Answer,
-    Crew,
     Failed,
     Function,
     Item,
+    ProcessPool,
     Runner,
+    Serial,
     default_size,
     do,
     lost,
 )
+from bridge.terminal import Output
 from twin.errors import TwinError
 from twin.replay.config import ReplayRunConfig
 
@@ -130,7 +130,7 @@ class NeedsPaths(Protocol):
 
 
 class RayRunner:
-    """Does pieces of work as Ray tasks; see ``twin.crew.pool.Runner``."""
+    """Does pieces of work as Ray tasks; see ``bridge.process_pool.Runner``."""
 
     def __init__(self, address: str, workers: int) -> None:
         """Connect later.
@@ -415,10 +415,10 @@ def runner_for(config: ReplayRunConfig) -> Iterator[Runner]:
         TwinError: When the cluster cannot be reached.
     """
     workers = config.workers or default_size()
-    runner: Runner = Alone()
+    runner: Runner = Serial()
     if config.ray:
         runner = RayRunner(config.ray, workers)
     elif workers > 1:
-        runner = Crew(workers)
+        runner = ProcessPool(workers)
     with runner:
         yield runner

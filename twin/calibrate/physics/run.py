@@ -13,6 +13,7 @@ from bridge.episode import provenance, streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
+from bridge.process_pool import default_size
 from bridge.task.robot import ARM_JOINTS
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
@@ -29,7 +30,6 @@ from twin.calibrate.physics.parameters import (
     rigid_parameters,
 )
 from twin.calibrate.physics.simulate import Evaluator
-from twin.crew.pool import default_size
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import ENGINE_VERSION
 from twin.scene.store.calibration import write_physics

@@ -12,6 +12,7 @@ from types import TracebackType
 import numpy as np
 from jaxtyping import Float
 
+from bridge.process_pool import Failed, ProcessPool
 from bridge.task.predicate import Rollout, all_hold, evaluate_success
 from bridge.task.robot import GRIPPER_LINKS
 from twin.calibrate.physics.cases import Case, Prediction, planar
@@ -23,7 +24,6 @@ from twin.calibrate.physics.parameters import (
     shifted,
     values_of,
 )
-from twin.crew.pool import Crew, Failed
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.physics.world import World
@@ -186,7 +186,7 @@ class LostPieceError(TwinError):
 
 
 class Evaluator:
-    """Predictions of cases at points in units of the prior. A context manager: it owns a crew."""
+    """Predictions of cases at points in units of the prior. A context manager."""
 
     def __init__(
         self,
@@ -210,7 +210,7 @@ class Evaluator:
         self._parameters = list(parameters)
         self._config = config
         self.num_samples = num_samples
-        self._crew = Crew(workers) if workers > 1 else None
+        self._pool = ProcessPool(workers) if workers > 1 else None
 
     def predict(
         self, points: Float[np.ndarray, "num_points num_parameters"], chosen: Sequence[int]
@@ -222,10 +222,10 @@ class Evaluator:
         """
         pairs = [(x, index) for x in points for index in chosen]
         pieces = [self._piece(number, *pair) for number, pair in enumerate(pairs)]
-        if self._crew is None:
+        if self._pool is None:
             flat = [_predict(piece) for piece in pieces]
         else:
-            flat = _side_by_side(self._crew, pieces)
+            flat = _side_by_side(self._pool, pieces)
         size = len(chosen)
         return [flat[k * size : (k + 1) * size] for k in range(len(points))]
 
@@ -244,14 +244,14 @@ class Evaluator:
         traceback: TracebackType | None,
     ) -> None:
         """End the processes; what is being done is lost."""
-        if self._crew is not None:
-            self._crew.__exit__()
+        if self._pool is not None:
+            self._pool.__exit__()
 
 
-def _side_by_side(crew: Crew, pieces: Sequence[Piece]) -> list[Prediction]:
+def _side_by_side(pool: ProcessPool, pieces: Sequence[Piece]) -> list[Prediction]:
     """Predict, and put the answers back into order."""
     answers: dict[int, Prediction] = {}
-    for (number, case, *_), answer in crew.run(_predict, pieces, _cost):
+    for (number, case, *_), answer in pool.run(_predict, pieces, _cost):
         if isinstance(answer, Failed):
             raise _error_of(case, answer)
         answers[number] = answer
