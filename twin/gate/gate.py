@@ -17,6 +17,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from bridge.episode.topics import ROBOT_DESCRIPTION
 from bridge.errors import GstError
 from bridge.task.plan import Plan
 from bridge.task.robot import BASE_FRAME
@@ -245,7 +246,7 @@ class Gate:
             )
         urdf = self._eyes.urdf()
         if urdf is None:
-            raise UndecidedError("no robot description has arrived on /robot_description")
+            raise UndecidedError(f"no robot description has arrived on {ROBOT_DESCRIPTION}")
         robot = robot_name(urdf)
         if plan.robot != robot:
             raise UndecidedError(

@@ -22,6 +22,7 @@ from bridge.episode.cdr.messages import (
     string_to_cdr,
     transforms_to_cdr,
 )
+from bridge.episode.topics import type_of_topic
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan, Stage, Waypoint
@@ -80,7 +81,7 @@ def publish_one_frame(cell: WireSession, stamp_ns: int = S) -> None:
         ("/lab/cam/side/depth/image", depth.to_cdr()),
     ]
     for topic, data in messages:
-        cell.publisher(topic, schema.type_of_topic(topic) or "").put(data, source_ns=stamp_ns)
+        cell.publisher(topic, type_of_topic(topic) or "").put(data, source_ns=stamp_ns)
 
 
 def plan_for(robot: str) -> bytes:
