@@ -14,7 +14,6 @@ ends: the stream it listens to closes.
 """
 
 import errno
-import io
 import os
 import pickle
 import queue
@@ -142,9 +141,8 @@ class Worker:
             bufsize=0,
             env={**os.environ, **ONE_THREAD, "PYTHONPATH": places},
         )
-        assert isinstance(self.process.stdout, io.FileIO)  # noqa: S101  # for the type checker
-        assert self.process.stdin is not None  # noqa: S101
-        self.outlet = self.process.stdout
+        assert self.process.stdin is not None  # noqa: S101  # for the type checker
+        self.outlet: Any = self.process.stdout
         """Becomes readable with an answer, and when the process ends."""
         os.set_blocking(self.process.stdin.fileno(), False)
         self._close = weakref.finalize(self, _end, self.process)
@@ -211,7 +209,8 @@ class Worker:
         if not wait([self.outlet], PATIENCE_S):
             self.process.kill()
             raise TimeIsUpError(f"it said no more for {PATIENCE_S:g} s")
-        return self.outlet.read(size)
+        found: bytes | None = self.outlet.read(size)
+        return found
 
     def _status(self) -> int | None:
         with suppress(subprocess.TimeoutExpired):
@@ -399,7 +398,7 @@ class ProcessPool:
                     self._begin(function, todo, at_work)
                 outlets = {worker.outlet: worker for worker in at_work}
                 for outlet in wait(list(outlets)):
-                    worker = outlets[outlet]  # type: ignore[index]
+                    worker = outlets[outlet]
                     try:
                         if self._has_prepared(worker):
                             continue
@@ -483,7 +482,7 @@ class ProcessPool:
         silent = outlets.values() if patience_s and not spoke else []
         failed = list(silent)
         for outlet in spoke:
-            worker = outlets[outlet]  # type: ignore[index]
+            worker = outlets[outlet]
             try:
                 if not self._has_prepared(worker):
                     shared.take(worker, worker.finish())

@@ -14,8 +14,6 @@ from bridge.task.robot import ARM_JOINTS, MAX_WIDTH_M
 from twin.replay.config import ReplayConfig
 from twin.replay.path import MAX_DURATION_S, WIDTH_SLACK_M, JointPath, UnusablePlanError
 
-# --- What recorded joints and gripper widths must be, so that an execution can be replayed.
-
 GRIPPER_WIDTH = "gripper_width"
 """The one joint on /gripper/state (docs/episode_format.md)."""
 LARGEST_GAP_NS = 500_000_000

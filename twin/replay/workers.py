@@ -37,8 +37,7 @@ from bridge.terminal import Output
 from twin.errors import TwinError
 from twin.replay.config import ReplayRunConfig
 
-# --- Pieces of work put together into tasks, where each task costs something beside its work.
-#
+# Pieces of work put together into tasks, where each task costs something beside its work.
 # A task of Ray costs processors some 10 ms (measured), which many short pieces together save;
 # single pieces at the end keep all processors busy (guided self-scheduling; Polychronopoulos and
 # Kuck 1987).
@@ -309,7 +308,7 @@ def _check_somebody_listens(address: str) -> None:
     host, _, port = address.rpartition(":")
     host = host.strip("[]")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        message = f"--ray {address!r} is no address: give HOST:PORT of the head, or {LOCAL}."
+        message = f"--ray {address!r} is not an address: give HOST:PORT of the head, or {LOCAL}."
         raise UsageError(message)
     try:
         socket.create_connection((host, int(port)), timeout=ANSWER_S).close()
@@ -358,7 +357,7 @@ def _task(function: Function, item: Any, version: str) -> Answer | Failed:
 
 
 def _out_of_place(item: Any, version: str) -> str | None:
-    """Say in a sentence why a node cannot do a piece of work; None when it can."""
+    """Say why a node cannot do a piece of work; None when it can."""
     node = socket.gethostname()
     if version != code_version():
         return (
@@ -382,16 +381,13 @@ def _first_line(error: BaseException) -> str:
     return (lines[0] if lines else type(error).__name__).rstrip(".")
 
 
-# --- Open what does the work, and import what the work needs while that starts.
-
-
 def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[str, Any]:
     """Replay all trial episodes of a run on what the settings ask for.
 
     See ``twin.replay.runner.replay_trajectories``, and what ``runner_for`` raises.
 
     Raises:
-        UsageError: When the folder is no run.
+        UsageError: When the folder is not a run.
     """
     if not run.episodes_dir.is_dir():
         message = (

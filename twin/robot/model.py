@@ -18,8 +18,6 @@ from bridge.episode.topics import ROBOT_DESCRIPTION
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME, FINGER_JOINTS, TCP_FRAME, resolve_mesh
 from twin.errors import TwinError
 
-# --- A URDF text as others can load it: every mesh an absolute path that exists.
-
 _MIMIC_DEFAULTS = (("multiplier", "1"), ("offset", "0"))
 
 
@@ -74,7 +72,7 @@ def _mimic(name: str, element: ET.Element, leaders: set[str]) -> Mimic:
         numbers = [math.nan]
     if not all(map(math.isfinite, numbers)):
         raise RobotDescriptionError(
-            found=f"lets the joint {name!r} mimic {leader!r} by something that is no number",
+            found=f"lets the joint {name!r} mimic {leader!r} by something that is not a number",
             hint="Give multiplier and offset as numbers.",
         )
     multiplier, offset = numbers
@@ -214,7 +212,7 @@ class RobotModel:
                 )
 
     def _check_limits(self) -> None:
-        """Nothing is ever beyond a limit that is no number."""
+        """Nothing is ever beyond a limit that is not a number."""
         rows = zip(
             ARM_JOINTS, self.lower_rad, self.upper_rad, self.velocity_limit_rad_s, strict=True
         )

@@ -1,4 +1,4 @@
-"""Live one case through: the recorded arm, the commanded gripper, and parameters to be judged.
+"""Simulate cases: the recorded arm, the commanded gripper, and parameters to be judged.
 
 Only the gripper collides: the arm's own shapes touch nothing in a probe, and leaving them out makes
 an evaluation several times quicker.
@@ -137,10 +137,10 @@ def _settle(
     stamps: list[int] = []
     poses: dict[str, list[Float[np.ndarray, "4 4"]]] = {key: [] for key in case.objects}
     touches: dict[str, list[bool]] = {key: [] for key in case.objects}
-    still = np.zeros(len(joints_rad))
+    at_rest = np.zeros(len(joints_rad))
     before: Float[np.ndarray, "num_objects 7"] | None = None
     for step in range(round(SETTLE_S * rate)):
-        world.command(joints_rad, still, width_m)
+        world.command(joints_rad, at_rest, width_m)
         world.step()
         if case.success is None and step % round(REST_S * rate) == 0:
             now = np.array([world.object_pose(key) for key in case.objects])
@@ -175,14 +175,12 @@ def gripper_only(urdf: str) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-# --- Live many cases through at many points, in one process or several; the order changes nothing.
-
 Piece = tuple[int, Case, Mapping[str, float], PhysicsConfig, int]
 """Its number, and what ``predict`` takes."""
 
 
 class LostPieceError(TwinError):
-    """A case could not be lived through, although it was tried again."""
+    """A case could not be simulated, although it was tried again."""
 
 
 class Evaluator:
@@ -269,7 +267,7 @@ def _error_of(case: Case, failed: Failed) -> Exception:
 
 
 def _cost(piece: Piece) -> float:
-    """Count the living-throughs."""
+    """Count the simulations."""
     _, case, _, _, num_samples = piece
     return 1.0 if case.success is None else 1.0 + num_samples
 

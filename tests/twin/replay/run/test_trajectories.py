@@ -123,7 +123,7 @@ def test_every_plan_and_every_execution_becomes_one_episode(
     (path,) = run.derived("trial_0001.replay.executed.dynamic.*")
     record = divergence_of(Episode.open(path))
     assert record is not None
-    assert all(item["between"] != ["planned", "executed"] for item in record["partings"])
+    assert all(item["between"] != ["planned", "executed"] for item in record["quantities"])
 
     stamps = {path: path.stat().st_mtime_ns for path in run.derived()}
     again = replay_run(run, ReplayRunConfig(replay=QUICK), QUIET)
