@@ -15,7 +15,6 @@ from bridge.episode.cdr.messages import JointSample, PoseSample
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import GRIPPER_STATE, is_truth
-from bridge.errors import UsageError
 from bridge.exchange.output import message_named, new_folder, write_note
 from bridge.geometry import se3
 from bridge.task.record import parse_record
