@@ -1,7 +1,6 @@
 """The gate with fakes for eyes, localisation and replay: undecided is never yes."""
 
 import json
-import time
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

@@ -113,7 +113,6 @@ def test_a_file_that_may_not_grow_is_recovered_with_all_but_the_refused(cell: Fa
     recorder = cell.record("--episode", "t1", "--cell", "cell", preexec_fn=limit)
     flow, asker = cell.publisher(), cell.publisher()
     flow.flow(60.0, *MIX)
-    part = cell.path("t1").with_suffix(".mcap.part")
     status = failed_status(asker)
     assert "File too large" in status["error"]
     assert recorder.process.wait(timeout=30.0) == 1
