@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bridge.episode.streams import JointTrack
 from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
 from twin.replay.config import ReplayConfig
+from twin.replay.execution import cut_track
 from twin.replay.path import JointPath, jumps
 from twin.robot.model import RobotModel, load_robot
 
@@ -62,3 +64,16 @@ def test_a_width_holds_from_its_own_instant_until_the_next_one() -> None:
     )
     asked = np.array([-1, 0, 99, 100, 199, 200, 300], dtype=np.int64)
     np.testing.assert_array_equal(path.width_at(asked), [0.08, 0.08, 0.08, 0.02, 0.02, 0.05, 0.05])
+
+
+def test_a_cut_track_begins_and_ends_with_the_interval() -> None:
+    """A sample at the very end belongs to it; one at the very start is there once."""
+    stamps = np.arange(6, dtype=np.int64) * 10
+    position = np.arange(6.0)[:, None] * np.ones((1, 6))
+    track = JointTrack(names=ARM_JOINTS, stamps_ns=stamps, position=position)
+    cut = cut_track(track, 10, 40)
+    np.testing.assert_array_equal(cut.stamps_ns, [10, 20, 30, 40])
+    np.testing.assert_array_equal(cut.position[:, 0], [1.0, 2.0, 3.0, 4.0])
+    between = cut_track(track, 15, 39)
+    np.testing.assert_array_equal(between.stamps_ns, [15, 20, 30])
+    np.testing.assert_allclose(between.position[:, 0], [1.5, 2.0, 3.0])
