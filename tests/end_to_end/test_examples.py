@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from bridge.task.robot import ur5_with_gripper_urdf
 
 from bridge.episode import schema
 from bridge.episode.metadata import EpisodeInfo
@@ -15,7 +16,6 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.sources.standin.kinematics import arm_kinematics
 from bridge.sources.standin.planner import NO_ERROR, plan_pick_and_place
-from bridge.task.robot import ur5_with_gripper_urdf
 from bridge.task.task_file import load_task
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
