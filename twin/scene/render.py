@@ -16,7 +16,7 @@ from bridge.errors import BridgeError, GstError, UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_png
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME
 from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture, posture_track
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at, unknown_mask

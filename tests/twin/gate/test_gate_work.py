@@ -13,8 +13,8 @@ import pytest
 
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
+from bridge.robots.default import ROBOT, ROBOT_NAME
 from bridge.task.plan import Plan
-from bridge.task.robot import ROBOT_NAME, ur5_with_gripper_urdf
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.gate.gate import UndecidedError
@@ -57,7 +57,7 @@ def question_of(run: RunFolder, **changes: Any) -> Question:
         task=task,
         Ts_base_object={"sloth": lying, "basket": np.eye(4)},
         covariances={},
-        urdf=ur5_with_gripper_urdf(),
+        urdf=ROBOT.urdf_text(),
         config=ReplayConfig(),
         max_steps=100_000,
     )
@@ -109,9 +109,7 @@ def test_a_plan_that_alone_needs_too_many_steps_gets_no_verdict(
 ) -> None:
     asked = accepting(monkeypatch)
     run = RunFolder.create(tmp_path / "run")
-    with pytest.raises(
-        UndecidedError, match="300 simulated steps, and a verdict at most 299"
-    ):
+    with pytest.raises(UndecidedError, match="300 simulated steps, and a verdict at most 299"):
         answer(question_of(run, max_steps=NOMINAL_STEPS - 1))
     assert not asked
 

@@ -18,7 +18,7 @@ from bridge.episode.cdr.messages import FrameTransform, transforms_from_cdr
 from bridge.episode.reader import Episode
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
-from bridge.task.robot import BASE_FRAME
+from bridge.robots.default import BASE_FRAME
 from bridge.terminal import Output
 from twin.scene.frames.odometry import CameraPath, TrackConfig, follow_camera
 from twin.scene.frames.pairing import UnusableCameraError, name_of, paired_stamps_ns

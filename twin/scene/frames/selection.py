@@ -197,6 +197,8 @@ QUIET = Output(quiet=True)
 class NoFramesError(TwinError):
     """There is nothing to rebuild from."""
 
+    exit_code = 2
+
 
 @dataclass(frozen=True, kw_only=True)
 class FrameChoice:

@@ -11,7 +11,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
-from bridge.task.robot import BASE_FRAME
+from bridge.robots.default import BASE_FRAME
 from twin.scene.frames.camera_poses import (
     CameraPoses,
     base_tree,

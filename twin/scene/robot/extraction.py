@@ -18,10 +18,10 @@ from bridge.episode.streams import RgbdFrame
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.task.robot import BASE_FRAME
+from bridge.robots.default import BASE_FRAME
 from bridge.terminal import Output
 from twin.robot.model import RobotModel, load_robot
-from twin.robot.posture import PostureTrack, far_apart, posture_track
+from twin.robot.posture import PostureTrack, distinct_postures, posture_track
 from twin.robot.surface import PosedSurface, link_poses, link_surfaces
 from twin.scene.align.align import Alignment, align_robot
 from twin.scene.align.view import RobotView
@@ -111,7 +111,7 @@ class RobotFrames:
         if tracked is None:
             return {}
         track = tracked.track
-        return {t: track.at(t).joints_rad for t in sorted(stamps_ns) if track.is_still(t)}
+        return {t: track.at(t).joints_rad for t in sorted(stamps_ns) if track.is_stationary(t)}
 
     def _surface(self, episode: Episode, stamp_ns: int) -> PosedSurface | None:
         tracked = self._tracked.get(str(episode.path))
@@ -130,7 +130,7 @@ class RobotFrames:
             se3.apply(T, points.p_m.astype(np.float64)),
             points.normals.astype(np.float64) @ T[:3, :3].T,
         )
-        if tracked.track.is_still(stamp_ns):
+        if tracked.track.is_stationary(stamp_ns):
             poses = link_poses(tracked.robot, tracked.track.at(stamp_ns))
             for link in {surface.links[index] for index in np.unique(owner[owner >= 0])}:
                 mine = np.isin(owner, [i for i, name in enumerate(surface.links) if name == link])
@@ -258,7 +258,7 @@ def look_closer(
         if not choice.stationary or not postures:
             continue
         stamps, joints = np.array(list(postures)), np.array(list(postures.values()))
-        wanted = frozenset(stamps[far_apart(joints, MAX_POSTURES)].tolist())
+        wanted = frozenset(stamps[distinct_postures(joints, MAX_POSTURES)].tolist())
         for frame in load(choice, wanted):
             points = FrameSurface(frame, limits).points(stride)
             found.frames.collect(choice.episode, frame.stamp_ns, points)
@@ -269,7 +269,7 @@ def _aligned(choices: Sequence[FrameChoice]) -> Alignment:
     choice = choices[0]
     track = posture_track(choice.episode)
     stamps = spread(np.array(sorted(choice.train_ns), dtype=np.int64), ALIGN_FRAMES)
-    wanted = frozenset(stamp for stamp in stamps.tolist() if track.is_still(stamp))
+    wanted = frozenset(stamp for stamp in stamps.tolist() if track.is_stationary(stamp))
     views = [
         RobotView.from_frame(frame, track.at(frame.stamp_ns), frame.T_base_depth)
         for frame in load(choice, wanted)

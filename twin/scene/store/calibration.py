@@ -19,7 +19,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
-from bridge.task.robot import BASE_FRAME
+from bridge.robots.default import BASE_FRAME
 from bridge.whole_file import write_whole
 from twin.errors import UnreadableFileError
 from twin.robot.model import load_robot

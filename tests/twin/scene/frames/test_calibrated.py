@@ -11,7 +11,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import JointTrack
 from bridge.errors import GstError
-from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
+from bridge.robots.default import ARM_JOINTS, ROBOT
 from bridge.terminal import Output
 from twin.robot.posture import PostureTrack
 from twin.scene.frames.selection import choose_frames, find_sources
@@ -38,7 +38,7 @@ def run(tmp_path: Path) -> RunFolder:
 
 def joints_at(monkeypatch: pytest.MonkeyPatch, stamps_ns: np.ndarray, position: np.ndarray) -> None:
     arm = JointTrack(names=tuple(ARM_JOINTS), stamps_ns=stamps_ns, position=position)
-    track = PostureTrack(urdf=ur5_with_gripper_urdf(), arm=arm, widths=None)
+    track = PostureTrack(urdf=ROBOT.urdf_text(), arm=arm, widths=None)
     answer: Callable[[Episode], PostureTrack] = lambda _episode: track  # noqa: E731
     monkeypatch.setattr(calibration_module, "posture_track", answer)
 

@@ -21,7 +21,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.media.color import encode_png
-from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
+from bridge.robots.default import ARM_JOINTS, ROBOT
 from bridge.terminal import Output
 from twin.scene.dataset.training_set import read_training_set
 from twin.scene.frames.selection import choose_frames, find_sources
@@ -53,7 +53,7 @@ def write_scan(path: Path, root: str, T_root_base: np.ndarray, *, with_joints: b
 
         writer.describe(EpisodeInfo(id=path.stem, kind="scan", cell="c", stand_in=True))
         put("/tf_static", transforms_to_cdr([pose]), schema.TF_MESSAGE, 1)
-        put("/robot_description", string_to_cdr(ur5_with_gripper_urdf()), schema.STRING, 1)
+        put("/robot_description", string_to_cdr(ROBOT.urdf_text()), schema.STRING, 1)
         for stream in ("color", "depth"):
             put(f"/c/cam/side/{stream}/info", info, schema.CAMERA_INFO, 1)
         for index, joints in enumerate(cell_views.POSTURES):
