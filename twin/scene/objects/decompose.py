@@ -41,14 +41,13 @@ from twin.scene.localise.episode import localise_episode
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.assignment import (
     HALO_M,
-    Poses,
     SplitConfig,
     assign_splats,
     hidden_table,
     object_poses,
 )
 from twin.scene.shape.files import MESH, TASK_SHAPE, remove_shape, write_shape
-from twin.scene.shape.from_training import shapes_of, write_static
+from twin.scene.shape.from_training import Poses, shapes_of, write_static
 from twin.scene.shape.mesh import mesh_ply
 from twin.scene.shape.reconstruct import ObjectShape
 from twin.scene.store.folder import UnreadableSceneError
