@@ -14,8 +14,6 @@ from bridge.task.plan import Plan, Stage
 from twin.replay.config import ReplayConfig
 from twin.replay.path import MAX_DURATION_S, WIDTH_SLACK_M, JointPath, UnusablePlanError
 
-# --- What recorded joints and gripper widths must be, so that an execution can be replayed.
-
 LARGEST_GAP_NS = 500_000_000
 """What was not recorded for longer than this is not made up."""
 

@@ -60,7 +60,7 @@ class ReplayOrigin:
     """Source time of the recorded execution's start, or of the plan when it was never executed."""
     urdf: str
     stages: tuple[Stage, ...]
-    """With the times at which they were lived through: the plan's, or the execution's."""
+    """With the times at which they were executed: the plan's, or the execution's."""
     gripper: tuple[tuple[int, str], ...]
     """When, from time 0, the gripper was told to close or open."""
     end_ns: int

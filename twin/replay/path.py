@@ -24,8 +24,6 @@ from twin.robot.follow import Clearance, follow_poses
 from twin.robot.inverse import pose_error, solve_ik
 from twin.robot.model import RobotModel
 
-# --- Joint limits, jumps and excess speed of a path, each named with its joint and instant.
-
 _LIMIT_SLACK_RAD = 1e-3
 _SPEED_SLACK = 1.02
 """Recorded and rounded joints may exceed a limit by as little as this."""
@@ -83,8 +81,6 @@ def jumps(
             )
     return failures
 
-
-# --- Whether a plan can be replayed at all, before anything is computed from it.
 
 MAX_DURATION_S = 600.0
 """Longest trajectory that is replayed [s]."""

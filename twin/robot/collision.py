@@ -12,8 +12,7 @@ from jaxtyping import Float
 from bridge.robots.default import FINGER_LINKS
 from twin.robot.model import RobotDescriptionError, RobotModel
 
-# --- Convex hulls of the robot's links, the one shape that pinocchio, coal and PyBullet all share.
-#
+# Convex hulls of the robot's links, the one shape that pinocchio, coal and PyBullet all share.
 # TRAP (measured, design page on physics): ``BVHModel.buildConvexRepresentation`` reuses the
 # concave triangles of the mesh; distances then come out up to 95 mm too large, which is the
 # unsafe side. ``ConvexBase.convexHull`` computes a true hull; a test pins hull distance <= mesh

@@ -19,8 +19,6 @@ from bridge.robots.default import ARM_JOINTS, BASE_FRAME, FINGER_JOINTS, ROBOT, 
 from bridge.robots.robot import resolve_mesh
 from twin.errors import TwinError
 
-# --- A URDF text as others can load it: every mesh an absolute path that exists.
-
 _MIMIC_DEFAULTS = (("multiplier", "1"), ("offset", "0"))
 
 
@@ -75,7 +73,7 @@ def _mimic(name: str, element: ET.Element, leaders: set[str]) -> Mimic:
         numbers = [math.nan]
     if not all(map(math.isfinite, numbers)):
         raise RobotDescriptionError(
-            found=f"lets the joint {name!r} mimic {leader!r} by something that is no number",
+            found=f"lets the joint {name!r} mimic {leader!r} by something that is not a number",
             hint="Give multiplier and offset as numbers.",
         )
     multiplier, offset = numbers
@@ -216,7 +214,7 @@ class RobotModel:
                 )
 
     def _check_limits(self) -> None:
-        """Nothing is ever beyond a limit that is no number."""
+        """Nothing is ever beyond a limit that is not a number."""
         rows = zip(
             ARM_JOINTS, self.lower_rad, self.upper_rad, self.velocity_limit_rad_s, strict=True
         )

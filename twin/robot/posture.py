@@ -15,8 +15,6 @@ from bridge.robots.default import ARM_JOINTS
 from twin.errors import TwinError
 from twin.robot.model import RobotDescriptionError
 
-# --- Recorded time that goes backwards: sorting it would make up an execution nobody saw.
-
 BACK_NS = 20_000_000
 """Messages of several publishers may overtake each other by this much."""
 
@@ -110,7 +108,7 @@ class PostureTrack:
         width = 0.0 if self.widths is None else float(self.widths.at(stamps)[0, 0])
         return Posture(joints_rad=self.arm.at(stamps)[0, order], width_m=width)
 
-    def is_still(self, stamp_ns: int) -> bool:
+    def is_stationary(self, stamp_ns: int) -> bool:
         """Whether joints were recorded, and hardly moved, around this instant."""
         if not self.covers(stamp_ns):
             return False
@@ -118,7 +116,9 @@ class PostureTrack:
         return bool(np.ptp(around, axis=0).max() < STILL_RAD)
 
 
-def far_apart(joints_rad: Float[np.ndarray, "num_postures num_joints"], count: int) -> list[int]:
+def distinct_postures(
+    joints_rad: Float[np.ndarray, "num_postures num_joints"], count: int
+) -> list[int]:
     """Choose at most so many postures far from each other, farthest first, until none is new."""
     chosen = [0]
     far = np.abs(joints_rad - joints_rad[0]).max(axis=1)

@@ -28,8 +28,7 @@ from twin.replay.failure import Failure
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, signed_distance
 
-# --- What may have happened between two states: how far anything moved, and the state half way.
-#
+# What may have happened between two states: how far anything moved, and the state half way.
 # A point that travels s between two instants is never farther than s / 2 from where it was at one
 # of them. Two bodies that were d0 and d1 apart and travelled s together therefore kept at least
 # (d0 + d1 - s) / 2. Where that is not enough, the state half way is looked at, and so on.

@@ -191,10 +191,8 @@ def test_a_process_that_is_killed_while_it_simulates_costs_nothing(slide: Case) 
     alone = Evaluator([slide], parameters, CONFIG, num_samples=0).predict(points, [0])
     with Evaluator([slide], parameters, CONFIG, num_samples=0, workers=2) as evaluator:
         evaluator.predict(points[:2], [0])
-        assert evaluator._crew is not None
-        first, second = [worker.pid for worker in evaluator._crew._idle]
-        assert first is not None
-        assert second is not None
+        assert evaluator._pool is not None
+        first, second = [worker.pid for worker in evaluator._pool.workers]
         os.kill(first, signal.SIGKILL)
         killer = threading.Timer(0.05, os.kill, (second, signal.SIGKILL))
         killer.start()

@@ -51,7 +51,9 @@ def test_images_without_joints_around_them_are_left_out_and_counted(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     joints_at(monkeypatch, np.arange(1 * S, 2 * S, S // 100), moving(100))
-    (choice,) = choose_frames(find_sources(run), FrameConfig(), Output(), read_calibration(run))
+    (choice,) = choose_frames(
+        find_sources(run), FrameConfig(), Output(), read_calibration(run)
+    ).choices
     assert choice.poses.source == "hand-eye"
     assert max(choice.train_ns | choice.holdout_ns) < 2.5 * S
     assert "frames of camera wrist are left out: joints" in " ".join(
@@ -68,7 +70,7 @@ def test_joints_that_are_no_numbers_place_no_camera(
     joints_at(monkeypatch, stamps, position)
     (choice,) = choose_frames(
         find_sources(run), FrameConfig(), Output(quiet=True), read_calibration(run)
-    )
+    ).choices
     assert max(choice.train_ns | choice.holdout_ns) < 2 * S
 
 

@@ -174,10 +174,10 @@ def episode(tmp_path_factory: pytest.TempPathFactory) -> Episode:
 
 def test_postures_know_when_the_robot_stood_still(episode: Episode) -> None:
     track = posture_track(episode)
-    assert track.is_still(SECOND)
-    assert not track.is_still(2 * SECOND)
-    assert track.is_still(3 * SECOND)
-    assert not track.is_still(30 * SECOND)
+    assert track.is_stationary(SECOND)
+    assert not track.is_stationary(2 * SECOND)
+    assert track.is_stationary(3 * SECOND)
+    assert not track.is_stationary(30 * SECOND)
     np.testing.assert_allclose(track.at(3 * SECOND).joints_rad, AWAY, atol=1e-9)
     assert track.at(SECOND).width_m == pytest.approx(WIDTH_M)
 
