@@ -4,7 +4,6 @@ Quaternions are ``wxyz``, scalar first, with w >= 0. Storage is quaternion plus 
 matrices exist only in memory.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -210,7 +209,7 @@ def pose_record(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
     return {"p_m": p.tolist(), "q_wxyz": q.tolist()}
 
 
-def pose_from_record(record: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
+def pose_from_record(record: Any) -> Float[np.ndarray, "4 4"]:
     """Read what ``pose_record`` made.
 
     Raises:
