@@ -100,7 +100,7 @@ def _rollout(recorded: Episode, localised: Episode, plan_id: str, task: Task) ->
         name, pose = str(record["object"]), record.get("T_base_object")
         if not record["found"] or pose is None:
             continue
-        T = se3.transform_from(np.array(pose["q_wxyz"]), np.array(pose["p_m"]))
+        T = se3.pose_from_record(pose)
         if (record.get("phase"), record.get("plan_id")) != (AFTER, plan_id):
             before[name] = T if not after else before.get(name, T)
             continue

@@ -58,7 +58,7 @@ def solve_hand_eye(
     clear &= np.linalg.norm(beta, axis=1) < HALF_TURN_RAD
     if clear.sum() < 2:
         clear[:] = True
-    R = nearest_rotation(alpha[clear].T @ beta[clear])
+    R = se3.nearest_rotation(alpha[clear].T @ beta[clear])
     left = P[:, :3, :3] - np.eye(3)
     right = Q[:, :3, 3] @ R.T - P[:, :3, 3]
     t, *_ = np.linalg.lstsq(left.reshape(-1, 3), right.reshape(-1), rcond=None)
@@ -86,16 +86,9 @@ def solve_robot_world(
     return _transform(R_x, t[:3]), _transform(R_z, t[3:])
 
 
-def nearest_rotation(M: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation R that maximises trace(R^T M)."""
-    U, _, Vt = np.linalg.svd(M)
-    sign = np.array([1.0, 1.0, np.linalg.det(U @ Vt)])
-    return np.asarray((U * sign) @ Vt)
-
-
 def _rotation_from_columns(values: Float[np.ndarray, "9"]) -> Float[np.ndarray, "3 3"]:
     M = values.reshape(3, 3).T
-    return nearest_rotation(M * np.sign(np.linalg.det(M)))
+    return se3.nearest_rotation(M * np.sign(np.linalg.det(M)))
 
 
 def _transform(R: Float[np.ndarray, "3 3"], t_m: Float[np.ndarray, "3"]) -> np.ndarray:

@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from bridge.errors import UsageError
+from bridge.geometry import se3
 from bridge.task.meshes.catalogue import ToyMesh, toy_mesh
 from bridge.task.meshes.lattice import Lattice, fill, make_lattice, volumes_m3
 from bridge.task.task_file import ObjectModel
@@ -22,22 +23,15 @@ def rigid_fit(
     nodes_m: Float[np.ndarray, "num_nodes 3"],
     mass_fraction: Float[np.ndarray, " num_nodes"],
 ) -> Float[np.ndarray, "4 4"]:
-    """Rigid motion that brings the nodes at rest nearest to where they are: Kabsch (1976).
+    """Rigid motion that brings the nodes at rest nearest to where they are.
 
     Squared distances are weighted by mass. Nodes that are no numbers give a pose that is none.
     """
-    T = np.eye(4)
     if not np.isfinite(nodes_m).all():
+        T = np.eye(4)
         T[:3] = np.nan
         return T
-    weight = mass_fraction / mass_fraction.sum()
-    middle_rest, middle = weight @ rest_m, weight @ nodes_m
-    cross = ((nodes_m - middle) * weight[:, None]).T @ (rest_m - middle_rest)
-    left, _, right = np.linalg.svd(cross)
-    flip = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))])
-    T[:3, :3] = left @ flip @ right
-    T[:3, 3] = middle - T[:3, :3] @ middle_rest
-    return T
+    return se3.align_rigid(rest_m, nodes_m, mass_fraction)
 
 
 def surface_triangles(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from bridge.geometry import se3
-from bridge.geometry.box import box_corners
+from bridge.geometry.mesh import box_corners
 from bridge.task.task_file import ObjectModel
 from twin.physics.soft import BURST_STRETCH, SoftHealth, SoftModel
 from twin.physics.world import Attachment, World

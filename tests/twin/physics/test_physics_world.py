@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from bridge.geometry.box import box_corners
+from bridge.geometry.mesh import box_corners
 from bridge.robots.default import ROBOT
 from twin.physics import engine
 from twin.physics.arm import Arm, write_description
