@@ -248,7 +248,9 @@ WIDEST = 26
 """Of an episode's name beside the other columns; a longer one has a line of its own."""
 
 
-WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}
+WRAPPED = textwrap.TextWrapper(
+    80, initial_indent="    ", subsequent_indent="    ", break_long_words=False
+)
 
 
 def _table(entries: "list[Entry]") -> list[str]:
@@ -269,8 +271,7 @@ def _table(entries: "list[Entry]") -> list[str]:
         cells += [text.rjust(width) for text, width in zip(row[4:], widths[4:], strict=True)]
         lines.append("  ".join(cells).rstrip())
         if entry is not None:
-            notes = textwrap.wrap(_notes(entry, is_named=not all_stand_in), 76, **WHOLE_WORDS)
-            lines += [f"    {note}" for note in notes]
+            lines += WRAPPED.wrap(_notes(entry, is_named=not all_stand_in))
     return lines
 
 
