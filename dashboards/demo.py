@@ -305,7 +305,6 @@ def _record_trials(
 ) -> None:
     log = run.notes_dir / "logs" / "gate.log"
     judge = ["gate", str(run.path), "--connect", endpoint, "--task", config.task]
-    judge += ["--deadline", "5min"]  # the last resort: the cell waits, its clock is its own
     label = f"4/6 {count} trials, {config.trials} starts without and with replanning"
     with _running(judge, log) as gate:
         gate.wait_until(lambda: "ready" in log.read_text(errors="replace"))

@@ -1,19 +1,44 @@
 """One session of the stand-in cell, from the files to the last episode."""
 
 import contextlib
+import threading
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from bridge.clock import AnchoredClock
+from bridge.episode.topics import (
+    COLOR_IMAGE,
+    COLOR_INFO,
+    DEPTH_IMAGE,
+    DEPTH_INFO,
+    EVENT,
+    GRIPPER_STATE,
+    JOINT_STATES,
+    PLAN,
+    PLAN_PATH,
+    PLAN_TRAJECTORY,
+    ROBOT_DESCRIPTION,
+    TCP_POSE,
+    TF,
+    TF_STATIC,
+    TRUTH,
+    camera_topic,
+    cell_topic,
+    object_topic,
+)
 from bridge.errors import BridgeError
 from bridge.sources.standin.cell import CellConfig, StandinCell, StoppedError
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.operator import Operator
 from bridge.sources.standin.settings import SessionConfig
-from bridge.sources.standin.streams import Session, Streams
+from bridge.sources.standin.streams import TRUTH_PARAMETERS, Session, Streams
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
+
+if TYPE_CHECKING:
+    from bridge.wire.session import WireSession
 
 
 def run_session(
@@ -65,6 +90,41 @@ def run_session(
             operator.abandon(discard=True)
         raise
     return _summary(operator, config, stopped=stopped)
+
+
+@dataclass(frozen=True)
+class StandinSource:
+    """The stand-in cell as a ``bridge.sources.source.Source``."""
+
+    config: SessionConfig
+
+    @property
+    def name(self) -> str:
+        """The cell's."""
+        return f"stand-in cell {self.config.cell}"
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Those of a real cell, and the truth that only tests and perception metrics read."""
+        task = load_task(self.config.task)
+        cell, cameras = self.config.cell, load_cell(self.config.cell_file or task.cell).cameras
+        endings = (COLOR_IMAGE, COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO)
+        of_cell = (JOINT_STATES, GRIPPER_STATE, TCP_POSE, PLAN, PLAN_TRAJECTORY, PLAN_PATH, EVENT)
+        soft = [key for key, model in task.objects.items() if model.soft is not None]
+        return (
+            *(cell_topic(cell, ending) for ending in of_cell),
+            *(camera_topic(cell, camera, ending) for camera in cameras for ending in endings),
+            *(object_topic(TRUTH, key, "pose") for key in task.objects),
+            *(object_topic(TRUTH, key, "nodes") for key in soft),
+            TRUTH_PARAMETERS,
+            TF,
+            TF_STATIC,
+            ROBOT_DESCRIPTION,
+        )
+
+    def run(self, session: "WireSession", stop: threading.Event, output: Output) -> dict[str, Any]:
+        """Record as the configuration says, or until stopped; see ``run_session``."""
+        return run_session(session, self.config, output, should_stop=stop.is_set)
 
 
 def _summary(operator: Operator, config: SessionConfig, *, stopped: bool) -> dict[str, Any]:

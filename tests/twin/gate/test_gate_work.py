@@ -109,9 +109,7 @@ def test_a_plan_that_alone_needs_too_many_steps_gets_no_verdict(
 ) -> None:
     asked = accepting(monkeypatch)
     run = RunFolder.create(tmp_path / "run")
-    with pytest.raises(
-        UndecidedError, match="300 simulated steps, and a verdict at most 299"
-    ):
+    with pytest.raises(UndecidedError, match="300 simulated steps, and a verdict at most 299"):
         answer(question_of(run, max_steps=NOMINAL_STEPS - 1))
     assert not asked
 
