@@ -1,4 +1,4 @@
-"""Commands of the room ``dashboards``; imports stay late so that --help is quick."""
+"""Commands of the package ``dashboards``; imports stay late so that --help is quick."""
 
 from pathlib import Path
 from typing import Annotated
@@ -66,7 +66,7 @@ def export_rrd(episode: Path, /, *, out: Path, output: Output = OUTPUT) -> int:
     Example: robot-gst export rrd runs/monday/episodes/trial_0001.mcap --out trial_0001.rrd
 
     Args:
-        episode: An episode file; of one inside a run, the replays and the rebuilt place come along.
+        episode: An episode file; of one inside a run, the replays and the rebuilt scene come along.
         out: The .rrd file to write; an older one is replaced.
         output: How to talk.
     """

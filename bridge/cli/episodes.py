@@ -83,9 +83,9 @@ def _outcome(kind: str, outcome: "Outcome | None") -> str:
 
 
 def check(episodes: list[Path], /, *, rerun: bool = False, output: Output = OUTPUT) -> int:
-    """Check that episodes are whole: CRCs, indexes, counts, decoding, and losses they declare.
+    """Verify episodes (CRCs, indexes, counts, decoding) and list dropped messages.
 
-    Exit code 0 clean, 3 losses, 1 broken. Example: robot-gst check runs/demo
+    Exit code 0: clean, 3: messages were dropped, 1: broken. Example: robot-gst check runs/demo
 
     Args:
         episodes: Episode files, or folders to search for them; parts go with their episode.
@@ -128,7 +128,7 @@ def check(episodes: list[Path], /, *, rerun: bool = False, output: Output = OUTP
 
 
 def doctor(*, output: Output = OUTPUT) -> int:
-    """Say what is installed, what is missing, and how to get it.
+    """Show what is installed, what is missing, and how to get it.
 
     Example: robot-gst doctor
 
@@ -147,14 +147,14 @@ def doctor(*, output: Output = OUTPUT) -> int:
 
 
 def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OUTPUT) -> int:
-    """Make readable episodes of files whose writer was killed, and say what was lost.
+    """Repair files whose writer was killed, and report what was lost.
 
-    Exit code 0 recovered, 1 when nothing could be read in one of them.
+    Exit code 0: repaired, 1: nothing could be read in one of them.
     Example: robot-gst recover runs/monday
 
     Args:
         paths: Files of any MCAP writer, or folders to search for ``*.mcap.part``.
-        in_place: Finish the file itself; without it a copy is made where the disk has room.
+        in_place: Finish the file itself; without it a copy is made where the disk has space.
         output: How to talk.
     """
     from bridge.episode import recover as recovery
@@ -318,7 +318,7 @@ def label(
     detail: str | None = None,
     output: Output = OUTPUT,
 ) -> int:
-    """Say after the fact how an episode ended; kept in notes/, the episode is not rewritten.
+    """Set the outcome of a recorded episode; kept in notes/, the episode is not rewritten.
 
     Example: robot-gst label runs/monday trial_0003 --result failure --detail "slipped"
 

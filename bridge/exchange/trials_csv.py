@@ -96,7 +96,7 @@ class SourceRow:
         return number
 
     def _number(self, name: str) -> float | None:
-        """Return the number in a field, None when it is empty, -1 when it is no number."""
+        """Return the number in a field, None when it is empty, -1 when it is not a number."""
         text = self.text(name)
         try:
             return float(text) if text else None

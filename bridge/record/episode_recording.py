@@ -379,11 +379,11 @@ class EpisodeRecording:
         )
 
     def tick(self, now_ns: int, health: dict[str, int]) -> None:
-        """Write what has waited long enough, and the ledger of the seconds that are over.
+        """Write what has waited long enough, and the drop log of the seconds that are over.
 
         Args:
             now_ns: The recorder's clock.
-            health: Numbers that go into each ledger record.
+            health: Numbers that go into each drop record.
         """
         # A message may wait in the queue while its second ends: give it one second more.
         before = second_of(now_ns) - 1

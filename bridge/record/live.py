@@ -213,7 +213,9 @@ class LiveRecorder:
         reports = recover_parts(run)
         for report in reports:
             say(_describe_recovery(report))
-        previews = Previews(session, config.recorder, config.preview_hz, lambda: core.intake.shed)
+        previews = Previews(
+            session, config.recorder, config.preview_hz, lambda: core.input_queue.shed
+        )
         core = self.core = Recorder(
             run, now_ns=session.now_ns, config=config, preview=previews.show
         )
@@ -245,7 +247,9 @@ class LiveRecorder:
     def _tell(self) -> None:
         while not self._ended.wait(STATUS_PERIOD_S):
             with contextlib.suppress(WireError):  # the session is closing
-                self.core.intake.watched = self._previews.look(self.core.intake.image_topics())
+                self.core.input_queue.watched = self._previews.look(
+                    self.core.input_queue.image_topics()
+                )
                 self._say_status()
 
     def _say_status(self) -> None:
@@ -272,7 +276,7 @@ class LiveRecorder:
 
         Raises:
             UsageError: When the id or a field is wrong, or another episode is open.
-            BridgeError: When the disk has no room.
+            BridgeError: When the disk has no space.
         """
         return self.core.start(parse_info(episode_id, about))
 

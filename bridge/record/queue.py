@@ -158,7 +158,7 @@ class Item:
     size: int
     """Bytes as they came over the wire."""
     is_bulk: bool
-    """Takes room from the budget of images, not from that of small messages."""
+    """Takes space from the budget of images, not from that of small messages."""
     finding: MessageState | None = None
     """None when nobody has looked yet."""
     reduced: bool = False
@@ -318,7 +318,7 @@ class InputQueue:
             size = len(sample.data)
             is_bulk = flow.is_image or size >= BULK_BYTES
             cost = size + OVERHEAD_BYTES
-            if not self._has_room(flow, sample, step, cost=cost, is_bulk=is_bulk):
+            if not self._fits(flow, sample, step, cost=cost, is_bulk=is_bulk):
                 return
             item = Item(sample, step, ticket, flow.type_name, size, is_bulk)
             if is_bulk:
@@ -346,7 +346,7 @@ class InputQueue:
         self._flows[sample.topic, sample.type_name] = flow
         return flow
 
-    def _has_room(
+    def _fits(
         self, flow: Flow, sample: WireSample, step: Step, *, cost: int, is_bulk: bool
     ) -> bool:
         """Say whether a message may be taken in; count it if not."""
@@ -362,13 +362,13 @@ class InputQueue:
             self._drop(sample, step, "messages of anybody but the recorder")
         elif is_bulk and self._is_shed(flow):
             self._drop(sample, step, None)
-        elif cost > self._room(is_bulk=is_bulk):
+        elif cost > self._free_bytes(is_bulk=is_bulk):
             self._drop(sample, step, "")
         else:
             return True
         return False
 
-    def _room(self, *, is_bulk: bool) -> int:
+    def _free_bytes(self, *, is_bulk: bool) -> int:
         if is_bulk:
             return self._bulk_budget - self._bulk_bytes
         return self._small_budget - (self._small_in - self._small_out)
@@ -388,7 +388,7 @@ class InputQueue:
         Args:
             sample: The message.
             step: Its place in its stream.
-            limit: The limit it broke, "" for want of room, None for shedding.
+            limit: The limit it broke, "" for want of space, None for shedding.
         """
         if self._dropped is None:
             self._dropped = Dropped(ticket=self._ticket - 1, received_ns=sample.received_ns)
@@ -450,7 +450,7 @@ class InputQueue:
         return entries, images
 
     def release(self, item: Item) -> None:
-        """Give back the room of a message that was dealt with; called by the writer thread."""
+        """Give back the space of a message that was dealt with; called by the writer thread."""
         cost = len(item.sample.data) + OVERHEAD_BYTES
         if item.is_bulk:
             with self._lock:
@@ -472,7 +472,7 @@ class InputQueue:
 
 
 class Merge:
-    """Fed with what the intake gives; yields what may be dealt with now."""
+    """Fed with what the input_queue gives; yields what may be dealt with now."""
 
     def __init__(self) -> None:
         """Start empty."""

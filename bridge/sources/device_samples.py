@@ -95,7 +95,7 @@ MAX_GAP = 10_000_000
 class NumberedPublisher:
     """Sends samples of one stream; numbers left out by the device become gaps on the wire.
 
-    The recorder enters gaps of sequence numbers in its ledger of losses, wherever they arose.
+    The recorder enters gaps of sequence numbers in its drop log, wherever they arose.
     """
 
     def __init__(self, publisher: WirePublisher) -> None:

@@ -90,7 +90,7 @@ class SharedPool:
         self._policy = zenoh_shm.Defragment(zenoh_shm.GarbageCollect())
 
     def place(self, data: bytes | bytearray) -> Any | None:
-        """Copy a message into the pool; None when there is no room now."""
+        """Copy a message into the pool; None when there is no space now."""
         try:
             buffer = self._pool.alloc(len(data), self._policy)
         except zenoh.ZError:

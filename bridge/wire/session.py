@@ -319,7 +319,7 @@ class WireSession:
         ``max_mb`` [MB], for nobody knows what a cache holds.
         """
         answers: list[WireSample] = []
-        room = max_mb * BYTES_PER_MB
+        left = max_mb * BYTES_PER_MB
         try:
             replies = self._inner.get(
                 key_expression,
@@ -331,8 +331,8 @@ class WireSession:
             for reply in replies:
                 if reply.ok is None:
                     continue
-                room -= len(reply.ok.payload)
-                if room < 0:
+                left -= len(reply.ok.payload)
+                if left < 0:
                     break
                 answers.append(copy_sample(reply.ok, self._clock.now_ns()))
         except zenoh.ZError as error:

@@ -343,7 +343,7 @@ def truth_rollout(sent: list[Any]) -> Rollout:
     )
 
 
-def test_importing_the_room_and_the_settings_loads_no_physics() -> None:
+def test_importing_the_package_and_the_settings_loads_no_physics() -> None:
     code = (
         "import sys, bridge.sources, bridge.sources.standin.settings;"
         "print([m for m in ('mujoco', 'open3d', 'pinocchio', 'zenoh') if m in sys.modules])"
