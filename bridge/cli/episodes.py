@@ -52,7 +52,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         f"{opened.duration_s:.1f} s, {sum(item.count for item in topics.values())} messages, "
         f"{sum(path.stat().st_size for path in opened.parts) / 1e6:.1f} MB"
         + (f" in {len(opened.parts)} parts" if len(opened.parts) > 1 else ""),
-        f"  outcome: {_outcome(about.kind, outcome)}",
+        f"  outcome: {_outcome('replay' if opened.derived else about.kind, outcome)}",
     ]
     if opened.derived:
         derived = opened.derived

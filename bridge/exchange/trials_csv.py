@@ -299,10 +299,6 @@ def _field(name: str, value: object) -> str:
     return "" if value is None else str(value)
 
 
-# --- Trials kept in a spreadsheet become part of a run: ``notes/trials.csv``, which evaluate
-# reads.
-
-
 def trials_path(run: RunFolder) -> Path:
     """Where a run keeps its imported trials."""
     return run.notes_dir / "trials.csv"

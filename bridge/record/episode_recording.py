@@ -23,8 +23,6 @@ from bridge.record.queue import Command, Dropped, Item, second_of
 from bridge.wire.rmw import ros_schema, type_hash_of
 from bridge.wire.session import WireSample
 
-# --- Which schema each message of an episode is written with, and how it is looked at.
-
 HASH_PREFIX = "RIHS01_"
 _SHOWN = len(HASH_PREFIX) + 12
 
@@ -135,9 +133,6 @@ def _from_ros(type_name: str, type_hash: str, folder: Path | None) -> schema.Sch
         return ros_schema(type_name, type_hash=type_hash, folder=folder)
     except MissingDependencyError:
         return None
-
-
-# --- The files of one episode: one, or several when it is split by size or time.
 
 
 class EpisodeFiles:

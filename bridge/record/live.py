@@ -41,8 +41,6 @@ from bridge.wire.qos import Qos
 from bridge.wire.rmw import read_definitions
 from bridge.wire.session import Subscriber, WireSample, WireSession, open_session
 
-# --- Small pictures of the cameras on ``rec/<recorder>/preview/<camera>``, while someone looks.
-
 WIDTH = 320
 QUALITY = 70
 MAX_PREVIEWS = 64
@@ -139,7 +137,7 @@ def small_picture(sample: WireSample) -> CompressedColor | None:
     return CompressedColor(stamp_ns=stamp_ns, frame_id=frame_id, format="jpeg", data=data)
 
 
-# --- Notices publishers that left, so that nothing they said is repeated in later episodes.
+# Notices publishers that left, so that nothing they said is repeated in later episodes.
 #
 # A source of ours declares ``<prefix>/alive``; with it go the latched messages under
 # ``/<prefix>/``. A ROS 2 publisher has a token; with the last one of a topic go that topic's

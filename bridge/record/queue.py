@@ -22,8 +22,6 @@ from bridge.record.inspection import MessageState, resolve_type
 from bridge.record.sequence import SequenceTracker, Step
 from bridge.wire.session import WireSample
 
-# --- Remembers the messages a late listener needs: static transforms, the URDF, calibrations.
-
 MAX_LATCHED = 1000
 MAX_LATCHED_BYTES = 256_000_000
 """Maps are large; a file that begins with more than this of the past is refused the rest."""
@@ -98,7 +96,7 @@ def _children(sample: WireSample) -> frozenset[str]:
         return frozenset()
 
 
-# --- What is left out first when images come faster than they can be written.
+# What is left out first when images come faster than they can be written.
 #
 # The order is fixed: previews, then the quality of colour, then every other colour image, then
 # every other depth image. Joints, plans and all other small messages are never shed.
@@ -138,8 +136,6 @@ def keep_every(level: LoadShedding, kind: str) -> int:
         return 2 if level >= LoadShedding.DEPTH_RATE else 1
     return 1
 
-
-# --- What goes through the recorder's queues: messages, counts of what was left out, commands.
 
 MAX_WARNINGS = 1000
 
@@ -464,7 +460,7 @@ class InputQueue:
             self._is_quiet = self._commands == after
 
 
-# --- Puts small messages, encoded images and commands back in order for the writer.
+# Puts small messages, encoded images and commands back in order for the writer.
 #
 # Small messages never wait for images. A barrier command (start, stop ...) waits until every
 # image received before it has come out of its encoder, and holds back everything received after

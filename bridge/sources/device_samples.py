@@ -13,7 +13,7 @@ from bridge.errors import GstError
 from bridge.wire.qos import Qos
 from bridge.wire.session import WirePublisher, WireSession
 
-# --- When did a device with a clock of its own take a sample, in this host's time?
+# When did a device with a clock of its own take a sample, in this host's time?
 #
 # A sample cannot arrive before it was taken, so the smallest (arrival - device stamp) of a while
 # is the offset between the clocks plus the shortest way the samples took. Queues and stalls only
@@ -85,8 +85,6 @@ class HostClock:
             self._minima[-1][1] = min(self._minima[-1][1], difference_ns)
         return min(smallest for _, smallest in self._minima)
 
-
-# --- Publishing with the numbers a device gives its samples, so that what it dropped is counted.
 
 MAX_GAP = 10_000_000
 """A larger step is a counter that was set anew, not a loss."""

@@ -39,8 +39,6 @@ from bridge.wire.publisher import WirePublisher as WirePublisher
 from bridge.wire.qos import Qos
 from bridge.wire.zenoh_config import zenoh, zenoh_config
 
-# --- Answering requests on one key.
-
 MAX_WAITING = 32
 """Requests that wait for one service; each may hold a whole plan."""
 CLOSE_S = 5.0
@@ -107,9 +105,6 @@ class Service:
         ends_s = time.monotonic() + CLOSE_S
         for thread in self._threads:
             thread.join(timeout=max(0.0, ends_s - time.monotonic()))
-
-
-# --- A message as it arrived, copied out of the network's own memory at once.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

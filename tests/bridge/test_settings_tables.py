@@ -20,7 +20,7 @@ def settings(folder: Path, text: str) -> str:
         ("replays", "has [replays], but no command has that name. There are: demo, record"),
         (
             "publish.stand-in",
-            "has [publish.stand-in], but no command has that name. There are: fol",
+            "has [publish.stand-in], but no command has that name. There are:",
         ),
     ],
 )

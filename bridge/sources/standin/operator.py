@@ -40,8 +40,6 @@ from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from bridge.terminal import Output
 
-# --- The operator's eye: an outcome from what really happened, by the task's hard predicates.
-
 OPERATOR = "stand-in operator"
 LIFTED_M = 0.05
 """An object that rose this far at any time was grasped."""
@@ -120,8 +118,6 @@ def _above(
     over = np.all(np.abs(p[:, :2]) < half, axis=1) & (p[:, 2] > container.size_m[2])
     return bool(over.any())
 
-
-# --- Executing a plan on the cell, with the events that say what was going on.
 
 SETTLE_S = 0.8
 """The arm waits after a plan, so that the final state is seen at rest."""

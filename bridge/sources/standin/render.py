@@ -287,8 +287,6 @@ def _shade(normals: Float[np.ndarray, "num_rays 3"]) -> Float[np.ndarray, " num_
     return np.asarray(light, dtype=np.float32)
 
 
-# --- From what an ideal camera sees to what a cheap one delivers.
-
 GAP_AT_EDGE_FRACTION = 0.6
 """Share of pixels without depth beside a jump in depth, where a stereo pair finds no match."""
 EDGE_JUMP = 0.05

@@ -18,7 +18,7 @@ from bridge.task.meshes.toys import Paint
 from bridge.task.robot import FINGER_LINKS
 from bridge.task.task_file import ObjectModel, Task
 
-# --- Surface colours of the laboratory, made from a seed: wood, patches, floor, walls.
+# Surface colours of the laboratory, made from a seed: wood, patches, floor, walls.
 #
 # A texture is a picture laid over a rectangle of a plane; features are several millimetres wide
 # so that a camera half a metre away sees them without aliasing.

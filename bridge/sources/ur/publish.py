@@ -33,8 +33,6 @@ from bridge.terminal import Output
 from bridge.wire.qos import Qos
 from bridge.wire.session import WireSession
 
-# --- Turns the samples of a UR arm into messages and publishes them, numbered by the robot's time.
-
 SLOW_HZ = 125.0
 """The gripper and the transform of the tool change slowly enough for this rate."""
 LONGEST_GAP_S = 3600.0
