@@ -8,26 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from bridge.clock import AnchoredClock
-from bridge.episode.topics import (
-    COLOR_IMAGE,
-    COLOR_INFO,
-    DEPTH_IMAGE,
-    DEPTH_INFO,
-    EVENT,
-    GRIPPER_STATE,
-    JOINT_STATES,
-    PLAN,
-    PLAN_PATH,
-    PLAN_TRAJECTORY,
-    ROBOT_DESCRIPTION,
-    TCP_POSE,
-    TF,
-    TF_STATIC,
-    TRUTH,
-    camera_topic,
-    cell_topic,
-    object_topic,
-)
+from bridge.episode import topics
 from bridge.errors import BridgeError
 from bridge.sources.standin.cell import CellConfig, StandinCell, StoppedError
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
@@ -108,18 +89,30 @@ class StandinSource:
         """Those of a real cell, and the truth that only tests and perception metrics read."""
         task = load_task(self.config.task)
         cell, cameras = self.config.cell, load_cell(self.config.cell_file or task.cell).cameras
-        endings = (COLOR_IMAGE, COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO)
-        of_cell = (JOINT_STATES, GRIPPER_STATE, TCP_POSE, PLAN, PLAN_TRAJECTORY, PLAN_PATH, EVENT)
+        endings = (topics.COLOR_IMAGE, topics.COLOR_INFO, topics.DEPTH_IMAGE, topics.DEPTH_INFO)
+        of_cell = (
+            topics.JOINT_STATES,
+            topics.GRIPPER_STATE,
+            topics.TCP_POSE,
+            topics.PLAN,
+            topics.PLAN_TRAJECTORY,
+            topics.PLAN_PATH,
+            topics.EVENT,
+        )
         soft = [key for key, model in task.objects.items() if model.soft is not None]
         return (
-            *(cell_topic(cell, ending) for ending in of_cell),
-            *(camera_topic(cell, camera, ending) for camera in cameras for ending in endings),
-            *(object_topic(TRUTH, key, "pose") for key in task.objects),
-            *(object_topic(TRUTH, key, "nodes") for key in soft),
+            *(topics.cell_topic(cell, ending) for ending in of_cell),
+            *(
+                topics.camera_topic(cell, camera, ending)
+                for camera in cameras
+                for ending in endings
+            ),
+            *(topics.object_topic(topics.TRUTH, key, "pose") for key in task.objects),
+            *(topics.object_topic(topics.TRUTH, key, "nodes") for key in soft),
             TRUTH_PARAMETERS,
-            TF,
-            TF_STATIC,
-            ROBOT_DESCRIPTION,
+            topics.TF,
+            topics.TF_STATIC,
+            topics.ROBOT_DESCRIPTION,
         )
 
     def run(self, session: "WireSession", stop: threading.Event, output: Output) -> dict[str, Any]:
