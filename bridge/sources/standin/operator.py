@@ -16,6 +16,7 @@ from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.topics import GATE, cell_topic
 from bridge.errors import BridgeError, UsageError
 from bridge.geometry import se3
+from bridge.robots.default import MAX_WIDTH_M, ROBOT_NAME
 from bridge.sources.standin.cell import StandinCell, TruthLog
 from bridge.sources.standin.kinematics import UnreachablePoseError
 from bridge.sources.standin.planner import (
@@ -35,7 +36,6 @@ from bridge.sources.standin.settings import (
 from bridge.sources.standin.streams import Session
 from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success, objects_done
-from bridge.task.robot import MAX_WIDTH_M, ROBOT_NAME
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from bridge.terminal import Output
