@@ -51,7 +51,7 @@ def demo(run: Path, /, *, config: DemoConfig = DEMO, output: Output = OUTPUT) ->
     Example: robot-gst demo runs/demo --quick
 
     Args:
-        run: Run folder; made where needed. Episodes already there are kept and used.
+        run: Run folder; made where needed. The same command again goes on where it was stopped.
         config: How much to do.
         output: How to talk.
     """
