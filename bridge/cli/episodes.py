@@ -138,10 +138,11 @@ def doctor(*, output: Output = OUTPUT) -> int:
     from bridge.doctor import examine
 
     findings = examine()
-    lines = [
-        f"{'ok  ' if item.ok else 'MISS'} {item.what:<28} {item.found:<12} {item.advice}".rstrip()
-        for item in findings
-    ]
+    lines = []
+    for item in findings:
+        line = f"{'ok  ' if item.ok else 'MISS'} {item.what:<28} {item.found:<12}"
+        apart = "\n     " if len(line) + len(item.advice) >= 80 else " "
+        lines.append(f"{line.rstrip()}{apart}{item.advice}".rstrip())
     output.result({"findings": [asdict(item) for item in findings]}, "\n".join(lines))
     return 0 if all(item.ok for item in findings) else 1
 
