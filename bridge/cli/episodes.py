@@ -221,7 +221,7 @@ def ls(
         output: How to talk.
     """
     entries = _find(run, query, output)
-    lines = _table(entries) if entries else [f"no episode in {run} passes these filters"]
+    lines = episode_table(entries) if entries else [f"no episode in {run} passes these filters"]
     output.result({"episodes": [vars(entry) for entry in entries]}, "\n".join(lines))
     return 1 if any(entry.error for entry in entries) else 0
 
@@ -254,7 +254,7 @@ WRAPPED = textwrap.TextWrapper(
 )
 
 
-def _table(entries: "list[Entry]") -> list[str]:
+def episode_table(entries: "list[Entry]") -> list[str]:
     """A header, a row for each episode within 80 columns, and below it what is special about it."""
     rows = [COLUMNS, *(_row(entry) for entry in entries)]
     widths = [

@@ -126,14 +126,3 @@ def describe_answer(answer: dict[str, Any]) -> str:
             f"{answer['undecodable']} undecodable, {answer['duration_s']:.1f} s"
         )
     return f"{answer['episode']}: ok"
-
-
-def describe_list(answer: dict[str, Any]) -> str:
-    """One line for each episode."""
-    lines = [
-        f"{item['id']:<24} {item['kind']:<8} {item['outcome']:<8} {item['duration_s']:>7.1f} s  "
-        f"{item['task'] or item['error']}"
-        for item in answer["episodes"]
-    ]
-    left_out = answer["of"] - len(lines)
-    return "\n".join([*([f"({left_out} more before these)"] if left_out else []), *lines])

@@ -137,6 +137,7 @@ def _summary(operator: Operator, config: SessionConfig, *, stopped: bool) -> dic
         "probes": operator.num_probes,
         "outcomes": {condition: dict(counter) for condition, counter in counts.items()},
         "objects": objects,
+        "unknown": {i.id: o.detail for i, o in operator.results if o.result == "unknown"},
         "stopped": stopped,
     }
 
@@ -150,6 +151,7 @@ def describe(summary: dict[str, Any]) -> str:
         sums = summary["objects"].get(condition)
         told = f"; {sums['k']} of {sums['n']} objects" if sums else ""
         lines.append(f"  {condition}: {total} trials, {listed}{told}")
+    lines += [f"  {name} unknown: {why}" for name, why in summary.get("unknown", {}).items()]
     if summary.get("probes"):
         lines.append(f"  {summary['probes']} probes")
     if summary["stopped"]:
