@@ -6,8 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bridge.terminal import Output
-from dashboards.config import DashboardConfig
-from dashboards.demo import DemoConfig
+from dashboards.config import DashboardConfig, DemoConfig
 
 OUTPUT = Output()
 DASHBOARD = DashboardConfig()
