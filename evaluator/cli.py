@@ -107,6 +107,7 @@ def _compare(
 ) -> "tuple[Comparison, Path]":
     from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError
+    from bridge.exchange.trials_csv import trials_path
     from evaluator.cache import FOLDER, SummaryCache
     from evaluator.compare import compare_csv, compare_run
 
@@ -119,7 +120,7 @@ def _compare(
             raise UsageError(message)
         return compare_csv(source, method=interval, goal=goal), beside
     run = RunFolder.open(source)
-    if not (run.notes_dir / "trials.csv").is_file():  # outcomes that were imported
+    if not trials_path(run).is_file():
         run.refuse_empty()
     with SummaryCache(run.results_dir / FOLDER, fresh=force, say=output.say) as cache:
         comparison = compare_run(

@@ -29,9 +29,6 @@ from bridge.sources.standin.kinematics import (
 from bridge.task.plan import Plan, Stage
 from bridge.task.task_file import ObjectModel, Task
 
-# --- The stages that the scripted planner's plans state: those of the task, with what they
-# predict.
-
 
 @dataclass(frozen=True, kw_only=True)
 class StageIds:
