@@ -1,4 +1,4 @@
-"""Soft bodies as lattices of tetrahedra: what they are made of, and whether they hold."""
+"""Soft bodies as lattices of tetrahedra: geometry, coarser lattices, material, and health."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

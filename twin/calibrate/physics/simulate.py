@@ -94,10 +94,10 @@ def _live(
             first, last = int(begin_s * rate), min(int(np.ceil(end_s * rate)), steps)
             world.reset_robot(targets[first], float(widths[first]))
             for step in range(first, last):
-                world.command(targets[step + 1], velocities[step], float(widths[step]))
+                world.robot.command(targets[step + 1], velocities[step], float(widths[step]))
                 world.step()
                 if step in holds:
-                    held[step] = world.width_m()
+                    held[step] = world.robot.width_m()
         success = _settle(world, case, statics, targets[-1], float(widths[-1]))
         settled = np.stack([planar(world.T_base_object(key)) for key in case.objects])
     return Prediction(
@@ -140,7 +140,7 @@ def _settle(
     at_rest = np.zeros(len(joints_rad))
     before: Float[np.ndarray, "num_objects 7"] | None = None
     for step in range(round(SETTLE_S * rate)):
-        world.command(joints_rad, at_rest, width_m)
+        world.robot.command(joints_rad, at_rest, width_m)
         world.step()
         if case.success is None and step % round(REST_S * rate) == 0:
             now = np.array([world.object_pose(key) for key in case.objects])
