@@ -114,7 +114,7 @@ def test_distances_that_cannot_be_read_are_no_free_way(run: RunFolder) -> None:
     with pytest.raises(UnreadableArraysError, match=r"sdf\.npz: .*robot-gst rebuild RUN --force"):
         read_rebuilt_scene(run, TASK)
     write_distances(run, np.nan)
-    with pytest.raises(UnreadableArraysError, match=r"sdf\.npz: a distance is no number"):
+    with pytest.raises(UnreadableArraysError, match=r"sdf\.npz: a distance is not finite"):
         read_rebuilt_scene(run, TASK)
     write_distances(run, -0.1)
     assert read_rebuilt_scene(run, TASK).static_sdf is not None
