@@ -25,7 +25,7 @@ def lattice_of_task(stretch: float = 1.0) -> Lattice:
     """The task's own lattice as a scene would hold it."""
     body = SoftModel.from_task(TASK.objects["sloth"])
     nodes = body.nodes_m * np.array([stretch, 1.0, 1.0], dtype=np.float32)
-    edges = body.edges().astype(np.int32)
+    edges = body.rest_edges[0].astype(np.int32)
     lengths = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
     return Lattice(
         nodes_m=nodes.astype(np.float32),
