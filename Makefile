@@ -1,5 +1,6 @@
 # make demo    the whole loop on a stand-in cell, ends with the dashboard's address
 # make test    all tests that need no device   make check   lint, types, import contracts
+# make mutants changes one line of the code at a time: does a test near by notice? (20 min a core)
 # make soak    kills, cuts, fuzzing, endurance at full size (minutes), smaller in make test
 # make bench   benchmarks against named references; BENCH=record picks those of the recorder
 # make sanitize  C++ under ASan and UBSan   make tidy  clang-tidy   make cross  C++ for aarch64
@@ -22,10 +23,10 @@ BENCH ?=
 export OMP_WAIT_POLICY ?= passive
 unexport PYTHONDONTWRITEBYTECODE # else every process a test starts would compile the packages again
 
-.PHONY: help setup demo test soak fast check format bench sanitize tidy cross wheel-test clean
+.PHONY: help setup demo test soak mutants fast check format bench sanitize tidy cross wheel-test clean
 
 help:
-	@sed -n '1,8s/^# //p' Makefile
+	@sed -n '1,9s/^# //p' Makefile
 
 setup: $(READY)
 
@@ -54,6 +55,9 @@ soak: $(READY)
 		tests/bridge/episode/test_writer_killed.py tests/bridge/episode/test_catalogue_at_scale.py \
 		tests/bridge/episode/test_recover.py tests/fuzz \
 		tests/bridge/record/faults/test_killed_recorders.py tests/bridge/record/faults/test_endurance.py
+
+mutants: $(READY)
+	@$(BIN)/python tests/mutants/mutants.py $(MUTANTS)
 
 fast: $(READY)
 	@$(PYTEST) -n 2 --max-worker-restart=1 --dist loadfile $(TEST)

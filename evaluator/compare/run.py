@@ -14,6 +14,7 @@ from evaluator.compare.bands import BandReport, compare_bands
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.gains import START_LIMIT_M
 from evaluator.compare.images.renders import compare_renders
+from evaluator.compare.images.scores import open_nets
 from evaluator.compare.images.views import ViewReport, compare_views
 from evaluator.compare.labels import label_results
 from evaluator.compare.measure import Part
@@ -25,7 +26,6 @@ from evaluator.compare.states import state_results
 from evaluator.compare.summaries import evaluation_pool, sum_up
 from evaluator.compare.trial import Trial, lay_out
 from evaluator.metrics.image_protocol import ImageOptions
-from evaluator.metrics.lpips import open_nets
 from evaluator.result import Exclusion
 from evaluator.run_reader.contents import ODD, RunContents, broken, read_contents
 from evaluator.run_reader.episodes import DerivedIndex

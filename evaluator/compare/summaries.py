@@ -13,10 +13,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from bridge.data_files import dataset_file
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.process_pool import SERIAL, ProcessPool, Serial, cores
-from bridge.task.data import dataset_file
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
 from evaluator.compare.known_task import known_task

@@ -18,7 +18,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import CAMERAS, DEPTH_IMAGE, DEPTH_INFO, TARGET_POSE, is_truth
 from bridge.errors import BridgeError, GstError, UsageError
 from bridge.geometry import se3
-from bridge.task.robot import BASE_FRAME
+from bridge.robots.default import BASE_FRAME
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.hand_eye import TargetCamera, find_camera

@@ -19,8 +19,8 @@ from jaxtyping import Float
 
 from bridge.episode.topics import ROBOT_DESCRIPTION
 from bridge.errors import GstError
+from bridge.robots.default import BASE_FRAME
 from bridge.task.plan import Plan
-from bridge.task.robot import BASE_FRAME
 from bridge.task.task_file import ObjectModel, Task
 from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
-from bridge.task.robot import ARM_JOINTS, FINGER_JOINTS, FINGER_LINKS, MAX_WIDTH_M, TCP_FRAME
+from bridge.robots.default import ARM_JOINTS, FINGER_JOINTS, FINGER_LINKS, MAX_WIDTH_M, TCP_FRAME
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet

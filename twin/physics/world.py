@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.task.robot import BASE_FRAME, TCP_FRAME
+from bridge.robots.default import BASE_FRAME, TCP_FRAME
 from twin.physics.arm import Arm, Hulls, PhysicsError, Press
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import give_client_back, pybullet, take_client

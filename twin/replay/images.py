@@ -21,7 +21,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
 from bridge.media.color import encode_jpeg
-from bridge.task.robot import BASE_FRAME
+from bridge.robots.default import BASE_FRAME
 from twin.replay.dynamics import soft_models
 from twin.replay.rebuilt_scene import Correction
 from twin.replay.result import ReplayResult

@@ -32,9 +32,8 @@ from bridge.episode.topics import (
     object_topic,
 )
 from bridge.episode.writer import EpisodeWriter
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME, GRIPPER, GRIPPER_WIDTH
 from bridge.task.plan import Plan, Stage
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME, GRIPPER
-from twin.replay.execution import GRIPPER_WIDTH
 from twin.replay.result import ReplayResult, stretches_ns
 
 MIN_CLEARANCE = "min_clearance_m"

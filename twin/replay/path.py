@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M
 from bridge.task.plan import Plan, Waypoint
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M
 from twin.errors import TwinError
 from twin.replay.clearance.bodies import own_links
 from twin.replay.config import ReplayConfig

@@ -387,14 +387,9 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
     See ``twin.replay.runner.replay_trajectories``, and what ``runner_for`` raises.
 
     Raises:
-        UsageError: When the folder is not a run.
+        UsageError: When the folder holds no episode.
     """
-    if not run.episodes_dir.is_dir():
-        message = (
-            f"{run.path} is not a run: it holds no folder episodes. "
-            "Give the folder that episodes/ lies in."
-        )
-        raise UsageError(message)
+    run.refuse_empty()
     with runner_for(config) as runner:
         # A second, in which a cluster starts its processes.
         from twin.replay.runner import replay_trajectories  # noqa: PLC0415

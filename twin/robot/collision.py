@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
-from bridge.task.robot import FINGER_LINKS
+from bridge.robots.default import FINGER_LINKS
 from twin.robot.model import RobotDescriptionError, RobotModel
 
 # Convex hulls of the robot's links, the one shape that pinocchio, coal and PyBullet all share.

@@ -11,7 +11,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack, joint_track, robot_description
 from bridge.episode.topics import GRIPPER_STATE, ROBOT_DESCRIPTION
 from bridge.errors import EpisodeError
-from bridge.task.robot import ARM_JOINTS
+from bridge.robots.default import ARM_JOINTS
 from twin.errors import TwinError
 from twin.robot.model import RobotDescriptionError
 
@@ -81,7 +81,7 @@ class Posture:
     """One configuration of arm and gripper."""
 
     joints_rad: Float[np.ndarray, " num_joints"]
-    """In the order of ``bridge.task.robot.ARM_JOINTS``."""
+    """In the order of ``bridge.robots.default.ARM_JOINTS``."""
     width_m: float = 0.0
     """Opening of the gripper."""
 

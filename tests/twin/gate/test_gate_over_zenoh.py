@@ -184,7 +184,7 @@ def test_a_replay_that_hangs_or_raises_is_null_on_the_wire_and_in_the_log(
     def replay(plan: Plan, *rest: Any) -> Verdict:
         if next(kinds) == "raise":
             raise ZeroDivisionError("oops")
-        go_on.wait(5)
+        go_on.wait()
         return accept(plan)
 
     a_gate(router, LiveView("lab"), replay, lambda *_: everything_at(), deadline_s=0.4)
@@ -194,9 +194,7 @@ def test_a_replay_that_hangs_or_raises_is_null_on_the_wire_and_in_the_log(
     raised = ask(cell)
     assert (raised.accepted, raised.reason) == (None, "internal error: ZeroDivisionError: oops")
     assert "oops" in capsys.readouterr().err
-    started = time.monotonic()
-    hung = ask(cell)
-    assert time.monotonic() - started < 3.0
+    hung = ask(cell)  # comes while the replay still hangs, or never
     assert hung.accepted is None
     assert "not done at the wall-clock limit of 0.4 s" in str(hung.reason)
     behind = ask(cell)
@@ -217,7 +215,7 @@ def test_plans_that_may_not_wait_are_told_at_once_on_the_wire(
 
     def replay(plan: Plan, *_: Any) -> Verdict:
         inside.release()
-        go_on.wait(8)
+        go_on.wait()
         return accept(plan)
 
     a_gate(router, LiveView("lab"), replay, lambda *_: everything_at(), waiting=0)
@@ -226,9 +224,8 @@ def test_plans_that_may_not_wait_are_told_at_once_on_the_wire(
     first = threading.Thread(target=lambda: answers.append(ask(cell)))
     first.start()
     assert inside.acquire(timeout=5)
-    started = time.monotonic()
     turned_away = ask(cell)
-    assert time.monotonic() - started < 2.0
+    assert answers == [], "the first plan is still being judged"
     assert turned_away.accepted is None
     assert "ask later" in str(turned_away.reason)
     go_on.set()

@@ -35,10 +35,8 @@ def test_a_process_stopped_between_two_plans_holds_no_more_than_one(twin: TwinPr
     assert asked(twin, "1 + 1") == 2
     assert twin._worker is not None
     os.kill(twin._worker.pid, signal.SIGSTOP)
-    started = time.monotonic()
     with pytest.raises(UndecidedError, match=r"wall-clock limit .*; it was stopped"):
         asked(twin, "1 + 1" + " " * 3_000_000, within_s=0.2)
-    assert time.monotonic() - started < 5
     assert asked(twin, "2 + 2") == 4
 
 

@@ -12,10 +12,13 @@ from bridge.task.verdict import Verdict
 
 
 def test_reading_a_plan_counts_towards_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = [time.monotonic()]
+
     def slowly(payload: bytes) -> Plan:
-        time.sleep(0.3)
+        now_s[0] += 0.3
         return PLAN
 
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
     monkeypatch.setattr(Plan, "from_json", staticmethod(slowly))
     verdict = gate_with(deadline_s=0.2).judge(b"a plan")
     assert verdict.accepted is None
@@ -26,13 +29,11 @@ def test_a_replay_past_the_wall_clock_limit_is_null_and_the_next_plan_waits_for_
     go_on = threading.Event()
 
     def slow(plan: Plan, poses: dict[str, Any], urdf: str, ends_s: float) -> Verdict:
-        go_on.wait(5)
+        go_on.wait()
         return accept(plan, poses, urdf)
 
     gate = gate_with(replay=slow, deadline_s=0.05)
-    started = time.monotonic()
-    late = gate.judge(PLAN.to_json())
-    assert time.monotonic() - started < 2.0
+    late = gate.judge(PLAN.to_json())  # comes while the replay still waits, or never
     assert late.accepted is None
     assert "not done at the wall-clock limit of 0.05 s (--deadline)" in str(late.reason)
     next_one = gate.judge(PLAN.to_json())

@@ -15,8 +15,8 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
+from bridge.robots.default import ARM_JOINTS, MAX_WIDTH_M
 from bridge.task.plan import Plan
-from bridge.task.robot import ARM_JOINTS, MAX_WIDTH_M
 from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output
 from twin.errors import TwinError

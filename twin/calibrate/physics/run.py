@@ -14,7 +14,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.process_pool import default_size
-from bridge.task.robot import ARM_JOINTS
+from bridge.robots.default import ARM_JOINTS
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.physics.cases import Case, read_cases

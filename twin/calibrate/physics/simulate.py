@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.process_pool import Failed, ProcessPool
+from bridge.robots.default import GRIPPER_LINKS
 from bridge.task.predicate import Rollout, all_hold, evaluate_success
-from bridge.task.robot import GRIPPER_LINKS
 from twin.calibrate.physics.cases import Case, Prediction, planar
 from twin.calibrate.physics.parameters import (
     BIAS,

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry.box import box_corners
-from bridge.task.robot import GRIPPER_LINKS
+from bridge.robots.default import GRIPPER_LINKS
 from bridge.task.task_file import ObjectModel
 from twin.replay._clearance import Bounds
 from twin.robot.collision import RobotHulls, convex_hull

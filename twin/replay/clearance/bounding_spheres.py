@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int32
 from scipy.spatial import ConvexHull, cKDTree
 
-from bridge.task.robot import GRIPPER_LINKS
+from bridge.robots.default import GRIPPER_LINKS
 from twin.replay._clearance import nearest
 from twin.replay.clearance.distance_grid import GridLookup
 from twin.robot.collision import RobotHulls

@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
+from bridge.robots.default import ARM_JOINTS, FINGER_LINKS
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan, Stage
 from bridge.task.predicate import Contact
-from bridge.task.robot import ARM_JOINTS, FINGER_LINKS
 from twin.replay.clearance.bodies import GRIPPER, group_of, placement_of, planes_of
 from twin.replay.clearance.surroundings import Pair, Surroundings
 from twin.replay.config import ReplayConfig

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.geometry.box import box_corners
-from bridge.task.robot import GRIPPER_LINKS, MAX_WIDTH_M
+from bridge.robots.default import GRIPPER_LINKS, MAX_WIDTH_M
 from twin.replay.clearance.bodies import (
     SCENE,
     TABLE,

@@ -18,7 +18,7 @@ from bridge.episode.streams import RgbdFrame
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.task.robot import BASE_FRAME
+from bridge.robots.default import BASE_FRAME
 from bridge.terminal import Output
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import PostureTrack, distinct_postures, posture_track
@@ -93,8 +93,9 @@ class RobotFrames:
         if surface is None:
             return points, view
         owner = self._keep(episode, frame.stamp_ns, surface, points)
-        masked = _masked(view, surface, self.T_base_root @ view.T_base_color)
-        return points.take(owner < 0), masked
+        T_base_color = self.T_base_root @ view.T_base_color
+        shown = robot_mask(surface, view.half.camera, T_base_color, view.half.depth_m)
+        return points.take(owner < 0), view.without(shown)
 
     def collect(self, episode: Episode, stamp_ns: int, points: PointSet) -> None:
         """Keep the robot's points of a frame that the background does not need."""
@@ -133,7 +134,12 @@ class RobotFrames:
             poses = link_poses(tracked.robot, tracked.track.at(stamp_ns))
             for link in {surface.links[index] for index in np.unique(owner[owner >= 0])}:
                 mine = np.isin(owner, [i for i, name in enumerate(surface.links) if name == link])
-                moved = _moved(points.take(mine), se3.invert(poses[link]) @ T)
+                T_link_root, own = se3.invert(poses[link]) @ T, points.take(mine)
+                moved = replace(
+                    own,
+                    p_m=as_float32(se3.apply(T_link_root, own.p_m.astype(np.float64))),
+                    normals=as_float32(own.normals @ T_link_root[:3, :3].T),
+                )
                 self._points.setdefault(link, []).append(moved)
         return owner
 
@@ -173,21 +179,6 @@ class RobotFrames:
         posture = tracked.track.at(stamp_ns)
         robot = posed(links, posture.joints_rad, tracked.track.urdf, width_m=posture.width_m)
         return concatenate([cloud, moved_cloud(robot, se3.invert(self.T_base_root))])
-
-
-def _moved(points: PointSet, T_link_base: Float[np.ndarray, "4 4"]) -> PointSet:
-    return replace(
-        points,
-        p_m=as_float32(se3.apply(T_link_base, points.p_m.astype(np.float64))),
-        normals=as_float32(points.normals @ T_link_base[:3, :3].T),
-    )
-
-
-def _masked(
-    view: TrainingView, surface: PosedSurface, T_base_camera: Float[np.ndarray, "4 4"]
-) -> TrainingView:
-    """Mark the pixels that show the robot as not static, at both sizes."""
-    return view.without(robot_mask(surface, view.half.camera, T_base_camera, view.half.depth_m))
 
 
 def robot_mask(

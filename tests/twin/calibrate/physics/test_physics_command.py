@@ -20,8 +20,8 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import JointTrack
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
+from bridge.robots.default import ARM_JOINTS
 from bridge.task.plan import Plan, Waypoint
-from bridge.task.robot import ARM_JOINTS
 from bridge.task.task_file import Task
 from twin.calibrate.physics import cases as cases_module
 from twin.calibrate.physics import run as physics_run

@@ -1,4 +1,4 @@
-"""Probes lived through in the replays' own physics: laws of friction, and parameters recovered."""
+"""Probes simulated in the replays' own physics: laws of friction, and parameters recovered."""
 
 import os
 import signal
@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
+from bridge.robots.default import MAX_WIDTH_M, ROBOT
 from bridge.sources.standin.cell_file import load_cell
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.probes import plan_probe
 from bridge.task.plan import Plan
-from bridge.task.robot import MAX_WIDTH_M, ur5_with_gripper_urdf
 from bridge.task.task_file import load_task
 from twin.calibrate.physics import simulate
 from twin.calibrate.physics.cases import Case, Prediction, planar
@@ -71,7 +71,7 @@ def case_of(kind: str, T: np.ndarray, number: int = 0) -> Case:
         sha256=f"{number:064x}",
         kind=kind,
         task=TASK,
-        urdf=ur5_with_gripper_urdf(),
+        urdf=ROBOT.urdf_text(),
         joint_times_s=times_s,
         joints_rad=np.array([w.joints_rad for w in plan.tau], dtype=np.float64),
         # A width holds for the time before its waypoint, as the cell executes it.
@@ -177,7 +177,7 @@ def test_friction_of_simulated_slides_is_recovered_within_its_interval_in_proces
 
 
 def test_only_the_gripper_collides() -> None:
-    text = gripper_only(ur5_with_gripper_urdf())
+    text = gripper_only(ROBOT.urdf_text())
     assert text.count("<collision") == 3
     assert "<visual" not in text
 

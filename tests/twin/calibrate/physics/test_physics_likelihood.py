@@ -142,11 +142,9 @@ def scattered(
     ]
 
 
-def worth(
-    cases: list[Case], pose: np.ndarray, beliefs: DiscrepancyPosterior | None = None
-) -> Score:
+def worth(cases: list[Case], pose: np.ndarray, prior: DiscrepancyPosterior | None = None) -> Score:
     said = Prediction(settled=pose[None], held_widths_m=np.zeros(0), success=np.nan)
-    return score(observations_of(cases, 0), features_of(cases, [said] * len(cases)), prior=beliefs)
+    return score(observations_of(cases, 0), features_of(cases, [said] * len(cases)), prior=prior)
 
 
 def test_what_some_episodes_teach_of_errors_is_taken_to_the_next_by_the_rule_of_bayes() -> None:
