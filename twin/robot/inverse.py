@@ -32,6 +32,7 @@ class IkSolution:
 
     joints_rad: Float[np.ndarray, " num_joints"]
     position_error_m: float
+    rotation_error_rad: float
     reached: bool
     """Whether both errors are within the tolerance."""
 
@@ -115,6 +116,7 @@ def _descend(
     return IkSolution(
         joints_rad=accepted,
         position_error_m=position,
+        rotation_error_rad=rotation,
         reached=last < math.inf  # nothing was tried of a pose that is no number
         and position <= config.position_tolerance_m
         and rotation <= config.rotation_tolerance_rad,
