@@ -485,7 +485,7 @@ class ProcessPool:
                 failed.append(worker)  # it ended, or came to load newer code than ours
         for worker in self.workers:
             try:
-                while worker not in self._preparing and shared.has_room(worker):
+                while worker not in self._preparing and shared.wants_more(worker):
                     shared.ask(worker, 1 + len(self.workers))
             except WorkerLostError:
                 failed.append(worker)
@@ -523,7 +523,7 @@ class _Shared(Generic[Item, Result]):
         """Whether this process has something to do."""
         return self._next < len(self.items) or bool(self._again)
 
-    def has_room(self, worker: Worker) -> bool:
+    def wants_more(self, worker: Worker) -> bool:
         """Whether there is an item nobody has had, for a process that has few."""
         return self._next < len(self.items) and len(self.asked.get(worker, ())) < AHEAD
 
