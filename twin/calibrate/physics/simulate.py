@@ -52,7 +52,7 @@ def predict(
         num_samples: Noisy starts of a judged trial.
     """
     physics = apply_values(values, config)
-    nominal = _live(case, values, physics, np.zeros((len(case.objects), 3)))
+    nominal = _simulated(case, values, physics, np.zeros((len(case.objects), 3)))
     success = float("nan")
     if case.success is not None and num_samples > 0:
         seed = int(case.sha256[:15] or "0", 16)
@@ -62,12 +62,12 @@ def predict(
             noise = np.stack(
                 [rng.multivariate_normal(np.zeros(3), C) for C in case.start_covariance]
             )
-            results.append(_live(case, values, physics, noise).success)
+            results.append(_simulated(case, values, physics, noise).success)
         success = float(np.mean(results))
     return Prediction(settled=nominal.settled, held_widths_m=nominal.held_widths_m, success=success)
 
 
-def _live(
+def _simulated(
     case: Case,
     values: Mapping[str, float],
     physics: PhysicsConfig,
