@@ -1,4 +1,8 @@
-"""``robot-gst calibrate RUN --cameras``: each camera by what was recorded of it."""
+"""``robot-gst calibrate RUN --cameras``: each camera from what was recorded of it.
+
+From pose pairs of a target where there are some; otherwise, when it stands still, from the robot
+in its depth images.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -120,10 +124,7 @@ def find_fixed_camera(
     nominal = _nominal_pose(chosen[0], camera_id)
     config = AlignConfig(seed=seed)
     try:
-        if nominal is None:
-            alignment = align_robot(views, robot, config=config)
-        else:
-            alignment = align_robot(views, robot, start=nominal, config=config)
+        alignment = align_robot(views, robot, start=nominal, config=config)
     except RobotNotAlignedError:
         if nominal is None:
             raise

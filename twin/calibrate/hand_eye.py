@@ -1,7 +1,10 @@
-"""AX = ZB from noisy pose pairs: refined, robust, with intervals, or refused with a reason.
+"""Hand-eye calibration: AX = ZB from noisy pose pairs, with intervals, or refused with a reason.
 
-See ``closed_form`` for what A, B, X and Z are. The misfit of a pair is E = (Z B)^-1 A X: what is
-left between the two ways to the same frame. It does not change with the choice of base frame.
+With a camera in the hand, A is ``T_base_hand``, B is ``T_target_camera``, X is ``T_hand_camera``
+and Z is ``T_base_target``. With a fixed camera and the target in the hand, B is
+``T_camera_target``, X is ``T_hand_target`` and Z is ``T_base_camera``. Closed forms give the
+start; a robust least squares refines it. The misfit of a pair is E = (Z B)^-1 A X: what is left
+between the two ways to the same frame. It does not change with the choice of base frame.
 """
 
 from dataclasses import dataclass
@@ -13,12 +16,6 @@ from bridge.geometry import se3
 from twin.calibrate.config import Mount
 from twin.calibrate.pairs import PosePairs
 from twin.errors import TwinError
-
-# Closed-form solutions of AX = XB and AX = ZB; where ``robot_world`` starts refining from.
-# Both describe one set of pose pairs. With a camera in the hand, A is ``T_base_hand``, B is
-# ``T_target_camera``, X is ``T_hand_camera`` and Z is ``T_base_target``. With a fixed camera and
-# the target in the hand, B is ``T_camera_target``, X is ``T_hand_target`` and Z is
-# ``T_base_camera``.
 
 MAX_MOTIONS = 2000
 """Motions between pairs of poses that are used; more change nothing but the time."""
@@ -164,7 +161,7 @@ def solve(
 
     Args:
         Ts_a: Poses from the robot.
-        Ts_b: Poses from the camera; see ``closed_form``.
+        Ts_b: Poses from the camera; see the module.
         seed: Of the resampling.
 
     Raises:

@@ -1,4 +1,4 @@
-"""How a soft body is handed to the native solver: masses, damping, where contact is looked for."""
+"""How soft bodies, and the convex pieces they touch, are handed to the native solver."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence

@@ -1,4 +1,9 @@
-"""Success as a probability: replays of varied starts and settings, and what they add up to."""
+"""Success probability by Monte Carlo: replays of varied starts and settings.
+
+Poses, frictions, forces, masses, stiffnesses and delays are varied. The same seed and the same
+start draw the same variations, whatever plan is replayed, on whichever worker and in whatever
+order (common random numbers: Law, Simulation Modeling and Analysis, ch. 11).
+"""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
@@ -17,11 +22,6 @@ from twin.physics.config import PhysicsConfig
 from twin.replay.config import ReplayConfig, VariationConfig
 from twin.replay.scene import ReplayScene
 from twin.scene.shape.known import yaw_period_rad
-
-# What is not known exactly, drawn: poses, frictions, forces, masses, stiffnesses and delays.
-# The same seed and the same start draw the same variations, whatever plan is replayed, on
-# whichever worker and in whatever order (common random numbers: Law, Simulation Modeling and
-# Analysis, ch. 11).
 
 UPRIGHT = 0.98
 """Cosine of the tilt up to which an object stands."""

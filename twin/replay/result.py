@@ -1,4 +1,4 @@
-"""What a replay says: states over time and the verdict."""
+"""What a replay says: states over time and the verdict, and when something holds in them."""
 
 from dataclasses import dataclass, field
 

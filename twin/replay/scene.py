@@ -1,4 +1,4 @@
-"""What a replay happens in: the task, where its objects were, and the robot."""
+"""What a replay happens in: the task, the robot, and where the objects were localised before it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

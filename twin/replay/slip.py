@@ -1,6 +1,6 @@
 """Whether a plan's grasps hold: how far a carried object moves in the hand.
 
-What moves in the hand is held by a hair: a little less friction or force, and it is dropped. On
+What moves in the hand is barely held: a little less friction or force, and it is dropped. On
 soft toys this margin tells right yes from wrong yes about as well as swing and lever do, and better
 than forces and contacts (docs/decisions/0018-replay-and-gate.md).
 """

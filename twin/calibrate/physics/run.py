@@ -1,4 +1,4 @@
-"""``robot-gst calibrate RUN --physics``: everything in order, from the run to the scene."""
+"""``robot-gst calibrate RUN --physics``: fit contact and delay, write the record and its table."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

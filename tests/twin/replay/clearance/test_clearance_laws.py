@@ -11,8 +11,7 @@ from scripted_plans import joints_over
 
 from bridge.geometry import se3
 from bridge.task.plan import Stage
-from twin.replay.clearance import ClearanceMonitor
-from twin.replay.clearance.monitor import State, allowed_pairs, object_travel_m
+from twin.replay.clearance.monitor import ClearanceMonitor, State, allowed_pairs, object_travel_m
 from twin.replay.config import ReplayConfig
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
