@@ -19,7 +19,7 @@ from dashboards import wording
 from dashboards.comparison import Judgement, agrees
 from dashboards.figures import RateGroup, Scatter, scatter
 from evaluator.compare import TrialRow
-from evaluator.compare.measure import slug
+from evaluator.measurements import slug
 from evaluator.result import Exclusion, Measurement
 
 NO_NAME = "-"

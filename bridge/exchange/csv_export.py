@@ -14,7 +14,7 @@ from bridge.episode.catalogue import outcome_of
 from bridge.episode.cdr.messages import JointSample, PoseSample
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import UsageError
+from bridge.episode.topics import GRIPPER_STATE, is_truth
 from bridge.exchange.output import message_named, new_folder, write_note
 from bridge.geometry import se3
 from bridge.task.record import parse_record
@@ -114,7 +114,7 @@ class TableKind:
             type_name == self.type_name
             and topic.endswith(self.ending)
             and not topic.endswith(self.not_ending or ("\0",))
-            and not schema.is_truth(topic)
+            and not is_truth(topic)
         )
 
 
@@ -174,14 +174,14 @@ TABLES = (
         type_name=schema.JOINT_STATE,
         columns=_JOINT,
         rows=_joints,
-        not_ending=("/gripper/state",),
+        not_ending=(GRIPPER_STATE,),
     ),
     TableKind(
         name="gripper",
         type_name=schema.JOINT_STATE,
         columns=_JOINT,
         rows=_joints,
-        ending="/gripper/state",
+        ending=GRIPPER_STATE,
     ),
     TableKind(name="poses", type_name=schema.POSE_STAMPED, columns=_POSE, rows=_poses),
     TableKind(name="events", type_name=schema.EVENT, columns=_EVENT, rows=_events),
@@ -260,11 +260,8 @@ def episode_files(source: Path, *, derived: bool) -> tuple[list[Path], Path]:
     if not source.is_dir():
         return [source], source.parent
     run = RunFolder.open(source)
-    files = run.episodes() + (run.derived() if derived else [])
-    if not files:
-        message = f"no episodes in {source}. Record some: robot-gst record {source}."
-        raise UsageError(message)
-    return files, source
+    run.refuse_empty()
+    return run.episodes() + (run.derived() if derived else []), source
 
 
 def export_csv(

@@ -13,9 +13,9 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
+from bridge.robots.default import ROBOT
 from bridge.sources.standin.kinematics import arm_kinematics
 from bridge.sources.standin.planner import NO_ERROR, plan_pick_and_place
-from bridge.task.robot import ur5_with_gripper_urdf
 from bridge.task.task_file import load_task
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -74,7 +74,7 @@ def write_trial(path: Path) -> None:
         writer.describe(EpisodeInfo(id=path.stem, kind="trial", task=plan.task))
         writer.attach(
             "robot.urdf",
-            ur5_with_gripper_urdf().encode(),
+            ROBOT.urdf_text().encode(),
             media_type="application/xml",
             log_time_ns=1,
         )

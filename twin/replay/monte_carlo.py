@@ -1,7 +1,6 @@
 """Success as a probability: replays of varied starts and settings, and what they add up to."""
 
 import hashlib
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,17 +18,16 @@ from twin.replay.config import ReplayConfig, VariationConfig
 from twin.replay.scene import ReplayScene
 from twin.scene.shape.known import yaw_period_rad
 
-# --- What is not known exactly, drawn: poses, frictions, forces, masses, stiffnesses and delays.
-#
+# What is not known exactly, drawn: poses, frictions, forces, masses, stiffnesses and delays.
 # The same seed and the same start draw the same variations, whatever plan is replayed, on
 # whichever worker and in whatever order (common random numbers: Law, Simulation Modeling and
 # Analysis, ch. 11).
 
 UPRIGHT = 0.98
 """Cosine of the tilt up to which an object stands."""
-STANDS_M = 1e-4
+RESTS_M = 1e-4
 """Localisation puts what stands exactly onto the table; within this counts as exactly [m]."""
-STANDING = (0, 1, 5)
+UNSURE_AXES = (0, 1, 5)
 """What is unsure of an object that stands: x, y and the turn about the vertical."""
 
 
@@ -134,20 +132,20 @@ def _root(
         m, rad = settings.unknown_pose_m**2, settings.unknown_pose_rad**2
         covariance = np.diag([m, m, 0.0, 0.0, 0.0, rad])
     rest_m = scene.table_height_m + model.rest_height_m
-    if T[2, 2] > UPRIGHT and abs(T[2, 3] - rest_m) < STANDS_M:
-        covariance = given_standing(covariance)
+    if T[2, 2] > UPRIGHT and abs(T[2, 3] - rest_m) < RESTS_M:
+        covariance = given_upright(covariance)
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     deviations = settings.pose_scale * np.sqrt(np.maximum(values, 0.0))
     return np.asarray((vectors * deviations) @ vectors.T)
 
 
-def given_standing(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
+def given_upright(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
     """Covariance of x, y and the turn once height and tilt are known; the others become zero.
 
     The conditional of a normal distribution (Schur complement).
     """
-    keep = list(STANDING)
-    known = [index for index in range(6) if index not in STANDING]
+    keep = list(UNSURE_AXES)
+    known = [index for index in range(6) if index not in UNSURE_AXES]
     across = covariance[np.ix_(keep, known)]
     inverse = np.linalg.pinv(covariance[np.ix_(known, known)], hermitian=True)
     left = np.zeros((6, 6))
@@ -175,8 +173,6 @@ def _pose(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
 
 SCHEMA_VERSION = 1
 LEVEL = 0.95
-SLOWER = 1.5
-"""A sample may take this much longer than the longest replay so far."""
 
 Replay = Callable[[ReplayScene, ReplayConfig], Verdict]
 
@@ -214,11 +210,8 @@ def replay_samples(
     *,
     plan_id: str,
     identity: str,
-    ends_s: float | None = None,
-    expected_s: float = 0.0,
-    monotonic: Callable[[], float] = time.monotonic,
 ) -> tuple[Sample, ...]:
-    """Run up to ``config.samples`` varied replays.
+    """Run ``config.samples`` varied replays.
 
     Args:
         replay: Replays one varied start; its verdict counts.
@@ -226,9 +219,6 @@ def replay_samples(
         config: The nominal settings.
         plan_id: Written into the records.
         identity: Of the start; the same one draws the same variations.
-        ends_s: No sample is begun that would not be done by then, on the monotonic clock.
-        expected_s: How long one replay takes, from the nominal one.
-        monotonic: The clock.
 
     Raises:
         UsageError: For a kinematic replay, which moves no objects.
@@ -237,14 +227,9 @@ def replay_samples(
         message = "a kinematic replay moves no objects: it has no success probability. Use dynamic."
         raise UsageError(message)
     samples: list[Sample] = []
-    longest_s = expected_s
     for index in range(config.samples):
-        started_s = monotonic()
-        if ends_s is not None and started_s + SLOWER * longest_s > ends_s:
-            break
         variation = draw_variation(sample_rng(config.seed, identity, index), scene, config)
         samples.append(_sample(replay, scene, config, variation, plan_id, index))
-        longest_s = max(longest_s, monotonic() - started_s)
     return tuple(samples)
 
 

@@ -1,4 +1,4 @@
-"""Draw the rebuilt scene from a recorded or a given camera pose."""
+"""Draw the rebuilt scene, also in another state than scanned: objects moved, the robot posed."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,12 +10,13 @@ from jaxtyping import Float, Float32, UInt16
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import ROBOT_DESCRIPTION
 from bridge.episode.transforms import TransformTree
 from bridge.errors import BridgeError, GstError, UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_png
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME
 from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture, posture_track
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at, unknown_mask
@@ -28,8 +29,6 @@ from twin.scene.robot.splats import posed, read_links
 from twin.scene.settings import RenderConfig
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import SCENE_FILE, Scene, read_scene
-
-# --- A scene in another state than the scanned one: objects moved, the robot in a given posture.
 
 PROBES = 9
 """Instants of an episode at which a camera's place in the hand is looked at."""
@@ -45,7 +44,7 @@ class Composed:
 
     cloud: GaussianCloud
     robot: str
-    """How the robot stands, or in one sentence why it is not drawn."""
+    """How the robot stands, or why it is not drawn."""
     posture: Posture | None
     """None: no robot is drawn."""
 
@@ -72,7 +71,8 @@ def compose(
     cloud = compose_parts(scene.background, objects, places)
     links = read_links(run, scene.record)
     if not links:
-        reason = "the scene has no robot splats" + _because(scene)
+        remark = scene.record.get("robot", {}).get("remark")
+        reason = "the scene has no robot splats" + (f" ({remark})" if remark else "")
         if config.joints is not None:
             message = f"--joints cannot be followed: {reason}."
             raise UsageError(message)
@@ -88,13 +88,8 @@ def compose(
     if root is not None:
         T_base_root = read_pose(root, run.scene_dir / SCENE_FILE)
         robot = moved_cloud(robot, se3.invert(T_base_root))
-    said = "given" if config.joints is not None else f"as {episode.info.id} has it at that time"
-    return Composed(cloud=concatenate([cloud, robot]), robot=f"joints {said}", posture=posture)
-
-
-def _because(scene: Scene) -> str:
-    remark = scene.record.get("robot", {}).get("remark")
-    return f" ({remark})" if remark else ""
+    source = "given" if config.joints is not None else f"as {episode.info.id} has it at that time"
+    return Composed(cloud=concatenate([cloud, robot]), robot=f"joints {source}", posture=posture)
 
 
 def _posture(episode: Episode, stamp_ns: int, config: RenderConfig) -> tuple[str, Posture]:
@@ -114,7 +109,7 @@ def _posture(episode: Episode, stamp_ns: int, config: RenderConfig) -> tuple[str
     if urdf is None:
         raise RobotDescriptionError(
             found=f"is missing in episode {episode.info.id}",
-            hint="Choose an --episode that has /robot_description.",
+            hint=f"Choose an --episode that has {ROBOT_DESCRIPTION}.",
         )
     return urdf, Posture(joints_rad=joints, width_m=config.width_m or 0.0)
 
@@ -182,8 +177,10 @@ def carried_camera(
     robot = load_robot(track.urdf)
     # By the source's clock, which may have little to do with when messages arrived; and where the
     # camera's pose was stated, because in a fast motion what lies between may be off by much.
-    stated = np.array([t for t in tree.stamps_ns(frame_id).tolist() if track.covers(t)])
-    stamps = stated[np.linspace(0, len(stated) - 1, min(PROBES, len(stated))).round().astype(int)]
+    posed_ns = np.array([t for t in tree.stamps_ns(frame_id).tolist() if track.covers(t)])
+    stamps = posed_ns[
+        np.linspace(0, len(posed_ns) - 1, min(PROBES, len(posed_ns))).round().astype(int)
+    ]
     pairs = [
         (robot.T_base_tcp(track.at(stamp).joints_rad), tree.T_root_frame(frame_id, stamp))
         for stamp in stamps.tolist()
@@ -224,7 +221,9 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     scene = read_scene(run)
     episode = _episode(run, scene, config.episode)
     camera_id = _camera_id(episode, config.camera)
-    stamp_ns = _stamp_ns(episode, config.at_s)
+    first_ns = streams.first_stamp_ns(episode)
+    began_ns = episode.start_ns if first_ns is None else first_ns
+    stamp_ns = began_ns + round(config.at_s * 1e9)
     composed = compose(run, scene, episode, stamp_ns, config)
     camera, T_base_camera = _view_of(run, scene, episode, camera_id, stamp_ns, config)
     view = rasteriser.view(composed.cloud, camera, T_base_camera)
@@ -267,11 +266,6 @@ def _episode(run: RunFolder, scene: Scene, wanted: str) -> Episode:
         message = f"no episode {name!r} in {run.path}. There are: {', '.join(episodes) or 'none'}."
         raise UsageError(message)
     return episodes[name]
-
-
-def _stamp_ns(episode: Episode, at_s: float) -> int:
-    first_ns = streams.first_stamp_ns(episode)
-    return (episode.start_ns if first_ns is None else first_ns) + round(at_s * 1e9)
 
 
 def _camera_id(episode: Episode, wanted: str) -> str:

@@ -15,7 +15,8 @@ from bridge.clock import split_ns
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.schema import StampedMessage
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME
+from bridge.episode.topics import EVENT, cell_topic
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME
 
 # --- Messages of one layout, serialised once: only stamp and numbers change from sample to sample.
 #
@@ -113,7 +114,6 @@ def safety_mode_name(number: int) -> str:
 
 CONTROLLER_TCP_FRAME = "tool0_controller"
 """The controller's active tool centre point, as ROS drivers of UR arms call it."""
-GRIPPER_JOINT = "gripper_width"
 SPEED_NAME = "speed_scaling"
 SMALLEST_ANGLE_RAD = 1e-12
 
@@ -207,7 +207,7 @@ def mode_event(
         "data": {"robot_mode": robot, "safety_mode": safety},
     }
     return StampedMessage(
-        topic=f"/{cell}/event",
+        topic=cell_topic(cell, EVENT),
         type_name=schema.EVENT,
         data=json.dumps(record).encode(),
         stamp_ns=stamp_ns,

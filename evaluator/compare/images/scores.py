@@ -6,11 +6,11 @@ Topics end in ``/cam/<id>/`` and ``rendered/image``, ``recorded/image`` (or, in 
 """
 
 import os
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -19,7 +19,15 @@ from jaxtyping import Bool, Float, UInt8
 from bridge.episode import schema
 from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.reader import Episode
-from bridge.errors import GstError
+from bridge.episode.topics import (
+    MASK_TOPIC,
+    POSE_ALIGNED_TOPIC,
+    RECORDED_DEPTH_TOPIC,
+    RECORDED_TOPIC,
+    RENDERED_DEPTH_TOPIC,
+    RENDERED_TOPIC,
+)
+from bridge.errors import GstError, MissingDependencyError
 from bridge.media.color import JPEG_MAGIC, decode_color
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.image import (
@@ -30,7 +38,7 @@ from evaluator.metrics.image import (
     refuse_swapped,
     score_depth,
 )
-from evaluator.metrics.image_protocol import MASK_MODES, MaskMode
+from evaluator.metrics.image_protocol import MASK_MODES, MaskMode, NetName
 from evaluator.metrics.image_scores import METRICS, ImageScore, score_image
 from evaluator.metrics.lpips import PerceptualNet
 
@@ -168,6 +176,24 @@ def shrunk_u8(
     return np.asarray(np.rint(squares.mean(axis=(1, 3))), dtype=np.uint8)
 
 
+def open_nets(backbones: Mapping[NetName, Path]) -> tuple[PerceptualNet, ...]:
+    """Load the networks of LPIPS that were asked for; without one, torch stays out.
+
+    Raises:
+        LpipsWeightsError: When a backbone or the linear heads cannot be used.
+        MissingDependencyError: When torch is not installed.
+    """
+    if not backbones:
+        return ()
+    try:
+        from evaluator.metrics.lpips_torch import LpipsNet  # noqa: PLC0415  # loads torch
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise MissingDependencyError(package="torch", extra="lpips", purpose="LPIPS") from error
+    return tuple(LpipsNet.open(net, path) for net, path in backbones.items())
+
+
 # --- Work on many images with a few threads; NumPy and the image decoders let go of the
 # interpreter.
 #
@@ -199,14 +225,13 @@ def spread(
 
 RENDERED, RECORDED, POSED = "rendered", "recorded", "pose_aligned"
 _COLOR_TOPICS = (
-    (RENDERED, re.compile(r"/cam/([^/]+)/(?:color/)?(?:rendered|replayed)(?:/image)?$")),
-    (RECORDED, re.compile(r"/cam/([^/]+)/(?:color|recorded)(?:/image)?$")),
-    (POSED, re.compile(r"/cam/([^/]+)/pose_aligned(?:/image)?$")),
+    (RENDERED, RENDERED_TOPIC),
+    (RECORDED, RECORDED_TOPIC),
+    (POSED, POSE_ALIGNED_TOPIC),
 )
-_MASK_TOPIC = re.compile(r"/cam/([^/]+)/mask/([a-z_]+)(?:/image)?$")
 _DEPTH_TOPICS = (
-    (RENDERED, re.compile(r"/cam/([^/]+)/rendered/depth$")),
-    (RECORDED, re.compile(r"/cam/([^/]+)/recorded/depth(?:_in_color)?$")),
+    (RENDERED, RENDERED_DEPTH_TOPIC),
+    (RECORDED, RECORDED_DEPTH_TOPIC),
 )
 
 Key = tuple[str, int]
@@ -300,7 +325,7 @@ def read_images(episode: Episode) -> Images:
                 put[topic] = partial(_put_color, images.color[name], match.group(1))
                 break
         else:
-            if match := _MASK_TOPIC.search(topic):
+            if match := MASK_TOPIC.search(topic):
                 masks = images.masks.setdefault(match.group(2), {})
                 put[topic] = partial(_put_color, masks, match.group(1))
     for topic in episode.topics_of_type(schema.IMAGE):

@@ -44,3 +44,17 @@ def test_rays_have_unit_depth() -> None:
     rays = CAMERA.rays()
     assert rays.shape == (48, 64, 3)
     assert rays[..., 2] == pytest.approx(1.0)
+
+
+@given(st.floats(0.2, 3.0))
+def test_the_corners_of_a_scaled_image_are_its_corners_whatever_the_rounding(factor: float) -> None:
+    """Width and height round differently, so the image is not scaled the same both ways."""
+    scaled = CAMERA.scaled(factor)
+    assert (scaled.width, scaled.height) == (round(64 * factor), round(48 * factor))
+    corners = np.array([[0.0, 0.0], [64.0, 0.0], [0.0, 48.0], [64.0, 48.0]])
+    rays = np.column_stack(
+        [(corners[:, 0] - 31.0) / 60.0, (corners[:, 1] - 25.0) / 58.0, np.ones(4)]
+    )
+    uv, _ = scaled.project(rays)
+    size = [scaled.width, scaled.height]
+    np.testing.assert_allclose(uv, corners / [64.0, 48.0] * size, atol=1e-9)

@@ -170,11 +170,16 @@ def test_what_a_departed_source_said_is_not_repeated(
 
 def test_what_a_crash_left_is_recovered_and_said(tmp_path: Path, wire: WireConfig) -> None:
     run = RunFolder.create(tmp_path / "run")
-    writer = EpisodeWriter(run.episodes_dir / "old.mcap", config=WriterConfig(flush_s=0.01))
+    now_s = [0.0]
+    writer = EpisodeWriter(
+        run.episodes_dir / "old.mcap",
+        config=WriterConfig(flush_s=0.01),
+        monotonic=lambda: now_s[0],
+    )
     writer.describe(EpisodeInfo(id="old", kind="trial"))
     for number in range(10):
         writer.write_json("/a/event", {}, type_name=schema.EVENT, log_time_ns=number)
-    time.sleep(0.02)
+    now_s[0] = 0.02
     writer.tick()
     writer.abandon()
     said: list[str] = []

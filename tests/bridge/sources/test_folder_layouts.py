@@ -277,7 +277,9 @@ def test_the_kitchen_reads_the_same_with_and_without_its_index(tmp_path: Path) -
     assert read_index(raw).depth_camera.fx == record["depth_intrinsics"]["fx"]
 
 
-def test_a_published_tum_folder_keeps_the_distances_between_its_times(tum: Path) -> None:
+def test_a_published_tum_folder_keeps_the_distances_between_its_times(
+    tum: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Session:
         def __init__(self) -> None:
             self.sent: dict[str, list[int]] = {}
@@ -298,7 +300,10 @@ def test_a_published_tum_folder_keeps_the_distances_between_its_times(tum: Path)
     from bridge.sources.folder.publish import publish_folder_frames
 
     session = Session()
-    begun = time.monotonic()
+    slept_s = [0.0]
+    now_s = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now_s + slept_s[0])
+    monkeypatch.setattr(time, "sleep", lambda seconds: slept_s.append(slept_s.pop() + seconds))
     unchecked = getattr(publish_folder_frames, "__wrapped__", publish_folder_frames)
     sent = unchecked(  # our session only looks like one
         session,
@@ -308,7 +313,7 @@ def test_a_published_tum_folder_keeps_the_distances_between_its_times(tum: Path)
         should_stop=lambda: False,
         advance=lambda done, note: None,
     )
-    assert time.monotonic() - begun >= (STAMPS_NS[2] - STAMPS_NS[0]) * 1e-9
+    assert slept_s[0] == pytest.approx((STAMPS_NS[2] - STAMPS_NS[0]) * 1e-9)
     assert sent["frames"] == 3
     color = session.sent["/kitchen/cam/kinect/color/image"]
     assert color == [50_000_000_000 + stamp - STAMPS_NS[0] for stamp in STAMPS_NS]

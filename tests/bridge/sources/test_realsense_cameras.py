@@ -321,15 +321,24 @@ def test_a_camera_that_was_unplugged_is_taken_up_again(
     before.send(900, 1.7e12, color=color_image(1))
     running.wait("/lab/cam/eye/color/image", 1)
     attached.clear()
-    time.sleep(2.8)  # silent for two seconds, then looked for
+    said = ""
+
+    def wait_until_said(words: str, times: int) -> None:
+        nonlocal said
+        end_s = time.monotonic() + ANSWER_S
+        while (said := said + capsys.readouterr().err).count(words) < times:
+            assert time.monotonic() < end_s, said
+            time.sleep(0.02)
+
+    wait_until_said("unplugged?", 1)
     attached.append(after.device)
     running.wait("/lab/cam/eye/depth/info", 2)
-    time.sleep(0.3)
+    wait_until_said("streaming", 2)
     after.send(1, 1.7e12 + 9000, color=color_image(2))  # its counter starts again: no loss
     running.wait("/lab/cam/eye/color/image", 2)
     result = running.end()["eye"]
     assert (result["connections"], result["color_frames"], result["color_lost"]) == (2, 2, 0)
-    said = capsys.readouterr().err
+    said += capsys.readouterr().err
     assert said.count("no frames for 2 s, unplugged? Waiting for it to come back.") == 1
     assert said.count("streaming") == 2
 

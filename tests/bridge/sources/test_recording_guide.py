@@ -115,7 +115,9 @@ def test_from_an_arm_to_a_checked_episode_and_through_a_crash(start: Run, tmp_pa
         )
         wait_for_status("/lab/joint_states")
         assert ask("ctl", "start", "--id", "trial_0001", "--cell", "lab", *here)[0] == 0
-        time.sleep(0.5)
+        sent = len(server.sent)
+        while len(server.sent) < sent + 250:  # half a second of samples
+            time.sleep(0.02)
         assert ask("ctl", "mark", "grasped", *here)[0] == 0
         assert ask("ctl", "stop", "--result", "success", *here)[0] == 0
         code, said = ask("check", run)
@@ -124,7 +126,9 @@ def test_from_an_arm_to_a_checked_episode_and_through_a_crash(start: Run, tmp_pa
         assert "failure" in ask("ls", run)[1]
 
         assert ask("ctl", "start", "--id", "trial_0002", *here)[0] == 0
-        time.sleep(1.0)
+        sent = len(server.sent)
+        while len(server.sent) < sent + 500:
+            time.sleep(0.02)
         recorder.kill()
         recorder.communicate()
         code, said = ask("recover", run)

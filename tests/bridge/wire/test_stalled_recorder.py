@@ -1,23 +1,22 @@
-"""A recorder must never slow a controller: it is stopped for 4 s under a running publisher."""
+"""A recorder must never hold a controller up: it is stopped under a running publisher."""
 
-import json
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[3]
 CHILD = Path(__file__).with_name("stall_child.py")
-CALM_S, STALL_S, AFTER_S = 2.0, 4.0, 0.5
-NOISE_S = 5e-3
-"""Another process on the same core delays any call by this much now and then."""
-ATTEMPTS = 3
-"""A stall is 3 s in every attempt; a burst of outside load is not there in all of them."""
+PUTS = 3000
+"""More than the network's buffers take: those of a reliable publisher are full before."""
+STUCK_S = 5.0
+"""A publisher that makes no put() for so long waits for the recorder."""
 
 pytestmark = pytest.mark.slow
 
@@ -27,6 +26,7 @@ def spawn(*arguments: str) -> "subprocess.Popen[str]":
         [sys.executable, *arguments],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
@@ -51,51 +51,60 @@ def recorder(endpoint: str, tmp_path: Path) -> Iterator["subprocess.Popen[str]"]
         child.communicate()
 
 
-def slowest_puts(
+class Controller:
+    """The child, and how many of its put() have returned."""
+
+    def __init__(self, endpoint: str, preset: str) -> None:
+        """Start it."""
+        self._child = spawn(str(CHILD), endpoint, preset)
+        assert self._child.stdout is not None
+        assert self._child.stdout.readline().strip() == "go"
+
+    def returned(self) -> int:
+        assert self._child.stdin is not None
+        assert self._child.stdout is not None
+        self._child.stdin.write("\n")
+        self._child.stdin.flush()
+        return int(self._child.stdout.readline())
+
+    def wait_for(self, count: int) -> bool:
+        """Whether so many return before none returns for a while."""
+        seen, changed_s = self.returned(), time.monotonic()
+        while seen < count:
+            if time.monotonic() > changed_s + STUCK_S:
+                return False
+            time.sleep(0.02)
+            if (now := self.returned()) != seen:
+                seen, changed_s = now, time.monotonic()
+        return True
+
+    def close(self) -> None:
+        self._child.kill()
+        self._child.communicate()
+
+
+def goes_on_while_stopped(
     recorder: "subprocess.Popen[str]", endpoint: str, preset: str
-) -> tuple[float, float, float]:
-    """Slowest put() before and during the stop [s], and puts a second during over before it."""
-    child = spawn(str(CHILD), endpoint, preset, str(1.0 + CALM_S + STALL_S + AFTER_S))
-    try:
-        assert child.stdout is not None
-        assert child.stdout.readline().strip() == "go"
-        time.sleep(1.0)  # the first messages find and fill caches
-        calm_s = time.monotonic()
-        time.sleep(CALM_S)
+) -> tuple[bool, bool]:
+    """Whether a publisher goes on while the recorder is stopped, and after that."""
+    with closing(Controller(endpoint, preset)) as controller:
+        assert controller.wait_for(500), "the first messages find and fill caches"
         recorder.send_signal(signal.SIGSTOP)
-        stop_s = time.monotonic()
-        time.sleep(STALL_S)
+        during = controller.wait_for(controller.returned() + PUTS)
         recorder.send_signal(signal.SIGCONT)
-        took = json.loads(child.stdout.readline())
-    finally:
-        recorder.send_signal(signal.SIGCONT)
-        child.kill()
-        child.communicate()
-    before = [each for begin, each in took if calm_s <= begin < stop_s]
-    during = [each for begin, each in took if stop_s <= begin < stop_s + STALL_S]
-    print(
-        f"{preset}: slowest put() {max(before) * 1e3:.2f} ms before, "
-        f"{max(during) * 1e3:.2f} ms while the recorder was stopped; {len(during)} puts in "
-        f"{STALL_S:g} s, load {os.getloadavg()[0]:.1f}"
-    )
-    # Compared with the same machine a moment before: a busy one does not reach 500 Hz either way.
-    return max(before), max(during), len(during) * (stop_s - calm_s) / (len(before) * STALL_S)
+        return during, controller.wait_for(controller.returned() + 100)
 
 
-def test_a_stopped_recorder_does_not_slow_a_control_publisher(
+def test_a_stopped_recorder_does_not_hold_a_control_publisher(
     recorder: "subprocess.Popen[str]", endpoint: str
 ) -> None:
-    for _ in range(ATTEMPTS):
-        before_s, during_s, pace = slowest_puts(recorder, endpoint, "control")
-        if during_s <= max(1.2 * before_s, NOISE_S) and pace > 0.9:
-            return
-    pytest.fail("a put() took 1.2 times as long, or fewer were made, in every attempt")
+    """How long each put() takes then, ``make bench BENCH=record_live`` measures."""
+    assert goes_on_while_stopped(recorder, endpoint, "control") == (True, True)
 
 
 def test_a_stopped_recorder_does_stall_a_reliable_publisher(
     recorder: "subprocess.Popen[str]", endpoint: str
 ) -> None:
     """The reason for the other preset; when this fails, the test above proves nothing."""
-    _, during_s, pace = slowest_puts(recorder, endpoint, "reliable")
-    assert during_s > 1.0
-    assert pace < 0.9
+    during, _ = goes_on_while_stopped(recorder, endpoint, "reliable")
+    assert not during

@@ -22,6 +22,7 @@ from bridge.episode.cdr.messages import (
     string_to_cdr,
     transforms_to_cdr,
 )
+from bridge.episode.topics import type_of_topic
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan, Stage, Waypoint
@@ -80,7 +81,7 @@ def publish_one_frame(cell: WireSession, stamp_ns: int = S) -> None:
         ("/lab/cam/side/depth/image", depth.to_cdr()),
     ]
     for topic, data in messages:
-        cell.publisher(topic, schema.type_of_topic(topic) or "").put(data, source_ns=stamp_ns)
+        cell.publisher(topic, type_of_topic(topic) or "").put(data, source_ns=stamp_ns)
 
 
 def plan_for(robot: str) -> bytes:
@@ -101,7 +102,7 @@ def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(
     sessions: tuple[WireSession, WireSession],
 ) -> None:
     router, cell = sessions
-    eyes, config = LiveView("lab"), GateConfig(cell="lab", frame_wait_s=3.0, deadline_s=10.0)
+    perception, config = LiveView("lab"), GateConfig(cell="lab", frame_wait_s=3.0, deadline_s=10.0)
     seen: dict[str, Any] = {}
 
     def localise(frames: Any, task: Any, ends_s: float) -> dict[str, Any]:
@@ -115,13 +116,13 @@ def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(
     gate = Gate(
         task=load_task("cube_into_box"),
         config=config,
-        eyes=eyes,
+        perception=perception,
         localise=localise,
         replay=replay,
         now_ns=router.now_ns,
     )
-    watch_cell(router, "lab", eyes.take)
-    serve_gate(router, gate, eyes, config, Output(quiet=True))
+    watch_cell(router, "lab", perception.take)
+    serve_gate(router, gate, perception, config, Output(quiet=True))
     published: list[Any] = []
     cell.subscribe("lab/verdict", published.append)
     publish_one_frame(cell)
@@ -145,19 +146,21 @@ def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(
     assert published[0].source_ns == S
 
 
-def a_gate(router: WireSession, eyes: LiveView, replay: Any, found: Any, **settings: Any) -> None:
+def a_gate(
+    router: WireSession, perception: LiveView, replay: Any, found: Any, **settings: Any
+) -> None:
     """Serve a gate whose cell has shown itself."""
     config = GateConfig(**{"cell": "lab", "frame_wait_s": 3.0, "deadline_s": 10.0, **settings})
     gate = Gate(
         task=load_task("cube_into_box"),
         config=config,
-        eyes=eyes,
+        perception=perception,
         localise=found,
         replay=replay,
         now_ns=router.now_ns,
     )
-    watch_cell(router, "lab", eyes.take)
-    serve_gate(router, gate, eyes, config, Output(quiet=True))
+    watch_cell(router, "lab", perception.take)
+    serve_gate(router, gate, perception, config, Output(quiet=True))
 
 
 def everything_at(x_m: float = 0.0) -> dict[str, Any]:
@@ -181,7 +184,7 @@ def test_a_replay_that_hangs_or_raises_is_null_on_the_wire_and_in_the_log(
     def replay(plan: Plan, *rest: Any) -> Verdict:
         if next(kinds) == "raise":
             raise ZeroDivisionError("oops")
-        go_on.wait(5)
+        go_on.wait()
         return accept(plan)
 
     a_gate(router, LiveView("lab"), replay, lambda *_: everything_at(), deadline_s=0.4)
@@ -191,11 +194,9 @@ def test_a_replay_that_hangs_or_raises_is_null_on_the_wire_and_in_the_log(
     raised = ask(cell)
     assert (raised.accepted, raised.reason) == (None, "internal error: ZeroDivisionError: oops")
     assert "oops" in capsys.readouterr().err
-    started = time.monotonic()
-    hung = ask(cell)
-    assert time.monotonic() - started < 3.0
+    hung = ask(cell)  # comes while the replay still hangs, or never
     assert hung.accepted is None
-    assert "not done at the deadline of 0.4 s" in str(hung.reason)
+    assert "not done at the wall-clock limit of 0.4 s" in str(hung.reason)
     behind = ask(cell)
     assert behind.accepted is None
     assert "an earlier plan was still being judged" in str(behind.reason)
@@ -214,7 +215,7 @@ def test_plans_that_may_not_wait_are_told_at_once_on_the_wire(
 
     def replay(plan: Plan, *_: Any) -> Verdict:
         inside.release()
-        go_on.wait(8)
+        go_on.wait()
         return accept(plan)
 
     a_gate(router, LiveView("lab"), replay, lambda *_: everything_at(), waiting=0)
@@ -223,9 +224,8 @@ def test_plans_that_may_not_wait_are_told_at_once_on_the_wire(
     first = threading.Thread(target=lambda: answers.append(ask(cell)))
     first.start()
     assert inside.acquire(timeout=5)
-    started = time.monotonic()
     turned_away = ask(cell)
-    assert time.monotonic() - started < 2.0
+    assert answers == [], "the first plan is still being judged"
     assert turned_away.accepted is None
     assert "ask later" in str(turned_away.reason)
     go_on.set()
@@ -237,11 +237,11 @@ def test_an_object_moved_while_its_plan_is_judged_is_no_yes(
     sessions: tuple[WireSession, WireSession],
 ) -> None:
     router, cell = sessions
-    eyes = LiveView("lab")
+    perception = LiveView("lab")
     places = iter([0.0, 0.05, 0.05])
 
     def last_seen() -> int:
-        live = eyes.frames(max_age_ns=100 * S, max_per_camera=1)
+        live = perception.frames(max_age_ns=100 * S, max_per_camera=1)
         return max((frame.stamp_ns for frame in live.frames), default=0)
 
     def replay(plan: Plan, *_: Any) -> Verdict:
@@ -251,7 +251,7 @@ def test_an_object_moved_while_its_plan_is_judged_is_no_yes(
             time.sleep(0.01)
         return accept(plan)
 
-    a_gate(router, eyes, replay, lambda *_: everything_at(next(places)))
+    a_gate(router, perception, replay, lambda *_: everything_at(next(places)))
     publish_one_frame(cell)
     verdict = ask(cell)
     assert verdict.accepted is None
@@ -264,8 +264,8 @@ def test_pictures_that_are_old_on_the_cells_clock_are_no_basis(
     sessions: tuple[WireSession, WireSession],
 ) -> None:
     router, cell = sessions
-    eyes = LiveView("lab")
-    a_gate(router, eyes, accept, lambda *_: everything_at(), frame_wait_s=0.1)
+    perception = LiveView("lab")
+    a_gate(router, perception, accept, lambda *_: everything_at(), frame_wait_s=0.1)
     publish_one_frame(cell)
     assert ask(cell).accepted is True
     later = [
@@ -273,7 +273,7 @@ def test_pictures_that_are_old_on_the_cells_clock_are_no_basis(
     ]
     cell.publisher("/tf", schema.TF_MESSAGE).put(transforms_to_cdr(later), source_ns=60 * S)
     ends = time.monotonic() + 5
-    while eyes.newest_ns() < 60 * S and time.monotonic() < ends:
+    while perception.newest_ns() < 60 * S and time.monotonic() < ends:
         time.sleep(0.01)
     expired = ask(cell)
     assert expired.accepted is None

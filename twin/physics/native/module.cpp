@@ -69,6 +69,8 @@ class SoftSolver {
         need(spec.rest.size() == count && masses.shape(0) == count,
              "nodes, rest and masses differ in length");
         spec.tets = node_ids(tets, 4, count);
+        need(!spec.tets.empty(), "a soft body needs a tetrahedron");
+        need(spacing > 0, "cells need a size");
         spec.triangles = node_ids(triangles, 3, count);
         const std::vector<std::int32_t> ends = node_ids(samples, 2, count);
         for (std::size_t n = 0; n < ends.size(); n += 2)
@@ -206,7 +208,7 @@ class SoftSolver {
 
 }  // namespace
 
-NB_MODULE(_soft, m) {
+NB_MODULE(_soft, m) {  // NOLINT(performance-unnecessary-value-param): nanobind's signature
     m.doc() = "Soft bodies; see twin/physics/soft_world.py and the NumPy twin in tests/parity.";
     nb::class_<SoftSolver>(m, "SoftSolver")
         .def(nb::init<double, int, double, const char*>(), "period_s"_a, "num_substeps"_a,

@@ -1,10 +1,14 @@
-"""Load models through ``transformers``: from a local folder, no network, no code of the folder."""
+"""Load networks through ``transformers``: from a local folder, no network access, no foreign code.
+
+Only ``safetensors`` are accepted: the other formats are pickles, which run code when opened. Images
+are resized and normalised in torch, without torchvision.
+"""
 
 import importlib
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +18,6 @@ from jaxtyping import UInt8
 
 from bridge.episode import provenance
 from bridge.errors import MissingDependencyError, UsageError
-
-# --- Check a folder of weights before anything of it is loaded.
-#
-# Only ``safetensors`` are accepted: the other formats are pickles, which run code when opened.
 
 MAX_JSON_BYTES = 64_000_000
 MAX_WEIGHT_BYTES = 64_000_000_000
@@ -84,7 +84,9 @@ def check_folder(folder: Path, kind: WeightsKind) -> dict[str, Any]:
         raise WeightsError(folder=folder, found=found, kind=kind)
     for path in weight_files(folder, kind):
         _check_safetensors(path, folder, kind)
-    if kind.speaks and not _has_tokenizer(folder):
+    tokenizers = (("tokenizer.json",), ("vocab.json", "merges.txt"))
+    has_tokenizer = any(all((folder / name).is_file() for name in names) for names in tokenizers)
+    if kind.speaks and not has_tokenizer:
         raise WeightsError(folder=folder, found="there is no tokenizer.json", kind=kind)
     _check_sums(folder, kind)
     return config
@@ -140,11 +142,6 @@ def _json(path: Path, folder: Path, kind: WeightsKind) -> dict[str, Any]:
     return content
 
 
-def _has_tokenizer(folder: Path) -> bool:
-    pair = all((folder / name).is_file() for name in ("vocab.json", "merges.txt"))
-    return (folder / "tokenizer.json").is_file() or pair
-
-
 def _check_safetensors(path: Path, folder: Path, kind: WeightsKind) -> None:
     """Compare a file's size with its header: 8 bytes of length, JSON, then the numbers."""
     size = path.stat().st_size
@@ -159,18 +156,16 @@ def _check_safetensors(path: Path, folder: Path, kind: WeightsKind) -> None:
             raise WeightsError(folder=folder, found=found, kind=kind)
         try:
             header = json.loads(stream.read(length))
-            promised = 8 + length + _end_of_tensors(header)
+            ends = [
+                about["data_offsets"][1] for key, about in header.items() if key != "__metadata__"
+            ]
+            promised = 8 + length + max((int(end) for end in ends), default=0)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             found = f"the header of {path.name} is broken"
             raise WeightsError(folder=folder, found=found, kind=kind) from error
     if promised != size:
         found = f"{path.name} has {size} bytes where its header promises {promised}"
         raise WeightsError(folder=folder, found=found, kind=kind)
-
-
-def _end_of_tensors(header: Mapping[str, Any]) -> int:
-    ends = [int(item["data_offsets"][1]) for key, item in header.items() if key != "__metadata__"]
-    return max(ends, default=0)
 
 
 def _check_sums(folder: Path, kind: WeightsKind) -> None:
@@ -215,8 +210,6 @@ def read_normalisation(
         raise WeightsError(folder=folder, found=f"{path.name}: image_std holds a 0", kind=kind)
     return mean, deviation
 
-
-# --- Images for networks: resized and normalised in torch, without torchvision.
 
 Normalisation = tuple[tuple[float, ...], tuple[float, ...]]
 """Mean and standard deviation of red, green, blue, for colours 0..1."""

@@ -15,6 +15,7 @@ constexpr int kLanes = 4;
 
 typedef float Floats __attribute__((vector_size(4 * kLanes)));
 typedef std::int32_t Ints __attribute__((vector_size(4 * kLanes)));
+typedef std::uint32_t Uints __attribute__((vector_size(4 * kLanes)));
 typedef float Floats4 __attribute__((vector_size(16)));
 typedef std::int32_t Ints4 __attribute__((vector_size(16)));
 
@@ -79,7 +80,8 @@ static inline Floats4 four_sums(Floats a, Floats b, Floats c, Floats d) {
     return SPLAT_PICK(pq, rs, 0, 1, 4, 5) + SPLAT_PICK(pq, rs, 2, 3, 6, 7);
 }
 
-// 2^x for x in [-126, 126]; relative error 8e-8 (least-squares fit on [-1/2, 1/2]).
+// 2^x for x in [-126, 126]; relative error 8e-8 (least-squares fit on [-1/2, 1/2]). Beyond, any
+// number: callers drop it. The exponent is added without signs, for there it may wrap around.
 static inline Floats exp2(Floats x) {
     const float magic = 12582912.0f;  // 1.5 * 2^23: adding it rounds to a whole number
     const Floats shifted = x + magic;
@@ -89,7 +91,7 @@ static inline Floats exp2(Floats x) {
     p = p * f + 2.4022119726e-1f;
     p = p * f + 6.9314696704e-1f;
     p = p * f + 1.0000000717f;
-    return (Floats)((Ints)p + ((Ints)shifted << 23));
+    return (Floats)((Uints)p + ((Uints)shifted << 23));
 }
 
 }  // namespace splat::SPLAT_ISA

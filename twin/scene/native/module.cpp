@@ -22,10 +22,10 @@ class PyRasteriser {
     PyRasteriser(int threads, const std::string& isa)
         : kernels_(choose(isa)), rasteriser_(kernels_, thread_count(threads)) {}
 
-    NewArray<float> draw(Table3 means, Table4 quats, Table3 scales_log, Column opacities,
-                         Table3 colors, Pose T_camera_world, Intrinsics intrinsics,
-                         float alpha_cut, float transmittance_stop,
-                         std::optional<Table33> harmonics) {
+    NewArray<float> draw(const Table3& means, const Table4& quats, const Table3& scales_log,
+                         const Column& opacities, const Table3& colors, const Pose& T_camera_world,
+                         const Intrinsics& intrinsics, float alpha_cut, float transmittance_stop,
+                         const std::optional<Table33>& harmonics) {
         const std::size_t n = means.shape(0);
         if (quats.shape(0) != n || scales_log.shape(0) != n || opacities.shape(0) != n ||
             colors.shape(0) != n || (harmonics && harmonics->shape(0) != n))
@@ -43,7 +43,7 @@ class PyRasteriser {
         return planes;
     }
 
-    nb::tuple pull(Planes planes, Planes plane_gradients) {
+    nb::tuple pull(const Planes& planes, const Planes& plane_gradients) {
         check_size(planes.shape(1), planes.shape(2));
         check_size(plane_gradients.shape(1), plane_gradients.shape(2));
         const std::size_t n = rasteriser_.count(), num_harmonics = harmonics_ ? kHarmonics : 0;
@@ -63,7 +63,7 @@ class PyRasteriser {
         return nb::make_tuple(means, quats, scales, opacities, colors, harmonics, pose);
     }
 
-    NewArray<float> draw_features(Buffer<float, nb::shape<-1, -1>> features) {
+    NewArray<float> draw_features(const Buffer<float, nb::shape<-1, -1>>& features) {
         check_rows(features.shape(0));
         const Camera& camera = rasteriser_.camera();
         auto planes = new_array<float>({features.shape(1), height(camera), width(camera)});
@@ -75,7 +75,7 @@ class PyRasteriser {
         return planes;
     }
 
-    NewArray<float> lift(AnyPlanes planes) {
+    NewArray<float> lift(const AnyPlanes& planes) {
         check_size(planes.shape(1), planes.shape(2));
         const std::size_t n = rasteriser_.count();
         auto features = new_array<float>({n, planes.shape(0)});
@@ -86,7 +86,7 @@ class PyRasteriser {
         return features;
     }
 
-    nb::tuple label_map(Buffer<std::uint16_t, nb::shape<-1>> labels) {
+    nb::tuple label_map(const Buffer<std::uint16_t, nb::shape<-1>>& labels) {
         check_rows(labels.shape(0));
         const Camera& camera = rasteriser_.camera();
         auto ids = new_array<std::uint16_t>({height(camera), width(camera)});
@@ -142,7 +142,7 @@ class PySimilarity {
     PySimilarity(int threads, const std::string& isa)
         : similarity_(choose(isa), thread_count(threads)) {}
 
-    nb::tuple mean(Image rendered, Image target) {
+    nb::tuple mean(const Image& rendered, const Image& target) {
         const std::size_t height = rendered.shape(1), width = rendered.shape(2);
         if (target.shape(1) != height || target.shape(2) != width)
             throw nb::value_error("the two images differ in size");
@@ -160,9 +160,10 @@ class PySimilarity {
     Similarity similarity_;
 };
 
-void adam_step(Values values, nb::ndarray<const float, nb::c_contig, nb::device::cpu> gradients,
-               Values first, Values second, int step, float rate, float beta1, float beta2,
-               float epsilon, int threads) {
+void adam_step(const Values& values,
+               const nb::ndarray<const float, nb::c_contig, nb::device::cpu>& gradients,
+               const Values& first, const Values& second, int step, float rate, float beta1,
+               float beta2, float epsilon, [[maybe_unused]] int threads) {
     const std::int64_t size = static_cast<std::int64_t>(values.size());
     if (gradients.size() != values.size() || first.size() != values.size() ||
         second.size() != values.size() || step < 1)

@@ -1,6 +1,7 @@
 // The Python face of FitSession. Tables stay NumPy arrays of the caller and are changed in place.
 #include "python.hpp"
 
+#include <algorithm>
 #include <cstring>
 #include <vector>
 
@@ -22,6 +23,14 @@ using Rates = std::tuple<float, float, float, float, float, float>;
 
 constexpr std::size_t kColumns[Tables::kCount] = {3, 4, 3, 1, 3, 3 * kHarmonics};
 
+// How many Gaussians the first of the tables holds.
+std::size_t rows_of(const nb::tuple& arrays) {
+    if (arrays.size() != Tables::kCount) throw nb::value_error("a cloud has six tables");
+    const Values means = nb::cast<Values>(arrays[0], false);
+    if (means.ndim() < 1) throw nb::value_error("all tables need one row per Gaussian");
+    return means.shape(0);
+}
+
 // Means, quaternions, log scales, opacities, colours and, or None, harmonics.
 Tables tables_of(const nb::tuple& arrays, std::size_t count) {
     if (arrays.size() != Tables::kCount) throw nb::value_error("a cloud has six tables");
@@ -41,10 +50,11 @@ class PyFitSession {
     PyFitSession(int threads, const std::string& isa)
         : session_(choose(isa), thread_count(threads)) {}
 
-    nb::tuple step(nb::tuple values, nb::tuple first, nb::tuple second, Pose T_camera_world,
-                   Intrinsics intrinsics, float alpha_cut, float transmittance_stop,
-                   Bytes planes_u8, Depth depth_m, Mask static_mask, Gain gain, Loss loss,
-                   Rates rates, int step) {
+    nb::tuple step(const nb::tuple& values, const nb::tuple& first, const nb::tuple& second,
+                   const Pose& T_camera_world, const Intrinsics& intrinsics, float alpha_cut,
+                   float transmittance_stop, const Bytes& planes_u8, const Depth& depth_m,
+                   const Mask& static_mask, const Gain& gain, const Loss& loss, const Rates& rates,
+                   int step) {
         const Camera camera = make_camera(T_camera_world, intrinsics);
         const Settings settings = make_settings(alpha_cut, transmittance_stop);
         const std::size_t rows = camera.height, columns = camera.width;
@@ -52,7 +62,7 @@ class PyFitSession {
             depth_m.shape(0) != rows || depth_m.shape(1) != columns ||
             static_mask.shape(0) != rows || static_mask.shape(1) != columns || step < 1)
             throw nb::value_error("a step needs images of the camera's size, and counts from 1");
-        const std::size_t count = nb::cast<Values>(values[0], false).shape(0);
+        const std::size_t count = rows_of(values);
         Learning learning{tables_of(values, count),
                           tables_of(first, count),
                           tables_of(second, count),
@@ -83,8 +93,7 @@ class PyFitSession {
         const Camera& camera = session_.rasteriser().camera();
         auto planes = new_array<float>({kPlanes, static_cast<std::size_t>(camera.height),
                                         static_cast<std::size_t>(camera.width)});
-        std::memcpy(planes.data(), session_.planes().data(),
-                    session_.planes().size() * sizeof(float));
+        std::copy(session_.planes().begin(), session_.planes().end(), planes.data());
         return planes;
     }
 

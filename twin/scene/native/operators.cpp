@@ -1,6 +1,5 @@
 // The weights of the last drawing as a linear map, applied in blocks of channels.
 #include <algorithm>
-#include <cstring>
 
 #include "rasteriser.hpp"
 #include "threads.hpp"
@@ -44,7 +43,7 @@ void Rasteriser::lift(const float* planes, int num, float* features) {
 #pragma omp parallel for schedule(static) num_threads(threads_)
         for (int index = 0; index < count_; ++index) {
             float* out = features + static_cast<std::int64_t>(index) * num + first;
-            std::memset(out, 0, channels * sizeof(float));
+            std::fill_n(out, channels, 0.0f);
             add_pair_rows(index, channels, out);
         }
     }

@@ -6,7 +6,6 @@
 #include "rasteriser.hpp"
 
 #include <algorithm>
-#include <cstring>
 
 #include "threads.hpp"
 
@@ -163,8 +162,8 @@ void Rasteriser::draw(const Splats& splats, int count, const Camera& camera,
 float* Rasteriser::begin_pair_rows(int tile, int row_floats) {
     float* rows = pair_rows_.data() + tile_begin_[tile] * row_floats;
     const std::int64_t undrawn = tile_begin_[tile + 1] - tile_begin_[tile] - drawn_[tile];
-    std::memset(rows + static_cast<std::int64_t>(drawn_[tile]) * row_floats, 0,
-                static_cast<std::size_t>(undrawn) * row_floats * sizeof(float));
+    std::fill_n(rows + static_cast<std::int64_t>(drawn_[tile]) * row_floats, undrawn * row_floats,
+                0.0f);
     return rows;
 }
 

@@ -57,7 +57,7 @@ class Rasteriser {
     int num_tiles() const { return tiles_x_ * tiles_y_; }
 
     const Kernels& kernels_;
-    int threads_;
+    [[maybe_unused]] int threads_;  // not used without OpenMP
     int count_ = 0;
     int tiles_x_ = 0, tiles_y_ = 0;
     Camera camera_{};

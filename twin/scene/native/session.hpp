@@ -69,7 +69,7 @@ class FitSession {
     ColorRow color_row(const FitTarget&, int channel, int y) const;
 
     const Kernels& kernels_;
-    int threads_;
+    [[maybe_unused]] int threads_;  // not used without OpenMP
     Rasteriser rasteriser_;
     Similarity similarity_;
     std::vector<float> planes_, plane_gradients_;

@@ -19,7 +19,7 @@ class Similarity {
 
   private:
     const Kernels& kernels_;
-    int threads_;
+    [[maybe_unused]] int threads_;  // not used without OpenMP
     std::vector<double> sums_;  // of each strip
     double parallel_s_ = 0;
 };

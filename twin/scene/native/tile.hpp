@@ -43,8 +43,9 @@ struct Grid {
 static inline Grid block_grid() {
     Grid grid;
     for (int i = 0; i < kLanes; ++i) {
+        const int row = i / kBlockWidth;
         grid.x[i] = static_cast<float>(i % kBlockWidth);
-        grid.y[i] = static_cast<float>(i / kBlockWidth);
+        grid.y[i] = static_cast<float>(row);
     }
     return grid;
 }

@@ -1,4 +1,7 @@
-"""The form of a thing that stands on a plane: height map, cavity, box, and a word for it."""
+"""Describe the shape of a thing on its support plane: height map, cavity, box, and a word for it.
+
+The support plane is nearly level, found by RANSAC and refined by least squares.
+"""
 
 from dataclasses import dataclass
 
@@ -8,8 +11,6 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from twin.scene.semantics.result import SemanticsError
-
-# --- The plane that things stand on: nearly level, found by RANSAC, refined by least squares.
 
 UP = np.array([0.0, 0.0, 1.0])
 """Against gravity in the root frame of a robot cell."""
@@ -277,7 +278,7 @@ def find_height_map_cavity(
     return HeightMapCavity(mask=pool, rim_m=rim, floor_m=floor, volume_m3=volume)
 
 
-def measure_form(xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float) -> ShapeDescriptors:
+def measure_shape(xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float) -> ShapeDescriptors:
     """Measure a thing from the points of its visible surface.
 
     Args:

@@ -18,8 +18,6 @@ from twin.scene.shape.carve import ShapeError
 from twin.scene.shape.mesh import Faces
 from twin.scene.shape.reconstruct import ObjectShape
 
-# --- Convex hulls of points and of voxels.
-
 _CUBE = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 NUM_DIRECTIONS = 160
 
@@ -225,14 +223,14 @@ def _cut_up(shape: ObjectShape, config: CollisionConfig) -> tuple[ConvexPart, ..
                 continue
             others = [p for p in pieces if p is not worst]
             spare = sum(len(p.voxels) for p in pieces) - kept
-            room = config.max_parts - len(others)
-            cut = _best_cut(worst, free, room, min(CRUMB * len(voxels), spare))
+            parts_left = config.max_parts - len(others)
+            cut = _best_cut(worst, free, parts_left, min(CRUMB * len(voxels), spare))
             if cut is not None and _worth_it(worst, cut, len(voxels)):
                 pieces = others + cut
                 break
         else:
             break
-    return tuple(_placed(piece.hull, corner, grid.voxel_m) for piece in pieces)
+    return tuple(hull_of_points(corner + grid.voxel_m * piece.hull.vertices_m) for piece in pieces)
 
 
 def _worth_it(piece: _Piece, cut: list[_Piece], num_voxels: int) -> bool:
@@ -302,8 +300,3 @@ def _connected(voxels: np.ndarray, least: float) -> list[np.ndarray]:
     label = labels[tuple((voxels - low).T)]
     sizes = np.bincount(label, minlength=count + 1)
     return [voxels[label == n] for n in range(1, count + 1) if sizes[n] >= least]
-
-
-def _placed(hull: ConvexPart, corner_m: np.ndarray, voxel_m: float) -> ConvexPart:
-    """From voxels to metres."""
-    return hull_of_points(corner_m + voxel_m * hull.vertices_m)

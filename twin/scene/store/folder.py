@@ -1,4 +1,7 @@
-"""The scene folder: ``scene.json`` and ``background.ply``, whole or not at all."""
+"""The scene folder: ``scene.json`` and ``background.ply``, whole or not at all.
+
+A splat file edited elsewhere (SuperSplat and others) comes back into it.
+"""
 
 import json
 from collections.abc import Mapping
@@ -12,7 +15,7 @@ from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.errors import PathNotFoundError, UsageError
 from bridge.whole_file import write_whole
-from twin.errors import TwinError
+from twin.errors import UnreadableFileError
 from twin.scene.gaussians import GaussianCloud, UnreadablePlyError, read_ply, write_ply
 
 SCENE_VERSION = 1
@@ -24,19 +27,13 @@ HASH_DIGITS = 12
 """Hexadecimal digits of the SHA-256 of ``background.ply`` that name a scene."""
 
 
-class UnreadableSceneError(TwinError):
+class UnreadableSceneError(UnreadableFileError):
     """``scene.json`` is damaged or from a newer version."""
-
-    def __init__(self, *, path: Path, found: str, hint: str = "") -> None:
-        """Remember the file."""
-        self.path = path
-        hint = hint or "Make it again: robot-gst rebuild RUN --force."
-        super().__init__(f"{path}: {found}. {hint}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """A rebuilt place: the static background and how it came to be."""
+    """A rebuilt scene: the static background and how it came to be."""
 
     record: Mapping[str, Any]
     """The content of ``scene.json``."""
@@ -117,8 +114,6 @@ def write_record(run: RunFolder, record: Mapping[str, Any]) -> Path:
     write_whole(path, (json.dumps(record, indent=2) + "\n").encode())
     return path
 
-
-# --- A splat file edited elsewhere (SuperSplat and others) comes back into the scene.
 
 SPLATS = "gaussians.ply"
 EDITED = "splats were edited: what was said of each Gaussian no longer fits; rebuild to say it anew"

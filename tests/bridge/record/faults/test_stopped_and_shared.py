@@ -46,9 +46,12 @@ def test_a_recorder_stopped_for_seconds_accounts_for_every_message(cell: FaultCe
     for name in (*MIX, "raw"):  # what is lost before the first that arrives, nobody can know
         publisher.flow(0.0, name, qos="own")
         publisher.answer()
-        time.sleep(0.1)
+    while publisher.ask("status")["ok"]["messages"] < len(publisher.sent()):
+        time.sleep(0.02)
+    begun = len(publisher.sent())
     publisher.flow(STOP_S + 2.5, *MIX, "raw", qos="own")
-    time.sleep(1.0)
+    while len(publisher.sent()) < begun + 100:
+        time.sleep(0.02)
     recorder.send(signal.SIGSTOP)
     time.sleep(STOP_S)
     recorder.send(signal.SIGCONT)
@@ -72,9 +75,8 @@ def test_a_publisher_killed_and_come_back_is_no_gap(cell: FaultCell) -> None:
     asker.ask("start", {"id": "t1", "info": {"cell": "cell"}})
     first.flow(60.0, *MIX)
     end_s = time.monotonic() + 60.0
-    while not first.sent() and time.monotonic() < end_s:
+    while len(first.sent()) < 60 and time.monotonic() < end_s:
         time.sleep(0.02)
-    time.sleep(0.6)
     first.kill()
     second = cell.publisher()
     second.flow(0.5, *MIX)

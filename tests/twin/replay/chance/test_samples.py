@@ -20,7 +20,7 @@ from twin.replay.config import ReplayConfig, ReplayRunConfig, VariationConfig
 from twin.replay.monte_carlo import (
     Sample,
     draw_variation,
-    given_standing,
+    given_upright,
     replay_samples,
     sample_rng,
     with_probability,
@@ -96,7 +96,7 @@ def test_given_standing_is_the_conditional_distribution() -> None:
     rng = np.random.default_rng(3)
     root = rng.normal(size=(6, 6)) * 1e-2
     covariance = root @ root.T
-    left = given_standing(covariance)
+    left = given_upright(covariance)
     precision = np.linalg.inv(covariance)
     keep = [0, 1, 5]  # a conditional covariance is the inverse of that block of the precision
     np.testing.assert_allclose(
@@ -252,20 +252,6 @@ def test_a_variation_that_cannot_be_replayed_costs_only_itself(script: SimpleNam
     samples = asked(script, replay, 3)
     assert [sample.accepted for sample in samples] == [True, None, True]
     assert samples[1].reason == "the cube lies inside the box"
-
-
-def test_as_many_samples_are_run_as_fit_and_no_more_are_claimed(script: SimpleNamespace) -> None:
-    clock = [0.0]
-
-    def replay(scene: ReplayScene, config: ReplayConfig) -> Verdict:
-        clock[0] += 2.0
-        return verdict(True)
-
-    samples = asked(script, replay, 100, ends_s=11.0, expected_s=2.0, monotonic=lambda: clock[0])
-    assert clock[0] <= 11.0
-    assert len(samples) == 5
-    assert (with_probability(verdict(True), samples).p_success or {})["n"] == 5
-    assert asked(script, replay, 9, ends_s=2.0, expected_s=2.0, monotonic=lambda: 0.0) == ()
 
 
 def test_a_kinematic_replay_has_no_probability(script: SimpleNamespace) -> None:

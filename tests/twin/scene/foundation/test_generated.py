@@ -118,10 +118,8 @@ def test_a_worker_that_breaks_the_contract_is_told_apart(
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc to see processes")
 def test_a_worker_that_hangs_is_ended_with_all_it_started(source: Path, tmp_path: Path) -> None:
-    start = time.monotonic()
     with pytest.raises(GeneratorError, match=r"stopped after 1\.5 s.*the hang worker speaks"):
         run_generator(wanted(), tmp_path / "work", worker("hang", source, timeout_s=1.5))
-    assert time.monotonic() - start < 20.0
     child = int((source / "child").read_text())
     for _ in range(100):
         if not is_running(child):

@@ -1,0 +1,157 @@
+"""Laws of the hard predicates: what decides each of them, and what does not."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.geometry import se3
+from bridge.task.predicate import Rollout, all_hold, already_true_at_start, evaluate_success
+from bridge.task.task_file import Task, load_task
+from bridge.task.verdict import Factor, Verdict
+
+STEP_NS = 20_000_000
+STEPS = 100
+STAMPS_NS = np.arange(STEPS, dtype=np.int64) * STEP_NS
+SETTLED = {"kind": "settled", "object": "cube", "max_speed_m_s": 0.02, "for_s": 0.4}
+FOR_STEPS = 20
+FULL_STEP_M = SETTLED["max_speed_m_s"] * STEP_NS * 1e-9  # type: ignore[operator]
+
+
+def task_with(*success: dict[str, Any]) -> Task:
+    return replace(load_task("cube_into_box"), success=success)
+
+
+def track(p_m: np.ndarray) -> np.ndarray:
+    return se3.transform_from(np.tile([1.0, 0.0, 0.0, 0.0], (len(p_m), 1)), p_m)
+
+
+def along_x(steps_m: np.ndarray) -> Rollout:
+    """A cube that moves by one step after the other."""
+    p = np.zeros((len(steps_m) + 1, 3))
+    p[1:, 0] = np.cumsum(steps_m)
+    stamps = np.arange(len(p), dtype=np.int64) * STEP_NS
+    return Rollout(stamps_ns=stamps, Ts_base_object={"cube": track(p)}, finger_contact={})
+
+
+def settled(steps_m: np.ndarray) -> bool | None:
+    return evaluate_success(task_with(SETTLED), along_x(steps_m))[0].value
+
+
+@given(st.integers(1, FOR_STEPS))
+def test_one_fast_step_among_the_last_is_not_settled(back: int) -> None:
+    steps = np.zeros(STEPS)
+    steps[-back] = 1.5 * FULL_STEP_M
+    assert settled(steps) is False
+
+
+@given(st.floats(0.0, 0.99), st.floats(0.0, 50.0))
+def test_only_the_last_part_decides_whether_it_settled(late: float, early: float) -> None:
+    steps = np.full(STEPS, late * FULL_STEP_M)
+    steps[: STEPS - FOR_STEPS - 1] = early * FULL_STEP_M
+    assert settled(steps) is True
+
+
+def test_what_is_shorter_than_the_time_asked_for_is_open() -> None:
+    assert settled(np.zeros(FOR_STEPS - 2)) is None
+    assert settled(np.zeros(FOR_STEPS)) is True
+
+
+def inside(p_box_cube: np.ndarray, margin_m: float, Ts_box: np.ndarray | None = None) -> bool:
+    spec = {"kind": "inside", "object": "cube", "container": "box", "margin_m": margin_m}
+    boxes = np.tile(np.eye(4), (STEPS, 1, 1)) if Ts_box is None else Ts_box
+    cube = track(np.tile(se3.apply(boxes[-1], p_box_cube), (STEPS, 1)))
+    poses = {"cube": cube, "box": boxes}
+    rollout = Rollout(stamps_ns=STAMPS_NS, Ts_base_object=poses, finger_contact={})
+    value = evaluate_success(task_with(spec), rollout)[0].value
+    assert value is not None
+    return value
+
+
+@given(
+    st.sampled_from([0, 1]),
+    st.sampled_from([-1.0, 1.0]),
+    st.floats(-0.02, 0.02),
+    st.floats(-0.03, 0.03).filter(lambda gap: abs(gap) > 1e-6),
+)
+def test_a_margin_moves_the_walls_inwards(
+    axis: int, side: float, margin_m: float, beyond_m: float
+) -> None:
+    box = load_task("cube_into_box").objects["box"]
+    p = np.array([0.0, 0.0, box.wall_m + box.inner_m[2] / 2])  # type: ignore[index]
+    p[axis] = side * (box.inner_m[axis] / 2 - margin_m + beyond_m)  # type: ignore[index]
+    assert inside(p, margin_m) is (beyond_m <= 0)
+
+
+def test_the_cavity_begins_on_the_floor_and_ends_at_the_rim() -> None:
+    box = load_task("cube_into_box").objects["box"]
+    assert box.inner_m is not None
+    rim = box.wall_m + box.inner_m[2]
+    heights = {box.wall_m - 1e-4: False, box.wall_m + 1e-4: True, rim - 1e-4: True}
+    for z, wanted in {**heights, rim + 1e-4: False}.items():
+        assert inside(np.array([0.0, 0.0, z]), 0.0) is wanted, z
+
+
+def test_a_container_that_was_pushed_counts_where_it_ended() -> None:
+    boxes = np.tile(np.eye(4), (STEPS, 1, 1))
+    boxes[:, 0, 3] = np.linspace(0.0, 0.4, STEPS)
+    middle = np.array([0.0, 0.0, 0.03])
+    assert inside(middle, 0.0, boxes)
+    assert not inside(middle - [0.4, 0.0, 0.0], 0.0, boxes)
+
+
+def test_only_a_touch_at_the_end_counts() -> None:
+    spec = {"kind": "no_finger_contact", "object": "cube"}
+    for end in (False, True):
+        touching = np.ones(STEPS, dtype=bool)
+        touching[-1] = end
+        rollout = replace(along_x(np.zeros(STEPS - 1)), finger_contact={"cube": touching})
+        assert evaluate_success(task_with(spec), rollout)[0].value is not end
+
+
+def test_a_task_that_asks_for_nothing_is_no_success() -> None:
+    assert all_hold([]) is None
+
+
+@pytest.mark.parametrize("other_inside", [True, False])
+def test_the_goal_held_before_only_where_every_object_was_inside(other_inside: bool) -> None:
+    specs = [
+        {"kind": "inside", "object": name, "container": "box", "margin_m": 0.0}
+        for name in ("cube", "other")
+    ]
+    here, there = np.array([[0.0, 0.0, 0.03]]), np.array([[0.5, 0.0, 0.03]])
+    rollout = Rollout(
+        stamps_ns=STAMPS_NS[:1],
+        Ts_base_object={
+            "cube": track(here),
+            "other": track(here if other_inside else there),
+            "box": np.eye(4)[None],
+        },
+        finger_contact={},
+    )
+    assert already_true_at_start(task_with(*specs), rollout) is other_inside
+
+
+@pytest.mark.parametrize("ik", [True, None, False])
+@pytest.mark.parametrize("clearance", [True, None, False])
+@pytest.mark.parametrize("terminal", [True, None, False])
+def test_a_verdict_is_the_and_of_its_factors_and_names_the_first_that_fails(
+    ik: bool | None, clearance: bool | None, terminal: bool | None
+) -> None:
+    factors = {"ik": ik, "clearance": clearance, "terminal": terminal}
+    verdict = Verdict(
+        plan_id="p",
+        trajectory="planned",
+        mode="dynamic",
+        engine="none",
+        seed=0,
+        **{name: Factor(value=value) for name, value in factors.items()},
+    )
+    failing = [name for name, value in factors.items() if value is False]
+    assert verdict.first_failing == (failing[0] if failing else None)
+    # Kleene's logic: false beats unknown, unknown beats true.
+    order = {False: 0, None: 1, True: 2}
+    assert verdict.accepted is min(factors.values(), key=lambda value: order[value])

@@ -1,0 +1,296 @@
+"""Change one line of the code at a time and see whether the tests near by notice.
+
+``make mutants`` runs this over ``mutants.toml``. Each mutation is applied in a temporary copy of
+the packages, never in the checkout, and its tests run there with ``-x``. A mutation is caught when
+a test fails that passes on the unchanged copy; it survives when all pass.
+
+Exit codes: 0 all caught, 2 an entry is wrong (its text is not found exactly once, its tests do not
+exist, fail without the mutation, or take too long), 3 a mutation survived.
+"""
+
+import argparse
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from queue import SimpleQueue
+
+ROOT = Path(__file__).resolve().parents[2]
+LIST = Path(__file__).with_name("mutants.toml")
+PACKAGES = ("bridge", "twin", "evaluator", "dashboards")
+COPIED = (*PACKAGES, "tests", "datasets", "pyproject.toml", "robot_gst.py")
+LIMIT_S = 300.0
+"""A run that takes longer is an error: it says neither caught nor survived."""
+PYTEST = ("-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--hypothesis-seed=0")
+MARKS = "not gpu and not hardware and not network"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mutant:
+    """One changed line, and the test files near by that must notice."""
+
+    id: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+    only: str = ""
+    """A pytest expression (-k)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What the tests said of one mutant."""
+
+    id: str
+    outcome: str
+    """caught, survived or error."""
+    by: str
+    """The test that failed, or what is wrong."""
+    took_s: float
+
+
+class EntryError(Exception):
+    """An entry of the list does not fit the code or the tests."""
+
+
+def load(path: Path = LIST) -> list[Mutant]:
+    """Read the list."""
+    with path.open("rb") as file:
+        entries = tomllib.load(file)["mutant"]
+    return [Mutant(**{**entry, "tests": tuple(entry["tests"])}) for entry in entries]
+
+
+def sources(root: Path) -> dict[Path, str]:
+    """Every Python file of the packages, by its path below ``root``."""
+    return {
+        path.relative_to(root): path.read_text()
+        for package in PACKAGES
+        for path in sorted((root / package).rglob("*.py"))
+    }
+
+
+def applied(mutant: Mutant, texts: dict[Path, str]) -> tuple[Path, str]:
+    """Return the file that a mutant changes, and what it then holds.
+
+    Raises:
+        EntryError: The text is not found exactly once, more than one line differs, or the result
+            is no Python.
+    """
+    found = [path for path, text in texts.items() if mutant.old in text]
+    count = sum(texts[path].count(mutant.old) for path in found)
+    if count != 1:
+        where = ", ".join(map(str, found)) or "no file"
+        raise EntryError(f"its text is found {count} times ({where})")
+    before, after = mutant.old.splitlines(), mutant.new.splitlines()
+    differ = sum(a != b for a, b in zip(before, after, strict=False))
+    if len(before) != len(after) or differ != 1:
+        raise EntryError("it must change exactly one line")
+    text = texts[found[0]].replace(mutant.old, mutant.new)
+    try:
+        compile(text, str(found[0]), "exec")
+    except SyntaxError as error:
+        raise EntryError(f"the changed file is no Python: {error}") from error
+    return found[0], text
+
+
+def test_files(mutant: Mutant, root: Path) -> list[Path]:
+    """Return a mutant's test files below ``root``.
+
+    Raises:
+        EntryError: A name fits no file, several, or one far away.
+    """
+    files = []
+    for name in mutant.tests:
+        found = [p for p in (root / "tests").rglob(Path(name).name) if f"/{p}".endswith(f"/{name}")]
+        if len(found) != 1:
+            raise EntryError(f"{name} names {len(found)} test files")
+        if "end_to_end" in found[0].parts:
+            raise EntryError(f"{name} is not near by")
+        files.append(found[0].relative_to(root))
+    return files
+
+
+class Copy:
+    """A copy of the packages and tests, in which one mutation at a time is applied."""
+
+    def __init__(self, folder: Path) -> None:
+        """Copy the checkout; files keep their times, so that compiled ones stay valid."""
+        self.folder = folder
+        for name in COPIED:
+            if (ROOT / name).is_dir():
+                shutil.copytree(ROOT / name, folder / name)
+            else:
+                shutil.copy2(ROOT / name, folder / name)
+        # Processes of the tests import from here too.
+        site = folder / ".site"
+        site.mkdir()
+        (site / "sitecustomize.py").write_text(finder(folder))
+        self._env = os.environ | {
+            "PYTHONPATH": str(site),
+            "GST_CHECKOUT": str(folder),
+            "OMP_NUM_THREADS": "1",
+        }
+        self._ticks = 0
+
+    def run(self, mutant: Mutant, path: Path, text: str, limit_s: float) -> Outcome:
+        """Apply a mutation, run its tests and take it back."""
+        file = self.folder / path
+        original, times = file.read_text(), file.stat()
+        file.write_text(text)
+        # Compiled files are told apart by whole seconds and size: give each change its own second.
+        self._ticks += 1
+        os.utime(file, (times.st_mtime, times.st_mtime - 10 * self._ticks))
+        started_s = time.monotonic()
+        try:
+            chosen = ["-k", mutant.only] if mutant.only else []
+            names = [str(name) for name in test_files(mutant, self.folder)]
+            code, output = self.pytest([*chosen, *names], limit_s)
+        finally:
+            file.write_text(original)
+            os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
+        took_s = round(time.monotonic() - started_s, 1)
+        outcome, by = judged(code, output)
+        return Outcome(id=mutant.id, outcome=outcome, by=by, took_s=took_s)
+
+    def pytest(self, arguments: list[str], limit_s: float) -> tuple[int | None, str]:
+        """Run pytest here; without a code when it took too long."""
+        process = subprocess.Popen(
+            [sys.executable, "-m", "pytest", "-m", MARKS, *PYTEST, *arguments],
+            cwd=self.folder,
+            env=self._env,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            start_new_session=True,
+        )
+        try:
+            output, _ = process.communicate(timeout=limit_s)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            output, _ = process.communicate()
+            return None, output
+        return process.returncode, output
+
+
+def finder(folder: Path) -> str:
+    """A module that makes the packages' names mean those of a folder, before any other finder."""
+    return "\n".join(
+        (
+            "import sys",
+            "from importlib.machinery import PathFinder",
+            "class Finder:",
+            "    @staticmethod",
+            "    def find_spec(name, path=None, target=None):",
+            f"        if name in {(*PACKAGES, 'robot_gst')!r}:",
+            f"            return PathFinder.find_spec(name, [{str(folder)!r}])",
+            "sys.meta_path.insert(0, Finder)",
+            "",
+        )
+    )
+
+
+def judged(code: int | None, output: str) -> tuple[str, str]:
+    """Turn what pytest said into an outcome and the test that failed."""
+    failed = failing(output)
+    if code == 1 and failed:
+        return "caught", failed[0]
+    if code == 0:
+        return "survived", ""
+    why = {None: "it took too long", 5: "no test was chosen"}
+    last = next((line for line in reversed(output.splitlines()) if line.strip()), "")
+    return "error", why.get(code, f"pytest ended with {code}: {last}")
+
+
+def failing(output: str) -> list[str]:
+    """Names of the tests that pytest lists as failed."""
+    return re.findall(r"^(?:FAILED|ERROR) (\S+::.+?)(?: - .*)?$", output, flags=re.MULTILINE)
+
+
+def run_all(mutants: list[Mutant], jobs: int, limit_s: float) -> list[Outcome]:
+    """Run all mutants, ``jobs`` at a time, and see that their tests pass without them."""
+    texts = sources(ROOT)
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+        copies: SimpleQueue[Copy] = SimpleQueue()
+        for index in range(jobs):
+            copies.put(Copy(Path(folder) / str(index)))
+
+        def one(mutant: Mutant) -> Outcome:
+            copy = copies.get()
+            try:
+                outcome = copy.run(mutant, *applied(mutant, texts), limit_s)
+            except EntryError as error:
+                outcome = Outcome(id=mutant.id, outcome="error", by=str(error), took_s=0.0)
+            finally:
+                copies.put(copy)
+            print(f"{outcome.outcome:9} {outcome.id:50} {outcome.took_s:6.1f} s  {outcome.by}")
+            sys.stdout.flush()
+            return outcome
+
+        with ThreadPoolExecutor(jobs) as pool:
+            outcomes = list(pool.map(one, mutants))
+        return confirmed(outcomes, copies.get(), limit_s)
+
+
+def confirmed(outcomes: list[Outcome], copy: Copy, limit_s: float) -> list[Outcome]:
+    """Run the tests that failed once more without any mutation: there they must pass."""
+    # A file name and test are enough: what pytest prints of a parameter is not always its name.
+    names = sorted({item.by.partition("[")[0] for item in outcomes if item.outcome == "caught"})
+    broken: set[str] = set()
+    for _ in range(len(names)):
+        code, output = copy.pytest([*(n for n in names if n not in broken)], 20 * limit_s)
+        found = {name.partition("[")[0] for name in failing(output)}
+        if code == 0 or not found:
+            break
+        broken |= found
+    return [
+        Outcome(id=o.id, outcome="error", by=f"fails without it too: {o.by}", took_s=o.took_s)
+        if o.outcome == "caught" and o.by.partition("[")[0] in broken
+        else o
+        for o in outcomes
+    ]
+
+
+def main() -> int:
+    """Run the list and say what no test noticed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("only", nargs="*", help="run mutants whose id contains one of these words")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--limit-s", type=float, default=LIMIT_S, help="longest run of one mutant")
+    parser.add_argument("--output", type=Path, help="write the outcomes as JSON")
+    arguments = parser.parse_args()
+    mutants = [
+        mutant
+        for mutant in load()
+        if not arguments.only or any(word in mutant.id for word in arguments.only)
+    ]
+    started_s = time.monotonic()
+    outcomes = run_all(mutants, max(1, min(arguments.jobs, len(mutants))), arguments.limit_s)
+    if arguments.output:
+        records = [asdict(outcome) for outcome in outcomes]
+        arguments.output.write_text(json.dumps(records, indent=1) + "\n")
+    by_outcome = {
+        kind: [item for item in outcomes if item.outcome == kind]
+        for kind in ("caught", "survived", "error")
+    }
+    for kind in ("survived", "error"):
+        for item in by_outcome[kind]:
+            print(f"{kind:9} {item.id}  {item.by}")
+    counts = ", ".join(f"{len(items)} {kind}" for kind, items in by_outcome.items())
+    print(f"{len(outcomes)} mutants: {counts}, in {time.monotonic() - started_s:.0f} s")
+    if by_outcome["error"]:
+        return 2
+    return 3 if by_outcome["survived"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

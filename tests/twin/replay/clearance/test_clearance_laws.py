@@ -1,0 +1,86 @@
+"""Laws of clearance: how far an object travels, what a contact keeps, what stays allowed."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scripted_plans import joints_over
+
+from bridge.geometry import se3
+from bridge.task.plan import Stage
+from twin.replay.clearance import ClearanceMonitor
+from twin.replay.clearance.monitor import State, allowed_pairs, object_travel_m
+from twin.replay.config import ReplayConfig
+from twin.robot.collision import hulls_of
+from twin.robot.model import load_robot
+
+JOINTS = np.zeros(6)
+
+
+def with_cube(T: np.ndarray) -> State:
+    return State(t_ns=0, joints_rad=JOINTS, width_m=0.0, Ts_base_object={"cube": T})
+
+
+@given(st.integers(0, 10**6), st.floats(1e-3, 1.0), st.floats(0.01, 0.2))
+def test_no_point_of_an_object_travels_farther_than_is_said(
+    seed: int, size: float, radius_m: float
+) -> None:
+    """All states on the way: a straight shift and an even turn about the object's origin."""
+    rng = np.random.default_rng(seed)
+    T = se3.transform_from(rng.normal(size=4), rng.normal(size=3))
+    shift, turn = 0.1 * size * rng.normal(size=3), size * rng.normal(size=3)
+    points = rng.normal(size=(40, 3))
+    points *= radius_m / np.linalg.norm(points, axis=1)[:, None]
+
+    def at(share: float) -> np.ndarray:
+        moved = T.copy()
+        moved[:3, :3] = se3.rotation_from_vector(share * turn) @ T[:3, :3]
+        moved[:3, 3] += share * shift
+        return moved
+
+    way = np.array([se3.apply(at(share), points) for share in np.linspace(0, 1, 50)])
+    travelled = np.linalg.norm(np.diff(way, axis=0), axis=2).sum(axis=0)
+    if np.linalg.norm(turn) < 3.0:  # beyond half a turn the shorter way round is another one
+        assert travelled.max() <= object_travel_m(with_cube(T), with_cube(at(1)), "cube", radius_m)
+
+
+def test_the_travel_of_a_pure_turn_is_its_arc() -> None:
+    turned = np.eye(4)
+    turned[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, 1.2]))
+    travel = object_travel_m(with_cube(np.eye(4)), with_cube(turned), "cube", 0.1)
+    assert travel == pytest.approx(0.12, rel=1e-6)
+
+
+def test_a_contact_keeps_the_smallest_distance_of_its_time(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    monitor = ClearanceMonitor(
+        scene, script.plan(scene), hulls_of(load_robot(scene.urdf)), ReplayConfig()
+    )
+    for t_ns, tips_m in enumerate((0.0015, 0.0005, -0.001, 0.001, 0.05)):
+        monitor.measure(t_ns, joints_over(scene, 0.62, -0.1, 0.01 + tips_m), 0.08, {})
+    contacts = [contact for contact in monitor.contacts() if "table" in contact.bodies]
+    assert contacts
+    deepest = min(contact.min_distance_m for contact in contacts)
+    assert deepest == pytest.approx(-0.001, abs=1e-5)
+    for contact in contacts:
+        assert contact.min_distance_m <= 0.0005, "it came nearer after the first instant"
+
+
+@pytest.mark.parametrize("releases", [True, False])
+def test_what_was_let_go_of_may_stay_where_it_was_put_and_the_gripper_may_not(
+    releases: bool,
+) -> None:
+    put = Stage(
+        id="put",
+        text="",
+        t_start_ns=0,
+        release="cube" if releases else None,
+        allowed_contacts=(("cube", "box"), ("gripper", "cube")),
+    )
+    leave = replace(put, id="leave", t_start_ns=10, release=None, allowed_contacts=())
+    lies = frozenset(("cube", "box"))
+    assert allowed_pairs((put, leave), 5) == {lies, frozenset(("gripper", "cube"))}
+    assert allowed_pairs((put, leave), 15) == ({lies} if releases else set())
