@@ -154,10 +154,10 @@ def _labels(values: Sequence[float]) -> list[str]:
 
 
 def axis(low: float, high: float, px_low: float, px_high: float, wanted: int = 5) -> Axis:
-    """Build an axis with round ticks; a single value gets room around it."""
+    """Build an axis with round ticks; a single value gets a margin."""
     if high - low < 1e-12:
-        room = max(abs(low) * 0.1, 1e-3)
-        low, high = low - room, high + room
+        margin = max(abs(low) * 0.1, 1e-3)
+        low, high = low - margin, high + margin
     bare = Axis(low=low, high=high, px_low=px_low, px_high=px_high)
     values = nice_ticks(low, high, wanted)
     ticks = tuple(
@@ -222,9 +222,9 @@ def time_plot(
     high = max(float(values.max()) for values in finite)
     if level is not None:
         low, high = min(low, level), max(high, level)
-    room = max((high - low) * 0.06, (least_span - (high - low)) / 2)
+    margin = max((high - low) * 0.06, (least_span - (high - low)) / 2)
     x = axis(span_s[0], span_s[1], 46, width - 8, wanted=7)
-    y = axis(low - room, high + room, height - 24, 10, wanted=4)
+    y = axis(low - margin, high + margin, height - 24, 10, wanted=4)
     lines = tuple(
         Line(name=signal.name, style=signal.style, pieces=_pieces(*_thin(signal), x, y))
         for signal in signals
