@@ -17,7 +17,7 @@ from starlette.staticfiles import StaticFiles
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from dashboards import wording
-from dashboards.comparison import judge
+from dashboards.comparison import agrees, judge
 from dashboards.episode_page import build_page
 from dashboards.errors import NotHereError
 from dashboards.frames import read_frame
@@ -73,7 +73,8 @@ def _environment() -> Environment:
         wording.condition_word,
         wording.image_title,
         wording.percent,
-        wording.chance,
+        wording.success_share,
+        agrees,
     ):
         environment.filters[function.__name__] = function
     environment.filters["quoted"] = lambda path: shlex.quote(str(path))

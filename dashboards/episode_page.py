@@ -16,7 +16,6 @@ from bridge.episode.streams import JointTrack
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan
 from bridge.task.verdict import Factor, Verdict
-from dashboards.comparison import agrees
 from dashboards.figures import Signal, Span, StageChart, TimePlot, stage_chart, time_plot
 from dashboards.frames import CameraTrack
 from dashboards.library import derived_paths, episode_path
@@ -336,7 +335,6 @@ class EpisodePage:
     row: TrialRow | None
     label: Outcome | None
     """How it ended; a label given after the fact counts."""
-    agrees: bool | None
     verdicts: tuple[VerdictView, ...]
     gated: bool
     """The plan that was sent had a verdict before motion."""
@@ -386,7 +384,6 @@ def build_page(
         replays=replays,
         row=row,
         label=problems.attempt(lambda: outcome_of(run, Episode.open(path)), recording.outcome),
-        agrees=None if row is None else agrees(row),
         verdicts=verdicts,
         gated=any(view.title == GATE_BEFORE and view.of_sent_plan for view in verdicts),
         stages=episode_stages(recording, clock, failure_t_s),

@@ -9,7 +9,6 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
@@ -289,14 +288,6 @@ class Facet:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
-    """One line of the episode list."""
-
-    row: TrialRow
-    agrees: bool | None
-
-
-@dataclass(frozen=True, kw_only=True)
 class OtherFile:
     """A recording that is not a trial: a scan, a probe, an import."""
 
@@ -326,7 +317,7 @@ class Overview:
     rates: RateTable | None
     gains: tuple[GainRow, ...]
     gain_methods: str
-    trials: tuple[Trial, ...]
+    trials: tuple[TrialRow, ...]
     num_trials: int
     facets: tuple[Facet, ...]
     others: tuple[OtherFile, ...]
@@ -372,7 +363,7 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         rates=rate_table(judgement.measurements),
         gains=gains,
         gain_methods=methods(judgement.measurements, "gain."),
-        trials=tuple(Trial(row=row, agrees=agrees(row)) for row in rows if selection.takes(row)),
+        trials=tuple(row for row in rows if selection.takes(row)),
         num_trials=len(rows),
         facets=_facets(rows),
         others=others,
@@ -441,13 +432,9 @@ def _files(run: RunFolder, known: set[str]) -> tuple[tuple[OtherFile, ...], tupl
                     OtherFile(id=path.stem, info=episode.info, duration_s=episode.duration_s)
                 )
         except GstError as error:
-            broken.append(BrokenFile(name=_name(run, path), reason=str(error)))
+            broken.append(BrokenFile(name=str(path.relative_to(run.path)), reason=str(error)))
+    reason = "not finished: still being recorded, or its recorder was stopped"
     for folder in (run.episodes_dir, run.derived_dir):
-        for path in sorted(folder.glob("*.mcap.part")):
-            reason = "not finished: still being recorded, or its recorder was stopped"
-            broken.append(BrokenFile(name=_name(run, path), reason=reason))
+        parts = sorted(folder.glob("*.mcap.part"))
+        broken += [BrokenFile(name=str(p.relative_to(run.path)), reason=reason) for p in parts]
     return tuple(others), tuple(broken)
-
-
-def _name(run: RunFolder, path: Path) -> str:
-    return str(path.relative_to(run.path))
