@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 from measure import ROOT, Target, print_targets, report_targets
 
+from bridge.episode.topics import is_truth
+
 TASKS = {
     "cube_into_box": "standin",
     "sloth_into_basket": "standin_toys",
@@ -110,7 +112,7 @@ def judge_trial(run: Any, path: Path, config: Any, twin: Any) -> Judged:
 
 def ask(episode: Any, config: Any, twin: Any, calibration: Any = None) -> tuple[Any, float]:
     """Let the gate see what came before the plan, and judge it."""
-    from bridge.episode import schema, streams
+    from bridge.episode import streams
     from twin.gate.service import make_gate
     from twin.scene.localise.live import LiveView
 
@@ -122,7 +124,7 @@ def ask(episode: Any, config: Any, twin: Any, calibration: Any = None) -> tuple[
         watched = message.topic in CAMERAS_AND_FRAMES or message.topic.startswith(
             (f"/{config.cell}/cam/", f"/{config.cell}/event", f"/{config.cell}/joint_states")
         )
-        if watched and not schema.is_truth(message.topic):
+        if watched and not is_truth(message.topic):
             eyes.take(message.topic, message.data, message.log_time_ns, message.type_name)
     gate = make_gate(config, eyes, lambda: stamp_ns, twin)
     before = time.monotonic()

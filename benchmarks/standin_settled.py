@@ -21,7 +21,7 @@ from jaxtyping import Float
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.schema import TRUTH_PREFIX
+from bridge.episode.topics import TRUTH, object_topic
 from bridge.terminal import Output
 from twin.calibrate.physics.cases import Case, planar, read_cases
 from twin.calibrate.physics.parameters import BIAS
@@ -100,7 +100,7 @@ def _true_m(
     """Where the objects of a case truly lay at the beginning and at the end of its episode."""
     episode = Episode.open(run.episodes_dir / f"{case.episode}.mcap")
     tracks = [
-        streams.pose_track(episode, f"{TRUTH_PREFIX}object/{key}/pose").p_m for key in case.objects
+        streams.pose_track(episode, object_topic(TRUTH, key, "pose")).p_m for key in case.objects
     ]
     return np.array([p[0, :2] for p in tracks]), np.array([p[-1, :2] for p in tracks])
 

@@ -1,6 +1,5 @@
 """Camera frames of an episode: when they were taken, and their bytes as recorded."""
 
-import re
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,12 +9,11 @@ from pathlib import Path
 from bridge.episode import schema
 from bridge.episode.cdr.messages import color_file_from_message
 from bridge.episode.reader import Episode
+from bridge.episode.topics import RECORDED_TOPIC, RENDERED_TOPIC
 from dashboards.errors import NotHereError
 
 RENDERED = "rendered:"
 """Before a camera's id: its images as the twin renders them."""
-_RECORDED_TOPIC = re.compile(r"/cam/([^/]+)/(?:color|recorded)(?:/image)?$")
-_RENDERED_TOPIC = re.compile(r"/cam/([^/]+)/(?:color/)?(?:rendered|replayed)(?:/image)?$")
 MEDIA_TYPES = ((b"\xff\xd8", "image/jpeg"), (b"\x89PNG\r\n\x1a\n", "image/png"))
 
 
@@ -73,9 +71,9 @@ def _tracks(path: Path, _mtime_ns: int, _size: int) -> dict[str, CameraTrack]:
 
 
 def _camera_of(topic: str) -> str | None:
-    if match := _RECORDED_TOPIC.search(topic):
+    if match := RECORDED_TOPIC.search(topic):
         return match.group(1)
-    if match := _RENDERED_TOPIC.search(topic):
+    if match := RENDERED_TOPIC.search(topic):
         return RENDERED + match.group(1)
     return None
 

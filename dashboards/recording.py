@@ -9,10 +9,11 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float, Int
 
-from bridge.episode import schema, streams
+from bridge.episode import streams
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack
+from bridge.episode.topics import CLEARANCE, GRIPPER_STATE, JOINT_STATES, TCP_POSE, is_truth
 from bridge.errors import GstError
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan
@@ -98,7 +99,7 @@ def read_recording(path: Path) -> Recording:
 def _read(path: Path, _mtime_ns: int, size: int) -> Recording:
     episode = Episode.open(path)
     problems = Problems()
-    topics = {name: topic for name, topic in episode.topics().items() if not schema.is_truth(name)}
+    topics = {name: topic for name, topic in episode.topics().items() if not is_truth(name)}
 
     def joints(ending: str) -> JointTrack | None:
         if not any(topic.endswith(ending) for topic in topics):
@@ -125,10 +126,10 @@ def _read(path: Path, _mtime_ns: int, size: int) -> Recording:
         plans=tuple(problems.attempt(lambda: streams.plans(episode), [])),
         verdicts=tuple(problems.attempt(lambda: streams.verdicts(episode), [])),
         events=tuple(problems.attempt(lambda: streams.events(episode), [])),
-        joints=joints("/joint_states"),
-        widths=joints("/gripper/state"),
-        clearance=joints("/replay/clearance"),
-        tcp=poses(next((topic for topic in topics if topic.endswith("/tcp/pose")), None)),
+        joints=joints(JOINT_STATES),
+        widths=joints(GRIPPER_STATE),
+        clearance=joints(CLEARANCE),
+        tcp=poses(next((topic for topic in topics if topic.endswith(TCP_POSE)), None)),
         objects={name: track for name, track in tracked.items() if track is not None},
         cameras=problems.attempt(lambda: camera_tracks(path), {}),
         problems=tuple(problems.texts),

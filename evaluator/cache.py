@@ -3,7 +3,7 @@
 A summary is a frozen dataclass that follows from the bytes of a few files and from nothing else.
 It is kept under a key that names those bytes by their content hash, together with a digest of the
 code that makes summaries, so that neither a changed file nor changed code is answered from here.
-``docs/decisions/0040-what-an-evaluation-remembers.md`` says why.
+``docs/decisions/0008-caches-and-processes.md`` says why.
 """
 
 import hashlib

@@ -3,7 +3,7 @@
 Reading an episode is Python from end to end, so these are processes; ``parallel`` has threads, for
 images. Whatever another process did not do, this one does: one that is killed, hangs or runs out
 of memory costs time only, and an exception nobody expected is raised here, where it always was.
-``docs/decisions/0048-cold-evaluations-use-all-cores.md`` says why.
+``docs/decisions/0008-caches-and-processes.md`` says why.
 """
 
 import gc

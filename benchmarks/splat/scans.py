@@ -67,7 +67,7 @@ def held_out(run: RunFolder, record: Mapping[str, Any]) -> dict[str, HeldOut]:
     """By variant (raw, gain, pose_gain, static), as the evaluator scores them."""
     from evaluator.compare.images.scores import images_of, score_views
 
-    still = {item["id"] for item in record["cameras"] if item["still"]}
+    still = {item["id"] for item in record["cameras"] if item["stationary"]}
     found: dict[str, list[tuple[float, float]]] = {}
     for path in run.derived("*.views.*"):
         for view in score_views(images_of(Episode.open(path), None))[0]:

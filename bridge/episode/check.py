@@ -19,6 +19,7 @@ from bridge.episode.check_file import Faults, FileCheck
 from bridge.episode.check_topics import Decoder, Pauses, TopicCheck, TopicWatch
 from bridge.episode.reader import Episode, name_of_part, record_of
 from bridge.episode.run_folder import part_name
+from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import LIBRARY
 from bridge.errors import BridgeError, MissingDependencyError
 
@@ -244,7 +245,7 @@ def _check_metadata(episode: Episode, faults: Faults) -> None:
     if kind == "imported":
         return
     for topic, item in episode.topics().items():
-        expected = schema.type_of_topic(topic)
+        expected = type_of_topic(topic)
         if expected is None or not item.count or item.type_name in (expected, ""):
             continue
         images = {schema.IMAGE, schema.COMPRESSED_IMAGE}

@@ -23,6 +23,7 @@ from bridge.episode.cdr.messages import (
 )
 from bridge.episode.check_file import ScannedMessage
 from bridge.episode.schema import DEFINITIONS
+from bridge.episode.topics import DEPTH_IMAGE, type_of_topic
 from bridge.errors import BridgeError, MissingDependencyError
 from bridge.media.color import decode_color
 from bridge.task.plan import Plan
@@ -61,7 +62,7 @@ class Decoder:
         known = schema.schema_for(type_name)
         if known is None or encoding not in ("", known.message_encoding):
             return
-        if schema.type_of_topic(topic) is None and type_name in DEFINITIONS:
+        if type_of_topic(topic) is None and type_name in DEFINITIONS:
             codec.validate(type_name, data)
             return
         try:
@@ -70,7 +71,7 @@ class Decoder:
             self.missing.add(str(error))
 
     def _decode_contract(self, topic: str, type_name: str, data: bytes) -> None:
-        if topic.endswith("/depth/image") and type_name in (schema.IMAGE, schema.COMPRESSED_IMAGE):
+        if topic.endswith(DEPTH_IMAGE) and type_name in (schema.IMAGE, schema.COMPRESSED_IMAGE):
             height, width = DepthImage.from_message(type_name, data).depth_mm.shape
             before = self._depth_sizes.setdefault(topic, (width, height))
             if before != (width, height):

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import UInt64
 
-from bridge.episode import metadata, schema
+from bridge.episode import metadata
 from bridge.episode.mcap.file import McapFile, damaged
 from bridge.episode.mcap.format import MESSAGE_HEAD
 from bridge.episode.mcap.messages import (
@@ -23,6 +23,7 @@ from bridge.episode.mcap.messages import (
 from bridge.episode.mcap.walk import DAMAGE
 from bridge.episode.provenance import hash_files
 from bridge.episode.run_folder import EPISODE_ID, part_name
+from bridge.episode.topics import is_truth
 from bridge.errors import EpisodeError, PathNotFoundError, SchemaVersionError
 
 # --- Find the files of a split episode: ``<id>.mcap``, ``<id>.2.mcap``, ``<id>.3.mcap`` ...
@@ -392,7 +393,7 @@ class Episode:
         return [
             topic
             for topic, summary in self.topics().items()
-            if summary.type_name == type_name and not schema.is_truth(topic)
+            if summary.type_name == type_name and not is_truth(topic)
         ]
 
     def messages(

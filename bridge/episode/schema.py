@@ -1,7 +1,6 @@
-"""Topics and the schema each carries. ``docs/episode_format.md`` explains them field by field."""
+"""Message types and the schema of each. ``docs/episode_format.md`` explains them field by field."""
 
 import json
-import re
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -133,9 +132,6 @@ ADVICE = "gst/Advice"
 POSES_IN_FRAME = "foxglove.PosesInFrame"
 COMPRESSED_VIDEO = "foxglove.CompressedVideo"
 
-DROPS_TOPIC = "/recorder/drops"
-TRUTH_PREFIX = "/standin/truth/"
-
 _JSON_SCHEMAS = {
     PLAN: ("bridge.task", "schemas/plan.schema.json"),
     VERDICT: ("bridge.task", "schemas/verdict.schema.json"),
@@ -214,40 +210,3 @@ def json_schema_version(name: str) -> int:
         message = f"{name} has no JSON schema"
         raise KeyError(message)
     return int(json.loads(schema.data).get("version", 1))
-
-
-_TOPIC_RULES: tuple[tuple[str, str], ...] = (
-    (r"/cam/[^/]+/color/image$", COMPRESSED_IMAGE),
-    (r"/cam/[^/]+/color/preview$", COMPRESSED_VIDEO),
-    (r"/cam/[^/]+/depth/image$", IMAGE),
-    (r"/cam/[^/]+/(color|depth)/info$", CAMERA_INFO),
-    (r"/joint_states$", JOINT_STATE),
-    (r"/gripper/state$", JOINT_STATE),
-    (r"^/tf(_static)?$", TF_MESSAGE),
-    (r"^/robot_description$", STRING),
-    (r"/plan$", PLAN),
-    (r"/plan/trajectory$", JOINT_TRAJECTORY),
-    (r"/plan/path$", POSES_IN_FRAME),
-    (r"/event$", EVENT),
-    (r"/verdict$", VERDICT),
-    (r"/verdict/sample$", SAMPLE),
-    (r"/replay/contact$", CONTACT),
-    (r"/replay/divergence$", DIVERGENCE),
-    (r"/object/[^/]+/pose$", POSE_STAMPED),
-    (r"/object/[^/]+/nodes$", POINT_CLOUD),
-    (r"/localisation$", LOCALISATION),
-    (r"^/recorder/drops$", DROPS),
-)
-
-
-def type_of_topic(topic: str) -> str | None:
-    """Return the message type a topic of ours carries, or None for a foreign topic."""
-    for pattern, name in _TOPIC_RULES:
-        if re.search(pattern, topic):
-            return name
-    return None
-
-
-def is_truth(topic: str) -> bool:
-    """Say whether a topic holds stand-in ground truth, which ``twin`` must never read."""
-    return topic.startswith(TRUTH_PREFIX)

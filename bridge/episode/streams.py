@@ -1,6 +1,5 @@
 """Decode what an episode holds: joints, plans, events, cameras, poses."""
 
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +23,15 @@ from bridge.episode.cdr.messages import (
     transforms_from_cdr,
 )
 from bridge.episode.reader import Episode
+from bridge.episode.topics import (
+    CAMERAS,
+    COLOR_TOPIC,
+    JOINT_STATES,
+    OBJECTS,
+    ROBOT_DESCRIPTION,
+    TCP_POSE,
+    is_truth,
+)
 from bridge.episode.transforms import TransformTree
 from bridge.errors import EpisodeError
 from bridge.geometry import se3
@@ -33,7 +41,6 @@ from bridge.task.plan import Plan
 from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
 
-_COLOR_TOPIC = re.compile(r"/cam/([^/]+)/color/image$")
 PAIRING_TOLERANCE_NS = 20_000_000
 """Colour and depth of one frame lie at most this far apart."""
 
@@ -80,9 +87,9 @@ def first_stamp_ns(episode: Episode) -> int | None:
     joints = episode.topics_of_type(schema.JOINT_STATE)
     images = (schema.COMPRESSED_IMAGE, schema.IMAGE)
     topics = [
-        *(topic for topic in joints if topic.endswith("/joint_states")),
-        *(topic for topic in poses if topic.endswith("/tcp/pose") or "/object/" in topic),
-        *(t for name in images for t in episode.topics_of_type(name) if _COLOR_TOPIC.search(t)),
+        *(topic for topic in joints if topic.endswith(JOINT_STATES)),
+        *(topic for topic in poses if topic.endswith(TCP_POSE) or OBJECTS in topic),
+        *(t for name in images for t in episode.topics_of_type(name) if COLOR_TOPIC.search(t)),
     ]
     for topic in topics:
         for message in episode.messages([topic]):
@@ -101,14 +108,14 @@ def transform_tree(episode: Episode) -> TransformTree:
 
 def camera_ids(episode: Episode) -> list[str]:
     """Cameras that have colour images: the ``<id>`` of ``.../cam/<id>/color/image``."""
-    found = (_COLOR_TOPIC.search(topic) for topic in episode.topics() if not schema.is_truth(topic))
+    found = (COLOR_TOPIC.search(topic) for topic in episode.topics() if not is_truth(topic))
     return sorted({match[1] for match in found if match is not None})
 
 
 def find_camera_topic(episode: Episode, camera_id: str, tail: str) -> str | None:
     """Return a camera's topic by its end (``depth/image``); stand-in truth is never found."""
-    ending = f"/cam/{camera_id}/{tail}"
-    found = (t for t in episode.topics() if t.endswith(ending) and not schema.is_truth(t))
+    ending = f"{CAMERAS}{camera_id}/{tail}"
+    found = (t for t in episode.topics() if t.endswith(ending) and not is_truth(t))
     return next(found, None)
 
 
@@ -118,7 +125,7 @@ def _camera_topic(episode: Episode, camera_id: str, tail: str) -> str:
         return topic
     raise EpisodeError(
         path=episode.path,
-        found=f"no topic ends with /cam/{camera_id}/{tail}",
+        found=f"no topic ends with {CAMERAS}{camera_id}/{tail}",
         hint=f"Cameras here: {', '.join(camera_ids(episode)) or 'none'}.",
     )
 
@@ -173,7 +180,7 @@ def _pop_pair(
     return None
 
 
-def joint_track(episode: Episode, ending: str = "/joint_states") -> JointTrack:
+def joint_track(episode: Episode, ending: str = JOINT_STATES) -> JointTrack:
     """Collect the joint states of the topic with this ending, ordered by source time.
 
     ROS lets several nodes publish on one topic, each its own joints in its own order: those who
@@ -307,14 +314,14 @@ def object_pose_topics(episode: Episode) -> dict[str, str]:
     return {
         topic.split("/")[-2]: topic
         for topic in episode.topics_of_type(schema.POSE_STAMPED)
-        if "/object/" in topic
+        if OBJECTS in topic
     }
 
 
 def robot_description(episode: Episode) -> str | None:
     """Return the URDF text, from ``/robot_description`` or the attachment ``robot.urdf``."""
     for message in episode.messages(
-        topic for topic in episode.topics() if topic == "/robot_description"
+        topic for topic in episode.topics() if topic == ROBOT_DESCRIPTION
     ):
         return string_from_cdr(message.data)
     attached = episode.attachment("robot.urdf")

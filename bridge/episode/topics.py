@@ -1,10 +1,125 @@
-"""Names that become parts of topics."""
+"""The topics of an episode: their names, the type each carries, and how each travels.
+
+The only place that spells them. A name that begins after the cell (``/joint_states`` of
+``/lab/joint_states``) goes through ``cell_topic``; readers look for topics that end with it.
+``docs/episode_format.md`` explains the topics field by field.
+"""
 
 import re
+from typing import Literal
 
+from bridge.episode import schema
 from bridge.errors import UsageError
 
+Service = Literal["control", "camera", "reliable"]
+"""Small, frequent and never waits; large, the newest counts; nothing may be lost."""
+
+TF = "/tf"
+TF_STATIC = "/tf_static"
+ROBOT_DESCRIPTION = "/robot_description"
+DROPS = "/recorder/drops"
+TRUTH = "standin/truth"
+"""Takes the place of the cell in topics that hold a stand-in cell's ground truth."""
+
+JOINT_STATES = "/joint_states"
+JOINT_TARGETS = "/joint_targets"
+GRIPPER_STATE = "/gripper/state"
+SPEED_SCALING = "/speed_scaling"
+TCP_POSE = "/tcp/pose"
+TCP_WRENCH = "/tcp/wrench"
+PLAN = "/plan"
+PLAN_TRAJECTORY = "/plan/trajectory"
+PLAN_PATH = "/plan/path"
+EVENT = "/event"
+VERDICT = "/verdict"
+VERDICT_SAMPLE = "/verdict/sample"
+GATE = "/gate/verdict"
+"""A service, not a topic: a plan is asked, a verdict is answered."""
+LOCALISATION = "/localisation"
+CLEARANCE = "/replay/clearance"
+CONTACT = "/replay/contact"
+DIVERGENCE = "/replay/divergence"
+CAMERAS = "/cam/"
+OBJECTS = "/object/"
+
+COLOR_IMAGE = "/color/image"
+COLOR_INFO = "/color/info"
+DEPTH_IMAGE = "/depth/image"
+DEPTH_INFO = "/depth/info"
+TARGET_POSE = "/target/pose"
+"""Of a calibration target in the frame of the camera."""
+RECORDED_IMAGE = "/recorded/image"
+RENDERED_IMAGE = "/rendered/image"
+
+COLOR_TOPIC = re.compile(r"/cam/([^/]+)/color/image$")
+RECORDED_TOPIC = re.compile(r"/cam/([^/]+)/(?:color|recorded)(?:/image)?$")
+RENDERED_TOPIC = re.compile(r"/cam/([^/]+)/(?:color/)?(?:rendered|replayed)(?:/image)?$")
+POSE_ALIGNED_TOPIC = re.compile(r"/cam/([^/]+)/pose_aligned(?:/image)?$")
+MASK_TOPIC = re.compile(r"/cam/([^/]+)/mask/([a-z_]+)(?:/image)?$")
+RECORDED_DEPTH_TOPIC = re.compile(r"/cam/([^/]+)/recorded/depth(?:_in_color)?$")
+RENDERED_DEPTH_TOPIC = re.compile(r"/cam/([^/]+)/rendered/depth$")
+
+_TYPES: tuple[tuple[str, str], ...] = (
+    (r"/cam/[^/]+/color/image$", schema.COMPRESSED_IMAGE),
+    (r"/cam/[^/]+/color/preview$", schema.COMPRESSED_VIDEO),
+    (r"/cam/[^/]+/depth/image$", schema.IMAGE),
+    (r"/cam/[^/]+/(color|depth)/info$", schema.CAMERA_INFO),
+    (f"{JOINT_STATES}$", schema.JOINT_STATE),
+    (f"{GRIPPER_STATE}$", schema.JOINT_STATE),
+    (f"^({TF}|{TF_STATIC})$", schema.TF_MESSAGE),
+    (f"^{ROBOT_DESCRIPTION}$", schema.STRING),
+    (f"{PLAN}$", schema.PLAN),
+    (f"{PLAN_TRAJECTORY}$", schema.JOINT_TRAJECTORY),
+    (f"{PLAN_PATH}$", schema.POSES_IN_FRAME),
+    (f"{EVENT}$", schema.EVENT),
+    (f"{VERDICT}$", schema.VERDICT),
+    (f"{VERDICT_SAMPLE}$", schema.SAMPLE),
+    (f"{CONTACT}$", schema.CONTACT),
+    (f"{DIVERGENCE}$", schema.DIVERGENCE),
+    (r"/object/[^/]+/pose$", schema.POSE_STAMPED),
+    (r"/object/[^/]+/nodes$", schema.POINT_CLOUD),
+    (f"{LOCALISATION}$", schema.LOCALISATION),
+    (f"^{DROPS}$", schema.DROPS),
+)
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+
+
+def cell_topic(cell: str, ending: str) -> str:
+    """Name a topic of a cell: ``cell_topic("lab", JOINT_STATES)`` is ``/lab/joint_states``."""
+    return f"/{cell}{ending}"
+
+
+def camera_topic(cell: str, camera_id: str, ending: str = "") -> str:
+    """Name a topic of a camera: ``COLOR_IMAGE``, ``DEPTH_INFO`` ...; "" is what all begin with."""
+    return f"/{cell}{CAMERAS}{camera_id}{ending}"
+
+
+def object_topic(cell: str, object_id: str, what: Literal["pose", "nodes"]) -> str:
+    """Name the topic of an object's pose or, of a soft one, of its points."""
+    return f"/{cell}{OBJECTS}{object_id}/{what}"
+
+
+def type_of_topic(topic: str) -> str | None:
+    """Return the message type a topic of ours carries, or None for a foreign topic."""
+    return next((name for pattern, name in _TYPES if re.search(pattern, topic)), None)
+
+
+def service_of_topic(topic: str) -> Service:
+    """Say how a topic should travel when the network is behind; ``wire.qos`` has the presets."""
+    if topic.endswith((COLOR_IMAGE, DEPTH_IMAGE)):
+        return "camera"
+    control = (JOINT_STATES, JOINT_TARGETS, GRIPPER_STATE, SPEED_SCALING, TCP_POSE, TCP_WRENCH, TF)
+    return "control" if topic.endswith(control) else "reliable"
+
+
+def is_truth(topic: str) -> bool:
+    """Say whether a topic holds stand-in ground truth, which ``twin`` must never read."""
+    return topic.startswith(f"/{TRUTH}/")
+
+
+def is_latched(topic: str) -> bool:
+    """Say whether the last message of a topic stays true until the next."""
+    return topic in (TF_STATIC, ROBOT_DESCRIPTION) or topic.endswith("/info")
 
 
 def refuse_bad_name(what: str, name: str) -> None:

@@ -1,7 +1,7 @@
 """Write one episode: ``<name>.mcap.part`` while open, renamed when complete.
 
 Nothing half-written ever carries the final name; a crash leaves the ``.part`` file, which
-``recover`` reads. ``docs/decisions/0011-own-chunk-writer.md`` says why the chunks are our own.
+``recover`` reads. ``docs/decisions/0003-mcap-files.md`` says why the chunks are our own.
 """
 
 import json

@@ -14,6 +14,7 @@ from bridge.episode.catalogue import outcome_of
 from bridge.episode.cdr.messages import JointSample, PoseSample
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import GRIPPER_STATE, is_truth
 from bridge.errors import UsageError
 from bridge.exchange.output import message_named, new_folder, write_note
 from bridge.geometry import se3
@@ -114,7 +115,7 @@ class TableKind:
             type_name == self.type_name
             and topic.endswith(self.ending)
             and not topic.endswith(self.not_ending or ("\0",))
-            and not schema.is_truth(topic)
+            and not is_truth(topic)
         )
 
 
@@ -174,14 +175,14 @@ TABLES = (
         type_name=schema.JOINT_STATE,
         columns=_JOINT,
         rows=_joints,
-        not_ending=("/gripper/state",),
+        not_ending=(GRIPPER_STATE,),
     ),
     TableKind(
         name="gripper",
         type_name=schema.JOINT_STATE,
         columns=_JOINT,
         rows=_joints,
-        ending="/gripper/state",
+        ending=GRIPPER_STATE,
     ),
     TableKind(name="poses", type_name=schema.POSE_STAMPED, columns=_POSE, rows=_poses),
     TableKind(name="events", type_name=schema.EVENT, columns=_EVENT, rows=_events),

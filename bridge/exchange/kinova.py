@@ -26,6 +26,7 @@ from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.provenance import hash_file, hash_settings
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import TCP_POSE, cell_topic, object_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import BridgeError, PathNotFoundError
 from bridge.geometry import se3
@@ -33,9 +34,9 @@ from bridge.geometry import se3
 CELL = "kinova"
 FRAME = "world"
 """Motion capture and simulator share it: robot base near the origin, z up."""
-TCP_TOPIC = f"/{CELL}/tcp/pose"
-CUBE_TOPIC = f"/{CELL}/object/cube/pose"
-BASE_TOPIC = f"/{CELL}/base/pose"
+TCP_TOPIC = cell_topic(CELL, TCP_POSE)
+CUBE_TOPIC = object_topic(CELL, "cube", "pose")
+BASE_TOPIC = cell_topic(CELL, "/base/pose")
 _REAL_COLUMNS = 53
 _SIM_COLUMNS = 14
 _BODY_STARTS = {BASE_TOPIC: 2, TCP_TOPIC: 19, CUBE_TOPIC: 36}

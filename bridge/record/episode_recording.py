@@ -13,6 +13,7 @@ from bridge.clock import ns_from_s
 from bridge.episode import metadata, schema
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import part_name
+from bridge.episode.topics import DROPS, EVENT, cell_topic
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 from bridge.errors import BridgeError, MissingDependencyError
 from bridge.record.config import BYTES_PER_MB, DiskConfig, RecorderConfig
@@ -398,7 +399,7 @@ class EpisodeRecording:
         closed = self.ledger.close_seconds(before)
         self._records.extend({**record, **health} for record in closed)
         while self._records:
-            self._write_json(schema.DROPS_TOPIC, self._records[0], schema.DROPS, now_ns)
+            self._write_json(DROPS, self._records[0], schema.DROPS, now_ns)
             self._records.popleft()
 
     def _write_json(
@@ -424,7 +425,7 @@ class EpisodeRecording:
             record["data"] = data
         if outcome is not None:
             record["outcome"] = asdict(outcome)
-        topic = f"/{self.info.cell or 'recorder'}/event"
+        topic = cell_topic(self.info.cell or "recorder", EVENT)
         self._write_json(topic, record, schema.EVENT, stamp_ns)
         self.outcome = outcome or self.outcome
 

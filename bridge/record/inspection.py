@@ -14,6 +14,7 @@ from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.images import DEPTH_ENCODINGS, ImageHeader, image_header
 from bridge.episode.cdr.messages import VideoFrame
+from bridge.episode.topics import type_of_topic
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _TAIL_BYTES = 64
@@ -35,7 +36,7 @@ GOOD = MessageState.GOOD
 
 def resolve_type(topic: str, type_name: str) -> str:
     """Trust the publisher's type name; without one, go by the topic."""
-    return type_name or schema.type_of_topic(topic) or ""
+    return type_name or type_of_topic(topic) or ""
 
 
 def inspect(type_name: str, message_encoding: str, data: bytes) -> MessageState:

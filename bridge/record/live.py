@@ -10,7 +10,6 @@ with open_recorder(Path("runs/monday")) as recorder:
 
 import contextlib
 import json
-import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -27,6 +26,7 @@ from bridge.episode.metadata import Outcome
 from bridge.episode.recover import recover_parts
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.salvage import RecoveryReport
+from bridge.episode.topics import COLOR_TOPIC
 from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
 from bridge.record.config import RecorderConfig
 from bridge.record.control import parse_info, parse_outcome, serve_control
@@ -46,7 +46,6 @@ from bridge.wire.session import Subscriber, WireSample, WireSession, open_sessio
 WIDTH = 320
 QUALITY = 70
 MAX_PREVIEWS = 64
-_CAMERA = re.compile(r"/cam/([^/]+)/color/image$")
 
 
 class Previews:
@@ -92,7 +91,7 @@ class Previews:
         return self._watched
 
     def _name(self, topic: str) -> str:
-        found = _CAMERA.search(topic)
+        found = COLOR_TOPIC.search(topic)
         name = found[1] if found else ""
         if not name or name in self._names:  # two cells may call their cameras the same
             name = topic.strip("/").replace("/", "_")

@@ -16,6 +16,7 @@ from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.messages import transforms_from_cdr
+from bridge.episode.topics import DROPS, TF_STATIC, is_latched
 from bridge.record.config import BYTES_PER_MB, QueueConfig
 from bridge.record.inspection import MessageState, resolve_type
 from bridge.record.sequence import SequenceTracker, Step
@@ -27,14 +28,8 @@ MAX_LATCHED = 1000
 MAX_LATCHED_BYTES = 256_000_000
 """Maps are large; a file that begins with more than this of the past is refused the rest."""
 MAX_DECLARED = 1000
-TF_STATIC = "/tf_static"
 NOT_LATCHED = frozenset(("/rosout",))
 """Transient local in ROS 2, yet what was logged once does not stay true."""
-
-
-def is_latched(topic: str) -> bool:
-    """Say whether the last message of a topic stays true until the next."""
-    return topic in (TF_STATIC, "/robot_description") or topic.endswith("/info")
 
 
 class LatchedTopics:
@@ -346,7 +341,7 @@ class InputQueue:
             topic,
             type_name,
             is_image=type_name in IMAGE_TYPES,
-            is_ledger=topic == schema.DROPS_TOPIC,
+            is_ledger=topic == DROPS,
         )
         self._flows[sample.topic, sample.type_name] = flow
         return flow

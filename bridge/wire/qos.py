@@ -6,6 +6,8 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
+from bridge.episode.topics import service_of_topic
+
 
 @dataclass(frozen=True, kw_only=True)
 class Qos:
@@ -22,6 +24,12 @@ class Qos:
     """Large messages go through shared memory when the session has some."""
     is_remote: bool = False
     """Subscribers of the same session get none, and do not count as somebody who looks."""
+
+    @classmethod
+    def of(cls, topic: str) -> "Qos":
+        """Choose the preset of one of our topics; what is not known is reliable."""
+        presets = {"camera": cls.CAMERA, "control": cls.CONTROL, "reliable": cls.RELIABLE}
+        return presets[service_of_topic(topic)]
 
     CAMERA: ClassVar["Qos"]
     """Images: many bytes, each worth little; the newest frame is never worth a stall."""

@@ -16,7 +16,7 @@ NETWORK_THREADS = "(rx: (worker_threads: 1), acc: (handover: rx))"
 
 As zenoh comes, every message wakes one thread that waits and two that read. Our callbacks take
 turns in Python anyway, so more readers bring nothing: one costs a tenth of a core less while
-recording (``docs/decisions/0014-what-the-recorder-takes-in.md``)."""
+recording (``docs/decisions/0005-recorder.md``)."""
 
 os.environ.setdefault("ZENOH_RUNTIME", NETWORK_THREADS)  # read when the first session opens
 

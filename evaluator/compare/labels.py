@@ -10,6 +10,7 @@ from bridge.clock import NS_PER_S
 from bridge.episode import schema, streams
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.reader import Episode
+from bridge.episode.topics import TCP_POSE
 from bridge.geometry import se3
 from bridge.task.predicate import PredicateResult, Rollout, all_hold, evaluate_success, objects_done
 from bridge.task.task_file import Task
@@ -17,7 +18,6 @@ from evaluator.compare.known_task import known_task
 from evaluator.compare.measure import Part, proportion, slug
 from evaluator.compare.rows import TrialRow
 from evaluator.result import Cell, Exclusion, Measurement, Table
-from evaluator.run_reader.tracks import TOOL
 
 AFTER = "end"
 DECIDED_BY_A_LOOK = ("inside", "shape")
@@ -135,7 +135,7 @@ def _away(
 
 def _tool_m(recorded: Episode, seen_ns: int) -> Float[np.ndarray, "3"] | None:
     """Where the tool was when the objects were seen; it is asked for near that time first."""
-    topics = [t for t in recorded.topics_of_type(schema.POSE_STAMPED) if t.endswith(TOOL)][:1]
+    topics = [t for t in recorded.topics_of_type(schema.POSE_STAMPED) if t.endswith(TCP_POSE)][:1]
     for around_ns in (NS_PER_S, None):
         bounds = (None, None) if around_ns is None else (seen_ns - around_ns, seen_ns + around_ns)
         found = recorded.messages(topics, start_ns=bounds[0], end_ns=bounds[1])

@@ -10,6 +10,7 @@ from bridge.episode import schema
 from bridge.episode.metadata import Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.streams import pose_track
+from bridge.episode.topics import TCP_POSE
 from bridge.errors import BridgeError
 from bridge.exchange.trials_csv import MOST_IN_TRIAL
 from bridge.geometry.trajectory import PoseTrajectory
@@ -169,9 +170,7 @@ def _stages(outcome: Outcome | None) -> tuple[tuple[str, bool | None], ...]:
 def tcp_track(episode: Episode) -> PoseTrajectory | None:
     """Return the tool centre point's poses, or None where they were not recorded."""
     topics = [
-        topic
-        for topic in episode.topics_of_type(schema.POSE_STAMPED)
-        if topic.endswith("/tcp/pose")
+        topic for topic in episode.topics_of_type(schema.POSE_STAMPED) if topic.endswith(TCP_POSE)
     ]
     try:
         return pose_track(episode, topics[0]) if topics else None

@@ -8,12 +8,10 @@ from jaxtyping import Int
 from bridge.episode import schema
 from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack, execution_ns, joint_track_of, pose_track_of
+from bridge.episode.topics import JOINT_STATES, TCP_POSE
 from bridge.errors import BridgeError
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.record import parse_record
-
-JOINTS = "/joint_states"
-TOOL = "/tcp/pose"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,8 +78,8 @@ def read_tracks(episode: Episode, plan_id: str) -> Tracks:
 
     A stream that is not there, or is broken, is None.
     """
-    poses = [t for t in episode.topics_of_type(schema.POSE_STAMPED) if t.endswith(TOOL)]
-    joints = [t for t in episode.topics_of_type(schema.JOINT_STATE) if t.endswith(JOINTS)]
+    poses = [t for t in episode.topics_of_type(schema.POSE_STAMPED) if t.endswith(TCP_POSE)]
+    joints = [t for t in episode.topics_of_type(schema.JOINT_STATE) if t.endswith(JOINT_STATES)]
     events = episode.topics_of_type(schema.EVENT)
     of_tool, of_joints, of_events = episode.payloads(poses[:1], joints, events)
     records = [

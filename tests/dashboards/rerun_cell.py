@@ -18,6 +18,7 @@ from bridge.episode.cdr.messages import (
 from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import TRUTH, object_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
@@ -109,7 +110,7 @@ def extra(start: int, description: str) -> list[tuple[str, str, bytes, int]]:
             ("/tf", schema.TF_MESSAGE, transforms_to_cdr([moved]), ns),
             ("/standin/cam/hand/color/image", schema.COMPRESSED_IMAGE, color.to_cdr(), ns),
             ("/standin/cam/hand/depth/image", schema.IMAGE, depth.to_cdr(), ns),
-            (f"{schema.TRUTH_PREFIX}object/secret/pose", schema.POSE_STAMPED, truth.to_cdr(), ns),
+            (object_topic(TRUTH, "secret", "pose"), schema.POSE_STAMPED, truth.to_cdr(), ns),
         ]
     return found
 

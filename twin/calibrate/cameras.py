@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from bridge.episode import schema, streams
+from bridge.episode import streams
 from bridge.episode.cdr.messages import DepthImage
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import CAMERAS, DEPTH_IMAGE, DEPTH_INFO, TARGET_POSE, is_truth
 from bridge.errors import BridgeError, GstError, UsageError
 from bridge.geometry import se3
 from bridge.task.robot import BASE_FRAME
@@ -48,11 +49,10 @@ def placement(episodes: Sequence[Episode]) -> dict[str, str]:
 
 def depth_cameras(episode: Episode) -> list[str]:
     """Cameras of an episode with depth images and their intrinsics, never those of truth."""
-    topics = {topic for topic in episode.topics() if not schema.is_truth(topic)}
-    ending = "/depth/image"
-    stems = [topic.removesuffix(ending) for topic in topics if topic.endswith(ending)]
+    topics = {topic for topic in episode.topics() if not is_truth(topic)}
+    stems = [topic.removesuffix(DEPTH_IMAGE) for topic in topics if topic.endswith(DEPTH_IMAGE)]
     return sorted(
-        stem.split("/")[-1] for stem in stems if f"{stem}/depth/info" in topics and "/cam/" in stem
+        stem.split("/")[-1] for stem in stems if f"{stem}{DEPTH_INFO}" in topics and CAMERAS in stem
     )
 
 
@@ -254,16 +254,17 @@ def _camera(
         return _from_target(read_pairs(config.pairs), config)
     if camera_id in target_cameras(episodes):
         return _from_target(recorded_pairs(episodes, camera_id, config.link), config)
+    topic = f"...{CAMERAS}{camera_id}{TARGET_POSE}"
     if where == NO_DEPTH:
         message = (
-            f"camera {camera_id} has neither target poses (topic .../cam/{camera_id}/target/pose) "
+            f"camera {camera_id} has neither target poses (topic {topic}) "
             "nor depth images with intrinsics. Record one of them, or give --pairs FILE."
         )
         raise NothingToCalibrateError(message)
     if where == MOVING:
         message = (
             f"camera {camera_id} moves with the robot and there are no target poses of it. Record "
-            f"a target from 10 to 20 places on .../cam/{camera_id}/target/pose, or give --pairs "
+            f"a target from 10 to 20 places on {topic}, or give --pairs "
             "FILE."
         )
         raise NothingToCalibrateError(message)

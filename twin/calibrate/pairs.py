@@ -17,12 +17,12 @@ from jaxtyping import Float
 from bridge.episode import schema
 from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.reader import Episode
+from bridge.episode.topics import CAMERAS, TARGET_POSE
 from bridge.errors import PathNotFoundError, UsageError
 from bridge.geometry import se3
 from twin.robot.model import load_robot
 from twin.robot.posture import PostureTrack, posture_track
 
-TARGET_ENDING = "/target/pose"
 CSV_COLUMNS = tuple(
     f"{what}_{name}"
     for what in ("effector", "target")
@@ -106,7 +106,7 @@ def target_cameras(episodes: Sequence[Episode]) -> list[str]:
             topic.split("/")[-3]
             for episode in episodes
             for topic in episode.topics_of_type(schema.POSE_STAMPED)
-            if topic.endswith(TARGET_ENDING) and "/cam/" in topic
+            if topic.endswith(TARGET_POSE) and CAMERAS in topic
         }
     )
 
@@ -127,7 +127,7 @@ def recorded_pairs(episodes: Sequence[Episode], camera_id: str, link: str) -> Po
         topics = [
             topic
             for topic in episode.topics_of_type(schema.POSE_STAMPED)
-            if topic.endswith(f"/cam/{camera_id}{TARGET_ENDING}")
+            if topic.endswith(f"{CAMERAS}{camera_id}{TARGET_POSE}")
         ]
         samples = [PoseSample.from_cdr(message.data) for message in episode.messages(topics)]
         samples = [sample for sample in samples if np.isfinite(sample.T_frame_body).all()]

@@ -25,19 +25,23 @@ class GateConfig:
     """Whose plans are judged: topics and the service are below this name."""
     task: str = "cube_into_box"
     """The task whose objects and success predicate count."""
-    deadline_s: Annotated[float, Parameter(name="--deadline", converter=convert_duration)] = 20.0
-    """Answer after this long at the latest: 20s, 1min or plain seconds."""
+    max_steps: int = 100_000
+    """Simulated steps behind one verdict, the varied replays' among them: the deadline that gives
+    the same verdict on every machine. A plan that alone needs more gets no verdict."""
+    deadline_s: Annotated[float, Parameter(name="--deadline", converter=convert_duration)] = 300.0
+    """Last resort against what hangs: without an answer after this long on the wall clock (20s,
+    5min or plain seconds) there is no verdict, and its reason names this limit."""
     waiting: int = 4
     """Plans that may wait while one is judged; more are turned away at once."""
     samples: int = 0
-    """Varied replays behind each verdict, for its success probability: as many of them as fit
-    before the deadline."""
+    """Varied replays behind each verdict, for its success probability: as many of them as fit into
+    --max-steps."""
     min_p_success: float = 0.0
     """Refuse a plan that the nominal replay accepts when fewer of its samples succeed, as a
     fraction; 0 leaves the nominal replay alone to decide."""
     frames: int = 3
     """Frames per camera that are averaged to find the objects."""
-    frame_wait_s: float = 2.0
+    frame_wait_s: float = 10.0
     """Wait this long for fresh frames before giving up."""
     max_frame_age_s: float = 5.0
     """A camera that has been silent for longer, on the cell's clock, is not trusted."""
@@ -58,6 +62,7 @@ class GateConfig:
         refuse_outside(
             self,
             {
+                "max_steps": (1, 10**9),
                 "deadline_s": (0, day_s),
                 "waiting": (0, 1000),
                 "samples": (0, 100_000),

@@ -1,7 +1,8 @@
-"""Judging plans one at a time, before a deadline, from where the objects are seen at rest.
+"""Judge plans one at a time, from where the objects are seen at rest.
 
 What cannot be decided is answered with ``accepted: null`` and a reason; nothing is ever accepted
-by default.
+by default. How much is simulated for a verdict is counted in steps, so it does not depend on the
+machine's speed; the wall clock is the last resort against what hangs.
 """
 
 import queue
@@ -16,6 +17,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from bridge.episode.topics import ROBOT_DESCRIPTION
 from bridge.errors import GstError
 from bridge.task.plan import Plan
 from bridge.task.robot import BASE_FRAME
@@ -80,15 +82,13 @@ def _sigmas(item: Any) -> tuple[float, float]:
 ENGINE_NONE = "none"
 POLL_S = 0.05
 ANSWER_S = 0.1
-"""Kept back from the deadline for answering."""
-LOOK_AGAIN = 1.5
-"""Times the first localisation, kept back for looking again before a yes."""
+"""Kept back from the wall-clock limit for answering."""
 MAX_PLAN_BYTES = 32_000_000
 """Ten minutes of waypoints with joints at 125 Hz take less."""
 
 
 class PlanTooLargeError(TwinError):
-    """A payload is too large to be read before the deadline."""
+    """A payload is too large to be read as a plan."""
 
     def __init__(self, *, num_bytes: int) -> None:
         """Remember the size."""
@@ -130,7 +130,7 @@ Replay = Callable[[Plan, Mapping[str, Any], str, float], Verdict]
 
 
 class Gate:
-    """Judges plans one at a time; every answer comes before the deadline."""
+    """Judges plans one at a time; every answer comes within the wall-clock limit."""
 
     def __init__(
         self,
@@ -155,7 +155,7 @@ class Gate:
         self._contact_ns = 0
 
     def judge(self, payload: bytes) -> Verdict:
-        """Judge one plan; the deadline counts from here, reading it included.
+        """Judge one plan; the wall-clock limit counts from here, reading it included.
 
         Raises:
             InvalidRecordError: When the payload is no gst plan.
@@ -170,13 +170,13 @@ class Gate:
                 return no_verdict(plan, f"{self._inside} plans are being judged already; ask later")
             self._inside += 1
         try:
-            return self._before_deadline(plan, ends_s)
+            return self._in_time(plan, ends_s)
         finally:
             with self._counting:
                 self._inside -= 1
 
-    def _before_deadline(self, plan: Plan, ends_s: float) -> Verdict:
-        limit = f"the deadline of {self._config.deadline_s:g} s"
+    def _in_time(self, plan: Plan, ends_s: float) -> Verdict:
+        limit = f"the wall-clock limit of {self._config.deadline_s:g} s (--deadline)"
         if not self._turn.acquire(timeout=max(0.0, ends_s - time.monotonic())):
             return no_verdict(plan, f"an earlier plan was still being judged at {limit}")
         if time.monotonic() >= ends_s:
@@ -190,7 +190,7 @@ class Gate:
             finally:
                 self._turn.release()
 
-        # What runs in this process cannot be interrupted: past the deadline it finishes unheard,
+        # What runs in this process cannot be interrupted: past the limit it finishes unheard,
         # and until then holds the turn. A daemon thread does not keep the process from ending.
         worker = threading.Thread(target=work, name=f"judge {plan.id}", daemon=True)
         try:
@@ -223,10 +223,8 @@ class Gate:
 
     def _judged(self, plan: Plan, urdf: str, ends_s: float) -> Verdict:
         frames = self._wait_for_frames()
-        started_s = time.monotonic()
         found = self._find_objects(frames, ends_s)
-        again_s = LOOK_AGAIN * (time.monotonic() - started_s)
-        verdict = self._replay(plan, found, urdf, ends_s - again_s)
+        verdict = self._replay(plan, found, urdf, ends_s)
         if verdict.accepted is not True:
             return verdict
         verdict = self._likely(verdict)
@@ -248,7 +246,7 @@ class Gate:
             )
         urdf = self._eyes.urdf()
         if urdf is None:
-            raise UndecidedError("no robot description has arrived on /robot_description")
+            raise UndecidedError(f"no robot description has arrived on {ROBOT_DESCRIPTION}")
         robot = robot_name(urdf)
         if plan.robot != robot:
             raise UndecidedError(
@@ -273,7 +271,10 @@ class Gate:
             if live.frames:
                 return live.frames
             if time.monotonic() >= ends:
-                raise UndecidedError(f"no usable frames: {'; '.join(live.reasons)}")
+                raise UndecidedError(
+                    f"no usable frames within {self._config.frame_wait_s:g} s: "
+                    f"{'; '.join(live.reasons)}"
+                )
             time.sleep(POLL_S)
 
     def _frames(self) -> Any:
@@ -290,7 +291,8 @@ class Gate:
         p = verdict.p_success
         if p is None:
             raise UndecidedError(
-                f"no varied replay was done in time, and {wanted:.0%} of them are to succeed"
+                f"--max-steps {self._config.max_steps} leaves no step for a varied replay, and "
+                f"{wanted:.0%} of them are to succeed"
             )
         if p["value"] >= wanted:
             return verdict

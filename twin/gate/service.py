@@ -9,6 +9,17 @@ from typing import Any
 
 from bridge.episode import schema
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import (
+    CAMERAS,
+    EVENT,
+    GATE,
+    JOINT_STATES,
+    ROBOT_DESCRIPTION,
+    TF,
+    TF_STATIC,
+    VERDICT,
+    cell_topic,
+)
 from bridge.errors import UsageError
 from bridge.task.task_file import load_task
 from bridge.terminal import Output, printable, stop_signals
@@ -48,7 +59,7 @@ def serve_gate(
     A published verdict carries the time of the newest thing seen, on the cell's own clock, so
     that it lies before the execution it allows.
     """
-    publisher = session.publisher(f"/{config.cell}/verdict", schema.VERDICT)
+    publisher = session.publisher(cell_topic(config.cell, VERDICT), schema.VERDICT)
     publishing = threading.Lock()
 
     def answer(payload: bytes) -> bytes:
@@ -66,7 +77,7 @@ def serve_gate(
 
     # One is judged, some wait, and one more is told at once that it may not: all heard at once,
     # for the deadline runs from when a plan comes in.
-    session.serve(f"{config.cell}/gate/verdict", answer, side_by_side=config.waiting + 2)
+    session.serve(cell_topic(config.cell, GATE)[1:], answer, side_by_side=config.waiting + 2)
 
 
 def watch_cell(
@@ -81,9 +92,10 @@ def watch_cell(
     def on_sample(sample: Any) -> None:
         take(sample.topic, sample.data, sample.received_ns, sample.type_name)
 
-    keys = [f"{cell}/cam/**", f"{cell}/event", "tf", "tf_static", "robot_description"]
-    for key in [*keys, f"{cell}/joint_states"] if joints else keys:
-        session.subscribe(key, on_sample)
+    watched = [cell_topic(cell, CAMERAS) + "**", cell_topic(cell, EVENT)]
+    watched += [TF, TF_STATIC, ROBOT_DESCRIPTION]
+    for topic in [*watched, cell_topic(cell, JOINT_STATES)] if joints else watched:
+        session.subscribe(topic[1:], on_sample)
 
 
 def claim_gate(session: Any, cell: str) -> None:
@@ -98,7 +110,7 @@ def claim_gate(session: Any, cell: str) -> None:
     key = f"{cell}/gate/alive"
     if session.query_alive(key):
         raise GateError(
-            f"a gate answers on {cell}/gate/verdict already, and of two only one would be heard. "
+            f"a gate answers on {cell}{GATE} already, and of two only one would be heard. "
             "Stop it first; one whose machine is gone is forgotten after ten seconds."
         )
     session.declare_alive(key)
@@ -126,7 +138,7 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
         gate = make_gate(config, eyes, session.now_ns, twin)
         serve_gate(session, gate, eyes, config, output)
         output.say(
-            f"gate ready: {config.task} of cell {config.cell}, service {config.cell}/gate/verdict, "
+            f"gate ready: {config.task} of cell {config.cell}, service {config.cell}{GATE}, "
             f"{eyes.cameras_from()}. Stop with Ctrl-C."
         )
         while not stopped.wait(0.2):

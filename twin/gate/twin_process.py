@@ -24,9 +24,6 @@ from twin.replay.config import ReplayConfig
 
 # --- What the gate's own process does: finding objects and replaying plans.
 
-SAMPLING = 0.9
-"""Share of the time left in which samples are begun; a late one would cost the verdict too."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
@@ -50,8 +47,8 @@ class Question:
     covariances: dict[str, Float[np.ndarray, "6 6"]]
     urdf: str
     config: ReplayConfig
-    left_s: float
-    """No sample is begun that would not be done by then."""
+    max_steps: int
+    """Simulated steps, the samples' among them."""
 
 
 def get_ready(_: None) -> None:
@@ -73,10 +70,15 @@ def look(item: Look) -> dict[str, Any]:
 
 
 def answer(question: Question) -> Verdict:
-    """Replay a plan in the rebuilt place, then as many varied ones as were asked for and fit.
+    """Replay a plan in the rebuilt scene, then as many varied ones as were asked for and fit.
 
+    Nothing here looks at a clock: the same question has the same answer on every machine.
     Rounds of one start are tried against the same variations: their identity is the start's name.
+
+    Raises:
+        UndecidedError: When the nominal replay alone needs more steps than there may be.
     """
+    from twin.replay.dynamics import num_steps  # noqa: PLC0415
     from twin.replay.monte_carlo import replay_samples, with_probability  # noqa: PLC0415
     from twin.replay.rebuilt_scene import (  # noqa: PLC0415
         calibrated,
@@ -87,13 +89,19 @@ def answer(question: Question) -> Verdict:
     from twin.replay.verdict import replay_plan  # noqa: PLC0415
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
 
-    started_s = time.monotonic()
     run, plan = RunFolder.open(question.run_path), question.plan
     place = read_rebuilt_scene(run, question.task)
     scene = place.scene(
         question.task, question.urdf, question.Ts_base_object, covariances=question.covariances
     )
     config = for_task(calibrated(question.config, read_calibration(run)), question.task)
+    steps = num_steps(plan.tau[-1].t_ns if plan.tau else 0, config)
+    if steps > question.max_steps:
+        raise UndecidedError(
+            f"its replay takes {steps} simulated steps, and a verdict at most "
+            f"{question.max_steps} (--max-steps)"
+        )
+    most_samples = question.max_steps // steps - 1
 
     def judge(there: ReplayScene, settings: ReplayConfig) -> Verdict:
         return replay_plan(plan, there, settings).verdict
@@ -102,11 +110,9 @@ def answer(question: Question) -> Verdict:
     samples = replay_samples(
         judge,
         scene,
-        config,
+        replace(config, samples=min(config.samples, most_samples)),
         plan_id=plan.id,
         identity=plan.start_id or plan.id,
-        ends_s=started_s + SAMPLING * question.left_s,
-        expected_s=time.monotonic() - started_s,
     )
     return _with_remarks(with_probability(verdict, samples), place.remarks)
 
@@ -126,6 +132,7 @@ class TwinProcess:
         """Start it; it imports what it needs while the gate connects."""
         self._run_path, self._task, self._output = run_path, task, output
         self._config = replace(config.replay, mode="dynamic", samples=config.samples)
+        self._max_steps = config.max_steps
         self._swapping = threading.Lock()
         self._closed = False
         self._worker: Worker | None = None
@@ -169,7 +176,7 @@ class TwinProcess:
             },
             urdf=urdf,
             config=self._config,
-            left_s=max(0.0, ends_s - time.monotonic()),
+            max_steps=self._max_steps,
         )
         verdict: Verdict = self._do("replay", answer, question, ends_s)
         return verdict
@@ -184,7 +191,7 @@ class TwinProcess:
         except TimeIsUpError as error:
             self._replace(worker)
             raise UndecidedError(
-                f"the {what} was not done before the deadline; it was stopped"
+                f"the {what} was not done before the wall-clock limit (--deadline); it was stopped"
             ) from error
         except WorkerDiedError as error:
             self._replace(worker)

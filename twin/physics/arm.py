@@ -286,7 +286,7 @@ class Arm:
         """Let what is soft between the fingers slow, stall or push back their drive.
 
         The line of a geared motor: the speed falls with the load and is zero at the grip force.
-        Why not a force: docs/decisions/0029-soft-bodies-by-stress.md.
+        Why not a force: docs/decisions/0017-contact-physics.md.
 
         Args:
             reaction_N: Mean over both fingers of what pushes them apart.
@@ -365,7 +365,7 @@ def _numbers(joints: Joints) -> list[float]:
 # what stops a finger at the speed it is driven with. At the usual speed 20 N take 45 iterations;
 # all else takes 10. Fingers that stand still although they are told to close are therefore driven
 # faster. Their force is the same. What they hold may give way: then they are at the usual speed
-# again before they have gone far. docs/decisions/0049-stalled-fingers.md.
+# again before they have gone far. docs/decisions/0017-contact-physics.md.
 
 PRESS_M_S = 0.8
 """Speed with which stalled fingers are driven; until somebody looks they go 7 mm at most."""

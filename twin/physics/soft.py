@@ -296,7 +296,7 @@ class SoftModel:
         """Take the lattice of a rebuilt scene.
 
         One that is finer than the task asks for (``soft.cell_m``) is replaced by a coarser lattice
-        of the same solid, with the fine surface as skin: docs/decisions/0029.
+        of the same solid, with the fine surface as skin: docs/decisions/0017-contact-physics.md.
 
         Args:
             arrays: What ``objects/<id>/soft.npz`` holds: ``nodes_m``, ``tets``, ``mass_fraction``

@@ -29,7 +29,7 @@ from twin.physics.soft_world import SoftWorld
 # stays where it took hold while its force is within Coulomb's cone, and is let go when it is not.
 # The engine then keeps all of the point, also its normal in the world, which goes wrong when what
 # is held turns. So a body that has turned by a little takes hold anew.
-# docs/decisions/0046-friction-anchors.md.
+# docs/decisions/0017-contact-physics.md.
 
 TURN_RAD = 0.03
 """A body that has turned by this much takes hold anew."""

@@ -112,6 +112,19 @@ class States:
     """The first that burst; the replay ended there."""
 
 
+def num_steps(end_ns: int, config: ReplayConfig) -> int:
+    """Physics steps of a replay whose trajectory ends then, settling before and after included."""
+    return round(config.settle_before_s * config.physics.rate_hz) + _steps_kept(end_ns, config)
+
+
+def _steps_kept(end_ns: int, config: ReplayConfig) -> int:
+    """Those from the start on: whole samples, so that the last lies at the end of settling."""
+    rate = config.physics.rate_hz
+    stride = rate // config.sample_rate_hz
+    moving_steps = int(np.ceil(end_ns * 1e-9 * rate))
+    return -(-(moving_steps + round(config.settle_after_s * rate)) // stride) * stride
+
+
 def simulate(
     path: JointPath, scene: ReplayScene, hulls: RobotHulls, config: ReplayConfig
 ) -> States:
@@ -122,9 +135,7 @@ def simulate(
     """
     rate = config.physics.rate_hz
     stride = rate // config.sample_rate_hz
-    moving_steps = int(np.ceil(path.end_ns() * 1e-9 * rate))
-    # Whole samples, so that the last one lies at the end of settling.
-    total = -(-(moving_steps + round(config.settle_after_s * rate)) // stride) * stride
+    total = _steps_kept(path.end_ns(), config)
     times_ns = (np.arange(total + 1) * (1e9 / rate)).round().astype(np.int64)
     postures = path.joints_at(times_ns)
     targets = postures.tolist()

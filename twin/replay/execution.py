@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bridge.episode.streams import JointTrack
+from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES
 from bridge.task.plan import Plan, Stage
 from bridge.task.robot import ARM_JOINTS, MAX_WIDTH_M
 from twin.replay.config import ReplayConfig
@@ -113,7 +114,7 @@ def _not_recorded(plan: Plan, what: str, missing_ns: int, where: str) -> Unusabl
     return UnusablePlanError(
         plan_id=plan.id,
         found=f"was executed while no {what} were recorded for {missing_ns * 1e-9:.1f} s {where}",
-        hint="Record /joint_states and /gripper/state without gaps over the whole execution.",
+        hint=f"Record {JOINT_STATES} and {GRIPPER_STATE} without gaps over the whole execution.",
     )
 
 
@@ -143,7 +144,7 @@ def path_of_execution(
         raise UnusablePlanError(
             plan_id=plan.id,
             found="was executed without recorded joints or gripper",
-            hint="Record /joint_states and /gripper/state over the whole execution.",
+            hint=f"Record {JOINT_STATES} and {GRIPPER_STATE} over the whole execution.",
         )
     missing = [name for name in ARM_JOINTS if name not in track.names]
     if missing:

@@ -12,6 +12,7 @@ from bridge.episode.metadata import Derived
 from bridge.episode.provenance import hash_settings
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import EpisodeError, GstError
 from bridge.task.plan import Plan
 from bridge.task.predicate import evaluate_success
@@ -323,8 +324,6 @@ def _findings(said: list[dict[str, Any]]) -> Findings:
 
 # --- Do one replay: read the episode, re-live the trajectory, compare it, write the file.
 
-JOINTS, GRIPPER_STATE = "/joint_states", "/gripper/state"
-
 
 def run_job(job: ReplayJob) -> dict[str, Any]:
     """Replay and write; a failure the user can act on becomes a row, not an exception."""
@@ -385,7 +384,7 @@ def _open(job: ReplayJob) -> _Source:
         raise EpisodeError(
             path=job.episode_path,
             found="no robot description",
-            hint="Record /robot_description, or attach the URDF as robot.urdf.",
+            hint=f"Record {ROBOT_DESCRIPTION}, or attach the URDF as robot.urdf.",
         )
     plan = streams.plans(episode)[job.plan_index][1]
     task = load_task(job.task)
@@ -426,9 +425,9 @@ def _tracks(source: _Source) -> tuple[streams.JointTrack, streams.JointTrack]:
     """Recorded joints and widths, cut to the execution."""
     job, episode = source.job, source.episode
     end_ns = job.start_ns + job.length_ns()
-    check_clock(episode, (JOINTS, GRIPPER_STATE), job.start_ns, end_ns, source.plan.id)
+    check_clock(episode, (JOINT_STATES, GRIPPER_STATE), job.start_ns, end_ns, source.plan.id)
     check_length(job.length_ns(), source.plan)
-    arm = cut_track(streams.joint_track(episode, JOINTS), job.start_ns, end_ns)
+    arm = cut_track(streams.joint_track(episode, JOINT_STATES), job.start_ns, end_ns)
     check_covers(arm, "joints", end_ns, source.plan)
     widths = cut_track(streams.joint_track(episode, GRIPPER_STATE), job.start_ns, end_ns)
     check_covers(widths, "gripper widths", end_ns, source.plan)

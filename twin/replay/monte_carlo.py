@@ -1,7 +1,6 @@
 """Success as a probability: replays of varied starts and settings, and what they add up to."""
 
 import hashlib
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -175,8 +174,6 @@ def _pose(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
 
 SCHEMA_VERSION = 1
 LEVEL = 0.95
-SLOWER = 1.5
-"""A sample may take this much longer than the longest replay so far."""
 
 Replay = Callable[[ReplayScene, ReplayConfig], Verdict]
 
@@ -214,11 +211,8 @@ def replay_samples(
     *,
     plan_id: str,
     identity: str,
-    ends_s: float | None = None,
-    expected_s: float = 0.0,
-    monotonic: Callable[[], float] = time.monotonic,
 ) -> tuple[Sample, ...]:
-    """Run up to ``config.samples`` varied replays.
+    """Run ``config.samples`` varied replays.
 
     Args:
         replay: Replays one varied start; its verdict counts.
@@ -226,9 +220,6 @@ def replay_samples(
         config: The nominal settings.
         plan_id: Written into the records.
         identity: Of the start; the same one draws the same variations.
-        ends_s: No sample is begun that would not be done by then, on the monotonic clock.
-        expected_s: How long one replay takes, from the nominal one.
-        monotonic: The clock.
 
     Raises:
         UsageError: For a kinematic replay, which moves no objects.
@@ -237,14 +228,9 @@ def replay_samples(
         message = "a kinematic replay moves no objects: it has no success probability. Use dynamic."
         raise UsageError(message)
     samples: list[Sample] = []
-    longest_s = expected_s
     for index in range(config.samples):
-        started_s = monotonic()
-        if ends_s is not None and started_s + SLOWER * longest_s > ends_s:
-            break
         variation = draw_variation(sample_rng(config.seed, identity, index), scene, config)
         samples.append(_sample(replay, scene, config, variation, plan_id, index))
-        longest_s = max(longest_s, monotonic() - started_s)
     return tuple(samples)
 
 

@@ -14,6 +14,23 @@ from bridge.episode import schema
 from bridge.episode.cdr.batch import joint_messages, pose_messages
 from bridge.episode.cdr.messages import CompressedColor, PointCloudSample, string_to_cdr
 from bridge.episode.metadata import Derived, EpisodeInfo
+from bridge.episode.topics import (
+    CLEARANCE,
+    CONTACT,
+    DIVERGENCE,
+    EVENT,
+    GRIPPER_STATE,
+    JOINT_STATES,
+    PLAN,
+    RENDERED_IMAGE,
+    ROBOT_DESCRIPTION,
+    TCP_POSE,
+    VERDICT,
+    VERDICT_SAMPLE,
+    camera_topic,
+    cell_topic,
+    object_topic,
+)
 from bridge.episode.writer import EpisodeWriter
 from bridge.task.plan import Plan, Stage
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME, GRIPPER
@@ -76,38 +93,38 @@ def write_replay(path: Path, result: ReplayResult, plan: Plan, origin: ReplayOri
 
 def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterator[_Message]:
     prefix, start = f"/{origin.cell}", origin.start_ns
-    yield _Message(start, "/robot_description", schema.STRING, string_to_cdr(origin.urdf))
-    yield _Message(start, f"{prefix}/plan", schema.PLAN, plan.to_json())
+    yield _Message(start, ROBOT_DESCRIPTION, schema.STRING, string_to_cdr(origin.urdf))
+    yield _Message(start, f"{prefix}{PLAN}", schema.PLAN, plan.to_json())
     stamps = start + result.stamps_ns
     for topic, names, values in (
-        ("joint_states", ARM_JOINTS, result.joints_rad),
-        ("gripper/state", (GRIPPER_WIDTH,), result.width_m[:, None]),
-        ("replay/clearance", (MIN_CLEARANCE,), result.clearance_m[:, None]),
+        (JOINT_STATES, ARM_JOINTS, result.joints_rad),
+        (GRIPPER_STATE, (GRIPPER_WIDTH,), result.width_m[:, None]),
+        (CLEARANCE, (MIN_CLEARANCE,), result.clearance_m[:, None]),
     ):
         rows = joint_messages(stamps, names, values)
-        yield from _stamped(stamps, f"{prefix}/{topic}", schema.JOINT_STATE, rows)
-    poses = {"tcp": result.Ts_base_tcp} | {
-        f"object/{name}": Ts for name, Ts in result.Ts_base_object.items()
+        yield from _stamped(stamps, f"{prefix}{topic}", schema.JOINT_STATE, rows)
+    poses = {f"{prefix}{TCP_POSE}": result.Ts_base_tcp} | {
+        object_topic(origin.cell, name, "pose"): Ts for name, Ts in result.Ts_base_object.items()
     }
-    for name, Ts in poses.items():
+    for topic, Ts in poses.items():
         rows = pose_messages(stamps, BASE_FRAME, Ts)
-        yield from _stamped(stamps, f"{prefix}/{name}/pose", schema.POSE_STAMPED, rows)
-    yield from _nodes(result, prefix, start)
+        yield from _stamped(stamps, topic, schema.POSE_STAMPED, rows)
+    yield from _nodes(result, origin.cell, start)
     yield from _contacts(result, prefix, start)
     for camera_id, image in origin.images:
-        topic = f"{prefix}/cam/{camera_id}/rendered/image"
+        topic = camera_topic(origin.cell, camera_id, RENDERED_IMAGE)
         yield _Message(image.stamp_ns, topic, schema.COMPRESSED_IMAGE, image.to_cdr())
     end = start + int(result.stamps_ns[-1])
-    yield _Message(end, f"{prefix}/verdict", schema.VERDICT, result.verdict.to_json())
+    yield _Message(end, f"{prefix}{VERDICT}", schema.VERDICT, result.verdict.to_json())
     for sample in result.samples:
         data = json.dumps(sample.to_record(), separators=(",", ":")).encode()
-        yield _Message(end, f"{prefix}/verdict/sample", schema.SAMPLE, data)
+        yield _Message(end, f"{prefix}{VERDICT_SAMPLE}", schema.SAMPLE, data)
     if origin.divergence is not None:
         data = json.dumps(origin.divergence, separators=(",", ":")).encode()
-        yield _Message(end, f"{prefix}/replay/divergence", schema.DIVERGENCE, data)
+        yield _Message(end, f"{prefix}{DIVERGENCE}", schema.DIVERGENCE, data)
 
 
-def _nodes(result: ReplayResult, prefix: str, start_ns: int) -> Iterator[_Message]:
+def _nodes(result: ReplayResult, cell: str, start_ns: int) -> Iterator[_Message]:
     for name, nodes in result.nodes_m.items():
         due_ns = 0
         for t_ns, points in zip(result.stamps_ns.tolist(), nodes, strict=True):
@@ -117,13 +134,13 @@ def _nodes(result: ReplayResult, prefix: str, start_ns: int) -> Iterator[_Messag
             sample = PointCloudSample(
                 stamp_ns=start_ns + t_ns, frame_id=BASE_FRAME, points_m=points
             )
-            topic = f"{prefix}/object/{name}/nodes"
+            topic = object_topic(cell, name, "nodes")
             yield _Message(sample.stamp_ns, topic, schema.POINT_CLOUD, sample.to_cdr())
 
 
 def _contacts(result: ReplayResult, prefix: str, start_ns: int) -> Iterator[_Message]:
     """Measured distances below the margin, and what physics says of the fingers."""
-    topic = f"{prefix}/replay/contact"
+    topic = f"{prefix}{CONTACT}"
     for contact in result.contacts:
         record = _contact_record(
             start_ns, contact.start_ns, contact.end_ns, contact.bodies, source="distance"
@@ -163,7 +180,7 @@ def _stamped(
 
 def _events(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterator[_Message]:
     """Events: execution, stages, gripper, contacts that were not allowed."""
-    topic = f"/{origin.cell}/event"
+    topic = cell_topic(origin.cell, EVENT)
     end_ns = int(result.stamps_ns[-1])
     events: list[tuple[int, dict[str, object]]] = [(0, {"type": "execution_started"})]
     for stage in origin.stages:

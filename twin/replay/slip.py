@@ -2,7 +2,7 @@
 
 What moves in the hand is held by a hair: a little less friction or force, and it is dropped. On
 soft toys this margin tells right yes from wrong yes about as well as swing and lever do, and better
-than forces and contacts (docs/decisions/0047-what-moves-in-the-hand.md).
+than forces and contacts (docs/decisions/0018-replay-and-gate.md).
 """
 
 from collections.abc import Sequence

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from bridge.episode import schema, streams
 from bridge.episode.reader import Episode
+from bridge.episode.topics import GRIPPER_STATE, TCP_POSE
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan
@@ -82,8 +83,8 @@ def trace_of_file(path: Path, side: str, start_ns: int, end_ns: int) -> Trace:
         EpisodeError: When it is damaged or no replay.
     """
     episode = Episode.open(path)
-    width = streams.joint_track(episode, "/gripper/state")
-    tool = next(t for t in episode.topics_of_type(schema.POSE_STAMPED) if t.endswith("/tcp/pose"))
+    width = streams.joint_track(episode, GRIPPER_STATE)
+    tool = next(t for t in episode.topics_of_type(schema.POSE_STAMPED) if t.endswith(TCP_POSE))
     spans: dict[str, list[Touch]] = {}
     for message in episode.messages(episode.topics_of_type(schema.CONTACT)):
         record = parse_record(message.data, name="contact")

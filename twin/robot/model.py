@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
+from bridge.episode.topics import ROBOT_DESCRIPTION
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME, FINGER_JOINTS, TCP_FRAME, resolve_mesh
 from twin.errors import TwinError
 
@@ -104,7 +105,7 @@ def parse_description(urdf: str) -> ET.Element:
     except ET.ParseError as error:
         raise RobotDescriptionError(
             found=f"is not XML ({error})",
-            hint="Record the robot's URDF on /robot_description, or attach it as robot.urdf.",
+            hint=f"Record the robot's URDF on {ROBOT_DESCRIPTION}, or attach it as robot.urdf.",
         ) from error
     if root.tag != "robot":
         raise RobotDescriptionError(

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from bridge.episode import schema
 from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack, joint_track, robot_description
+from bridge.episode.topics import GRIPPER_STATE, ROBOT_DESCRIPTION
 from bridge.errors import EpisodeError
 from bridge.task.robot import ARM_JOINTS
 from twin.errors import TwinError
@@ -138,12 +139,12 @@ def posture_track(episode: Episode) -> PostureTrack:
     if urdf is None:
         raise RobotDescriptionError(
             found=f"is missing in episode {episode.info.id}",
-            hint="Record /robot_description, or attach the URDF as robot.urdf.",
+            hint=f"Record {ROBOT_DESCRIPTION}, or attach the URDF as robot.urdf.",
         )
     arm = joint_track(episode)
     check_joints(arm, f"episode {episode.info.id}")
     try:
-        widths = joint_track(episode, "/gripper/state")
+        widths = joint_track(episode, GRIPPER_STATE)
     except EpisodeError:
         widths = None
     return PostureTrack(urdf=urdf, arm=arm, widths=widths)

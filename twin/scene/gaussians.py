@@ -1,4 +1,7 @@
-"""A cloud of Gaussians: what is stored, what is fitted, what is drawn."""
+"""A cloud of Gaussians: what is stored, fitted, drawn and moved, and its PLY file.
+
+The file is the one that other splat viewers read (SuperSplat, Rerun).
+"""
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -180,9 +183,6 @@ def _spread_bits(values: np.ndarray) -> np.ndarray:
     return values
 
 
-# --- A cloud of Gaussians after a rigid motion.
-
-
 def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> GaussianCloud:
     """The same Gaussians after a rigid motion; what their colour owes to direction turns along."""
     q, _ = se3.split(T_new_old)
@@ -206,8 +206,6 @@ def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> Ga
         harmonics=turned_harmonics(cloud.harmonics, T_new_old[:3, :3]),
     )
 
-
-# --- Gaussians as the PLY file that other splat viewers read (SuperSplat, Rerun).
 
 COLUMNS = (
     *("x", "y", "z", "nx", "ny", "nz"),

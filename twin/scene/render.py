@@ -1,4 +1,4 @@
-"""Draw the rebuilt scene from a recorded or a given camera pose."""
+"""Draw the rebuilt scene, also in another state than scanned: objects moved, the robot posed."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32, UInt16
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import ROBOT_DESCRIPTION
 from bridge.episode.transforms import TransformTree
 from bridge.errors import BridgeError, GstError, UsageError
 from bridge.geometry import se3
@@ -29,8 +30,6 @@ from twin.scene.settings import RenderConfig
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import SCENE_FILE, Scene, read_scene
 
-# --- A scene in another state than the scanned one: objects moved, the robot in a given posture.
-
 PROBES = 9
 """Instants of an episode at which a camera's place in the hand is looked at."""
 RIGID_M = 0.01
@@ -45,7 +44,7 @@ class Composed:
 
     cloud: GaussianCloud
     robot: str
-    """How the robot stands, or in one sentence why it is not drawn."""
+    """How the robot stands, or why it is not drawn."""
     posture: Posture | None
     """None: no robot is drawn."""
 
@@ -88,8 +87,8 @@ def compose(
     if root is not None:
         T_base_root = read_pose(root, run.scene_dir / SCENE_FILE)
         robot = moved_cloud(robot, se3.invert(T_base_root))
-    said = "given" if config.joints is not None else f"as {episode.info.id} has it at that time"
-    return Composed(cloud=concatenate([cloud, robot]), robot=f"joints {said}", posture=posture)
+    source = "given" if config.joints is not None else f"as {episode.info.id} has it at that time"
+    return Composed(cloud=concatenate([cloud, robot]), robot=f"joints {source}", posture=posture)
 
 
 def _because(scene: Scene) -> str:
@@ -114,7 +113,7 @@ def _posture(episode: Episode, stamp_ns: int, config: RenderConfig) -> tuple[str
     if urdf is None:
         raise RobotDescriptionError(
             found=f"is missing in episode {episode.info.id}",
-            hint="Choose an --episode that has /robot_description.",
+            hint=f"Choose an --episode that has {ROBOT_DESCRIPTION}.",
         )
     return urdf, Posture(joints_rad=joints, width_m=config.width_m or 0.0)
 
@@ -182,8 +181,10 @@ def carried_camera(
     robot = load_robot(track.urdf)
     # By the source's clock, which may have little to do with when messages arrived; and where the
     # camera's pose was stated, because in a fast motion what lies between may be off by much.
-    stated = np.array([t for t in tree.stamps_ns(frame_id).tolist() if track.covers(t)])
-    stamps = stated[np.linspace(0, len(stated) - 1, min(PROBES, len(stated))).round().astype(int)]
+    posed_ns = np.array([t for t in tree.stamps_ns(frame_id).tolist() if track.covers(t)])
+    stamps = posed_ns[
+        np.linspace(0, len(posed_ns) - 1, min(PROBES, len(posed_ns))).round().astype(int)
+    ]
     pairs = [
         (robot.T_base_tcp(track.at(stamp).joints_rad), tree.T_root_frame(frame_id, stamp))
         for stamp in stamps.tolist()

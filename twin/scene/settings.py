@@ -16,6 +16,8 @@ _SECONDS = {None: 1.0, "s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0
 MAX_APPEARANCE_STEPS = 6
 MOST_S = 1e6
 """Eleven days: longer is a number gone wrong."""
+DEFAULT_BUDGET_S = 60.0
+"""Wall time of a fit when neither a time nor a number of images is given."""
 
 
 def parse_duration_s(text: str) -> float:
@@ -141,11 +143,13 @@ class InitialiseConfig:
 class FitConfig:
     """How the Gaussians are fitted to the images."""
 
-    budget_s: Annotated[float, Parameter(name="--budget", converter=convert_duration)] = 60.0
-    """Wall time for initialisation and fit: 60s, 2min or plain seconds. Reading the frames before
-    and all that is made of the scene afterwards come on top; scene.json says how long each took."""
+    budget_s: Annotated[float | None, Parameter(name="--budget", converter=convert_duration)] = None
+    """Wall time for initialisation and fit: 60s, 2min or plain seconds; 60s without --iterations.
+    With --iterations it is only a limit, none by default: where it strikes first, the scene is
+    reported as underfitted. Reading the frames before and all that is made of the scene afterwards
+    come on top; scene.json says how long each took."""
     iterations: int = 0
-    """Fit exactly this many images instead of a time; the result is then reproducible."""
+    """Fit exactly this many images: the result is then reproducible, on slow machines too."""
     loss: Literal["3dgs", "paper"] = "3dgs"
     """3dgs: 0.8 L1 + 0.2 (1 - SSIM); paper: squared error (Eq. 3). Both with depth L1."""
     depth_weight: float = 0.1
@@ -184,9 +188,16 @@ class FitConfig:
         if not 0 <= self.slab < math.inf:
             message = f"--slab {self.slab:g} is no thickness: 0 or more."
             raise UsageError(message)
-        if self.iterations == 0 and not 0 < self.budget_s <= MOST_S:
+        if self.budget_s is not None and not 0 < self.budget_s <= MOST_S:
             message = f"--budget {self.budget_s:g} s is no time to fit in; give more than 0."
             raise UsageError(message)
+
+    @property
+    def limit_s(self) -> float:
+        """Wall time after which the fit ends; infinite when only images are counted."""
+        if self.budget_s is None:
+            return math.inf if self.iterations else DEFAULT_BUDGET_S
+        return self.budget_s
 
 
 @Parameter(name="*", group="Foundation models")

@@ -119,7 +119,7 @@ LARGE_PACKING = zstandard.ZstdCompressionParameters(
     write_content_size=True,
 )
 """Level 1 with a hash table that leaves room in the first-level cache: on noisy depth 15 to 25 %
-less CPU time for 5 % more bytes (``docs/decisions/0011-own-chunk-writer.md``)."""
+less CPU time for 5 % more bytes (``docs/decisions/0003-mcap-files.md``)."""
 
 
 @dataclass(frozen=True, kw_only=True)

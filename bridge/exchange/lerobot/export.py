@@ -23,6 +23,7 @@ from bridge.episode.streams import (
     joint_track,
     plans,
 )
+from bridge.episode.topics import GRIPPER_STATE
 from bridge.errors import EpisodeError, UsageError
 from bridge.exchange.lerobot import layout
 from bridge.exchange.lerobot.layout import LeRobotConfig
@@ -37,7 +38,6 @@ from bridge.terminal import Advance
 # one nearest in time. Action: the plan's command for the next row, or the next row's state.
 
 ActionKind = Literal["plan", "next_state"]
-GRIPPER_ENDING = "/gripper/state"
 DEFAULT_FPS = 30
 """Rate of an episode without cameras."""
 
@@ -79,8 +79,8 @@ def sample(episode: Episode, fps: int) -> Samples:
         EpisodeError: When it has no joints, or its streams never overlap.
     """
     tracks = [joint_track(episode)]
-    if any(topic.endswith(GRIPPER_ENDING) for topic in episode.topics_of_type(schema.JOINT_STATE)):
-        tracks.append(joint_track(episode, GRIPPER_ENDING))
+    if any(topic.endswith(GRIPPER_STATE) for topic in episode.topics_of_type(schema.JOINT_STATE)):
+        tracks.append(joint_track(episode, GRIPPER_STATE))
     cameras = {camera: _image_stamps(episode, camera) for camera in camera_ids(episode)}
     spans = [track.stamps_ns for track in tracks] + [stamps for stamps, _ in cameras.values()]
     if any(not len(span) for span in spans):

@@ -24,6 +24,7 @@ from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import COLOR_IMAGE, JOINT_STATES, camera_topic, cell_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.exchange.lerobot import layout
@@ -337,7 +338,9 @@ def _plan(info: DatasetInfo, cell: str) -> _Plan:
                 camera += "_"
             cameras[key] = camera
         elif feature.is_numeric_vector:
-            joints[key] = f"/{cell}/joint_states" if key == layout.STATE else _topic(cell, key)
+            joints[key] = (
+                cell_topic(cell, JOINT_STATES) if key == layout.STATE else _topic(cell, key)
+            )
         else:
             left_out.append(f"{key} ({feature.dtype} {list(feature.shape)})")
     return _Plan(joints=joints, cameras=cameras, left_out=tuple(left_out))
@@ -379,7 +382,7 @@ def _write(
                     topic, sample.to_cdr(), type_name=schema.JOINT_STATE, log_time_ns=stamp_ns
                 )
             for key, camera in plan.cameras.items():
-                _write_image(writer, f"/{cell}/cam/{camera}", stamp_ns, next(images[key]))
+                _write_image(writer, camera_topic(cell, camera), stamp_ns, next(images[key]))
         writer.add_metadata("source", _source(info, plan, rows, origin))
         return writer.close()
     except BaseException:
@@ -395,7 +398,7 @@ def _write_image(writer: EpisodeWriter, prefix: str, stamp_ns: int, data: bytes)
         data=data,
     )
     writer.write(
-        f"{prefix}/color/image",
+        f"{prefix}{COLOR_IMAGE}",
         color.to_cdr(),
         type_name=schema.COMPRESSED_IMAGE,
         log_time_ns=stamp_ns,

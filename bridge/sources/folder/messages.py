@@ -18,6 +18,7 @@ from bridge.episode.cdr.messages import (
 )
 from bridge.episode.provenance import hash_file
 from bridge.episode.schema import StampedMessage
+from bridge.episode.topics import COLOR_IMAGE, DEPTH_IMAGE, TF, TF_STATIC, camera_topic
 from bridge.errors import PathNotFoundError, UsageError
 from bridge.geometry.camera import Camera
 from bridge.media.color import JPEG_MAGIC, UnreadableImageError, decode_color, encode_jpeg
@@ -198,7 +199,7 @@ def _pose_messages(
             child=f"{config.camera}_depth_optical",
             T_parent_child=T_world_depth,
         )
-        yield _message("/tf", schema.TF_MESSAGE, transforms_to_cdr([pose]), stamp_ns)
+        yield _message(TF, schema.TF_MESSAGE, transforms_to_cdr([pose]), stamp_ns)
 
 
 def _images(
@@ -221,10 +222,10 @@ def _images(
         format="jpeg",
         data=stored if stored[:2] == JPEG_MAGIC else encode_jpeg(color),
     )
-    prefix = f"/{config.cell}/cam/{config.camera}"
+    prefix = camera_topic(config.cell, config.camera)
     return [
-        _message(f"{prefix}/depth/image", schema.IMAGE, depth.to_cdr(), depth_ns),
-        _message(f"{prefix}/color/image", schema.COMPRESSED_IMAGE, image.to_cdr(), color_ns),
+        _message(f"{prefix}{DEPTH_IMAGE}", schema.IMAGE, depth.to_cdr(), depth_ns),
+        _message(f"{prefix}{COLOR_IMAGE}", schema.COMPRESSED_IMAGE, image.to_cdr(), color_ns),
     ]
 
 
@@ -235,7 +236,7 @@ def _calibration(
     for stream, camera in (("depth", index.depth_camera), ("color", color_camera)):
         frame_id = f"{config.camera}_{stream}_optical"
         info = CameraInfo(stamp_ns=stamp_ns, frame_id=frame_id, camera=camera)
-        topic = f"/{config.cell}/cam/{config.camera}/{stream}/info"
+        topic = camera_topic(config.cell, config.camera, f"/{stream}/info")
         messages.append(_message(topic, schema.CAMERA_INFO, info.to_cdr(), stamp_ns))
     between = FrameTransform(
         stamp_ns=stamp_ns,
@@ -243,9 +244,7 @@ def _calibration(
         child=f"{config.camera}_color_optical",
         T_parent_child=index.T_depth_color,
     )
-    messages.append(
-        _message("/tf_static", schema.TF_MESSAGE, transforms_to_cdr([between]), stamp_ns)
-    )
+    messages.append(_message(TF_STATIC, schema.TF_MESSAGE, transforms_to_cdr([between]), stamp_ns))
     return messages
 
 

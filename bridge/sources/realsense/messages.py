@@ -18,6 +18,7 @@ from bridge.episode.cdr.messages import (
     transforms_to_cdr,
 )
 from bridge.episode.schema import StampedMessage
+from bridge.episode.topics import TF_STATIC, camera_topic
 from bridge.errors import PathNotFoundError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
@@ -113,7 +114,7 @@ class CameraMessages:
     def __init__(self, config: RealSenseConfig, camera: str) -> None:
         """Name its topics and frames."""
         self._config = config
-        self.root = f"/{config.cell}/cam/{camera}"
+        self.root = camera_topic(config.cell, camera)
         self.color_frame = f"{camera}_color_optical"
         self.depth_frame = f"{camera}_depth_optical"
 
@@ -144,7 +145,7 @@ class CameraMessages:
                     T_parent_child=T_parent_color,
                 )
             )
-        made = [("/tf_static", schema.TF_MESSAGE, transforms_to_cdr(transforms))]
+        made = [(TF_STATIC, schema.TF_MESSAGE, transforms_to_cdr(transforms))]
         for stream, frame_id, camera in (
             ("color", self.color_frame, calibration.color_camera),
             ("depth", self.depth_frame, calibration.depth_camera),

@@ -58,10 +58,9 @@ class CameraWorker:
         self._output = output
         self._messages = CameraMessages(config, camera)
         self._streams = {
-            stream: NumberedPublisher(
-                session.publisher(*self._messages.topic_and_type(stream), qos=Qos.CAMERA)
-            )
+            stream: NumberedPublisher(session.publisher(topic, type_name, qos=Qos.of(topic)))
             for stream in ("color", "depth")
+            for topic, type_name in (self._messages.topic_and_type(stream),)
         }
         self.failure: GstError | None = None
         self.connections = 0

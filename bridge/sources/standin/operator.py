@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.metadata import EpisodeInfo, Outcome
+from bridge.episode.topics import GATE, cell_topic
 from bridge.errors import BridgeError, UsageError
 from bridge.geometry import se3
 from bridge.sources.standin.cell import StandinCell, TruthLog
@@ -428,7 +429,7 @@ class Operator:
 
     def _ask_gate(self, plan: Plan) -> tuple[Verdict | None, str]:
         """Return the verdict, None when there is none, and why it is not a yes."""
-        key = f"{self._config.gate_cell or self._config.cell}/gate/verdict"
+        key = cell_topic(self._config.gate_cell or self._config.cell, GATE)[1:]
         try:
             answer = self._session.query(key, plan.to_json(), timeout_s=self._config.gate_timeout_s)
             verdict = Verdict.from_json(answer)

@@ -1,6 +1,6 @@
 """Probe episodes: short scripted plans whose outcome depends on physics and on little else.
 
-What each one shows (``docs/decisions/0032-calibration-of-physics.md`` has the arithmetic):
+What each one shows (``docs/decisions/0015-calibration.md`` has the arithmetic):
 
 - **push**: slowly against one side of the object, then against the next. Where it ends up is where
   the closed fingers stopped, so it shows how localisation and robot lie to each other.

@@ -21,6 +21,25 @@ from bridge.episode.cdr.messages import (
     string_to_cdr,
     transforms_to_cdr,
 )
+from bridge.episode.topics import (
+    COLOR_IMAGE,
+    DEPTH_IMAGE,
+    EVENT,
+    GRIPPER_STATE,
+    JOINT_STATES,
+    PLAN,
+    PLAN_PATH,
+    PLAN_TRAJECTORY,
+    ROBOT_DESCRIPTION,
+    TCP_POSE,
+    TF,
+    TF_STATIC,
+    TRUTH,
+    camera_topic,
+    cell_topic,
+    object_topic,
+    type_of_topic,
+)
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan
@@ -29,7 +48,7 @@ from bridge.task.robot import ARM_JOINTS, BASE_FRAME
 from bridge.wire.qos import Qos
 
 GRIPPER_JOINT = "gripper_width"
-TRUTH_PARAMETERS = f"{schema.TRUTH_PREFIX}parameters"
+TRUTH_PARAMETERS = cell_topic(TRUTH, "/parameters")
 
 
 @runtime_checkable
@@ -73,14 +92,14 @@ class Streams:
     def _put(self, topic: str, data: bytes, stamp_ns: int, type_name: str | None = None) -> None:
         publisher = self._publishers.get(topic)
         if publisher is None:
-            known = type_name or schema.type_of_topic(topic)
+            known = type_name or type_of_topic(topic)
             publisher = self._session.publisher(topic, known or schema.STRING, qos=Qos.RELIABLE)
             self._publishers[topic] = publisher
         publisher.put(data, source_ns=stamp_ns)
 
     def description(self, urdf: str, stamp_ns: int) -> None:
         """Publish the robot's URDF."""
-        self._put("/robot_description", string_to_cdr(urdf), stamp_ns)
+        self._put(ROBOT_DESCRIPTION, string_to_cdr(urdf), stamp_ns)
 
     def camera_poses(
         self, poses: Mapping[str, Float[np.ndarray, "4 4"]], stamp_ns: int, *, static: bool
@@ -93,7 +112,7 @@ class Streams:
             for camera_id, T in poses.items()
         ]
         if items:
-            self._put("/tf_static" if static else "/tf", transforms_to_cdr(items), stamp_ns)
+            self._put(TF_STATIC if static else TF, transforms_to_cdr(items), stamp_ns)
 
     def depth_frames(self, camera_ids: Iterable[str], stamp_ns: int) -> None:
         """Publish that depth is aligned: each depth frame coincides with its colour frame."""
@@ -106,13 +125,15 @@ class Streams:
             )
             for camera_id in camera_ids
         ]
-        self._put("/tf_static", transforms_to_cdr(items), stamp_ns)
+        self._put(TF_STATIC, transforms_to_cdr(items), stamp_ns)
 
     def camera_info(self, camera_id: str, camera: Camera, stamp_ns: int) -> None:
         """Publish the intrinsics of colour and (aligned) depth."""
         for stream, frame in (("color", color_frame(camera_id)), ("depth", depth_frame(camera_id))):
             info = CameraInfo(stamp_ns=stamp_ns, frame_id=frame, camera=camera)
-            self._put(f"/{self._cell}/cam/{camera_id}/{stream}/info", info.to_cdr(), stamp_ns)
+            self._put(
+                camera_topic(self._cell, camera_id, f"/{stream}/info"), info.to_cdr(), stamp_ns
+            )
 
     def frame(
         self,
@@ -129,9 +150,9 @@ class Streams:
             data=encode_jpeg(image_u8),
         )
         depth = DepthImage(stamp_ns=stamp_ns, frame_id=depth_frame(camera_id), depth_mm=depth_mm)
-        prefix = f"/{self._cell}/cam/{camera_id}"
-        self._put(f"{prefix}/color/image", color.to_cdr(), stamp_ns)
-        self._put(f"{prefix}/depth/image", depth.to_cdr(), stamp_ns)
+        prefix = camera_topic(self._cell, camera_id)
+        self._put(f"{prefix}{COLOR_IMAGE}", color.to_cdr(), stamp_ns)
+        self._put(f"{prefix}{DEPTH_IMAGE}", depth.to_cdr(), stamp_ns)
 
     def joints(
         self,
@@ -148,7 +169,7 @@ class Streams:
             velocity=velocity,
             effort=effort,
         )
-        self._put(f"/{self._cell}/joint_states", sample.to_cdr(), stamp_ns)
+        self._put(cell_topic(self._cell, JOINT_STATES), sample.to_cdr(), stamp_ns)
 
     def gripper(self, width_m: float, stamp_ns: int) -> None:
         """Publish the distance between the pads."""
@@ -159,28 +180,27 @@ class Streams:
             velocity=np.zeros(0),
             effort=np.zeros(0),
         )
-        self._put(f"/{self._cell}/gripper/state", sample.to_cdr(), stamp_ns)
+        self._put(cell_topic(self._cell, GRIPPER_STATE), sample.to_cdr(), stamp_ns)
 
     def tcp(self, T_base_tcp: Float[np.ndarray, "4 4"], stamp_ns: int) -> None:
         """Publish the controller's own forward kinematics."""
         sample = PoseSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=T_base_tcp)
-        self._put(f"/{self._cell}/tcp/pose", sample.to_cdr(), stamp_ns, schema.POSE_STAMPED)
+        topic = cell_topic(self._cell, TCP_POSE)
+        self._put(topic, sample.to_cdr(), stamp_ns, schema.POSE_STAMPED)
 
     def truth_object(
         self, object_id: str, T_base_object: Float[np.ndarray, "4 4"], stamp_ns: int
     ) -> None:
         """Publish a true pose, for tests and the evaluator's perception metrics only."""
         sample = PoseSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=T_base_object)
-        topic = f"{schema.TRUTH_PREFIX}object/{object_id}/pose"
-        self._put(topic, sample.to_cdr(), stamp_ns)
+        self._put(object_topic(TRUTH, object_id, "pose"), sample.to_cdr(), stamp_ns)
 
     def truth_nodes(
         self, object_id: str, points_m: Float[np.ndarray, "num_points 3"], stamp_ns: int
     ) -> None:
         """Publish where the points of a soft object really are, in ``base_link``."""
         sample = PointCloudSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, points_m=points_m)
-        topic = f"{schema.TRUTH_PREFIX}object/{object_id}/nodes"
-        self._put(topic, sample.to_cdr(), stamp_ns)
+        self._put(object_topic(TRUTH, object_id, "nodes"), sample.to_cdr(), stamp_ns)
 
     def truth_parameters(self, record: Mapping[str, Any], stamp_ns: int) -> None:
         """Publish the hidden parameters as JSON text, under truth only."""
@@ -188,20 +208,20 @@ class Streams:
 
     def plan(self, plan: Plan, stamp_ns: int) -> None:
         """Publish a plan: the authority, and two forms of it for viewers."""
-        self._put(f"/{self._cell}/plan", plan.to_json(), stamp_ns)
+        self._put(cell_topic(self._cell, PLAN), plan.to_json(), stamp_ns)
         times = [waypoint.t_ns for waypoint in plan.tau]
         joints = np.array([waypoint.joints_rad for waypoint in plan.tau], dtype=np.float64)
         trajectory = joint_trajectory_to_cdr(
             stamp_ns=stamp_ns, names=plan.joint_names, times_ns=times, positions_rad=joints
         )
-        self._put(f"/{self._cell}/plan/trajectory", trajectory, stamp_ns)
-        self._put(f"/{self._cell}/plan/path", _path_json(plan, stamp_ns), stamp_ns)
+        self._put(cell_topic(self._cell, PLAN_TRAJECTORY), trajectory, stamp_ns)
+        self._put(cell_topic(self._cell, PLAN_PATH), _path_json(plan, stamp_ns), stamp_ns)
 
     def event(self, kind: str, stamp_ns: int, **fields: Any) -> None:
         """Publish one event; the schema lists the kinds and the fields."""
         record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, **fields}
         check_record(record, name="event", package="bridge.episode")
-        self._put(f"/{self._cell}/event", json.dumps(record).encode(), stamp_ns)
+        self._put(cell_topic(self._cell, EVENT), json.dumps(record).encode(), stamp_ns)
 
 
 def _path_json(plan: Plan, stamp_ns: int) -> bytes:

@@ -15,6 +15,7 @@ from bridge.clock import split_ns
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.schema import StampedMessage
+from bridge.episode.topics import EVENT, cell_topic
 from bridge.task.robot import ARM_JOINTS, BASE_FRAME
 
 # --- Messages of one layout, serialised once: only stamp and numbers change from sample to sample.
@@ -207,7 +208,7 @@ def mode_event(
         "data": {"robot_mode": robot, "safety_mode": safety},
     }
     return StampedMessage(
-        topic=f"/{cell}/event",
+        topic=cell_topic(cell, EVENT),
         type_name=schema.EVENT,
         data=json.dumps(record).encode(),
         stamp_ns=stamp_ns,

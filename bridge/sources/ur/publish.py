@@ -9,6 +9,17 @@ from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.schema import StampedMessage
+from bridge.episode.topics import (
+    GRIPPER_STATE,
+    JOINT_STATES,
+    JOINT_TARGETS,
+    ROBOT_DESCRIPTION,
+    SPEED_SCALING,
+    TCP_POSE,
+    TCP_WRENCH,
+    TF,
+    cell_topic,
+)
 from bridge.errors import PathNotFoundError, UsageError
 from bridge.sources.device_samples import Announcer, HostClock, NumberedPublisher
 from bridge.sources.ur import messages
@@ -66,15 +77,17 @@ class ArmPublisher:
         targets = messages.joints_template(ARM_JOINTS, velocities=False)
         width = messages.joints_template((messages.GRIPPER_JOINT,), velocities=False)
         speed = messages.joints_template((messages.SPEED_NAME,), velocities=False)
-        self._joints = _Topic(f"/{cell}/joint_states", state, messages.arm_template())
-        self._targets = _Topic(f"/{cell}/joint_targets", state, targets)
-        self._pose = _Topic(f"/{cell}/tcp/pose", schema.POSE_STAMPED, messages.pose_template())
-        self._wrench = _Topic(
-            f"/{cell}/tcp/wrench", schema.WRENCH_STAMPED, messages.wrench_template()
+        self._joints = _Topic(cell_topic(cell, JOINT_STATES), state, messages.arm_template())
+        self._targets = _Topic(cell_topic(cell, JOINT_TARGETS), state, targets)
+        self._pose = _Topic(
+            cell_topic(cell, TCP_POSE), schema.POSE_STAMPED, messages.pose_template()
         )
-        self._width = _Topic(f"/{cell}/gripper/state", state, width)
-        self._frame = _Topic("/tf", schema.TF_MESSAGE, messages.frame_template())
-        self._speed = _Topic(f"/{cell}/speed_scaling", state, speed)
+        self._wrench = _Topic(
+            cell_topic(cell, TCP_WRENCH), schema.WRENCH_STAMPED, messages.wrench_template()
+        )
+        self._width = _Topic(cell_topic(cell, GRIPPER_STATE), state, width)
+        self._frame = _Topic(TF, schema.TF_MESSAGE, messages.frame_template())
+        self._speed = _Topic(cell_topic(cell, SPEED_SCALING), state, speed)
         self._streams: dict[str, NumberedPublisher] = {}
         self._clock = HostClock()
         self._rate_hz = SLOW_HZ
@@ -160,7 +173,7 @@ class ArmPublisher:
     def _put(self, topic: _Topic, numbers: Sequence[float], stamp_ns: int, number: int) -> None:
         stream = self._streams.get(topic.name)
         if stream is None:
-            publisher = self._session.publisher(topic.name, topic.type_name, qos=Qos.CONTROL)
+            publisher = self._session.publisher(topic.name, topic.type_name, qos=Qos.of(topic.name))
             stream = self._streams[topic.name] = NumberedPublisher(publisher)
         stream.put(number, topic.template.fill(stamp_ns, numbers), source_ns=stamp_ns)
 
@@ -253,7 +266,7 @@ def _read_urdf_file(path: Path) -> str:
 
 def _description(urdf: str, stamp_ns: int) -> StampedMessage:
     return StampedMessage(
-        topic="/robot_description",
+        topic=ROBOT_DESCRIPTION,
         type_name=schema.STRING,
         data=string_to_cdr(urdf),
         stamp_ns=stamp_ns,

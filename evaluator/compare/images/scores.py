@@ -6,7 +6,6 @@ Topics end in ``/cam/<id>/`` and ``rendered/image``, ``recorded/image`` (or, in 
 """
 
 import os
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -19,6 +18,14 @@ from jaxtyping import Bool, Float, UInt8
 from bridge.episode import schema
 from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.reader import Episode
+from bridge.episode.topics import (
+    MASK_TOPIC,
+    POSE_ALIGNED_TOPIC,
+    RECORDED_DEPTH_TOPIC,
+    RECORDED_TOPIC,
+    RENDERED_DEPTH_TOPIC,
+    RENDERED_TOPIC,
+)
 from bridge.errors import GstError
 from bridge.media.color import JPEG_MAGIC, decode_color
 from evaluator.errors import UndefinedStatisticError
@@ -199,14 +206,13 @@ def spread(
 
 RENDERED, RECORDED, POSED = "rendered", "recorded", "pose_aligned"
 _COLOR_TOPICS = (
-    (RENDERED, re.compile(r"/cam/([^/]+)/(?:color/)?(?:rendered|replayed)(?:/image)?$")),
-    (RECORDED, re.compile(r"/cam/([^/]+)/(?:color|recorded)(?:/image)?$")),
-    (POSED, re.compile(r"/cam/([^/]+)/pose_aligned(?:/image)?$")),
+    (RENDERED, RENDERED_TOPIC),
+    (RECORDED, RECORDED_TOPIC),
+    (POSED, POSE_ALIGNED_TOPIC),
 )
-_MASK_TOPIC = re.compile(r"/cam/([^/]+)/mask/([a-z_]+)(?:/image)?$")
 _DEPTH_TOPICS = (
-    (RENDERED, re.compile(r"/cam/([^/]+)/rendered/depth$")),
-    (RECORDED, re.compile(r"/cam/([^/]+)/recorded/depth(?:_in_color)?$")),
+    (RENDERED, RENDERED_DEPTH_TOPIC),
+    (RECORDED, RECORDED_DEPTH_TOPIC),
 )
 
 Key = tuple[str, int]
@@ -300,7 +306,7 @@ def read_images(episode: Episode) -> Images:
                 put[topic] = partial(_put_color, images.color[name], match.group(1))
                 break
         else:
-            if match := _MASK_TOPIC.search(topic):
+            if match := MASK_TOPIC.search(topic):
                 masks = images.masks.setdefault(match.group(2), {})
                 put[topic] = partial(_put_color, masks, match.group(1))
     for topic in episode.topics_of_type(schema.IMAGE):

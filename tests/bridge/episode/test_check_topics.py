@@ -19,6 +19,7 @@ from bridge.episode.cdr.messages import CameraInfo, DepthImage, JointSample
 from bridge.episode.check import CheckReport, check_episode
 from bridge.episode.check_topics import SequenceWatch
 from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.topics import DROPS
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry.camera import Camera
 
@@ -102,7 +103,7 @@ def test_losses_the_ledger_lists_are_declared(tmp_path: Path) -> None:
     def fill(writer: EpisodeWriter) -> None:
         write_joints(writer, [0, 1, 5, 6, 9])
         record = drops(JOINTS, gaps=2, queue_drops=2, shed=1)
-        writer.write_json(schema.DROPS_TOPIC, record, type_name=schema.DROPS, log_time_ns=2000)
+        writer.write_json(DROPS, record, type_name=schema.DROPS, log_time_ns=2000)
 
     report = check(tmp_path, fill)
     assert (report.exit_code, report.summary) == (3, "losses declared")
@@ -115,7 +116,7 @@ def test_losses_the_ledger_does_not_list_are_named(tmp_path: Path) -> None:
     def fill(writer: EpisodeWriter) -> None:
         write_joints(writer, [0, 1, 5])
         record = drops(JOINTS, gaps=1)
-        writer.write_json(schema.DROPS_TOPIC, record, type_name=schema.DROPS, log_time_ns=2000)
+        writer.write_json(DROPS, record, type_name=schema.DROPS, log_time_ns=2000)
 
     report = check(tmp_path, fill)
     assert (report.exit_code, report.summary) == (3, "losses not declared")
@@ -141,9 +142,7 @@ def test_what_a_pause_left_out_is_no_loss_and_nothing_else_is_excused(
             writer.write_json(
                 "/c/event", event, type_name=schema.EVENT, log_time_ns=event["stamp_ns"]
             )
-        writer.write_json(
-            schema.DROPS_TOPIC, drops(JOINTS), type_name=schema.DROPS, log_time_ns=9 * second_ns
-        )
+        writer.write_json(DROPS, drops(JOINTS), type_name=schema.DROPS, log_time_ns=9 * second_ns)
         if not is_recovered:
             paused = [[3 * second_ns // 2, 17 * second_ns // 10], [9 * second_ns // 2] * 2, "x"]
             writer.add_metadata("recorder", {"paused": json.dumps(paused)})
@@ -250,7 +249,7 @@ def test_the_command_prints_everything_as_json(
     def fill(writer: EpisodeWriter) -> None:
         write_joints(writer, [0, 2])
         record = drops(JOINTS, gaps=1)
-        writer.write_json(schema.DROPS_TOPIC, record, type_name=schema.DROPS, log_time_ns=2000)
+        writer.write_json(DROPS, record, type_name=schema.DROPS, log_time_ns=2000)
 
     check(tmp_path, fill)
     part = tmp_path / "e2.mcap.part"

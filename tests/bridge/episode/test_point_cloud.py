@@ -6,6 +6,7 @@ import pytest
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.messages import PointCloudSample
+from bridge.episode.topics import type_of_topic
 
 POINTS = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32).astype(np.float64)
 
@@ -46,4 +47,4 @@ def test_a_cloud_of_another_layout_is_refused() -> None:
 
 
 def test_the_topic_of_a_soft_object_carries_clouds() -> None:
-    assert schema.type_of_topic("/standin/truth/object/sloth/nodes") == schema.POINT_CLOUD
+    assert type_of_topic("/standin/truth/object/sloth/nodes") == schema.POINT_CLOUD

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from bridge.episode import protobuf, schema
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.messages import VideoFrame, video_message
+from bridge.episode.topics import type_of_topic
 
 NS = 1_700_000_000_123_456_789
 
@@ -52,7 +53,7 @@ def test_arbitrary_bytes_are_a_frame_or_one_error(data: bytes) -> None:
 
 
 def test_the_preview_topic_carries_video() -> None:
-    assert schema.type_of_topic("/cell/cam/a/color/preview") == schema.COMPRESSED_VIDEO
+    assert type_of_topic("/cell/cam/a/color/preview") == schema.COMPRESSED_VIDEO
     found = schema.schema_for(schema.COMPRESSED_VIDEO)
     assert found is not None
     assert (found.schema_encoding, found.message_encoding) == ("protobuf", "protobuf")

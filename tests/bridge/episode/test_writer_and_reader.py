@@ -18,6 +18,7 @@ from bridge.episode.cdr.messages import (
 )
 from bridge.episode.check import check_episode
 from bridge.episode.reader import Episode
+from bridge.episode.topics import DROPS
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import BridgeError, EpisodeError, SchemaVersionError, UsageError
 from bridge.geometry.camera import Camera
@@ -209,7 +210,7 @@ def test_declared_losses_have_their_own_exit_code(tmp_path: Path) -> None:
         "bytes": 10,
     }
     with EpisodeWriter(path) as writer:
-        writer.write_json(schema.DROPS_TOPIC, record, type_name=schema.DROPS, log_time_ns=1)
+        writer.write_json(DROPS, record, type_name=schema.DROPS, log_time_ns=1)
         writer.describe(INFO)
     report = check_episode(path)
     assert (report.exit_code, report.declared_losses) == (3, 3)

@@ -21,6 +21,7 @@ from bridge.episode.cdr.messages import (
     transforms_to_cdr,
 )
 from bridge.episode.metadata import EpisodeInfo, Outcome
+from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
@@ -115,7 +116,7 @@ class MadeTrial:
         messages = []
 
         def put(topic: str, data: bytes, stamp_ns: int, type_name: str | None = None) -> None:
-            name = type_name or schema.type_of_topic(topic)
+            name = type_name or type_of_topic(topic)
             assert name is not None
             messages.append((stamp_ns, topic, data, name))
 

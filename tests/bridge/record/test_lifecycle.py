@@ -14,6 +14,7 @@ from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import events
+from bridge.episode.topics import DROPS
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import BridgeError, UsageError
 from bridge.record.config import EpisodeAbout, QueueConfig, RecorderConfig
@@ -74,7 +75,7 @@ def test_losses_are_in_the_ledger_and_the_totals(
         recorder.receive(make_sample(sequence=sequence, source_gid=b"n" * 16))
     assert recorder.stop()["lost"] == 5
     episode = Episode.open(path_of(run))
-    records = [json.loads(m.data) for m in episode.messages([schema.DROPS_TOPIC])]
+    records = [json.loads(m.data) for m in episode.messages([DROPS])]
     assert sum(record["gaps"] for record in records) == 5
     assert sum(record["received"] for record in records) == 5
     assert episode.metadata_records["drops"]["gaps"] == 5
@@ -93,7 +94,7 @@ def test_unknown_and_broken_messages_are_recorded_and_counted(
     answer = recorder.stop()
     assert (answer["messages"], answer["unknown_type"], answer["undecodable"]) == (4, 2, 2)
     episode = Episode.open(path_of(run))
-    messages = {m.data: m for m in episode.messages() if m.topic != schema.DROPS_TOPIC}
+    messages = {m.data: m for m in episode.messages() if m.topic != DROPS}
     assert set(messages) == {b"\x00raw", b"foo", b"\x00\x01\x00\x00broken", b""}
     assert messages[b"\x00raw"].topic == odd
     assert messages[b"foo"].type_name == "my_msgs/msg/Foo"

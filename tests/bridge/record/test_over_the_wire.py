@@ -14,6 +14,7 @@ import robot_gst
 from bridge.episode import schema
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import DROPS
 from bridge.record.control import RecorderClient, serve_control
 from bridge.record.recorder import Recorder
 from bridge.record.status import describe_status
@@ -134,5 +135,5 @@ def test_a_folder_is_recorded_as_a_camera(joined: Joined, tmp_path: Path) -> Non
     assert (sent["frames"], sent["of"], progress) == (4, 5, [1, 2, 3, 4])
     assert answer["messages"] == sent["messages"] == 4 * 3 + 3
     topics = Episode.open(joined.run.episodes_dir / "scan.mcap").topics()
-    counts = {topic: item.count for topic, item in topics.items() if topic != schema.DROPS_TOPIC}
+    counts = {topic: item.count for topic, item in topics.items() if topic != DROPS}
     assert counts == sent["topics"]

@@ -16,6 +16,7 @@ from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import events
+from bridge.episode.topics import DROPS
 from bridge.errors import UsageError
 from bridge.record.config import DiskConfig, RecorderConfig
 from bridge.record.errors import LifecycleError
@@ -293,7 +294,7 @@ def test_ledger_records_say_how_things_stood(
         sample = make_sample()
         recorder.receive(replace(sample, source_ns=sample.received_ns - delay_ns))
     recorder.stop()
-    records = [json.loads(data) for data in data_of(episode_of(run), schema.DROPS_TOPIC)]
+    records = [json.loads(data) for data in data_of(episode_of(run), DROPS)]
     mine = [record for record in records if record["topic"] == JOINTS]
     assert min(record["clock_offset_ns"] for record in mine) == 3_000_000
     for record in mine:

@@ -20,6 +20,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.schema import StampedMessage
 from bridge.episode.streams import rgbd_frames
+from bridge.episode.topics import type_of_topic
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.exchange.rgbd import write_scan
 from bridge.sources.folder.config import FolderConfig, FolderError
@@ -103,7 +104,7 @@ def test_topics_types_and_stamps_are_those_of_a_camera(folder: Path) -> None:
         (f"{prefix}/color/image", schema.COMPRESSED_IMAGE),
         (f"{prefix}/depth/image", schema.IMAGE),
     }
-    assert all(schema.type_of_topic(m.topic) == m.type_name for m in first)
+    assert all(type_of_topic(m.topic) == m.type_name for m in first)
     assert {m.stamp_ns for m in first} == {1_000}
     assert {m.stamp_ns for m in second} == {100_001_000}
     assert len(second) == 3  # calibration is repeated once a second only

@@ -16,6 +16,7 @@ from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import JointSample, transforms_from_cdr
 from bridge.episode.check import check_episode
 from bridge.episode.reader import Episode
+from bridge.episode.topics import DROPS
 from bridge.sources.ur.config import UrConfig
 from bridge.sources.ur.publish import publish_arm
 from bridge.terminal import Output
@@ -185,7 +186,7 @@ def test_an_older_controller_does_without_what_it_does_not_know(
     said = capsys.readouterr().err
     assert "does not know target_q, actual_TCP_pose" in said
     assert "test: hello" in said
-    topics = set(Episode.open(joined.episode_path("t1")).topics()) - {schema.DROPS_TOPIC}
+    topics = set(Episode.open(joined.episode_path("t1")).topics()) - {DROPS}
     assert topics == {"/lab/joint_states"}
 
 

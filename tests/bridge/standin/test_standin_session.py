@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bridge.episode import schema
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
@@ -19,6 +18,7 @@ from bridge.episode.cdr.messages import (
     string_from_cdr,
     transforms_from_cdr,
 )
+from bridge.episode.topics import is_truth, type_of_topic
 from bridge.errors import UsageError
 from bridge.media.color import decode_color
 from bridge.sources.standin import operator
@@ -85,9 +85,9 @@ def looked_at(
 def test_every_topic_carries_the_type_the_format_names(looked_at: tuple[Any, StandinCell]) -> None:
     session, _ = looked_at
     for item in session.sent:
-        named = schema.type_of_topic(item.topic)
+        named = type_of_topic(item.topic)
         assert named in (item.type_name, None), item.topic
-    untyped = {item.topic for item in session.sent if schema.type_of_topic(item.topic) is None}
+    untyped = {item.topic for item in session.sent if type_of_topic(item.topic) is None}
     assert untyped == {"/standin/tcp/pose", TRUTH_PARAMETERS}
 
 
@@ -136,7 +136,7 @@ def test_hidden_parameters_appear_under_truth_only(looked_at: tuple[Any, Standin
     numbers = [value for value in numbers if value not in (0.0, 1.0)]
     assert len(numbers) > 30
     for item in session.sent:
-        if schema.is_truth(item.topic):
+        if is_truth(item.topic):
             continue
         for value in numbers:
             assert struct.pack("<d", value) not in item.data, item.topic
@@ -290,7 +290,7 @@ def truth_rollout(sent: list[Any]) -> Rollout:
     poses: dict[str, list[np.ndarray]] = {}
     stamps = []
     for item in sent:
-        if schema.is_truth(item.topic) and item.topic.endswith("/pose"):
+        if is_truth(item.topic) and item.topic.endswith("/pose"):
             object_id = item.topic.split("/")[-2]
             poses.setdefault(object_id, []).append(PoseSample.from_cdr(item.data).T_frame_body)
             if object_id == "cube":

@@ -57,7 +57,7 @@ def test_an_accepted_plan_is_accepted() -> None:
 @pytest.mark.parametrize(
     ("settings", "plan", "reason"),
     [
-        ({"eyes": FakeEyes(seen=[])}, PLAN, "no usable frames: side: silent for 9.0 s"),
+        ({"eyes": FakeEyes(seen=[])}, PLAN, "no usable frames within 0 s: side: silent for 9.0 s"),
         ({"eyes": FakeEyes(description=None)}, PLAN, "no robot description"),
         ({"eyes": FakeEyes(running="plan_0")}, PLAN, "plan_0 is being executed"),
         (

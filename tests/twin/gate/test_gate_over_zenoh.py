@@ -22,6 +22,7 @@ from bridge.episode.cdr.messages import (
     string_to_cdr,
     transforms_to_cdr,
 )
+from bridge.episode.topics import type_of_topic
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
 from bridge.task.plan import Plan, Stage, Waypoint
@@ -80,7 +81,7 @@ def publish_one_frame(cell: WireSession, stamp_ns: int = S) -> None:
         ("/lab/cam/side/depth/image", depth.to_cdr()),
     ]
     for topic, data in messages:
-        cell.publisher(topic, schema.type_of_topic(topic) or "").put(data, source_ns=stamp_ns)
+        cell.publisher(topic, type_of_topic(topic) or "").put(data, source_ns=stamp_ns)
 
 
 def plan_for(robot: str) -> bytes:
@@ -193,7 +194,7 @@ def test_a_replay_that_hangs_or_raises_is_null_on_the_wire_and_in_the_log(
     assert "oops" in capsys.readouterr().err
     hung = ask(cell)  # comes while the replay still hangs, or never
     assert hung.accepted is None
-    assert "not done at the deadline of 0.4 s" in str(hung.reason)
+    assert "not done at the wall-clock limit of 0.4 s" in str(hung.reason)
     behind = ask(cell)
     assert behind.accepted is None
     assert "an earlier plan was still being judged" in str(behind.reason)

@@ -36,7 +36,7 @@ def test_a_process_stopped_between_two_plans_holds_no_more_than_one(twin: TwinPr
     assert twin._worker is not None
     assert twin._worker.pid is not None
     os.kill(twin._worker.pid, signal.SIGSTOP)
-    with pytest.raises(UndecidedError, match="not done before the deadline; it was stopped"):
+    with pytest.raises(UndecidedError, match=r"wall-clock limit .*; it was stopped"):
         asked(twin, "1 + 1" + " " * 3_000_000, within_s=0.2)
     assert asked(twin, "2 + 2") == 4
 

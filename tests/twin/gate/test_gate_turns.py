@@ -1,4 +1,4 @@
-"""Plans that come while another is judged: deadlines, turns, and how many may wait."""
+"""Plans that come while another is judged: limits, turns, and how many may wait."""
 
 import threading
 import time
@@ -11,7 +11,7 @@ from bridge.task.plan import Plan
 from bridge.task.verdict import Verdict
 
 
-def test_reading_a_plan_counts_towards_its_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reading_a_plan_counts_towards_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = [time.monotonic()]
 
     def slowly(payload: bytes) -> Plan:
@@ -22,10 +22,10 @@ def test_reading_a_plan_counts_towards_its_deadline(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(Plan, "from_json", staticmethod(slowly))
     verdict = gate_with(deadline_s=0.2).judge(b"a plan")
     assert verdict.accepted is None
-    assert "at the deadline of 0.2 s" in str(verdict.reason)
+    assert "at the wall-clock limit of 0.2 s (--deadline)" in str(verdict.reason)
 
 
-def test_a_replay_past_the_deadline_is_null_and_the_next_plan_waits_for_its_turn() -> None:
+def test_a_replay_past_the_wall_clock_limit_is_null_and_the_next_plan_waits_for_its_turn() -> None:
     go_on = threading.Event()
 
     def slow(plan: Plan, poses: dict[str, Any], urdf: str, ends_s: float) -> Verdict:
@@ -35,7 +35,7 @@ def test_a_replay_past_the_deadline_is_null_and_the_next_plan_waits_for_its_turn
     gate = gate_with(replay=slow, deadline_s=0.05)
     late = gate.judge(PLAN.to_json())  # comes while the replay still waits, or never
     assert late.accepted is None
-    assert "not done at the deadline of 0.05 s" in str(late.reason)
+    assert "not done at the wall-clock limit of 0.05 s (--deadline)" in str(late.reason)
     next_one = gate.judge(PLAN.to_json())
     assert next_one.accepted is None
     assert "an earlier plan was still being judged" in str(next_one.reason)

@@ -1,6 +1,9 @@
 """What the gate's process replays with: the run's calibration, and the force of the task."""
 
+import itertools
 import json
+import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +17,7 @@ from bridge.task.plan import Plan
 from bridge.task.robot import ROBOT_NAME, ur5_with_gripper_urdf
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
+from twin.gate.gate import UndecidedError
 from twin.gate.twin_process import Question, answer
 from twin.replay import verdict as verdict_module
 from twin.replay.config import ReplayConfig
@@ -39,7 +43,7 @@ def asked(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> tuple[ReplayScene,
     return seen[0]
 
 
-def question_of(run: RunFolder) -> Question:
+def question_of(run: RunFolder, **changes: Any) -> Question:
     """A plan for the sloth, which lies somewhere."""
     task = load_task("sloth_into_basket")
     lying = se3.transform_from(np.array([1.0, 0, 0, 0]), np.array([0.5, -0.1, 0.03]))
@@ -47,7 +51,7 @@ def question_of(run: RunFolder) -> Question:
         id="p", planner="", policy="", condition="without_replanning", robot=ROBOT_NAME,
         frame="base_link", instruction="", stages=(), tau=(),
     )  # fmt: skip
-    return Question(
+    question = Question(
         run_path=run.path,
         plan=plan,
         task=task,
@@ -55,8 +59,59 @@ def question_of(run: RunFolder) -> Question:
         covariances={},
         urdf=ur5_with_gripper_urdf(),
         config=ReplayConfig(),
-        left_s=1.0,
+        max_steps=100_000,
     )
+    return replace(question, **changes)
+
+
+YES = Factor(value=True)
+ACCEPTED = Verdict(
+    plan_id="p", trajectory="planned", mode="dynamic", ik=YES, clearance=YES, terminal=YES,
+    engine="fake", seed=0,
+)  # fmt: skip
+
+
+def accepting(monkeypatch: pytest.MonkeyPatch) -> list[ReplayConfig]:
+    """Let every replay succeed; the settings of each."""
+    asked: list[ReplayConfig] = []
+
+    def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> Any:
+        asked.append(config)
+        return SimpleNamespace(verdict=ACCEPTED)
+
+    monkeypatch.setattr(verdict_module, "replay_plan", replay_plan)
+    return asked
+
+
+NOMINAL_STEPS = 60 + 240
+"""A plan without waypoints settles for 0.25 s before and 1 s after, at 240 Hz."""
+
+
+@pytest.mark.parametrize(("more_steps", "count"), [(0, 0), (299, 0), (300, 1), (1500, 5)])
+def test_as_many_samples_are_run_as_fit_into_the_steps_on_any_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more_steps: int, count: int
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    question = question_of(
+        run, config=ReplayConfig(samples=5), max_steps=NOMINAL_STEPS + more_steps
+    )
+    asked = accepting(monkeypatch)
+    idle = answer(question)
+    assert len(asked) == 1 + count
+    assert (idle.p_success or {"n": 0})["n"] == count
+    hours = itertools.count(step=3600.0)
+    monkeypatch.setattr(time, "monotonic", lambda: next(hours))
+    assert answer(question).to_json() == idle.to_json()
+
+
+def test_a_plan_that_alone_needs_too_many_steps_gets_no_verdict(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = accepting(monkeypatch)
+    run = RunFolder.create(tmp_path / "run")
+    with pytest.raises(UndecidedError, match="300 simulated steps, and a verdict at most 299"):
+        answer(question_of(run, max_steps=NOMINAL_STEPS - 1))
+    assert not asked
 
 
 def test_a_gate_without_a_calibration_presses_as_the_task_says(
@@ -90,12 +145,7 @@ def test_a_yes_that_knows_less_than_a_scene_could_tell_says_what_is_missing(
     record = {"schema_version": 1, "key": "k", "scene_hash": "abc", "background": {},
               "sources": [], "views": []}  # fmt: skip
     (run.scene_dir / "scene.json").write_text(json.dumps(record))
-    yes = Factor(value=True)
-    verdict = Verdict(
-        plan_id="p", trajectory="planned", mode="dynamic", ik=yes, clearance=yes, terminal=yes,
-        engine="fake", seed=0,
-    )  # fmt: skip
-    monkeypatch.setattr(verdict_module, "replay_plan", lambda *_: SimpleNamespace(verdict=verdict))
+    accepting(monkeypatch)
     said = answer(question_of(run))
     assert said.accepted is True
     assert said.warnings == (

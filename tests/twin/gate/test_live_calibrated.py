@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from live_cell import CAMERA, IMAGE, S, calibrate, event, look, place, shoot
 
-from bridge.episode import schema
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
@@ -23,6 +22,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
+from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
@@ -74,7 +74,7 @@ class Recorder(LiveView):
     def take(self, topic: str, data: bytes, received_ns: int, type_name: str = "") -> None:
         """Show and write."""
         super().take(topic, data, received_ns, type_name)
-        named = type_name or schema.type_of_topic(topic) or ""
+        named = type_name or type_of_topic(topic) or ""
         self.writer.write(topic, data, type_name=named, log_time_ns=received_ns)
 
     def episode(self) -> Episode:

@@ -12,6 +12,7 @@ from bridge.episode import streams
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
 from bridge.task.plan import Plan
@@ -127,7 +128,7 @@ def widths_of(episode: Episode, start_ns: int) -> Series:
         UnusableCaseError: When a width is no number.
     """
     try:
-        track = streams.joint_track(episode, "/gripper/state")
+        track = streams.joint_track(episode, GRIPPER_STATE)
     except GstError:
         return np.zeros(0), np.zeros(0)
     if not np.isfinite(track.position).all():
@@ -230,14 +231,14 @@ def read_case(run: RunFolder, episode: Episode) -> Case:
         BackwardTimeError: Its clock went back meanwhile.
     """
     plan, start_ns, end_ns = _executed(episode)
-    check_clock(episode, ("/joint_states", "/gripper/state"), start_ns, end_ns, plan.id)
+    check_clock(episode, (JOINT_STATES, GRIPPER_STATE), start_ns, end_ns, plan.id)
     task = load_task(plan.task or episode.info.task)
     if task.soft_objects:
         message = f"task {task.name} has soft objects, and only rigid ones are calibrated."
         raise UnusableCaseError(message)
     urdf = streams.robot_description(episode)
     if urdf is None:
-        raise UnusableCaseError("no robot description was recorded (/robot_description).")
+        raise UnusableCaseError(f"no robot description was recorded ({ROBOT_DESCRIPTION}).")
     path = write_localised(run, episode, task, scene_hash=scene_hash_of(run))
     before, after = _localised(path, plan.id)
     objects = _moving(task, before, after)

@@ -1,4 +1,10 @@
-"""Align scene and robot: search, refine, judge; accepted only when the images determine it."""
+"""Align scene and robot: search, refine, judge; accepted only when the images determine it.
+
+Every yaw and position on a level surface is tried. A hypothesis is judged by looking: points of the
+posed robot are carried into the depth image and compared with what was measured there. That needs
+no idea which points of the scene are robot, counts what hides the robot as neutral, and what is
+seen through it against the hypothesis.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,15 +19,6 @@ from twin.robot.model import RobotModel
 from twin.robot.surface import PosedSurface, sample_surface
 from twin.scene.align.refine import COARSE, FINE, Equations, ScenePose, refine
 from twin.scene.align.view import LevelPlane, RobotView, find_planes
-
-# --- Where on a level surface the robot may stand: every yaw and place is tried.
-#
-# A hypothesis is judged by looking: points of the posed robot are carried into the depth image
-# and compared with what was measured there. That needs no idea which points of the scene are
-# robot, counts what hides the robot as no evidence, and what is seen through it as evidence
-# against.
-
-# --- How well a place of the robot explains the depth images, and how sure it is.
 
 STRIDE_PX = 3
 ERROR_CAP_M = 0.05
@@ -444,11 +441,11 @@ def _ranked(candidates: Sequence[_Candidate]) -> tuple[_Candidate, list[_Candida
     least = max(len(item.looked.errors_m) for item in candidates) // 2
     ordered = sorted(candidates, key=lambda item: item.looked.cost_m(least))
     best = ordered[0]
-    others = [item for item in ordered[1:] if _apart(item.place, best.place)]
+    others = [item for item in ordered[1:] if _differ(item.place, best.place)]
     return best, others[:1]
 
 
-def _apart(a: ScenePose, b: ScenePose) -> bool:
+def _differ(a: ScenePose, b: ScenePose) -> bool:
     change = se3.invert(a.T_base_source) @ b.T_base_source
     turn = float(se3.rotation_angle_rad(change[:3, :3]))
     base = se3.invert(a.T_base_source)[:3, 3] - se3.invert(b.T_base_source)[:3, 3]

@@ -1,4 +1,4 @@
-"""Depth images that show the robot in known postures: what alignment starts from."""
+"""Depth images that show the robot in known postures, and the level surfaces it may stand on."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -95,8 +95,6 @@ def thin(views: Sequence[RobotView], count: int) -> list[ViewCloud]:
     step = max(1, total // max(count, 1))
     return [view.cloud.take(np.arange(0, len(view.cloud.p_m), step)) for view in views]
 
-
-# --- Level surfaces the robot may stand on: roll, pitch and height of the scene.
 
 NUM_POINTS = 6000
 NUM_TRIALS = 400

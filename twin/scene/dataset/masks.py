@@ -1,10 +1,15 @@
-"""What moves with the camera: a gripper before a wrist camera whose joints nobody recorded.
+"""Masks of what does not belong to the static scene: what moved, and what moves with a camera.
 
-While a camera scans, the scene runs through its image and what is fixed to the camera stays. Such
-pixels have edges that point the same way in all frames and brightness that follows the exposure
-only. An edge along the camera's path, or the point that a camera circles around, does so too: where
-depth was measured, other frames say whether the place stood still in the scene, and then it counts
-as scene. Nothing here needs a model of the gripper, and no held-out frame is looked at.
+Moving things (a robot, a hand, an object) show as a surface in a few frames, while other frames
+measure something farther behind it. No model of the robot is needed; what never moves, such as the
+robot's base, is static.
+
+The ego mask is what is fixed to a camera whose robot is not known by joints, such as a gripper
+before a wrist camera. While the camera scans, the scene runs through its image and these pixels
+stay: their edges point the same way in all frames and their brightness follows the exposure only.
+An edge along the camera's path, or the point a camera circles around, does so too: where depth was
+measured, other frames say whether it stood still in the scene, and then it counts as scene. No
+held-out frame is looked at.
 """
 
 from collections.abc import Sequence
@@ -17,12 +22,6 @@ from scipy import ndimage
 from bridge.geometry import se3
 from twin.scene.frames.camera_poses import same_pose
 from twin.scene.frames.rgbd import PointSet, Target, TrainingView
-
-# --- What moved during the recording: surfaces that other frames look through.
-#
-# The scene folder holds the static place. A robot, a hand or an object that was carried shows up
-# as a surface in a few frames, while other frames measure something farther behind it. No model
-# of the robot is needed. A thing that never moves, such as the robot's base, is static and stays.
 
 VOXEL_M = 0.02
 """Points are judged in groups of this size."""
@@ -41,7 +40,7 @@ INDEX_BITS = 20
 
 @dataclass(frozen=True, kw_only=True)
 class MovingVoxels:
-    """Where something was that is not part of the static place."""
+    """Where something was that is not part of the static scene."""
 
     keys: Int64[np.ndarray, " num_voxels"]
 
@@ -72,7 +71,7 @@ class ReferenceView:
     view: TrainingView
     nearest_m: Float32[np.ndarray, "height width"]
 
-    def testify(
+    def look_through(
         self, p_base: Float[np.ndarray, "num_points 3"]
     ) -> tuple[Bool[np.ndarray, " num_points"], Bool[np.ndarray, " num_points"]]:
         """Say which points it looks through, and which it sees where they should be."""
@@ -93,7 +92,7 @@ class ReferenceView:
 
 
 def choose_reference_views(views: Sequence[TrainingView]) -> list[ReferenceView]:
-    """Take training frames spread evenly; their depth images are the witnesses."""
+    """Take training frames spread evenly; their depth images are compared with."""
     step = max(1, -(-len(views) // MAX_REFERENCE_VIEWS))
     return [
         ReferenceView(view=view, nearest_m=nearest_around(view.half.depth_m))
@@ -101,20 +100,20 @@ def choose_reference_views(views: Sequence[TrainingView]) -> list[ReferenceView]
     ]
 
 
-def find_moving(points: Sequence[PointSet], witnesses: Sequence[ReferenceView]) -> MovingVoxels:
+def find_moving(points: Sequence[PointSet], references: Sequence[ReferenceView]) -> MovingVoxels:
     """Find voxels that more frames look through than confirm.
 
     Args:
         points: Surface points of all training frames, or of one held-out frame.
-        witnesses: Training frames.
+        references: Training frames.
     """
     p = np.concatenate([item.p_m for item in points])
     keys, inverse, counts = np.unique(_keys(p), return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(inverse, weights=c) / counts for c in p.T], axis=1)
     through = np.zeros(len(keys), dtype=np.int32)
     confirmed = np.zeros(len(keys), dtype=np.int32)
-    for witness in witnesses:
-        passed, met = witness.testify(means)
+    for reference in references:
+        passed, met = reference.look_through(means)
         through += passed
         confirmed += met
     return MovingVoxels(keys=keys[(through >= MIN_THROUGH) & (through > confirmed)])
@@ -214,7 +213,7 @@ def find_ego_mask(views: Sequence[TrainingView]) -> EgoMask | None:
     Args:
         views: Of one camera; the robot need not be masked in them.
     """
-    chosen = _apart(views)
+    chosen = _from_other_places(views)
     if len(chosen) < MIN_VIEWS:
         return None
     images = np.stack([_blurred(view.half) for view in chosen])
@@ -230,7 +229,7 @@ def find_ego_mask(views: Sequence[TrainingView]) -> EgoMask | None:
     return EgoMask(half=mask) if mask.mean() <= MAX_SHARE else None
 
 
-def _apart(views: Sequence[TrainingView]) -> list[TrainingView]:
+def _from_other_places(views: Sequence[TrainingView]) -> list[TrainingView]:
     """Views from places that differ, spread evenly when there are many."""
     kept: list[TrainingView] = []
     for view in views:
@@ -282,15 +281,15 @@ def _stands_in_scene(views: Sequence[TrainingView]) -> Bool[np.ndarray, "height 
     confirmed, grid = np.zeros_like(through), np.zeros(through.shape, dtype=bool)
     grid[::EVIDENCE_STRIDE, ::EVIDENCE_STRIDE] = True
     asked = views[:: -(-len(views) // EVIDENCE_VIEWS)]
-    witnesses = [ReferenceView(view=v, nearest_m=nearest_around(v.half.depth_m)) for v in asked]
+    references = [ReferenceView(view=v, nearest_m=nearest_around(v.half.depth_m)) for v in asked]
     for view in asked:
         known = (view.half.depth_m > 0) & grid
         p_camera = view.half.camera.unproject(view.half.depth_m)[known]
         p_base = se3.apply(view.T_base_color, p_camera)
-        for witness in witnesses:
-            if witness.view is view:
+        for reference in references:
+            if reference.view is view:
                 continue
-            passed, met = witness.testify(p_base)
+            passed, met = reference.look_through(p_base)
             through[known] += passed
             confirmed[known] += met
     window = EVIDENCE_PX
@@ -302,7 +301,7 @@ def _stands_in_scene(views: Sequence[TrainingView]) -> Bool[np.ndarray, "height 
 def _more_of_it(
     mask: Bool[np.ndarray, "height width"], depth_m: Float32[np.ndarray, "num_views height width"]
 ) -> Bool[np.ndarray, "height width"]:
-    """What wobbles has no edge that stays, but a depth: that of what is carried, or less.
+    """What wobbles has no edge that stays, but a depth: that of the other masked pixels, or less.
 
     The scene does not come so near, and where it does, not by the same depth in every view.
     """

@@ -100,13 +100,13 @@ def refine_poses(
 
 def with_corrections(
     choices: Sequence[FrameChoice],
-    owners: Sequence[int],
+    choice_of_view: Sequence[int],
     views: Sequence[TrainingView],
     corrections: Sequence[np.ndarray],
 ) -> list[FrameChoice]:
     """Write the corrections of views into the choices they come from, for later readers."""
     found: list[dict[int, np.ndarray]] = [{} for _ in choices]
-    for owner, view, T in zip(owners, views, corrections, strict=True):
+    for owner, view, T in zip(choice_of_view, views, corrections, strict=True):
         found[owner][view.stamp_ns] = T
     return [replace(c, corrections=mine) for c, mine in zip(choices, found, strict=True)]
 

@@ -1,4 +1,10 @@
-"""What can be wrong with a scan, each in one sentence, before time goes into a fit."""
+"""Checks of a scan before time goes into a fit: pose conventions, moved cameras, unusable depth.
+
+Points of one depth image are carried into another by the recorded poses. Where both cameras see the
+same surface the depths must be equal; with a pose read in the wrong convention they are not. Images
+of a stationary camera say nothing of its pose, because they agree whatever it is: what a moving
+camera measured is carried into them instead.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,15 +20,6 @@ from twin.scene.frames.downscaled import DownscaledDepth, Meeting, meet
 from twin.scene.frames.rgbd import NEAR_M
 from twin.scene.frames.selection import FrameChoice
 from twin.scene.settings import FrameConfig
-
-# --- Whether recorded poses and depth fit together, and if not, which reading of the poses would.
-#
-# Points of one depth image are carried into another by the recorded poses. Where both cameras see
-# the same surface the depths must be equal; with a pose read in the wrong convention they are not.
-
-# --- What depth says about the poses of one camera, whatever it was compared with.
-
-# --- The ways in which poses and depth can be meant: ours, and those others are known to write.
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 BODY_AXES = np.array(
@@ -111,7 +108,7 @@ class PoseReport:
 
     @property
     def fits(self) -> bool:
-        """Whether the recorded poses can be believed as far as the depth tells."""
+        """Whether the recorded poses are consistent with the depth."""
         return self.agreement is None or self.agreement >= GOOD
 
     @property
@@ -120,7 +117,7 @@ class PoseReport:
         return self.agreement is not None and self.fits
 
     def remark(self) -> str:
-        """One sentence about what is wrong; empty when nothing is."""
+        """What is wrong; empty when nothing is."""
         if self.better is not None and self.better_agreement is not None:
             return (
                 f"only {100 * (self.agreement or 0.0):.0f} % of the depth agrees between views, "
@@ -173,7 +170,7 @@ def is_clearly_better(agreement: float, recorded: PoseReport) -> bool:
 MAX_PAIRS = 10
 GAPS = (1, 2, 4, 8, 16)
 """Pairs are this many training frames apart."""
-STILL_AGREEMENT = 0.7
+STATIONARY_AGREEMENT = 0.7
 """Where this much agrees without any motion, the camera hardly moved and poses say nothing."""
 SHIFT_MATTERS = 0.05
 """A unit under which cameras move less must fit better than cameras that only turn."""
@@ -189,13 +186,13 @@ class MovedCameraError(TwinError):
     """A camera moved while its poses say that it stood still."""
 
 
-def check_poses(thumbs: Sequence[DownscaledDepth]) -> PoseReport:
+def check_poses(images: Sequence[DownscaledDepth]) -> PoseReport:
     """Carry depth between frames of one camera under every convention.
 
     Args:
-        thumbs: Small depth images in time order, with poses as recorded.
+        images: Small depth images in time order, with poses as recorded.
     """
-    pairs = list(_informative(thumbs))
+    pairs = list(_informative(images))
     if not pairs:
         return PoseReport(num_pairs=0, agreement=None, overlap=0.0)
     recorded = _score(pairs, Convention())
@@ -210,14 +207,14 @@ def check_poses(thumbs: Sequence[DownscaledDepth]) -> PoseReport:
     return replace(plain, agreement=recorded.agreement, better=better, better_agreement=score)
 
 
-def still_agreement(thumbs: Sequence[DownscaledDepth]) -> float | None:
+def stationary_agreement(images: Sequence[DownscaledDepth]) -> float | None:
     """Share of the depth that stays the same in the images of a camera said to stand still.
 
     The median over all pairs: a robot that passes by once does not count. None when no two images
     measured the same place.
     """
     found = []
-    for first, second in combinations(thumbs, 2):
+    for first, second in combinations(images, 2):
         met = meet(first, second, se3.invert(second.T_base_depth) @ first.T_base_depth)
         if met.overlap >= MIN_OVERLAP:
             found.append(met.agreement)
@@ -250,28 +247,23 @@ def _met(first: DownscaledDepth, second: DownscaledDepth, convention: Convention
 
 
 def _informative(
-    thumbs: Sequence[DownscaledDepth],
+    images: Sequence[DownscaledDepth],
 ) -> Iterator[tuple[DownscaledDepth, DownscaledDepth]]:
     """Pairs of frames whose images show that the camera moved; both directions of time alike."""
     found = 0
     for gap in GAPS:
-        starts = range(0, len(thumbs) - gap, max(1, (len(thumbs) - gap) // MAX_PAIRS))
+        starts = range(0, len(images) - gap, max(1, (len(images) - gap) // MAX_PAIRS))
         for start in starts:
-            first, second = thumbs[start], thumbs[start + gap]
+            first, second = images[start], images[start + gap]
             met = meet(first, second, np.eye(4))
             if not first.depth_m.any() or not second.depth_m.any():
                 continue
-            if met.agreement < STILL_AGREEMENT:
+            if met.agreement < STATIONARY_AGREEMENT:
                 yield first, second
                 found += 1
         if found >= MAX_PAIRS:
             return
 
-
-# --- Whether a camera that stands still sees things where cameras that move see them.
-#
-# Its own images say nothing of its pose: they agree wherever it is believed to be. What a moving
-# camera measured is carried into them instead.
 
 MAX_OTHERS = 12
 """Images of other cameras that are carried over."""
@@ -288,7 +280,7 @@ def check_between(own: Sequence[DownscaledDepth], others: Sequence[DownscaledDep
         No agreement when there is nothing to compare with, or when no reading of its pose lets the
         camera see what the others saw: it may look at another place.
     """
-    first = next((thumb for thumb in own if thumb.depth_m.any()), None)
+    first = next((image for image in own if image.depth_m.any()), None)
     places = np.unique(np.linspace(0, len(others) - 1, min(len(others), MAX_OTHERS)).round())
     chosen = [others[int(place)] for place in places]
     if first is None or not chosen:
@@ -330,7 +322,7 @@ class CameraCheck:
     """What one camera's training frames showed."""
 
     choice: FrameChoice
-    thumbs: Sequence[DownscaledDepth]
+    images: Sequence[DownscaledDepth]
     trusted: Sequence[float]
     """Share of trusted depth pixels of each frame."""
 
@@ -350,13 +342,13 @@ class ScanReport:
     """Sentences about what is wrong."""
     moving_fraction: float = 0.0
     """Share of the measured surface that other frames look through."""
-    carried: Mapping[str, float] = field(default_factory=dict)
+    ego_mask_shares: Mapping[str, float] = field(default_factory=dict)
     """By camera without joints: share of its image that moves with it."""
 
     def remarks(self) -> list[str]:
         """All sentences, that about motion included."""
         found = list(self.found)
-        for name, share in self.carried.items():
+        for name, share in self.ego_mask_shares.items():
             found.append(
                 f"{100 * share:.0f} % of the image of {name} moves with the camera, as a gripper "
                 "before it does, and was left out"
@@ -374,7 +366,9 @@ class ScanReport:
         return {
             "remarks": self.remarks(),
             "moving_fraction": self.moving_fraction,
-            "carried_fraction": {name: round(share, 4) for name, share in self.carried.items()},
+            "carried_fraction": {
+                name: round(share, 4) for name, share in self.ego_mask_shares.items()
+            },
             "pose_agreement": {
                 name: None if report.agreement is None else round(report.agreement, 4)
                 for name, report in self.poses.items()
@@ -390,12 +384,12 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
         PoseConventionError: When a camera's poses fit only if read in another convention.
         MovedCameraError: When a camera moved that is said to stand still.
     """
-    seen = [camera for camera in cameras if camera.thumbs]
+    seen = [camera for camera in cameras if camera.images]
     blind = [camera for camera in seen if max(camera.trusted) < SPARSE]
     usable = [camera for camera in seen if max(camera.trusted) >= SPARSE]
     if blind and not usable:
         raise NoDepthError(_no_depth(blind[0], config))
-    moved = _still_cameras(usable, refuse=config.check_poses)
+    moved = _moved_cameras(usable, refuse=config.check_poses)
     poses = _pose_reports(usable)
     for name, report in poses.items():
         if report.better is not None and config.check_poses:
@@ -406,10 +400,10 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
             raise PoseConventionError(message)
     found = [_no_depth(camera, config) for camera in blind] + moved
     found += [f"{name}: {report.remark()}" for name, report in poses.items() if report.remark()]
-    still = [camera.name for camera in usable if camera.choice.still]
-    if any(name in poses and not poses[name].fits for name in still):
+    stationary = [camera.name for camera in usable if camera.choice.stationary]
+    if any(name in poses and not poses[name].fits for name in stationary):
         found.append("robot-gst calibrate RUN --cameras finds where cameras are that stand still")
-    total = sum(len(camera.thumbs) for camera in seen)
+    total = sum(len(camera.images) for camera in seen)
     if total < FEW_FRAMES:
         found.append(
             f"only {total} training frame{'s' if total > 1 else ''}: the scene holds what "
@@ -420,21 +414,21 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
 
 
 def _pose_reports(usable: Sequence[CameraCheck]) -> dict[str, PoseReport]:
-    """Judge moving cameras by themselves, and the others by moving ones that can be believed."""
+    """Judge moving cameras by themselves, and the others by moving ones whose poses fit."""
     poses = {
-        camera.name: check_poses(camera.thumbs) for camera in usable if not camera.choice.still
+        camera.name: check_poses(camera.images) for camera in usable if not camera.choice.stationary
     }
     sure = [camera for camera in usable if camera.name in poses and poses[camera.name].is_sure]
-    others = [thumb for camera in sure for thumb in camera.thumbs]
+    others = [image for camera in sure for image in camera.images]
     for camera in usable:
-        if camera.choice.still:
-            report = check_between(camera.thumbs, others)
+        if camera.choice.stationary:
+            report = check_between(camera.images, others)
             if report.agreement is not None:  # else it looks at another place
                 poses[camera.name] = report
     return poses
 
 
-def _still_cameras(usable: Sequence[CameraCheck], *, refuse: bool) -> list[str]:
+def _moved_cameras(usable: Sequence[CameraCheck], *, refuse: bool) -> list[str]:
     """Say which cameras moved although their poses do not.
 
     Raises:
@@ -442,8 +436,8 @@ def _still_cameras(usable: Sequence[CameraCheck], *, refuse: bool) -> list[str]:
     """
     found = []
     for camera in usable:
-        agreement = still_agreement(camera.thumbs) if camera.choice.still else None
-        if agreement is None or agreement >= STILL_AGREEMENT:
+        agreement = stationary_agreement(camera.images) if camera.choice.stationary else None
+        if agreement is None or agreement >= STATIONARY_AGREEMENT:
             continue
         about = (
             f"{camera.name} stands still by its poses, but only {100 * agreement:.0f} % of its "
@@ -464,7 +458,7 @@ def _still_cameras(usable: Sequence[CameraCheck], *, refuse: bool) -> list[str]:
 
 def _no_depth(camera: CameraCheck, config: FrameConfig) -> str:
     """Say why a camera's depth is not usable."""
-    values = np.concatenate([thumb.depth_m[thumb.depth_m > 0] for thumb in camera.thumbs])
+    values = np.concatenate([image.depth_m[image.depth_m > 0] for image in camera.images])
     if len(values) == 0:
         return f"{camera.name} measured no depth at all: every pixel is 0 or not a number"
     median = float(np.median(values))

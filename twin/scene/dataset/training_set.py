@@ -26,7 +26,7 @@ from twin.scene.settings import RebuildConfig
 
 MAX_POINTS = 3_000_000
 """Depth points to fuse; more change nothing but the time."""
-THUMB_PX = 120
+DOWNSCALED_PX = 120
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,12 +38,12 @@ class TrainingSet:
     points: list[PointSet]
     """Static surface points of each training frame."""
     views: list[TrainingView]
-    owners: list[int]
+    choice_of_view: list[int]
     """Index of each view's choice."""
     moving: MovingVoxels
-    carried: dict[int, EgoMask]
+    ego_masks: dict[int, EgoMask]
     """By index of the choice: what moves with a camera whose robot is not known by joints."""
-    witnesses: list[ReferenceView]
+    reference_views: list[ReferenceView]
     report: ScanReport
     robot: FoundRobot
 
@@ -61,11 +61,13 @@ class _Read:
 
     points: list[PointSet] = field(default_factory=list)
     views: list[TrainingView] = field(default_factory=list)
-    owners: list[int] = field(default_factory=list)
+    choice_of_view: list[int] = field(default_factory=list)
     cameras: list[CameraCheck] = field(default_factory=list)
 
 
-def learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output) -> TrainingSet:
+def read_training_set(
+    choices: Sequence[FrameChoice], config: RebuildConfig, output: Output
+) -> TrainingSet:
     """Read every training frame, check the scan, and set aside what moved.
 
     Raises:
@@ -78,33 +80,33 @@ def learn(choices: Sequence[FrameChoice], config: RebuildConfig, output: Output)
     if not read.views:
         message = "no frame of this run has colour, depth and a pose together. Record it again."
         raise NoFramesError(message)
-    still_stride = _stride(MAX_POSTURES, read.views[0].full.depth_m.size)
-    look_closer(robot, choices, limits_of(config), still_stride)
+    stride = _stride(MAX_POSTURES, read.views[0].full.depth_m.size)
+    look_closer(robot, choices, limits_of(config), stride)
     report = check_scan(read.cameras, config.frames)
-    carried = _set_carried_aside(choices, read, robot)
-    shares = {read.cameras[index].name: item.share for index, item in carried.items()}
-    points, views, owners = read.points, read.views, read.owners
+    ego_masks = _set_ego_pixels_aside(choices, read, robot)
+    shares = {read.cameras[index].name: item.share for index, item in ego_masks.items()}
+    points, views, choice_of_view = read.points, read.views, read.choice_of_view
     moved = list(choices)
     if config.frames.align_poses:
         refined = refine_poses(points, views, output)
         points, views = refined.points, refined.views
-        moved = with_corrections(choices, owners, views, refined.corrections)
-    witnesses = choose_reference_views(views)
-    moving = find_moving(points, witnesses)
+        moved = with_corrections(choices, choice_of_view, views, refined.corrections)
+    reference_views = choose_reference_views(views)
+    moving = find_moving(points, reference_views)
     static = [moving.drop_from(item) for item in points]
     total_points = max(sum(len(p.p_m) for p in points), 1)
     gone = sum(len(p.p_m) - len(s.p_m) for p, s in zip(points, static, strict=True)) / total_points
-    report = replace(report, moving_fraction=round(gone, 4), carried=shares)
+    report = replace(report, moving_fraction=round(gone, 4), ego_mask_shares=shares)
     for remark in report.remarks():
         output.say(remark)
     return TrainingSet(
         choices=moved,
         points=static,
         views=[moving.mask_in(view) for view in views],
-        owners=owners,
+        choice_of_view=choice_of_view,
         moving=moving,
-        carried=carried,
-        witnesses=witnesses,
+        ego_masks=ego_masks,
+        reference_views=reference_views,
         report=report,
         robot=robot,
     )
@@ -118,7 +120,7 @@ def _read(
     read = _Read()
     with output.progress("read frames", total) as advance:
         for index, choice in enumerate(choices):
-            thumbs: list[DownscaledDepth] = []
+            images: list[DownscaledDepth] = []
             trusted = []
             for frame in load(choice, choice.train_ns):
                 surface = FrameSurface(frame, limits_of(config))
@@ -127,48 +129,48 @@ def _read(
                 seen, view = robot.frames.take_out(choice.episode, frame, seen, view)
                 read.points.append(seen)
                 read.views.append(view)
-                read.owners.append(index)
-                thumbs.append(downscaled_depth(frame, THUMB_PX))
+                read.choice_of_view.append(index)
+                images.append(downscaled_depth(frame, DOWNSCALED_PX))
                 trusted.append(float(surface.trusted.mean()))
                 advance(len(read.views), f"camera {frame.camera_id}")
-            read.cameras.append(CameraCheck(choice=choice, thumbs=thumbs, trusted=trusted))
+            read.cameras.append(CameraCheck(choice=choice, images=images, trusted=trusted))
     return read
 
 
-def _set_carried_aside(
+def _set_ego_pixels_aside(
     choices: Sequence[FrameChoice], read: _Read, robot: FoundRobot
 ) -> dict[int, EgoMask]:
     """Take out of points and views what moves with a camera, where no joints tell the robot."""
     found: dict[int, EgoMask] = {}
     for index, choice in enumerate(choices):
-        if choice.still or robot.frames.knows(choice.episode):
+        if choice.stationary or robot.frames.knows(choice.episode):
             continue
-        mine = [place for place, owner in enumerate(read.owners) if owner == index]
-        carried = find_ego_mask([read.views[place] for place in mine])
-        if carried is None:
+        mine = [place for place, owner in enumerate(read.choice_of_view) if owner == index]
+        mask = find_ego_mask([read.views[place] for place in mine])
+        if mask is None:
             continue
-        found[index] = carried
+        found[index] = mask
         for place in mine:
-            read.points[place] = carried.drop_from(read.points[place], read.views[place])
-            read.views[place] = carried.mask_in(read.views[place])
+            read.points[place] = mask.drop_from(read.points[place], read.views[place])
+            read.views[place] = mask.mask_in(read.views[place])
     return found
 
 
 def with_fitted_poses(
-    learnt: TrainingSet, Ts_base_color: Float[np.ndarray, "num_views 4 4"]
+    training: TrainingSet, Ts_base_color: Float[np.ndarray, "num_views 4 4"]
 ) -> TrainingSet:
     """Carry the poses the fit ended with into views and choices, for all that comes after."""
-    found: list[dict[int, np.ndarray]] = [dict(choice.corrections) for choice in learnt.choices]
-    views = list(learnt.views)
-    for index, (owner, T) in enumerate(zip(learnt.owners, Ts_base_color, strict=True)):
+    found: list[dict[int, np.ndarray]] = [dict(choice.corrections) for choice in training.choices]
+    views = list(training.views)
+    for index, (owner, T) in enumerate(zip(training.choice_of_view, Ts_base_color, strict=True)):
         view = views[index]
         if np.allclose(T, view.T_base_color, atol=1e-9):
             continue
         before = found[owner].get(view.stamp_ns, np.eye(4))
         found[owner][view.stamp_ns] = T @ se3.invert(view.T_base_color) @ before
         views[index] = replace(view, T_base_color=T)
-    choices = [replace(c, corrections=T) for c, T in zip(learnt.choices, found, strict=True)]
-    return replace(learnt, views=views, choices=choices)
+    choices = [replace(c, corrections=T) for c, T in zip(training.choices, found, strict=True)]
+    return replace(training, views=views, choices=choices)
 
 
 def _stride(num_frames: int, num_pixels: int) -> int:

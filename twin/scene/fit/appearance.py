@@ -1,8 +1,10 @@
-"""Colours in closed form: with the geometry fixed, an image is linear in them.
+"""Colours and features in closed form: with the geometry fixed, an image is linear in them.
 
 A view is A c with A = alpha T, the weight of each Gaussian in each pixel (paper Eq. 2 with the
 product transmittance). All views together make a least-squares problem that a few steps of
-conjugate gradients solve; A is never stored, only drawn (A c) and lifted (A^T image).
+conjugate gradients solve; A is never stored, only drawn (A c) and lifted (A^T image). The feature
+term of the paper's Eq. 3, lambda_f sum |A f - F|^2, meets the other terms only through the geometry
+in A, so it is solved the same way afterwards and does not depend on lambda_f.
 """
 
 import math
@@ -17,8 +19,6 @@ from bridge.geometry.camera import Camera
 from twin.scene.frames.rgbd import Target
 from twin.scene.gaussians import NUM_FIRST, GaussianCloud, as_float32, harmonic_basis
 from twin.scene.raster.rasteriser import Rasteriser
-
-# --- How long one stage of a fit may take, so that the budget holds however many views there are.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,12 +265,6 @@ class _ImageModel:
         cloud = replace(self._cloud, colors=as_float32(x[:, 0]), harmonics=as_float32(x[:, 1:]))
         return self._rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)
 
-
-# --- The feature term of the paper's Eq. 3, minimised in closed form.
-#
-# lambda_f sum |A f - F|^2 is quadratic in the features f of the Gaussians and meets the other
-# terms only through the geometry in A. With the geometry that colour and depth gave, its minimum
-# is a linear solve like that of the colours and does not depend on lambda_f.
 
 RIDGE = 0.05
 """Pull of a feature towards its start, in squared weights of a pixel."""

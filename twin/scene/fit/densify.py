@@ -104,9 +104,9 @@ def densify(cloud: GaussianCloud, scores: Scores, *, max_splats: int, most: int)
         most: Never more splits than this at once.
     """
     kept = _kept_mask(cloud, scores)
-    room = max(min(max_splats - int(kept.sum()), most), 0)
+    free = max(min(max_splats - int(kept.sum()), most), 0)
     wanting = np.flatnonzero(kept & (scores.size_px > FINEST_PX) & (scores.error > 0))
-    worst = wanting[np.argsort(-scores.error[wanting], kind="stable")[:room]]
+    worst = wanting[np.argsort(-scores.error[wanting], kind="stable")[:free]]
     whole = kept.copy()
     whole[worst] = False
     ids = np.concatenate([np.flatnonzero(whole), worst, worst])

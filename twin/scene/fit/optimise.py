@@ -1,6 +1,13 @@
 """Fit Gaussians to images: half size first, then full size, for a time or a number of images.
 
-Adam moves everything; what happens between its steps is in ``events``.
+Adam moves everything. Between its steps gains and colours are solved in closed form
+(``appearance``) and Gaussians are split where the error is large (``densify``). Each of these looks
+at many images at once, so none may take more than its share of the budget.
+
+Images alone let a Gaussian slide along its rays as long as the training views agree; the depth term
+sees only the mean depth of a pixel, so Gaussians before and behind the surface cancel in it. From
+other viewpoints they come apart as a haze of millimetres. With ``slab`` each Gaussian is held
+within a slab around the piece of the fused surface that it began on.
 """
 
 import io
@@ -25,22 +32,6 @@ from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import NUM_FIRST, GaussianCloud, arrays, as_float32, with_harmonics
 from twin.scene.raster.rasteriser import FitSession, RasterConfig, Rasteriser, psnr_db
 from twin.scene.settings import FitConfig
-
-# --- What happens between the steps of a fit, each at its share of the budget and within its time.
-#
-# Gains and colours are solved in closed form (``appearance``), Gaussians are split where the
-# error is large (``densify``). Each of these looks at many images at once, so with many images it
-# could take longer than the fit itself: none may take more than its share of the budget.
-
-# --- Everything a fit has reached, and the file it is kept in so that it can go on.
-
-# --- Gaussians stay near the surface that depth fused.
-#
-# Images alone let a Gaussian slide along its rays as long as the training views agree; the depth
-# term sees only the mean depth of a pixel, so Gaussians before and behind the surface cancel in
-# it. From other viewpoints they come apart as a haze of millimetres. The fused surface is where
-# many depth images agree, so each Gaussian is held within a slab around the piece of it that it
-# began on.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,7 +215,8 @@ class Progress:
     clock: Callable[[], float]
     """What the budget is counted in."""
     end_s: float
-    """When the budget is used up, on that clock; infinite when images are counted."""
+    """When the budget is used up, on that clock; infinite when images are counted, so that what
+    is done does not depend on time."""
 
     def allowance(self, share: float) -> Allowance:
         """Time for a stage that may take this share of the budget, and no more than is left."""
@@ -314,8 +306,8 @@ class Events:
         cloud = state.session.cloud
         scores = score(cloud, self._observations(state, coarse), self._rasteriser, allowance)
         left = sum(event.act == self._densify for event in self._schedule[state.events_done :])
-        room = max(self._max_splats - len(cloud), 0)
-        done = densify(cloud, scores, max_splats=self._max_splats, most=-(-room // left))
+        left_over = max(self._max_splats - len(cloud), 0)
+        done = densify(cloud, scores, max_splats=self._max_splats, most=-(-left_over // left))
         state.session.rearrange(done.cloud, done.parents)
         state.surface = state.surface.take(done.parents)
         state.num_split += done.num_split
@@ -352,6 +344,8 @@ class FitResult:
 
     cloud: GaussianCloud
     iterations: int
+    iterations_asked: int | None
+    """None: as many as the time allowed."""
     coarse_iterations: int
     seconds: float
     """Wall time, initialisation and that of an interrupted fit before included."""
@@ -369,6 +363,11 @@ class FitResult:
     colour_steps: int
     """Conjugate gradient steps that solved colours; 0 when there was no time for them."""
 
+    @property
+    def underfitted(self) -> bool:
+        """Whether the time limit struck before all the images asked for were done."""
+        return self.iterations < (self.iterations_asked or 0)
+
 
 def fit(
     cloud: GaussianCloud,
@@ -384,7 +383,8 @@ def fit(
     """Minimise the loss over the views with Adam; each step draws one image.
 
     The time budget covers everything in here, the solutions in closed form included: it is
-    exceeded by one image at most.
+    exceeded by one image at most. Where images are counted, the time is only a limit, looked at
+    between two images: nothing that decides the result depends on it until it strikes.
 
     Args:
         cloud: Where to start.
@@ -402,7 +402,7 @@ def fit(
     if state is None or len(state.gains) != len(views):
         harmonics = NUM_FIRST if config.harmonics else cloud.num_harmonics
         state = first_state(learner.session(with_harmonics(cloud, harmonics)), len(views))
-        state.seconds = min(spent_s, SPENT_AT_MOST * config.budget_s)
+        state.seconds = min(spent_s, SPENT_AT_MOST * config.limit_s)
     cpu_start, last_saved = time.process_time(), state.seconds
     for at in _steps(config, state, clock):
         events.keep(state, at)
@@ -416,6 +416,7 @@ def fit(
     return FitResult(
         cloud=state.session.cloud,
         iterations=state.session.steps,
+        iterations_asked=config.iterations or None,
         coarse_iterations=state.coarse_steps,
         seconds=state.seconds,
         cpu_seconds=time.process_time() - cpu_start,
@@ -431,12 +432,12 @@ def fit(
 def _steps(config: FitConfig, state: FitState, clock: Callable[[], float]) -> Iterator[Progress]:
     begin_s = clock() - state.seconds
     by_images = config.iterations > 0
-    end_s = math.inf if by_images else begin_s + config.budget_s
+    end_s = math.inf if by_images else begin_s + config.limit_s
     while True:
         state.seconds = clock() - begin_s
         seen = state.session.steps
-        fraction = seen / config.iterations if by_images else state.seconds / config.budget_s
-        if fraction >= 1.0:
+        fraction = seen / config.iterations if by_images else state.seconds / config.limit_s
+        if fraction >= 1.0 or state.seconds >= config.limit_s:
             return
         yield Progress(fraction=fraction, seconds=state.seconds, clock=clock, end_s=end_s)
 
@@ -447,9 +448,11 @@ def _recent_psnr_db(state: FitState, num_views: int) -> float | None:
 
 def _note(state: FitState, at: Progress, num_views: int) -> str:
     recent = _recent_psnr_db(state, num_views)
-    said = "" if recent is None else f", training PSNR {recent:.2f} dB"
+    quality = "" if recent is None else f", training PSNR {recent:.2f} dB"
     left = at.seconds / at.fraction - at.seconds if at.fraction > 0 else None
-    return f"image {state.session.steps}{said}" + ("" if left is None else f", {left:.0f} s left")
+    return f"image {state.session.steps}{quality}" + (
+        "" if left is None else f", {left:.0f} s left"
+    )
 
 
 class _Learner:

@@ -1,4 +1,8 @@
-"""Load models through ``transformers``: from a local folder, no network, no code of the folder."""
+"""Load networks through ``transformers``: from a local folder, no network access, no foreign code.
+
+Only ``safetensors`` are accepted: the other formats are pickles, which run code when opened. Images
+are resized and normalised in torch, without torchvision.
+"""
 
 import importlib
 import json
@@ -14,10 +18,6 @@ from jaxtyping import UInt8
 
 from bridge.episode import provenance
 from bridge.errors import MissingDependencyError, UsageError
-
-# --- Check a folder of weights before anything of it is loaded.
-#
-# Only ``safetensors`` are accepted: the other formats are pickles, which run code when opened.
 
 MAX_JSON_BYTES = 64_000_000
 MAX_WEIGHT_BYTES = 64_000_000_000
@@ -215,8 +215,6 @@ def read_normalisation(
         raise WeightsError(folder=folder, found=f"{path.name}: image_std holds a 0", kind=kind)
     return mean, deviation
 
-
-# --- Images for networks: resized and normalised in torch, without torchvision.
 
 Normalisation = tuple[tuple[float, ...], tuple[float, ...]]
 """Mean and standard deviation of red, green, blue, for colours 0..1."""

@@ -15,8 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from twin.errors import TwinError
 
-# --- Points on a surface, and which of them a camera sees.
-
 
 class MetricFitError(TwinError):
     """The shape does not lie on the measured points, whatever its size and place."""

@@ -1,4 +1,9 @@
-"""Open an adapter by what was written on the command line: ``sam3:FOLDER``, ``dinov3:FOLDER``."""
+"""Adapters of foundation models, opened by ``sam3:FOLDER``, ``dinov3:FOLDER`` or a CLIP folder.
+
+SAM 3 (Carion et al. 2025): words in, masks out, by text prompts only, because boxes would need
+torchvision's region pooling. DINOv3 (Simeoni et al. 2025): features of every part of an image, from
+a ViT or a ConvNeXt. CLIP (Radford et al. 2021): words and pieces of images in one space.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,10 +28,6 @@ from twin.scene.foundation.loading import (
     read_normalisation,
 )
 from twin.scene.semantics.result import FeatureMap, Mask, MaskSet
-
-# --- SAM 3: words in, masks out (Carion et al. 2025), by text prompts only.
-#
-# Boxes as prompts would need torchvision's region pooling, which we do not ask for.
 
 SAM3_KIND = WeightsKind(
     name="SAM 3",
@@ -142,8 +143,6 @@ class Sam3Segmenter:
         return masks
 
 
-# --- DINOv3: features of every part of an image (Simeoni et al. 2025), from a ViT or a ConvNeXt.
-
 VIT, CONVNEXT = "dinov3_vit", "dinov3_convnext"
 DINOV3_KIND = WeightsKind(
     name="DINOv3",
@@ -239,8 +238,6 @@ class DinoFeatures:
         result: np.ndarray = tokens.float().cpu().numpy()
         return result
 
-
-# --- CLIP: words and pieces of images in one space (Radford et al. 2021).
 
 CLIP_KIND = WeightsKind(
     name="CLIP",

@@ -2,6 +2,10 @@
 
 It needs an environment that cannot be ours (CUDA, its own torch), so it is a subprocess with files
 between us. ``docs/foundation_models.md`` states the contract and shows a worker.
+
+The mesh in ``mesh.glb`` is y-up, the Gaussians in ``splat.ply`` and the pose are z-up; PyTorch3D's
+camera looks along +z with x left and y up, and multiplies row vectors, so the stored quaternion
+turns the other way round for columns.
 """
 
 import contextlib
@@ -35,11 +39,11 @@ class GeneratorError(TwinError):
     """The generator failed, or what it left behind breaks the contract."""
 
     def __init__(self, *, found: str, stderr: str = "") -> None:
-        """Remember the end of what the generator said."""
+        """Remember the end of what the generator wrote."""
         self.stderr = stderr
-        said = f" It said: {stderr}" if stderr else " It said nothing on its error output."
+        told = f" It wrote: {stderr}" if stderr else " It wrote nothing on its error output."
         super().__init__(
-            f"the shape generator {found}. See the contract in docs/foundation_models.md.{said}"
+            f"the shape generator {found}. See the contract in docs/foundation_models.md.{told}"
         )
 
 
@@ -139,9 +143,9 @@ def _write_input(path: Path, wanted: GeneratorInput, seed: int) -> None:
 
 def _run(command: Sequence[str], work: Path, config: GeneratorConfig) -> None:
     """Start the program as a process group of its own and watch time and disk."""
-    said = work / "stderr.txt"
+    written = work / "stderr.txt"
     try:
-        with said.open("wb") as stderr:
+        with written.open("wb") as stderr:
             process = subprocess.Popen(
                 command,
                 cwd=work,
@@ -170,7 +174,7 @@ def _run(command: Sequence[str], work: Path, config: GeneratorConfig) -> None:
     elif not found and process.returncode > 0:
         found = f"ended with exit code {process.returncode}"
     if found:
-        raise GeneratorError(found=found, stderr=_tail(said))
+        raise GeneratorError(found=found, stderr=_tail(written))
 
 
 def _end_group(process: "subprocess.Popen[bytes]") -> None:
@@ -192,21 +196,21 @@ def _folder_bytes(folder: Path) -> int:
     return total
 
 
-def _check_output(out: Path, config: GeneratorConfig, said: str) -> None:
+def _check_output(out: Path, config: GeneratorConfig, stderr: str) -> None:
     if out.is_symlink() or not out.is_dir():
-        raise GeneratorError(found="replaced its output folder", stderr=said)
+        raise GeneratorError(found="replaced its output folder", stderr=stderr)
     if _folder_bytes(out.parent) > config.max_output_bytes:
         found = f"wrote more than {config.max_output_bytes} bytes"
-        raise GeneratorError(found=found, stderr=said)
+        raise GeneratorError(found=found, stderr=stderr)
     names = sorted(path.name for path in out.iterdir())
     for name in OUTPUTS:
         path = out / name
         if path.is_symlink():
             found = f"left {name} as a link, which is not followed"
-            raise GeneratorError(found=found, stderr=said)
+            raise GeneratorError(found=found, stderr=stderr)
         if not path.is_file() or path.stat().st_size == 0:
             found = f"left no {name}; it left {', '.join(names) or 'nothing'}"
-            raise GeneratorError(found=found, stderr=said)
+            raise GeneratorError(found=found, stderr=stderr)
 
 
 def _tail(path: Path) -> str:
@@ -228,12 +232,6 @@ class CameraPose:
     iou: float | None
     """How well its own layout step made mask and shape overlap, 0..1; None: it was not done."""
 
-
-# --- What the shape generator left, read and laid onto the measured points.
-#
-# Conventions of SAM 3D Objects: the mesh in ``mesh.glb`` is y-up, the Gaussians in ``splat.ply``
-# and the pose are z-up; PyTorch3D's camera looks along +z with x left and y up, and multiplies
-# row vectors, so the stored quaternion turns the other way round for columns.
 
 Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """From the axes of the glb file to those of the Gaussians and the pose."""

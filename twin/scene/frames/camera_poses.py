@@ -1,4 +1,10 @@
-"""Where a camera was at each of its images: from ``/tf``, or from the images themselves."""
+"""Where a camera was at each of its images: from ``/tf``, a calibration, or the images themselves.
+
+A transform tree answers at any instant: between two poses it interpolates, before the first and
+after the last it gives the nearest. Far from any pose that is a guess: images stamped by another
+clock than ``/tf`` all get the first pose, or all the last. Such instants are marked as unknown. The
+root of all frames is the robot's base, wherever ``/tf`` says where it is.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,14 +25,6 @@ from twin.scene.frames.pairing import UnusableCameraError, name_of, paired_stamp
 from twin.scene.settings import FrameConfig
 from twin.scene.store.calibration import Calibration, MountedCamera, calibrated_tree, without_joints
 
-# --- At which instants a recording says where a camera was, and at which it only seems to.
-#
-# A transform tree answers at any instant: between two poses it interpolates, before the first and
-# after the last it gives the nearest. Far from any pose that is a guess, and it may be a bad one:
-# images stamped by another clock than /tf all get the first pose, or all the last.
-
-# --- When two poses of a camera count as one.
-
 
 def same_pose(
     T_base_a: Float[np.ndarray, "4 4"],
@@ -41,8 +39,8 @@ def same_pose(
 
 
 FAR_NS = 500_000_000
-"""A pose stated farther away in time says nothing of a camera that moves."""
-STILL_M, STILL_RAD = 0.002, 0.0035
+"""A pose published farther away in time says nothing of a camera that moves."""
+STATIONARY_M, STATIONARY_RAD = 0.002, 0.0035
 """A camera whose pose varies less than these stands still."""
 LOOKS = 40
 """Poses that are compared to see whether a camera ever moves."""
@@ -51,7 +49,7 @@ LOOKS = 40
 def unknown_mask(
     tree: TransformTree, frames: Iterable[str], stamps_ns: Int[np.ndarray, " num_stamps"]
 ) -> Bool[np.ndarray, " num_stamps"]:
-    """Mark instants at which the pose of a frame is no number, or was stated by nobody around.
+    """Mark instants at which the pose of a frame is not finite, or was not published near by.
 
     Args:
         tree: Knows the frames.
@@ -66,51 +64,53 @@ def unknown_mask(
     return unknown
 
 
-def apart_s(
+def least_gap_s(
     tree: TransformTree, frame: str, stamps_ns: Int[np.ndarray, " num_stamps"]
 ) -> float | None:
-    """Least time between an instant and a stated pose [s]; None without either."""
-    stated = tree.stamps_ns(frame)
-    if len(stated) == 0 or len(stamps_ns) == 0:
+    """Least time between an instant and a published pose [s]; None without either."""
+    posed_ns = tree.stamps_ns(frame)
+    if len(posed_ns) == 0 or len(stamps_ns) == 0:
         return None
-    return float(np.min(_gaps_ns(stated, stamps_ns))) * 1e-9
+    return float(np.min(_gaps_ns(posed_ns, stamps_ns))) * 1e-9
 
 
 def _far_from_any(
     tree: TransformTree, frame: str, stamps_ns: Int[np.ndarray, " num_stamps"]
 ) -> Bool[np.ndarray, " num_stamps"]:
-    stated = tree.stamps_ns(frame)
+    posed_ns = tree.stamps_ns(frame)
     none = np.zeros(len(stamps_ns), dtype=bool)
-    if len(stated) < 2:  # static
+    if len(posed_ns) < 2:  # static
         return none
-    far = _gaps_ns(stated, stamps_ns) > FAR_NS
-    if not far.any() or _never_moves(tree, frame, stated):
+    far = _gaps_ns(posed_ns, stamps_ns) > FAR_NS
+    if not far.any() or _never_moves(tree, frame, posed_ns):
         return none
     for index in np.flatnonzero(far):
-        after = int(np.searchsorted(stated, stamps_ns[index]))
-        if 0 < after < len(stated):  # whoever stands still may say so once
-            before, behind = (tree.T_root_frame(frame, int(stated[k])) for k in (after - 1, after))
-            far[index] = not same_pose(before, behind, distance_m=STILL_M, angle_rad=STILL_RAD)
+        after = int(np.searchsorted(posed_ns, stamps_ns[index]))
+        if 0 < after < len(posed_ns):  # a stationary camera may say so once
+            before, behind = (
+                tree.T_root_frame(frame, int(posed_ns[k])) for k in (after - 1, after)
+            )
+            far[index] = not same_pose(
+                before, behind, distance_m=STATIONARY_M, angle_rad=STATIONARY_RAD
+            )
     return np.asarray(far)
 
 
 def _gaps_ns(
-    stated: Int[np.ndarray, " num_stated"], stamps_ns: Int[np.ndarray, " num_stamps"]
+    posed_ns: Int[np.ndarray, " num_poses"], stamps_ns: Int[np.ndarray, " num_stamps"]
 ) -> Int[np.ndarray, " num_stamps"]:
-    """Time from each instant to the nearest stated one."""
-    after = np.clip(np.searchsorted(stated, stamps_ns), 0, len(stated) - 1)
+    """Time from each instant to the nearest published pose."""
+    after = np.clip(np.searchsorted(posed_ns, stamps_ns), 0, len(posed_ns) - 1)
     before = np.maximum(after - 1, 0)
-    gaps = np.minimum(np.abs(stated[after] - stamps_ns), np.abs(stated[before] - stamps_ns))
+    gaps = np.minimum(np.abs(posed_ns[after] - stamps_ns), np.abs(posed_ns[before] - stamps_ns))
     return np.asarray(gaps)
 
 
-def _never_moves(tree: TransformTree, frame: str, stated: Int[np.ndarray, " num_stated"]) -> bool:
-    some = stated[np.unique(np.linspace(0, len(stated) - 1, LOOKS).round().astype(int))]
+def _never_moves(tree: TransformTree, frame: str, posed_ns: Int[np.ndarray, " num_poses"]) -> bool:
+    some = posed_ns[np.unique(np.linspace(0, len(posed_ns) - 1, LOOKS).round().astype(int))]
     Ts = tree.Ts_root_frame(frame, some)
-    return all(same_pose(Ts[0], T, distance_m=STILL_M, angle_rad=STILL_RAD) for T in Ts)
+    return all(same_pose(Ts[0], T, distance_m=STATIONARY_M, angle_rad=STATIONARY_RAD) for T in Ts)
 
-
-# --- The frames of an episode with the robot's base as their root, wherever /tf says where it is.
 
 SAME = 1e-6
 """A base whose pose varies by more, in metres or in a rotation's entries, drives about."""
@@ -128,8 +128,8 @@ def rooted_in_base(transforms: Sequence[FrameTransform]) -> list[FrameTransform]
     """Turn round what lies between the robot's base and the root above it.
 
     Drivers often hang the base on a frame ``world``. Joints, plans and objects are given in the
-    base, so the scene has to be, too. A base that moves in its root keeps it: it is the room that
-    stands still then.
+    base, so the scene has to be, too. A base that moves in its root keeps it: the surroundings
+    do not move then.
     """
     parents = {item.child: item.parent for item in transforms}
     above: list[str] = []
@@ -307,20 +307,20 @@ def _say_unposed(
     """Count the images without a pose; refuse the camera when they are all of them."""
     if not poses.unposed_ns:
         return
-    witness = "/tf" if poses.source == "tf" else "joints"
+    clock = "/tf" if poses.source == "tf" else "joints"
     if len(poses.unposed_ns) < len(stamps_ns):
         output.say(
             f"{len(poses.unposed_ns)} of {len(stamps_ns)} frames of camera {camera_id} are left "
-            f"out: {witness} says nothing within {FAR_NS * 1e-9:g} s of them, or a pose that is "
+            f"out: {clock} says nothing within {FAR_NS * 1e-9:g} s of them, or a pose that is "
             "not finite"
         )
         return
-    gap_s = apart_s(poses.tree, _frame_ids(episode, camera_id)[0], stamps_ns)
+    gap_s = least_gap_s(poses.tree, _frame_ids(episode, camera_id)[0], stamps_ns)
     least = f", {gap_s:.1f} s away at least" if gap_s and poses.source == "tf" else ""
     message = (
-        f"no image of {name_of(episode, camera_id)} was taken while {witness} said where it "
+        f"no image of {name_of(episode, camera_id)} was taken while {clock} said where it "
         f"is{least}: clocks that differ, or recordings of different times. Record images and "
-        f"{witness} by one clock, or rebuild with --poses odometry."
+        f"{clock} by one clock, or rebuild with --poses odometry."
     )
     raise UnusableCameraError(message)
 

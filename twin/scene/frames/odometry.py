@@ -1,8 +1,8 @@
 """Follow a hand-held RGB-D camera by its own images, where nobody recorded poses.
 
-Each frame is laid onto the last keyframe (``aligner``); keyframes that see the same place again are
-tied together, and the pose graph is solved (Choi, Zhou, Koltun 2015). The gauge is the first
-keyframe.
+Each frame is laid onto the last keyframe by Open3D's hybrid photometric and geometric odometry
+(Park, Zhou, Koltun 2017); keyframes that see the same surface again are tied together, and the pose
+graph is solved (Choi, Zhou, Koltun 2015). The gauge is the first keyframe.
 """
 
 from collections.abc import Iterable, Mapping
@@ -19,10 +19,6 @@ from bridge.geometry.camera import Camera
 from bridge.terminal import Advance
 from twin.scene.frames.downscaled import DownscaledDepth, colors_in_depth, downscaled_depth, meet
 from twin.scene.frames.pairing import UnusableCameraError
-
-# --- Lay one RGB-D image onto another, and say whether they then agree.
-#
-# Open3D's hybrid photometric and geometric odometry (Park, Zhou, Koltun 2017).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +37,7 @@ class TrackConfig:
     min_overlap: float = 0.3
     min_agreement: float = 0.5
     min_likeness: float = 0.6
-    """A pose is believed when two images meet and agree by these shares, and their brightness
+    """A pose is accepted when two images meet and agree by these shares, and their brightness
     correlates: depth alone lets a plane slide along itself."""
     pyramid: tuple[int, ...] = (20, 20, 10, 5)
     """Iterations per level, the coarsest first."""
@@ -67,7 +63,7 @@ class Step:
 class Look:
     """What is kept of one frame."""
 
-    thumb: DownscaledDepth
+    small: DownscaledDepth
     image: Any
 
 
@@ -94,25 +90,25 @@ class Aligner:
 
     def look(self, frame: RgbdFrame) -> Look:
         """Thin a frame; colour is looked up for each depth pixel."""
-        thumb = downscaled_depth(frame, self.config.width_px)
-        step = round(frame.depth_camera.fx / thumb.camera.fx)
+        small = downscaled_depth(frame, self.config.width_px)
+        step = round(frame.depth_camera.fx / small.camera.fx)
         colors = np.ascontiguousarray(colors_in_depth(frame, step))
-        thumb = replace(thumb, grey=colors.mean(axis=2, dtype=np.float32))
+        small = replace(small, grey=colors.mean(axis=2, dtype=np.float32))
         image = self.open3d.geometry.RGBDImage.create_from_color_and_depth(
             self.open3d.geometry.Image(colors),
-            self.open3d.geometry.Image(np.ascontiguousarray(thumb.depth_m)),
+            self.open3d.geometry.Image(np.ascontiguousarray(small.depth_m)),
             depth_scale=1.0,
             depth_trunc=self.config.max_depth_m,
             convert_rgb_to_intensity=True,
         )
-        return Look(thumb=thumb, image=image)
+        return Look(small=small, image=image)
 
     def lay(self, source: Look, target: Look, T_guess: Float[np.ndarray, "4 4"]) -> Step | None:
         """Lay one frame onto another, from a guess; None when they then disagree."""
         success, T, information = self.open3d.pipelines.odometry.compute_rgbd_odometry(
             source.image,
             target.image,
-            self._pinhole(source.thumb.camera),
+            self._pinhole(source.small.camera),
             T_guess,
             self._term,
             self._option,
@@ -120,7 +116,7 @@ class Aligner:
         T = np.array(T)
         if not success or not np.isfinite(T).all():
             return None
-        met = meet(source.thumb, target.thumb, T)
+        met = meet(source.small, target.small, T)
         config = self.config
         if met.overlap < config.min_overlap or met.agreement < config.min_agreement:
             return None
@@ -188,7 +184,7 @@ class _Follower:
         if step is None:
             self._motion = self._motion if held_out else np.eye(4)
             return
-        self.places[look.thumb.stamp_ns] = (len(self.keys) - 1, step.T_target_source)
+        self.places[look.small.stamp_ns] = (len(self.keys) - 1, step.T_target_source)
         if not held_out:
             before = np.eye(4) if self._last is None else self._last[1].T_target_source
             self._motion = se3.invert(before) @ step.T_target_source
@@ -198,7 +194,7 @@ class _Follower:
 
     def _begin(self, look: Look) -> None:
         self.keys.append(Keyframe(look=look, T_first_key=np.eye(4), from_previous=None))
-        self.places[look.thumb.stamp_ns] = (0, np.eye(4))
+        self.places[look.small.stamp_ns] = (0, np.eye(4))
         for early in self._early:
             self.take(early, held_out=True)
 
@@ -230,7 +226,7 @@ class _Follower:
         look, step = self._last
         T_first_key = self.keys[-1].T_first_key @ step.T_target_source
         self.keys.append(Keyframe(look=look, T_first_key=T_first_key, from_previous=step))
-        self.places[look.thumb.stamp_ns] = (len(self.keys) - 1, np.eye(4))
+        self.places[look.small.stamp_ns] = (len(self.keys) - 1, np.eye(4))
         self._last = None
 
     def _is_far(self, T_key_frame: np.ndarray) -> bool:
@@ -361,8 +357,8 @@ def _agreement(keys: list[Keyframe], Ts_first_key: list[np.ndarray]) -> float:
     """Mean share of the depth that agrees between neighbouring keyframes."""
     met = [
         meet(
-            keys[i + 1].look.thumb,
-            keys[i].look.thumb,
+            keys[i + 1].look.small,
+            keys[i].look.small,
             se3.invert(Ts_first_key[i]) @ Ts_first_key[i + 1],
         ).agreement
         for i in range(len(keys) - 1)

@@ -1,4 +1,8 @@
-"""Whether a camera's images can be used at all, before anything is made of them."""
+"""Pairs of colour and depth images of a camera, and whether they can be used at all.
+
+A scan holds thousands of frames: stamps are read from headers, and only frames that are wanted are
+decoded.
+"""
 
 from collections.abc import Collection, Iterator
 
@@ -13,11 +17,6 @@ from bridge.episode.streams import RgbdFrame
 from bridge.episode.transforms import TransformTree
 from bridge.errors import BridgeError
 from twin.errors import TwinError
-
-# --- Which colour and depth images of a camera make frames, and the few of them that are wanted.
-#
-# A scan holds thousands of frames. Stamps are read from headers, and only frames that somebody
-# wants are decoded.
 
 Stamped = tuple[int, RawMessage | None]
 """Source stamp [ns] of an image, and the image itself where it is wanted."""

@@ -1,4 +1,4 @@
-"""Coloured, oriented points of one RGB-D frame, and its depth as the colour camera sees it."""
+"""One RGB-D frame as oriented, coloured points and as a training view at half and full size."""
 
 from dataclasses import dataclass, replace
 
@@ -207,9 +207,6 @@ def _sample(image_u8: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     top = image_u8[y0, x0] * (1 - fx) + image_u8[y0, x0 + 1] * fx
     bottom = image_u8[y0 + 1, x0] * (1 - fx) + image_u8[y0 + 1, x0 + 1] * fx
     return as_float32((top * (1 - fy) + bottom * fy) * (1 / 255))
-
-
-# --- One training image in memory, at half and at full size.
 
 
 @dataclass(frozen=True, kw_only=True)

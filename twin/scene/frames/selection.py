@@ -1,4 +1,9 @@
-"""Choose posed RGB-D frames of a run: some to learn from, some held out."""
+"""Choose posed RGB-D frames of a run: some to train on, some held out.
+
+A scan holds far more frames than a fit can use. Frames a camera took while it moved fast are
+smeared, and their pose is as wrong as the clocks of camera and robot differ: of each stretch of the
+camera's path the slowest and sharpest frame is taken.
+"""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -6,17 +11,24 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from bridge.episode import schema, streams
+from bridge.episode import streams
 from bridge.episode.cdr.messages import color_from_message
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
+from bridge.episode.topics import COLOR_IMAGE, COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO, is_truth
 from bridge.episode.transforms import TransformTree
 from bridge.errors import BridgeError, EpisodeError
 from bridge.geometry import se3
 from bridge.terminal import Output
 from twin.errors import TwinError
-from twin.scene.frames.camera_poses import STILL_M, STILL_RAD, CameraPoses, find_poses, same_pose
+from twin.scene.frames.camera_poses import (
+    STATIONARY_M,
+    STATIONARY_RAD,
+    CameraPoses,
+    find_poses,
+    same_pose,
+)
 from twin.scene.frames.pairing import (
     UnusableCameraError,
     check_camera,
@@ -26,11 +38,6 @@ from twin.scene.frames.pairing import (
 )
 from twin.scene.settings import FrameConfig
 from twin.scene.store.calibration import Calibration
-
-# --- Pick training frames: one for each stretch of the camera's path, the stillest and sharpest.
-#
-# A scan holds far more frames than a fit can use. Frames a camera took while it moved fast are
-# smeared, and their pose is as wrong as the clocks of camera and robot differ.
 
 TURN_M_PER_RAD = 0.5
 """How much path a turn counts for: what a camera sees at this distance moves by as much."""
@@ -182,8 +189,8 @@ def _around(values: np.ndarray) -> np.ndarray:
     return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
 
 
-STILL_TRAIN_FRAMES = 4
-STILL_HOLDOUT_FRAMES = 2
+STATIONARY_TRAIN_FRAMES = 4
+STATIONARY_HOLDOUT_FRAMES = 2
 """A camera that stands still shows the same again and again; this many frames are enough."""
 QUIET = Output(quiet=True)
 
@@ -198,7 +205,7 @@ class FrameChoice:
 
     episode: Episode
     camera_id: str
-    still: bool
+    stationary: bool
     train_ns: frozenset[int]
     holdout_ns: frozenset[int]
     """Nothing is learnt from these, the objects' places included."""
@@ -266,11 +273,11 @@ def find_sources(run: RunFolder) -> Sources:
 
 def rgbd_camera_ids(episode: Episode) -> list[str]:
     """Cameras with colour and depth, both with intrinsics; never those of stand-in truth."""
-    topics = {topic for topic in episode.topics() if not schema.is_truth(topic)}
-    tails = ("color/image", "color/info", "depth/image", "depth/info")
-    stems = {topic.removesuffix(tails[0]) for topic in topics if topic.endswith("/" + tails[0])}
+    topics = {topic for topic in episode.topics() if not is_truth(topic)}
+    others = (COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO)
+    stems = {topic.removesuffix(COLOR_IMAGE) for topic in topics if topic.endswith(COLOR_IMAGE)}
     return sorted(
-        stem.split("/")[-2] for stem in stems if all(stem + tail in topics for tail in tails)
+        stem.split("/")[-1] for stem in stems if all(stem + ending in topics for ending in others)
     )
 
 
@@ -315,8 +322,8 @@ def choose_with_reasons(
             lost.append(error)
     if lost and not choices:
         raise lost[0]
-    kept, apart = _in_one_frame(choices)
-    left_out = (*(f"left out: {reason}" for reason in lost), *apart)
+    kept, others = _in_one_frame(choices)
+    left_out = (*(f"left out: {reason}" for reason in lost), *others)
     for sentence in left_out:
         output.say(sentence)
     if not any(choice.train_ns for choice in kept):
@@ -335,13 +342,13 @@ def _in_one_frame(choices: list[FrameChoice]) -> tuple[list[FrameChoice], list[s
         return choices, []
     root = root_frame(ordered[0])
     kept = [choice for choice in choices if root_frame(choice) == root]
-    apart = [
+    others = [
         f"camera {choice.camera_id} of {choice.episode.info.id} is left out: its poses are in "
         f"frame {root_frame(choice)!r}, and nothing says where that is in {root!r}"
         for choice in choices
         if root_frame(choice) != root
     ]
-    return kept, apart
+    return kept, others
 
 
 def root_frame(choice: FrameChoice) -> str:
@@ -373,22 +380,22 @@ def _choose(
         episode, camera_id, stamps, frozenset(held.tolist()), config, output, calibration
     )
     unposed = np.array(sorted(poses.unposed_ns), dtype=np.int64)
-    still = _stands_still(episode, camera_id, poses, np.setdiff1d(stamps, unposed))
+    stationary = _is_stationary(episode, camera_id, poses, np.setdiff1d(stamps, unposed))
     train_count, holdout_count = config.max_train_frames, config.max_holdout_frames
-    if still:
-        train_count = min(train_count, STILL_TRAIN_FRAMES)
-        holdout_count = min(holdout_count, STILL_HOLDOUT_FRAMES)
+    if stationary:
+        train_count = min(train_count, STATIONARY_TRAIN_FRAMES)
+        holdout_count = min(holdout_count, STATIONARY_HOLDOUT_FRAMES)
     held = np.setdiff1d(held, unposed)
     if config.train_every:
         rest = np.setdiff1d(stamps[:: config.train_every], np.concatenate([held, unposed]))
         train = spread(rest, train_count)
     else:
         rest = np.setdiff1d(stamps, np.concatenate([held, unposed]))
-        train = _pick(episode, camera_id, poses, rest, train_count, still=still)
+        train = _pick(episode, camera_id, poses, rest, train_count, stationary=stationary)
     return FrameChoice(
         episode=episode,
         camera_id=camera_id,
-        still=still,
+        stationary=stationary,
         train_ns=frozenset(train.tolist()),
         holdout_ns=frozenset(spread(held, holdout_count).tolist()),
         poses=poses,
@@ -403,12 +410,12 @@ def _pick(
     stamps: Int[np.ndarray, " num_frames"],
     count: int,
     *,
-    still: bool,
+    stationary: bool,
 ) -> Int[np.ndarray, " num_picked"]:
     if len(stamps) == 0:
         return stamps
     info = streams.camera_info(episode, camera_id)
-    if still:
+    if stationary:
         smear = robot_smear_px(episode, stamps, info.camera.fx)
     else:
         smear = smear_px(poses.tree, info.frame_id, stamps, info.camera.fx)
@@ -429,13 +436,15 @@ def spread(values: np.ndarray, count: int) -> np.ndarray:
     return np.asarray(values[np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))])
 
 
-def _stands_still(
+def _is_stationary(
     episode: Episode, camera_id: str, poses: CameraPoses, stamps: Int[np.ndarray, " num_frames"]
 ) -> bool:
     frame_id = streams.camera_info(episode, camera_id).frame_id
     Ts = poses.tree.Ts_root_frame(frame_id, spread(stamps, 40))
-    still = all(same_pose(Ts[0], T, distance_m=STILL_M, angle_rad=STILL_RAD) for T in Ts)
-    return still and len(stamps) > 1
+    stationary = all(
+        same_pose(Ts[0], T, distance_m=STATIONARY_M, angle_rad=STATIONARY_RAD) for T in Ts
+    )
+    return stationary and len(stamps) > 1
 
 
 def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:

@@ -13,6 +13,7 @@ from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import LOCALISATION, cell_topic, object_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError
 from bridge.task.robot import BASE_FRAME
@@ -242,7 +243,7 @@ def _write_phase(
         stamp_ns = found.stamp_ns or phase.after_ns or phase.before_ns or 0
         record = {**found.to_record(), "phase": phase.name, "plan_id": phase.plan_id}
         writer.write_json(
-            f"/{cell}/localisation",
+            cell_topic(cell, LOCALISATION),
             record,
             type_name=schema.LOCALISATION,
             log_time_ns=stamp_ns,
@@ -253,7 +254,7 @@ def _write_phase(
                 stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=found.T_base_object
             )
             writer.write(
-                f"/{cell}/object/{object_id}/pose",
+                object_topic(cell, object_id, "pose"),
                 sample.to_cdr(),
                 type_name=schema.POSE_STAMPED,
                 log_time_ns=stamp_ns,

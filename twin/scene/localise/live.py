@@ -1,7 +1,7 @@
-"""The latest still frames of a live cell, in bounded memory.
+"""The latest frames of stationary cameras of a live cell, in bounded memory.
 
-Takes messages as they arrive and turns them into posed frames when asked. Says in a sentence why
-there are none. Knows nothing of the network: whoever is connected hands the messages over.
+Takes messages as they arrive and turns them into frames, posed as recorded ones are, when asked;
+says why there are none. Knows nothing of the network: whoever is connected hands the messages over.
 """
 
 import threading
@@ -13,7 +13,6 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Int
 
-from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.messages import (
     CameraInfo,
@@ -27,6 +26,17 @@ from bridge.episode.cdr.messages import (
     transforms_from_cdr,
 )
 from bridge.episode.streams import PAIRING_TOLERANCE_NS, RgbdFrame, joint_track_of
+from bridge.episode.topics import (
+    CAMERAS,
+    EVENT,
+    JOINT_STATES,
+    ROBOT_DESCRIPTION,
+    TF,
+    TF_STATIC,
+    cell_topic,
+    is_truth,
+    type_of_topic,
+)
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
 from bridge.task.record import parse_record
@@ -34,14 +44,12 @@ from twin.errors import TwinError
 from twin.robot.posture import PostureTrack, check_joints
 from twin.scene.frames.camera_poses import CameraPoses, rooted_in_base
 from twin.scene.localise.stationary_frames import (
-    STILL_WINDOW_NS,
+    STATIONARY_WINDOW_NS,
     common_root,
     is_stationary,
     with_true_depth,
 )
 from twin.scene.store.calibration import Calibration, MountedCamera, mounted_tree, unknown_postures
-
-# --- Frames of one camera of a live cell, posed as recorded ones are.
 
 KEPT_IMAGES = 6
 MAX_SPAN_NS = 1_000_000_000
@@ -104,7 +112,7 @@ class LiveCell:
             return CameraPoses(tree=self.tree, source="tf")
         track = None if place.fixed else self.track
         # Around each image too: between far images a motion of the hand would not show.
-        window = np.array([-STILL_WINDOW_NS, 0, STILL_WINDOW_NS])
+        window = np.array([-STATIONARY_WINDOW_NS, 0, STATIONARY_WINDOW_NS])
         instants = np.unique(stamps_ns[:, None] + window)
         lost = unknown_postures(track, instants)
         if lost.issuperset(stamps_ns.tolist()) and len(stamps_ns):
@@ -134,7 +142,7 @@ def frames_of(
     pairs = [
         (color, depth)
         for color, depth in _pairs(camera)
-        if color.stamp_ns - STILL_WINDOW_NS >= quiet_since_ns
+        if color.stamp_ns - STATIONARY_WINDOW_NS >= quiet_since_ns
     ]
     stamps_ns = np.array([color.stamp_ns for color, _ in pairs], dtype=np.int64)
     poses = cell.poses(camera_id, frame_id, camera.infos["depth"].frame_id, stamps_ns)
@@ -234,33 +242,33 @@ class LiveView:
             received_ns: On the receiver's clock.
             type_name: Of an image: raw or compressed; "" is what the topic's name promises.
         """
-        if schema.is_truth(topic) or (topic == self._joint_topic and not self.needs_joints):
+        if is_truth(topic) or (topic == self._joint_topic and not self.needs_joints):
             return
         try:
             with self._lock:
-                self._take(topic, data, type_name or schema.type_of_topic(topic) or "")
+                self._take(topic, data, type_name or type_of_topic(topic) or "")
                 self._heard_ns = max(self._heard_ns, received_ns)
         except (GstError, codec.MalformedMessageError, ValueError):
             self.malformed += 1
 
     def _take(self, topic: str, data: bytes, type_name: str) -> None:
-        if topic == "/tf":
+        if topic == TF:
             items = transforms_from_cdr(data)
             self._moving.extend(items)
             self._newest_ns = max([self._newest_ns, *(item.stamp_ns for item in items)])
-        elif topic == "/tf_static":
+        elif topic == TF_STATIC:
             for item in transforms_from_cdr(data):
                 if item.child in self._static or len(self._static) < MAX_FRAMES:
                     self._static[item.child] = item
-        elif topic == "/robot_description":
+        elif topic == ROBOT_DESCRIPTION:
             self._urdf = string_from_cdr(data)
         elif topic == self._joint_topic:
             sample = JointSample.from_cdr(data)
             self._joints.append(data)
             self._newest_ns = max(self._newest_ns, sample.stamp_ns)
-        elif topic == f"/{self._cell}/event":
+        elif topic == cell_topic(self._cell, EVENT):
             self._take_event(data)
-        elif topic.startswith(f"/{self._cell}/cam/"):
+        elif topic.startswith(cell_topic(self._cell, CAMERAS)):
             self._take_image(topic, data, type_name)
 
     def _take_event(self, data: bytes) -> None:
@@ -290,7 +298,7 @@ class LiveView:
 
     @property
     def _joint_topic(self) -> str:
-        return f"/{self._cell}/joint_states"
+        return cell_topic(self._cell, JOINT_STATES)
 
     @property
     def needs_joints(self) -> bool:
@@ -348,7 +356,9 @@ class LiveView:
             joints, urdf = list(self._joints), self._urdf
             quiet_since_ns, newest_ns = self._quiet_since_ns, self._newest_ns
         if not cameras:
-            return LiveFrames(frames=[], reasons=[f"no images on /{self._cell}/cam/**"])
+            return LiveFrames(
+                frames=[], reasons=[f"no images on {cell_topic(self._cell, CAMERAS)}**"]
+            )
         cell = LiveCell(
             tree=TransformTree(rooted_in_base(transforms)),
             places=self._places,

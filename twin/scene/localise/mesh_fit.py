@@ -2,7 +2,8 @@
 
 Point to plane (Chen and Medioni 1992) with Tukey weights against those parts of the mesh that face
 the camera of each point. Of several starts the one wins that explains the points and does not
-claim surface where a camera saw through.
+claim surface where a camera saw through. Meshes come from the task, or from the scene where an
+object's shape is only known from a scan.
 """
 
 import json
@@ -26,8 +27,6 @@ from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.known import pose_of
 from twin.scene.shape.mesh import read_mesh
 from twin.scene.store.folder import UnreadableSceneError
-
-# --- The surface of a mesh as points, and what cameras see of it.
 
 FACING = 0.15
 """Cosine below which a camera hardly sees a surface."""
@@ -144,9 +143,6 @@ def _looked_at(
 
 def _share(part: int, whole: int) -> float:
     return part / whole if whole else 0.0
-
-
-# --- Shapes that only a scan knows: the reconstructed meshes of a scene, to localise with.
 
 
 @dataclass(frozen=True, kw_only=True)

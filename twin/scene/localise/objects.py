@@ -1,10 +1,12 @@
 """Where the objects of a task are, from RGB-D frames: colour proposes, known shapes fit.
 
 Boxes are laid onto points and outlines, meshes onto points; soft toys come last, out of what the
-rigid objects leave.
+rigid objects leave. Reads posed frames only, in the robot's ``base_link`` frame whose z = 0 is the
+table top: the shapes come from the task file, the pixels from the cameras.
 
-Reads posed frames only, in the robot's ``base_link`` frame whose z = 0 is the table top. Nothing
-here learns from a simulator: the shapes come from the task file, the pixels from the cameras.
+The table corrects each camera that sees it too high or tilted, because its pose or depth scale is
+wrong. The table alone cannot tell a camera that sits too high from depth that reads too short, so a
+prior on each shares the blame (maximum a posteriori, linearised about the recorded pose).
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,12 +39,6 @@ from twin.scene.localise.result import (
 from twin.scene.localise.shape_fit import ShapeFitConfig, fit_shape
 from twin.scene.localise.soft import SoftConfig, SoftFit, fit_toys
 from twin.scene.shape.known import rest_height_m, yaw_period_rad
-
-# --- The table as a witness: z = 0 is known, so where a camera sees it corrects that camera.
-#
-# A camera that sees the table top too high or tilted has a wrong pose or a wrong depth scale. The
-# table alone cannot tell a camera that sits too high from depth that reads too short, so a prior
-# on each shares the blame (maximum a posteriori, linearised about the recorded pose).
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,8 @@
-"""From frames to the coloured points of one object: average stills, back-project, cluster."""
+"""From frames to the coloured points of one object: average frames, back-project, cluster.
+
+Diffuse shading scales linear light by one factor, so the share of each channel in the sum is a
+property of the surface alone. The likeness of a pixel is 1 on the object's colour, 0 on grey.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,11 +16,6 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.task_file import ObjectModel, Task
 from twin.scene.frames.camera_poses import same_pose
-
-# --- How much a pixel has an object's colour, whatever the shading.
-#
-# Diffuse shading scales linear light by one factor, so the share of each channel in the sum is a
-# property of the surface alone. The likeness is 1 on the object's colour, 0 on grey.
 
 _SRGB = np.arange(256) / 255.0
 _LINEAR = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4).astype(
@@ -64,8 +63,8 @@ def likeness(
     return np.where(dark | other_hue | (along <= 0), 0.0, along / strength)
 
 
-STILL_DISTANCE_M = 5e-4
-STILL_ANGLE_RAD = 1e-3
+STATIONARY_DISTANCE_M = 5e-4
+STATIONARY_ANGLE_RAD = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +133,10 @@ def _same_pose(a: RgbdFrame, b: RgbdFrame) -> bool:
     if a.camera_id != b.camera_id or a.depth_m.shape != b.depth_m.shape:
         return False
     return same_pose(
-        a.T_base_depth, b.T_base_depth, distance_m=STILL_DISTANCE_M, angle_rad=STILL_ANGLE_RAD
+        a.T_base_depth,
+        b.T_base_depth,
+        distance_m=STATIONARY_DISTANCE_M,
+        angle_rad=STATIONARY_ANGLE_RAD,
     )
 
 

@@ -1,8 +1,11 @@
 """Lay a known shape onto points and outlines by Gauss-Newton: x, y, z and yaw.
 
+Seen from outside, the outline of a box, open or not, is the convex hull of its eight projected
+corners. Outlines do not depend on the depth scale, and cover the edges that depth blurs.
+
 Each view also gets a shift and a turn of its own, with a prior: cameras disagree by more than
-their pixels' noise, and a nearby camera is the better witness. Objects stand upright: roll and
-pitch are not estimated, and their share of the covariance is a stated prior.
+their pixels' noise, and a nearby camera sees more of the truth. Objects stand upright: roll and
+pitch are not estimated, and their share of the covariance is a given prior.
 """
 
 from collections.abc import Sequence
@@ -16,11 +19,6 @@ from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
 from twin.scene.localise.points import CameraView, Cluster, ColourConfig, likeness
 from twin.scene.shape.known import pose_of, starts, surface_distances
-
-# --- The outline of an object in an image: where its colour ends, and where its shape would end.
-#
-# Seen from outside, the outline of a box, open or not, is the convex hull of its eight projected
-# corners. Outlines do not depend on the depth scale, and cover the edges that depth blurs.
 
 EDGE_LIKENESS = 0.5
 """Half object, half background."""
@@ -59,7 +57,7 @@ def find_outlines(
     window_m: float,
     sigma_px: float,
 ) -> list[Outline]:
-    """Collect the edge points near where the object is believed to be.
+    """Collect the edge points near the nominal pose of the object.
 
     Points at the image border and points beside something nearer are left out: there the object
     goes on.
@@ -169,7 +167,7 @@ class ShapeFitConfig:
     outline_sigma_px: float = 0.7
     """Standard error of one edge point."""
     outline_window_m: float = 0.012
-    """Edges farther than this from the believed outline belong to something else."""
+    """Edges farther than this from the nominal outline belong to something else."""
     tukey_m: float = 0.008
     """Residuals beyond this have no say."""
     iterations: int = 12

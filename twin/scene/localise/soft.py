@@ -37,12 +37,6 @@ from twin.scene.localise.points import (
 from twin.scene.localise.shape_fit import ShapeFitConfig
 from twin.scene.shape.known import surface_distances
 
-# --- Clusters of points that may be one soft toy each.
-
-# --- How far a soft toy is deformed: its extents along the axes of its pose.
-
-# --- When points count as a soft toy, and when two toys count as told apart.
-
 
 @dataclass(frozen=True, kw_only=True)
 class SoftConfig:
@@ -136,12 +130,12 @@ def soft_shape(
     distance, _ = cKDTree(surface.p_m).query(local)
     local = local[distance < soft.stretch_m]
     # An end that every camera looks at from behind was not seen; it is taken as at rest.
-    eyes = se3.apply(T_object_base, np.array([view.T_base_depth[:3, 3] for view in views]))
-    towards = eyes / np.linalg.norm(eyes, axis=1, keepdims=True)
+    centres = se3.apply(T_object_base, np.array([view.T_base_depth[:3, 3] for view in views]))
+    directions = centres / np.linalg.norm(centres, axis=1, keepdims=True)
     faced = np.any([facing(T_object_base, view, surface) for view in views], axis=0)
     half, ends = np.array(model.size_m) / 2, np.zeros((2, 3))
     for row, sign in enumerate((1.0, -1.0)):
-        seen = (sign * towards).max(axis=0) > -0.2
+        seen = (sign * directions).max(axis=0) > -0.2
         reached = np.percentile(sign * local, 98, axis=0)
         rest = np.percentile(sign * surface.p_m[faced], 98, axis=0)
         ends[row] = sign * np.maximum(half + np.where(seen, reached - rest, 0.0), 0.1 * half)

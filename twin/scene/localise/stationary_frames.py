@@ -23,10 +23,10 @@ from twin.scene.frames.pairing import check_camera, frames_at, paired_stamps_ns
 from twin.scene.frames.selection import rgbd_camera_ids, spread
 from twin.scene.store.calibration import Calibration
 
-STILL_WINDOW_NS = 40_000_000
+STATIONARY_WINDOW_NS = 40_000_000
 """A camera is still when its pose is the same this long before and after an image."""
-STILL_DISTANCE_M = 1e-3
-STILL_ANGLE_RAD = 3e-3
+STATIONARY_DISTANCE_M = 1e-3
+STATIONARY_ANGLE_RAD = 3e-3
 
 HeldOut = Mapping[str, Collection[int]]
 """Stamps of frames to leave out, by camera id."""
@@ -63,13 +63,13 @@ def stationary_frames(
     """
     tree = base_tree(episode)
     failed: list[GstError] = []
-    usable: dict[str, _Still] = {}
+    usable: dict[str, _Stationary] = {}
     camera_ids = rgbd_camera_ids(episode)
     for camera_id in camera_ids:
         known = (poses or {}).get(camera_id) or CameraPoses(tree=tree, source="tf")
         hidden = known.unposed_ns.union((held_out_ns or {}).get(camera_id, ()))
         try:
-            usable[camera_id] = _still(
+            usable[camera_id] = _stationary(
                 episode, camera_id, replace(known, unposed_ns=hidden), after_ns, before_ns
             )
         except GstError as error:
@@ -88,7 +88,7 @@ def stationary_frames(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Still:
+class _Stationary:
     """When one camera stood still, and where."""
 
     poses: CameraPoses
@@ -97,18 +97,18 @@ class _Still:
     stamps_ns: list[int]
 
 
-def _still(
+def _stationary(
     episode: Episode,
     camera_id: str,
     poses: CameraPoses,
     after_ns: int | None,
     before_ns: int | None,
-) -> _Still:
+) -> _Stationary:
     check_camera(episode, camera_id)
     frame_id = streams.camera_info(episode, camera_id, "color").frame_id
     check_connected(poses.tree, episode, camera_id)
     stamps = _between(paired_stamps_ns(episode, camera_id), after_ns, before_ns)
-    return _Still(
+    return _Stationary(
         poses=poses,
         root=poses.tree.root_of(frame_id),
         stamps_ns=[
@@ -155,13 +155,15 @@ def is_stationary(
 ) -> bool:
     """Say whether a frame's pose is the same shortly before and after an instant."""
     last_ns = (
-        stamp_ns + STILL_WINDOW_NS
+        stamp_ns + STATIONARY_WINDOW_NS
         if until_ns is None
-        else min(stamp_ns + STILL_WINDOW_NS, until_ns)
+        else min(stamp_ns + STATIONARY_WINDOW_NS, until_ns)
     )
-    before = tree.T_root_frame(frame_id, stamp_ns - STILL_WINDOW_NS)
+    before = tree.T_root_frame(frame_id, stamp_ns - STATIONARY_WINDOW_NS)
     after = tree.T_root_frame(frame_id, last_ns)
-    return same_pose(before, after, distance_m=STILL_DISTANCE_M, angle_rad=STILL_ANGLE_RAD)
+    return same_pose(
+        before, after, distance_m=STATIONARY_DISTANCE_M, angle_rad=STATIONARY_ANGLE_RAD
+    )
 
 
 def calibrated_cameras(episode: Episode, calibration: Calibration | None) -> Poses:

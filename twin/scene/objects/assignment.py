@@ -1,4 +1,9 @@
-"""Which Gaussians belong to which object: by distance to its surface, by colour near the table."""
+"""Which Gaussians belong to which object: by distance to its surface, by colour near the table.
+
+A shape is reconstructed from views that were laid onto each other; Gaussians still stand where each
+camera's wrong pose put them, some millimetres off. Those in the halo of an object go with it, or a
+grey outline would stay on the table. What a fit put where object and table touch, nobody has seen.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,13 +20,6 @@ from twin.scene.localise.result import LocalisedObject
 from twin.scene.localise.shape_fit import ShapeFitConfig, refine_on_points
 from twin.scene.shape.known import surface_distances
 from twin.scene.shape.reconstruct import ObjectShape
-
-# --- What an object leaves behind when only Gaussians at its surface are taken out of a scene.
-#
-# A shape is reconstructed from views that were laid onto each other; Gaussians still stand where
-# each camera's wrong pose put them, some millimetres off. Without them a grey outline of the
-# object would stay on the table. And what a fit has put where object and table touch, nobody has
-# seen.
 
 Poses = Mapping[str, Float[np.ndarray, "4 4"]]
 Shapes = Mapping[str, ObjectShape]

@@ -1,4 +1,11 @@
-"""Take a fitted scene apart into background and objects, and put it together again."""
+"""Decompose a fitted scene into background and objects, and compose it again.
+
+The background plus objects in their own frames: an object can be put anywhere. Gaussians are cut
+along the reconstructed shape (``assign_splats``). The mesh is reconstructed from the views where
+they allow it; otherwise it is the known shape of the task file, and ``shape_source`` says so. Table
+under the objects that nobody saw is filled with the distance-weighted mean of the table around: a
+guess that keeps renders free of black holes, counted separately in ``scene.json``.
+"""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -45,18 +52,6 @@ from twin.scene.shape.from_training import shapes_of, write_static
 from twin.scene.shape.mesh import mesh_ply
 from twin.scene.shape.reconstruct import ObjectShape
 from twin.scene.store.folder import UnreadableSceneError
-
-# --- Objects as parts of their own: their Gaussians taken out of the scene, and their mesh.
-#
-# The scene is the background plus objects in their own frames, so an object can be put anywhere.
-# Gaussians are cut along the reconstructed shape (``assign_splats``). The mesh is reconstructed
-# from the views where they allow it; otherwise it is the known shape of the task file, and
-# ``shape_source`` says so.
-
-# --- Table that nobody saw, under objects that were taken out: filled in, and said so.
-#
-# The colour is the distance-weighted mean of the table around. It keeps renders free of black
-# holes when an object moves; it is a guess and is counted apart in ``scene.json``.
 
 SPACING_M = 0.004
 GROWN_M = HALO_M + 0.003
@@ -122,7 +117,7 @@ class ObjectSplats:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneParts:
-    """A scene taken apart."""
+    """A scene divided into background and objects."""
 
     background: GaussianCloud
     objects: dict[str, ObjectSplats]

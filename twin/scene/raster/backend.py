@@ -1,8 +1,8 @@
-"""The rasteriser's second backend: the same calls answered by ``gsplat`` on a CUDA device.
+"""Choose what draws Gaussians: our own code on the CPU, or ``gsplat`` on a CUDA device.
 
-Only its documented function ``gsplat.rasterization`` is used, in the mode ``antialiased`` with
-``eps2d = 0.1``, which is our mip compensation. Known differences: its Jacobian is held at 15 % of
-the image beyond the border where ours is at 30 %, and its cuts are fixed.
+Of gsplat only the documented function ``gsplat.rasterization`` is used, in the mode ``antialiased``
+with ``eps2d = 0.1``, which is our mip compensation. Known differences: its Jacobian is held at 15 %
+of the image beyond the border where ours is at 30 %, and its cuts are fixed.
 """
 
 import importlib
@@ -268,9 +268,6 @@ class CudaRasteriser:
 
     def _numpy(self, values: Any) -> np.ndarray:
         return np.ascontiguousarray(values.detach().cpu().numpy(), dtype=np.float32)
-
-
-# --- Choose what draws Gaussians: our own code on the CPU, or gsplat on a CUDA device.
 
 
 def open_rasteriser(config: RasterConfig | None = None) -> Rasteriser | CudaRasteriser:

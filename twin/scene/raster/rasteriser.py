@@ -1,6 +1,7 @@
-"""Draw Gaussians and pull gradients back, through the native extension ``twin.scene._splat``.
+"""Draw Gaussians, pull gradients back and fit, through the native extension ``twin.scene._splat``.
 
-The slow readable twin of this module is ``tests/parity/splat_reference.py``.
+The slow readable twin of drawing is ``tests/parity/splat_reference.py``. A whole step of a fit
+(draw, compare, pull back, Adam) runs in native code; a test holds it equal to the separate steps.
 """
 
 import importlib
@@ -18,14 +19,6 @@ from bridge.geometry.camera import Camera
 from twin.errors import TwinError
 from twin.scene.frames.rgbd import Target
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32
-
-# --- One step of fitting in native code: draw, compare, pull back, Adam; nothing goes through
-# Python.
-#
-# The separate steps are ``rasteriser.Rasteriser``, ``losses.Loss`` and Adam; a test holds them
-# equal.
-
-# --- What all users of the native rasteriser share: its settings, its loading, its gradients.
 
 NUM_PLANES = 5
 """Red, green, blue, sum of weighted depth, sum of weights."""
@@ -404,8 +397,6 @@ def view_of_planes(planes: Float32[np.ndarray, "5 height width"]) -> View:
         alpha=alpha,
     )
 
-
-# --- What the fit minimises, with its gradient on the drawn planes.
 
 L1_SHARE = 0.8
 """0.8 L1 + 0.2 (1 - SSIM), as in 3D Gaussian splatting (Kerbl et al. 2023, Eq. 7)."""

@@ -1,5 +1,6 @@
 """What ``scene.json`` says: where the scene came from, how it was made, how good it is."""
 
+import math
 import resource
 import sys
 from collections.abc import Mapping, Sequence
@@ -49,7 +50,7 @@ def make_record(
     scene_hash: str,
     sources: Sources,
     left_out: Sequence[str],
-    learnt: TrainingSet,
+    training: TrainingSet,
     config: RebuildConfig,
     fitted: FitResult,
     views: Mapping[str, Any],
@@ -59,25 +60,28 @@ def make_record(
     """Put together the content of ``scene.json``."""
     settings = asdict(config)
     settings.pop("force")
-    scan = learnt.report.to_record()
+    settings["fit"]["budget_s"] = None if math.isinf(config.fit.limit_s) else config.fit.limit_s
+    scan = training.report.to_record()
     return {
         "schema_version": SCENE_VERSION,
         "key": key,
         "scene_hash": scene_hash,
-        "frame": root_frame(learnt.choices[0]),
+        "frame": root_frame(training.choices[0]),
         "units": {"length": "m", "colour": "sRGB", "quaternion": "wxyz"},
         "remark": sources.remark,
         "stand_in": any(episode.info.stand_in for episode in sources.episodes),
         "sources": [
             {"id": e.info.id, "kind": e.info.kind, "sha256": e.sha256()} for e in sources.episodes
         ],
-        "cameras": [camera_record(choice) for choice in learnt.choices],
+        "cameras": [camera_record(choice) for choice in training.choices],
         "scan": scan | {"remarks": [*left_out, *scan["remarks"]]},
         "settings": settings,
         "background": {"file": BACKGROUND, "num_splats": num_background},
         "fit": {
             "num_splats": len(fitted.cloud),
             "iterations": fitted.iterations,
+            "iterations_asked": fitted.iterations_asked,
+            "underfitted": fitted.underfitted,
             "coarse_iterations": fitted.coarse_iterations,
             "seconds": round(fitted.seconds, 2),
             "cpu_seconds": round(fitted.cpu_seconds, 2),
@@ -105,6 +109,8 @@ def protocol_of(
         "cameras_from": sorted({SAYS[choice.poses.source] for choice in choices}),
         "poses_refined": frames.align_poses or config.fit.refine_poses,
         "num_splats": len(fitted.cloud),
+        "fit_iterations": fitted.iterations,
+        "underfitted": fitted.underfitted,
         "fit_seconds": round(fitted.seconds, 2),
         "fit_cpu_seconds": round(fitted.cpu_seconds, 2),
         "rebuild_seconds": round(cost.seconds, 2),
@@ -122,7 +128,7 @@ def holdout_text(frames: FrameConfig) -> str:
 
 
 def training_text(frames: FrameConfig) -> str:
-    """Which frames were learnt from, in words."""
+    """Which frames were trained on, in words."""
     if frames.train_every:
         return f"frame 0 and every {frames.train_every}th after it, but no held-out one"
     return "of the others the stillest and sharpest of each stretch of the camera's path"
@@ -134,7 +140,7 @@ def camera_record(choice: FrameChoice) -> dict[str, Any]:
     return {
         "episode": choice.episode.info.id,
         "id": choice.camera_id,
-        "still": choice.still,
+        "stationary": choice.stationary,
         "poses_from": choice.poses.source,
         "poses_quality": dict(choice.poses.quality),
         "poses_corrected": len(choice.corrections),
@@ -151,7 +157,7 @@ def describe_scene(record: Mapping[str, Any]) -> str:
     lines = [
         f"scene {record['scene_hash']}: {record['background']['num_splats']} Gaussians"
         + (" (stand-in)" if record["stand_in"] else ""),
-        f"fit: {fitted['iterations']} images in {fitted['seconds']:.1f} s"
+        f"fit: {_images_done(fitted)} in {fitted['seconds']:.1f} s"
         + (
             ""
             if fitted["train_psnr_db"] is None
@@ -161,15 +167,26 @@ def describe_scene(record: Mapping[str, Any]) -> str:
         f"{cost['peak_memory_mb']} MB at most",
     ]
     lines += [
-        f"camera {item['id']} of {item['episode']}: {item['train_frames']} frames learnt, "
+        f"camera {item['id']} of {item['episode']}: {item['train_frames']} training frames, "
         f"{item['holdout_frames']} held out; poses from {SAYS[item['poses_from']]}"
         for item in record["cameras"]
     ]
+    if fitted.get("underfitted"):
+        lines.insert(2, "underfitted: the time limit struck first; give --budget more time")
     lines += _view_lines(record["views"])
     lines += record["scan"]["remarks"]
     if record["remark"]:
         lines.append(record["remark"])
     return "\n".join(lines)
+
+
+def _images_done(fitted: Mapping[str, Any]) -> str:
+    asked = fitted.get("iterations_asked")  # not in scenes of older versions
+    return (
+        f"{fitted['iterations']} images"
+        if asked is None
+        else f"{fitted['iterations']} of {asked} images"
+    )
 
 
 def _view_lines(views: Mapping[str, Any]) -> list[str]:

@@ -19,7 +19,12 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import BridgeError, UsageError
 from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output
-from twin.scene.dataset.training_set import TrainingSet, learn, limits_of, with_fitted_poses
+from twin.scene.dataset.training_set import (
+    TrainingSet,
+    limits_of,
+    read_training_set,
+    with_fitted_poses,
+)
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FIT_STATE, Checkpoint, FitResult, fit
 from twin.scene.foundation.complete import complete_shapes
@@ -39,7 +44,7 @@ from twin.scene.rebuild.record import Cost, make_record, protocol_of
 from twin.scene.rebuild.semantics import write_scene_semantics
 from twin.scene.rebuild.views import ENGINE, ViewsJob, summarise_views, views_path, write_views
 from twin.scene.robot.extraction import DrivenRobot, write_robot
-from twin.scene.settings import RebuildConfig
+from twin.scene.settings import DEFAULT_BUDGET_S, RebuildConfig
 from twin.scene.store.calibration import Calibration, read_calibration
 from twin.scene.store.folder import (
     BACKGROUND,
@@ -102,35 +107,37 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         return done
     clock = _Clock()
     chosen = choose_with_reasons(sources, config.frames, output, calibration)
-    learnt = learn(chosen.choices, config, output)
+    training = read_training_set(chosen.choices, config, output)
     clock.end("read")
     run.scene_dir.mkdir(parents=True, exist_ok=True)
     kept = Checkpoint(path=run.scene_dir / FIT_STATE, key=key)
     if config.force:
         kept.path.unlink(missing_ok=True)
-    fitted = _fit(learnt, config, kept, output)
+    fitted = _fit(training, config, kept, output)
     clock.end("initialise_and_fit")
-    learnt = with_fitted_poses(learnt, fitted.Ts_base_color)
+    training = with_fitted_poses(training, fitted.Ts_base_color)
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
-    apart = decompose(sources, fitted.cloud, learnt.choices, learnt.views, complete, output)
-    if apart.remark:
-        output.say(apart.remark)
-    write_ply(run.scene_dir / BACKGROUND, apart.background)
-    links = learnt.robot.frames.links(config.initialise)
+    decomposed = decompose(
+        sources, fitted.cloud, training.choices, training.views, complete, output
+    )
+    if decomposed.remark:
+        output.say(decomposed.remark)
+    write_ply(run.scene_dir / BACKGROUND, decomposed.background)
+    links = training.robot.frames.links(config.initialise)
     clock.end("take_apart")
-    views = _hold_out(run, learnt, fitted, apart, links, config, clock, output)
+    views = _hold_out(run, training, fitted, decomposed, links, config, clock, output)
     clock.end("held_out_views")
     output.say("write objects, robot links and the distances to what is static")
-    extras = apart.write(run, learnt.views) | write_robot(run, learnt.robot, links)
+    extras = decomposed.write(run, training.views) | write_robot(run, training.robot, links)
     extras |= write_scene_semantics(
         run.scene_dir,
-        apart,
-        learnt.views,
+        decomposed,
+        training.views,
         config.fit.threads,
         output,
         models=config.models,
-        choices=learnt.choices,
+        choices=training.choices,
         task=_task(sources),
     )
     clock.end("objects_and_semantics")
@@ -139,11 +146,11 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         scene_hash=background_hash(run),
         sources=sources,
         left_out=chosen.left_out,
-        learnt=learnt,
+        training=training,
         config=config,
         fitted=fitted,
         views=views,
-        num_background=len(apart.background),
+        num_background=len(decomposed.background),
         cost=clock.cost(),
     )
     record |= extras
@@ -152,14 +159,16 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     return record
 
 
-def _fit(learnt: TrainingSet, config: RebuildConfig, kept: Checkpoint, output: Output) -> FitResult:
+def _fit(
+    training: TrainingSet, config: RebuildConfig, kept: Checkpoint, output: Output
+) -> FitResult:
     began_s = time.monotonic()
-    first = fuse(learnt.points, config.initialise)
-    output.say(f"{len(first)} Gaussians from {len(learnt.views)} training frames")
+    first = fuse(training.points, config.initialise)
+    output.say(f"{len(first)} Gaussians from {len(training.views)} training frames")
     with output.progress("fit", 100) as advance:
         return fit(
             first,
-            learnt.views,
+            training.views,
             config.fit,
             advance,
             max_splats=config.initialise.max_splats,
@@ -170,28 +179,28 @@ def _fit(learnt: TrainingSet, config: RebuildConfig, kept: Checkpoint, output: O
 
 def _hold_out(
     run: RunFolder,
-    learnt: TrainingSet,
+    training: TrainingSet,
     fitted: FitResult,
-    apart: Decomposition,
+    decomposed: Decomposition,
     links: Mapping[str, GaussianCloud],
     config: RebuildConfig,
     clock: _Clock,
     output: Output,
 ) -> dict[str, Any]:
     """Render what was held out, and say how well it came out."""
-    choices = learnt.choices
+    choices = training.choices
     job = ViewsJob(
         scene_hash=background_hash(run),
         cloud=fitted.cloud,
-        witnesses=learnt.witnesses,
+        reference_views=training.reference_views,
         limits=limits_of(config),
         raster=RasterConfig(threads=config.fit.threads),
         protocol=protocol_of(choices, fitted, config, clock.cost()),
-        marked=_marked_objects(apart),
-        robot=DrivenRobot(frames=learnt.robot.frames, links=links),
-        carried={
+        marked=_marked_objects(decomposed),
+        robot=DrivenRobot(frames=training.robot.frames, links=links),
+        ego_masks={
             (choices[index].episode.path, choices[index].camera_id): mask
-            for index, mask in learnt.carried.items()
+            for index, mask in training.ego_masks.items()
         },
         align=config.frames.align_holdout,
     )
@@ -201,15 +210,15 @@ def _hold_out(
     return summarise_views(numbers, _remove_stale_views(run, choices, job.scene_hash))
 
 
-def _marked_objects(apart: Decomposition) -> GaussianCloud | None:
+def _marked_objects(decomposed: Decomposition) -> GaussianCloud | None:
     """The scene with its objects white and all else black: where they show in a view."""
-    objects = {} if apart.parts is None else apart.parts.objects
+    objects = {} if decomposed.parts is None else decomposed.parts.objects
     if not objects:
         return None
     placed = [moved_cloud(item.cloud, item.T_base_object) for item in objects.values()]
-    cloud = with_harmonics(concatenate([apart.background, *placed]), 0)
+    cloud = with_harmonics(concatenate([decomposed.background, *placed]), 0)
     colors = np.ones((len(cloud), 3))
-    colors[: len(apart.background)] = 0.0
+    colors[: len(decomposed.background)] = 0.0
     return GaussianCloud(
         means_m=cloud.means_m,
         quats_wxyz=cloud.quats_wxyz,
@@ -223,6 +232,7 @@ def _key(sources: Sources, config: RebuildConfig, calibration: Calibration | Non
     settings = asdict(config)
     settings.pop("force")
     settings["fit"].pop("threads")
+    settings["fit"]["budget_s"] = config.fit.budget_s or DEFAULT_BUDGET_S  # keys of older scenes
     settings["models"].pop("device")
     hashes = {str(e.path.name): e.sha256() for e in sources.episodes}
     task = _task(sources)

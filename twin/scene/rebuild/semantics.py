@@ -1,4 +1,4 @@
-"""Semantics as a stage of ``rebuild``."""
+"""Semantics as a stage of ``rebuild``: ask the models, find what is what, write it down."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,8 +29,6 @@ from twin.scene.semantics.store import (
     write_semantics,
 )
 from twin.scene.settings import ModelConfig
-
-# --- The one call of ``rebuild``: say what is what, and write it beside the splats.
 
 MAX_VIEWPOINTS = 24
 """Frames that count support; more are thinned out evenly."""
@@ -111,9 +109,6 @@ def add_semantics(
 def _rows(rows: Mapping[str, int], key: str) -> Bool[np.ndarray, " num_splats"]:
     """Which Gaussians of the whole scene are one part's."""
     return np.repeat([name == key for name in rows], list(rows.values()))
-
-
-# --- The calls of ``rebuild``: ask the models before semantics is written, give vectors after.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,7 +207,7 @@ def training_frames(choices: Sequence[FrameChoice], count: int) -> list[RgbdFram
 
 def write_scene_semantics(
     folder: Path,
-    apart: Decomposition,
+    decomposed: Decomposition,
     views: Sequence[TrainingView],
     threads: int,
     output: Output,
@@ -221,11 +216,11 @@ def write_scene_semantics(
     choices: Sequence[FrameChoice] = (),
     task: Task | None = None,
 ) -> dict[str, Any]:
-    """Say what is what in a scene that was taken apart.
+    """Say what is what in a decomposed scene.
 
     Args:
         folder: The scene folder.
-        apart: The scene.
+        decomposed: The scene in parts.
         views: What it was fitted to.
         threads: For drawing; 0: all cores.
         output: How to talk.
@@ -239,24 +234,24 @@ def write_scene_semantics(
     Raises:
         UsageError: When a model cannot be used.
     """
-    objects = {} if apart.parts is None else apart.parts.objects
+    objects = {} if decomposed.parts is None else decomposed.parts.objects
     placed = {key: moved_cloud(item.cloud, item.T_base_object) for key, item in objects.items()}
-    cloud = concatenate([apart.background, *placed.values()])
+    cloud = concatenate([decomposed.background, *placed.values()])
     output.say(f"name what is in the scene: {len(cloud)} Gaussians, {len(objects)} objects known")
     asked = ask_models_about(models or ModelConfig(), choices, cloud, task, output, threads=threads)
     with output.progress("name things", 100) as advance:
         record = add_semantics(
             folder,
-            apart.background,
+            decomposed.background,
             placed,
             [Viewpoint(camera=v.half.camera, T_base_camera=v.T_base_color) for v in views],
             masks=asked.findings.masks,
             features=asked.findings.features,
-            surfaces_m=apart.surfaces_m(),
+            surfaces_m=decomposed.surfaces_m(),
             threads=threads,
             advance=advance,
         )
-    rows = {BACKGROUND_KEY: len(apart.background)}
+    rows = {BACKGROUND_KEY: len(decomposed.background)}
     rows |= {key: len(part) for key, part in placed.items()}
     record |= asked.give_vectors(folder, rows, cloud, output, threads=threads)
     labels = ", ".join(item["label"] for item in record["instances"])

@@ -22,6 +22,7 @@ from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
+from bridge.episode.topics import camera_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.color import encode_png
 from bridge.terminal import Advance
@@ -32,8 +33,6 @@ from twin.scene.frames.selection import FrameChoice, load
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View, load_native, psnr_db
 from twin.scene.robot.extraction import DrivenRobot
-
-# --- How held-out views came out, in numbers for ``scene.json``; the evaluator's are official.
 
 VIEWS_NOTE = (
     "held out from initialisation, poses, exposure, fit and objects; means of the images' values; "
@@ -55,7 +54,7 @@ class ViewNumbers:
     episode: str
     camera_id: str
     stamp_ns: int
-    still_camera: bool
+    stationary_camera: bool
     """The camera does not move, so training frames show the same view."""
     psnr_db: float
     """Over the whole image, as recorded: a robot in view counts as error."""
@@ -82,7 +81,7 @@ def rate_view(
     static_mask: Bool[np.ndarray, "height width"],
     *,
     episode: str,
-    still: bool,
+    stationary: bool,
 ) -> ViewNumbers:
     """Compare one rendered view with its recorded frame."""
     rendered = view.image_u8().astype(np.float32) / 255.0
@@ -94,7 +93,7 @@ def rate_view(
         episode=episode,
         camera_id=frame.camera_id,
         stamp_ns=frame.stamp_ns,
-        still_camera=still,
+        stationary_camera=stationary,
         psnr_db=finite_psnr_db(float(squared.mean())),
         static_psnr_db=finite_psnr_db(float(squared[static_mask].mean()))
         if static_mask.any()
@@ -130,11 +129,11 @@ def _similarity(rendered: np.ndarray, wanted: np.ndarray) -> float:
 
 def summarise_views(numbers: Sequence[ViewNumbers], files: Sequence[str]) -> dict[str, Any]:
     """Average the held-out views; cameras that stand still are kept apart."""
-    moving = [item for item in numbers if not item.still_camera]
-    still = [item for item in numbers if item.still_camera]
+    moving = [item for item in numbers if not item.stationary_camera]
+    stationary = [item for item in numbers if item.stationary_camera]
     averages = {
         f"{name}{ending}": _mean([getattr(item, name) for item in items])
-        for ending, items in (("", moving), ("_still_cameras", still))
+        for ending, items in (("", moving), ("_still_cameras", stationary))
         for name in AVERAGED
     }
     return {
@@ -142,7 +141,7 @@ def summarise_views(numbers: Sequence[ViewNumbers], files: Sequence[str]) -> dic
         "note": VIEWS_NOTE,
         **averages,
         "num_images": len(moving),
-        "num_images_still_cameras": len(still),
+        "num_images_still_cameras": len(stationary),
         "images": [asdict(item) for item in numbers],
     }
 
@@ -169,7 +168,7 @@ class ViewsJob:
 
     scene_hash: str
     cloud: GaussianCloud
-    witnesses: Sequence[ReferenceView]
+    reference_views: Sequence[ReferenceView]
     limits: DepthLimits
     raster: RasterConfig
     protocol: Mapping[str, Any]
@@ -178,7 +177,7 @@ class ViewsJob:
     """The same scene with objects white and everything else black; None without objects."""
     robot: DrivenRobot | None = None
     """Drawn where it stood at each frame; the cloud holds only what is static."""
-    carried: Mapping[tuple[Path, str], EgoMask] = field(default_factory=dict)
+    ego_masks: Mapping[tuple[Path, str], EgoMask] = field(default_factory=dict)
     """By episode and camera: what moves with the camera and is not part of the scene."""
     align: bool = False
     """Also draw each view where it fits the recorded image best."""
@@ -239,7 +238,7 @@ def write_views(
                             item.view,
                             item.masks["static"],
                             episode=choice.episode.info.id,
-                            still=choice.still,
+                            stationary=choice.stationary,
                         )
                     )
                     advance(len(numbers), f"{numbers[-1].psnr_db:.1f} dB")
@@ -252,7 +251,7 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
         cloud = job.cloud
         if job.robot is not None:
             cloud = job.robot.joined(cloud, choice.episode, frame.stamp_ns)
-        recorded = _recorded(frame, job, job.carried.get((choice.episode.path, choice.camera_id)))
+        recorded = _recorded(frame, job, job.ego_masks.get((choice.episode.path, choice.camera_id)))
         masks = {"static": recorded.full.static_mask}
         if job.marked is not None:
             planes = rasteriser.draw_planes(job.marked, camera, T)
@@ -271,13 +270,13 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
         )
 
 
-def _recorded(frame: RgbdFrame, job: ViewsJob, carried: EgoMask | None) -> TrainingView:
+def _recorded(frame: RgbdFrame, job: ViewsJob, ego_mask: EgoMask | None) -> TrainingView:
     """A held-out frame without what training frames look through or moves with the camera."""
     surface = FrameSurface(frame, job.limits)
     view, points = training_view(surface), surface.points()
-    if carried is not None:
-        view, points = carried.mask_in(view), carried.drop_from(points, view)
-    return find_moving([points], job.witnesses).mask_in(view)
+    if ego_mask is not None:
+        view, points = ego_mask.mask_in(view), ego_mask.drop_from(points, view)
+    return find_moving([points], job.reference_views).mask_in(view)
 
 
 def one_camera(frame: RgbdFrame) -> bool:
@@ -290,7 +289,7 @@ def one_camera(frame: RgbdFrame) -> bool:
 def _write_view(writer: EpisodeWriter, item: HeldOutViews) -> None:
     choice, frame = item.choice, item.frame
     cell = choice.episode.info.cell or "cell"
-    topic = f"/{cell}/views/cam/{frame.camera_id}"
+    topic = camera_topic(f"{cell}/views", frame.camera_id)
     frame_id = streams.camera_info(choice.episode, frame.camera_id).frame_id
     stamp = frame.stamp_ns
 

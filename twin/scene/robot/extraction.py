@@ -1,4 +1,8 @@
-"""The robot's part of a rebuild: found in the frames, kept out of the background, kept as links."""
+"""The robot's part of a rebuild: found in the frames, kept out of the background, kept as links.
+
+Where its joints are known, pixels that show the robot are masked and its points go to its links.
+What it hid in one frame is filled by the frames in which it stood elsewhere; nothing is invented.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,11 +31,6 @@ from twin.scene.frames.selection import FrameChoice, load, root_frame, spread
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
 from twin.scene.robot.splats import posed, surface_links, write_links
 from twin.scene.settings import InitialiseConfig
-
-# --- The robot in a scan's frames: known from its joints, it is kept out of the background.
-#
-# Pixels that show it are masked, its points go to its links. What it hid in one frame is filled
-# by the frames in which it stood elsewhere; nothing is invented.
 
 IN_FRONT_M = 0.03
 """A measurement this much nearer than the robot shows something in front of it."""
@@ -103,7 +102,7 @@ class RobotFrames:
         if surface is not None:
             self._keep(episode, stamp_ns, surface, points)
 
-    def still_postures(
+    def stationary_postures(
         self, episode: Episode, stamps_ns: Iterable[int]
     ) -> dict[int, Float[np.ndarray, " num_joints"]]:
         """Joints at those of some instants at which the robot of an episode stood still [rad]."""
@@ -264,8 +263,8 @@ def look_closer(
     posture, so up to two dozen postures far from each other are read for its links.
     """
     for choice in choices:
-        postures = found.frames.still_postures(choice.episode, choice.spare_ns)
-        if not choice.still or not postures:
+        postures = found.frames.stationary_postures(choice.episode, choice.spare_ns)
+        if not choice.stationary or not postures:
             continue
         stamps, joints = np.array(list(postures)), np.array(list(postures.values()))
         wanted = frozenset(stamps[far_apart(joints, MAX_POSTURES)].tolist())

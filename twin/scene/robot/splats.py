@@ -1,7 +1,7 @@
 """Gaussians bound to the robot's links: forward kinematics drives them.
 
 They lie in ``scene`` and not in ``robot``, because they are Gaussians and ``robot`` stands below
-``scene``: see docs/decisions/0026-calibration-and-robot.md.
+``scene``: see docs/decisions/0015-calibration.md.
 """
 
 from collections.abc import Mapping
@@ -126,8 +126,8 @@ def surface_links(
 
 
 def _never_moves(robot: RobotModel, surface: PosedSurface) -> Bool[np.ndarray, " num_shapes"]:
-    still = fixed_links(robot)
-    return np.array([link in still for link in surface.links], dtype=bool)
+    stationary = fixed_links(robot)
+    return np.array([link in stationary for link in surface.links], dtype=bool)
 
 
 def _nearest(surface: PosedSurface, p_base: Float64[np.ndarray, "num_points 3"]) -> tuple[Any, Any]:

@@ -17,8 +17,6 @@ from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.semantics.colour import lab_from_srgb, without_shading
 from twin.scene.semantics.lift import Observation
 
-# --- Neighbours of one colour belong together: shares diffused over the surface.
-
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothConfig:

@@ -1,4 +1,4 @@
-"""Points in voxels, and voxels that hang together."""
+"""Divide points into things: connected voxels, cut along valleys and where colours differ."""
 
 import heapq
 from collections.abc import Sequence
@@ -125,12 +125,6 @@ def make_patches(
     normals = means_of(voxels.normals, patch, num)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return patch, means_of(voxels.p_m, patch, num), normals / np.maximum(length, 1e-9)
-
-
-# --- Cut things that touch along valleys where both sides stand on their own, and join what is
-# one.
-#
-# ``split_colour`` cuts them by colour before.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -310,9 +304,6 @@ def _within(points: np.ndarray, outline: np.ndarray) -> Bool[np.ndarray, " num_p
     except (QhullError, ValueError):
         return np.zeros(len(points), dtype=bool)
     return np.asarray(hull.find_simplex(points[:, :2]) >= 0)
-
-
-# --- Cut things that touch where their colours differ.
 
 
 def split_by_colour(

@@ -147,7 +147,7 @@ def scene_by_default(
     shown = _num_shown(cloud, final.labels, total, looked, rasteriser)
     named = [(key, "", 1.0, NAMED) for key in final.keys]
     named += [("", things[n - 1].label, things[n - 1].score, SOURCE) for n in final.others]
-    telling = _told(named, SHOWN, 100, advance, "things measured")
+    reporting = _told(named, SHOWN, 100, advance, "things measured")
     instances = tuple(
         describe(
             cloud,
@@ -162,7 +162,7 @@ def scene_by_default(
             plane=plane,
             surface_m=(surfaces_m or {}).get(key),
         )
-        for number, (key, label, score, source) in enumerate(telling, start=1)
+        for number, (key, label, score, source) in enumerate(reporting, start=1)
     )
     return SemanticScene(instances=instances, labels=final.labels, source=SOURCE, remark=remark)
 

@@ -1,4 +1,8 @@
-"""From words to things: which instances and parts a text means, and who says so."""
+"""From words to things: which instances and parts a text means, and by what they were found.
+
+A lexicon says which words mean the same, what things look like and what parts they have. Objects of
+the task are known already: their Gaussians are separate.
+"""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,8 +14,6 @@ from jaxtyping import Bool, Float, Float32, UInt16
 
 from twin.scene.semantics.colour import COLOUR_NAMES
 from twin.scene.semantics.result import Instance, SemanticScene, SemanticsError
-
-# --- Words for things: which mean the same, what they look like, what parts they have.
 
 FORMS = {
     "open container": (
@@ -133,9 +135,6 @@ def kind_of(label: str) -> str:
 def _any_of(words: list[str], names: tuple[str, ...]) -> bool:
     return any(word in names for word in words)
 
-
-# --- Things that a task names: their Gaussians were taken out already, so nobody has to guess
-# them.
 
 NAMED = "task"
 """Source of an instance that is an object of the task."""

@@ -1,4 +1,7 @@
-"""Parts of a thing by its geometry: what a container and what an animal is made of."""
+"""Segment a thing into parts by its geometry: rim, wall and handle, or body, head and limbs.
+
+The visible surface is filled to cells; thick places are body and head, what sticks out is a limb.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,10 +18,6 @@ from twin.scene.semantics.shape_descriptors import (
     find_height_map_cavity,
     height_map,
 )
-
-# --- Body, head and limbs of an animal or toy: what is thick, and what sticks out of it.
-
-# --- From the visible surface of a thing to the cells it fills.
 
 MAX_CELLS = 72
 """Along the longest side."""
@@ -113,7 +112,7 @@ def _stand_on_plane(solid: Bool[np.ndarray, "num_x num_y num_z"], num_unseen: in
 
 
 CONNECTED = np.ones((3, 3, 3), dtype=bool)
-BODY, HEAD, LIMB = 1, 2, 3
+BODY, HEAD, PROTRUSION = 1, 2, 3
 LEVELS = tuple(np.arange(0.97, 0.5, -0.03))
 """Thickness, as a share of the largest, at which thick places are told apart."""
 MIN_PROMINENCE = 1.06
@@ -142,7 +141,7 @@ class Core:
 
 
 def animal_parts(
-    xyh_m: Float[np.ndarray, "num_points 3"], limb_ratio: float
+    xyh_m: Float[np.ndarray, "num_points 3"], protrusion_ratio: float
 ) -> tuple[dict[str, Bool[np.ndarray, " num_points"]], dict[str, Float[np.ndarray, "3"]]]:
     """Tell body, head and limbs apart by thickness.
 
@@ -154,35 +153,35 @@ def animal_parts(
 
     Args:
         xyh_m: Points of the surface: x, y and height above the plane.
-        limb_ratio: Radius of the ball over the radius of the thickest place.
+        protrusion_ratio: Radius of the ball over the radius of the thickest place.
 
     Returns:
         Masks of the parts that are there, and keypoints: the middle of body and head, the tip
         of each limb.
     """
     solid = fill_solid(xyh_m)
-    parts, limbs = _label_cells(solid.cells, thickness_of(solid.cells), limb_ratio)
+    parts, protrusions = _label_cells(solid.cells, thickness_of(solid.cells), protrusion_ratio)
     nearest = ndimage.distance_transform_edt(
         parts == 0, return_distances=False, return_indices=True
     )
     of_point = parts[tuple(nearest)][solid.cells_of(xyh_m)]
     masks = {
         name: of_point == part
-        for name, part in (("body", BODY), ("head", HEAD), ("limbs", LIMB))
+        for name, part in (("body", BODY), ("head", HEAD), ("limbs", PROTRUSION))
         if (of_point == part).any()
     }
-    return masks, _keypoints(parts, limbs, solid)
+    return masks, _keypoints(parts, protrusions, solid)
 
 
 def _label_cells(
     solid: Bool[np.ndarray, "num_x num_y num_z"],
     thickness: Float[np.ndarray, "num_x num_y num_z"],
-    limb_ratio: float,
+    protrusion_ratio: float,
 ) -> tuple[Int[np.ndarray, "num_x num_y num_z"], list[np.ndarray]]:
     """Part of each solid cell, and the cells of each limb."""
     smooth = _smooth(thickness)
     most = float(smooth.max())
-    ball = limb_ratio * most
+    ball = protrusion_ratio * most
     thick = solid & _grown(smooth > ball, ball)
     pieces = _pieces(solid & ~thick, int(solid.sum()))
     parts = np.where(solid, BODY, 0)
@@ -194,7 +193,7 @@ def _label_cells(
         parts[pieces[head_piece]] = HEAD
         pieces = [piece for k, piece in enumerate(pieces) if k != head_piece]
         touches = [0] * len(pieces)
-    limbs: list[np.ndarray] = []
+    protrusions: list[np.ndarray] = []
     low = MARGIN_CELLS + LOW_FRACTION * (
         int(np.flatnonzero(solid.any(axis=(0, 1))).max()) - MARGIN_CELLS
     )
@@ -202,9 +201,9 @@ def _label_cells(
         if touched == head and float(np.nonzero(piece)[2].mean()) > low:
             parts[piece] = HEAD
         else:
-            parts[piece] = LIMB
-            limbs.append(piece)
-    return parts, limbs
+            parts[piece] = PROTRUSION
+            protrusions.append(piece)
+    return parts, protrusions
 
 
 def thickness_of(
@@ -312,7 +311,7 @@ def find_cores(thickness: Float[np.ndarray, "num_x num_y num_z"]) -> list[Core]:
     done: list[Core] = []
     for level in LEVELS:
         cells, num = ndimage.label(thickness > level * most, structure=CONNECTED)
-        still: list[tuple[tuple[int, ...], Core]] = []
+        unmet: list[tuple[tuple[int, ...], Core]] = []
         taken = {int(cells[_inside(core)]) for core in done}
         for number in range(1, num + 1):
             region = cells == number
@@ -324,8 +323,8 @@ def find_cores(thickness: Float[np.ndarray, "num_x num_y num_z"]) -> list[Core]:
                 inside = np.where(region, thickness, 0.0)
                 peak = np.unravel_index(int(inside.argmax()), thickness.shape)
                 grown = Core(region=region, level=level * most)
-                still.append((tuple(int(k) for k in peak), grown))
-        growing = still
+                unmet.append((tuple(int(k) for k in peak), grown))
+        growing = unmet
     cores = done + [core for peak, core in growing if thickness[peak] > 0.6 * most]
     return sorted(cores, key=lambda core: -float(thickness[core.region].max()))
 
@@ -382,14 +381,14 @@ def _headness(piece: np.ndarray, thickness: np.ndarray) -> float:
 
 
 def _keypoints(
-    parts: Int[np.ndarray, "num_x num_y num_z"], limbs: list[np.ndarray], solid: FilledCells
+    parts: Int[np.ndarray, "num_x num_y num_z"], protrusions: list[np.ndarray], solid: FilledCells
 ) -> dict[str, Float[np.ndarray, "3"]]:
     points = {"body": solid.centres_m(parts == BODY).mean(axis=0)}
     if (parts == HEAD).any():
         points["head"] = solid.centres_m(parts == HEAD).mean(axis=0)
     tips = []
-    for limb in limbs:
-        cells = solid.centres_m(limb)
+    for protrusion in protrusions:
+        cells = solid.centres_m(protrusion)
         away = np.linalg.norm(cells - points["body"], axis=1)
         tips.append(cells[away >= np.quantile(away, 0.9)].mean(axis=0))
     around = sorted(tips, key=lambda tip: _bearing(tip - points["body"]))
@@ -428,7 +427,7 @@ class PartsConfig:
     """Points in the lowest share of the cavity's depth are its floor."""
     handle_fraction: float = 0.08
     """Points this share of the height above the rim are handle."""
-    limb_ratio: float = 0.55
+    protrusion_ratio: float = 0.55
     """What is thinner than this share of the thickest place sticks out of the body."""
 
 
@@ -465,7 +464,7 @@ def find_parts(
             masks = _container(xyh_m, heights, cavity, float(high[2]), config)
             keypoints |= _container_points(xyh_m, heights, cavity, masks)
     elif kind == "animal":
-        masks, places = animal_parts(xyh_m, config.limb_ratio)
+        masks, places = animal_parts(xyh_m, config.protrusion_ratio)
         keypoints |= places
     least = MIN_SHARE * len(xyh_m)
     return Parts(

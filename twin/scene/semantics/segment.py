@@ -56,7 +56,7 @@ class SegmentConfig:
     min_height_m: float = 0.007
     """Above the plane; lower points belong to a thing only by colour."""
     max_height_m: float = 0.6
-    """Higher points belong to the room."""
+    """Higher points belong to the surroundings."""
     voxel_m: float = 0.004
     """Finest size of the voxels that hang together; grows with the spacing of the points."""
     reach_voxels: float = 1.8
@@ -268,8 +268,6 @@ def _thing(
     firm = float((height_m > 2 * config.min_height_m).mean())
     return Thing(label=f"{colour_name(color)} {form.word}", form=form, score=firm)
 
-
-# --- The default segmenter on what is there: one RGB-D frame, or the Gaussians of a scene.
 
 MIN_OPACITY = 0.3
 MAX_SPLAT_M = 0.04

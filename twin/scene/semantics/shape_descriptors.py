@@ -1,4 +1,7 @@
-"""The form of a thing that stands on a plane: height map, cavity, box, and a word for it."""
+"""Describe the shape of a thing on its support plane: height map, cavity, box, and a word for it.
+
+The support plane is nearly level, found by RANSAC and refined by least squares.
+"""
 
 from dataclasses import dataclass
 
@@ -8,8 +11,6 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from twin.scene.semantics.result import SemanticsError
-
-# --- The plane that things stand on: nearly level, found by RANSAC, refined by least squares.
 
 UP = np.array([0.0, 0.0, 1.0])
 """Against gravity in the root frame of a robot cell."""

@@ -16,10 +16,6 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.errors import TwinError
 
-# --- A box of voxels, and how each voxel stands to the surface that one view sees.
-
-# --- What one camera says about one object: which pixels are the object, how far each pixel sees.
-
 
 class ShapeError(TwinError):
     """There is not enough to make a shape from, or what there is contradicts itself."""
@@ -45,7 +41,7 @@ class MaskedView:
         """Refuse images that do not belong together.
 
         Raises:
-            ShapeError: When sizes differ, or the pose is no number.
+            ShapeError: When sizes differ, or the pose is not finite.
         """
         size = (self.camera.height, self.camera.width)
         if self.depth_m.shape != size or self.mask.shape != size:
@@ -316,8 +312,6 @@ def solid_of(
         raise ShapeError(message)
     return np.asarray(ndimage.binary_fill_holes(solid))
 
-
-# --- Where between two voxels a carved surface runs: what views measured there says it.
 
 UNSEEN_VOXELS = 0.5
 """Where nobody measured, the surface runs in the middle between a solid and a free voxel."""

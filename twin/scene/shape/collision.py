@@ -18,8 +18,6 @@ from twin.scene.shape.carve import ShapeError
 from twin.scene.shape.mesh import Faces
 from twin.scene.shape.reconstruct import ObjectShape
 
-# --- Convex hulls of points and of voxels.
-
 _CUBE = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 NUM_DIRECTIONS = 160
 
@@ -225,8 +223,8 @@ def _cut_up(shape: ObjectShape, config: CollisionConfig) -> tuple[ConvexPart, ..
                 continue
             others = [p for p in pieces if p is not worst]
             spare = sum(len(p.voxels) for p in pieces) - kept
-            room = config.max_parts - len(others)
-            cut = _best_cut(worst, free, room, min(CRUMB * len(voxels), spare))
+            parts_left = config.max_parts - len(others)
+            cut = _best_cut(worst, free, parts_left, min(CRUMB * len(voxels), spare))
             if cut is not None and _worth_it(worst, cut, len(voxels)):
                 pieces = others + cut
                 break

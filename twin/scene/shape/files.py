@@ -1,4 +1,9 @@
-"""The geometry files of one object: mesh, distances, collision parts, lattice, and their record."""
+"""The geometry files of one object: mesh, distances, collision parts, lattice, and their record.
+
+The mass is a prior by name and volume. Volumes come from the outside: a hollow toy counts as if it
+were filled, so densities are "what it weighs over what it displaces". Calibration replaces the
+prior when the log allows.
+"""
 
 import re
 import shutil
@@ -12,11 +17,6 @@ from twin.scene.shape.collision import CollisionParts, collision_parts
 from twin.scene.shape.lattice import lattice
 from twin.scene.shape.mesh import Faces, Vertices, mesh_ply, read_mesh
 from twin.scene.shape.reconstruct import ObjectShape
-
-# --- How heavy a thing of a given name and volume probably is.
-#
-# Volumes come from the outside: a hollow toy counts as if it were filled, so densities here are
-# "what it weighs over what it displaces". Calibration replaces the prior when the log allows.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Depth images with masks in, one closed metric shape out."""
+"""One closed metric shape of an object and its cavity, from masked depth or a foreign mesh."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,14 +23,12 @@ from twin.scene.shape.mesh import Faces, Vertices, face_normals, is_watertight, 
 from twin.scene.shape.registration import laid_together
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid, smoothed
 
-# --- The room inside a container: what a view looked into and walls enclose all around.
-
 MIN_SHARE = 0.05
 """Of the volume with the cavity filled; less is a dent."""
 MIN_VOXELS = 30
 MAX_POINTS = 400
 LEAK_VOXELS = 2
-"""Gaps in a wall up to twice this are closed before looking for the room behind it."""
+"""Gaps in a wall up to twice this are closed before looking for the cavity behind it."""
 CLEARANCE_VOXELS = 2.0
 """Sample points keep this distance from the walls."""
 
@@ -53,26 +51,26 @@ def find_cavity(
 ) -> Cavity | None:
     """Fill each horizontal layer; what that adds and somebody looked through is the cavity.
 
-    Only the largest connected room counts. None when there is no cavity worth the name. One that
+    Only the largest connected cavity counts. None when there is no cavity worth the name. One that
     no view looked into stays solid, and is found among the faces nobody saw.
     """
     in_layer = ndimage.generate_binary_structure(3, 1)
     in_layer[:, :, [0, 2]] = False
     tight = ndimage.binary_closing(solid, structure=in_layer, iterations=LEAK_VOXELS)
     filled = ndimage.binary_fill_holes(tight | solid, structure=in_layer)
-    room = filled & ~solid & free
-    pieces, count = ndimage.label(room)
+    cavity = filled & ~solid & free
+    pieces, count = ndimage.label(cavity)
     if count == 0:
         return None
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0
-    room = pieces == sizes.argmax()
-    num = int(room.sum())
+    cavity = pieces == sizes.argmax()
+    num = int(cavity.sum())
     if num < max(MIN_VOXELS, MIN_SHARE * (num + int(solid.sum()))):
         return None
-    layers = np.flatnonzero(room.any(axis=(0, 1)))
+    layers = np.flatnonzero(cavity.any(axis=(0, 1)))
     away = ndimage.distance_transform_edt(~solid) - 0.5
-    ids = np.flatnonzero(room & (away >= CLEARANCE_VOXELS))
+    ids = np.flatnonzero(cavity & (away >= CLEARANCE_VOXELS))
     chosen = ids[np.linspace(0, len(ids) - 1, min(MAX_POINTS, len(ids))).round().astype(np.int64)]
     return Cavity(
         volume_m3=num * box.voxel_m**3,
@@ -324,8 +322,6 @@ def moved_views(
     return [replace(v, T_base_camera=T_new_base @ v.T_base_camera) for v in views]
 
 
-# --- A shape from triangles that somebody else made: filled, and told apart what was measured.
-
 MAX_SAMPLES = 2_000_000
 MEASURED_VOXELS = 2.0
 """Faces this near to a measured point were measured; the rest is somebody's guess."""
@@ -400,15 +396,15 @@ def _dense(vertices_m: Vertices, faces: Faces, spacing_m: float) -> tuple[np.nda
     normals = cross / np.maximum(area, 1e-300)[:, None]
     if volume_m3(vertices_m, faces) < 0:
         normals = -normals
-    points, owners = [], []
+    points, triangles = [], []
     for step in np.unique(steps):
         own = np.flatnonzero(steps == step)
         i, j = np.nonzero(np.add.outer(np.arange(step + 1), np.arange(step + 1)) <= step)
         u, v = (i / step)[None, :, None], (j / step)[None, :, None]
         p = a[own][:, None] * (1 - u - v) + b[own][:, None] * u + c[own][:, None] * v
         points.append(p.reshape(-1, 3))
-        owners.append(np.repeat(own, len(i)))
-    return np.concatenate(points), normals[np.concatenate(owners)]
+        triangles.append(np.repeat(own, len(i)))
+    return np.concatenate(points), normals[np.concatenate(triangles)]
 
 
 def _near_points(

@@ -10,8 +10,6 @@ from scipy.spatial import cKDTree
 from bridge.geometry import se3
 from twin.scene.shape.carve import MaskedView
 
-# --- What one view saw of an object and of the plane around it: points in the camera's frame.
-
 MAX_POINTS = 500
 """Points of one view that are compared."""
 MAX_HEIGHTS = 400

@@ -79,7 +79,7 @@ class SdfGrid:
             found_ = f"values of shape {values.shape} and type {values.dtype} are no grid"
             raise UnreadableArraysError(path=path, found=found_)
         if not (np.isfinite(values).all() and np.isfinite(origin).all() and voxel > 0):
-            raise UnreadableArraysError(path=path, found="a distance or a place is no number")
+            raise UnreadableArraysError(path=path, found="a distance or a position is not finite")
         return SdfGrid(values_m=values, origin_m=origin, voxel_m=float(voxel), closed=bool(closed))
 
     def _interpolate(

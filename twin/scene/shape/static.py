@@ -103,7 +103,7 @@ class StaticSdf:
         if not values.shape == state.shape == grid.values_m.shape or state.dtype != np.uint8:
             raise UnreadableArraysError(path=path, found="grids of different sizes")
         if not np.isfinite(values).all():
-            raise UnreadableArraysError(path=path, found="a distance is no number")
+            raise UnreadableArraysError(path=path, found="a distance is not finite")
         table = float(found["table_z_m"])
         return StaticSdf(
             conservative=grid,

@@ -260,7 +260,7 @@ def without_joints(
 def unknown_postures(
     track: PostureTrack | None, stamps_ns: Int[np.ndarray, " num_frames"]
 ) -> frozenset[int]:
-    """Those of some instants around which a track has no joints, or what is no number."""
+    """Those of some instants around which a track has no joints, or values that are not finite."""
     if track is None:
         return frozenset()
     return frozenset(

@@ -1,4 +1,7 @@
-"""The scene folder: ``scene.json`` and ``background.ply``, whole or not at all."""
+"""The scene folder: ``scene.json`` and ``background.ply``, whole or not at all.
+
+A splat file edited elsewhere (SuperSplat and others) comes back into it.
+"""
 
 import json
 from collections.abc import Mapping
@@ -36,7 +39,7 @@ class UnreadableSceneError(TwinError):
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """A rebuilt place: the static background and how it came to be."""
+    """A rebuilt scene: the static background and how it came to be."""
 
     record: Mapping[str, Any]
     """The content of ``scene.json``."""
@@ -117,8 +120,6 @@ def write_record(run: RunFolder, record: Mapping[str, Any]) -> Path:
     write_whole(path, (json.dumps(record, indent=2) + "\n").encode())
     return path
 
-
-# --- A splat file edited elsewhere (SuperSplat and others) comes back into the scene.
 
 SPLATS = "gaussians.ply"
 EDITED = "splats were edited: what was said of each Gaussian no longer fits; rebuild to say it anew"

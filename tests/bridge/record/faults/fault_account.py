@@ -11,7 +11,7 @@ from fault_cell import FaultCell, PublisherChild, Sent
 from mcap.reader import make_reader
 
 import robot_gst
-from bridge.episode import schema
+from bridge.episode.topics import DROPS
 
 LOSSES = ("gaps", "queue_drops", "shed")
 
@@ -42,7 +42,7 @@ def read(path: Path) -> list[Found]:
             for kind, channel, message in make_reader(stream, validate_crcs=True).iter_messages(
                 log_time_order=False
             )
-            if channel.topic != schema.DROPS_TOPIC and not channel.topic.endswith("/event")
+            if channel.topic != DROPS and not channel.topic.endswith("/event")
         ]
 
 
@@ -59,7 +59,7 @@ def ledger(path: Path) -> dict[str, dict[str, int]]:
     names = ("received", "repeated", "undecodable", *LOSSES)
     summed = {topic: Counter(dict.fromkeys(names, 0)) for topic in topics}
     with path.open("rb") as stream:
-        for _, _, message in make_reader(stream).iter_messages(topics=[schema.DROPS_TOPIC]):
+        for _, _, message in make_reader(stream).iter_messages(topics=[DROPS]):
             record = json.loads(message.data)
             for name in names:
                 summed[record["topic"]][name] += record[name]

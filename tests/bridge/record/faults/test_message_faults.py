@@ -19,6 +19,7 @@ from fault_account import LiveCell, accounts_are_exact, check_code, ledger, lost
 from fault_messages import color, depth_mm, image, joints, jpeg
 
 from bridge.episode import schema
+from bridge.episode.topics import DROPS
 from bridge.wire.publisher import Attachment, encode
 
 GID, OTHER_GID = b"g" * 16, b"h" * 16
@@ -318,12 +319,12 @@ def test_nobody_else_writes_into_the_ledger(live: LiveCell) -> None:
     live.start("forged")
     live.put(
         put("/cell/joint_states", joints(), 0),
-        put(schema.DROPS_TOPIC, data, 0, encoding=f"application/json;{schema.DROPS}"),
+        put(DROPS, data, 0, encoding=f"application/json;{schema.DROPS}"),
     )
     answer = live.stop()
     path = live.path("forged")
     topics = ledger(path)  # the seconds add up to the totals
-    assert answer["lost"] == topics[schema.DROPS_TOPIC]["queue_drops"] == 1
+    assert answer["lost"] == topics[DROPS]["queue_drops"] == 1
     assert topics["/cell/joint_states"]["gaps"] == 0
-    assert any(schema.DROPS_TOPIC in text for text in metadata(path, "drops")["warnings"])
+    assert any(DROPS in text for text in metadata(path, "drops")["warnings"])
     assert check_code(path) == 3

@@ -254,20 +254,6 @@ def test_a_variation_that_cannot_be_replayed_costs_only_itself(script: SimpleNam
     assert samples[1].reason == "the cube lies inside the box"
 
 
-def test_as_many_samples_are_run_as_fit_and_no_more_are_claimed(script: SimpleNamespace) -> None:
-    clock = [0.0]
-
-    def replay(scene: ReplayScene, config: ReplayConfig) -> Verdict:
-        clock[0] += 2.0
-        return verdict(True)
-
-    samples = asked(script, replay, 100, ends_s=11.0, expected_s=2.0, monotonic=lambda: clock[0])
-    assert clock[0] <= 11.0
-    assert len(samples) == 5
-    assert (with_probability(verdict(True), samples).p_success or {})["n"] == 5
-    assert asked(script, replay, 9, ends_s=2.0, expected_s=2.0, monotonic=lambda: 0.0) == ()
-
-
 def test_a_kinematic_replay_has_no_probability(script: SimpleNamespace) -> None:
     config = ReplayConfig(mode="kinematic", samples=3)
     with pytest.raises(UsageError, match="moves no objects: it has no success probability"):

@@ -84,11 +84,11 @@ def test_a_fixed_camera_elsewhere_is_said_and_one_read_wrongly_is_refused(
     run = RunFolder.create(tmp_path_factory.mktemp("run"))
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=8)
     choice = choose_frames(find_sources(run), CONFIG)[0]
-    wrist = CameraCheck(choice=choice, thumbs=thumbs(), trusted=[1.0] * NUM)
-    still = replace(choice, camera_id="side", still=True)
+    wrist = CameraCheck(choice=choice, images=thumbs(), trusted=[1.0] * NUM)
+    still = replace(choice, camera_id="side", stationary=True)
 
     def judged(change: Callable[[np.ndarray], np.ndarray]) -> list[str]:
-        fixed = CameraCheck(choice=still, thumbs=side(change), trusted=[1.0] * 3)
+        fixed = CameraCheck(choice=still, images=side(change), trusted=[1.0] * 3)
         return check_scan([wrist, fixed], CONFIG).remarks()
 
     assert judged(lambda T: T) == []

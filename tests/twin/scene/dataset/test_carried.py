@@ -13,7 +13,7 @@ from bridge.geometry.camera import Camera
 from bridge.terminal import Output
 from twin.scene.dataset.masks import EgoMask, find_ego_mask
 from twin.scene.dataset.scan_check import ScanReport
-from twin.scene.dataset.training_set import learn
+from twin.scene.dataset.training_set import read_training_set
 from twin.scene.frames.rgbd import PointSet, Target, TrainingView
 from twin.scene.frames.selection import choose_frames, find_sources
 from twin.scene.settings import FrameConfig, RebuildConfig
@@ -169,7 +169,7 @@ def test_points_and_pixels_of_the_gripper_are_left_out(views: list[TrainingView]
 
 
 def test_what_was_left_out_is_said() -> None:
-    report = ScanReport(poses={}, found=(), carried={"camera wrist of episode scan": 0.123})
+    report = ScanReport(poses={}, found=(), ego_mask_shares={"camera wrist of episode scan": 0.123})
     assert "12 % of the image of camera wrist of episode scan" in report.remarks()[0]
     assert report.to_record()["carried_fraction"] == {"camera wrist of episode scan": 0.123}
 
@@ -181,12 +181,12 @@ def test_the_fingers_before_a_real_wrist_camera_are_found_and_the_shelf_is_not(
 ) -> None:
     import_rgbd(SHELF, tmp_path / "run", output=QUIET)
     choices = choose_frames(find_sources(RunFolder.open(tmp_path / "run")), FrameConfig(), QUIET)
-    learnt = learn(choices, RebuildConfig(), QUIET)
-    mask = learnt.carried[0]
+    training = read_training_set(choices, RebuildConfig(), QUIET)
+    mask = training.ego_masks[0]
     for columns in (slice(18, 60), slice(258, 300)):
         assert mask.half[4:76, columns].mean() > 0.95
     assert mask.half[110:230, 70:250].mean() < 0.01
-    assert f"{100 * mask.share:.0f} % of the image of camera" in " ".join(learnt.report.remarks())
-    assert not any(view.half.static_mask[mask.half].any() for view in learnt.views)
-    near = [(view.half.depth_m > 0) & (view.half.depth_m < 0.2) for view in learnt.views]
+    assert f"{100 * mask.share:.0f} % of the image of camera" in " ".join(training.report.remarks())
+    assert not any(view.half.static_mask[mask.half].any() for view in training.views)
+    near = [(view.half.depth_m > 0) & (view.half.depth_m < 0.2) for view in training.views]
     assert np.mean(near) < 1e-4  # suction cups wobble; the shelf begins farther away

@@ -24,7 +24,7 @@ def with_visitor(item: RgbdFrame) -> RgbdFrame:
 
 
 @pytest.fixture(scope="module")
-def learnt() -> tuple[list[PointSet], list[TrainingView]]:
+def training() -> tuple[list[PointSet], list[TrainingView]]:
     frames = [textured_room.frame(index, 8) for index in range(8)]
     frames[3] = with_visitor(frames[3])
     surfaces = [FrameSurface(item, LIMITS) for item in frames]
@@ -32,9 +32,9 @@ def learnt() -> tuple[list[PointSet], list[TrainingView]]:
 
 
 def test_a_visitor_is_found_and_the_room_is_left_alone(
-    learnt: tuple[list[PointSet], list[TrainingView]],
+    training: tuple[list[PointSet], list[TrainingView]],
 ) -> None:
-    points, views = learnt
+    points, views = training
     moving = find_moving(points, choose_reference_views(views))
     kept = moving.drop_from(points[3])
     near = np.linalg.norm(points[3].p_m - views[3].T_base_color[:3, 3], axis=1) < 0.42
@@ -48,9 +48,9 @@ def test_a_visitor_is_found_and_the_room_is_left_alone(
 
 
 def test_the_pixels_of_a_visitor_are_masked(
-    learnt: tuple[list[PointSet], list[TrainingView]],
+    training: tuple[list[PointSet], list[TrainingView]],
 ) -> None:
-    points, views = learnt
+    points, views = training
     moving = find_moving(points, choose_reference_views(views))
     masked = moving.mask_in(views[3])
     magenta = (views[3].full.planes_u8 == VISITOR_COLOR[:, None, None]).all(axis=0)
@@ -62,9 +62,9 @@ def test_the_pixels_of_a_visitor_are_masked(
 
 
 def test_what_was_masked_before_stays_masked(
-    learnt: tuple[list[PointSet], list[TrainingView]],
+    training: tuple[list[PointSet], list[TrainingView]],
 ) -> None:
-    points, views = learnt
+    points, views = training
     moving = find_moving(points, choose_reference_views(views))
     robot = np.zeros(views[3].half.static_mask.shape, dtype=bool)
     robot[:5, 20:] = True
@@ -75,9 +75,9 @@ def test_what_was_masked_before_stays_masked(
 
 
 def test_a_visitor_leaves_no_trace_in_the_fitted_scene(
-    learnt: tuple[list[PointSet], list[TrainingView]],
+    training: tuple[list[PointSet], list[TrainingView]],
 ) -> None:
-    points, views = learnt
+    points, views = training
     moving = find_moving(points, choose_reference_views(views))
     start = fuse([moving.drop_from(p) for p in points], InitialiseConfig(max_splats=1000))
     fitted = fit(
@@ -101,16 +101,16 @@ def test_a_still_room_has_nothing_moving() -> None:
 
 
 def test_without_moving_voxels_a_view_passes_unchanged(
-    learnt: tuple[list[PointSet], list[TrainingView]],
+    training: tuple[list[PointSet], list[TrainingView]],
 ) -> None:
     nothing = MovingVoxels(keys=np.zeros(0, dtype=np.int64))
-    assert nothing.mask_in(learnt[1][0]) is learnt[1][0]
+    assert nothing.mask_in(training[1][0]) is training[1][0]
 
 
 def test_a_visitor_in_a_held_out_frame_is_found_by_the_training_frames(
-    learnt: tuple[list[PointSet], list[TrainingView]],
+    training: tuple[list[PointSet], list[TrainingView]],
 ) -> None:
-    witnesses = choose_reference_views([view for i, view in enumerate(learnt[1]) if i != 3])
-    moving = find_moving([learnt[0][3]], witnesses)
-    masked = moving.mask_in(learnt[1][3])
+    reference_views = choose_reference_views([view for i, view in enumerate(training[1]) if i != 3])
+    moving = find_moving([training[0][3]], reference_views)
+    masked = moving.mask_in(training[1][3])
     assert 0.3 < (~masked.full.static_mask).mean() < 0.6

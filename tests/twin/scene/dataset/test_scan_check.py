@@ -38,7 +38,7 @@ def choice(tmp_path_factory: pytest.TempPathFactory) -> FrameChoice:
 def camera(choice: FrameChoice, *, count: int = 8, depth_times: float = 1.0) -> CameraCheck:
     thumbs = [downscaled_depth(textured_room.frame(k, 8), 72) for k in range(count)]
     scaled = [replace(t, depth_m=np.float32(depth_times) * t.depth_m) for t in thumbs]
-    return CameraCheck(choice=choice, thumbs=scaled, trusted=[float(depth_times == 1.0)] * count)
+    return CameraCheck(choice=choice, images=scaled, trusted=[float(depth_times == 1.0)] * count)
 
 
 def test_a_good_scan_gives_no_remark(choice: FrameChoice) -> None:
@@ -75,9 +75,9 @@ def test_one_blind_camera_of_two_is_a_remark(choice: FrameChoice) -> None:
 def test_poses_in_a_wrong_convention_are_refused_unless_told_not_to(choice: FrameChoice) -> None:
     right = camera(choice)
     thumbs: list[DownscaledDepth] = [
-        replace(t, T_base_depth=se3.invert(t.T_base_depth)) for t in right.thumbs
+        replace(t, T_base_depth=se3.invert(t.T_base_depth)) for t in right.images
     ]
-    wrong = replace(right, thumbs=thumbs)
+    wrong = replace(right, images=thumbs)
     with pytest.raises(PoseConventionError, match=r"world-to-camera.*--no-check-poses") as caught:
         check_scan([wrong], CONFIG)
     assert caught.value.exit_code == 1
@@ -99,17 +99,17 @@ def test_cameras_with_next_to_no_usable_depth_are_refused_when_no_other_is_there
 def test_a_camera_in_motion_that_is_said_to_stand_still_is_refused(choice: FrameChoice) -> None:
     """As when /tf ends at the camera's own link: all images get one pose, no pose moves."""
     right = camera(choice)
-    first = right.thumbs[0]
+    first = right.images[0]
     thumbs = [replace(first, depth_m=first.depth_m * np.float32(1 - 0.08 * k)) for k in range(8)]
-    wrong = replace(right, choice=replace(choice, still=True), thumbs=thumbs)
+    wrong = replace(right, choice=replace(choice, stationary=True), images=thumbs)
     with pytest.raises(MovedCameraError, match=r"stands still by its poses.*--poses odometry"):
         check_scan([wrong], CONFIG)
     (remark,) = check_scan([wrong], FrameConfig(check_poses=False)).remarks()
     assert "it was moved" in remark
-    orbit = [replace(t, T_base_depth=first.T_base_depth) for t in right.thumbs]
-    (doubt,) = check_scan([replace(wrong, thumbs=orbit)], CONFIG).remarks()
+    orbit = [replace(t, T_base_depth=first.T_base_depth) for t in right.images]
+    (doubt,) = check_scan([replace(wrong, images=orbit)], CONFIG).remarks()
     assert "much moved before it, or it moved itself" in doubt
-    truly = replace(wrong, thumbs=[thumbs[0]] * 4)
+    truly = replace(wrong, images=[thumbs[0]] * 4)
     assert "moved" not in " ".join(check_scan([truly], CONFIG).remarks())
 
 

@@ -105,11 +105,25 @@ def test_initialisation_counts_but_always_leaves_half(
     assert less.seconds == pytest.approx(whole.seconds, abs=STEP_S)
 
 
+def test_a_limit_that_does_not_strike_changes_nothing_and_one_that_does_is_reported(
+    room: tuple[GaussianCloud, list[TrainingView]], clock: DrawingClock
+) -> None:
+    counted = replace(BUDGET, iterations=20, budget_s=None)
+    free, roomy, cut = (
+        fitted(room, clock, config=replace(counted, budget_s=limit_s))
+        for limit_s in (None, 1000.0, 7.5 * STEP_S)
+    )
+    assert (free.iterations, roomy.iterations, cut.iterations) == (20, 20, 8)
+    assert [found.underfitted for found in (free, roomy, cut)] == [False, False, True]
+    np.testing.assert_array_equal(free.cloud.means_m, roomy.cloud.means_m)
+    np.testing.assert_array_equal(free.cloud.colors, roomy.cloud.colors)
+
+
 def test_counting_images_knows_no_time(
     room: tuple[GaussianCloud, list[TrainingView]], clock: DrawingClock
 ) -> None:
     clock.draw_s = 100.0
-    found = fitted(room, clock, config=replace(BUDGET, iterations=12))
+    found = fitted(room, clock, config=replace(BUDGET, iterations=12, budget_s=None))
     assert found.iterations == 12
     assert found.colour_steps == BUDGET.appearance_steps
     assert np.isfinite(found.gains).all()

@@ -271,7 +271,9 @@ def test_a_rebuild_asks_the_models_it_is_given(
     assert record["features"]["source"] == "DINOv3"
     assert record["vectors"]["source"] == "CLIP"
     json.dumps(record)  # it is part of scene.json
-    monkeypatch.setattr("twin.scene.rebuild.run.learn", None)  # nothing is learnt a second time
+    monkeypatch.setattr(
+        "twin.scene.rebuild.run.read_training_set", None
+    )  # nothing is learnt a second time
     rebuild(run, config, Output(quiet=True))
     (run.scene_dir / "features.npz").unlink()
     with pytest.raises(TypeError):

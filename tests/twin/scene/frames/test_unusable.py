@@ -87,7 +87,7 @@ def test_a_camera_that_stands_still_may_say_so_once(
 
     write(run, monkeypatch, first_pose)
     (choice,) = choose_frames(find_sources(run), FrameConfig(), QUIET)
-    assert choice.still
+    assert choice.stationary
     assert not choice.poses.unposed_ns
 
 

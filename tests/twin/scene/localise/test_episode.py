@@ -232,7 +232,7 @@ def test_the_twin_names_neither_the_stand_in_code_nor_its_truth() -> None:
                 assert "truth" not in str(node.value), f"{path}:{node.lineno}"
             if isinstance(node, ast.Attribute | ast.Name):
                 name = node.attr if isinstance(node, ast.Attribute) else node.id
-                assert name != "TRUTH_PREFIX", f"{path}:{node.lineno}"
+                assert name != "TRUTH", f"{path}:{node.lineno}"
 
 
 def test_records_of_the_derived_episode_are_plain_json(episode: Episode, task: Task) -> None:

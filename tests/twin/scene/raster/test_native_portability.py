@@ -14,7 +14,7 @@ from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 
 NATIVE = Path(__file__).parents[4] / "twin" / "scene" / "native"
 DRIVER = Path(__file__).with_name("native_driver.cpp")
-KERNELS = ("project", "unproject", "draw", "operate", "structure", "compare", "learn")
+KERNELS = ("project", "unproject", "draw", "operate", "structure", "compare", "adam")
 SHARED = ("rasteriser", "depth_order", "operators", "dispatch", "similarity", "session")
 CAMERA = Camera(width=70, height=45, fx=80.0, fy=80.0, cx=35.0, cy=22.5)
 COUNT = 300

@@ -1,6 +1,7 @@
 """The scene folder: what vouches for what, what is damaged, and what is never looked at."""
 
 import json
+import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -237,5 +238,23 @@ def test_settings_that_nothing_can_be_made_with_are_refused(
         make()
 
 
-def test_a_count_of_images_needs_no_time_budget() -> None:
-    assert replace(FitConfig(iterations=3), budget_s=0.0).iterations == 3
+def test_only_a_fit_by_time_has_a_limit_by_default() -> None:
+    assert FitConfig().limit_s == 60.0
+    assert math.isinf(FitConfig(iterations=3).limit_s)
+    assert FitConfig(iterations=3, budget_s=5.0).limit_s == 5.0
+
+
+def test_a_scene_whose_time_ended_before_its_images_is_reported_as_underfitted(
+    tmp_path: Path,
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9)
+    fitted = replace(CONFIG.fit, iterations=100_000, budget_s=0.05)
+    record = rebuild(run, replace(CONFIG, fit=fitted), QUIET)
+    assert record["fit"]["underfitted"]
+    done = f"{record['fit']['iterations']} of 100000 images"
+    assert done in describe_scene(record)
+    assert "underfitted" in describe_scene(record)
+    whole = rebuild(run, CONFIG, QUIET)
+    assert not whole["fit"]["underfitted"]
+    assert "underfitted" not in describe_scene(whole)

@@ -180,7 +180,7 @@ def test_a_camera_that_stands_still_is_known_as_such(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path)
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=24, still=True)
     (choice,) = choose_frames(find_sources(run), FrameConfig())
-    assert choice.still
+    assert choice.stationary
     assert len(choice.train_ns) == 4
     assert len(choice.holdout_ns) == 2
 

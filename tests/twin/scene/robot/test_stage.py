@@ -23,7 +23,7 @@ from bridge.geometry import se3
 from bridge.media.color import encode_png
 from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
 from bridge.terminal import Output
-from twin.scene.dataset.training_set import learn
+from twin.scene.dataset.training_set import read_training_set
 from twin.scene.frames.selection import choose_frames, find_sources
 from twin.scene.robot.extraction import find_robot, write_robot
 from twin.scene.settings import FrameConfig, InitialiseConfig, RebuildConfig
@@ -88,12 +88,12 @@ def run(tmp_path: Path) -> RunFolder:
 def test_in_the_robots_own_frame_its_links_are_collected(run: RunFolder) -> None:
     write_scan(run.episodes_dir / "scan.mcap", "base_link", np.eye(4))
     choices = choose_frames(find_sources(run), FrameConfig(), QUIET)
-    learnt = learn(choices, RebuildConfig(), QUIET)
-    assert learnt.robot.alignment is None
-    assert learnt.robot.remark == ""
-    links = learnt.robot.frames.links(InitialiseConfig())
+    training = read_training_set(choices, RebuildConfig(), QUIET)
+    assert training.robot.alignment is None
+    assert training.robot.remark == ""
+    links = training.robot.frames.links(InitialiseConfig())
     assert {"base_link", "upper_arm_link"} <= set(links)
-    record = write_robot(run, learnt.robot, links)["robot"]
+    record = write_robot(run, training.robot, links)["robot"]
     assert set(record["links"]) == set(links)
     assert "T_base_root" not in record
     assert all((run.scene_dir / item["file"]).is_file() for item in record["links"].values())

@@ -83,7 +83,7 @@ def test_every_cell_of_any_shape_belongs_to_a_part() -> None:
             x, y = rng.choice(np.argwhere(solid.any(axis=2)))
             solid[x : x + 2, y : y + 2, MARGIN_CELLS : rng.integers(10, 27)] = True
         solid[:, :, :MARGIN_CELLS] = False
-        parts, _ = _label_cells(solid, thickness_of(solid), PartsConfig().limb_ratio)
+        parts, _ = _label_cells(solid, thickness_of(solid), PartsConfig().protrusion_ratio)
         np.testing.assert_array_equal(parts > 0, solid)
 
 
