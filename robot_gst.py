@@ -5,6 +5,7 @@ Everything is lazy: a command's module is imported when the command runs.
 
 import io
 import os
+import shlex
 import sys
 import tomllib
 from collections.abc import Sequence
@@ -20,6 +21,9 @@ HELP = (
     "Record a robot cell over zenoh, rebuild it as a Gaussian-splat twin, re-live every plan and "
     "execution, and say how far the twin can be trusted."
 )
+
+RESUMED = ("demo", "rebuild", "replay", "evaluate")
+"""Commands that keep what they did when they are interrupted, and go on from there."""
 
 EPISODES, LIVE, IMPORTS = "bridge.cli.episodes", "bridge.cli.publish", "bridge.cli.exchange"
 RECORDING = "bridge.cli.recording"
@@ -218,6 +222,7 @@ def build_app() -> App:
         help=HELP,
         version=_version,
         result_action="return_value",
+        suppress_keyboard_interrupt=False,
         console=Console(),
         error_console=Console(stderr=True),
     )
@@ -259,7 +264,9 @@ def run(arguments: Sequence[str]) -> int:
         )
         return 1
     except KeyboardInterrupt:
-        sys.stderr.write("robot-gst: interrupted\n")
+        again = shlex.join(["robot-gst", *arguments])
+        more = f"; continue with: {again}" if arguments and arguments[0] in RESUMED else ""
+        sys.stderr.write(f"robot-gst: interrupted{more}\n")
         return 130
     except SystemExit as end:  # cyclopts leaves this way on wrong use
         return end.code if isinstance(end.code, int) else 2

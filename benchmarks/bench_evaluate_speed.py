@@ -115,12 +115,12 @@ def evaluate(run: RunFolder) -> Ran:
 def outcomes(run: RunFolder, processes: int | None = None) -> Spent:
     """Hash and read all outcomes, nothing kept; on all cores unless told otherwise."""
     from evaluator.cache import SummaryCache
+    from evaluator.compare.summaries import evaluation_pool
     from evaluator.run_reader.contents import read_contents
-    from evaluator.workers import Workers
 
     def read() -> None:
-        with Workers(processes) as workers:
-            read_contents(run, SummaryCache(None), QUIET, workers)
+        with evaluation_pool(processes) as pool:
+            read_contents(run, SummaryCache(None), QUIET, pool)
 
     return spent(read)
 

@@ -117,7 +117,7 @@ def ask(episode: Any, config: Any, twin: Any, calibration: Any = None) -> tuple[
     from twin.scene.localise.live import LiveView
 
     ((stamp_ns, plan),) = streams.plans(episode)
-    eyes = LiveView(config.cell, calibration)
+    perception = LiveView(config.cell, calibration)
     for message in episode.messages():
         if message.log_time_ns >= stamp_ns:  # the execution begins with the same stamp
             break
@@ -125,8 +125,8 @@ def ask(episode: Any, config: Any, twin: Any, calibration: Any = None) -> tuple[
             (f"/{config.cell}/cam/", f"/{config.cell}/event", f"/{config.cell}/joint_states")
         )
         if watched and not is_truth(message.topic):
-            eyes.take(message.topic, message.data, message.log_time_ns, message.type_name)
-    gate = make_gate(config, eyes, lambda: stamp_ns, twin)
+            perception.take(message.topic, message.data, message.log_time_ns, message.type_name)
+    gate = make_gate(config, perception, lambda: stamp_ns, twin)
     before = time.monotonic()
     return gate.judge(plan.to_json()), time.monotonic() - before
 

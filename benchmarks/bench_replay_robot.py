@@ -36,12 +36,12 @@ def cpu_us(work: Callable[[], object], *, repeats: int, each: int = 1) -> float:
 
 
 def inverse_rows(num_poses: int) -> list[Target]:
-    from bridge.task.robot import ur5_with_gripper_urdf
+    from bridge.robots.default import ROBOT
     from twin.robot.config import IkConfig
     from twin.robot.inverse import UrInverse, pose_error, solve_ik
     from twin.robot.model import load_robot
 
-    robot = load_robot(ur5_with_gripper_urdf())
+    robot = load_robot(ROBOT.urdf_text())
     inverse = UrInverse.for_robot(robot)
     if inverse is None:
         raise SystemExit("the default robot is no UR any more")
@@ -164,14 +164,14 @@ def static_of(vertices: np.ndarray, faces: np.ndarray) -> object:
 def clearance_rows(num_states: int) -> list[Target]:
     import coal
 
-    from bridge.task.robot import ur5_with_gripper_urdf
+    from bridge.robots.default import ROBOT
     from bridge.task.task_file import load_task
     from twin.replay.clearance.surroundings import Surroundings
     from twin.replay.scene import ReplayScene
     from twin.robot.collision import hulls_of, signed_distance
     from twin.robot.model import load_robot
 
-    robot = load_robot(ur5_with_gripper_urdf())
+    robot = load_robot(ROBOT.urdf_text())
     hulls = hulls_of(robot)
     rng = np.random.default_rng(SEED)
     postures = np.array([0.0, -1.3, 1.5, -1.7, -1.57, 0.0]) + rng.uniform(

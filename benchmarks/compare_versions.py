@@ -28,6 +28,8 @@ from mcap.reader import make_reader
 
 IGNORED_KEYS = {"scene_hash", "settings_hash", "config_hash", "task_sha256", "software"}
 """Fields of JSON payloads that name the code or the settings by their digest."""
+RENAMED_KEYS = {"partings": "quantities"}
+"""Keys of JSON payloads before, and as they are called since."""
 ITERATIONS = "400"
 
 
@@ -134,7 +136,8 @@ def _messages(path: Path) -> dict[str, list[bytes]]:
 
 def _without_ignored(value: Any) -> Any:
     if isinstance(value, dict):
-        return {k: _without_ignored(v) for k, v in value.items() if k not in IGNORED_KEYS}
+        kept = ((k, _without_ignored(v)) for k, v in value.items() if k not in IGNORED_KEYS)
+        return {RENAMED_KEYS.get(k, k): v for k, v in kept}
     return [_without_ignored(item) for item in value] if isinstance(value, list) else value
 
 

@@ -23,8 +23,8 @@ from bridge.episode.metadata import Derived, EpisodeInfo, Outcome  # noqa: E402
 from bridge.episode.provenance import hash_file  # noqa: E402
 from bridge.episode.run_folder import RunFolder  # noqa: E402
 from bridge.episode.writer import EpisodeWriter  # noqa: E402
+from bridge.robots.default import ARM_JOINTS  # noqa: E402
 from bridge.task.plan import Plan, Stage, Waypoint  # noqa: E402
-from bridge.task.robot import ARM_JOINTS  # noqa: E402
 from bridge.task.task_file import load_task  # noqa: E402
 from bridge.task.verdict import Factor, Verdict  # noqa: E402
 from twin.replay.config import ReplayConfig  # noqa: E402

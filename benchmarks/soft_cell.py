@@ -7,13 +7,13 @@ from functools import cache
 
 import numpy as np
 
+from bridge.robots.default import ROBOT
 from bridge.sources.standin.cell import HOME_SEED_RAD
 from bridge.sources.standin.cell_file import load_cell, nominal_hidden
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.planner import GraspError, plan_pick_and_place
 from bridge.sources.standin.world import World as MujocoWorld
 from bridge.task.meshes.catalogue import toy_mesh
-from bridge.task.robot import ur5_with_gripper_urdf
 from bridge.task.task_file import ObjectModel, Task, load_task
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
@@ -133,9 +133,7 @@ def planned_path(
         max_joint_speed_rad_s=JOINT_SPEED_RAD_S, plan_id="bench", condition="ungated",
         start_id="0",
     )  # fmt: skip
-    path, failures, unreachable = path_of_plan(
-        plan, load_robot(ur5_with_gripper_urdf()), ReplayConfig()
-    )
+    path, failures, unreachable = path_of_plan(plan, load_robot(ROBOT.urdf_text()), ReplayConfig())
     if failures or unreachable is not None:
         message = f"the scripted plan cannot be followed: {failures}"
         raise RuntimeError(message)
@@ -166,7 +164,7 @@ def scene_lattice(mesh: str, size_m: tuple[float, float, float]) -> dict[str, np
 
 def furnished(trial: Trial) -> World:
     """The twin's world with the trial's objects."""
-    hulls = hulls_of(load_robot(ur5_with_gripper_urdf()))
+    hulls = hulls_of(load_robot(ROBOT.urdf_text()))
     meshes: dict[str, list[np.ndarray]] = {}
     for hull in hulls.hulls:
         if hull.from_mesh:

@@ -2,6 +2,7 @@
 
 import json
 import queue
+import shutil
 import signal
 import sys
 import threading
@@ -9,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import Parameter
@@ -68,6 +70,15 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(sign if sign.isprintable() or sign in "\n\t" else "?" for sign in text)
+
+
+def how_to_activate() -> str:
+    """What to do before a command that we advise is found; empty when it is found already."""
+    if shutil.which("robot-gst"):
+        return ""
+    here = Path(".venv")
+    named = f": . {here}/bin/activate" if here.resolve() == Path(sys.prefix) else ""
+    return f"(robot-gst is not on the PATH: activate its Python environment first{named})"
 
 
 def _err() -> Console:

@@ -1,9 +1,11 @@
 """The demo: the real commands, one after the other, on the stand-in cell.
 
 Recorder, gate and stand-in cell are separate processes that talk zenoh on the loopback address,
-exactly as a user would start them. Nothing here computes a result.
+exactly as a user would start them. Nothing here computes a result. Interrupted and started again,
+it keeps what is whole, records anew what is not, and adds what is missing.
 """
 
+import json
 import os
 import shutil
 import signal
@@ -11,22 +13,28 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from cyclopts import Parameter
 
+from bridge.episode.catalogue import outcome_of, sidecar_path
+from bridge.episode.mcap.part_file import lock_dead
+from bridge.episode.metadata import Outcome
+from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import GstError, refuse_outside
+from bridge.errors import GstError, UsageError, refuse_outside
+from bridge.sources.standin.settings import CONDITIONS, INTERRUPTED, SEEDS_PER_SESSION
 from bridge.task.task_file import load_task
-from bridge.terminal import Output
+from bridge.terminal import Output, how_to_activate
 from dashboards.config import PORTS
 from dashboards.errors import DashboardError
 
-START_TIMEOUT_S = 60.0
-STOP_TIMEOUT_S = 20.0
+START_TIMEOUT_S = 300.0
+STOP_TIMEOUT_S = 60.0
 
 
 @Parameter(name="*")
@@ -35,9 +43,9 @@ class DemoConfig:
     """What the demo does."""
 
     quick: bool = False
-    """Two trials per condition and a short rebuild."""
+    """Two trials per condition and a short fit."""
     full: bool = False
-    """Ten trials per condition, the number the paper used, and a longer rebuild."""
+    """Ten trials per condition, the number the paper used, and a longer fit."""
     seed: int = 1
     """Start positions and grasp errors of the trials; the cell's hidden parameters too."""
     task: str = "cube_into_box"
@@ -57,9 +65,14 @@ class DemoConfig:
         return 10 if self.full else 2 if self.quick else 3
 
     @property
-    def budget(self) -> str:
-        """Time the rebuild may take."""
-        return "90s" if self.full else "15s" if self.quick else "40s"
+    def iterations(self) -> int:
+        """Images that the scene is fitted to: 15, 40 and 90 s on two idle cores."""
+        return 7000 if self.full else 1000 if self.quick else 3000
+
+    @property
+    def limit(self) -> str:
+        """Time after which the fit ends all the same, and is reported as underfitted."""
+        return "60min" if self.full else "15min" if self.quick else "30min"
 
     @property
     def samples(self) -> int:
@@ -86,135 +99,285 @@ class Background:
     process: subprocess.Popen[bytes]
     log: Path
 
+    def check(self) -> None:
+        """Raise when it has ended."""
+        code = self.process.poll()
+        if code is not None:
+            raise StepFailedError(command=self.command, code=code, log=self.log)
+
     def wait_until(self, ready: Callable[[], bool]) -> None:
         """Wait until it answers; raises when it ends or stays silent."""
         deadline = time.monotonic() + START_TIMEOUT_S
         while time.monotonic() < deadline:
-            code = self.process.poll()
-            if code is not None:
-                raise StepFailedError(command=self.command, code=code, log=self.log)
+            self.check()
             if ready():
                 return
             time.sleep(0.1)
         message = f"'{self.command}' did not answer in {START_TIMEOUT_S:.0f} s; see {self.log}."
         raise DashboardError(message)
 
-    def stop(self) -> None:
-        """Ask it to finish, as Ctrl-C would, and insist after a while."""
-        _stop(self.process)
-
 
 def _stop(process: subprocess.Popen[bytes]) -> None:
+    """Ask it to finish, as Ctrl-C would, and insist after a while or when told so twice."""
     if process.poll() is None:
         process.send_signal(signal.SIGTERM)
         try:
             process.wait(STOP_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
+        except (subprocess.TimeoutExpired, KeyboardInterrupt):
             process.kill()
             process.wait()
 
 
+@dataclass
+class Recorded:
+    """What a run folder holds of a demo."""
+
+    has_scan: bool = False
+    missing: list[tuple[int, str]] = field(default_factory=list)
+    """Start seed and condition of each trial that is not there."""
+    unusable: dict[Path, str] = field(default_factory=dict)
+    """Files that were cut short, and why."""
+    void: dict[Path, str] = field(default_factory=dict)
+    """Trials that were recorded to their end and have no outcome, and why."""
+    num_known: int = 0
+    """Trials with an outcome."""
+
+
+def look(run: RunFolder, config: DemoConfig) -> Recorded:
+    """Say what of the demo is recorded, and what of it is of no use.
+
+    Raises:
+        UsageError: When the folder holds episodes of anything else, or is being recorded into.
+    """
+    found = Recorded()
+    first = config.seed * SEEDS_PER_SESSION
+    trials = {(first + k, each) for k in range(config.trials) for each in CONDITIONS}
+    for path in sorted(run.episodes_dir.glob("*.part")):
+        descriptor = lock_dead(path)
+        if descriptor is None:
+            message = f"{path} is being written: another recorder works in {run.path}."
+            raise UsageError(message)
+        os.close(descriptor)
+        found.unusable[path] = "its recorder was killed"
+    for path in run.episodes():
+        try:
+            episode = Episode.open(path)
+        except GstError as error:
+            found.unusable[path] = str(error)
+            continue
+        info = episode.info
+        _refuse_other(run, config, episode)
+        outcome = outcome_of(run, episode)
+        problem = _cut_short(episode, outcome)
+        if problem:
+            found.unusable[path] = problem
+        elif info.kind == "scan":
+            found.has_scan = True
+        elif info.kind == "trial" and info.start_seed is not None:
+            trials.discard((info.start_seed, info.condition))
+            if outcome is None or outcome.result == "unknown":
+                found.void[path] = (outcome and outcome.detail) or "nobody labelled it"
+            else:
+                found.num_known += 1
+    found.missing = sorted(trials)
+    return found
+
+
+def _refuse_other(run: RunFolder, config: DemoConfig, episode: Episode) -> None:
+    info = episode.info
+    if not info.stand_in:
+        found = f"{episode.path.name}, which is not from the stand-in cell"
+    elif info.task != config.task:
+        found = f"episodes of --task {info.task}"
+    elif info.start_seed is not None and info.start_seed // SEEDS_PER_SESSION != config.seed:
+        found = f"episodes of --seed {info.start_seed // SEEDS_PER_SESSION}"
+    else:
+        return
+    message = f"{run.path} holds {found}. Give the demo that option again, or another folder."
+    raise UsageError(message)
+
+
+def _cut_short(episode: Episode, outcome: Outcome | None) -> str:
+    """What ended an episode before its time; empty when nothing did."""
+    records = episode.metadata_records
+    stopped_by = records.get("recorder", {}).get("stopped_by", "command")
+    if "recovered" in records or episode.missing_parts:
+        return "its end is missing"
+    if stopped_by != "command":
+        return str(stopped_by)
+    return INTERRUPTED if outcome is not None and outcome.detail == INTERRUPTED else ""
+
+
+def _set_aside(run: RunFolder, path: Path, why: str, output: Output) -> None:
+    """Move an episode, and all that was made of it, to where no command looks for episodes."""
+    folder = run.notes_dir / INTERRUPTED / time.strftime("%Y%m%d_%H%M%S")
+    folder.mkdir(parents=True, exist_ok=True)
+    name = path.name.split(".")[0]
+    output.say(f"    {path.name} is recorded anew ({why}); this one goes to {folder}")
+    belonging = [*run.episodes_dir.glob(f"{name}.*"), *run.derived_dir.glob(f"{name}.*")]
+    for each in [*belonging, sidecar_path(run, name)]:
+        if each.exists():
+            shutil.move(each, folder / each.name)
+
+
 def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
-    """Record, rebuild, replay, evaluate, and say what to look at next."""
+    """Record, rebuild, replay, evaluate, and say what to look at next.
+
+    Raises:
+        DashboardError: When a step failed, or nothing could be measured.
+    """
     started = time.monotonic()
     load_task(config.task)  # refuse an unknown one before anything is made
     run = RunFolder.create(path)
-    with _ending_on_sigterm():
-        _steps(run, config, output)
-    seconds = time.monotonic() - started
-    _close(run, config, output, seconds)
+    with _ending_on_signals():
+        _record(run, config, output)
+        replay = ["replay", str(path), "--samples", str(config.samples)]
+        _step(output, "5/6 replaying every plan and execution in PyBullet", replay)
+        _step(output, "6/6 evaluating", ["evaluate", str(path)], show_result=True)
+        _refuse_nothing(run)
+    _close(run, config, output, time.monotonic() - started)
     return 0
 
 
-def _steps(run: RunFolder, config: DemoConfig, output: Output) -> None:
-    path = str(run.path)
-    if run.episodes():
-        output.say(
-            f"{path} holds {len(run.episodes())} episodes already: they are kept and used. "
-            "For a fresh recording choose another folder."
-        )
-        if not (run.scene_dir / "scene.json").is_file():  # an earlier demo was cut off
-            _step(output, "3/6 rebuilding the scene", ["rebuild", path])
-    else:
-        _record(run, config, output)
-    replay = ["replay", path, "--samples", str(config.samples)]
-    _step(output, "5/6 replaying every plan and execution in PyBullet", replay)
-    _step(output, "6/6 evaluating", ["evaluate", path], show_result=True)
-
-
 @contextmanager
-def _ending_on_sigterm() -> Iterator[None]:
-    """Make SIGTERM end the demo as Ctrl-C does, so that what it started ends with it."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+def _ending_on_signals() -> Iterator[None]:
+    """Let SIGTERM and a closed terminal end the demo as Ctrl-C does, with all that it started."""
+    signals = (signal.SIGTERM, signal.SIGHUP)
+    before = [signal.signal(each, signal.default_int_handler) for each in signals]
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for each, handler in zip(signals, before, strict=True):
+            signal.signal(each, handler)
 
 
 def _record(run: RunFolder, config: DemoConfig, output: Output) -> None:
+    """Do the steps 1 to 4, as far as they have not been done."""
     path = str(run.path)
+    fit = ["--iterations", str(config.iterations), "--budget", config.limit]
+    rebuild = ["rebuild", path, *fit]
+    label = f"3/6 rebuilding the scene ({config.iterations} images)"
+    found = look(run, config)
+    for episode, why in (found.unusable | found.void).items():
+        _set_aside(run, episode, why, output)
+    found = look(run, config)
+    if found.has_scan and not found.missing:
+        output.say(f"1/6 to 4/6: {path} holds the scan and all trials; they are kept and used")
+        if not _scene(run):
+            _step(output, label, rebuild)
+        return
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
     logs = run.notes_dir / "logs"
     logs.mkdir(parents=True, exist_ok=True)
     standin = ["publish", "standin", "--connect", endpoint, "--seed", str(config.seed)]
-    standin += ["--task", config.task]
+    standin += ["--task", config.task, "--trials"]
     output.say("1/6 starting the recorder (zenoh on the loopback address)")
-    recorder = _start(["record", path, "--listen", endpoint], logs / "record.log")
-    gate: Background | None = None
-    try:
+    with _running(["record", path, "--listen", endpoint], logs / "record.log") as recorder:
         recorder.wait_until(lambda: _answers(endpoint, "rec/main/ctl/status"))
-        _step(output, "2/6 the stand-in cell scans its table", [*standin, "--trials", "0"])
-        rebuild = ["rebuild", path, "--budget", config.budget]
-        _step(output, f"3/6 rebuilding the scene ({config.budget})", rebuild)
-        judge = ["gate", path, "--connect", endpoint, "--task", config.task]
-        gate = _start(judge, logs / "gate.log")
-        gate.wait_until(lambda: "ready" in (logs / "gate.log").read_text(errors="replace"))
-        trials = [*standin, "--no-scan", "--ask-always", "--trials", str(config.trials)]
-        label = f"4/6 {2 * config.trials} trials: {config.trials} without and with replanning"
-        _step(output, label, trials)
-    finally:
-        if gate is not None:
-            gate.stop()
-        recorder.stop()
+        if found.has_scan:
+            output.say("2/6 the scan is recorded; it is kept and used")
+        else:
+            _step(output, "2/6 the stand-in cell scans its table", [*standin, "0"], recorder)
+        if found.has_scan and _scene(run):
+            output.say("3/6 the scene is rebuilt; it is kept and used")
+        else:
+            _step(output, label, rebuild, recorder)
+        if found.missing:
+            _record_trials(run, config, endpoint, standin, len(found.missing), recorder, output)
+    found = look(run, config)
+    cause = next(iter((found.void | found.unusable).values()), "the session was stopped")
+    if not found.has_scan:
+        raise DashboardError(f"there is no scan: {cause}. Start the demo again.")
+    if found.missing or not found.num_known:
+        count = len(found.missing) + len(found.void)
+        message = f"{count} of {2 * config.trials} trials have no outcome: {cause}. "
+        raise DashboardError(f"{message}Start the demo again; it adds what is missing.")
 
 
-def _program() -> str:
-    """The command as this shell finds it: with the environment's folder where it is not active."""
-    if shutil.which("robot-gst"):
-        return "robot-gst"
-    return os.path.relpath(Path(sys.executable).parent / "robot-gst")
+def _record_trials(
+    run: RunFolder,
+    config: DemoConfig,
+    endpoint: str,
+    standin: list[str],
+    count: int,
+    recorder: Background,
+    output: Output,
+) -> None:
+    log = run.notes_dir / "logs" / "gate.log"
+    judge = ["gate", str(run.path), "--connect", endpoint, "--task", config.task]
+    judge += ["--deadline", "5min"]  # the last resort: the cell waits, its clock is its own
+    label = f"4/6 {count} trials, {config.trials} starts without and with replanning"
+    with _running(judge, log) as gate:
+        gate.wait_until(lambda: "ready" in log.read_text(errors="replace"))
+        trials = [*standin, str(config.trials), "--no-scan", "--ask-always", "--missing"]
+        _step(output, label, trials, recorder, gate)
+
+
+def _scene(run: RunFolder) -> Mapping[str, Any]:
+    """What ``scene.json`` says; empty without a rebuilt scene."""
+    try:
+        return dict(json.loads((run.scene_dir / "scene.json").read_bytes()))
+    except (OSError, ValueError):
+        return {}
+
+
+def _refuse_nothing(run: RunFolder) -> None:
+    """Raise when the evaluation has no number of a replay."""
+    results = json.loads((run.results_dir / "results.json").read_bytes())
+    if not run.derived("*.replay.*"):
+        found = "no replay was written"
+    elif all(item["value"] is None for item in results["measurements"]):
+        reasons = {item.get("reason_if_undefined") for item in results["measurements"]} - {None}
+        found = "; ".join(sorted(reasons)) or "there is no measurement"
+    else:
+        return
+    message = f"nothing was measured: {found}. See {run.results_dir / 'report.html'}."
+    raise DashboardError(message)
 
 
 def _command(arguments: list[str]) -> list[str]:
     return [sys.executable, "-m", "robot_gst", *arguments]
 
 
-def _step(output: Output, label: str, arguments: list[str], *, show_result: bool = False) -> None:
+def _step(
+    output: Output,
+    label: str,
+    arguments: list[str],
+    *needed: Background,
+    show_result: bool = False,
+) -> None:
+    """Run one command to its end; where it fails, what it needed may be the cause."""
     output.say(label)
     started = time.monotonic()
     quiet = ["--quiet"] if output.quiet else []
     stdout = None if show_result and not output.json else subprocess.DEVNULL
-    process = subprocess.Popen(_command([*arguments, *quiet]), stdout=stdout)
+    process = _start([*arguments, *quiet], stdout=stdout)
     try:
         code = process.wait()
     finally:
         _stop(process)
+    for background in needed:
+        background.check()
     if code != 0:
         raise StepFailedError(command=f"robot-gst {' '.join(arguments)}", code=code, log=None)
     output.say(f"    {time.monotonic() - started:.0f} s: robot-gst {' '.join(arguments)}")
 
 
-def _start(arguments: list[str], log: Path) -> Background:
-    with log.open("wb") as stream:
-        process = subprocess.Popen(
-            _command(arguments),
-            stdout=stream,
-            stderr=subprocess.STDOUT,
-            stdin=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONUNBUFFERED": "1"},
-        )
-    return Background(command=f"robot-gst {' '.join(arguments)}", process=process, log=log)
+def _start(arguments: list[str], **options: Any) -> subprocess.Popen[bytes]:
+    """Start a command that Ctrl-C does not reach: it is told to end in its turn."""
+    return subprocess.Popen(
+        _command(arguments), stdin=subprocess.DEVNULL, start_new_session=True, **options
+    )
+
+
+@contextmanager
+def _running(arguments: list[str], log: Path) -> Iterator[Background]:
+    """Leave a command running while the context lasts."""
+    with ExitStack() as stack, log.open("wb") as stream:
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+        process = _start(arguments, stdout=stream, stderr=subprocess.STDOUT, env=environment)
+        stack.callback(_stop, process)
+        yield Background(command=f"robot-gst {' '.join(arguments)}", process=process, log=log)
 
 
 def _answers(endpoint: str, key: str) -> bool:
@@ -236,24 +399,39 @@ def _free_port() -> int:
 
 
 def _close(run: RunFolder, config: DemoConfig, output: Output, seconds: float) -> None:
-    path, program = run.path, _program()
+    path, fit, void = run.path, _scene(run).get("fit", {}), look(run, config).void
     summary = {
         "run": str(path),
         "seconds": round(seconds, 1),
         "episodes": len(run.episodes()),
         "replays": len(run.derived("*.replay.*")),
+        "underfitted": bool(fit.get("underfitted")),
+        "without_outcome": {episode.stem: why for episode, why in void.items()},
         "report": str(run.results_dir / "report.html"),
     }
-    text = (
+    lines = [
         f"\nDone in {seconds:.0f} s: {summary['episodes']} episodes, {summary['replays']} replays. "
-        "All of it is from the stand-in cell, none of it is a real robot.\n"
-        "Look at next:\n"
-        f"  {summary['report']}   success table and agreement in one file\n"
-        f"  {program} ls {path}          what was recorded\n"
-        f"  {program} view {path}        the newest trial and the rebuilt scene in Rerun\n"
-        f"  {program} dashboard {path}   review pages"
-    )
-    output.result(summary, text)
+        "All of it is from the stand-in cell, none of it is a real robot."
+    ]
+    if summary["underfitted"]:
+        lines.append(
+            f"The scene is underfitted: its time limit struck after {fit['iterations']} of "
+            f"{config.iterations} images, so its renders are worse than they could be."
+        )
+    lines += [f"{episode.stem} has no outcome: {why}." for episode, why in void.items()]
+    lines += [
+        "Look at next:",
+        f"  {summary['report']}",
+        "      success table and agreement in one file",
+        f"  robot-gst ls {path}",
+        "      what was recorded",
+        f"  robot-gst view {path}",
+        "      the newest trial and the rebuilt scene in Rerun",
+        f"  robot-gst dashboard {path}",
+        "      review pages",
+        how_to_activate(),
+    ]
+    output.result(summary, "\n".join(lines))
     serve = sys.stdout.isatty() if config.serve is None else config.serve
     if serve:
         os.execv(  # the dashboard takes this process over, so Ctrl-C reaches it directly

@@ -14,7 +14,7 @@ from dashboards import wording
 from dashboards.comparison import Judgement, agrees
 from dashboards.figures import Cell, Scatter, scatter
 from evaluator.compare import TrialRow
-from evaluator.compare.measure import slug
+from evaluator.measurements import slug
 from evaluator.result import Exclusion, Measurement
 
 # --- Which of the evaluator's numbers go where on the overview. Chooses by id; computes nothing.

@@ -20,7 +20,8 @@ from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
-from bridge.task.robot import BASE_FRAME, FINGER_JOINTS, resolve_mesh
+from bridge.robots.default import BASE_FRAME, ROBOT
+from bridge.robots.robot import resolve_mesh
 from bridge.task.task_file import ObjectModel, Task
 from dashboards.errors import DashboardError
 from dashboards.frames import media_type
@@ -178,8 +179,9 @@ def log_robot(
     for index, name in enumerate(joints.names):
         _move(file, tree, prefix, name, joints, joints.position[:, index])
     if widths is not None:
-        for name in FINGER_JOINTS:
-            _move(file, tree, prefix, name, widths, widths.position[:, 0] / 2)
+        for finger in ROBOT.gripper.fingers:
+            values = finger.value(widths.position[:, 0])
+            _move(file, tree, prefix, finger.joint, widths, values)
     return True
 
 

@@ -119,6 +119,8 @@ def _compare(
             raise UsageError(message)
         return compare_csv(source, method=interval, goal=goal), beside
     run = RunFolder.open(source)
+    if not (run.notes_dir / "trials.csv").is_file():  # outcomes that were imported
+        run.refuse_empty()
     with SummaryCache(run.results_dir / FOLDER, fresh=force, say=output.say) as cache:
         comparison = compare_run(
             run, method=interval, goal=goal, images=images, cache=cache, output=output

@@ -1,1 +1,1 @@
-"""Rebuilds the place and re-lives the episode."""
+"""Rebuild a scene from recorded episodes, and replay plans and executions in it."""

@@ -1,4 +1,4 @@
-"""Commands of the room ``twin``; imports stay late so that --help is quick."""
+"""Commands of the package ``twin``; imports stay late so that --help is quick."""
 
 from pathlib import Path
 

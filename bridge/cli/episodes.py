@@ -1,24 +1,20 @@
-"""Commands about episodes on disk, and the doctor."""
+"""Commands about episodes on disk, alone or all of a run, and the doctor."""
 
+import textwrap
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-from bridge.terminal import Output
-
-if TYPE_CHECKING:
-    from bridge.episode.recover import RecoveryReport
-from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from bridge.episode.catalogue_store import CatalogueQuery
-from bridge.terminal import Advance
+from bridge.episode.catalogue_store import UNLABELLED, CatalogueQuery
+from bridge.terminal import Advance, Output
 
 if TYPE_CHECKING:
     from bridge.episode.catalogue_store import Entry
-
+    from bridge.episode.metadata import Outcome
+    from bridge.episode.recover import RecoveryReport
 
 OUTPUT = Output()
 
@@ -56,7 +52,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         f"{opened.duration_s:.1f} s, {sum(item.count for item in topics.values())} messages, "
         f"{sum(path.stat().st_size for path in opened.parts) / 1e6:.1f} MB"
         + (f" in {len(opened.parts)} parts" if len(opened.parts) > 1 else ""),
-        f"  outcome: {outcome.result if outcome else 'not labelled'}",
+        f"  outcome: {_outcome(about.kind, outcome)}",
     ]
     if opened.derived:
         derived = opened.derived
@@ -76,6 +72,14 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
     ]
     output.result(data, "\n".join(lines))
     return 0
+
+
+def _outcome(kind: str, outcome: "Outcome | None") -> str:
+    """How it ended, and why nobody knows where nobody does."""
+    if outcome is None:
+        return f"unknown ({UNLABELLED})" if kind == "trial" else f"none (a {kind} has none)"
+    unknown = outcome.result == "unknown" and outcome.detail
+    return f"{outcome.result} ({outcome.detail})" if unknown else outcome.result
 
 
 def check(episodes: list[Path], /, *, rerun: bool = False, output: Output = OUTPUT) -> int:
@@ -142,9 +146,6 @@ def doctor(*, output: Output = OUTPUT) -> int:
     return 0 if all(item.ok for item in findings) else 1
 
 
-# --- The command that finishes what a killed recorder left.
-
-
 def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OUTPUT) -> int:
     """Make readable episodes of files whose writer was killed, and say what was lost.
 
@@ -157,10 +158,12 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
         output: How to talk.
     """
     from bridge.episode import recover as recovery
-    from bridge.errors import GstError
+    from bridge.errors import GstError, UsageError
 
     files: list[Path] = []
     for path in paths:
+        if path.is_dir() and not any(path.rglob("*.mcap*")):
+            raise UsageError(f"no episodes in {path}. Give a run folder, or a file to recover.")
         files.extend(sorted(path.rglob("*.mcap.part")) if path.is_dir() else [path])
     reports = []
     for path in files:
@@ -170,7 +173,10 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
             if len(files) == 1:
                 raise
             reports.append(recovery.RecoveryReport(path=path, output=None, reason=str(error)))
-    text = "\n".join(_describe(report) for report in reports) or "nothing to recover"
+    text = (
+        "\n".join(_describe(report) for report in reports)
+        or "nothing to recover: every file is finished"
+    )
     output.result({"files": [asdict(report) for report in reports]}, text)
     return 1 if any(report.output is None for report in reports) else 0
 
@@ -190,8 +196,6 @@ def _describe(report: "RecoveryReport") -> str:
         lines.append(f"  the damaged original is kept: {report.original}")
     return "\n".join(lines)
 
-
-# --- Commands about all episodes of a run: list, label, export the list.
 
 EVERYTHING = CatalogueQuery()
 WORTH_A_BAR = 200
@@ -216,10 +220,7 @@ def ls(
         output: How to talk.
     """
     entries = _find(run, query, output)
-    lines = [_line(entry) for entry in entries]
-    if not lines:
-        empty = f"no episodes in {run}. Record some: robot-gst record {run}"
-        lines = [empty if query == EVERYTHING else f"no episode in {run} passes these filters"]
+    lines = _table(entries) if entries else [f"no episode in {run} passes these filters"]
     output.result({"episodes": [vars(entry) for entry in entries]}, "\n".join(lines))
     return 1 if any(entry.error for entry in entries) else 0
 
@@ -237,26 +238,65 @@ def _find(run: Path, query: CatalogueQuery, output: Output) -> "list[Entry]":
             for show in shown:
                 show(done, "")
 
-        return find_episodes(RunFolder.open(run), query, advance=advance)
+        opened = RunFolder.open(run)
+        opened.refuse_empty()
+        return find_episodes(opened, query, advance=advance)
 
 
-def _line(entry: "Entry") -> str:
-    flags = [f"{entry.parts} parts"] if entry.parts > 1 else []
-    flags += [f"{entry.lost} lost"] if entry.lost else []
-    flags += [
-        text
-        for text, there in (
-            ("recovered, tail missing", entry.recovered),
-            ("stand-in", entry.stand_in),
-            (_shown(entry.error), entry.error),
-        )
-        if there
+COLUMNS = ("episode", "kind", "condition", "outcome", "seconds", "MB")
+WIDEST = 26
+"""Of an episode's name beside the other columns; a longer one has a line of its own."""
+
+
+WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}
+
+
+def _table(entries: "list[Entry]") -> list[str]:
+    """A header, a row for each episode within 80 columns, and below it what is special about it."""
+    rows = [COLUMNS, *(_row(entry) for entry in entries)]
+    widths = [
+        max(len(row[k]) for row in rows if len(row[k]) <= WIDEST) for k in range(len(COLUMNS))
     ]
+    all_stand_in = all(entry.stand_in for entry in entries)
+    lines = ["all from the stand-in cell"] if all_stand_in else []
+    for row, entry in zip(rows, [None, *entries], strict=True):
+        name = row[0]
+        if len(name) > WIDEST:
+            lines.append(name)
+            name = ""
+        cells = [name.ljust(widths[0])]
+        cells += [text.ljust(width) for text, width in zip(row[1:4], widths[1:4], strict=True)]
+        cells += [text.rjust(width) for text, width in zip(row[4:], widths[4:], strict=True)]
+        lines.append("  ".join(cells).rstrip())
+        if entry is not None:
+            notes = textwrap.wrap(_notes(entry, is_named=not all_stand_in), 76, **WHOLE_WORDS)
+            lines += [f"    {note}" for note in notes]
+    return lines
+
+
+def _row(entry: "Entry") -> tuple[str, ...]:
+    outcome = _shown(entry.outcome)
+    if entry.outcome == "unknown" and entry.cause in ("", UNLABELLED):
+        outcome = "unlabelled" if entry.cause else "-"
     return (
-        f"{_shown(entry.id):<28} {_shown(entry.kind):<9} {_shown(entry.condition):<20} "
-        f"{_shown(entry.outcome):<8} {entry.duration_s:7.1f} s {entry.size_bytes / 1e6:7.1f} MB"
-        f"{'  ' + ', '.join(flags) if flags else ''}"
+        _shown(entry.id),
+        _shown(entry.kind) or "-",
+        _shown(entry.condition) or "-",
+        outcome,
+        f"{entry.duration_s:.1f}",
+        f"{entry.size_bytes / 1e6:.1f}",
     )
+
+
+def _notes(entry: "Entry", *, is_named: bool) -> str:
+    """What is special about an episode, and why its outcome is unknown."""
+    notes = [f"{entry.parts} parts"] if entry.parts > 1 else []
+    notes += [f"{entry.lost} messages lost"] if entry.lost else []
+    notes += ["recovered, its end is missing"] if entry.recovered else []
+    notes += ["from the stand-in cell"] if entry.stand_in and is_named else []
+    if entry.cause and entry.cause != UNLABELLED:
+        notes.append(f"unknown: {_shown(entry.cause)}")
+    return "; ".join(notes + ([_shown(entry.error)] if entry.error else []))
 
 
 def _shown(text: str, most: int = 200) -> str:

@@ -15,6 +15,7 @@ from typing import Any
 from bridge.episode.catalogue_store import (
     FILE_NAME,
     LABEL_SUFFIX,
+    UNLABELLED,
     CatalogueQuery,
     CatalogueStore,
     Trace,
@@ -86,6 +87,8 @@ def find_episodes(
         advance: Called while files are read that the catalogue does not know yet.
     """
     path = run.path / FILE_NAME
+    if not run.episodes_dir.is_dir():  # somebody else's folder: nothing is written into it
+        return _answer(run, CatalogueStore(None), query, advance)
     try:
         return _answer(run, CatalogueStore(path), query, advance)
     except sqlite3.Error as error:
@@ -205,12 +208,20 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         stand_in=info.stand_in,
         tags=tuple(printable(str(tag)) for tag in info.tags),
         outcome=printable(outcome.result) if outcome else "unknown",
+        cause=printable(_cause(info.kind, outcome)),
         start_ns=_fit(episode.start_ns),
         duration_s=episode.duration_s,
         messages=messages,
         lost=_declared_lost(records.get("drops")),
         recovered="recovered" in records,
     )
+
+
+def _cause(kind: str, outcome: Outcome | None) -> str:
+    """Why an outcome is unknown; a scan has none, and needs none."""
+    if outcome is None:
+        return UNLABELLED if kind == "trial" else ""
+    return outcome.detail or "" if outcome.result == "unknown" else ""
 
 
 def _extent(parts: tuple[Path, ...]) -> dict[str, Any]:

@@ -23,6 +23,8 @@ from bridge.errors import UsageError, refuse_outside
 #
 # Opens no file, so that listing what is known costs no more than a look at the folder.
 
+UNLABELLED = "nobody labelled it"
+"""Why the outcome of a trial is unknown that has no label."""
 LABEL_SUFFIX = ".outcome.json"
 """Of the sidecar under ``notes/`` that holds a label given after the fact."""
 UNSETTLED_NS = 2_000_000_000
@@ -49,6 +51,8 @@ class Entry:
     tags: tuple[str, ...] = ()
     outcome: str = "unknown"
     """success, failure or unknown; a label given after the fact wins."""
+    cause: str = ""
+    """Why the outcome is unknown, where somebody said so."""
     start_ns: int = 0
     """First log time [ns]."""
     duration_s: float = 0.0
@@ -234,7 +238,7 @@ def _instant_ns(name: str, text: str | None) -> int | None:
 
 
 FILE_NAME = "catalogue.sqlite"
-VERSION = 1
+VERSION = 2
 """Raise it whenever a column, or the way one is read from an episode, changes."""
 BUSY_S = 5.0
 

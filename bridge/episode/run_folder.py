@@ -141,6 +141,16 @@ class RunFolder:
         names = [path.name for path in self.episodes_dir.glob("*.mcap")]
         return [self.episodes_dir / name for name in first_parts(names)]
 
+    def refuse_empty(self) -> None:
+        """Raise where there is nothing to work on.
+
+        Raises:
+            UsageError: When the folder holds no episode.
+        """
+        if not self.episodes():
+            message = f"no episodes in {self.path}. Record some: robot-gst record {self.path}."
+            raise UsageError(message)
+
     def parts(self, path: Path) -> list[Path]:
         """All files of the episode that begins with this one, in order."""
         return part_paths(path)

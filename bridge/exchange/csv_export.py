@@ -15,7 +15,6 @@ from bridge.episode.cdr.messages import JointSample, PoseSample
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import GRIPPER_STATE, is_truth
-from bridge.errors import UsageError
 from bridge.exchange.output import message_named, new_folder, write_note
 from bridge.geometry import se3
 from bridge.task.record import parse_record
@@ -261,11 +260,8 @@ def episode_files(source: Path, *, derived: bool) -> tuple[list[Path], Path]:
     if not source.is_dir():
         return [source], source.parent
     run = RunFolder.open(source)
-    files = run.episodes() + (run.derived() if derived else [])
-    if not files:
-        message = f"no episodes in {source}. Record some: robot-gst record {source}."
-        raise UsageError(message)
-    return files, source
+    run.refuse_empty()
+    return run.episodes() + (run.derived() if derived else []), source
 
 
 def export_csv(

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from bridge.data_files import dataset_file
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.task.data import dataset_file
 from bridge.task.meshes.toys import DESIGNS
 
 SCHEMA_VERSION = 1

@@ -7,9 +7,26 @@ from functools import partial
 
 import numpy as np
 
-from evaluator.compare.measure import measured, slug
+from evaluator.compare.measure import measured
 from evaluator.compare.rows import RateCell
 from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import (
+    BIAS,
+    CALIBRATION_INTERCEPT,
+    CALIBRATION_SLOPE,
+    KENDALL,
+    LARGEST_GAP,
+    MAE,
+    MMRV_RECORDED,
+    MMRV_SIM,
+    ORDER_ACCURACY,
+    PEARSON_R,
+    PEARSON_R_OF_CONDITION,
+    PEARSON_R_REMEASURED,
+    RMSE,
+    SPEARMAN,
+    Quantity,
+)
 from evaluator.result import Cell, Interval, Measurement, Table
 from evaluator.statistics import agreement
 from evaluator.statistics.agreement import Number, counted_cells, fisher_interval, pearson
@@ -258,16 +275,13 @@ def cell_agreement(cells: Sequence[RateCell]) -> list[Measurement]:
     what += f", rates counted in different units ({', '.join(units)})" if len(units) > 1 else ""
     make = partial(_measure, usable, intervals, what)
     return [
-        _pearson(usable, "agreement.pearson_r", what),
+        _pearson(usable, PEARSON_R, what),
         *_pearson_by_condition(usable),
         _remeasured(usable, intervals, what),
-        *_errors(usable, make),
-        *_line_and_ranks(usable, make),
+        *_rest(usable, make),
         measured(
-            "agreement.largest_gap_pp",
+            LARGEST_GAP.of(what=what),
             lambda: 100 * agreement.largest_gap(**_both(usable)),
-            unit="pp",
-            definition=f"largest |sim rate - recorded rate| {what}",
             n=len(usable),
             counted="cell",
             reason_without_interval="a largest value grows with the number of cells",
@@ -294,14 +308,13 @@ def _measure(
     cells: Sequence[RateCell],
     intervals: CellIntervals,
     what: str,
-    name: str,
+    quantity: Quantity,
     statistic: str,
     value: Statistic,
-    unit: str,
-    definition: str,
+    **parts: str,
 ) -> Measurement:
     """Measure one statistic with the interval that the coverage map chooses for it."""
-    factor = 100.0 if unit == "pp" else 1.0
+    factor = 100.0 if quantity.unit == "pp" else 1.0
     found = intervals.of(statistic)
 
     def compute() -> tuple[float, Interval | None]:
@@ -317,10 +330,8 @@ def _measure(
 
     resampled = f"; interval: {intervals.unit} resampled" if intervals.kind == "clusters" else ""
     return measured(
-        name,
+        quantity.of(what=what, resampled=resampled, **parts),
         compute,
-        unit=unit,
-        definition=f"{definition.format(what)}{resampled}",
         n=len(cells),
         counted="cell",
         reason_without_interval=found.reason,
@@ -331,103 +342,36 @@ def _measure(
     )
 
 
-def _errors(cells: Sequence[RateCell], make: "partial[Measurement]") -> list[Measurement]:
+def _rest(cells: Sequence[RateCell], make: "partial[Measurement]") -> list[Measurement]:
+    """Ranks, errors, the calibration line, and MMRV in both conventions."""
     both = _both(cells)
+    recorded, sim = both["recorded"], both["sim"]
     return [
+        make(SPEARMAN, "spearman", lambda: agreement.spearman(recorded, sim)),
+        make(KENDALL, "kendall", lambda: agreement.kendall(recorded, sim)),
+        make(BIAS, "bias", lambda: agreement.bias(**both)),
+        make(MAE, "mae", lambda: agreement.mean_absolute_error(**both)),
+        make(RMSE, "rmse", lambda: agreement.root_mean_square_error(**both)),
+        make(CALIBRATION_SLOPE, "slope", lambda: agreement.calibration_line(**both).slope),
         make(
-            "agreement.spearman_rho",
-            "spearman",
-            lambda: agreement.spearman(both["recorded"], both["sim"]),
-            "1",
-            "Spearman rank correlation of the same rates {}; average ranks",
+            CALIBRATION_INTERCEPT, "intercept", lambda: agreement.calibration_line(**both).intercept
         ),
-        make(
-            "agreement.kendall_tau_b",
-            "kendall",
-            lambda: agreement.kendall(both["recorded"], both["sim"]),
-            "1",
-            "Kendall's tau-b of the same rates {}",
-        ),
-        make(
-            "agreement.bias_pp",
-            "bias",
-            lambda: agreement.bias(**both),
-            "pp",
-            "mean of sim rate - recorded rate {}; above 0 the twin is optimistic",
-        ),
-        make(
-            "agreement.mae_pp",
-            "mae",
-            lambda: agreement.mean_absolute_error(**both),
-            "pp",
-            "mean |sim rate - recorded rate| {}",
-        ),
-        make(
-            "agreement.rmse_pp",
-            "rmse",
-            lambda: agreement.root_mean_square_error(**both),
-            "pp",
-            "square root of the mean (sim rate - recorded rate)^2 {}",
-        ),
+        make(ORDER_ACCURACY, "order", lambda: agreement.order_accuracy(**both).value),
+        make(MMRV_RECORDED, "mmrv-recorded", partial(agreement.mmrv, **both, gap="recorded")),
+        make(MMRV_SIM, "mmrv-sim", partial(agreement.mmrv, **both, gap="sim")),
     ]
 
 
-def _line_and_ranks(cells: Sequence[RateCell], make: "partial[Measurement]") -> list[Measurement]:
-    both = _both(cells)
-    return [
-        make(
-            "agreement.calibration_slope",
-            "slope",
-            lambda: agreement.calibration_line(**both).slope,
-            "1",
-            "slope of recorded = a + b x sim, least squares {}; 1 is calibrated, noise pulls it "
-            "towards 0",
-        ),
-        make(
-            "agreement.calibration_intercept_pp",
-            "intercept",
-            lambda: agreement.calibration_line(**both).intercept,
-            "pp",
-            "intercept of the same line {}",
-        ),
-        make(
-            "agreement.order_accuracy",
-            "order",
-            lambda: agreement.order_accuracy(**both).value,
-            "1",
-            "pairs of cells that the twin orders as the recorded rates do / pairs whose recorded "
-            "rates differ; a tie in the twin counts 1/2; {}",
-        ),
-        make(
-            "agreement.mmrv_recorded_gap",
-            "mmrv-recorded",
-            partial(agreement.mmrv, **both, gap="recorded"),
-            "1",
-            "mean maximum rank violation {}; convention: gap of recorded rates (SIMPLER equation "
-            "1); it grows with the number of cells",
-        ),
-        make(
-            "agreement.mmrv_sim_gap",
-            "mmrv-sim",
-            partial(agreement.mmrv, **both, gap="sim"),
-            "1",
-            "mean maximum rank violation {}; convention: gap of sim rates (arguments swapped, as "
-            "some published code does); it grows with the number of cells",
-        ),
-    ]
-
-
-def _pearson(cells: Sequence[RateCell], name: str, what: str) -> Measurement:
+def _pearson(cells: Sequence[RateCell], quantity: Quantity, what: str, **parts: str) -> Measurement:
     recorded, sim = sides(cells)
     return _measure(
         cells,
         CellIntervals(cells),
         what,
-        name,
+        quantity,
         "pearson",
         lambda: agreement.pearson(recorded, sim),
-        "1",
-        "Pearson r of the twin's and the recorded success rates {}",
+        **parts,
     )
 
 
@@ -438,8 +382,9 @@ def _pearson_by_condition(cells: Sequence[RateCell]) -> list[Measurement]:
     return [
         _pearson(
             [cell for cell in cells if cell.condition == condition],
-            f"agreement.pearson_r.{slug(condition)}",
+            PEARSON_R_OF_CONDITION,
             f"over cells {condition} only",
+            condition=condition,
         )
         for condition in conditions
     ]
@@ -457,11 +402,8 @@ def _remeasured(cells: Sequence[RateCell], intervals: CellIntervals, what: str) 
             return r, None
 
     return measured(
-        "agreement.pearson_r_remeasured",
+        PEARSON_R_REMEASURED.of(what=what),
         compute,
-        unit="1",
-        definition=f"the same r {what}; its band is where r would fall if the same cells were "
-        "measured again with as many trials",
         n=len(cells),
         counted="cell",
         reason_without_interval="r is exactly 1 or -1, or no other outcome changes it",

@@ -8,10 +8,18 @@ from statistics import median
 import numpy as np
 
 from bridge.geometry.trajectory import PoseTrajectory
-from evaluator.compare.measure import interval_or_reason, measured, slug
+from evaluator.compare.measure import interval_or_reason, measured
 from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import (
+    BAND_ALONG_PATH,
+    BAND_DISTANCES,
+    BAND_MEDIAN,
+    BAND_WIDTH,
+    BAND_WITHOUT_OFFSET,
+    INSIDE_BAND,
+    REPEATABILITY,
+)
 from evaluator.metrics.trajectory import (
-    MOVING_THRESHOLD_M,
     BandDistance,
     Repeatability,
     band_distance,
@@ -25,36 +33,6 @@ from evaluator.result import Interval, Measurement
 from evaluator.statistics.intervals import median_interval
 
 NO_INTERVAL = "the runs' own spread is the repeatability beside it"
-WHOLE = "whole recordings, waiting at their ends included"
-MOVING = (
-    "the moving part only, from leaving the start to arriving at the end, each within "
-    f"{MOVING_THRESHOLD_M * 1000:.0f} mm"
-)
-BAND_WIDTH = 2.0
-"""The recorded band reaches this many of its root mean square distances from its mean curve."""
-
-DISTANCES: tuple[tuple[str, str, str], ...] = (
-    (
-        "mean_over_pairs_m",
-        "m",
-        "distance over normalised time, mean over all (recorded, simulated) pairs of runs",
-    ),
-    ("between_mean_curves_m", "m", "distance of the two mean curves, mean over normalised time"),
-    ("max_between_mean_curves_m", "m", "largest distance of the two mean curves"),
-    ("end_point_over_pairs_m", "m", "distance of the end points, mean over all pairs of runs"),
-    ("end_point_between_means_m", "m", "distance of the mean end points"),
-    (
-        "turned_over_pairs_rad",
-        "rad",
-        "angle between what both turned since they began, over normalised time, mean over all "
-        "(recorded, simulated) pairs of runs",
-    ),
-)
-SPREADS: tuple[tuple[str, str], ...] = (
-    ("mean_m", "root mean square distance from the mean curve, mean over normalised time"),
-    ("worst_m", "root mean square distance from the mean curve at its worst instant"),
-    ("end_point_m", "root mean square distance from the mean end point"),
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,62 +88,51 @@ def distance_measurements(task: str, real: Side, simulated: Side) -> list[Measur
     measurements = []
     what = f"end effector, {len(real.runs)} recorded against {len(simulated.runs)} "
     what += f"{simulated.name} runs, unpaired"
-    for prefix, part, cut in (("", WHOLE, _whole), ("moving_", MOVING, moving_part)):
+    parts = {"task": task, "engine": simulated.name, "what": what}
+    for prefix, cut in (("", _whole), ("moving_", moving_part)):
         distance = band_distance(real.tracks(cut), simulated.tracks(cut))
         make = partial(measured, episodes=[*real.episodes, *simulated.episodes])
-        first = f"bands.{slug(task)}.{slug(simulated.name)}.{prefix}"
         measurements += [
             make(
-                f"{first}{name}",
+                quantity.of(**parts),
                 partial(_field, distance, name),
-                unit=unit,
-                definition=f"{what}: {words}; {part}",
                 n=len(real.runs) * len(simulated.runs),
                 counted="pair of runs",
                 reason_without_interval=NO_INTERVAL,
             )
-            for name, unit, words in DISTANCES
+            for name, quantity in BAND_DISTANCES[prefix].items()
         ]
         _, why_none = interval_or_reason(median_interval, distance.of_recorded_m)
         measurements.append(
             make(
-                f"{first}median_over_recorded_m",
+                BAND_MEDIAN[prefix].of(**parts),
                 partial(_median, distance.of_recorded_m),
-                unit="m",
-                definition=f"{what}: median over recorded runs of the mean distance to these "
-                f"simulated runs, so where another recorded run would lie; {part}",
                 n=len(real.runs),
                 counted="run",
                 reason_without_interval=why_none,
             )
         )
-    return [*measurements, *_shape(task, real, simulated, what)]
+    return [*measurements, *_shape(real, simulated, parts)]
 
 
-def _shape(task: str, real: Side, simulated: Side, what: str) -> list[Measurement]:
+def _shape(real: Side, simulated: Side, parts: dict[str, str]) -> list[Measurement]:
     """Measure the moving parts without their speed, and without a constant offset."""
     tracks = real.tracks(moving_part), simulated.tracks(moving_part)
     make = partial(
         measured,
-        unit="m",
         n=len(real.runs) * len(simulated.runs),
         counted="pair of runs",
         reason_without_interval=NO_INTERVAL,
         episodes=[*real.episodes, *simulated.episodes],
     )
-    first = f"bands.{slug(task)}.{slug(simulated.name)}.moving_"
     return [
         make(
-            f"{first}along_path_m",
+            BAND_ALONG_PATH.of(**parts),
             lambda: path_distance_m(*tracks),
-            definition=f"{what}: distance at equal shares of the way, whatever the speed, mean "
-            f"over all (recorded, simulated) pairs of runs; {MOVING}",
         ),
         make(
-            f"{first}without_offset_m",
+            BAND_WITHOUT_OFFSET.of(**parts),
             lambda: float(without_rigid_motion(*(mean_curve_m(side) for side in tracks)).mean()),
-            definition=f"{what}: distance of the two mean curves after the best rigid motion is "
-            f"taken out, mean over normalised time; {MOVING}",
         ),
     ]
 
@@ -181,12 +148,8 @@ def inside_band(task: str, real: Side, simulated: Side) -> list[Measurement]:
 
     return [
         measured(
-            f"bands.{slug(task)}.{slug(simulated.name)}.moving_inside_band",
+            INSIDE_BAND.of(task=task, engine=simulated.name),
             share,
-            unit="1",
-            definition="share of normalised time in which the simulated mean curve is nearer to "
-            f"the recorded one than {BAND_WIDTH:g} root mean square distances of the recorded runs "
-            f"from it; {MOVING}",
             n=len(real.runs),
             counted="run",
             reason_without_interval=NO_INTERVAL,
@@ -211,16 +174,14 @@ def spread_measurements(task: str, side: Side) -> list[Measurement]:
 
     return [
         measured(
-            f"repeatability.{slug(task)}.{slug(side.name)}.{name}",
+            quantity.of(task=task, side=side.name, count=len(side.runs)),
             partial(read, name),
-            unit="m",
-            definition=f"end effector, spread of {len(side.runs)} {side.name} runs: {words}",
             n=len(side.runs),
             counted="run",
             reason_without_interval="not estimated",
             episodes=side.episodes,
         )
-        for name, words in SPREADS
+        for name, quantity in REPEATABILITY.items()
     ]
 
 

@@ -10,20 +10,28 @@ from dataclasses import dataclass
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from evaluator.compare.band_measurements import (
-    BAND_WIDTH,
-    MOVING,
+    BandCurve as BandCurve,  # part of what the report says
+)
+from evaluator.compare.band_measurements import (
     Run,
     Side,
     distance_measurements,
     inside_band,
     spread_measurements,
 )
-from evaluator.compare.band_measurements import (
-    BandCurve as BandCurve,  # part of what the report says
-)
-from evaluator.compare.measure import Part, degrees, millimetres, slug
+from evaluator.compare.measure import Part, degrees, millimetres
 from evaluator.compare.trial import tcp_track
 from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import (
+    BAND_ALONG_PATH,
+    BAND_DISTANCES,
+    BAND_WIDTH,
+    BAND_WITHOUT_OFFSET,
+    INSIDE_BAND,
+    MOVING,
+    REPEATABILITY,
+    Quantity,
+)
 from evaluator.metrics.trajectory import band_distance, moving_part, repeatability
 from evaluator.result import Cell, Exclusion, Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
@@ -37,25 +45,26 @@ OVER_TIME = range(0, 101, 10)
 def band_row(task: str, engine: str, by_id: Mapping[str, Measurement]) -> tuple[Cell, ...]:
     """One engine's row."""
 
-    def length(measurement_id: str) -> float | None:
-        return millimetres(by_id[measurement_id].value)
+    def of(quantity: Quantity, side: str = "") -> Measurement:
+        words = {"task": task, "engine": engine, "side": side, "what": "", "count": 0}
+        return by_id[quantity.of(**words).id]
 
-    band = f"bands.{slug(task)}.{slug(engine)}"
-    recorded, simulated = (f"repeatability.{slug(task)}.{slug(s)}" for s in ("recorded", engine))
-    inside = by_id[f"{band}.moving_inside_band"].value
+    recorded, simulated = (of(REPEATABILITY["mean_m"], side) for side in ("recorded", engine))
+    whole, moving = BAND_DISTANCES[""], BAND_DISTANCES["moving_"]
+    inside = of(INSIDE_BAND).value
     return (
         engine,
-        by_id[f"{recorded}.mean_m"].n,
-        by_id[f"{simulated}.mean_m"].n,
-        length(f"{band}.mean_over_pairs_m"),
-        length(f"{band}.moving_mean_over_pairs_m"),
-        length(f"{band}.moving_between_mean_curves_m"),
-        length(f"{band}.moving_without_offset_m"),
-        length(f"{band}.moving_along_path_m"),
-        length(f"{band}.end_point_over_pairs_m"),
-        degrees(by_id[f"{band}.moving_turned_over_pairs_rad"].value),
-        length(f"{recorded}.mean_m"),
-        length(f"{simulated}.mean_m"),
+        recorded.n,
+        simulated.n,
+        millimetres(of(whole["mean_over_pairs_m"]).value),
+        millimetres(of(moving["mean_over_pairs_m"]).value),
+        millimetres(of(moving["between_mean_curves_m"]).value),
+        millimetres(of(BAND_WITHOUT_OFFSET).value),
+        millimetres(of(BAND_ALONG_PATH).value),
+        millimetres(of(whole["end_point_over_pairs_m"]).value),
+        degrees(of(moving["turned_over_pairs_rad"]).value),
+        millimetres(recorded.value),
+        millimetres(simulated.value),
         None if inside is None else f"{100 * inside:.0f} %",
     )
 

@@ -8,6 +8,7 @@ from evaluator.compare.agreement import sides, usable_cells
 from evaluator.compare.measure import measured, proportion
 from evaluator.compare.rows import RateCell
 from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import DECISIONS, REGRET
 from evaluator.result import Measurement, Table
 from evaluator.statistics import agreement
 from evaluator.statistics.agreement import Decision, choose, over_tasks, without_each
@@ -32,27 +33,19 @@ def decisions(cells: Sequence[RateCell]) -> tuple[list[Measurement], tuple[Table
     measurements = [
         _of_these_tasks(
             proportion(
-                f"decision.{name}",
+                quantity.of(),
                 sum(getattr(decision, name) for decision in found.values()),
                 len(found),
-                definition=f"tasks in which {words} (best: highest rate, ties together) / tasks "
-                "with a choice of condition or policy",
                 counted="task",
                 reason_if_undefined=why,
             )
         )
-        for name, words in (
-            ("surely_right", "every choice that is best in the twin is among the recorded best"),
-            ("possibly_right", "one choice that is best in the twin is among the recorded best"),
-        )
+        for name, quantity in DECISIONS.items()
     ]
     measurements.append(
         measured(
-            "decision.regret_pp",
+            REGRET.of(),
             lambda: _mean_regret(found, why),
-            unit="pp",
-            definition="recorded success lost by choosing what is best in the twin, the worst of "
-            "a tie, mean over tasks with a choice",
             n=len(found),
             counted="task",
             reason_without_interval=NO_SAMPLE,

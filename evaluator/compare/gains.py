@@ -7,10 +7,25 @@ from typing import Any
 
 import numpy as np
 
-from evaluator.compare.measure import measured, slug
+from evaluator.compare.measure import measured
 from evaluator.compare.rows import RateCell, TrialRow, is_streamed
 from evaluator.compare.success import WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import (
+    BOSCHLOO,
+    BOSCHLOO_POOLED,
+    DETECTABLE_RATE,
+    GAIN_POINTS,
+    GAIN_POINTS_AVERAGE,
+    GAIN_RELATIVE,
+    GAIN_RELATIVE_AVERAGE,
+    MCNEMAR,
+    PAIRED_GAIN,
+    PAIRED_POWER,
+    POWER_UNPAIRED,
+    START_DISTANCE,
+    TRIALS_NEEDED,
+)
 from evaluator.result import Exclusion, Interval, Measurement
 from evaluator.statistics.differences import (
     boschloo,
@@ -104,12 +119,10 @@ def start_distances(pairs: Sequence[StartPair]) -> list[Measurement]:
     unknown = len(pairs) - len(known)
     return [
         measured(
-            f"paired.start_distance_{name}_m",
+            START_DISTANCE[name].of(
+                limit_mm=START_LIMIT_M * 1000, unknown=unknown, count=len(pairs)
+            ),
             partial(_summary_m, summary, distances),
-            unit="m",
-            definition=f"{name} over paired starts of the largest distance between the localised "
-            f"objects of both trials; pairs beyond {START_LIMIT_M * 1000:.0f} mm are excluded, "
-            f"{unknown} of {len(pairs)} pairs were not localised and are kept",
             n=len(known),
             counted="pair",
             reason_without_interval="the limit is what counts",
@@ -142,16 +155,13 @@ def paired_gain(pairs: Sequence[StartPair]) -> list[Measurement]:
         words = f"{improved} improved, {worsened} worsened of {len(known)} paired starts ({side})"
         measurements.append(_paired_points(side, known, improved, worsened, words))
         measurements.append(_paired_power(side, known, improved, worsened, words))
-        for kind in ("exact", "mid"):
+        for kind, quantity in MCNEMAR.items():
             measurements.append(
                 measured(
-                    f"paired.mcnemar_p_{kind}.{side}",
+                    quantity.of(side=side, words=words),
                     lambda answers=answers, kind=kind: getattr(  # type: ignore[misc]
                         mcnemar(answers), f"p_{kind}"
                     ),
-                    unit="1",
-                    definition=f"two-sided McNemar test, {kind}"
-                    f"{'-p' if kind == 'mid' else ' binomial'}: {words}",
                     n=len(known),
                     counted="pair",
                     reason_without_interval="a p-value",
@@ -170,10 +180,8 @@ def _paired_points(
         return 100 * (improved - worsened) / len(known), interval
 
     return measured(
-        f"paired.gain_pp.{side}",
+        PAIRED_GAIN.of(side=side, words=words),
         points,
-        unit="pp",
-        definition=f"gain with replanning in percentage points over paired starts: {words}",
         n=len(known),
         counted="pair",
         episodes=[r.episode for pair in known for r in (pair.before, pair.after)],
@@ -189,11 +197,8 @@ def _paired_power(
         return power_paired(improved / len(known), worsened / len(known), len(known))
 
     return measured(
-        f"power.paired.{side}",
+        PAIRED_POWER.of(side=side, count=len(known), words=words),
         power,
-        unit="1",
-        definition=f"chance that McNemar's exact test on {len(known)} pairs is significant at 0.05 "
-        f"if these shares are true: {words}",
         n=len(known),
         counted="pair",
         reason_without_interval="a plan, not an estimate",
@@ -212,8 +217,8 @@ A_RATIO = "a ratio of two rates; the interval is that of the gain in percentage 
 class Change:
     """One task and policy on one side, without and with replanning."""
 
-    name: str
-    """As the ids spell it."""
+    task: str
+    policy: str
     side: str
     before: Measurement
     after: Measurement
@@ -225,6 +230,11 @@ class Change:
         if first.k is None or not first.n or second.k is None or not second.n:
             return None
         return first.k, first.n, second.k, second.n
+
+    @property
+    def parts(self) -> dict[str, str]:
+        """Parts of the ids."""
+        return {"side": self.side, "task": self.task, "policy": self.policy}
 
     @property
     def words(self) -> str:
@@ -241,10 +251,9 @@ def changes(cells: Sequence[RateCell]) -> list[Change]:
         after = found.get((task, policy, WITH))
         if condition != WITHOUT or after is None:
             continue
-        name = f"{slug(task)}.{slug(policy)}"
         for side in SIDES:
             first, second = getattr(before, side), getattr(after, side)
-            pairs.append(Change(name=name, side=side, before=first, after=second))
+            pairs.append(Change(task=task, policy=policy, side=side, before=first, after=second))
     return pairs
 
 
@@ -295,19 +304,14 @@ def _gain(change: Change, method: str) -> list[Measurement]:
     )
     return [
         make(
-            f"gain.pp.{change.side}.{change.name}",
+            GAIN_POINTS.of(**change.parts, words=change.words),
             points,
-            unit="pp",
-            definition=f"gain with replanning in percentage points ({change.side}): {change.words}",
             reason_without_interval="no n",
             interval_n=arms,
         ),
         make(
-            f"gain.relative.{change.side}.{change.name}",
+            GAIN_RELATIVE.of(**change.parts, words=change.words),
             lambda: relative_gain(_value(before), _value(after)),
-            unit="1",
-            definition=f"relative gain with replanning ({change.side}), (with - without) / "
-            f"without: {change.words}; not percentage points",
             reason_without_interval=A_RATIO,
         ),
     ]
@@ -321,22 +325,17 @@ def _average_gains(pairs: Sequence[Change]) -> list[Measurement]:
             continue
         first = partial(_mean, [change.before for change in mine])
         second = partial(_mean, [change.after for change in mine])
-        what = f"of the unrounded mean rates of {len(mine)} tasks ({side})"
         measurements += [
             measured(
-                f"gain.pp.{side}.average",
+                GAIN_POINTS_AVERAGE.of(side=side, count=len(mine)),
                 lambda first=first, second=second: 100 * (second() - first()),  # type: ignore[misc]
-                unit="pp",
-                definition=f"gain with replanning in percentage points {what}",
                 n=len(mine),
                 counted="task",
                 reason_without_interval="tasks may be counted in different units",
             ),
             measured(
-                f"gain.relative.{side}.average",
+                GAIN_RELATIVE_AVERAGE.of(side=side, count=len(mine)),
                 lambda first=first, second=second: relative_gain(first(), second()),  # type: ignore[misc]
-                unit="1",
-                definition=f"relative gain with replanning {what}; not percentage points",
                 n=len(mine),
                 counted="task",
                 reason_without_interval="a ratio of two means over these tasks",
@@ -351,40 +350,30 @@ def _tests(change: Change) -> list[Measurement]:
         return []
     k_first, n_first, k_second, n_second = counts
     p_first, p_second = k_first / n_first, k_second / n_second
-    arm, name = min(n_first, n_second), f"{change.side}.{change.name}"
+    arm, parts = min(n_first, n_second), change.parts
     about = f"{change.words} ({change.side})"
     power = f"{100 * POWER:.0f} % power, two-sided at {ALPHA:g}, normal approximation"
     episodes = (*change.before.episodes, *change.after.episodes)
     make = partial(measured, n=arm, counted=change.before.counted, episodes=episodes)
     return [
         make(
-            f"unpaired.boschloo_p.{name}",
+            BOSCHLOO.of(**parts, about=about),
             partial(boschloo, *counts),
-            unit="1",
-            definition=f"two-sided p of Boschloo's exact test, starts not paired: {about}",
             reason_without_interval="a p-value",
         ),
         make(
-            f"power.trials_needed.{name}",
+            TRIALS_NEEDED.of(**parts, about=about, power=power),
             lambda: float(trials_needed(p_first, p_second)),
-            unit="count",
-            definition=f"per condition, to show a gain as large as {about} with {power}",
             reason_without_interval="a plan, not an estimate",
         ),
         make(
-            f"power.this_large.{name}",
+            POWER_UNPAIRED.of(**parts, about=about, arm=arm, alpha=ALPHA),
             lambda: power_unpaired(p_first, p_second, arm),
-            unit="1",
-            definition=f"chance that {arm} per condition show a gain as large as {about}, were it "
-            f"true; two-sided at {ALPHA:g}, normal approximation",
             reason_without_interval="a plan, not an estimate",
         ),
         make(
-            f"power.detectable_rate.{name}",
+            DETECTABLE_RATE.of(**parts, arm=arm, percent=100 * p_first, power=power),
             lambda: detectable_rate(p_first, arm),
-            unit="1",
-            definition=f"smallest better rate that {arm} per condition tell from "
-            f"{100 * p_first:.0f} % with {power} ({change.side})",
             reason_without_interval="a plan, not an estimate",
         ),
     ]
@@ -403,11 +392,8 @@ def _pooled_test(mine: Sequence[Change], side: str) -> Measurement:
         return boschloo(first_k, first_n, second_k, second_n)
 
     return measured(
-        f"unpaired.boschloo_p.{side}.pooled",
+        BOSCHLOO_POOLED.of(side=side, count=len(mine)),
         compute,
-        unit="1",
-        definition=f"two-sided p of Boschloo's exact test over the pooled trials of {len(mine)} "
-        f"tasks ({side}), starts not paired",
         n=len(mine),
         counted="task",
         reason_without_interval="a p-value",

@@ -3,14 +3,27 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from evaluator.compare.measure import measured, proportion, slug, vouched_rate
+from evaluator.compare.measure import measured, proportion, vouched_rate
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import WITH, WITHOUT, Answer, names_of
 from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import (
+    AGREED,
+    BREAK_EVEN_PRICE,
+    BRIER,
+    BRIER_OF_BASE_RATE,
+    CLAUSE_REFUSED,
+    CLAUSE_RIGHT,
+    ECE,
+    FACTOR_NPV,
+    KAPPA,
+    NPV,
+    PHI,
+    PPV,
+)
 from evaluator.result import Cell, Measurement, Table
 from evaluator.run_reader.episodes import FACTORS, Clauses
 from evaluator.statistics.gate import (
-    NUM_BINS,
     Confusion,
     break_even,
     brier,
@@ -93,29 +106,16 @@ def _measure(
     refused = [row for row in asked if _answer(said(row), clause) is False]
     return [
         proportion(
-            f"gate.clause.{name}.{slug(clause)}.{what}",
+            quantity.of(by=name, clause=clause, name=clause, side=side),
             k,
             n,
-            definition=words,
             counted="trial",
             reason_if_undefined=f"{clause} never said no ({side})",
             episodes=names_of(episodes),
         )
-        for what, k, n, words, episodes in (
-            (
-                "refused",
-                counts.said_failure,
-                counts.n,
-                f"trials in which {clause} said no / trials in which it was decided ({side})",
-                asked,
-            ),
-            (
-                "right",
-                counts.true_negative,
-                counts.said_failure,
-                f"trials that failed / trials in which {clause} said no ({side})",
-                refused,
-            ),
+        for quantity, k, n, episodes in (
+            (CLAUSE_REFUSED, counts.said_failure, counts.n, asked),
+            (CLAUSE_RIGHT, counts.true_negative, counts.said_failure, refused),
         )
     ]
 
@@ -202,10 +202,6 @@ def _clause_cost_table(costs: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
 
 
 CLAUSES = ("ik", "clearance", "terminal")
-WHOSE = (
-    "the probability is the planned replay's, where it has none the verdict's before motion; with "
-    "replanning the twin selected these plans"
-)
 REFUSAL_PRICES = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)
 """What refusing a good plan costs, in bad executions."""
 
@@ -258,7 +254,6 @@ def _agreement_of(
     make = partial(proportion, counted="trial", method=method)
     coefficient = partial(
         measured,
-        unit="1",
         n=counts.n,
         counted="trial",
         episodes=names_of(seen),
@@ -266,38 +261,25 @@ def _agreement_of(
     )
     return [
         make(
-            f"agreement.{name}.rate",
+            AGREED.of(by=name, words=words),
             counts.agreed,
             counts.n,
-            definition=f"trials where {words} and the labelled outcome say the same / trials",
             reason_if_undefined=nothing,
             episodes=names_of(seen),
         ),
-        coefficient(
-            f"agreement.{name}.phi",
-            lambda: phi(counts),
-            definition=f"phi coefficient of {words} and the labelled outcome over trials",
-        ),
-        coefficient(
-            f"agreement.{name}.kappa",
-            lambda: kappa(counts),
-            definition=f"Cohen's kappa of {words} and the labelled outcome over trials",
-        ),
+        coefficient(PHI.of(by=name, words=words), lambda: phi(counts)),
+        coefficient(KAPPA.of(by=name, words=words), lambda: kappa(counts)),
         make(
-            f"agreement.{name}.ppv",
+            PPV.of(by=name, words=words),
             counts.true_positive,
             counts.said_success,
-            definition=f"positive predictive value: trials that succeeded / trials where {words} "
-            "said success",
             reason_if_undefined=nothing if not counts.n else "it never said success",
             episodes=names_of(row for row in seen if said(row)),
         ),
         make(
-            f"agreement.{name}.npv",
+            NPV.of(by=name, words=words),
             counts.true_negative,
             counts.said_failure,
-            definition=f"negative predictive value: trials that failed / trials where {words} "
-            "said failure",
             reason_if_undefined=nothing if not counts.n else "it never said failure",
             episodes=names_of(row for row in seen if not said(row)),
         ),
@@ -310,11 +292,8 @@ def gate_scorecard(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[T
     counts = confusion_of(asked, unheeded_verdict)
     measurements = [
         measured(
-            "gate.break_even_price",
+            BREAK_EVEN_PRICE.of(),
             lambda: break_even(counts),
-            unit="1",
-            definition="bad executions avoided / good plans refused, by verdicts that were not "
-            "obeyed: what refusing a good plan may cost, in bad executions, for the gate to pay",
             n=counts.n,
             counted="trial",
             reason_without_interval="a ratio of two counts, both in the confusion table",
@@ -339,11 +318,9 @@ def _clauses(rows: Sequence[TrialRow]) -> list[Measurement]:
         counts = confusion_of(blamed, lambda row: row.sim_planned)
         measurements.append(
             proportion(
-                f"gate.clause.{clause}.npv",
+                FACTOR_NPV.of(clause=clause),
                 counts.true_negative,
                 counts.said_failure,
-                definition=f"trials that failed / trials where planned-in-twin failed first in "
-                f"{clause}",
                 counted="trial",
                 reason_if_undefined=f"no trial with a known outcome failed in {clause} first",
                 episodes=names_of(blamed),
@@ -382,31 +359,15 @@ def reliability(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Tabl
     said, happened = [p for _, p, _ in seen], [outcome for _, _, outcome in seen]
     make = partial(
         measured,
-        unit="1",
         n=len(seen),
         counted="trial",
         episodes=[episode for episode, _, _ in seen],
         reason_without_interval="the bins and their counts are in the reliability table",
     )
     measurements = [
-        make(
-            "reliability.brier",
-            lambda: brier(said, happened),
-            definition=f"Brier score: mean of (sampled success probability - outcome)^2; {WHOSE}",
-        ),
-        make(
-            "reliability.brier_of_base_rate",
-            lambda: brier_of_base_rate(happened),
-            definition="Brier score of always saying the observed success rate; above it the "
-            "probability is worth nothing",
-        ),
-        make(
-            "reliability.ece",
-            lambda: expected_calibration_error(said, happened),
-            definition=f"expected calibration error: {NUM_BINS} bins of equal width, sum of "
-            "n_bin / n x |mean probability - success rate|; biased upwards for few trials; "
-            f"{WHOSE}",
-        ),
+        make(BRIER.of(), lambda: brier(said, happened)),
+        make(BRIER_OF_BASE_RATE.of(), lambda: brier_of_base_rate(happened)),
+        make(ECE.of(), lambda: expected_calibration_error(said, happened)),
     ]
     bins = reliability_bins(said, happened)
     table = Table(

@@ -4,7 +4,7 @@ from functools import cache
 
 from bridge.errors import GstError
 from bridge.task.task_file import Task, load_task
-from evaluator.compare.measure import slug
+from evaluator.measurements import slug
 
 
 @cache

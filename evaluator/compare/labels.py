@@ -15,8 +15,9 @@ from bridge.geometry import se3
 from bridge.task.predicate import PredicateResult, Rollout, all_hold, evaluate_success, objects_done
 from bridge.task.task_file import Task
 from evaluator.compare.known_task import known_task
-from evaluator.compare.measure import Part, proportion, slug
+from evaluator.compare.measure import Part, proportion
 from evaluator.compare.rows import TrialRow
+from evaluator.measurements import LABEL_AGREED, LABEL_AGREED_OF_TASK, LABEL_OBJECTS
 from evaluator.result import Cell, Exclusion, Measurement, Table
 
 AFTER = "end"
@@ -171,15 +172,9 @@ def label_results(
     of_episode: Mapping[str, PerceivedOutcome] = {witness.episode: witness for witness in witnesses}
     pairs = [(row, of_episode[row.episode]) for row in rows if row.episode in of_episode]
     tasks = sorted({row.task for row, _ in pairs})
-    measurements = [_rate("label.localised.rate", "", pairs, method)]
+    measurements = [_rate("", pairs, method)]
     measurements += [
-        _rate(
-            f"label.localised.{slug(task)}.rate",
-            f" of {task}",
-            [pair for pair in pairs if pair[0].task == task],
-            method,
-        )
-        for task in tasks
+        _rate(task, [pair for pair in pairs if pair[0].task == task], method) for task in tasks
     ]
     counted = [pair for pair in pairs if pair[0].unit == "object"]
     if counted:
@@ -195,18 +190,18 @@ def _known(pairs: Sequence[Pair]) -> list[Pair]:
     return [(r, w) for r, w in pairs if r.recorded is not None and w.says is not None]
 
 
-def _rate(measurement_id: str, where: str, pairs: Sequence[Pair], method: str) -> Measurement:
+def _rate(task: str, pairs: Sequence[Pair], method: str) -> Measurement:
+    """Measure the trials of one task, or of all when it is empty."""
     known = _known(pairs)
     agreed = sum(row.recorded is witness.says for row, witness in known)
     skipped = sorted({kind for _, witness in known for kind in witness.not_asked})
     without = f"; clauses that one look leaves open are not asked: {', '.join(skipped)}"
+    quantity = LABEL_AGREED_OF_TASK if task else LABEL_AGREED
+    where = f" of {task}" if task else ""
     return proportion(
-        measurement_id,
+        quantity.of(task=task, where=where, without=without if skipped else ""),
         agreed,
         len(known),
-        definition=f"trials{where} where the operator's label and the success predicate on the "
-        f"poses localised after the execution say the same / trials where both are known"
-        f"{without if skipped else ''}",
         counted="trial",
         reason_if_undefined="no trial has both a label and a decided predicate",
         episodes=[row.episode for row, _ in known],
@@ -217,11 +212,9 @@ def _rate(measurement_id: str, where: str, pairs: Sequence[Pair], method: str) -
 def _counts(pairs: Sequence[Pair], method: str) -> Measurement:
     known = [(r, w) for r, w in pairs if r.k is not None and w.objects_done is not None]
     return proportion(
-        "label.objects.rate",
+        LABEL_OBJECTS.of(),
         sum(row.k == witness.objects_done for row, witness in known),
         len(known),
-        definition="trials where the operator counted as many objects as the predicate on the "
-        "localised poses / trials labelled by object where both are known",
         counted="trial",
         reason_if_undefined="no trial labelled by object has a decided predicate of each object",
         episodes=[row.episode for row, _ in known],

@@ -1,12 +1,12 @@
 """Turn counts and statistics into ``Measurement`` records; what is undefined keeps its reason."""
 
 import math
-import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
 from evaluator.errors import AlikeNamesError, UndefinedStatisticError
+from evaluator.measurements import Defined, slug
 from evaluator.result import Exclusion, Interval, Measurement, Table
 from evaluator.statistics.coverage.stored import Size, vouch
 from evaluator.statistics.intervals import RATE_INTERVALS
@@ -65,20 +65,6 @@ class Part:
 Statistic = Callable[[], float | tuple[float, Interval | None]]
 
 
-def slug(text: str) -> str:
-    """Return text usable as one part of a measurement id.
-
-    Letters beyond ASCII are written as their code points, so that names in any script stay apart.
-    Blanks and signs become ``_``, so that names may still share one: ``refuse_alike``.
-    """
-    plain = text if text.isascii() else "".join(c if c.isascii() else _code(c) for c in text)
-    return re.sub(r"[^A-Za-z0-9_+-]+", "_", plain) or "-"
-
-
-def _code(letter: str) -> str:
-    return f"+{ord(letter):04x}"
-
-
 def refuse_alike(kind: str, named: Iterable[tuple[str, str]]) -> None:
     """Refuse two names that would share an id: the number of one would stand for both.
 
@@ -110,11 +96,9 @@ def interval_or_reason(
 
 
 def measured(
-    measurement_id: str,
+    defined: Defined,
     compute: Statistic,
     *,
-    unit: str,
-    definition: str,
     n: int | None = None,
     counted: str | None = None,
     reason_without_interval: str | None = None,
@@ -145,10 +129,8 @@ def measured(
         interval, refusal = vouch(interval, size, key=coverage_key, instead=instead)
         reason_without_interval = refusal or reason_without_interval
     return Measurement(
-        id=measurement_id,
+        **vars(defined),
         value=value,
-        unit=unit,
-        definition=definition,
         interval=interval,
         n=n,
         counted=counted,
@@ -159,11 +141,10 @@ def measured(
 
 
 def proportion(
-    measurement_id: str,
+    defined: Defined,
     k: int,
     n: int,
     *,
-    definition: str,
     counted: str,
     reason_if_undefined: str,
     episodes: Iterable[str] = (),
@@ -172,10 +153,8 @@ def proportion(
     """Measure k/n with its interval, Wilson's unless another was asked for; undefined for n = 0."""
     interval, refusal = vouched_rate(k, n, method) if n else (None, "")
     return Measurement(
-        id=measurement_id,
+        **vars(defined),
         value=k / n if n else None,
-        unit="1",
-        definition=definition,
         interval=interval,
         k=k,
         n=n,

@@ -18,6 +18,7 @@ from bridge.episode.streams import JointTrack
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.compare.measure import Part, average, degrees, measured, millimetres, milliseconds
 from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import MOTIONS
 from evaluator.memory import Packed, packed
 from evaluator.metrics.trajectory import (
     NORMALISED_SAMPLES,
@@ -398,8 +399,6 @@ def worst_table(groups: Groups) -> Table:
     )
 
 
-Read = Callable[[MotionSummary], float | None]
-
 TWIN = "twin"
 MEANING = {
     PLANNED: "recorded against the planned replay (what was commanded; the controller's tracking "
@@ -408,45 +407,6 @@ MEANING = {
     "base calibration)",
     TWIN: "executed against planned replay (what reached the twin's objects differently)",
 }
-TOOL = "tool centre point"
-QUANTITIES: tuple[tuple[str, str, str, str, Read], ...] = (
-    ("position_mean_m", "m", TOOL, "mean distance over time", lambda s: s.position_mean_m),
-    ("position_max_m", "m", TOOL, "largest distance over time", lambda s: s.position_max_m),
-    ("end_point_m", "m", TOOL, "distance at the last common instant", lambda s: s.end_point_m),
-    ("rotation_mean_rad", "rad", TOOL, "mean angle over time", lambda s: s.rotation_mean_rad),
-    ("rotation_max_rad", "rad", TOOL, "largest angle over time", lambda s: s.rotation_max_rad),
-    ("end_point_rad", "rad", TOOL, "angle at the last common instant", lambda s: s.end_point_rad),
-    (
-        "lag_s",
-        "s",
-        TOOL,
-        "delay of least distance, a rigid motion apart",
-        lambda s: s.lag_s,
-    ),
-    (
-        "without_lag_mean_m",
-        "m",
-        TOOL,
-        "mean distance after that delay is taken out",
-        lambda s: s.without_lag_mean_m,
-    ),
-    (
-        "without_offset_mean_m",
-        "m",
-        TOOL,
-        "mean distance after delay and best rigid motion are taken out",
-        lambda s: s.without_offset_mean_m,
-    ),
-    (
-        "relative_mean_m",
-        "m",
-        TOOL,
-        "mean difference of what both do within one second",
-        lambda s: s.relative_mean_m,
-    ),
-    ("joint_rms_rad", "rad", "joints", "root mean square error", lambda s: s.joint_rms_rad),
-    ("joint_max_rad", "rad", "joints", "largest error of any joint", lambda s: s.joint_max_rad),
-)
 SHARED = "not computed: trials share one calibration"
 
 
@@ -468,15 +428,12 @@ def motion_results(motions: Sequence[MotionSummary]) -> Part:
 def _measure(name: str, motions: Sequence[MotionSummary]) -> list[Measurement]:
     how = sorted({motion.aligned_by for motion in motions})
     measurements = []
-    for quantity, unit, what, words, read in QUANTITIES:
-        known = [(m.episode, value) for m in motions if (value := read(m)) is not None]
+    for field, quantity in MOTIONS.items():
+        known = [(m.episode, v) for m in motions if (v := getattr(m, field)) is not None]
         measurements.append(
             measured(
-                f"motion.{name}.{quantity}",
+                quantity.of(against=name, meaning=MEANING[name], how=" or ".join(how) or "stamps"),
                 partial(_mean, [value for _, value in known], name),
-                unit=unit,
-                definition=f"{what}, {MEANING[name]}: {words}, mean over trials; aligned by "
-                f"{' or '.join(how) or 'stamps'}",
                 n=len(known),
                 counted="trial",
                 reason_without_interval=SHARED,

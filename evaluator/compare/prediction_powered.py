@@ -2,19 +2,30 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64
 
 from evaluator.compare.gains import StartPair
 from evaluator.compare.gate import confusion_of
-from evaluator.compare.measure import Statistic, measured
+from evaluator.compare.measure import measured
 from evaluator.compare.rows import TrialRow
-from evaluator.compare.success import Key, group_rows, names_of, rate_id, trials_in
+from evaluator.compare.success import Key, group_rows, names_of, of_group, trials_in
 from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import (
+    PROXY_RATE,
+    PROXY_RATE_PPI,
+    RANDOM_STARTS_P,
+    REPLANNING_EVIDENCE,
+    SEQUENCE,
+    SEQUENCE_GAIN,
+    STARTS_ALIKE_P,
+    STARTS_COVERED,
+    TRIALS_SAVED,
+)
 from evaluator.result import Cell, Interval, Measurement, Table
 from evaluator.statistics.gate import Confusion
 from evaluator.statistics.prediction_powered import (
@@ -115,44 +126,24 @@ class StartOverlap:
         covered, total = starts_covered(self._places.tried, self._places.others)
         return covered / total
 
-    def measurements(self, id_of: Callable[[str], str]) -> list[Measurement]:
-        """Measure the overlap, or say why it is not computed.
-
-        Args:
-            id_of: Makes the id of a measurement from its name.
-        """
+    def measurements(self, key: Key) -> list[Measurement]:
+        """Measure the overlap, or say why it is not computed."""
         try:
             compared, num_others = f"; {self._places.words}", len(self._places.others)
         except UndefinedStatisticError:  # each measurement gives the reason
             compared, num_others = "", 0
         return [
             measured(
-                id_of(name),
+                of_group(quantity, key, compared=compared),
                 compute,
-                unit="1",
-                definition=f"{words}{compared}",
                 n=num_others,
                 counted="start",
                 reason_without_interval=why,
                 episodes=names_of([*self._tried, *self._others]),
             )
-            for name, compute, words, why in (
-                (
-                    "starts_alike_p",
-                    self.p_alike,
-                    "p of the permutation test on the energy distance that the starts with a robot "
-                    "trial and those only the twin has were drawn alike: small forbids the "
-                    "estimates",
-                    "a p-value",
-                ),
-                (
-                    "starts_covered",
-                    self._covered,
-                    "share of the starts only the twin has that lie no further from a tried start "
-                    "than tried starts lie from their neighbours; alike, n tried ones cover about "
-                    "n / (n + 1)",
-                    "it describes these starts",
-                ),
+            for quantity, compute, why in (
+                (STARTS_ALIKE_P, self.p_alike, "a p-value"),
+                (STARTS_COVERED, self._covered, "it describes these starts"),
             )
         ]
 
@@ -242,41 +233,23 @@ def _assisted_rate(
     many = f"{cell.counts.n} trials with an outcome and {cell.alone_n} starts that only the "
     many += "twin has"
 
-    def make(name: str, compute: Statistic, unit: str, words: str) -> Measurement:
-        return measured(
-            _proxy_id(key, name),
+    measurements = [
+        measured(
+            of_group(quantity, key, many=many),
             compute,
-            unit=unit,
-            definition=f"{words}; {many}",
             n=cell.counts.n,
             counted="trial",
             reason_without_interval="a count or a p-value",
             episodes=names_of(paired),
         )
-
-    return [
-        make(
-            "recorded_rate",
-            cell.rate,
-            "1",
-            "recorded success rate with the twin's help: strata of the twin's answer, each with a "
-            "Beta(1/2, 1/2) prior",
-        ),
-        make("recorded_rate_ppi", cell.rate_ppi, "1", "the same by PPI++ (normal approximation)"),
-        make("trials_saved", cell.saved, "count", "further trials Wilson's interval would need"),
-        make(
-            "random_starts_p",
-            cell.p_random,
-            "1",
-            "p of Boschloo's test that the twin succeeds as often on the tried starts as on the "
-            "others: small forbids the estimates",
-        ),
-        *cell.overlap.measurements(partial(_proxy_id, key)),
+        for quantity, compute in (
+            (PROXY_RATE, cell.rate),
+            (PROXY_RATE_PPI, cell.rate_ppi),
+            (TRIALS_SAVED, cell.saved),
+            (RANDOM_STARTS_P, cell.p_random),
+        )
     ]
-
-
-def _proxy_id(key: Key, name: str) -> str:
-    return rate_id(name, key).replace("rate.", "proxy.", 1)
+    return [*measurements, *cell.overlap.measurements(key)]
 
 
 def sequences(rows: Sequence[TrialRow], pairs: Sequence[StartPair]) -> list[Measurement]:
@@ -311,12 +284,8 @@ def _sequence(key: Key, known: Sequence[TrialRow]) -> Measurement:
         return sequence.k / sequence.n, sequence.interval
 
     return measured(
-        rate_id("recorded", key).replace("rate.", "sequence.", 1),
+        of_group(SEQUENCE, key),
         compute,
-        unit="1",
-        definition="successes / trials as labelled, with a betting confidence sequence in the "
-        "order in which they were recorded (of a table: its rows): it may be looked at after every "
-        "one, to stop or to continue",
         n=len(known),
         counted="trial",
         episodes=names_of(known),
@@ -378,11 +347,8 @@ def _gain_sequence(pairs: Sequence[StartPair]) -> Measurement:
         return 100 * sum(changes) / len(changes), interval
 
     return measured(
-        "sequence.gain_pp.recorded",
+        SEQUENCE_GAIN.of(),
         compute,
-        unit="pp",
-        definition="recorded gain with replanning over paired starts, with a betting confidence "
-        "sequence in the order in which pairs became complete: it may be looked at after every one",
         n=len(changes),
         counted="pair",
         episodes=[row.episode for pair in pairs for row in (pair.before, pair.after)],
@@ -393,12 +359,10 @@ def _evidence(pairs: Sequence[StartPair]) -> Measurement:
     answers = _changes(pairs)
     improved, worsened = answers.count(1), answers.count(-1)
     return measured(
-        "sequence.replanning_evidence.recorded",
+        REPLANNING_EVIDENCE.of(
+            improved=improved, worsened=worsened, enough=1 / ALPHA, alpha=ALPHA, most=MOST
+        ),
         lambda: math.exp(min(MOST_LOG, capital_log(improved, improved + worsened, GOAL))),
-        unit="1",
-        definition=f"what a bettor against 'replanning changes nothing' made of 1, over {improved} "
-        f"improved and {worsened} worsened pairs; {1 / ALPHA:.0f} or more: stop, it is shown at "
-        f"{ALPHA:g}, however often one looked; {MOST:g} stands for all that is more",
         n=len(answers),
         counted="pair",
         reason_without_interval="evidence, not an estimate",

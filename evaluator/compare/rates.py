@@ -9,11 +9,12 @@ from bridge.exchange.trials_rates import RateRecord, read_rates
 from evaluator.compare.agreement import agreement_intervals, cell_agreement
 from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import gain_tests, replanning_gains
-from evaluator.compare.measure import refuse_alike, slug, vouched_rate
+from evaluator.compare.measure import refuse_alike, vouched_rate
 from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.rows import Comparison, RateCell
 from evaluator.compare.success import WITH, averages
 from evaluator.compare.tables import gains_table, layout_table, success_table
+from evaluator.measurements import RATE_AS_GIVEN
 from evaluator.result import Exclusion, Measurement
 
 
@@ -113,12 +114,11 @@ def _rate(
     interval, why = None, "no n"
     if record is not None and record.k is not None and record.n is not None:
         interval, why = vouched_rate(record.k, record.n, method)
+    where = "" if record is None else f" in row {record.row} ({record.side})"
+    defined = RATE_AS_GIVEN.of(side=side, task=task, condition=condition, unit=unit, where=where)
     return Measurement(
-        id=f"rate.{side}.{slug(task)}.{slug(condition)}.-",
+        **vars(defined),
         value=None if record is None else float(record.rate),
-        unit="1",
-        definition=f"successes / {unit}s, as given"
-        + (f" in row {record.row} ({record.side})" if record is not None else ""),
         interval=interval,
         k=record.k if record is not None else None,
         n=record.n if record is not None else None,

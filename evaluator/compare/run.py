@@ -14,6 +14,7 @@ from evaluator.compare.bands import BandReport, compare_bands
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.gains import START_LIMIT_M
 from evaluator.compare.images.renders import compare_renders
+from evaluator.compare.images.scores import open_nets
 from evaluator.compare.images.views import ViewReport, compare_views
 from evaluator.compare.labels import label_results
 from evaluator.compare.measure import Part
@@ -22,14 +23,12 @@ from evaluator.compare.notes import check_settings, with_notes
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.spreadsheet import imported_rows
 from evaluator.compare.states import state_results
-from evaluator.compare.summaries import sum_up
+from evaluator.compare.summaries import evaluation_pool, sum_up
 from evaluator.compare.trial import Trial, lay_out
 from evaluator.metrics.image_protocol import ImageOptions
-from evaluator.metrics.lpips import open_nets
 from evaluator.result import Exclusion
 from evaluator.run_reader.contents import ODD, RunContents, broken, read_contents
 from evaluator.run_reader.episodes import DerivedIndex
-from evaluator.workers import Workers
 
 Item = TypeVar("Item")
 AnyPart = Part | ViewReport | BandReport
@@ -63,10 +62,10 @@ def compare_run(
     """
     run = RunFolder.open(run.path)
     cache = SummaryCache(None) if cache is None else cache
-    with Workers() as workers:
-        contents = read_contents(run, cache, output, workers)
+    with evaluation_pool() as pool:
+        contents = read_contents(run, cache, output, pool)
         trials, left_out = trials_of(contents)
-        summaries = sum_up(trials, cache, output, workers)
+        summaries = sum_up(trials, cache, output, pool)
     recorded_ids = {recorded.facts.info.id for recorded in contents.recorded}
     imported, doubled = imported_rows(run, recorded_ids)
     rows = [*(trial.row for trial in trials), *imported]

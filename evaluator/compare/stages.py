@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 
 from evaluator.compare.known_task import known_task
-from evaluator.compare.measure import proportion, slug
+from evaluator.compare.measure import proportion
 from evaluator.compare.rows import TrialRow
+from evaluator.measurements import STAGE
 from evaluator.result import Exclusion, Measurement, Table
 from evaluator.statistics.funnel import (
     CurvePoint,
@@ -76,11 +77,9 @@ def stage_results(
 
 def _measure(task: str, condition: str, stage: Stage, episodes: list[str]) -> Measurement:
     return proportion(
-        f"stage.{slug(task)}.{slug(condition)}.{slug(stage.name)}",
+        STAGE.of(task=task, condition=condition, stage=stage.name),
         stage.passed,
         stage.reached - stage.unknown,
-        definition=f"trials that passed stage {stage.name} of {task} / trials that reached it and "
-        "whose ending is known",
         counted="trial",
         reason_if_undefined="no trial reached it, or none is labelled",
         episodes=episodes,

@@ -17,9 +17,9 @@ from evaluator.compare.measure import (
     measured,
     millimetre_ends,
     millimetres,
-    slug,
 )
 from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import STATES, Defined
 from evaluator.metrics.state import extents_apart_m, turn_between_rad, turns_alike
 from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.run_reader.object_states import (
@@ -165,19 +165,31 @@ Group = tuple[str, str, str, str]
 """Who predicts, what it is held against, task, condition."""
 
 
-def state_id(key: Group) -> str:
-    """Return the first part of a group's ids."""
+def _number(
+    by_id: Mapping[str, Measurement], key: Group, quantity: str, kind: str = "median"
+) -> Measurement | None:
+    """Return one measurement of a group."""
+    return by_id.get(_defined(key, quantity, kind).id)
+
+
+def _defined(key: Group, name: str, kind: str, **words: object) -> Defined:
     predicted_by, against, task, condition = key
-    return f"state.{predicted_by}_to_{against}.{slug(task)}.{slug(condition)}"
+    return STATES[name, kind].of(
+        by=predicted_by,
+        against=against,
+        task=task,
+        condition=condition,
+        **{"quantity": "", "who": "", "other": "", "where": "", "count": 0} | words,
+    )
 
 
 def final_table(keys: Sequence[Group], by_id: dict[str, Measurement]) -> Table:
     """Medians of each group."""
     rows = []
     for key in keys:
-        position = by_id[f"{state_id(key)}.position_median_m"]
-        rotation = by_id.get(f"{state_id(key)}.rotation_median_rad")
-        extents = by_id.get(f"{state_id(key)}.extents_median_m")
+        position = by_id[_defined(key, "position", "median").id]
+        rotation = _number(by_id, key, "rotation")
+        extents = _number(by_id, key, "extents")
         rows.append(
             (
                 key[2],
@@ -187,7 +199,7 @@ def final_table(keys: Sequence[Group], by_id: dict[str, Measurement]) -> Table:
                 position.n,
                 millimetres(position.value),
                 millimetre_ends(position.interval),
-                millimetres(by_id[f"{state_id(key)}.position_mean_m"].value),
+                millimetres(by_id[_defined(key, "position", "mean").id].value),
                 None if rotation is None else degrees(rotation.value),
                 None if extents is None else millimetres(extents.value),
             )
@@ -264,10 +276,10 @@ WHO = {
     EXECUTED: "the executed replay's",
     RECORDED: "the localised recording's",
 }
-QUANTITIES: tuple[tuple[str, str, str, Callable[[StateSummary], float | None]], ...] = (
-    ("position", "m", "distance of the object", lambda s: s.position_m),
-    ("rotation", "rad", "angle modulo the object's symmetry", lambda s: s.rotation_rad),
-    ("extents", "m", "largest difference of a soft object's extents", lambda s: s.extents_m),
+QUANTITIES: tuple[tuple[str, str, Callable[[StateSummary], float | None]], ...] = (
+    ("position", "distance of the object", lambda s: s.position_m),
+    ("rotation", "angle modulo the object's symmetry", lambda s: s.rotation_rad),
+    ("extents", "largest difference of a soft object's extents", lambda s: s.extents_m),
 )
 UNKNOWN = {
     "position": "no position is known",
@@ -307,17 +319,21 @@ def state_results(states: Sequence[StateSummary]) -> Part:
 def _measure(key: Group, states: Sequence[StateSummary]) -> list[Measurement]:
     predicted_by, against, task, condition = key
     found = []
-    for name, unit, words, read in QUANTITIES:
+    for name, quantity, read in QUANTITIES:
         pairs = [(value, s.episode) for s in states if (value := read(s)) is not None]
         if name == "extents" and (predicted_by == PLAN or not any(s.soft for s in states)):
             continue  # a plan predicts a pose and no shape
         values, episodes = [value for value, _ in pairs], [episode for _, episode in pairs]
         of_episode = cluster_means(values, episodes)
-        about = f"{words} after its last stage, {WHO[predicted_by]} against {WHO[against]}, in "
-        about += f"{task}, {condition.replace('_', ' ')}"
+        words = {
+            "quantity": quantity,
+            "who": WHO[predicted_by],
+            "other": WHO[against],
+            "where": f"{task}, {condition.replace('_', ' ')}",
+            "count": len(of_episode),
+        }
         make = partial(
             measured,
-            unit=unit,
             n=len(values),
             counted="object",
             episodes=list(dict.fromkeys(episodes)),
@@ -325,20 +341,16 @@ def _measure(key: Group, states: Sequence[StateSummary]) -> list[Measurement]:
         )
         found.append(
             make(
-                f"{state_id(key)}.{name}_median_{unit}",
+                _defined(key, name, "median", **words),
                 partial(_median, of_episode, states, name),
-                definition=f"{about}: median over {len(of_episode)} episodes of each one's mean "
-                "over its objects",
                 reason_without_interval=interval_or_reason(median_interval, of_episode)[1],
             )
         )
         if name == "position":
             found.append(
                 make(
-                    f"{state_id(key)}.{name}_mean_{unit}",
+                    _defined(key, name, "mean", **words),
                     partial(_mean, of_episode, states, name),
-                    definition=f"{about}: mean over {len(of_episode)} episodes of each one's mean "
-                    "over its objects",
                     reason_without_interval=interval_or_reason(student_interval, of_episode)[1],
                     coverage_key=MEAN_KEY,
                     instead=USE_MEDIAN,

@@ -5,35 +5,34 @@ from fractions import Fraction
 
 from bridge.episode.metadata import WITH as WITH
 from bridge.episode.metadata import WITHOUT as WITHOUT
-from evaluator.compare.measure import measured, proportion, slug
+from evaluator.compare.measure import measured, proportion
 from evaluator.compare.rows import RateCell, TrialRow
 from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import (
+    AVERAGE_MACRO,
+    AVERAGE_POOLED,
+    NEVER_SENT,
+    RATE_BY_UNIT,
+    RATE_VARIED,
+    RATES,
+    RATES_IN_COMMON,
+    SELECTION_BIAS,
+    Defined,
+    Quantity,
+)
 from evaluator.result import Cell, Measurement, Table
 from evaluator.statistics.agreement import counted_cells, mean_rate
-
-SIM_DEFINITION = (
-    "successes / trials in the twin: the plan actually sent, planned trajectory, dynamic replay; "
-    "with replanning the twin itself selected these plans"
-)
-EXECUTED_DEFINITION = (
-    "successes / trials in the twin: the executed joints re-lived dynamically; diagnosis only, "
-    "never part of r"
-)
-VERDICT_DEFINITION = (
-    "plans accepted / plans judged: the gate's verdict on the plan actually sent, before motion; "
-    "without replanning it was recorded and not obeyed, with replanning it selected these plans"
-)
 
 Key = tuple[str, str, str]
 """Task, condition, policy."""
 Answer = Callable[[TrialRow], bool | None]
 
-SIDES: tuple[tuple[str, Answer, str], ...] = (
-    ("recorded", lambda row: row.recorded, "successes / trials as labelled by the operator"),
-    ("sim_planned", lambda row: row.sim_planned, SIM_DEFINITION),
-    ("sim_executed", lambda row: row.sim_executed, EXECUTED_DEFINITION),
-    ("verdict", lambda row: row.verdict, VERDICT_DEFINITION),
-)
+SIDES: dict[str, Answer] = {
+    "recorded": lambda row: row.recorded,
+    "sim_planned": lambda row: row.sim_planned,
+    "sim_executed": lambda row: row.sim_executed,
+    "verdict": lambda row: row.verdict,
+}
 
 
 def group_rows(rows: Sequence[TrialRow]) -> dict[Key, list[TrialRow]]:
@@ -57,21 +56,19 @@ def names_of(rows: Iterable[TrialRow]) -> list[str]:
 
 
 def answered(
-    measurement_id: str,
+    defined: Defined,
     rows: Sequence[TrialRow],
     answer: Answer,
     *,
-    definition: str,
     reason_if_undefined: str,
     method: str = "wilson",
 ) -> Measurement:
     """Measure the share of yes among the trials whose answer is known."""
     known = [row for row in rows if answer(row) is not None]
     return proportion(
-        measurement_id,
+        defined,
         trials_in(row for row in known if answer(row)),
         trials_in(known),
-        definition=definition,
         counted="trial",
         reason_if_undefined=reason_if_undefined,
         episodes=names_of(known),
@@ -83,13 +80,12 @@ def side_rates(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Meas
     """Measure every side of every cell, counted in trials; object counts beside them."""
     measurements = []
     for key, members in group_rows(rows).items():
-        for side, answer, definition in SIDES:
+        for side, answer in SIDES.items():
             measurements.append(
                 answered(
-                    rate_id(side, key),
+                    of_group(RATES[side], key),
                     members,
                     answer,
-                    definition=definition,
                     reason_if_undefined=f"none of {trials_in(members)} trials has it",
                     method=method,
                 )
@@ -109,11 +105,9 @@ def _counted_rate(key: Key, members: Sequence[TrialRow], method: str) -> list[Me
     firsts = " and ".join(f"{row.episode} in {name}s" for name, row in sorted(by_unit.items()))
     return [
         proportion(
-            rate_id(f"recorded_{unit}", key),
+            of_group(RATE_BY_UNIT, key, unit=unit),
             0 if mixed else sum((row.k or 0) * row.count for row in counted),
             0 if mixed else sum((row.n or 0) * row.count for row in counted),
-            definition=f"successes / {unit}s as labelled; {unit}s of one trial are not "
-            "independent, so the interval is narrower than the trials justify",
             counted=unit,
             reason_if_undefined=f"trials are counted in different units: {firsts}",
             episodes=names_of(counted),
@@ -130,11 +124,8 @@ def never_sent(rows: Sequence[TrialRow]) -> list[Measurement]:
     made = sum(row.num_plans for row in planned)
     return [
         measured(
-            "plans.never_sent",
+            NEVER_SENT.of(),
             lambda: float(made - sum(row.num_plans_sent for row in planned)),
-            unit="count",
-            definition="plans that were published and never executed, of all plans published; "
-            "they are part of no rate",
             n=made,
             counted="plan",
             reason_without_interval="a count",
@@ -153,14 +144,13 @@ def rate_cells(
         both = [r for r in members if r.recorded is not None and r.sim_planned is not None]
         recorded_common, sim_common = (
             answered(
-                rate_id(side, key).replace("rate.", "rate_common.", 1),
+                of_group(common, key),
                 both,
-                answer,
-                definition=f"{definition}; over the trials where both sides are known",
+                SIDES[side],
                 reason_if_undefined="no trial has both sides",
                 method=method,
             )
-            for side, answer, definition in SIDES[:2]
+            for side, common in RATES_IN_COMMON.items()
         )
         cells.append(
             RateCell(
@@ -168,8 +158,8 @@ def rate_cells(
                 condition=key[1],
                 policy=key[2],
                 unit="trial",
-                recorded=by_id[rate_id("recorded", key)],
-                sim=by_id[rate_id("sim_planned", key)],
+                recorded=by_id[of_group(RATES["recorded"], key).id],
+                sim=by_id[of_group(RATES["sim_planned"], key).id],
                 recorded_rate=fraction_of(recorded_common),
                 sim_rate=fraction_of(sim_common),
                 episodes=tuple(names_of(both)),
@@ -222,26 +212,21 @@ def _averages(
     countable = len(units) == 1 and all(rate.k is not None and rate.n for rate in rates)
     why = f"cells are counted in different units ({', '.join(units)})"
     why = why if len(units) > 1 else "the number of trials of a cell is not known"
-    name = f"{side}.{slug(condition)}"
+    words = {"side": side, "condition": condition, "over": over}
     episodes = [episode for rate in rates for episode in rate.episodes]
     return [
         measured(
-            f"average.macro.{name}",
+            AVERAGE_MACRO.of(**words),
             lambda: _macro(rates),
-            unit="1",
-            definition=f"mean of the unrounded {side} rates of {over} {condition}: "
-            "every cell counts the same",
             n=len(members),
             counted="cell",
             reason_without_interval="the cells are these, not a sample of others",
             episodes=episodes,
         ),
         proportion(
-            f"average.pooled.{name}",
+            AVERAGE_POOLED.of(**words, unit=units[0]),
             sum(rate.k or 0 for rate in rates) if countable else 0,
             sum(rate.n or 0 for rate in rates) if countable else 0,
-            definition=f"successes / {units[0]}s over {over} {condition} ({side}): "
-            "every trial counts the same",
             counted=units[0],
             reason_if_undefined=why,
             episodes=episodes,
@@ -257,9 +242,9 @@ def _macro(rates: Sequence[Measurement]) -> float:
     return mean_rate([rate.value for rate in rates if rate.value is not None])
 
 
-def rate_id(side: str, key: Key) -> str:
-    """Return the id of a cell's rate on one side."""
-    return f"rate.{side}.{slug(key[0])}.{slug(key[1])}.{slug(key[2])}"
+def of_group(quantity: Quantity, key: Key, **words: object) -> Defined:
+    """Name a measurement of one task, condition and policy."""
+    return quantity.of(task=key[0], condition=key[1], policy=key[2], **words)
 
 
 # --- Sim estimated again with fresh seeds: what the twin says beyond the replay that chose a plan.
@@ -270,12 +255,6 @@ def rate_id(side: str, key: Key) -> str:
 # those draws: those of a replay are named after its recording, those of a gate after the start it
 # was asked about.
 
-VARIED_DEFINITION = (
-    "mean over trials of the share of varied planned replays of the plan actually sent that "
-    "succeed: start, friction, forces, masses, stiffness and timing drawn anew, no draw that the "
-    "gate used"
-)
-GAP_DEFINITION = "sim - sim estimated again, over the trials that have varied replays"
 NO_INTERVAL = "means of shares are no counts, and no interval of them was checked for its coverage"
 
 
@@ -300,10 +279,8 @@ def varied_sim(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Table
 
 def _again(key: Key, rows: Sequence[TrialRow]) -> Measurement:
     return measured(
-        rate_id("sim_varied", key),
+        of_group(RATE_VARIED, key),
         lambda: _mean(rows),
-        unit="1",
-        definition=VARIED_DEFINITION,
         n=len(rows),
         counted="trial",
         reason_without_interval=NO_INTERVAL,
@@ -321,10 +298,8 @@ def _gap(key: Key, rows: Sequence[TrialRow]) -> Measurement:
         return 100 * (_nominal(both) / len(both) - _mean(both))
 
     return measured(
-        rate_id("selection", key).replace("rate.", "bias.", 1),
+        of_group(SELECTION_BIAS, key),
         gap_pp,
-        unit="pp",
-        definition=GAP_DEFINITION,
         n=len(both),
         counted="trial",
         reason_without_interval=NO_INTERVAL,

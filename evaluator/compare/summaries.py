@@ -5,15 +5,18 @@ content in the key. Only summaries stay in memory, no series.
 """
 
 import functools
+import gc
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from bridge.data_files import dataset_file
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
-from bridge.task.data import dataset_file
+from bridge.process_pool import SERIAL, ProcessPool, Serial, cores
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
 from evaluator.compare.known_task import known_task
@@ -23,8 +26,9 @@ from evaluator.compare.states import StateSummary, summarise_states
 from evaluator.compare.trial import TRAJECTORIES, Trial
 from evaluator.result import Exclusion
 from evaluator.run_reader.contents import ODD, broken
-from evaluator.workers import SERIAL, Workers
 
+MAX_PROCESSES = 32
+"""Beyond this the one that collects what the others found cannot keep up."""
 COMPARE_S = 0.03
 """About what comparing one trial takes [s]."""
 
@@ -84,8 +88,25 @@ class _Part:
 _Job = tuple[_Files, tuple[_Part, ...]]
 
 
+def evaluation_pool(processes: int | None = None) -> ProcessPool:
+    """Processes for reading and comparing, this one included; one for each core by default."""
+    size = min(cores(), MAX_PROCESSES) if processes is None else processes
+    return ProcessPool(size - 1, prepare=get_ready, quiet=True)
+
+
+def get_ready(_: None) -> None:
+    """Make a new process ready; what nearly all work needs was imported to call this."""
+    gc.collect()
+    gc.freeze()  # nothing loaded so far is garbage
+    # What would be printed is told by the owner, who does it once more.
+    warnings.simplefilter("error", append=True)
+
+
 def sum_up(
-    trials: Sequence[Trial], cache: SummaryCache, output: Output, workers: Workers = SERIAL
+    trials: Sequence[Trial],
+    cache: SummaryCache,
+    output: Output,
+    pool: ProcessPool | Serial = SERIAL,
 ) -> Summaries:
     """Summarise motions, final states and localised success of every trial with a plan sent."""
     found: dict[type[Any], list[Any]] = {part.kind: [] for part in PARTS}
@@ -103,7 +124,7 @@ def sum_up(
     if unknown:
         jobs = [job for _, job in unknown]
         with output.progress("compare motions", len(unknown)) as advance:
-            all_made = zip(unknown, workers.map(_make, jobs, each_s=COMPARE_S), strict=True)
+            all_made = zip(unknown, pool.map(_make, jobs, each_s=COMPARE_S), strict=True)
             for done, ((trial, (_, parts)), made) in enumerate(all_made, start=1):
                 for part, summaries in zip(parts, made, strict=True):
                     if isinstance(summaries, Exclusion):

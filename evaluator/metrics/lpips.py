@@ -6,16 +6,12 @@ splatting feed it images in 0..1, which gives other numbers. So each backbone ma
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 from evaluator.metrics.image_protocol import ImageMetric, NetName
-
-if TYPE_CHECKING:
-    from evaluator.metrics.lpips_torch import LpipsNet
 
 NET_WORDS: dict[NetName, str] = {"vgg": "VGG16", "alex": "AlexNet"}
 InputName = Literal["01", "pm1"]
@@ -78,26 +74,6 @@ class PerceptualNet(Protocol):
         replayed: Float[np.ndarray, "height width 3"],
     ) -> Distances:
         """Return a distance, or the reason against one, by metric id."""
-
-
-def open_nets(backbones: Mapping[NetName, Path]) -> "tuple[LpipsNet, ...]":
-    """Load the networks that were asked for; without one, torch stays out.
-
-    Raises:
-        LpipsWeightsError: When a backbone or the linear heads cannot be used.
-        MissingDependencyError: When torch is not installed.
-    """
-    if not backbones:
-        return ()
-    from bridge.errors import MissingDependencyError  # noqa: PLC0415  # beside what needs it
-
-    try:
-        from evaluator.metrics.lpips_torch import LpipsNet  # noqa: PLC0415  # loads torch
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise MissingDependencyError(package="torch", extra="lpips", purpose="LPIPS") from error
-    return tuple(LpipsNet.open(net, path) for net, path in backbones.items())
 
 
 def net_of(metric: ImageMetric, nets: Sequence[PerceptualNet]) -> PerceptualNet | None:

@@ -11,6 +11,7 @@ from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
+from bridge.process_pool import SERIAL, ProcessPool, Serial
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
 from evaluator.result import Exclusion
@@ -22,7 +23,6 @@ from evaluator.run_reader.episodes import (
     read_recorded,
 )
 from evaluator.run_reader.inventory import RunFile, take_inventory
-from evaluator.workers import SERIAL, Workers
 
 ODD = (GstError, OSError, TypeError, ValueError, KeyError, RecursionError)
 """What one file of another program, or a failing disk, may raise; it costs that file only."""
@@ -57,7 +57,7 @@ class RunContents:
 
 
 def read_contents(
-    run: RunFolder, cache: SummaryCache, output: Output, workers: Workers = SERIAL
+    run: RunFolder, cache: SummaryCache, output: Output, pool: ProcessPool | Serial = SERIAL
 ) -> RunContents:
     """Read what is new or has changed in a run; a broken file is left out and named."""
     inventory = take_inventory(run, cache, output)
@@ -69,7 +69,7 @@ def read_contents(
         partial(_recorded, run),
         cache,
         output,
-        workers,
+        pool,
     )
     derived, broken = _read(
         inventory.derived,
@@ -78,7 +78,7 @@ def read_contents(
         _derived,
         cache,
         output,
-        workers,
+        pool,
     )
     found, doubled = _each_once(
         [
@@ -158,7 +158,7 @@ def _read(
     read: Callable[[RunFile], Facts | Exclusion],
     cache: SummaryCache,
     output: Output,
-    workers: Workers,
+    pool: ProcessPool | Serial,
 ) -> tuple[dict[str, Facts], list[Exclusion]]:
     """Return what the files say of themselves, by name, and the files left out."""
     facts: dict[str, Facts] = {}
@@ -173,7 +173,7 @@ def _read(
     if not unknown:
         return facts, left_out
     with output.progress("read episodes", len(unknown)) as advance:
-        all_made = zip(unknown, workers.map(read, unknown, each_s=READ_S), strict=True)
+        all_made = zip(unknown, pool.map(read, unknown, each_s=READ_S), strict=True)
         for done, (file, made) in enumerate(all_made, start=1):
             if isinstance(made, Exclusion):
                 left_out.append(made)

@@ -12,7 +12,7 @@ import pytest
 
 import robot_gst
 from bridge.episode.catalogue import label_episode, list_episodes
-from bridge.episode.metadata import EpisodeInfo, Outcome
+from bridge.episode.metadata import EpisodeInfo, Outcome, to_strings
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
@@ -57,6 +57,49 @@ def test_a_broken_episode_is_listed_with_its_error(run_path: Path) -> None:
     entries = {entry.id: entry for entry in list_episodes(RunFolder.open(run_path))}
     assert "not a finished MCAP file" in entries["bad"].error
     assert entries["t1"].error == ""
+
+
+READING = ("check", "evaluate", "info", "ls", "rebuild", "recover", "replay", "view")
+
+
+@pytest.mark.parametrize("command", READING)
+def test_a_folder_with_nothing_to_work_on_is_wrong_use_and_stays_as_it_is(
+    command: str, tmp_path: Path
+) -> None:
+    (tmp_path / "holiday.txt").write_text("somebody else's")
+    assert robot_gst.run([command, str(tmp_path), "--quiet"]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["holiday.txt"]
+
+
+def test_reading_a_run_on_a_read_only_medium_writes_nothing(run_path: Path) -> None:
+    folder = run_path / "episodes"
+    for words in (["info", str(folder / "t1.mcap")], ["check", str(folder)]):
+        assert robot_gst.run([*words, "--quiet"]) == 0
+    assert [path.name for path in run_path.iterdir()] == ["episodes"]
+    assert [path.name for path in folder.iterdir()] == ["t1.mcap"]
+
+
+def test_the_list_fits_eighty_columns_and_gives_the_cause_of_what_is_unknown(
+    run_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    why = "nothing executed, no verdict (not every object was found: cube hidden by the gripper)"
+    name = "a_long_name_" * 7
+    for id_, outcome in (("t2", Outcome(result="unknown", k=0, detail=why)), (name, None)):
+        with EpisodeWriter(run_path / "episodes" / f"{id_}.mcap") as writer:
+            info = EpisodeInfo(id=id_, kind="trial", condition="without_replanning")
+            writer.describe(info)
+            if outcome is not None:
+                writer.add_metadata("outcome", to_strings(outcome))
+    assert robot_gst.run(["ls", str(run_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split()[0] == "episode"
+    assert name in lines  # a name too long for its column has a line of its own
+    assert max(len(line) for line in lines if line != name) <= 80
+    text = " ".join(line.strip() for line in lines)
+    assert f"unknown: {why}" in text
+    assert " unlabelled " in text
+    robot_gst.run(["info", str(run_path / "episodes" / "t2.mcap")])
+    assert f"outcome: unknown ({why})" in capsys.readouterr().out
 
 
 def test_a_label_given_later_wins_and_leaves_the_episode_untouched(run_path: Path) -> None:

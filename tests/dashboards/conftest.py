@@ -18,8 +18,8 @@ from bridge.episode.provenance import hash_file
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.color import encode_jpeg
+from bridge.robots.default import ARM_JOINTS
 from bridge.task.plan import Plan, Stage, Waypoint
-from bridge.task.robot import ARM_JOINTS
 from bridge.task.verdict import Factor, Verdict
 from dashboards.app import create_app
 from dashboards.library import Library

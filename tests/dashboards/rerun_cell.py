@@ -23,7 +23,7 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
-from bridge.task.robot import ARM_JOINTS
+from bridge.robots.default import ARM_JOINTS
 
 CUBE_STL = """solid s
 facet normal 0 0 1

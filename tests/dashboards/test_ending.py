@@ -58,15 +58,13 @@ def test_a_demo_terminated_while_it_replays_leaves_no_replay_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = RunFolder.create(tmp_path / "run")
-    run.scene_dir.mkdir()
-    (run.scene_dir / "scene.json").write_text("{}")
     pid_file = tmp_path / "pid"
     code = (
         "import os, signal, sys, time; "
         "open(sys.argv[1], 'w').write(str(os.getpid())); "
         "os.kill(os.getppid(), signal.SIGTERM); time.sleep(60)"
     )
-    monkeypatch.setattr(RunFolder, "episodes", lambda _: [run.path])
+    monkeypatch.setattr(demo, "_record", lambda *_: None)
     monkeypatch.setattr(demo, "_command", lambda _: [sys.executable, "-c", code, str(pid_file)])
     before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:

@@ -19,7 +19,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import joint_track
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
-from bridge.task.robot import ARM_JOINTS
+from bridge.robots.default import ARM_JOINTS
 from dashboards.errors import DashboardError
 from dashboards.rerun_entities import drawable, read_splats
 from dashboards.rerun_file import RerunFile

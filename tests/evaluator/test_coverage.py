@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import binom
 
 from evaluator.compare.measure import measured, proportion
+from evaluator.measurements import Defined
 from evaluator.result import Interval
 from evaluator.statistics.bootstrap import METHODS
 from evaluator.statistics.coverage import exact, simulate, stored
@@ -29,6 +30,8 @@ from evaluator.statistics.sequential import betting_interval
 from evaluator.statistics.weighted import STATISTICS
 
 REQUIRED = range(5, 101)
+
+ANY = Defined(id="x", unit="1", definition="d")
 
 
 def test_clopper_pearson_covers_95_percent_everywhere() -> None:
@@ -187,12 +190,10 @@ def test_between_stored_sizes_the_worse_neighbour_counts_and_above_them_the_last
 def test_a_measurement_without_its_interval_says_why() -> None:
     jeffreys_refused = [p.n for p in stored.load_map()["jeffreys"].points if p.worst < 0.9]
     n = jeffreys_refused[0]
-    rate = proportion(
-        "x", 1, n, definition="d", counted="trial", reason_if_undefined="r", method="jeffreys"
-    )
+    rate = proportion(ANY, 1, n, counted="trial", reason_if_undefined="r", method="jeffreys")
     assert rate.interval is None
     assert "jeffreys at" in str(rate.reason_without_interval)
-    value = measured("x", lambda: (0.5, jeffreys(1, n)), unit="1", definition="d", n=n)
+    value = measured(ANY, lambda: (0.5, jeffreys(1, n)), n=n)
     assert value.value == 0.5
     assert value.interval is None
     assert "use wilson" in str(value.reason_without_interval)

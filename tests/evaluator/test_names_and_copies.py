@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from bridge.episode.catalogue import label_episode
 from bridge.episode.metadata import Outcome
 from evaluator.compare import compare_csv, compare_run
-from evaluator.compare.measure import refuse_alike, slug
+from evaluator.compare.measure import refuse_alike
 from evaluator.errors import AlikeNamesError
+from evaluator.measurements import slug
 from evaluator.result import Results
 
 HEADER = "trial_id,task,condition,recorded,sim_planned\n"

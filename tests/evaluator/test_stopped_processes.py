@@ -6,9 +6,9 @@ from multiprocessing.connection import wait
 
 import pytest
 
-from evaluator import child_process, workers
+from bridge import process_pool
+from bridge.process_pool import ProcessPool
 from evaluator.report.figures.beside import Beside
-from evaluator.workers import Workers
 
 LARGE = 3_000_000
 """Bytes; a pipe holds 65 536."""
@@ -17,7 +17,7 @@ LARGE = 3_000_000
 def test_a_process_that_does_not_listen_is_not_sent_to_for_ever(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(child_process, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(process_pool, "PATIENCE_S", 0.1)
     second = Beside()
     os.kill(second.process.pid, signal.SIGSTOP)
     second.send(bytes(LARGE))
@@ -29,16 +29,15 @@ def test_a_process_that_does_not_listen_is_not_sent_to_for_ever(
 def test_a_process_stopped_in_the_middle_of_an_answer_costs_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with Workers(2) as pool:
-        pool._start(1)
-        (worker,) = pool.started
+    with ProcessPool(1) as pool:
+        worker = pool._start()
+        shared = process_pool._Shared(bytes, [LARGE])
+        shared.ask(worker, 2)
         assert wait([worker.outlet], 60)
-        assert worker.answer() is None
-        worker.ask(bytes, [LARGE], range(1))
-        assert wait([worker.outlet], 60)
-        os.kill(worker.process.pid, signal.SIGSTOP)
-        monkeypatch.setattr(workers, "MAX_WAIT_S", 0.1)
-        found = list(pool.map(bytes, [LARGE] * 3, each_s=workers.WORTH_S))
-        assert [len(each) for each in found] == [LARGE] * 3
-        assert pool.started == []
+        os.kill(worker.pid, signal.SIGSTOP)
+        monkeypatch.setattr(process_pool, "PATIENCE_S", 0.1)
+        pool._exchange(shared)
+        shared.do_one()
+        assert len(shared.found[0]) == LARGE
+        assert pool.workers == []
     assert worker.process.returncode == -signal.SIGKILL

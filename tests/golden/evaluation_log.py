@@ -18,8 +18,8 @@ from bridge.episode.cdr.messages import (
 )
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
+from bridge.robots.default import ARM_JOINTS
 from bridge.task.plan import Plan
-from bridge.task.robot import ARM_JOINTS
 from bridge.task.task_file import Task
 
 START_NS = 100_000_000_000

@@ -25,9 +25,9 @@ from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.provenance import hash_file
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
+from bridge.robots.default import ARM_JOINTS
 from bridge.task.plan import Plan, Waypoint
 from bridge.task.plan import Stage as PlanStage
-from bridge.task.robot import ARM_JOINTS
 from bridge.task.task_file import Task, load_task
 from bridge.task.verdict import Factor, Verdict
 

@@ -52,13 +52,13 @@ def test_no_point_is_nearer_than_the_tree_says(grid: SdfGrid) -> None:
 
 
 def test_the_same_bits_on_every_call(grid: SdfGrid) -> None:
-    shell = BoundingSpheres(
+    spheres = BoundingSpheres(
         [bounding_spheres_of(np.random.default_rng(3).uniform(-0.05, 0.05, (25, 3)))]
     )
     lookup = GridLookup(grid)
     R, t = poses(1, 7)
-    first = shell.distances_m(lookup, R, t)
-    assert all(shell.distances_m(lookup, R, t).tobytes() == first.tobytes() for _ in range(20))
+    first = spheres.distances_m(lookup, R, t)
+    assert all(spheres.distances_m(lookup, R, t).tobytes() == first.tobytes() for _ in range(20))
 
 
 def test_what_does_not_fit_together_is_refused(grid: SdfGrid) -> None:

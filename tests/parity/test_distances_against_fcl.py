@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from bridge.task.robot import ur5_with_gripper_urdf
+from bridge.robots.default import ROBOT
 from twin.robot.collision import RobotHulls, convex_hull, hulls_of, signed_distance
 from twin.robot.model import load_robot
 
@@ -20,7 +20,7 @@ BOXES_M = ((0.03, 0.03, 0.03), (0.2, 0.15, 0.08), (1.2, 0.9, 0.04))
 
 @pytest.fixture(scope="module")
 def hulls() -> RobotHulls:
-    return hulls_of(load_robot(ur5_with_gripper_urdf()))
+    return hulls_of(load_robot(ROBOT.urdf_text()))
 
 
 def fcl_convex(shape: coal.ConvexBase) -> fcl.Convex:

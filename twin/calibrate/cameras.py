@@ -14,19 +14,17 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import CAMERAS, DEPTH_IMAGE, DEPTH_INFO, TARGET_POSE, is_truth
 from bridge.errors import BridgeError, GstError, UsageError
 from bridge.geometry import se3
-from bridge.task.robot import BASE_FRAME
+from bridge.robots.default import BASE_FRAME
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.hand_eye import TargetCamera, find_camera
 from twin.calibrate.pairs import PosePairs, read_pairs, recorded_pairs, target_cameras
 from twin.robot.model import load_robot
-from twin.robot.posture import Posture, PostureTrack, far_apart, posture_track
+from twin.robot.posture import Posture, PostureTrack, distinct_postures, posture_track
 from twin.scene.align.align import AlignConfig, Alignment, RobotNotAlignedError, align_robot
 from twin.scene.align.view import RobotView
 from twin.scene.frames.camera_poses import base_tree, same_pose
 from twin.scene.store.calibration import CALIBRATION_FILE, write_calibration
-
-# --- Which cameras of a run stand still, which the robot carries, as far as its transforms say.
 
 FIXED, MOVING, NO_DEPTH = "fixed", "moving", "no depth"
 STILL_M, STILL_RAD = 0.002, 0.0035
@@ -69,17 +67,14 @@ def _moves(episode: Episode, camera_id: str) -> bool:
     )
 
 
-# --- A fixed camera found from the robot it sees: depth against the posed description.
-
-
 @dataclass(frozen=True, kw_only=True)
 class FixedCamera:
     """What was found of one fixed camera."""
 
     alignment: Alignment
     """``T_base_source`` is ``T_base_depth``, the pose of the depth camera."""
-    T_base_believed: Float[np.ndarray, "4 4"] | None
-    """What the recording believed of it."""
+    T_base_nominal: Float[np.ndarray, "4 4"] | None
+    """Where the recording has it."""
     episodes: tuple[str, ...]
 
 
@@ -97,8 +92,8 @@ def find_fixed_camera(
 ) -> FixedCamera:
     """Find the pose and depth scale of a fixed camera in the robot's base frame.
 
-    Where the recording believes the camera to be is where the search begins; when the robot is
-    not there, or nothing is believed, the whole table is searched.
+    The search begins where the recording has the camera; when the robot is not there, or the
+    recording does not say, the whole table is searched.
 
     Raises:
         RobotNotAlignedError: The images do not determine it, or none shows a robot that stands
@@ -111,7 +106,7 @@ def find_fixed_camera(
         item
         for episode in episodes
         if str(episode.path) in tracks
-        for item in _still(episode, camera_id, tracks[str(episode.path)])
+        for item in _stationary(episode, camera_id, tracks[str(episode.path)])
     ]
     if not seen:
         raise RobotNotAlignedError(
@@ -119,23 +114,23 @@ def find_fixed_camera(
             hint="Stop the robot for half a second at each of several postures while recording.",
         )
     joints = np.array([item.posture.joints_rad for item in seen])
-    chosen = [seen[index] for index in far_apart(joints, max_postures)]
+    chosen = [seen[index] for index in distinct_postures(joints, max_postures)]
     views = [view for episode in episodes for view in _load(episode, camera_id, chosen)]
     robot = load_robot(tracks[str(chosen[0].episode.path)].urdf)
-    believed = _nominal_pose(chosen[0], camera_id)
+    nominal = _nominal_pose(chosen[0], camera_id)
     config = AlignConfig(seed=seed)
     try:
-        if believed is None:
+        if nominal is None:
             alignment = align_robot(views, robot, config=config)
         else:
-            alignment = align_robot(views, robot, start=believed, config=config)
+            alignment = align_robot(views, robot, start=nominal, config=config)
     except RobotNotAlignedError:
-        if believed is None:
+        if nominal is None:
             raise
         alignment = align_robot(views, robot, config=config)
     return FixedCamera(
         alignment=alignment,
-        T_base_believed=believed,
+        T_base_nominal=nominal,
         episodes=tuple(dict.fromkeys(item.episode.info.id for item in chosen)),
     )
 
@@ -154,13 +149,13 @@ def _tracks(episodes: Sequence[Episode]) -> dict[str, PostureTrack]:
     return tracks
 
 
-def _still(episode: Episode, camera_id: str, track: PostureTrack) -> Iterator[_Seen]:
+def _stationary(episode: Episode, camera_id: str, track: PostureTrack) -> Iterator[_Seen]:
     topic = streams.find_camera_topic(episode, camera_id, "depth/image")
     if topic is None:
         return
     for message in episode.messages([topic]):
         stamp = DepthImage.from_message(message.type_name, message.data).stamp_ns
-        if track.is_still(stamp):
+        if track.is_stationary(stamp):
             yield _Seen(episode=episode, stamp_ns=stamp, posture=track.at(stamp))
 
 
@@ -314,8 +309,8 @@ def fixed_record(found: FixedCamera) -> dict[str, Any]:
         **found.alignment.to_record(),
         "sources": list(found.episodes),
     }
-    if found.T_base_believed is not None:
-        change = se3.invert(found.T_base_believed) @ found.alignment.T_base_source
+    if found.T_base_nominal is not None:
+        change = se3.invert(found.T_base_nominal) @ found.alignment.T_base_source
         record["correction_m"] = float(np.linalg.norm(change[:3, 3]))
         record["correction_rad"] = float(se3.rotation_angle_rad(change[:3, :3]))
     return record
@@ -360,5 +355,5 @@ def _describe(item: Mapping[str, Any]) -> str:
     text += f", depth scale {item['depth_scale']:.4f}"
     if "correction_m" in item:
         moved, turned = item["correction_m"] * 1e3, float(np.degrees(item["correction_rad"]))
-        text += f"; {moved:.1f} mm and {turned:.2f} degrees from where the recording believed it"
+        text += f"; {moved:.1f} mm and {turned:.2f} degrees from where the recording has it"
     return text

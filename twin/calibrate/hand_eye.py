@@ -14,8 +14,7 @@ from twin.calibrate.config import Mount
 from twin.calibrate.pairs import PosePairs
 from twin.errors import TwinError
 
-# --- Closed-form solutions of AX = XB and AX = ZB; where ``robot_world`` starts refining from.
-#
+# Closed-form solutions of AX = XB and AX = ZB; where ``robot_world`` starts refining from.
 # Both describe one set of pose pairs. With a camera in the hand, A is ``T_base_hand``, B is
 # ``T_target_camera``, X is ``T_hand_camera`` and Z is ``T_base_target``. With a fixed camera and
 # the target in the hand, B is ``T_camera_target``, X is ``T_hand_target`` and Z is
@@ -347,9 +346,6 @@ def _interval(values: np.ndarray, low: float, high: float) -> Interval:
 def _spread(rows: np.ndarray) -> float:
     return float(np.sqrt(rows.var(axis=0).sum()))
 
-
-# --- A camera found from pose pairs of a target: in the hand, or fixed with the target in the
-# hand.
 
 CLEARLY = 3.0
 """One explanation of the pairs beats the other when its misfit is this many times smaller."""

@@ -152,7 +152,7 @@ def _stops(
     robot = load_robot(track.urdf)
     groups: list[tuple[np.ndarray, list[np.ndarray]]] = []
     for sample in sorted(samples, key=lambda item: item.stamp_ns):
-        if not track.is_still(sample.stamp_ns):
+        if not track.is_stationary(sample.stamp_ns):
             continue
         joints = track.at(sample.stamp_ns).joints_rad
         if groups and np.abs(groups[-1][0] - joints).max() < SAME_PLACE_RAD:

@@ -54,7 +54,7 @@ class GateConfig:
     moved_rad: float = 0.3
     """Or turned by this much [rad]."""
     replay: Annotated[ReplayConfig, Parameter(name="replay")] = field(default_factory=ReplayConfig)
-    """How each plan is re-lived."""
+    """How each plan is replayed."""
 
     def __post_init__(self) -> None:
         """Refuse numbers with which no gate can work."""

@@ -19,16 +19,14 @@ from jaxtyping import Float
 
 from bridge.episode.topics import ROBOT_DESCRIPTION
 from bridge.errors import GstError
+from bridge.robots.default import BASE_FRAME
 from bridge.task.plan import Plan
-from bridge.task.robot import BASE_FRAME
 from bridge.task.task_file import ObjectModel, Task
 from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
 from twin.replay.failure import with_reasons
 from twin.scene.shape.known import yaw_period_rad
-
-# --- Whether objects are still where a verdict took them to be.
 
 SIGMAS = 4.0
 """What localisation says of its own errors, so many times, is no motion."""
@@ -137,7 +135,7 @@ class Gate:
         *,
         task: Task,
         config: GateConfig,
-        eyes: Perception,
+        perception: Perception,
         localise: Localise,
         replay: Replay,
         now_ns: Callable[[], int],
@@ -145,7 +143,7 @@ class Gate:
         """Put together what sees, what finds objects and what replays."""
         self._task = task
         self._config = config
-        self._eyes = eyes
+        self._perception = perception
         self._localise = localise
         self._replay = replay
         self._now_ns = now_ns
@@ -204,7 +202,7 @@ class Gate:
             return no_verdict(plan, f"the replay was not done at {limit}")
 
     def _decide(self, plan: Plan, ends_s: float) -> Verdict:
-        silent_ns = self._now_ns() - max(self._eyes.heard_ns(), self._contact_ns)
+        silent_ns = self._now_ns() - max(self._perception.heard_ns(), self._contact_ns)
         try:
             urdf = self._check(plan)
             if silent_ns > self._config.max_silence_s * 1e9:
@@ -244,7 +242,7 @@ class Gate:
                 f"plan {plan.id} is given in frame {plan.frame!r}; only {BASE_FRAME!r}, the "
                 "robot's root, is judged"
             )
-        urdf = self._eyes.urdf()
+        urdf = self._perception.urdf()
         if urdf is None:
             raise UndecidedError(f"no robot description has arrived on {ROBOT_DESCRIPTION}")
         robot = robot_name(urdf)
@@ -252,7 +250,7 @@ class Gate:
             raise UndecidedError(
                 f"plan {plan.id} is for robot {plan.robot!r}; the cell's robot is {robot!r}"
             )
-        running = self._eyes.executing()
+        running = self._perception.executing()
         if running is not None:
             raise UndecidedError(f"{running} is being executed; objects are judged at rest")
         return urdf
@@ -278,7 +276,7 @@ class Gate:
             time.sleep(POLL_S)
 
     def _frames(self) -> Any:
-        return self._eyes.frames(
+        return self._perception.frames(
             max_age_ns=round(self._config.max_frame_age_s * 1e9),
             max_per_camera=self._config.frames,
         )
@@ -306,7 +304,7 @@ class Gate:
         Raises:
             UndecidedError: When something was started or moved meanwhile, or nobody can see.
         """
-        running = self._eyes.executing()
+        running = self._perception.executing()
         if running is not None:
             raise UndecidedError(f"{running} was started while the plan was being judged")
         live = self._frames()

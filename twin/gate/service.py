@@ -38,13 +38,13 @@ class GateError(TwinError):
 
 
 def make_gate(
-    config: GateConfig, eyes: Perception, now_ns: Callable[[], int], twin: TwinProcess
+    config: GateConfig, perception: Perception, now_ns: Callable[[], int], twin: TwinProcess
 ) -> Gate:
     """Put the real localisation and replay behind the gate."""
     return Gate(
         task=load_task(config.task),
         config=config,
-        eyes=eyes,
+        perception=perception,
         localise=twin.localise,
         replay=twin.replay,
         now_ns=now_ns,
@@ -52,7 +52,7 @@ def make_gate(
 
 
 def serve_gate(
-    session: Any, gate: Gate, eyes: Perception, config: GateConfig, output: Output
+    session: Any, gate: Gate, perception: Perception, config: GateConfig, output: Output
 ) -> None:
     """Answer on ``<cell>/gate/verdict`` and publish every verdict on ``/<cell>/verdict``.
 
@@ -67,7 +67,7 @@ def serve_gate(
         verdict = gate.judge(payload)
         data = verdict.to_json()
         with publishing:
-            publisher.put(data, source_ns=eyes.newest_ns() or session.now_ns())
+            publisher.put(data, source_ns=perception.newest_ns() or session.now_ns())
         seconds = time.monotonic() - started
         p = verdict.p_success
         share = f" {p['k']:g} of {p['n']:g} samples succeed." if p else ""
@@ -126,7 +126,7 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
         message = f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'."
         raise UsageError(message)
     run, task = RunFolder.open(path), load_task(config.task)
-    eyes = LiveView(config.cell, read_calibration(run))
+    perception = LiveView(config.cell, read_calibration(run))
     wire = WireConfig(connect=config.connect, config=config.zenoh_config)
     with (
         stop_signals() as stopped,
@@ -134,12 +134,12 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
         TwinProcess(run.path, task, config, output) as twin,
     ):
         claim_gate(session, config.cell)
-        watch_cell(session, config.cell, eyes.take, joints=eyes.needs_joints)
-        gate = make_gate(config, eyes, session.now_ns, twin)
-        serve_gate(session, gate, eyes, config, output)
+        watch_cell(session, config.cell, perception.take, joints=perception.needs_joints)
+        gate = make_gate(config, perception, session.now_ns, twin)
+        serve_gate(session, gate, perception, config, output)
         output.say(
             f"gate ready: {config.task} of cell {config.cell}, service {config.cell}{GATE}, "
-            f"{eyes.cameras_from()}. Stop with Ctrl-C."
+            f"{perception.cameras_from()}. Stop with Ctrl-C."
         )
         while not stopped.wait(0.2):
             pass

@@ -13,16 +13,14 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.run_folder import RunFolder
+from bridge.process_pool import Failed, Function, TimeIsUpError, Worker, WorkerDiedError
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from bridge.terminal import Output
-from twin.crew.pool import Failed, Function, TimeIsUpError, Worker, WorkerDiedError
 from twin.gate.config import GateConfig
 from twin.gate.gate import UndecidedError
 from twin.replay.config import ReplayConfig
-
-# --- What the gate's own process does: finding objects and replaying plans.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,8 +88,8 @@ def answer(question: Question) -> Verdict:
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
 
     run, plan = RunFolder.open(question.run_path), question.plan
-    place = read_rebuilt_scene(run, question.task)
-    scene = place.scene(
+    rebuilt = read_rebuilt_scene(run, question.task)
+    scene = rebuilt.scene(
         question.task, question.urdf, question.Ts_base_object, covariances=question.covariances
     )
     config = for_task(calibrated(question.config, read_calibration(run)), question.task)
@@ -114,14 +112,14 @@ def answer(question: Question) -> Verdict:
         plan_id=plan.id,
         identity=plan.start_id or plan.id,
     )
-    return _with_remarks(with_probability(verdict, samples), place.remarks)
+    return _with_notes(with_probability(verdict, samples), rebuilt.notes)
 
 
-def _with_remarks(verdict: Verdict, remarks: tuple[str, ...]) -> Verdict:
+def _with_notes(verdict: Verdict, notes: tuple[str, ...]) -> Verdict:
     """Say what the scene could not tell; a yes that knows less than it might says so first."""
-    if not remarks:
+    if not notes:
         return verdict
-    warnings = (*verdict.warnings, *remarks)
+    warnings = (*verdict.warnings, *notes)
     return replace(verdict, warnings=warnings, reason=verdict.reason or warnings[0])
 
 

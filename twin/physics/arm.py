@@ -11,13 +11,12 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
-from bridge.task.robot import ARM_JOINTS, FINGER_JOINTS, FINGER_LINKS, MAX_WIDTH_M, TCP_FRAME
+from bridge.robots.default import ARM_JOINTS, FINGER_JOINTS, FINGER_LINKS, MAX_WIDTH_M, TCP_FRAME
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
 
-# --- The robot description as PyBullet should load it.
-#
+# The robot description as PyBullet should load it.
 # PyBullet gives links without ``<inertial>`` a mass of 1 kg, massless frames included, and makes
 # its own hulls of meshes; both are settled here so that it simulates the robot that was described.
 
@@ -359,8 +358,7 @@ def _numbers(joints: Joints) -> list[float]:
     return joints if isinstance(joints, list) else joints.tolist()
 
 
-# --- Fingers that press on what does not yield get their force in fewer iterations of the solver.
-#
+# Fingers that press on what does not yield get their force in fewer iterations of the solver.
 # The solver begins each step with fingers that press by nothing, and each of its iterations adds
 # what stops a finger at the speed it is driven with. At the usual speed 20 N take 45 iterations;
 # all else takes 10. Fingers that stand still although they are told to close are therefore driven

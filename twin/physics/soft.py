@@ -16,8 +16,6 @@ from bridge.task.meshes.lattice import Lattice, fill, make_lattice, volumes_m3
 from bridge.task.task_file import ObjectModel
 from twin.errors import TwinError
 
-# --- Shapes of tetrahedra in motion: surface, rigid fit, and points that follow.
-
 
 def rigid_fit(
     rest_m: Float[np.ndarray, "num_nodes 3"],
@@ -92,8 +90,7 @@ def bind_points(
     return Skin(node_ids=tets[owner].astype(np.int64), weights=weights)
 
 
-# --- A coarser lattice for a body whose own is finer than physics can pay for.
-#
+# A coarser lattice for a body whose own is finer than physics can pay for.
 # Substeps shorten with the cells and their number grows with the cube: a lattice of half the
 # spacing costs about sixteen times as much. What is drawn keeps its detail: the fine surface
 # follows as skin.
@@ -380,7 +377,7 @@ class SoftHealth:
         return self.is_finite and self.num_inverted == 0 and self.max_stretch < MAX_STRETCH
 
     def describe(self) -> str:
-        """One sentence about what is wrong; empty when nothing is."""
+        """Say about what is wrong; empty when nothing is."""
         if not self.is_finite:
             return "it burst: its nodes are no numbers any more"
         if self.max_stretch >= MAX_STRETCH:

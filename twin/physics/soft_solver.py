@@ -15,8 +15,6 @@ from twin.physics._soft import SoftSolver as SoftSolver
 from twin.physics.arm import Hulls
 from twin.physics.soft import SoftModel
 
-# --- Convex rigid pieces that soft bodies touch, as the half-spaces they lie in.
-
 _NORMAL_DIGITS = 2
 """Faces of a hull whose normals agree so far become one; the piece grows by a hundredth at most."""
 _SIDES = 12

@@ -18,8 +18,7 @@ from twin.physics.engine import pybullet
 from twin.physics.soft import Skin, SoftHealth, SoftModel, bind_points, health_of, rigid_fit
 from twin.physics.soft_solver import ConvexPiece, SoftSolver, add_body, box_piece, link_pieces
 
-# --- What soft bodies do to the robot: forces on its links, and fingers that yield.
-#
+# What soft bodies do to the robot: forces on its links, and fingers that yield.
 # Called in every physics step, so in plain numbers: arrays of three cost more than the sums.
 
 Three = tuple[float, float, float]
@@ -52,7 +51,7 @@ class Reaction:
             pushes: Momentum and its moment about the frame, per piece, of the last step.
             poses: Where the links are.
         """
-        apart = 0.0
+        opening = 0.0
         wrenches: dict[str | None, list[float]] = {}
         for piece in pushed:
             link = self._link_of.get(piece)
@@ -63,7 +62,7 @@ class Reaction:
             force, moment = tuple(row[:3]), tuple(row[3:])
             finger = self._arm.links[link] in self._arm.finger_links
             if finger:
-                apart += _dot(force, _rotated(q, self._arm.opening_axis(link)))
+                opening += _dot(force, _rotated(q, self._arm.opening_axis(link)))
             # The fingers' own forces meet in what carries them; their drive feels the rest.
             wrench = wrenches.setdefault(None if finger else link, [0.0] * 6)
             for k, value in enumerate((*force, *_sum(moment, _cross(p, force)))):
@@ -75,7 +74,7 @@ class Reaction:
             point = tuple(value / size for value in _cross(force, moment)) if size else force
             self._arm.push(link, force, point)
         if wrenches or self._yields:
-            self._arm.yield_fingers(apart / len(self._arm.finger_links))
+            self._arm.yield_fingers(opening / len(self._arm.finger_links))
         self._yields = bool(wrenches)
 
 

@@ -15,15 +15,14 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from bridge.geometry import se3
-from bridge.task.robot import BASE_FRAME, TCP_FRAME
+from bridge.robots.default import BASE_FRAME, TCP_FRAME
 from twin.physics.arm import Arm, Hulls, Joints, PhysicsError, Press
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import give_client_back, pybullet, take_client
 from twin.physics.soft import SoftHealth, SoftModel
 from twin.physics.soft_world import SoftWorld
 
-# --- Friction that holds where it held: PyBullet's friction anchors, with fresh contact normals.
-#
+# Friction that holds where it held: PyBullet's friction anchors, with fresh contact normals.
 # Without anchors friction acts against velocities only, and what the solver leaves of them adds
 # up to a creep that takes hundreds of iterations to keep small. With an anchor a contact point
 # stays where it took hold while its force is within Coulomb's cone, and is let go when it is not.
@@ -325,9 +324,8 @@ class World:
         self.close()
 
 
-# --- Tie an object to the tool instead of holding it by friction: ``--grasp attach``, not the
+# Tie an object to the tool instead of holding it by friction: ``--grasp attach``, not the
 # default.
-#
 # For robots or grippers whose friction nobody knows. What is tied cannot slip, so a verdict made
 # this way says nothing about the grasp; the engine's name carries the word wherever it is shown.
 

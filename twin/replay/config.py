@@ -10,8 +10,6 @@ from bridge.errors import UsageError, refuse_outside
 from twin.physics.config import PhysicsConfig
 from twin.robot.config import IkConfig
 
-# --- How unsure we are of what a replay assumes; imports nothing heavy.
-
 FRICTIONS = ("object_friction", "finger_friction", "surface_friction")
 """Fields of ``PhysicsConfig`` that are frictions."""
 GRIP_FORCE = "grip_force_N"
@@ -128,7 +126,7 @@ class DivergenceConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayConfig:
-    """How one trajectory is re-lived and when it is accepted."""
+    """How one trajectory is replayed and when it is accepted."""
 
     mode: Annotated[Mode, Parameter(parse=False)] = "dynamic"
     """kinematic follows the joints exactly; dynamic lets physics answer. No flag: the commands
@@ -174,7 +172,7 @@ class ReplayConfig:
     """Varied replays behind each nominal one. No flag here: the commands have --samples."""
     variation: VariationConfig = field(default_factory=VariationConfig)
     """What the samples vary, and how far."""
-    parting: DivergenceConfig = field(default_factory=DivergenceConfig)
+    divergence: DivergenceConfig = field(default_factory=DivergenceConfig)
     """From which size on planned, executed and recorded are apart."""
     ik: IkConfig = field(default_factory=IkConfig)
     """When a pose counts as reached."""
@@ -215,7 +213,7 @@ class ReplayRunConfig:
     relocalise: bool = False
     """Redo the localisation of objects that is there already."""
     replay: Annotated[ReplayConfig, Parameter(name="replay")] = field(default_factory=ReplayConfig)
-    """How each trajectory is re-lived."""
+    """How each trajectory is replayed."""
 
     def __post_init__(self) -> None:
         """Refuse numbers with which nothing can be replayed."""

@@ -1,12 +1,12 @@
-"""Where planned in the twin, executed in the twin and recorded part first, and why.
+"""Where planned in the twin, executed in the twin and recorded diverge first, and why.
 
-Three tellings of one execution are laid over each other, two at a time. The recorded tool lags
+Three trajectories of one execution are laid over each other, two at a time. The recorded tool lags
 behind the command by the latency of the controller: that constant is found first, reported, and
 taken out. Then four quantities are followed until they differ by more than a limit: the tool's
 pose, the width of the gripper, the objects' positions, and when the fingers touch what.
 
-What parts first decides the attribution of a pair; what parts later may follow from it and carries
-the same name:
+What diverges first decides the attribution of a pair; what diverges later may follow from it and
+carries the same name:
 
 - tool pose: tracking;
 - gripper width, at rest, while neither side touches anything: tracking; while something is held:
@@ -31,8 +31,6 @@ from bridge.geometry import se3
 from bridge.task.record import check_record
 from twin.replay.config import DivergenceConfig
 from twin.replay.trace import Touch, Trace
-
-# --- The constant by which the tool of one telling lags behind that of another.
 
 LAG_STEP_NS = 66_666_668
 """Between the instants at which tools are compared: four steps of the physics."""
@@ -94,7 +92,7 @@ UNITS = {"tool_rotation": "rad", "contact": "s"}
 
 @dataclass(frozen=True, kw_only=True)
 class DivergedQuantity:
-    """One quantity in which two tellings differ, from its first instant on."""
+    """One quantity in which two trajectories differ, from its first instant on."""
 
     between: tuple[str, str]
     quantity: str
@@ -110,18 +108,18 @@ class DivergedQuantity:
 
 @dataclass(frozen=True, kw_only=True)
 class Divergence:
-    """All partings of one execution."""
+    """Everything in which the trajectories of one execution differ."""
 
     plan_id: str
     lag_s: float | None
     """How far the recorded tool lags behind the planned one."""
-    partings: tuple[DivergedQuantity, ...]
+    quantities: tuple[DivergedQuantity, ...]
     not_compared: tuple[str, ...] = ()
 
     @property
     def first(self) -> DivergedQuantity | None:
         """The earliest; of several at one instant, the one nearest to the cause."""
-        return min(self.partings, key=_rank, default=None)
+        return min(self.quantities, key=_rank, default=None)
 
     def to_record(self) -> dict[str, Any]:
         """Return the gst divergence v1 record, checked against its schema."""
@@ -130,7 +128,7 @@ class Divergence:
             "plan_id": self.plan_id,
             "lag_s": self.lag_s,
             "first": None if self.first is None else _plain(self.first),
-            "partings": [_plain(parting) for parting in self.partings],
+            "quantities": [_plain(one) for one in self.quantities],
             "not_compared": list(self.not_compared),
         }
         check_record(record, name="divergence")
@@ -145,41 +143,43 @@ def diverge(
     findings: Mapping[str, Mapping[tuple[str, str], bool | None]] | None = None,
     not_compared: Sequence[str] = (),
 ) -> Divergence:
-    """Compare every two tellings of one execution.
+    """Compare every two trajectories of one execution.
 
     Args:
         plan_id: Whose.
         traces: Two or three of planned, executed and recorded.
         config: From which size on things differ.
         findings: Per side what each predicate (its kind and object) said; compared where nothing
-            else parts.
+            else diverges.
         not_compared: Why a side is missing.
     """
-    partings: list[DivergedQuantity] = []
+    quantities: list[DivergedQuantity] = []
     lags: dict[tuple[str, str], float] = {}
     ordered = sorted(traces, key=lambda trace: SIDES.index(trace.side))
     for first, second in combinations(ordered, 2):
         pair = (first.side, second.side)
         lags[pair] = lag_s(first, second)
-        found = sorted(_partings(first, without_lag(second, lags[pair]), config), key=_rank)
+        found = sorted(_quantities(first, without_lag(second, lags[pair]), config), key=_rank)
         if found:
-            found = [replace(parting, attribution=found[0].attribution) for parting in found]
+            found = [replace(one, attribution=found[0].attribution) for one in found]
         else:
             found = list(_predicates(pair, findings or {}, max(first.end_ns, second.end_ns)))
-        partings += found
+        quantities += found
     return Divergence(
         plan_id=plan_id,
         lag_s=lags.get(("planned", "recorded")),
-        partings=tuple(partings),
+        quantities=tuple(quantities),
         not_compared=tuple(not_compared),
     )
 
 
-def _partings(first: Trace, second: Trace, config: DivergenceConfig) -> Iterator[DivergedQuantity]:
+def _quantities(
+    first: Trace, second: Trace, config: DivergenceConfig
+) -> Iterator[DivergedQuantity]:
     times = np.arange(0, max(min(first.end_ns, second.end_ns), 1), STEP_NS)
     pair = (first.side, second.side)
     one, two = first.tool.at(times), second.tool.at(times)
-    apart = np.linalg.norm(one.p_m - two.p_m, axis=1)
+    shifted = np.linalg.norm(one.p_m - two.p_m, axis=1)
     turned = se3.rotation_angle_rad(
         np.swapaxes(one.transforms()[:, :3, :3], 1, 2) @ two.transforms()[:, :3, :3]
     )
@@ -187,7 +187,7 @@ def _partings(first: Trace, second: Trace, config: DivergenceConfig) -> Iterator
     recorded = "recorded" in pair
     held = _held(first, times) | _held(second, times)
     for quantity, values, limit in (
-        ("tool_position", apart, config.tool_m),
+        ("tool_position", shifted, config.tool_m),
         ("tool_rotation", turned, config.tool_rad),
         ("gripper_width", widths, config.width_m),
     ):
@@ -197,7 +197,7 @@ def _partings(first: Trace, second: Trace, config: DivergenceConfig) -> Iterator
         cause = "tracking"
         if quantity == "gripper_width" and held[index]:
             cause = "perception" if recorded else "contact"
-        yield _parting(pair, quantity, int(times[index]), values[index:].max(), limit, cause)
+        yield _quantity(pair, quantity, int(times[index]), values[index:].max(), limit, cause)
     yield from _touches(first, second, config)
     yield from _objects(first, second, config)
 
@@ -253,7 +253,7 @@ def _touches(first: Trace, second: Trace, config: DivergenceConfig) -> Iterator[
             if gap_s > config.contact_s:
                 earlier = pair[0] if one[end] < two[end] else pair[1]
                 yield replace(
-                    _parting(
+                    _quantity(
                         pair, "contact", min(one[end], two[end]), gap_s, config.contact_s, cause
                     ),
                     body=name,
@@ -266,8 +266,8 @@ def _only_one(
     pair: tuple[str, str], name: str, touch: Touch, side: str, config: DivergenceConfig, cause: str
 ) -> DivergedQuantity:
     lasted_s = (touch[1] - touch[0]) * 1e-9
-    parting = _parting(pair, "contact", touch[0], lasted_s, config.contact_s, cause)
-    return replace(parting, body=name, detail=f"only {_where(side)} do the fingers touch {name}")
+    found = _quantity(pair, "contact", touch[0], lasted_s, config.contact_s, cause)
+    return replace(found, body=name, detail=f"only {_where(side)} do the fingers touch {name}")
 
 
 def _objects(first: Trace, second: Trace, config: DivergenceConfig) -> Iterator[DivergedQuantity]:
@@ -276,13 +276,13 @@ def _objects(first: Trace, second: Trace, config: DivergenceConfig) -> Iterator[
     for name in sorted(set(first.objects) & set(second.objects)):
         one, two = first.objects[name], second.objects[name]
         times = min(one, two, key=len).stamps_ns
-        apart = np.linalg.norm(one.at(times).p_m - two.at(times).p_m, axis=1)
+        shifted = np.linalg.norm(one.at(times).p_m - two.at(times).p_m, axis=1)
         # A recording looks twice; of two replays, one drops a moment later than the other.
-        index = _first_above(apart, config.object_m, 1 if len(times) < FALL_STEPS else FALL_STEPS)
+        index = _first_above(shifted, config.object_m, 1 if len(times) < FALL_STEPS else FALL_STEPS)
         if index is not None:
-            size = float(apart[index:].max())
+            size = float(shifted[index:].max())
             yield replace(
-                _parting(
+                _quantity(
                     pair, "object_position", int(times[index]), size, config.object_m, "contact"
                 ),
                 body=name,
@@ -297,18 +297,18 @@ def _predicates(
 ) -> Iterator[DivergedQuantity]:
     one, two = findings.get(pair[0], {}), findings.get(pair[1], {})
     for kind, name in sorted(set(one) & set(two)):
-        said = (one[kind, name], two[kind, name])
-        if None in said or said[0] == said[1]:
+        values = (one[kind, name], two[kind, name])
+        if None in values or values[0] == values[1]:
             continue
         yield replace(
-            _parting(pair, "predicate", end_ns, 1.0, 0.0, "predicate"),
+            _quantity(pair, "predicate", end_ns, 1.0, 0.0, "predicate"),
             body=name,
             detail=f"{kind} of {name or 'the execution'} holds only "
-            f"{_where(pair[0] if said[0] else pair[1])}, all states within their limits",
+            f"{_where(pair[0] if values[0] else pair[1])}, all states within their limits",
         )
 
 
-def _parting(
+def _quantity(
     pair: tuple[str, str], quantity: str, t_ns: int, size: float, limit: float, cause: str
 ) -> DivergedQuantity:
     unit = UNITS.get(quantity, "" if quantity == "predicate" else "m")
@@ -330,10 +330,10 @@ def _where(side: str) -> str:
     return "in the recording" if side == "recorded" else f"as {side} in the twin"
 
 
-def _rank(parting: DivergedQuantity) -> tuple[int, int]:
-    quantity = parting.quantity
-    return parting.first_t_ns, ORDER.index(quantity) if quantity in ORDER else len(ORDER)
+def _rank(found: DivergedQuantity) -> tuple[int, int]:
+    quantity = found.quantity
+    return found.first_t_ns, ORDER.index(quantity) if quantity in ORDER else len(ORDER)
 
 
-def _plain(parting: DivergedQuantity) -> dict[str, Any]:
-    return {**asdict(parting), "between": list(parting.between)}
+def _plain(found: DivergedQuantity) -> dict[str, Any]:
+    return {**asdict(found), "between": list(found.between)}

@@ -20,8 +20,6 @@ from twin.replay.path import JointPath
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, convex_hull, signed_distance
 
-# --- Put a replay's objects into a physics world: boxes, containers of panels, soft bodies.
-
 LIFT_M = 0.0002
 """Objects localised into their support start this far above it instead."""
 
@@ -177,7 +175,7 @@ class _Samples:
     def __init__(self, scene: ReplayScene, soft: dict[str, SoftModel]) -> None:
         self._objects = list(scene.movable())
         self._soft = list(soft)
-        self._still = scene.containers()
+        self._fixed = scene.containers()
         self._stamps: list[int] = []
         self._joints: list[Float[np.ndarray, " num_joints"]] = []
         self._widths: list[float] = []
@@ -215,7 +213,7 @@ class _Samples:
     def states(self, world: World) -> States:
         poses = {name: self._Ts_base_object(name) for name in self._objects}
         poses |= {
-            name: np.repeat(T[None], len(self._stamps), axis=0) for name, T in self._still.items()
+            name: np.repeat(T[None], len(self._stamps), axis=0) for name, T in self._fixed.items()
         }
         return States(
             stamps_ns=np.array(self._stamps, dtype=np.int64),
@@ -234,7 +232,7 @@ class _Samples:
             return np.stack(self._fits[name])
         rows = np.array(self._poses[name])
         if not np.isfinite(rows).all():
-            raise NotEvaluatedError(f"physics lost {name}: its place is no number any more")
+            raise NotEvaluatedError(f"physics lost {name}: its place is not a number any more")
         return se3.transform_from(rows[:, 3:], rows[:, :3])
 
     def _broken(self, world: World) -> dict[str, str]:
@@ -254,8 +252,7 @@ def burst_of(health: SoftHealth) -> str | None:
     return health.describe() if burst else None
 
 
-# --- Objects that were localised into each other: small overlaps are resolved, large ones refused.
-#
+# Objects that were localised into each other: small overlaps are resolved, large ones refused.
 # Physics answers an overlap with a kick, and what follows says nothing about the plan.
 
 GAP_M = 0.0002
@@ -274,7 +271,7 @@ class _Solid:
     shape: coal.CollisionGeometry
     T: Float[np.ndarray, "4 4"]
     soft: bool = False
-    still: bool = False
+    fixed: bool = False
 
 
 def free_start(
@@ -283,7 +280,7 @@ def free_start(
     """Move objects apart that lie in each other or in a container by little.
 
     The object that can move is moved, along the direction of least depth; of two, each by half.
-    Objects are their convex hulls. The table is left to ``furnish``, which lifts what reaches in.
+    Objects are their convex hulls. The table is left to ``spawn``, which lifts what reaches in.
 
     Args:
         scene: Where the objects were localised.
@@ -297,28 +294,30 @@ def free_start(
     shapes = {
         name: convex_hull(outline_m(scene.task.objects[name], soft.get(name))) for name in movable
     }
-    still = _still(scene)
+    fixed = _fixed_solids(scene)
     moved = {name: T.copy() for name, T in movable.items()}
     for _ in range(ROUNDS):
         solids = [_Solid(n, shapes[n], T, soft=n in soft) for n, T in moved.items()]
-        if not _apart(solids, still, moved, max_depth_m):
+        if not _separate(solids, fixed, moved, max_depth_m):
             break
     else:
         names = ", ".join(moved)
-        raise NotEvaluatedError(f"the objects ({names}) start in each other and cannot be parted")
+        raise NotEvaluatedError(
+            f"the objects ({names}) start in each other and cannot be separated"
+        )
     return replace(scene, Ts_base_object={**scene.Ts_base_object, **moved})
 
 
-def _apart(
+def _separate(
     solids: list[_Solid],
-    still: list[_Solid],
+    fixed: list[_Solid],
     moved: dict[str, Float[np.ndarray, "4 4"]],
     max_depth_m: float,
 ) -> bool:
     """One round; says whether anything had to be moved."""
     anything = False
     for index, solid in enumerate(solids):
-        for other in [*still, *solids[index + 1 :]]:
+        for other in [*fixed, *solids[index + 1 :]]:
             depth, normal = _overlap(solid, other)
             if depth <= TOUCH_M:
                 continue
@@ -329,17 +328,17 @@ def _apart(
                     f"{limit * 1e3:.0f} mm are moved apart. Localise them again, or look whether "
                     "one hides the other"
                 )
-            share = 1.0 if other.still else 0.5
+            share = 1.0 if other.fixed else 0.5
             moved[solid.name][:3, 3] -= share * (depth + GAP_M) * normal
-            if not other.still:
+            if not other.fixed:
                 moved[other.name][:3, 3] += share * (depth + GAP_M) * normal
             anything = True
     return anything
 
 
-def _still(scene: ReplayScene) -> list[_Solid]:
+def _fixed_solids(scene: ReplayScene) -> list[_Solid]:
     return [
-        _Solid(name, coal.Box(*extents), T_base_panel, still=True)
+        _Solid(name, coal.Box(*extents), T_base_panel, fixed=True)
         for name, T in scene.containers().items()
         for T_base_panel, extents in placed_panels(scene.task.objects[name], T)
     ]

@@ -9,15 +9,11 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.episode.streams import JointTrack
 from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES
+from bridge.robots.default import ARM_JOINTS, GRIPPER_WIDTH, MAX_WIDTH_M
 from bridge.task.plan import Plan, Stage
-from bridge.task.robot import ARM_JOINTS, MAX_WIDTH_M
 from twin.replay.config import ReplayConfig
 from twin.replay.path import MAX_DURATION_S, WIDTH_SLACK_M, JointPath, UnusablePlanError
 
-# --- What recorded joints and gripper widths must be, so that an execution can be replayed.
-
-GRIPPER_WIDTH = "gripper_width"
-"""The one joint on /gripper/state (docs/episode_format.md)."""
 LARGEST_GAP_NS = 500_000_000
 """What was not recorded for longer than this is not made up."""
 

@@ -21,7 +21,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
 from bridge.media.color import encode_jpeg
-from bridge.task.robot import BASE_FRAME
+from bridge.robots.default import BASE_FRAME
 from twin.replay.dynamics import soft_models
 from twin.replay.rebuilt_scene import Correction
 from twin.replay.result import ReplayResult
@@ -46,7 +46,7 @@ MAX_IMAGES = 300
 class _Stage:
     """Everything that can be drawn, ready to be moved."""
 
-    still: GaussianCloud
+    static: GaussianCloud
     objects: Mapping[str, GaussianCloud]
     """Those that can move, in their own frames."""
     bindings: Mapping[str, Binding]
@@ -57,7 +57,7 @@ class _Stage:
 
     def at(self, result: ReplayResult, scene: ReplayScene, index: int) -> GaussianCloud:
         """The scene at one of the replay's states."""
-        parts = [self.still]
+        parts = [self.static]
         for name, cloud in self.objects.items():
             Ts = result.Ts_base_object.get(name)
             T = scene.Ts_base_object[name] if Ts is None else Ts[index]
@@ -167,13 +167,13 @@ def _set_up(
     places |= {
         name: item.T_base_object for name, item in objects.items() if name not in scene.task.objects
     }
-    still = [moved_cloud(objects[name].cloud, T) for name, T in places.items() if name in objects]
+    static = [moved_cloud(objects[name].cloud, T) for name, T in places.items() if name in objects]
     movable = {name: item.cloud for name, item in objects.items() if name in scene.movable()}
     soft = {name: body for name, body in soft_models(scene).items() if name in movable}
     root = rebuilt.record.get("robot", {}).get("T_base_root")
     T_base_root = np.eye(4) if root is None else read_pose(root, run.scene_dir / SCENE_FILE)
     return _Stage(
-        still=concatenate([rebuilt.background, *still]),
+        static=concatenate([rebuilt.background, *static]),
         objects=movable,
         bindings={
             name: bind(movable[name].means_m, body.nodes_m)

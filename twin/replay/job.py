@@ -226,7 +226,7 @@ def judged(
     *,
     skipped: bool = False,
 ) -> dict[str, Any]:
-    """Return the row of a trajectory with its verdict, and where it parts from the others."""
+    """Return the row of a trajectory with its verdict, and where it diverges from the others."""
     return {
         **_row(job),
         "skipped": skipped,
@@ -256,8 +256,6 @@ def predicates_hold(verdict: Verdict) -> bool | None:
         return False
     return None if None in values or not values else True
 
-
-# --- Compare a replayed execution with its plan in the twin and with the recording.
 
 Findings = dict[tuple[str, str], bool | None]
 
@@ -291,19 +289,21 @@ def compare(job: ReplayJob, result: ReplayResult, recording: Recording, end_ns: 
             for finding in evaluate_success(task, states_of_recording(recording, robot))
         },
     }
-    planned, said = _planned(job, recording)
+    planned, planned_findings = _planned(job, recording)
     if isinstance(planned, str):
         missing = [planned]
     else:
         traces.append(planned)
-        findings["planned"] = said
+        findings["planned"] = planned_findings
         missing = []
     missing += [
         f"{name} was not localised after the execution: {reason}"
         for name, reason in recording.end.reasons.items()
         if name in recording.scene.movable()
     ]
-    return diverge(job.plan_id, traces, job.config.parting, findings=findings, not_compared=missing)
+    return diverge(
+        job.plan_id, traces, job.config.divergence, findings=findings, not_compared=missing
+    )
 
 
 def _planned(job: ReplayJob, recording: Recording) -> tuple[Trace | str, Findings]:
@@ -318,11 +318,8 @@ def _planned(job: ReplayJob, recording: Recording) -> tuple[Trace | str, Finding
     return trace, _findings([f for f in verdict.findings if f["side"] == "replayed"])
 
 
-def _findings(said: list[dict[str, Any]]) -> Findings:
-    return {(item["kind"], str(item.get("object", ""))): item["value"] for item in said}
-
-
-# --- Do one replay: read the episode, re-live the trajectory, compare it, write the file.
+def _findings(found: list[dict[str, Any]]) -> Findings:
+    return {(item["kind"], str(item.get("object", ""))): item["value"] for item in found}
 
 
 def run_job(job: ReplayJob) -> dict[str, Any]:
@@ -343,8 +340,8 @@ class _Source:
     episode: Episode
     plan: Plan
     """As it was sent."""
-    lived: Plan
-    """With the stages at the times at which they were lived through."""
+    plan_as_executed: Plan
+    """With the stages at the times at which they were executed."""
     events: list[dict[str, Any]]
     scene: ReplayScene
     correction: Correction
@@ -388,12 +385,12 @@ def _open(job: ReplayJob) -> _Source:
         )
     plan = streams.plans(episode)[job.plan_index][1]
     task = load_task(job.task)
-    place = (
+    rebuilt = (
         RebuiltScene()
         if job.run_path is None
         else read_rebuilt_scene(RunFolder(job.run_path), task)
     )
-    scene = replace(place, scene_hash=job.scene_hash).scene(
+    scene = replace(rebuilt, scene_hash=job.scene_hash).scene(
         task,
         urdf,
         job.start.Ts_base_object,
@@ -402,23 +399,23 @@ def _open(job: ReplayJob) -> _Source:
     )
     executed = job.trajectory == "executed" and job.end_ns is not None
     events = streams.events(episode) if executed else []
-    lived = replace(plan, stages=stages_as_executed(plan, events, job.start_ns))
+    plan_as_executed = replace(plan, stages=stages_as_executed(plan, events, job.start_ns))
     return _Source(
         job=job,
         episode=episode,
         plan=plan,
-        lived=lived,
+        plan_as_executed=plan_as_executed,
         events=events,
         scene=scene,
-        correction=place.correction,
+        correction=rebuilt.correction,
     )
 
 
 def _run(source: _Source, scene: ReplayScene, job: ReplayJob) -> ReplayResult:
     if not source.executed:
-        return replay_plan(source.lived, scene, job.config)
+        return replay_plan(source.plan_as_executed, scene, job.config)
     arm, widths = _tracks(source)
-    return replay_joints(arm, widths, scene, job.config, plan=source.lived)
+    return replay_joints(arm, widths, scene, job.config, plan=source.plan_as_executed)
 
 
 def _tracks(source: _Source) -> tuple[streams.JointTrack, streams.JointTrack]:
@@ -440,8 +437,8 @@ def _recording(source: _Source) -> Recording:
     kinematic = replace(job.config, mode="kinematic")
     seen_ns = job.end.seen_ns
     return Recording(
-        plan=source.lived,
-        path=path_of_execution(arm, widths, source.lived, kinematic),
+        plan=source.plan_as_executed,
+        path=path_of_execution(arm, widths, source.plan_as_executed, kinematic),
         scene=source.scene,
         end=source.correction.state(job.end),
         end_seen_ns=job.length_ns() if seen_ns is None else seen_ns - job.start_ns,
@@ -508,7 +505,7 @@ def _origin(
         cell=cell_of(episode),
         start_ns=job.start_ns,
         urdf=source.scene.urdf,
-        stages=source.lived.stages,
+        stages=source.plan_as_executed.stages,
         gripper=_recorded_grips(plan, source.events, job.start_ns)
         if source.executed
         else _planned_grips(plan),

@@ -18,17 +18,16 @@ from twin.replay.config import ReplayConfig, VariationConfig
 from twin.replay.scene import ReplayScene
 from twin.scene.shape.known import yaw_period_rad
 
-# --- What is not known exactly, drawn: poses, frictions, forces, masses, stiffnesses and delays.
-#
+# What is not known exactly, drawn: poses, frictions, forces, masses, stiffnesses and delays.
 # The same seed and the same start draw the same variations, whatever plan is replayed, on
 # whichever worker and in whatever order (common random numbers: Law, Simulation Modeling and
 # Analysis, ch. 11).
 
 UPRIGHT = 0.98
 """Cosine of the tilt up to which an object stands."""
-STANDS_M = 1e-4
+RESTS_M = 1e-4
 """Localisation puts what stands exactly onto the table; within this counts as exactly [m]."""
-STANDING = (0, 1, 5)
+UNSURE_AXES = (0, 1, 5)
 """What is unsure of an object that stands: x, y and the turn about the vertical."""
 
 
@@ -133,20 +132,20 @@ def _root(
         m, rad = settings.unknown_pose_m**2, settings.unknown_pose_rad**2
         covariance = np.diag([m, m, 0.0, 0.0, 0.0, rad])
     rest_m = scene.table_height_m + model.rest_height_m
-    if T[2, 2] > UPRIGHT and abs(T[2, 3] - rest_m) < STANDS_M:
-        covariance = given_standing(covariance)
+    if T[2, 2] > UPRIGHT and abs(T[2, 3] - rest_m) < RESTS_M:
+        covariance = given_upright(covariance)
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     deviations = settings.pose_scale * np.sqrt(np.maximum(values, 0.0))
     return np.asarray((vectors * deviations) @ vectors.T)
 
 
-def given_standing(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
+def given_upright(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
     """Covariance of x, y and the turn once height and tilt are known; the others become zero.
 
     The conditional of a normal distribution (Schur complement).
     """
-    keep = list(STANDING)
-    known = [index for index in range(6) if index not in STANDING]
+    keep = list(UNSURE_AXES)
+    known = [index for index in range(6) if index not in UNSURE_AXES]
     across = covariance[np.ix_(keep, known)]
     inverse = np.linalg.pinv(covariance[np.ix_(known, known)], hermitian=True)
     left = np.zeros((6, 6))

@@ -32,9 +32,8 @@ from bridge.episode.topics import (
     object_topic,
 )
 from bridge.episode.writer import EpisodeWriter
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME, GRIPPER, GRIPPER_WIDTH
 from bridge.task.plan import Plan, Stage
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME, GRIPPER
-from twin.replay.execution import GRIPPER_WIDTH
 from twin.replay.result import ReplayResult, stretches_ns
 
 MIN_CLEARANCE = "min_clearance_m"
@@ -61,7 +60,7 @@ class ReplayOrigin:
     """Source time of the recorded execution's start, or of the plan when it was never executed."""
     urdf: str
     stages: tuple[Stage, ...]
-    """With the times at which they were lived through: the plan's, or the execution's."""
+    """With the times at which they were executed: the plan's, or the execution's."""
     gripper: tuple[tuple[int, str], ...]
     """When, from time 0, the gripper was told to close or open."""
     end_ns: int

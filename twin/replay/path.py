@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M
 from bridge.task.plan import Plan, Waypoint
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M
 from twin.errors import TwinError
 from twin.replay.clearance.bodies import own_links
 from twin.replay.config import ReplayConfig
@@ -23,8 +23,6 @@ from twin.robot.collision import RobotHulls
 from twin.robot.follow import Clearance, follow_poses
 from twin.robot.inverse import pose_error, solve_ik
 from twin.robot.model import RobotModel
-
-# --- Joint limits, jumps and excess speed of a path, each named with its joint and instant.
 
 _LIMIT_SLACK_RAD = 1e-3
 _SPEED_SLACK = 1.02
@@ -83,8 +81,6 @@ def jumps(
             )
     return failures
 
-
-# --- Whether a plan can be replayed at all, before anything is computed from it.
 
 MAX_DURATION_S = 600.0
 """Longest trajectory that is replayed [s]."""

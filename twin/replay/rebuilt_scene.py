@@ -1,8 +1,8 @@
 """What a rebuilt scene adds to a task: shapes of soft bodies, distances, calibrated physics.
 
 Nothing here is needed: for what the scene does not have, and for lattices that cannot be trusted,
-the task file stands in, and the place says so in a sentence. Distances that are there and cannot be
-read are an error: somebody saw what stands in the way, and a yes without it would be no answer.
+the task file stands in, and ``notes`` say so. Distances that are there and cannot be read are an
+error: somebody saw what stands in the way, and a yes without it would not be an answer.
 """
 
 import json
@@ -28,8 +28,6 @@ from twin.scene.shape.static import StaticSdf
 from twin.scene.store.calibration import Calibration, read_calibration
 from twin.scene.store.folder import read_record
 from twin.scene.store.npz import UnreadableArraysError
-
-# --- What a calibration changes about replays: physics, where objects start, how heavy they are.
 
 INTERVAL_SIGMAS = 2 * 1.96
 """Width of a 95 % interval in standard deviations."""
@@ -245,7 +243,7 @@ class RebuiltScene:
     calibration_id: str | None = None
     correction: Correction = field(default_factory=Correction)
     """What a calibration says of localised poses and of masses; ``static_sdf`` is moved already."""
-    remarks: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     """What the scene does not have, or has in a state in which it is not used."""
 
     def scene(
@@ -257,7 +255,7 @@ class RebuiltScene:
         reasons: Mapping[str, str] | None = None,
         covariances: Mapping[str, Float[np.ndarray, "6 6"]] | None = None,
     ) -> ReplayScene:
-        """Put objects into the place: where a replay happens.
+        """Put objects into the scene: where a replay happens.
 
         Args:
             task: Whose objects they are.
@@ -290,30 +288,30 @@ def read_rebuilt_scene(run: RunFolder, task: Task) -> RebuiltScene:
     """
     sources = dict.fromkeys(task.objects, TASK_SHAPE)
     calibration = read_calibration(run)
-    place = RebuiltScene(
+    rebuilt = RebuiltScene(
         shape_sources=sources,
         calibration_id=None if calibration is None else calibration.calibration_id,
         correction=correction_of(calibration),
     )
     record = read_record(run)
     if record is None:
-        return place
-    lattices, remarks = {}, []
+        return rebuilt
+    lattices, notes = {}, []
     for key in task.soft_objects:
         arrays, sources[key] = _lattice(run.scene_dir / "objects" / key, task.objects[key])
         if arrays is None:
-            remarks.append(f"{key}: {sources[key]}")
+            notes.append(f"{key}: {sources[key]}")
         else:
             lattices[key] = arrays
-    static = _static(run.scene_dir / "sdf.npz", place.correction)
+    static = _static(run.scene_dir / "sdf.npz", rebuilt.correction)
     if static is None:
-        remarks.append(NO_DISTANCES)
+        notes.append(NO_DISTANCES)
     return replace(
-        place,
+        rebuilt,
         scene_hash=str(record["scene_hash"]),
         static_sdf=static,
         lattices=lattices,
-        remarks=tuple(remarks),
+        notes=tuple(notes),
     )
 
 
@@ -329,7 +327,7 @@ def shape_hashes(run: RunFolder) -> dict[str, str]:
 
 
 def _lattice(folder: Path, model: ObjectModel) -> tuple[Mapping[str, np.ndarray] | None, str]:
-    """The scene's lattice of one object, or None; and in a sentence where its shape comes from."""
+    """The scene's lattice of one object, or None; and where its shape comes from, in words."""
     path = folder / "soft.npz"
     if not path.is_file():
         return None, f"{TASK_SHAPE} (the scene has no lattice of it)"

@@ -46,9 +46,6 @@ class ReplayResult:
         )
 
 
-# --- Stretches of time in which something holds.
-
-
 def stretches(flags: Bool[np.ndarray, " num_steps"]) -> list[tuple[int, int]]:
     """First step of each run of True, and the one after its last."""
     edges = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))

@@ -12,10 +12,10 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import execution_ns
 from bridge.errors import GstError, PathNotFoundError, UsageError
+from bridge.process_pool import Failed, Runner
 from bridge.task.plan import Plan
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
-from twin.crew.pool import Failed, Runner
 from twin.replay.config import ReplayRunConfig
 from twin.replay.job import ReplayJob, row_of_existing, row_of_failure, run_job
 from twin.replay.rebuilt_scene import calibrated, for_task, read_rebuilt_scene, shape_hashes
@@ -23,8 +23,6 @@ from twin.replay.scene import localised_starts
 from twin.replay.summary import against_recorded, count_verdicts, executions_of, recorded_labels
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import SCENE_FILE, read_record, scene_hash_of
-
-# --- When a plan was executed, and why what was recorded of it says nothing.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,9 +57,8 @@ def execution_of(events: Iterable[Mapping[str, Any]], plan_id: str) -> Execution
     return Execution(interval_ns=interval, problem=problem)
 
 
-# --- What is to be replayed of one episode: its objects localised, its plans and executions
+# What is to be replayed of one episode: its objects localised, its plans and executions
 # listed.
-#
 # Each episode is a piece of work of its own, for a process of the pool as for this one.
 
 
@@ -151,9 +148,6 @@ def replayed_task(episode: Episode, plans: list[tuple[int, Plan]]) -> str | None
     return episode.info.task or plans[0][1].task
 
 
-# --- Replays that were made before, and count again.
-
-
 def there_already(
     jobs: Sequence[ReplayJob], *, force: bool
 ) -> tuple[list[dict[str, Any]], list[ReplayJob]]:
@@ -230,8 +224,8 @@ def replay_trajectories(
     _say_what_is_missing(run, jobs, output)
     if config.render:
         tasks = sorted({job.task for job in jobs})
-        for remark in describe_undrawn(read_record(run) or {}, tasks):
-            output.say(remark)
+        for note in describe_undrawn(read_record(run) or {}, tasks):
+            output.say(note)
     rows, todo = there_already(jobs, force=config.force)
     if todo:
         run.derived_dir.mkdir(parents=True, exist_ok=True)  # each node is asked whether it is there
@@ -312,11 +306,11 @@ def _say_what_is_missing(run: RunFolder, jobs: list[ReplayJob], output: Output) 
     """Tell what the task file stands in for, once for all replays of a task."""
     for task in sorted({job.task for job in jobs}):
         try:
-            remarks = read_rebuilt_scene(run, load_task(task)).remarks
+            notes = read_rebuilt_scene(run, load_task(task)).notes
         except GstError:  # which each of its replays will say
             continue
-        for remark in remarks:
-            output.say(f"{task}: {remark}")
+        for note in notes:
+            output.say(f"{task}: {note}")
 
 
 def _chosen(run: RunFolder, config: ReplayRunConfig) -> list[str]:
@@ -345,25 +339,22 @@ def _replayed(todo: list[ReplayJob], runner: Runner, output: Output) -> Iterator
                 yield answer
 
 
-# --- What pictures of replays will lack, said before they are drawn.
-
-
 def describe_undrawn(record: Mapping[str, Any], tasks: Iterable[str]) -> list[str]:
-    """Say in a sentence each what the rebuilt scene has no Gaussians of.
+    """Name what the rebuilt scene has no Gaussians of.
 
     Args:
         record: The content of ``scene.json``.
         tasks: Tasks whose objects the replays move.
     """
-    said = []
+    found = []
     for name in tasks:
         missing = [key for key in load_task(name).objects if key not in record.get("objects", {})]
         if missing:
             because = record.get("objects_remark")
             reason = f" ({because})" if because else ""
-            said.append(f"{', '.join(missing)}: not in the scene, not in pictures{reason}")
+            found.append(f"{', '.join(missing)}: not in the scene, not in pictures{reason}")
     robot = record.get("robot", {})
     if not robot.get("links"):
         reason = f" ({robot['remark']})" if robot.get("remark") else ""
-        said.append(f"robot: not in the scene, not in pictures{reason}")
-    return said
+        found.append(f"robot: not in the scene, not in pictures{reason}")
+    return found

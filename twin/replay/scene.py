@@ -65,11 +65,8 @@ class ReplayScene:
 
     def movable(self) -> dict[str, Float[np.ndarray, "4 4"]]:
         """Poses of the objects that a trajectory may move."""
-        still = self.containers()
-        return {name: T for name, T in self.Ts_base_object.items() if name not in still}
-
-
-# --- Where the objects were when a plan began, read from the localised episode.
+        fixed = self.containers()
+        return {name: T for name, T in self.Ts_base_object.items() if name not in fixed}
 
 
 @dataclass(frozen=True, kw_only=True)

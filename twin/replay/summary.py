@@ -1,4 +1,7 @@
-"""What the tables of ``robot-gst replay`` count: verdicts, and what was said against the label."""
+"""The tables of ``robot-gst replay``: verdicts counted, and held against the operator's labels.
+
+Every answer that is not a yes is listed with its reason.
+"""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -53,13 +56,13 @@ def _label(run: RunFolder, episode_id: str) -> str:
     outcome = outcome_of(run, episode)
     if outcome is not None:
         return outcome.result
-    said = [event.get("outcome") for event in streams.events(episode) if event["type"] == "label"]
-    last = said[-1] if said else None
+    labels = [event.get("outcome") for event in streams.events(episode) if event["type"] == "label"]
+    last = labels[-1] if labels else None
     return str(last.get("result", "unknown")) if isinstance(last, dict) else "unknown"
 
 
 def executions_of(rows: Rows, labels: Mapping[str, str]) -> list[dict[str, Any]]:
-    """One entry per executed plan: what each side says, and where they part first."""
+    """One entry per executed plan: what each side says, and where they diverge first."""
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
         if not row["executed"]:
@@ -76,7 +79,7 @@ def executions_of(rows: Rows, labels: Mapping[str, str]) -> list[dict[str, Any]]
                 "planned": None,
                 "executed": None,
                 "lag_s": None,
-                "apart": None,
+                "divergence": None,
             },
         )
         if row["mode"] == "kinematic":
@@ -84,7 +87,8 @@ def executions_of(rows: Rows, labels: Mapping[str, str]) -> list[dict[str, Any]]
         else:
             entry[row["trajectory"]] = row["accepted"]
         if row.get("divergence"):
-            entry["apart"], entry["lag_s"] = row["divergence"]["first"], row["divergence"]["lag_s"]
+            entry["divergence"] = row["divergence"]["first"]
+            entry["lag_s"] = row["divergence"]["lag_s"]
     return list(found.values())
 
 
@@ -126,9 +130,6 @@ def against_recorded(executions: Rows) -> dict[str, dict[str, Any]]:
         task: {"counts": cross_table(mine), "agreement": agreement_of(mine)}
         for task, mine in sorted(by_task.items())
     }
-
-
-# --- The tables of ``robot-gst replay`` as text, with a reason for every answer that is no yes.
 
 
 def describe_run(summary: Mapping[str, Any]) -> str:
@@ -246,13 +247,13 @@ def _cross_of(counts: Mapping[str, Counts], agreement: Counts) -> list[str]:
 
 
 def _divergence_lines(executions: Rows) -> list[str]:
-    lines = ["where planned, executed and recorded part first:"]
+    lines = ["where planned, executed and recorded diverge first:"]
     for entry in executions:
-        apart = entry["apart"]
-        if apart is None:
-            said = "nowhere" if entry["executed"] is not None else "not compared"
+        first = entry["divergence"]
+        if first is None:
+            text = "nowhere" if entry["executed"] is not None else "not compared"
         else:
-            said = f"{apart['first_t_ns'] * 1e-9:.2f} s: {apart['detail']} ({apart['attribution']})"
+            text = f"{first['first_t_ns'] * 1e-9:.2f} s: {first['detail']} ({first['attribution']})"
         lag = "" if entry["lag_s"] is None else f", lag {entry['lag_s'] * 1e3:.0f} ms"
-        lines.append(f"  {entry['episode']} {entry['plan']}: {said}{lag}")
+        lines.append(f"  {entry['episode']} {entry['plan']}: {text}{lag}")
     return lines

@@ -1,4 +1,4 @@
-"""One telling of an execution: planned in the twin, executed in the twin, or recorded.
+"""The trace of one execution: planned in the twin, executed in the twin, or recorded.
 
 Times count from the start of the execution, so that the three can be laid over each other.
 """
@@ -15,10 +15,10 @@ from bridge.episode.reader import Episode
 from bridge.episode.topics import GRIPPER_STATE, TCP_POSE
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
+from bridge.robots.default import GRIPPER
 from bridge.task.plan import Plan
 from bridge.task.predicate import Rollout
 from bridge.task.record import parse_record
-from bridge.task.robot import GRIPPER
 from twin.replay.clearance import ClearanceMonitor
 from twin.replay.config import ReplayConfig
 from twin.replay.execution import closed_mask
@@ -125,8 +125,7 @@ def _since(track: PoseTrajectory, start_ns: int) -> PoseTrajectory:
     return PoseTrajectory(track.stamps_ns - start_ns, track.p_m, track.q_wxyz)
 
 
-# --- What a recording itself says of an execution, without physics: the third telling.
-#
+# What a recording itself says of an execution, without physics.
 # Joints and gripper are measured. Objects are localised before and after, and in between
 # inferred: what the fingers hold moves with the tool. Contacts follow from that, so they are
 # called inferred.
@@ -146,7 +145,7 @@ class Recording:
     """What was measured during one execution, times from its start."""
 
     plan: Plan
-    """With the stages at the times at which they were lived through."""
+    """With the stages at the times at which they were executed."""
     path: JointPath
     """Recorded joints and widths, as they were."""
     scene: ReplayScene
@@ -187,7 +186,7 @@ class Recording:
 
 
 def trace_of_recording(recording: Recording, robot: RobotModel, rate_hz: int) -> Trace:
-    """The recorded telling; objects only at the instants at which they were localised."""
+    """The recorded trace; objects only at the instants at which they were localised."""
     times = _times(recording.path, rate_hz)
     movable = recording.scene.movable()
     seen = np.array([0, max(recording.end_seen_ns, recording.path.end_ns() + 1)])
@@ -221,11 +220,11 @@ def states_of_recording(recording: Recording, robot: RobotModel) -> Rollout:
     One look afterwards does not say whether anything still moves: ``settled`` stays undecided.
     """
     scene, end = recording.scene, recording.end
-    still = scene.containers()
+    fixed = scene.containers()
     places = {
         name: np.stack([T, end.Ts_base_object.get(name, T)])
         for name, T in scene.Ts_base_object.items()
-        if name in still or name in end.Ts_base_object
+        if name in fixed or name in end.Ts_base_object
     }
     seen = np.array([0, max(recording.end_seen_ns, recording.path.end_ns() + 1)])
     tool = robot.T_base_tcp(recording.path.joints_rad[-1])[:3, 3]

@@ -34,8 +34,6 @@ from twin.replay.slip import grasped_objects, slips, unless_slipped
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 
-# --- The terminal factor of I(tau), what each predicate found, and the reason a verdict gives.
-
 HELD_BEFORE = "the goal held before anything moved"
 MANY = 8
 """Of more findings than this, those that hold are not worth reading one by one."""
@@ -144,7 +142,7 @@ def warnings_of(scene: ReplayScene, result: ReplayResult) -> tuple[str, ...]:
 
 
 def reason_of(verdict: Verdict) -> str | None:
-    """One sentence: the first factor that fails, or what is open, or the first warning."""
+    """The first factor that fails, or what is open, or the first warning."""
     name = verdict.first_failing
     if name is not None:
         factor: Factor = getattr(verdict, name)
@@ -279,14 +277,14 @@ def follow(path: JointPath, scene: ReplayScene, config: ReplayConfig) -> States:
     stamps: Int[np.ndarray, " num_steps"] = (
         np.linspace(0, path.end_ns(), count).round().astype(np.int64)
     )
-    still: dict[str, Float[np.ndarray, "num_steps 4 4"]] = {
+    fixed: dict[str, Float[np.ndarray, "num_steps 4 4"]] = {
         name: np.repeat(T[None], count, axis=0) for name, T in scene.containers().items()
     }
     return States(
         stamps_ns=stamps,
         joints_rad=path.joints_at(stamps),
         width_m=path.width_at(stamps),
-        Ts_base_object=still,
+        Ts_base_object=fixed,
         finger_contact={},
     )
 

@@ -9,11 +9,10 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
-from bridge.task.robot import FINGER_LINKS
+from bridge.robots.default import FINGER_LINKS
 from twin.robot.model import RobotDescriptionError, RobotModel
 
-# --- Convex hulls of the robot's links, the one shape that pinocchio, coal and PyBullet all share.
-#
+# Convex hulls of the robot's links, the one shape that pinocchio, coal and PyBullet all share.
 # TRAP (measured, design page on physics): ``BVHModel.buildConvexRepresentation`` reuses the
 # concave triangles of the mesh; distances then come out up to 95 mm too large, which is the
 # unsafe side. ``ConvexBase.convexHull`` computes a true hull; a test pins hull distance <= mesh

@@ -123,8 +123,7 @@ def _descend(
     )
 
 
-# --- Whether an arm has the geometry of a UR, and its lengths, read off its joint axes.
-#
+# Whether an arm has the geometry of a UR, and its lengths, read off its joint axes.
 # Nothing depends on how a description places its link frames: the axes at zero joints decide. A
 # Denavit-Hartenberg chain is laid through them and must then reproduce pinocchio's kinematics.
 
@@ -268,8 +267,7 @@ def _link(theta: float, a_m: float, d_m: float, alpha: float) -> Float[np.ndarra
     )
 
 
-# --- Closed-form inverse kinematics of UR-type arms: all eight branches of many poses at once.
-#
+# Closed-form inverse kinematics of UR-type arms: all eight branches of many poses at once.
 # The second, third and fourth axes are parallel, so the direction n they share and the wrist
 # point (where the last two axes meet) give the joints one after another (Hawkins 2013, "Analytic
 # inverse kinematics for the Universal Robots UR-5/UR-10 arms"):

@@ -15,10 +15,9 @@ import pinocchio as pin
 from jaxtyping import Float
 
 from bridge.episode.topics import ROBOT_DESCRIPTION
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME, FINGER_JOINTS, TCP_FRAME, resolve_mesh
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME, FINGER_JOINTS, ROBOT, TCP_FRAME
+from bridge.robots.robot import resolve_mesh
 from twin.errors import TwinError
-
-# --- A URDF text as others can load it: every mesh an absolute path that exists.
 
 _MIMIC_DEFAULTS = (("multiplier", "1"), ("offset", "0"))
 
@@ -74,7 +73,7 @@ def _mimic(name: str, element: ET.Element, leaders: set[str]) -> Mimic:
         numbers = [math.nan]
     if not all(map(math.isfinite, numbers)):
         raise RobotDescriptionError(
-            found=f"lets the joint {name!r} mimic {leader!r} by something that is no number",
+            found=f"lets the joint {name!r} mimic {leader!r} by something that is not a number",
             hint="Give multiplier and offset as numbers.",
         )
     multiplier, offset = numbers
@@ -163,10 +162,11 @@ class RobotModel:
         self.arm_velocity_ids = np.array(
             [int(self.model.joints[self.model.getJointId(name)].idx_v) for name in ARM_JOINTS]
         )
-        self.finger_ids = np.array(
-            [self._q_id(name) for name in FINGER_JOINTS if self.model.existJointName(name)],
-            dtype=np.int64,
-        )
+        self._fingers = [
+            (self._q_id(finger.joint), finger)
+            for finger in ROBOT.gripper.fingers
+            if self.model.existJointName(finger.joint)
+        ]
         followers = [m for m in mimics if self.model.existJointName(m.joint)]
         self._check_followers(followers)
         self._follower_ids = np.array([self._q_id(m.joint) for m in followers], dtype=np.int64)
@@ -214,7 +214,7 @@ class RobotModel:
                 )
 
     def _check_limits(self) -> None:
-        """Nothing is ever beyond a limit that is no number."""
+        """Nothing is ever beyond a limit that is not a number."""
         rows = zip(
             ARM_JOINTS, self.lower_rad, self.upper_rad, self.velocity_limit_rad_s, strict=True
         )
@@ -267,10 +267,11 @@ class RobotModel:
     def configuration(
         self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float = 0.0
     ) -> Float[np.ndarray, " num_values"]:
-        """Put arm joints and half the gripper width per finger into pinocchio's order."""
+        """Put arm joints and what the gripper width makes of its fingers into pinocchio's order."""
         q = self._neutral.copy()
         q[self.arm_ids] = joints_rad
-        q[self.finger_ids] = width_m / 2
+        for index, finger in self._fingers:
+            q[index] = finger.value(width_m)
         if len(self._follower_ids):
             q[self._follower_ids] = self._ratios * q[self._leader_ids] + self._shifts
         return q

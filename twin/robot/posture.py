@@ -11,11 +11,9 @@ from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack, joint_track, robot_description
 from bridge.episode.topics import GRIPPER_STATE, ROBOT_DESCRIPTION
 from bridge.errors import EpisodeError
-from bridge.task.robot import ARM_JOINTS
+from bridge.robots.default import ARM_JOINTS
 from twin.errors import TwinError
 from twin.robot.model import RobotDescriptionError
-
-# --- Recorded time that goes backwards: sorting it would make up an execution nobody saw.
 
 BACK_NS = 20_000_000
 """Messages of several publishers may overtake each other by this much."""
@@ -83,7 +81,7 @@ class Posture:
     """One configuration of arm and gripper."""
 
     joints_rad: Float[np.ndarray, " num_joints"]
-    """In the order of ``bridge.task.robot.ARM_JOINTS``."""
+    """In the order of ``bridge.robots.default.ARM_JOINTS``."""
     width_m: float = 0.0
     """Opening of the gripper."""
 
@@ -110,7 +108,7 @@ class PostureTrack:
         width = 0.0 if self.widths is None else float(self.widths.at(stamps)[0, 0])
         return Posture(joints_rad=self.arm.at(stamps)[0, order], width_m=width)
 
-    def is_still(self, stamp_ns: int) -> bool:
+    def is_stationary(self, stamp_ns: int) -> bool:
         """Whether joints were recorded, and hardly moved, around this instant."""
         if not self.covers(stamp_ns):
             return False
@@ -118,7 +116,9 @@ class PostureTrack:
         return bool(np.ptp(around, axis=0).max() < STILL_RAD)
 
 
-def far_apart(joints_rad: Float[np.ndarray, "num_postures num_joints"], count: int) -> list[int]:
+def distinct_postures(
+    joints_rad: Float[np.ndarray, "num_postures num_joints"], count: int
+) -> list[int]:
     """Choose at most so many postures far from each other, farthest first, until none is new."""
     chosen = [0]
     far = np.abs(joints_rad - joints_rad[0]).max(axis=1)

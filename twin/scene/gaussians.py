@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32
 from bridge.errors import PathNotFoundError
 from bridge.geometry import se3
 from bridge.whole_file import write_whole
-from twin.errors import TwinError
+from twin.errors import TwinError, UnreadableFileError
 
 SH_DC = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi)); PLY files store (c - 0.5) / SH_DC."""
@@ -22,10 +22,6 @@ SH_FIRST = 0.4886025119029199
 
 NUM_FIRST = 3
 """Spherical harmonics of degree 1."""
-
-
-def _no_harmonics() -> np.ndarray:
-    return np.zeros((0, 0, 3), dtype=np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +41,7 @@ class GaussianCloud:
     colors: Float32[np.ndarray, "num_splats 3"]
     """sRGB, nominally 0..1; may leave that range, the drawn image is clipped."""
     harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"] = field(
-        default_factory=_no_harmonics
+        default_factory=lambda: np.zeros((0, 0, 3), dtype=np.float32)
     )
     """How colour changes with the direction it is seen along: coefficients of the real spherical
     harmonics of degree 1, none or three of them (``harmonic_basis``) for each colour."""
@@ -219,16 +215,10 @@ REST_COUNTS = (9, 24, 45)
 MAX_SPLATS = 50_000_000
 
 
-class UnreadablePlyError(TwinError):
+class UnreadablePlyError(UnreadableFileError):
     """The file is not a splat PLY of the kind we write."""
 
-    def __init__(self, *, path: Path, found: str) -> None:
-        """Remember the file."""
-        self.path = path
-        super().__init__(
-            f"{path}: {found}. Expected a binary little-endian PLY with float columns "
-            f"{', '.join(COLUMNS)}."
-        )
+    hint = f"Expected a binary little-endian PLY with float columns {', '.join(COLUMNS)}."
 
 
 def write_ply(path: Path, cloud: GaussianCloud) -> None:

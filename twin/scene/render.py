@@ -16,7 +16,7 @@ from bridge.errors import BridgeError, GstError, UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_png
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME
 from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture, posture_track
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at, unknown_mask
@@ -71,7 +71,8 @@ def compose(
     cloud = compose_parts(scene.background, objects, places)
     links = read_links(run, scene.record)
     if not links:
-        reason = "the scene has no robot splats" + _because(scene)
+        remark = scene.record.get("robot", {}).get("remark")
+        reason = "the scene has no robot splats" + (f" ({remark})" if remark else "")
         if config.joints is not None:
             message = f"--joints cannot be followed: {reason}."
             raise UsageError(message)
@@ -89,11 +90,6 @@ def compose(
         robot = moved_cloud(robot, se3.invert(T_base_root))
     source = "given" if config.joints is not None else f"as {episode.info.id} has it at that time"
     return Composed(cloud=concatenate([cloud, robot]), robot=f"joints {source}", posture=posture)
-
-
-def _because(scene: Scene) -> str:
-    remark = scene.record.get("robot", {}).get("remark")
-    return f" ({remark})" if remark else ""
 
 
 def _posture(episode: Episode, stamp_ns: int, config: RenderConfig) -> tuple[str, Posture]:
@@ -225,7 +221,9 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     scene = read_scene(run)
     episode = _episode(run, scene, config.episode)
     camera_id = _camera_id(episode, config.camera)
-    stamp_ns = _stamp_ns(episode, config.at_s)
+    first_ns = streams.first_stamp_ns(episode)
+    began_ns = episode.start_ns if first_ns is None else first_ns
+    stamp_ns = began_ns + round(config.at_s * 1e9)
     composed = compose(run, scene, episode, stamp_ns, config)
     camera, T_base_camera = _view_of(run, scene, episode, camera_id, stamp_ns, config)
     view = rasteriser.view(composed.cloud, camera, T_base_camera)
@@ -268,11 +266,6 @@ def _episode(run: RunFolder, scene: Scene, wanted: str) -> Episode:
         message = f"no episode {name!r} in {run.path}. There are: {', '.join(episodes) or 'none'}."
         raise UsageError(message)
     return episodes[name]
-
-
-def _stamp_ns(episode: Episode, at_s: float) -> int:
-    first_ns = streams.first_stamp_ns(episode)
-    return (episode.start_ns if first_ns is None else first_ns) + round(at_s * 1e9)
 
 
 def _camera_id(episode: Episode, wanted: str) -> str:

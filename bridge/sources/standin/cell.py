@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from bridge.clock import ns_from_s
 from bridge.errors import BridgeError
+from bridge.robots.default import MAX_WIDTH_M, ROBOT
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.render import Layer, Renderer, measure_color, measure_depth
@@ -22,7 +23,6 @@ from bridge.sources.standin.surfaces import (
 )
 from bridge.sources.standin.world import World
 from bridge.task.predicate import Rollout
-from bridge.task.robot import MAX_WIDTH_M, ur5_with_gripper_urdf
 from bridge.task.task_file import Task
 
 TICK_NS = ns_from_s(0.008)
@@ -141,7 +141,7 @@ class StandinCell:
 
     def announce(self) -> None:
         """Publish what a listener needs before anything else: URDF, calibration, frames."""
-        self.streams.description(ur5_with_gripper_urdf(), self.now_ns)
+        self.streams.description(ROBOT.urdf_text(), self.now_ns)
         for camera_id, camera in self._cameras.items():
             self.streams.camera_info(camera_id, camera, self.now_ns)
         fixed = {

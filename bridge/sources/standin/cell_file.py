@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from bridge.data_files import dataset_file
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.task.data import dataset_file
+from bridge.robots.default import ARM_JOINTS
 from bridge.task.meshes.toys import DESIGNS
-from bridge.task.robot import ARM_JOINTS
 from bridge.task.task_file import read_tables
 
 SCHEMA_VERSION = 1

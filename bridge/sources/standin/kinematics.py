@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from bridge.clock import ns_from_s
 from bridge.errors import BridgeError
 from bridge.geometry import se3
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M, ROBOT, TCP_FRAME
 from bridge.task.plan import Waypoint
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M, TCP_FRAME, ur5_with_gripper_urdf
 
 TOLERANCE_M = 1e-5
 TOLERANCE_RAD = 1e-5
@@ -49,7 +49,7 @@ class Kinematics:
 
     def __init__(self) -> None:
         """Build the Pinocchio model from the URDF."""
-        self._model: Any = pinocchio.buildModelFromXML(ur5_with_gripper_urdf())
+        self._model: Any = pinocchio.buildModelFromXML(ROBOT.urdf_text())
         self._data: Any = self._model.createData()
         self._frame = self._model.getFrameId(TCP_FRAME)
         joints = [self._model.joints[self._model.getJointId(name)] for name in ARM_JOINTS]

@@ -2,6 +2,8 @@
 
 import contextlib
 import json
+import re
+import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -14,6 +16,7 @@ from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.topics import GATE, cell_topic
 from bridge.errors import BridgeError, UsageError
 from bridge.geometry import se3
+from bridge.robots.default import MAX_WIDTH_M, ROBOT_NAME
 from bridge.sources.standin.cell import StandinCell, TruthLog
 from bridge.sources.standin.kinematics import UnreachablePoseError
 from bridge.sources.standin.planner import (
@@ -24,11 +27,15 @@ from bridge.sources.standin.planner import (
 )
 from bridge.sources.standin.probes import PROBES, NoRoomForProbeError, plan_probe
 from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
-from bridge.sources.standin.settings import CONDITIONS, SessionConfig
+from bridge.sources.standin.settings import (
+    CONDITIONS,
+    INTERRUPTED,
+    SEEDS_PER_SESSION,
+    SessionConfig,
+)
 from bridge.sources.standin.streams import Session
 from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success, objects_done
-from bridge.task.robot import MAX_WIDTH_M, ROBOT_NAME
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from bridge.terminal import Output
@@ -179,15 +186,15 @@ RESET_STREAM = 404
 PROBE_STREAM = 505
 PROBE_TRIES = 100
 """The object is put elsewhere until there is room for the probe."""
-SEEDS_PER_SESSION = 1000
-"""Session 7 starts at start seed 7000; sessions never share a start."""
 LOOK_S = 0.9
 """The arm waits at home before a plan, so that the start is seen at rest."""
 BETWEEN_S = 8.0
 """Putting the objects back takes a person about this long; nothing is published meanwhile."""
 STILL_S = 0.16
 """The arm rests this long at a viewpoint before the picture."""
-CONTROL_TIMEOUT_S = 60.0
+CONTROL_TIMEOUT_S = 300.0
+LISTED = 1000
+"""As many episodes as a recorder lists at once."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,10 +229,36 @@ class Operator:
         self.num_probes = 0
         self.results: list[tuple[EpisodeInfo, Outcome]] = []
 
-    def start_seeds(self) -> list[int]:
+    def start_seeds(self, count: int) -> list[int]:
         """One seed per start; both conditions share them."""
         first = self._config.seed * SEEDS_PER_SESSION
-        return [first + k for k in range(self._config.trials)]
+        return [first + k for k in range(count)]
+
+    def _recorded(self) -> list[dict[str, Any]]:
+        """The run's episodes as the recorder lists them."""
+        answer = self._control("list", {"last": LISTED})
+        episodes: list[dict[str, Any]] = answer["episodes"]
+        if self._config.missing and answer["of"] > len(episodes):
+            message = (
+                f"--missing needs the list of all {answer['of']} episodes, and the recorder lists "
+                f"{LISTED}. Record the other trials into another run."
+            )
+            raise UsageError(message)
+        return episodes
+
+    def _next_number(self, kind: str) -> int:
+        """The number after the highest that the run's episodes of this kind have."""
+        names = [re.fullmatch(rf"{kind}_(\d+)", item["id"]) for item in self._recorded()]
+        return 1 + max((int(found[1]) for found in names if found), default=0)
+
+    def _wanted(self) -> list[tuple[int, str]]:
+        """Start seed and condition of each trial to record."""
+        config, task = self._config, self._cell.task.name
+        all_ = [(s, c) for s in self.start_seeds(config.trials) for c in config.conditions]
+        if not config.missing:
+            return all_
+        there = {(item["start_id"], item["condition"]) for item in self._recorded()}
+        return [(s, c) for s, c in all_ if (f"{task}/{s}", c) not in there]
 
     def start_poses(self, start_seed: int, condition: str) -> dict[str, Float[np.ndarray, "4 4"]]:
         """The declared start as a person puts it down: a little off, differently each time."""
@@ -242,9 +275,10 @@ class Operator:
 
     def scan(self) -> None:
         """Record one scan with the objects where the first trial has them."""
-        cell = self._cell
-        cell.reset(self.start_poses(self._config.seed * SEEDS_PER_SESSION, "scan"))
-        self._begin(self._info(self._config.scan_id, kind="scan"))
+        cell, start_seed = self._cell, self.start_seeds(1)[0]
+        scan_id = self._config.scan_id or f"scan_{self._next_number('scan'):04d}"
+        cell.reset(self.start_poses(start_seed, "scan"))
+        self._begin(self._info(scan_id, kind="scan", start_seed=start_seed))
         joints = cell.home_rad
         mount = next(item for item in cell.file.cameras.values() if item.moving)
         cell.wait(STILL_S)
@@ -268,16 +302,15 @@ class Operator:
 
     def trials(self) -> None:
         """Record every trial: each start once per condition; ``results`` grows."""
-        number = self._config.first_trial
-        total = self._config.trials * len(self._config.conditions)
-        with self._output.progress("trials", total) as advance:
-            for start_seed in self.start_seeds():
-                for condition in self._config.conditions:
-                    info, outcome = self._trial(number, start_seed, condition)
-                    self.results.append((info, outcome))
-                    self._output.detail(f"{info.id} {condition}: {outcome.result}")
-                    number += 1
-                    advance(len(self.results), f"{info.id} {outcome.result}")
+        wanted, first = self._wanted(), self._config.first_trial
+        if wanted and first is None:
+            first = self._next_number("trial")
+        with self._output.progress("trials", len(wanted)) as advance:
+            for number, (start_seed, condition) in enumerate(wanted, start=first or 0):
+                info, outcome = self._trial(number, start_seed, condition)
+                self.results.append((info, outcome))
+                self._output.detail(f"{info.id} {condition}: {outcome.result}")
+                advance(len(self.results), f"{info.id} {outcome.result}")
 
     def _trial(self, number: int, start_seed: int, condition: str) -> tuple[EpisodeInfo, Outcome]:
         cell = self._cell
@@ -313,8 +346,11 @@ class Operator:
     def probes(self) -> None:
         """Record every probe of every round, each from a start of its own."""
         kinds = [kind for _ in range(self._config.probes) for kind in PROBES]
+        first = self._config.first_probe
+        if kinds and first is None:
+            first = self._next_number("probe")
         with self._output.progress("probes", len(kinds)) as advance:
-            for number, kind in enumerate(kinds, start=self._config.first_probe):
+            for number, kind in enumerate(kinds, start=first or 1):
                 self._probe(number, kind)
                 self.num_probes += 1
                 advance(self.num_probes, kind)
@@ -430,11 +466,14 @@ class Operator:
     def _ask_gate(self, plan: Plan) -> tuple[Verdict | None, str]:
         """Return the verdict, None when there is none, and why it is not a yes."""
         key = cell_topic(self._config.gate_cell or self._config.cell, GATE)[1:]
+        limit_s, asked_s = self._config.gate_timeout_s, time.monotonic()
         try:
-            answer = self._session.query(key, plan.to_json(), timeout_s=self._config.gate_timeout_s)
+            answer = self._session.query(key, plan.to_json(), timeout_s=limit_s)
             verdict = Verdict.from_json(answer)
         except BridgeError as error:
-            return None, str(error)
+            if time.monotonic() - asked_s < limit_s:  # at once: there is no gate, or it refused
+                return None, str(error)
+            return None, f"the wall-clock limit of {limit_s:g} s (--gate-timeout-s) struck first"
         if verdict.plan_id != plan.id:
             return None, f"the gate judged {verdict.plan_id!r} instead of {plan.id!r}"
         return verdict, _reason(verdict)
@@ -472,7 +511,7 @@ class Operator:
         """Close an episode that was interrupted, if one is open, or throw it away."""
         self._cell.cameras_running = False
         if self._open:
-            self._end(void_trial(self._cell.task, "interrupted"), discard=discard)
+            self._end(void_trial(self._cell.task, INTERRUPTED), discard=discard)
 
     def _control(self, verb: str, request: Mapping[str, Any]) -> dict[str, Any]:
         key = f"rec/{self._config.recorder}/ctl/{verb}"

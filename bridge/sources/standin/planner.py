@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME, ROBOT_NAME
 from bridge.sources.standin.cell_file import PlannerNoise
 from bridge.sources.standin.kinematics import (
     Kinematics,
@@ -26,7 +27,6 @@ from bridge.sources.standin.kinematics import (
     yaw_of,
 )
 from bridge.task.plan import Plan, Stage
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME, ROBOT_NAME
 from bridge.task.task_file import ObjectModel, Task
 
 # --- The stages that the scripted planner's plans state: those of the task, with what they

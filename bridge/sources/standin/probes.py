@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.errors import BridgeError, UsageError
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M, ROBOT_NAME
 from bridge.sources.standin.kinematics import (
     Kinematics,
     Leg,
@@ -30,7 +31,6 @@ from bridge.sources.standin.kinematics import (
     yaw_of,
 )
 from bridge.task.plan import Plan, Stage
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M, ROBOT_NAME
 from bridge.task.task_file import Task
 
 PROBES = ("push", "slide", "squeeze", "drop")

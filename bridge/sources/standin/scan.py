@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
+from bridge.robots.default import TCP_FRAME
 from bridge.sources.standin.cell_file import CameraMount
 from bridge.sources.standin.kinematics import Kinematics, UnreachablePoseError
-from bridge.task.robot import TCP_FRAME
 
 SAFE_HEIGHT_M = {"forearm_link": 0.12, "wrist_1_link": 0.10, "wrist_2_link": 0.10, TCP_FRAME: 0.09}
 """Lowest allowed height of links above the table, on the way too."""

@@ -42,12 +42,11 @@ from bridge.episode.topics import (
 )
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME, GRIPPER_WIDTH
 from bridge.task.plan import Plan
 from bridge.task.record import check_record
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME
 from bridge.wire.qos import Qos
 
-GRIPPER_JOINT = "gripper_width"
 TRUTH_PARAMETERS = cell_topic(TRUTH, "/parameters")
 
 
@@ -175,7 +174,7 @@ class Streams:
         """Publish the distance between the pads."""
         sample = JointSample(
             stamp_ns=stamp_ns,
-            names=(GRIPPER_JOINT,),
+            names=(GRIPPER_WIDTH,),
             position=np.array([width_m]),
             velocity=np.zeros(0),
             effort=np.zeros(0),

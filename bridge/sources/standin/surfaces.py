@@ -11,11 +11,11 @@ from jaxtyping import Float, Int, UInt32
 from scipy.ndimage import gaussian_filter, zoom
 
 from bridge.geometry import se3
+from bridge.robots.default import FINGER_LINKS
 from bridge.sources.standin.cell_file import Clutter
 from bridge.sources.standin.world import TABLE_CENTRE_M, TABLE_SIZE_M, LinkShape, robot_links
 from bridge.task.meshes.catalogue import ToyMesh, object_mesh, toy_mesh
 from bridge.task.meshes.toys import Paint
-from bridge.task.robot import FINGER_LINKS
 from bridge.task.task_file import ObjectModel, Task
 
 # --- Surface colours of the laboratory, made from a seed: wood, patches, floor, walls.

@@ -11,19 +11,19 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.sources.standin.cell_file import Clutter, HiddenParameters
-from bridge.sources.standin.soft import SoftBody, soft_body, soft_model_xml
-from bridge.task.meshes.toys import BoxPart, basket_parts
-from bridge.task.robot import (
+from bridge.robots.default import (
     ARM_JOINTS,
     BASE_FRAME,
     FINGER_JOINTS,
     FINGER_LINKS,
     MAX_WIDTH_M,
+    ROBOT,
     TCP_FRAME,
-    resolve_mesh,
-    ur5_with_gripper_urdf,
 )
+from bridge.robots.robot import resolve_mesh
+from bridge.sources.standin.cell_file import Clutter, HiddenParameters
+from bridge.sources.standin.soft import SoftBody, soft_body, soft_model_xml
+from bridge.task.meshes.toys import BoxPart, basket_parts
 from bridge.task.task_file import BASKET, ObjectModel, Task
 
 # --- The robot's links and joints, read once from the URDF for physics and for the cameras.
@@ -58,7 +58,7 @@ class LinkModel:
 
 def robot_links() -> list[LinkModel]:
     """Return every link, parents before children, starting at ``base_link``."""
-    root = ET.fromstring(ur5_with_gripper_urdf())
+    root = ET.fromstring(ROBOT.urdf_text())
     elements = {item.attrib["name"]: item for item in root.findall("link")}
     joints = root.findall("joint")
     links = []

@@ -16,7 +16,7 @@ from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.schema import StampedMessage
 from bridge.episode.topics import EVENT, cell_topic
-from bridge.task.robot import ARM_JOINTS, BASE_FRAME
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME
 
 # --- Messages of one layout, serialised once: only stamp and numbers change from sample to sample.
 #
@@ -114,7 +114,6 @@ def safety_mode_name(number: int) -> str:
 
 CONTROLLER_TCP_FRAME = "tool0_controller"
 """The controller's active tool centre point, as ROS drivers of UR arms call it."""
-GRIPPER_JOINT = "gripper_width"
 SPEED_NAME = "speed_scaling"
 SMALLEST_ANGLE_RAD = 1e-12
 

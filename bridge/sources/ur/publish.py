@@ -21,12 +21,12 @@ from bridge.episode.topics import (
     cell_topic,
 )
 from bridge.errors import PathNotFoundError, UsageError
+from bridge.robots.default import ARM_JOINTS, GRIPPER_WIDTH, ROBOT
 from bridge.sources.device_samples import Announcer, HostClock, NumberedPublisher
 from bridge.sources.ur import messages
 from bridge.sources.ur.config import ControllerError, UrConfig
 from bridge.sources.ur.messages import MessageTemplate
 from bridge.sources.ur.rtde import RtdeClient, Sample, Wish
-from bridge.task.robot import ARM_JOINTS, ur5_urdf, ur5_with_gripper_urdf
 from bridge.terminal import Output
 from bridge.wire.qos import Qos
 from bridge.wire.session import WireSession
@@ -75,7 +75,7 @@ class ArmPublisher:
         self._gripper = config.make_gripper()
         state = schema.JOINT_STATE
         targets = messages.joints_template(ARM_JOINTS, velocities=False)
-        width = messages.joints_template((messages.GRIPPER_JOINT,), velocities=False)
+        width = messages.joints_template((GRIPPER_WIDTH,), velocities=False)
         speed = messages.joints_template((messages.SPEED_NAME,), velocities=False)
         self._joints = _Topic(cell_topic(cell, JOINT_STATES), state, messages.arm_template())
         self._targets = _Topic(cell_topic(cell, JOINT_TARGETS), state, targets)
@@ -249,7 +249,7 @@ def read_urdf(config: UrConfig) -> str | None:
         return _read_urdf_file(config.urdf)
     if config.robot == "none":
         return None
-    return ur5_with_gripper_urdf() if config.robot == "ur5_parallel_gripper" else ur5_urdf()
+    return ROBOT.urdf_text() if config.robot == "ur5_parallel_gripper" else ROBOT.arm_urdf()
 
 
 def _read_urdf_file(path: Path) -> str:

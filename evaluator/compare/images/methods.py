@@ -29,8 +29,8 @@ from evaluator.compare.images.tables import (
     resolution_words,
     stamped_measurements,
 )
-from evaluator.compare.measure import slug
 from evaluator.errors import EvaluatorError
+from evaluator.measurements import RENDERS
 from evaluator.metrics.image import ImageShapeError, as_float, refuse_swapped
 from evaluator.metrics.image_scores import ImageScore
 from evaluator.metrics.lpips import PerceptualNet
@@ -460,10 +460,11 @@ def _numbers(
         number
         for variant in variants
         for number in stamped_measurements(
-            f"image.{slug(method.name)}",
+            RENDERS,
             variant,
             [scored[variant] for scored in scores if variant in scored],
             protocol,
+            method=method.name,
         )
     ]
 

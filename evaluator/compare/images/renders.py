@@ -22,7 +22,7 @@ from evaluator.compare.images.methods import (
     list_files,
     read_mask,
 )
-from evaluator.compare.images.scores import RAW, RECORDED, RENDERED, Images, images_of
+from evaluator.compare.images.scores import RAW, RECORDED, RENDERED, Images, images_of, open_nets
 from evaluator.compare.images.tables import (
     StampedMeasurement,
     StampedValue,
@@ -39,12 +39,12 @@ from evaluator.compare.images.views import (
     newest_views,
     opened,
 )
-from evaluator.compare.measure import slug
 from evaluator.compare.rows import Comparison
 from evaluator.errors import EvaluatorError
+from evaluator.measurements import slug
 from evaluator.metrics.image_protocol import UNSTATED, ImageOptions, Stamp
 from evaluator.metrics.image_scores import METRICS
-from evaluator.metrics.lpips import PerceptualNet, open_nets
+from evaluator.metrics.lpips import PerceptualNet
 from evaluator.result import Table
 from evaluator.run_reader.episodes import DerivedFile
 

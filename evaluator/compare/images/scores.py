@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -26,7 +27,7 @@ from bridge.episode.topics import (
     RENDERED_DEPTH_TOPIC,
     RENDERED_TOPIC,
 )
-from bridge.errors import GstError
+from bridge.errors import GstError, MissingDependencyError
 from bridge.media.color import JPEG_MAGIC, decode_color
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.image import (
@@ -37,7 +38,7 @@ from evaluator.metrics.image import (
     refuse_swapped,
     score_depth,
 )
-from evaluator.metrics.image_protocol import MASK_MODES, MaskMode
+from evaluator.metrics.image_protocol import MASK_MODES, MaskMode, NetName
 from evaluator.metrics.image_scores import METRICS, ImageScore, score_image
 from evaluator.metrics.lpips import PerceptualNet
 
@@ -173,6 +174,24 @@ def shrunk_u8(
     rows, columns = image.shape[0] // side, image.shape[1] // side
     squares = values[: rows * side, : columns * side].reshape(rows, side, columns, side, 3)
     return np.asarray(np.rint(squares.mean(axis=(1, 3))), dtype=np.uint8)
+
+
+def open_nets(backbones: Mapping[NetName, Path]) -> tuple[PerceptualNet, ...]:
+    """Load the networks of LPIPS that were asked for; without one, torch stays out.
+
+    Raises:
+        LpipsWeightsError: When a backbone or the linear heads cannot be used.
+        MissingDependencyError: When torch is not installed.
+    """
+    if not backbones:
+        return ()
+    try:
+        from evaluator.metrics.lpips_torch import LpipsNet  # noqa: PLC0415  # loads torch
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise MissingDependencyError(package="torch", extra="lpips", purpose="LPIPS") from error
+    return tuple(LpipsNet.open(net, path) for net, path in backbones.items())
 
 
 # --- Work on many images with a few threads; NumPy and the image decoders let go of the

@@ -1,6 +1,6 @@
 """Tables of image numbers: no row without the protocol it was measured by."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -9,6 +9,7 @@ import numpy as np
 from evaluator.compare.images.scores import AFFINE, GAIN, POSE_GAIN, RAW, Variant, ViewScore
 from evaluator.compare.measure import measured
 from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import Quantity
 from evaluator.metrics.image_protocol import ImageMetric, Stamp, common_text
 from evaluator.metrics.image_scores import METRICS, PLAIN_METRICS, ImageScore
 from evaluator.metrics.lpips import LPIPS_METRICS, LPIPS_NOT_COMPUTED, PerceptualNet, net_of
@@ -16,6 +17,8 @@ from evaluator.result import Cell, Measurement, Table
 
 # --- Turn the scores of many images into measurements, each with its protocol stamp.
 
+Quantities = Mapping[tuple[str, bool], Quantity]
+"""By the metric, and whether the images were compared as they are stored."""
 NOT_A_SAMPLE = (
     "views of one scene are no random sample of views; the per-image list is in the table"
 )
@@ -29,7 +32,7 @@ class Protocol:
     split: str
     stored: str
     nets: Sequence[PerceptualNet] = ()
-    remark: str = ""
+    note: str = ""
     """Said at the end of each definition."""
 
 
@@ -53,37 +56,40 @@ def resolution_words(sizes: Sequence[tuple[int, int]]) -> str:
 
 
 def stamped_measurements(
-    prefix: str,
+    quantities: Quantities,
     variant: Variant,
     scores: Sequence[ImageScore],
     protocol: Protocol,
     *,
     episodes: Sequence[str] = (),
+    **part: str,
 ) -> list[StampedMeasurement]:
     """Measure the mean of every metric that a variant can have.
 
     Args:
-        prefix: Of the ids: ``views.all`` or ``image.<method>``.
+        quantities: ``VIEWS`` or ``RENDERS``.
         variant: How the images were scored.
         scores: One for each image.
         protocol: What goes onto every stamp.
         episodes: The recorded episodes the numbers rest on.
+        part: Of the ids: which views, or whose renders.
     """
     metrics = [*PLAIN_METRICS, *(LPIPS_METRICS if protocol.nets and variant.learned else ())]
     return [
-        _stamped(prefix, metric, variant, scores, protocol, episodes)
+        _stamped(quantities, metric, variant, scores, protocol, episodes, part)
         for metric in metrics
         if variant.mode != "mask-pixels" or metric.by_pixel
     ]
 
 
 def _stamped(
-    prefix: str,
+    quantities: Quantities,
     metric: ImageMetric,
     variant: Variant,
     scores: Sequence[ImageScore],
     protocol: Protocol,
     episodes: Sequence[str],
+    part: Mapping[str, str],
 ) -> StampedMeasurement:
     values = [s.values[metric.id] for s in scores if metric.id in s.values]
     net = net_of(metric, protocol.nets)
@@ -103,12 +109,12 @@ def _stamped(
         n=len(values),
     )
     without = LPIPS_NOT_COMPUTED if metric in LPIPS_METRICS and net is None else ""
-    parts = (metric.definition, stamp.text(), _lacking(metric, scores), protocol.remark)
+    parts = (stamp.text(), _lacking(metric, scores), protocol.note)
+    protocol_words = "".join(f"; {part}" for part in parts if part)
+    quantity = quantities[metric.id, variant == RAW]
     measurement = measured(
-        f"{prefix}.{metric.named(variant.name)}",
+        quantity.of(variant=variant.name, protocol=protocol_words, **part),
         partial(_mean, metric.column, values, without or _first_reason(metric, scores)),
-        unit=metric.unit,
-        definition="; ".join(part for part in parts if part),
         n=len(values),
         counted="image",
         reason_without_interval=NOT_A_SAMPLE,

@@ -6,7 +6,6 @@ episode are found, and their scores become measurements, each with its protocol.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,9 +41,9 @@ from evaluator.compare.images.tables import (
     stamp_table,
     stamped_measurements,
 )
-from evaluator.compare.measure import measured, slug
-from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.image import DEPTH_PROTOCOL, DepthScore
+from evaluator.compare.measure import measured
+from evaluator.measurements import DEPTHS, LPIPS_MISSING, VIEWS, slug
+from evaluator.metrics.image import DepthScore
 from evaluator.metrics.image_protocol import UNSTATED
 from evaluator.metrics.image_scores import ImageScore
 from evaluator.metrics.lpips import LPIPS_NOT_COMPUTED, PerceptualNet
@@ -262,7 +261,6 @@ def _measure(
     nets: Sequence[PerceptualNet],
 ) -> tuple[list[Measurement], list[StampedMeasurement]]:
     """All numbers about some views; the raw ones first."""
-    prefix = f"views.{part}"
     settings: list[Mapping[str, Any]] = [file.derived.settings for file in files]
     said = _said(settings)
     stored = "rendered images stored as JPEG" if any(s.jpeg for s in scores) else "stored lossless"
@@ -271,7 +269,7 @@ def _measure(
         split=agreed_setting(settings, "holdout") or UNSTATED,
         stored=stored,
         nets=nets,
-        remark=said,
+        note=said,
     )
     variants: dict[Variant, None] = {}
     for score in scores:
@@ -280,23 +278,22 @@ def _measure(
         number
         for variant in variants or {RAW: None}
         for number in stamped_measurements(
-            prefix,
+            VIEWS,
             variant,
             [s.scores[variant] for s in scores if variant in s.scores],
             protocol,
             episodes=episodes,
+            part=part,
         )
     ]
     measurements = [number.measurement for number in stamped]
     after = "; ".join(part for part in (stored, "mean of per-image values", said) if part)
-    measurements += _measure_depth(prefix, episodes, scores, after)
+    measurements += _measure_depth(part, episodes, scores, after)
     if not nets:
         measurements.append(
             Measurement(
-                id=f"{prefix}.lpips",
+                **vars(LPIPS_MISSING.of(part=part)),
                 value=None,
-                unit="1",
-                definition="learned perceptual image patch similarity",
                 reason_if_undefined=LPIPS_NOT_COMPUTED,
                 episodes=tuple(episodes),
             )
@@ -305,27 +302,21 @@ def _measure(
 
 
 def _measure_depth(
-    prefix: str, episodes: Sequence[str], scores: Sequence[ViewScore], after: str
+    part: str, episodes: Sequence[str], scores: Sequence[ViewScore], after: str
 ) -> list[Measurement]:
     depths = [score.depth for score in scores if score.depth is not None]
     if not depths:
         return []
     return [
         measured(
-            f"{prefix}.{name}",
-            partial(_mean, statistic, values),
-            unit="m",
-            definition=f"{statistic}, {DEPTH_PROTOCOL}; {after}",
-            n=len(values),
+            quantity.of(part=part, after=after),
+            lambda name=name: float(np.mean([getattr(d, name) for d in depths])),
+            n=len(depths),
             counted="image",
             reason_without_interval="the per-image list is in the table",
             episodes=episodes,
         )
-        for name, statistic, values in (
-            ("depth_mean_abs_m", "mean absolute depth error", [d.mean_abs_m for d in depths]),
-            ("depth_median_abs_m", "median absolute depth error", [d.median_abs_m for d in depths]),
-            ("depth_rmse_m", "root mean square depth error", [d.rmse_m for d in depths]),
-        )
+        for name, quantity in DEPTHS.items()
     ]
 
 
@@ -353,10 +344,3 @@ def _said(settings: Sequence[Mapping[str, Any]]) -> str:
         if agreed := agreed_setting(settings, name):
             parts.append(text.format(agreed))
     return "; ".join(parts)
-
-
-def _mean(statistic: str, values: Iterable[float]) -> float:
-    found = list(values)
-    if not found:
-        raise UndefinedStatisticError(statistic=statistic, reason="no pair of images has it")
-    return float(np.mean(found))

@@ -5,13 +5,12 @@ Whatever becomes of the process, the same figures can be drawn without it.
 """
 
 import os
-import pickle
-import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
-from evaluator.child_process import ChildProcess
+from bridge.process_pool import Failed, Function, Worker, WorkerLostError
 from evaluator.report.figures.drawing import Drawing, Rendered
 
 if TYPE_CHECKING:
@@ -29,7 +28,7 @@ Forms = tuple[bytes, bytes, str]
 """SVG, PDF and the SVG for the page."""
 
 
-class Beside(ChildProcess):
+class Beside(Worker):
     """A second process that draws; it ends with this object, or with the program."""
 
     def __init__(self) -> None:
@@ -38,7 +37,16 @@ class Beside(ChildProcess):
         Raises:
             OSError: When the system gives no further process.
         """
-        super().__init__(__name__)
+        super().__init__(quiet=True)
+        self._begin(_load, None)
+
+    def send(self, shown: "Drawable") -> None:
+        """Hand over what the figures show, and go on."""
+        self._begin(_draw, shown)
+
+    def _begin(self, function: Function, item: object) -> None:
+        with suppress(WorkerLostError):  # found out when it should answer
+            self.begin(function, item)
 
     def take(self, drawn: Sequence[Drawing]) -> list[Rendered] | None:
         """Wait for the figures and end the process.
@@ -49,17 +57,14 @@ class Beside(ChildProcess):
         Returns:
             The figures in this order, or None when the process did not bring them to an end.
         """
-        assert self.process.stdout is not None  # noqa: S101  # for the type checker
-        limit = threading.Timer(MAX_WAIT_S, self.process.kill)
-        limit.start()
         try:
-            found: dict[str, Forms] = pickle.load(self.process.stdout)
-            return [_rendered(drawing, found[drawing.id]) for drawing in drawn]
-        except (EOFError, OSError, pickle.UnpicklingError):
+            self.finish(MAX_WAIT_S)  # it has loaded what it needs
+            found: dict[str, Forms] | Failed = self.finish(MAX_WAIT_S)
+        except WorkerLostError:
             return None
         finally:
-            limit.cancel()
-            self.end()
+            self.close()
+        return None if isinstance(found, Failed) else [_rendered(one, found) for one in drawn]
 
 
 def beside(source: Path | None) -> Beside | None:
@@ -73,25 +78,21 @@ def beside(source: Path | None) -> Beside | None:
         return None
 
 
-def _rendered(drawing: Drawing, forms: Forms) -> Rendered:
-    svg, pdf, inline = forms
+def _rendered(drawing: Drawing, found: dict[str, Forms]) -> Rendered:
+    svg, pdf, inline = found[drawing.id]
     return Rendered(drawing=drawing, svg=svg, pdf=pdf, inline=inline)
 
 
-def serve(receive: Callable[[], "Drawable"], outbox: BinaryIO) -> None:
-    """Load what drawing needs, then draw what arrives.
-
-    Args:
-        receive: Brings what the figures show.
-        outbox: Takes a pickled dictionary: the forms of each figure by its id.
-    """
-    from evaluator.report.figures.render import render, warm_up  # noqa: PLC0415  # and matplotlib
-    from evaluator.report.figures.selection import drawings_of  # noqa: PLC0415  # loads the numbers
+def _load(_: None) -> None:
+    from evaluator.report.figures import selection  # noqa: F401, PLC0415  # loads the numbers
+    from evaluator.report.figures.render import warm_up  # noqa: PLC0415  # and matplotlib
 
     warm_up()
-    found: dict[str, Forms] = {}
-    for drawing in drawings_of(receive())[0]:
-        item = render(drawing)
-        found[drawing.id] = (item.svg, item.pdf, item.inline)
-    outbox.write(pickle.dumps(found))
-    outbox.flush()
+
+
+def _draw(shown: "Drawable") -> dict[str, Forms]:
+    from evaluator.report.figures.render import render  # noqa: PLC0415
+    from evaluator.report.figures.selection import drawings_of  # noqa: PLC0415
+
+    drawn = (render(drawing) for drawing in drawings_of(shown)[0])
+    return {item.drawing.id: (item.svg, item.pdf, item.inline) for item in drawn}

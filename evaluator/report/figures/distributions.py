@@ -27,10 +27,11 @@ if TYPE_CHECKING:
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
-from evaluator.compare.band_measurements import BAND_WIDTH, BandCurve
+from evaluator.compare.band_measurements import BandCurve
 from evaluator.compare.images.scores import ViewQuality
 from evaluator.compare.plot_data import shares_of
 from evaluator.compare.states import StateSummary
+from evaluator.measurements import BAND_WIDTH
 from evaluator.report.pairs import ViewPair
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from bridge.episode.cdr.messages import FrameTransform, JointSample, PoseSample, transforms_to_cdr
 from bridge.episode.cdr.messages import transforms_from_cdr as read_transforms
 from bridge.geometry import se3
+from bridge.robots.default import ARM_JOINTS
 from bridge.sources.ur import messages
 from bridge.sources.ur.messages import MessageTemplate
 from bridge.task.record import check_record
-from bridge.task.robot import ARM_JOINTS
 
 stamps = st.integers(0, 2**31 * 10**9 - 1)
 numbers = st.floats(-1e6, 1e6)

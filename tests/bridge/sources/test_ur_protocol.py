@@ -140,9 +140,9 @@ def test_the_tool_pose_agrees_with_the_urdf_and_the_vendors_table() -> None:
     pinocchio = pytest.importorskip("pinocchio")
     from scipy.spatial.transform import Rotation
 
-    from bridge.task.robot import ur5_urdf
+    from bridge.robots.default import ROBOT
 
-    model = pinocchio.buildModelFromXML(ur5_urdf())
+    model = pinocchio.buildModelFromXML(ROBOT.arm_urdf())
     data = model.createData()
     rng = np.random.default_rng(3)
     rows = [

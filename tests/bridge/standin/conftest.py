@@ -40,6 +40,8 @@ class FakeSession:
     sent: list[Sent] = field(default_factory=list)
     control: list[tuple[str, dict]] = field(default_factory=list)
     asked: list[str] = field(default_factory=list)
+    there: list[dict] = field(default_factory=list)
+    """Episodes that the recorder lists."""
     episode: str | None = None
 
     def publisher(self, topic: str, type_name: str, *, qos: Qos = Qos.RELIABLE) -> "FakePublisher":
@@ -49,6 +51,8 @@ class FakeSession:
         request = json.loads(payload)
         if key.startswith("rec/main/ctl/"):
             verb = key.rsplit("/", 1)[-1]
+            if verb == "list":
+                return json.dumps({"of": len(self.there), "episodes": self.there}).encode()
             self.control.append((verb, request))
             self.episode = request["id"] if verb == "start" else None
             return b'{"ok": true}'

@@ -11,6 +11,7 @@ import pytest
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
+from bridge.robots.default import MAX_WIDTH_M
 from bridge.sources.standin import operator
 from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.operator import execute_plan
@@ -18,7 +19,6 @@ from bridge.sources.standin.probes import PROBES, NoRoomForProbeError, plan_prob
 from bridge.sources.standin.session import run_session
 from bridge.sources.standin.settings import SessionConfig
 from bridge.task.plan import Plan
-from bridge.task.robot import MAX_WIDTH_M
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
 

@@ -221,10 +221,51 @@ def test_both_conditions_share_start_ids_but_not_the_exact_poses(
 ) -> None:
     session = make_session()
     operator = Operator(make_cell(session), session, settings(trials=2))
-    assert operator.start_seeds() == [9_000_000, 9_000_001]
+    assert operator.start_seeds(2) == [9_000_000, 9_000_001]
     without = operator.start_poses(9_000_000, "without_replanning")["cube"]
     with_ = operator.start_poses(9_000_000, "with_replanning")["cube"]
     assert 0 < np.linalg.norm(without[:3, 3] - with_[:3, 3]) < 0.01
+
+
+def listed(name: str, condition: str = "", start_seed: int = 0) -> dict[str, str]:
+    return {"id": name, "condition": condition, "start_id": f"cube_into_box/{start_seed}"}
+
+
+def test_a_second_session_goes_on_with_the_numbering_of_the_run(
+    make_session: Callable[..., Any], make_cell: Callable[..., StandinCell]
+) -> None:
+    there = [listed("scan_0002"), listed("trial_0007"), listed("trial_0003"), listed("trial_x")]
+    session = make_session(there=there)
+    run_session(session, settings(conditions=("with_replanning",)), QUIET, start_ns=0)
+    assert session.control[0][1]["id"] == "trial_0008"
+    at_work = Operator(make_cell(session), session, settings())
+    assert at_work._next_number("scan") == 3
+    assert at_work._next_number("probe") == 1
+
+
+def test_missing_records_only_what_the_recorder_does_not_have(
+    make_session: Callable[..., Any], make_cell: Callable[..., StandinCell]
+) -> None:
+    there = [
+        listed("trial_0001", "without_replanning", 9_000_000),
+        listed("trial_0002", "with_replanning", 9_000_000),
+        listed("trial_0004", "with_replanning", 9_000_001),
+    ]
+    session = make_session(there=there)
+    operator = Operator(make_cell(session), session, settings(trials=2, missing=True))
+    assert operator._wanted() == [(9_000_001, "without_replanning")]
+    operator = Operator(make_cell(session), session, settings(trials=2))
+    assert len(operator._wanted()) == 4
+
+
+def test_the_limit_of_waiting_for_the_gate_is_named_when_it_strikes(
+    make_session: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ticks = iter(range(0, 10_000, 100))
+    monkeypatch.setattr(operator.time, "monotonic", lambda: float(next(ticks)))
+    session, summary = with_replanning(make_session, None, gate_timeout_s=100.0)
+    assert summary["outcomes"] == {"with_replanning": {"unknown": 1}}
+    assert "wall-clock limit of 100 s (--gate-timeout-s)" in session.events()[0]["text"]
 
 
 def test_an_unknown_condition_is_refused(

@@ -7,16 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bridge.data_files import dataset_file
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.task.data import dataset_file
 from bridge.task.predicate import (
     Rollout,
     all_hold,
     already_true_at_start,
     evaluate_success,
 )
-from bridge.task.robot import FINGER_JOINTS, resolve_mesh, ur5_with_gripper_urdf
 from bridge.task.task_file import Task, load_task
 
 
@@ -150,19 +149,3 @@ def test_a_grip_that_is_no_force_is_refused(tmp_path: Path, force: str) -> None:
     path.write_text(text.replace("grip_force_N = 9.0", f"grip_force_N = {force}"))
     with pytest.raises(UsageError, match="not a task file"):
         load_task(str(path))
-
-
-def test_the_robot_description_has_arm_gripper_and_existing_meshes() -> None:
-    pytest.importorskip("pinocchio")
-    text = ur5_with_gripper_urdf()
-    assert all(f'name="{joint}"' in text for joint in FINGER_JOINTS)
-    uris = {part.split('"')[0] for part in text.split('filename="')[1:]}
-    assert len(uris) == 14
-    assert all(resolve_mesh(uri).is_file() for uri in uris)
-
-
-def test_a_mesh_uri_cannot_leave_its_package() -> None:
-    with pytest.raises(UsageError, match="leaves its package"):
-        resolve_mesh("package://example-robot-data/../../../../etc/passwd")
-    with pytest.raises(UsageError, match="only 'example-robot-data'"):
-        resolve_mesh("package://other/mesh.stl")

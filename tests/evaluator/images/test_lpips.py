@@ -12,9 +12,9 @@ import torch
 from own_process import printed
 
 from bridge.errors import MissingDependencyError
-from evaluator.compare.images.scores import score_variants
+from evaluator.compare.images.scores import open_nets, score_variants
 from evaluator.metrics import lpips_torch
-from evaluator.metrics.lpips import LPIPS_METRICS, metric_id, open_nets
+from evaluator.metrics.lpips import LPIPS_METRICS, metric_id
 from evaluator.metrics.lpips_torch import LAYERS, LpipsNet, LpipsWeightsError, read_heads
 
 

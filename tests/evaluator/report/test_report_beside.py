@@ -2,7 +2,6 @@
 
 import io
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -13,9 +12,11 @@ import pytest
 from other_processes import ended_within, is_running
 
 import robot_gst
+from bridge import process_pool
 from evaluator.compare import Comparison, compare_csv
 from evaluator.report.figures import beside as module
 from evaluator.report.figures.beside import MIN_FILES, Beside, beside
+from evaluator.report.figures.drawing import Rendered
 from evaluator.report.figures.selection import drawable, drawings
 from evaluator.report.write import write_report
 
@@ -39,7 +40,7 @@ def in_process(comparison: Comparison, tmp_path_factory: pytest.TempPathFactory)
 def second() -> Iterator[Beside]:
     process = Beside()
     yield process
-    process.end()
+    process.close()
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -79,14 +80,21 @@ def test_a_killed_process_takes_nothing_of_the_report_with_it(
 
 
 def test_half_an_answer_is_none(comparison: Comparison, second: Beside) -> None:
-    second.end()
+    second.close()
     drawn = drawings(comparison)[0]
-    answer = pickle.dumps({item.id: (b"svg", b"pdf", "inline") for item in drawn})
-    for length in (0, 1, len(answer) // 2, len(answer) - 1):
-        second.process.stdout = io.BytesIO(answer[:length])
-        assert second.take(drawn) is None
-    second.process.stdout = io.BytesIO(answer)
-    found = second.take(drawn)
+    loaded = process_pool._packed(None)
+    data = loaded + process_pool._packed({item.id: (b"svg", b"pdf", "inline") for item in drawn})
+
+    def take(heard: bytes) -> list[Rendered] | None:
+        outlet, inlet = os.pipe()
+        os.write(inlet, heard)
+        os.close(inlet)
+        with io.FileIO(outlet) as second.outlet:
+            return second.take(drawn)
+
+    for length in (0, 1, len(loaded), (len(loaded) + len(data)) // 2, len(data) - 1):
+        assert take(data[:length]) is None
+    found = take(data)
     assert found is not None
     assert [item.drawing for item in found] == drawn
 

@@ -25,7 +25,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
+from bridge.robots.default import ARM_JOINTS, ROBOT
 from twin.calibrate import cameras
 from twin.calibrate.cameras import placement
 from twin.calibrate.pairs import recorded_pairs
@@ -41,7 +41,7 @@ from twin.scene.store.calibration import (
 sys.path.insert(0, str(Path(__file__).parents[1] / "scene" / "align"))
 import cell_views
 
-URDF = ur5_with_gripper_urdf()
+URDF = ROBOT.urdf_text()
 SECOND = 1_000_000_000
 CAMERA = Camera(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
 T_TOOL_CAMERA = se3.transform_from(np.array([0.7, 0.1, 0.1, 0.7]), np.array([-0.09, 0.01, 0.02]))

@@ -1,4 +1,4 @@
-"""Fakes for eyes, localisation and replay, and a gate between them."""
+"""Fakes for perception, localisation and replay, and a gate between them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -30,7 +30,7 @@ PLAN = Plan(
 
 
 @dataclass
-class FakeEyes:
+class FakePerception:
     description: str | None = URDF
     running: str | None = None
     heard: int = 1
@@ -77,7 +77,7 @@ def accept(plan: Plan, *_: Any) -> Verdict:
 
 
 def gate_with(
-    eyes: FakeEyes | None = None,
+    perception: FakePerception | None = None,
     localise: Callable[..., Any] = lambda *_: found(),
     replay: Callable[..., Verdict] = accept,
     now_ns: Callable[[], int] = lambda: 0,
@@ -87,7 +87,7 @@ def gate_with(
     return Gate(
         task=TASK,
         config=config,
-        eyes=eyes or FakeEyes(),
+        perception=perception or FakePerception(),
         localise=localise,
         replay=replay,
         now_ns=now_ns,

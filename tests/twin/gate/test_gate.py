@@ -1,4 +1,4 @@
-"""The gate with fakes for eyes, localisation and replay: undecided is never yes."""
+"""The gate with fakes for perception, localisation and replay: undecided is never yes."""
 
 import json
 from dataclasses import replace
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gate_fakes import PLAN, URDF, FakeEyes, accept, found, gate_with, raising
+from gate_fakes import PLAN, URDF, FakePerception, accept, found, gate_with, raising
 
 from bridge.errors import InvalidRecordError
 from bridge.task.plan import Plan
@@ -42,7 +42,7 @@ def test_a_task_with_soft_objects_is_replayed_like_any_other() -> None:
     gate = Gate(
         task=task,
         config=GateConfig(deadline_s=5.0, frame_wait_s=0.0),
-        eyes=FakeEyes(),
+        perception=FakePerception(),
         localise=lambda *_: there,
         replay=accept,
         now_ns=lambda: 0,
@@ -57,9 +57,13 @@ def test_an_accepted_plan_is_accepted() -> None:
 @pytest.mark.parametrize(
     ("settings", "plan", "reason"),
     [
-        ({"eyes": FakeEyes(seen=[])}, PLAN, "no usable frames within 0 s: side: silent for 9.0 s"),
-        ({"eyes": FakeEyes(description=None)}, PLAN, "no robot description"),
-        ({"eyes": FakeEyes(running="plan_0")}, PLAN, "plan_0 is being executed"),
+        (
+            {"perception": FakePerception(seen=[])},
+            PLAN,
+            "no usable frames within 0 s: side: silent for 9.0 s",
+        ),
+        ({"perception": FakePerception(description=None)}, PLAN, "no robot description"),
+        ({"perception": FakePerception(running="plan_0")}, PLAN, "plan_0 is being executed"),
         (
             {"localise": lambda *_: found(cube="0 points")},
             PLAN,
@@ -92,7 +96,7 @@ def test_a_cell_not_heard_for_long_is_not_judged_from_memory_however_often_one_a
 def test_a_cell_that_stands_still_while_it_waits_for_a_verdict_is_not_silent() -> None:
     """Each verdict takes 60 s, the cell asks again 1 s later: 1 s of silence, then 2."""
     clock = iter([1_000_000_000, 61_000_000_000, 62_000_000_000, 122_000_000_000, 200_000_000_000])
-    gate = gate_with(FakeEyes(heard=0), now_ns=lambda: next(clock))
+    gate = gate_with(FakePerception(heard=0), now_ns=lambda: next(clock))
     assert gate.judge(PLAN.to_json()).accepted is True
     assert gate.judge(PLAN.to_json()).accepted is True
     assert "for 80 s" in str(gate.judge(PLAN.to_json()).reason)

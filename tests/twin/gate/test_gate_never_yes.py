@@ -32,7 +32,7 @@ def frame(stamp_ns: int) -> Any:
 
 
 @dataclass
-class ChangingEyes:
+class ChangingPerception:
     """What is seen first, and what is seen when one looks again."""
 
     looks: list[list[Any]] = field(default_factory=lambda: [[frame(1)]])
@@ -78,7 +78,7 @@ def accepted(p_success: dict[str, float] | None = None) -> Verdict:
 
 
 def judged(
-    eyes: ChangingEyes | None = None,
+    perception: ChangingPerception | None = None,
     found: list[dict[str, Any]] | None = None,
     verdict: Verdict | None = None,
     **settings: Any,
@@ -87,7 +87,7 @@ def judged(
     gate = Gate(
         task=TASK,
         config=GateConfig(**{"deadline_s": 5.0, "frame_wait_s": 0.0, **settings}),
-        eyes=eyes or ChangingEyes(),
+        perception=perception or ChangingPerception(),
         localise=lambda *_: answers.pop(0) if len(answers) > 1 else answers[0],
         replay=lambda *_: verdict or accepted(),
         now_ns=lambda: 0,
@@ -99,26 +99,34 @@ LOOKS = [[frame(1)], [frame(2)]]
 
 
 def test_a_yes_needs_the_cell_to_be_as_it_was_judged() -> None:
-    assert judged(ChangingEyes(looks=list(LOOKS))).accepted is True
+    assert judged(ChangingPerception(looks=list(LOOKS))).accepted is True
 
 
 @pytest.mark.parametrize(
-    ("eyes", "found", "reason"),
+    ("perception", "found", "reason"),
     [
         (
-            ChangingEyes(looks=list(LOOKS)),
+            ChangingPerception(looks=list(LOOKS)),
             [seen(pose()), seen(pose(0.53))],
             "moved while the plan was being judged: cube by 30 mm and 0 degrees",
         ),
         (
-            ChangingEyes(looks=list(LOOKS)),
+            ChangingPerception(looks=list(LOOKS)),
             [seen(pose()), seen(pose(yaw_rad=0.6))],
             "cube by 0 mm and 34 degrees",
         ),
-        (ChangingEyes(running=[None, "plan_0"]), None, "plan_0 was started while the plan was"),
-        (ChangingEyes(looks=[[frame(1)], []]), None, "lost from sight while the plan was judged"),
         (
-            ChangingEyes(looks=list(LOOKS)),
+            ChangingPerception(running=[None, "plan_0"]),
+            None,
+            "plan_0 was started while the plan was",
+        ),
+        (
+            ChangingPerception(looks=[[frame(1)], []]),
+            None,
+            "lost from sight while the plan was judged",
+        ),
+        (
+            ChangingPerception(looks=list(LOOKS)),
             [
                 seen(pose()),
                 {**seen(pose()), "cube": SimpleNamespace(found=False, reason="0 points")},
@@ -128,9 +136,9 @@ def test_a_yes_needs_the_cell_to_be_as_it_was_judged() -> None:
     ],
 )
 def test_what_changes_while_a_plan_is_judged_takes_the_yes_away(
-    eyes: ChangingEyes, found: list[dict[str, Any]] | None, reason: str
+    perception: ChangingPerception, found: list[dict[str, Any]] | None, reason: str
 ) -> None:
-    verdict = judged(eyes, found)
+    verdict = judged(perception, found)
     assert verdict.accepted is None
     assert reason in str(verdict.reason)
 
@@ -138,7 +146,7 @@ def test_what_changes_while_a_plan_is_judged_takes_the_yes_away(
 def test_a_no_is_a_no_whatever_happens_meanwhile() -> None:
     no = Factor(value=False, cause="inside", detail="beside the box")
     verdict = judged(
-        ChangingEyes(running=[None, "plan_0"]),
+        ChangingPerception(running=[None, "plan_0"]),
         verdict=Verdict(**{**vars(accepted()), "terminal": no}),
     )
     assert verdict.accepted is False

@@ -102,7 +102,7 @@ def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(
     sessions: tuple[WireSession, WireSession],
 ) -> None:
     router, cell = sessions
-    eyes, config = LiveView("lab"), GateConfig(cell="lab", frame_wait_s=3.0, deadline_s=10.0)
+    perception, config = LiveView("lab"), GateConfig(cell="lab", frame_wait_s=3.0, deadline_s=10.0)
     seen: dict[str, Any] = {}
 
     def localise(frames: Any, task: Any, ends_s: float) -> dict[str, Any]:
@@ -116,13 +116,13 @@ def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(
     gate = Gate(
         task=load_task("cube_into_box"),
         config=config,
-        eyes=eyes,
+        perception=perception,
         localise=localise,
         replay=replay,
         now_ns=router.now_ns,
     )
-    watch_cell(router, "lab", eyes.take)
-    serve_gate(router, gate, eyes, config, Output(quiet=True))
+    watch_cell(router, "lab", perception.take)
+    serve_gate(router, gate, perception, config, Output(quiet=True))
     published: list[Any] = []
     cell.subscribe("lab/verdict", published.append)
     publish_one_frame(cell)
@@ -146,19 +146,21 @@ def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(
     assert published[0].source_ns == S
 
 
-def a_gate(router: WireSession, eyes: LiveView, replay: Any, found: Any, **settings: Any) -> None:
+def a_gate(
+    router: WireSession, perception: LiveView, replay: Any, found: Any, **settings: Any
+) -> None:
     """Serve a gate whose cell has shown itself."""
     config = GateConfig(**{"cell": "lab", "frame_wait_s": 3.0, "deadline_s": 10.0, **settings})
     gate = Gate(
         task=load_task("cube_into_box"),
         config=config,
-        eyes=eyes,
+        perception=perception,
         localise=found,
         replay=replay,
         now_ns=router.now_ns,
     )
-    watch_cell(router, "lab", eyes.take)
-    serve_gate(router, gate, eyes, config, Output(quiet=True))
+    watch_cell(router, "lab", perception.take)
+    serve_gate(router, gate, perception, config, Output(quiet=True))
 
 
 def everything_at(x_m: float = 0.0) -> dict[str, Any]:
@@ -235,11 +237,11 @@ def test_an_object_moved_while_its_plan_is_judged_is_no_yes(
     sessions: tuple[WireSession, WireSession],
 ) -> None:
     router, cell = sessions
-    eyes = LiveView("lab")
+    perception = LiveView("lab")
     places = iter([0.0, 0.05, 0.05])
 
     def last_seen() -> int:
-        live = eyes.frames(max_age_ns=100 * S, max_per_camera=1)
+        live = perception.frames(max_age_ns=100 * S, max_per_camera=1)
         return max((frame.stamp_ns for frame in live.frames), default=0)
 
     def replay(plan: Plan, *_: Any) -> Verdict:
@@ -249,7 +251,7 @@ def test_an_object_moved_while_its_plan_is_judged_is_no_yes(
             time.sleep(0.01)
         return accept(plan)
 
-    a_gate(router, eyes, replay, lambda *_: everything_at(next(places)))
+    a_gate(router, perception, replay, lambda *_: everything_at(next(places)))
     publish_one_frame(cell)
     verdict = ask(cell)
     assert verdict.accepted is None
@@ -262,8 +264,8 @@ def test_pictures_that_are_old_on_the_cells_clock_are_no_basis(
     sessions: tuple[WireSession, WireSession],
 ) -> None:
     router, cell = sessions
-    eyes = LiveView("lab")
-    a_gate(router, eyes, accept, lambda *_: everything_at(), frame_wait_s=0.1)
+    perception = LiveView("lab")
+    a_gate(router, perception, accept, lambda *_: everything_at(), frame_wait_s=0.1)
     publish_one_frame(cell)
     assert ask(cell).accepted is True
     later = [
@@ -271,7 +273,7 @@ def test_pictures_that_are_old_on_the_cells_clock_are_no_basis(
     ]
     cell.publisher("/tf", schema.TF_MESSAGE).put(transforms_to_cdr(later), source_ns=60 * S)
     ends = time.monotonic() + 5
-    while eyes.newest_ns() < 60 * S and time.monotonic() < ends:
+    while perception.newest_ns() < 60 * S and time.monotonic() < ends:
         time.sleep(0.01)
     expired = ask(cell)
     assert expired.accepted is None

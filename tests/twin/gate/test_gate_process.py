@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from bridge.process_pool import Worker, WorkerDiedError
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
-from twin.crew.pool import Worker, WorkerDiedError
 from twin.gate import twin_process
 from twin.gate.config import GateConfig
 from twin.gate.gate import UndecidedError
@@ -34,7 +34,6 @@ def test_a_process_stopped_between_two_plans_holds_no_more_than_one(twin: TwinPr
     """A plan with frames is more than a pipe takes: it would be sent for ever."""
     assert asked(twin, "1 + 1") == 2
     assert twin._worker is not None
-    assert twin._worker.pid is not None
     os.kill(twin._worker.pid, signal.SIGSTOP)
     with pytest.raises(UndecidedError, match=r"wall-clock limit .*; it was stopped"):
         asked(twin, "1 + 1" + " " * 3_000_000, within_s=0.2)
@@ -53,8 +52,8 @@ def test_a_process_killed_while_it_is_started_is_replaced(
             super().__init__()
             starts.append(self)
             if len(starts) == 1:
-                self._process.kill()
-                self._process.join()
+                self.process.kill()
+                self.process.wait()
 
     monkeypatch.setattr(twin_process, "Worker", Doomed)
     for _ in range(2):

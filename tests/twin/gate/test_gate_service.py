@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from gate_fakes import PLAN, FakeEyes, gate_with
+from gate_fakes import PLAN, FakePerception, gate_with
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import InvalidRecordError, UsageError
@@ -43,7 +43,7 @@ class FakeSession:
 
 def test_the_service_answers_and_publishes_with_the_cells_own_time() -> None:
     session = FakeSession()
-    serve_gate(session, gate_with(), FakeEyes(), GateConfig(), Output(quiet=True))
+    serve_gate(session, gate_with(), FakePerception(), GateConfig(), Output(quiet=True))
     answer = session.services["standin/gate/verdict"](PLAN.to_json())
     assert Verdict.from_json(answer).accepted is True
     assert session.published == [("/standin/verdict", answer, 42)]
@@ -53,7 +53,7 @@ def test_an_id_from_the_network_does_not_move_the_cursor(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     session, plan = FakeSession(), replace(PLAN, id="plan\x1b[2J\x1b[31m")
-    serve_gate(session, gate_with(), FakeEyes(), GateConfig(), Output())
+    serve_gate(session, gate_with(), FakePerception(), GateConfig(), Output())
     session.services["standin/gate/verdict"](plan.to_json())
     said = capsys.readouterr().err
     assert "\x1b" not in said
@@ -62,7 +62,7 @@ def test_an_id_from_the_network_does_not_move_the_cursor(
 
 def test_a_malformed_plan_is_not_published() -> None:
     session = FakeSession()
-    serve_gate(session, gate_with(), FakeEyes(), GateConfig(), Output(quiet=True))
+    serve_gate(session, gate_with(), FakePerception(), GateConfig(), Output(quiet=True))
     with pytest.raises(InvalidRecordError):
         session.services["standin/gate/verdict"](b"nonsense")
     assert session.published == []

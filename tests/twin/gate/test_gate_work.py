@@ -13,8 +13,8 @@ import pytest
 
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
+from bridge.robots.default import ROBOT, ROBOT_NAME
 from bridge.task.plan import Plan
-from bridge.task.robot import ROBOT_NAME, ur5_with_gripper_urdf
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.gate.gate import UndecidedError
@@ -57,7 +57,7 @@ def question_of(run: RunFolder, **changes: Any) -> Question:
         task=task,
         Ts_base_object={"sloth": lying, "basket": np.eye(4)},
         covariances={},
-        urdf=ur5_with_gripper_urdf(),
+        urdf=ROBOT.urdf_text(),
         config=ReplayConfig(),
         max_steps=100_000,
     )

@@ -25,7 +25,7 @@ from bridge.episode.streams import RgbdFrame
 from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
-from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
+from bridge.robots.default import ARM_JOINTS, ROBOT
 from bridge.terminal import Output
 from twin.gate import service
 from twin.gate.config import GateConfig
@@ -34,7 +34,7 @@ from twin.scene.localise.live import LiveView
 from twin.scene.localise.stationary_frames import calibrated_cameras, stationary_frames
 from twin.scene.store.calibration import Calibration, read_calibration, write_calibration
 
-URDF = ur5_with_gripper_urdf()
+URDF = ROBOT.urdf_text()
 HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
 T_LINK_CAMERA = se3.transform_from(np.array([0.9, 0.1, 0.0, 0.4]), np.array([0.03, -0.02, 0.1]))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from bridge.task.robot import ur5_with_gripper_urdf
+from bridge.robots.default import ROBOT
 from twin.physics import world as world_module
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
@@ -23,7 +23,7 @@ CARRIED_KG = 2 * WEAK.object_friction * WEAK.finger_friction * WEAK.grip_force_N
 
 @pytest.fixture(scope="module")
 def urdf() -> str:
-    return with_absolute_meshes(ur5_with_gripper_urdf())
+    return with_absolute_meshes(ROBOT.urdf_text())
 
 
 def gripping(world: World, mass_kg: float) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.geometry.box import box_corners
-from bridge.task.robot import ur5_with_gripper_urdf
+from bridge.robots.default import ROBOT
 from twin.physics import engine
 from twin.physics.arm import Arm, write_description
 from twin.physics.config import PhysicsConfig
@@ -22,7 +22,7 @@ SIZE = np.array([0.04, 0.04, 0.04])
 
 @pytest.fixture(scope="module")
 def urdf() -> str:
-    return with_absolute_meshes(ur5_with_gripper_urdf())
+    return with_absolute_meshes(ROBOT.urdf_text())
 
 
 def at(x: float, y: float, z: float) -> np.ndarray:

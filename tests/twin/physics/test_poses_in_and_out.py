@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from bridge.task.robot import ur5_with_gripper_urdf
+from bridge.robots.default import ROBOT
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
 from twin.physics.world import Attachment, World
@@ -18,7 +18,7 @@ SIZE = np.array([0.04, 0.04, 0.04])
 
 @pytest.fixture(scope="module")
 def urdf() -> str:
-    return with_absolute_meshes(ur5_with_gripper_urdf())
+    return with_absolute_meshes(ROBOT.urdf_text())
 
 
 @pytest.mark.parametrize("seed", range(5))

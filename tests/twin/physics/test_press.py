@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bridge.task.robot import FINGER_JOINTS, ur5_with_gripper_urdf
+from bridge.robots.default import FINGER_JOINTS, ROBOT
 from twin.physics import arm
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
@@ -21,7 +21,7 @@ OPEN_M, CLOSED_M = 0.06, 0.0
 
 @pytest.fixture(scope="module")
 def urdf() -> str:
-    return with_absolute_meshes(ur5_with_gripper_urdf())
+    return with_absolute_meshes(ROBOT.urdf_text())
 
 
 def fingers(world: World) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from bridge.task.robot import ur5_with_gripper_urdf
+from bridge.robots.default import ROBOT
 from twin.physics.arm import PhysicsError
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
@@ -20,7 +20,7 @@ Boxes = Callable[..., SoftModel]
 
 @pytest.fixture(scope="module")
 def urdf() -> str:
-    return with_absolute_meshes(ur5_with_gripper_urdf())
+    return with_absolute_meshes(ROBOT.urdf_text())
 
 
 def at(x: float, y: float, z: float) -> np.ndarray:

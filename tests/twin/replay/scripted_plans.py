@@ -7,8 +7,8 @@ import numpy as np
 from bridge.episode.streams import JointTrack
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
+from bridge.robots.default import ARM_JOINTS, ROBOT, ROBOT_NAME
 from bridge.task.plan import Plan, Stage, Waypoint
-from bridge.task.robot import ARM_JOINTS, ROBOT_NAME, ur5_with_gripper_urdf
 from bridge.task.task_file import Task, load_task
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
@@ -27,7 +27,7 @@ def scene_of_test(missing: tuple[str, ...] = ()) -> ReplayScene:
     return ReplayScene(
         task=load_task("cube_into_box"),
         Ts_base_object={name: T for name, T in poses.items() if name not in missing},
-        urdf=ur5_with_gripper_urdf(),
+        urdf=ROBOT.urdf_text(),
     )
 
 
@@ -168,7 +168,7 @@ def toy_scene(task_name: str = "sloth_into_basket") -> ReplayScene:
         yaw = 0.0 if name in task.containers else 0.3
         q = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
         poses[name] = se3.transform_from(q, np.array([x, y, task.objects[name].rest_height_m]))
-    return ReplayScene(task=task, Ts_base_object=poses, urdf=ur5_with_gripper_urdf())
+    return ReplayScene(task=task, Ts_base_object=poses, urdf=ROBOT.urdf_text())
 
 
 def toy_plan(scene: ReplayScene, *, miss_m: float = 0.0, plan_id: str = "toys") -> Plan:

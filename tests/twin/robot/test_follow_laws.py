@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from bridge.task.robot import ur5_with_gripper_urdf
+from bridge.robots.default import ROBOT
 from twin.robot.config import IkConfig
 from twin.robot.follow import follow_poses
 from twin.robot.inverse import HOME_RAD, UrInverse, pose_error
@@ -17,7 +17,7 @@ NEARLY_STRAIGHT = np.array([0.2, -1.4, 1.6, -0.9, 0.1, 0.3])
 
 @pytest.fixture(scope="module")
 def robot() -> RobotModel:
-    return load_robot(ur5_with_gripper_urdf())
+    return load_robot(ROBOT.urdf_text())
 
 
 def spinning(turn_rad: float, count: int = 60) -> np.ndarray:
@@ -75,7 +75,7 @@ def test_more_than_a_turn_between_narrow_limits_winds_back_and_stays_inside(
         re.sub(
             r'(<joint name="wrist_3_joint".*?lower=")[^"]*(" upper=")[^"]*(")',
             r"\g<1>-3.14159265359\g<2>3.14159265359\g<3>",
-            ur5_with_gripper_urdf(),
+            ROBOT.urdf_text(),
             flags=re.DOTALL,
         )
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from bridge.task.robot import ur5_with_gripper_urdf
+from bridge.robots.default import ROBOT
 from twin.robot.config import IkConfig
 from twin.robot.follow import NO_BRANCH, follow_poses
 from twin.robot.inverse import UrInverse, pose_error
@@ -17,7 +17,7 @@ HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
 
 @pytest.fixture(scope="module")
 def robot() -> RobotModel:
-    return load_robot(ur5_with_gripper_urdf())
+    return load_robot(ROBOT.urdf_text())
 
 
 def arc(start: np.ndarray, end: np.ndarray, count: int = 60) -> np.ndarray:
@@ -80,7 +80,7 @@ def test_a_turn_that_fits_no_limits_winds_back_once_and_stays_inside(robot: Robo
         re.sub(
             r'(<joint name="wrist_3_joint".*?lower=")[^"]*(" upper=")[^"]*(")',
             r"\g<1>-3.14159265359\g<2>3.14159265359\g<3>",
-            ur5_with_gripper_urdf(),
+            ROBOT.urdf_text(),
             flags=re.DOTALL,
         )
     )
@@ -143,7 +143,7 @@ def test_a_path_that_leaves_the_reach_is_followed_up_to_there(robot: RobotModel)
 def test_an_arm_that_is_no_ur_is_followed_by_iterating(robot: RobotModel) -> None:
     """Calibrated kinematics: every axis a little off, as a controller reports them."""
     off = RobotModel(
-        ur5_with_gripper_urdf()
+        ROBOT.urdf_text()
         .replace('xyz="0.0 -0.1197 0.425"', 'xyz="0.0003 -0.1195 0.4252"')
         .replace(
             'rpy="0.0 1.57079632679 0.0" xyz="0.0 0.13585',
@@ -160,7 +160,7 @@ def test_an_arm_that_is_no_ur_is_followed_by_iterating(robot: RobotModel) -> Non
 
 def test_a_roughly_written_ur_is_solved_in_closed_form_and_polished(robot: RobotModel) -> None:
     rough = RobotModel(
-        ur5_with_gripper_urdf().replace(
+        ROBOT.urdf_text().replace(
             'rpy="0.0 0.0 0.0" xyz="0.0 -0.1197 0.425"', 'rpy="3e-6 0 0" xyz="0.0 -0.1197 0.425"'
         )
     )

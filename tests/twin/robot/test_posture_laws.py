@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.episode.streams import JointTrack
-from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
+from bridge.robots.default import ARM_JOINTS, ROBOT
 from twin.robot.config import IkConfig
 from twin.robot.inverse import UrInverse, solve_ik
 from twin.robot.model import RobotModel, load_robot
@@ -19,7 +19,7 @@ POSTURE = np.array([0.3, -1.3, 1.5, -1.6, -1.4, 0.4])
 
 @pytest.fixture(scope="module")
 def robot() -> RobotModel:
-    return load_robot(ur5_with_gripper_urdf())
+    return load_robot(ROBOT.urdf_text())
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_a_pose_is_reached_within_both_tolerances_only(
 
 @given(st.lists(st.floats(-2 * math.pi, 0.0), min_size=6, max_size=6))
 def test_limits_a_whole_turn_apart_lose_no_answer_wherever_they_are(lower: list[float]) -> None:
-    robot = load_robot(ur5_with_gripper_urdf())
+    robot = load_robot(ROBOT.urdf_text())
     wide = UrInverse.for_robot(robot)
     assert wide is not None
     low = np.array(lower)

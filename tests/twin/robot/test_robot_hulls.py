@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from bridge.task.robot import ur5_with_gripper_urdf
+from bridge.robots.default import ROBOT
 from twin.robot.collision import RobotHulls, hulls_of, signed_distance
 from twin.robot.model import RobotDescriptionError, load_robot
 
@@ -17,7 +17,7 @@ HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
 
 @pytest.fixture(scope="module")
 def hulls() -> RobotHulls:
-    return hulls_of(load_robot(ur5_with_gripper_urdf()))
+    return hulls_of(load_robot(ROBOT.urdf_text()))
 
 
 @pytest.mark.parity
@@ -99,7 +99,7 @@ def test_penetration_depth_of_boxes_is_the_overlap() -> None:
 def test_a_collision_mesh_that_is_no_mesh_is_named(tmp_path: Path) -> None:
     mesh = tmp_path / "broken.stl"
     mesh.write_bytes(b"not a mesh")
-    urdf = ur5_with_gripper_urdf()
+    urdf = ROBOT.urdf_text()
     first = re.search(r'<collision>.*?filename="([^"]+)"', urdf, flags=re.DOTALL)
     assert first is not None
     broken = urdf.replace(first[1], str(mesh))

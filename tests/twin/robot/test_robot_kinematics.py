@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
+from bridge.robots.default import ARM_JOINTS, ROBOT
 from twin.robot.config import IkConfig
 from twin.robot.inverse import pose_error, solve_ik
 from twin.robot.model import RobotDescriptionError, RobotModel, load_robot, with_absolute_meshes
@@ -16,7 +16,7 @@ HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
 
 @pytest.fixture(scope="module")
 def robot() -> RobotModel:
-    return load_robot(ur5_with_gripper_urdf())
+    return load_robot(ROBOT.urdf_text())
 
 
 @pytest.mark.parity
@@ -97,7 +97,7 @@ def test_the_same_pose_gives_the_same_joints_on_every_call(robot: RobotModel) ->
 
 
 def test_a_description_without_an_arm_joint_is_refused_with_the_joints_there_are() -> None:
-    urdf = ur5_with_gripper_urdf().replace("wrist_3_joint", "last_joint")
+    urdf = ROBOT.urdf_text().replace("wrist_3_joint", "last_joint")
     with pytest.raises(RobotDescriptionError, match=r"wrist_3_joint.*last_joint"):
         RobotModel(urdf)
 

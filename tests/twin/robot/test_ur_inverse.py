@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.task.robot import ur5_with_gripper_urdf
+from bridge.robots.default import ROBOT
 from twin.robot.inverse import UrInverse
 from twin.robot.model import RobotModel, load_robot
 
@@ -17,7 +17,7 @@ ROBOTS = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix/share/example-ro
 
 @pytest.fixture(scope="module")
 def robot() -> RobotModel:
-    return load_robot(ur5_with_gripper_urdf())
+    return load_robot(ROBOT.urdf_text())
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_lengths_are_those_of_the_data_sheet(inverse: UrInverse) -> None:
     [("wrist_2_joint", "0.01 0.093 0.0"), ("elbow_joint", "0.05 -0.1197 0.425")],
 )
 def test_an_arm_whose_axes_do_not_meet_is_refused(joint: str, origin: str) -> None:
-    urdf = ur5_with_gripper_urdf()
+    urdf = ROBOT.urdf_text()
     bent = re.sub(
         rf'(<joint name="{joint}".*?xyz=")[^"]*(")', rf"\g<1>{origin}\g<2>", urdf, flags=re.DOTALL
     )
@@ -119,7 +119,7 @@ def test_an_arm_whose_axes_do_not_meet_is_refused(joint: str, origin: str) -> No
 
 
 def test_an_arm_with_a_tilted_axis_is_refused() -> None:
-    urdf = ur5_with_gripper_urdf()
+    urdf = ROBOT.urdf_text()
     tilted = re.sub(
         r'(<joint name="elbow_joint".*?rpy=")[^"]*(")',
         r"\g<1>0.02 0.0 0.0\g<2>",
@@ -187,7 +187,7 @@ def test_a_wrist_inside_the_shoulder_cylinder_has_no_answer(
 
 
 def test_joints_are_within_limits_and_whole_turns_are_used_to_stay_there(robot: RobotModel) -> None:
-    urdf = ur5_with_gripper_urdf()
+    urdf = ROBOT.urdf_text()
     shifted = re.sub(
         r'(<joint name="shoulder_pan_joint".*?lower=")[^"]*(" upper=")[^"]*(")',
         r"\g<1>0.0\g<2>6.28318530718\g<3>",

@@ -1,4 +1,4 @@
-"""Lets the tests of these rooms import the modules that lie beside them; a scene for each test."""
+"""Lets these tests import the modules that lie beside them; a scene for each test."""
 
 import shutil
 import sys

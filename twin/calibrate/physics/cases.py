@@ -15,8 +15,8 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
+from bridge.robots.default import ARM_JOINTS, MAX_WIDTH_M
 from bridge.task.plan import Plan
-from bridge.task.robot import ARM_JOINTS, MAX_WIDTH_M
 from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output
 from twin.errors import TwinError
@@ -25,8 +25,6 @@ from twin.robot.posture import check_clock
 from twin.scene.localise.episode import write_localised
 from twin.scene.shape.known import yaw_period_rad
 from twin.scene.store.folder import scene_hash_of
-
-# --- One episode as the calibration sees it: what the robot did, and what was observed of objects.
 
 TIPPED = 0.7
 PLANAR = (0, 1, 5)
@@ -75,7 +73,7 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """What one living-through of a case says about the same observations."""
+    """What one simulation of a case says about the same observations."""
 
     settled: Float[np.ndarray, "num_objects 3"]
     held_widths_m: Float[np.ndarray, " num_holds"]
@@ -92,8 +90,6 @@ def planar(T_base_object: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3"]:
     level = 0 if abs(R[2, 0]) < TIPPED else 1
     return np.array([*T_base_object[:2, 3], np.arctan2(R[1, level], R[0, level])])
 
-
-# --- What the gripper of a recorded trial was told, how wide it was, and when it held something.
 
 HELD_M = 0.002
 """Fingers that stop this far above what they were told hold something."""
@@ -125,14 +121,14 @@ def widths_of(episode: Episode, start_ns: int) -> Series:
     """Recorded opening [s, m]; empty where it was not recorded.
 
     Raises:
-        UnusableCaseError: When a width is no number.
+        UnusableCaseError: When a width is not a number.
     """
     try:
         track = streams.joint_track(episode, GRIPPER_STATE)
     except GstError:
         return np.zeros(0), np.zeros(0)
     if not np.isfinite(track.position).all():
-        raise UnusableCaseError("gripper widths hold what is no number.")
+        raise UnusableCaseError("gripper widths hold what is not a number.")
     return (track.stamps_ns - start_ns) * 1e-9, track.position[:, 0].astype(np.float64)
 
 
@@ -144,8 +140,8 @@ def is_holding(
         return np.zeros(len(times_s), dtype=bool)
     told = commands[1][np.searchsorted(commands[0], times_s, side="right") - 1]
     width = np.interp(times_s, *widths)
-    still = np.abs(width - np.interp(times_s - HELD_S, *widths)) < STILL_M
-    return np.asarray(still & (width > told + HELD_M))
+    steady = np.abs(width - np.interp(times_s - HELD_S, *widths)) < STILL_M
+    return np.asarray(steady & (width > told + HELD_M))
 
 
 def holds(commands: Series, widths: Series) -> Series:
@@ -346,7 +342,9 @@ def _check_joints(arm: streams.JointTrack, start_ns: int, end_ns: int) -> None:
         raise UnusableCaseError("joint states have gaps while the plan was executed.")
     order = [arm.names.index(name) for name in ARM_JOINTS]
     if not np.isfinite(arm.position[during][:, order]).all():
-        raise UnusableCaseError("joint states hold what is no number while the plan was executed.")
+        raise UnusableCaseError(
+            "joint states hold what is not a number while the plan was executed."
+        )
 
 
 def _stretches(

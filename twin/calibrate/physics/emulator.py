@@ -18,7 +18,7 @@ from twin.calibrate.physics.likelihood import Observations, Scales, scales_of, s
 LEVEL = 3.841
 """95 % of chi square with one degree of freedom: Wilks (1938)."""
 TRUST = 2.5
-"""The emulator is believed this many widths of its cloud from its centre."""
+"""The emulator is trusted this many widths of its cloud from its centre."""
 STEP = 1e-3
 POLISH = 6
 """Iterations with which the other parameters follow along a profile; they begin near their best."""
@@ -50,7 +50,7 @@ class Emulator:
         return found.log_likelihood - 0.5 * float(x @ x)
 
     def trusted(self) -> Float[np.ndarray, "num_parameters 2"]:
-        """Where the emulator is believed."""
+        """Where the emulator is trusted."""
         low, high = self.centre - TRUST * self.width, self.centre + TRUST * self.width
         return np.stack(
             [np.maximum(low, self.bounds[:, 0]), np.minimum(high, self.bounds[:, 1])], axis=1

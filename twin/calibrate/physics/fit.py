@@ -29,8 +29,6 @@ from twin.calibrate.physics.likelihood import (
 )
 from twin.calibrate.physics.parameters import PhysicsParameter
 
-# --- Keep episodes back, whole ones, and say what parameters are worth on them.
-
 SHARE = 0.3
 SPLIT_STREAM = 808
 
@@ -80,7 +78,7 @@ class HeldOut:
 def judge(
     cases: Sequence[Case],
     predictions: Sequence[Prediction],
-    beliefs: DiscrepancyPosterior,
+    posterior: DiscrepancyPosterior,
     num_samples: int,
 ) -> HeldOut:
     """Compare predictions of held-out cases with what was seen.
@@ -88,12 +86,12 @@ def judge(
     Args:
         cases: The held-out ones.
         predictions: Theirs.
-        beliefs: In errors, as the training episodes left them for the same parameters.
+        posterior: Of errors, as the training episodes left them for the same parameters.
         num_samples: Noisy starts behind each share of successes.
     """
     observed = observations_of(cases, num_samples)
     predicted = features_of(cases, predictions)
-    found = score(observed, predicted, beliefs=beliefs)
+    found = score(observed, predicted, prior=posterior)
     off = np.linalg.norm((observed.settled - predicted.settled)[:, :2], axis=1)
     return HeldOut(
         log_likelihood=found.log_likelihood,
@@ -110,8 +108,7 @@ def _mean(values: Sequence[float]) -> float | None:
     return float(np.mean(values)) if values else None
 
 
-# --- Look for the best point: the covariance matrix adaptation evolution strategy.
-#
+# Look for the best point: the covariance matrix adaptation evolution strategy.
 # Hansen, "The CMA evolution strategy: a tutorial" (2016), in the package ``cmaes``. All points
 # see the same noise (common random numbers), so that differences between them are the parameters'
 # own.
@@ -186,7 +183,7 @@ CLOUD_PER_POSTERIOR = 1.5
 
 @runtime_checkable
 class Predictor(Protocol):
-    """What lives cases through: ``evaluate.Evaluator``, or a formula in a test."""
+    """What simulates cases: ``evaluate.Evaluator``, or a formula in a test."""
 
     @property
     def cases(self) -> Sequence[Case]:
@@ -227,7 +224,7 @@ class Estimate:
     high: float
     identified: bool
     why: str
-    """In a sentence what was decided and from which numbers."""
+    """What was decided and from which numbers."""
     sigma_share: float
     """Posterior width as a share of the prior's."""
 
@@ -405,7 +402,7 @@ def _held_out(
     return judge(
         [predictor.cases[index] for index in split.held_out],
         predictor.predict(x[None], split.held_out)[0],
-        trained.beliefs,
+        trained.posterior,
         predictor.num_samples,
     )
 
@@ -418,5 +415,5 @@ def _promote(
     if not split.held_out:
         return False, "no episode could be held out: record at least two of a kind"
     gain = calibrated.log_likelihood - nominal.log_likelihood
-    said = f"log-likelihood of {len(split.held_out)} held-out episodes {gain:+.1f}"
-    return gain > 0, f"{said}: {'promoted' if gain > 0 else 'not promoted, nothing changes'}"
+    change = f"log-likelihood of {len(split.held_out)} held-out episodes {gain:+.1f}"
+    return gain > 0, f"{change}: {'promoted' if gain > 0 else 'not promoted, nothing changes'}"

@@ -5,7 +5,7 @@ is otherwise right still misses a contact now and then; success is a coin. No mo
 of localisation's noise there is a discrepancy of the twin, of unknown size, for each kind of
 episode one of its own: where pushed objects stop is nearly certain, how far they slide is not.
 Every size has its say by how likely it is (Kennedy and O'Hagan, Bayesian calibration of computer
-models, 2001, in its simplest form; sizes and beliefs are in ``beliefs``).
+models, 2001, in its simplest form; ``DiscrepancyPosterior`` holds the sizes).
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,9 +17,8 @@ from scipy.special import gammaln
 
 from twin.calibrate.physics.cases import Case, Prediction, planar
 
-# --- What is believed of errors whose size nobody knows: the twin's own, and localisation's noise.
-#
-# Probabilities over a few sizes, as logarithms. Episodes turn one belief into the next by Bayes'
+# Errors whose size nobody knows: the twin's own, and localisation's noise.
+# Probabilities over a few sizes, as logarithms. Episodes turn a prior into a posterior by Bayes'
 # rule, so held-out episodes are judged with what the training episodes taught.
 
 NOISE_SHARE = (1.0, 0.5, 0.25, 0.125)
@@ -30,7 +29,7 @@ POSE_DISCREPANCY_M = (0.00025, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016)
 """Sizes that are tried; the turn has the same at the edge of a 3 cm object."""
 WIDTH_DISCREPANCY_M = (0.0003, 0.0006, 0.0012, 0.0024, 0.0048)
 EXPECTED_M = 0.001
-"""Discrepancy believed in beforehand; twice or half of it is one standard deviation away."""
+"""Discrepancy expected beforehand; twice or half of it is one standard deviation away."""
 EXPECTED_OF_KIND_M = {"slide": 0.003}
 """Of the kinds of which more is known. Three slides may agree by chance; at the true friction they
 are off by 2.4 mm along their way and 5 mm beside it (19 slides, the scale of a Student's t)."""
@@ -71,7 +70,7 @@ class DiscrepancyPosterior:
     width: Float[np.ndarray, " num_width_sizes"] = field(default_factory=lambda: _WIDTH)
 
     def of_kind(self, kind: str) -> Float[np.ndarray, "num_shares num_sizes"]:
-        """Of a kind that no episode has shown yet, what is believed beforehand."""
+        """Of a kind that no episode has shown yet, the prior."""
         return self.pose.get(kind, _POSE_OF_KIND.get(kind, _POSE))
 
     def after(
@@ -86,7 +85,7 @@ class DiscrepancyPosterior:
             widths: For every size.
 
         Returns:
-            The belief afterwards, and the log-likelihood of everything under the one before.
+            The posterior, and the log-likelihood of everything under the prior.
         """
         share, pose = self.share, dict(self.pose)
         if poses:
@@ -140,7 +139,7 @@ class Observations:
     """Of localisation before and after together."""
     held: Bool[np.ndarray, " num_poses"]
     """Fingers held the object. How they jammed is seen in their opening and again in its turn; only
-    the opening counts, or one chance would be taken for two witnesses."""
+    the opening counts, or one chance would be counted twice."""
     period_rad: Float[np.ndarray, " num_poses"]
     way: Float[np.ndarray, "num_poses 3"]
     """How x, y and turn of an object changed, per metre of change; zero where it stayed."""
@@ -174,10 +173,10 @@ class Features:
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """What a point is worth, and what is believed of errors if it is the right one."""
+    """How likely a point is, and the posterior of errors if it is the right one."""
 
     log_likelihood: float
-    beliefs: DiscrepancyPosterior
+    posterior: DiscrepancyPosterior
 
 
 def observations_of(cases: Sequence[Case], num_samples: int) -> Observations:
@@ -292,7 +291,7 @@ def score(
     observed: Observations,
     predicted: Features,
     *,
-    beliefs: DiscrepancyPosterior | None = None,
+    prior: DiscrepancyPosterior | None = None,
     scales: Scales | None = None,
 ) -> Score:
     """Log-likelihood of observations, whatever the sizes of the errors are.
@@ -300,15 +299,15 @@ def score(
     Args:
         observed: What was seen.
         predicted: What a point says.
-        beliefs: In errors, from other episodes; None: those beforehand.
+        prior: Of errors, from other episodes; None: the one before any.
         scales: Of the same observations; None: without any variance of the prediction's own.
     """
     known = scales_of(observed) if scales is None else scales
-    before = DiscrepancyPosterior() if beliefs is None else beliefs
+    before = DiscrepancyPosterior() if prior is None else prior
     after, total = before.after(
         _poses(observed, predicted, known), _widths(observed, predicted, known)
     )
-    return Score(log_likelihood=total + _coins(observed, predicted), beliefs=after)
+    return Score(log_likelihood=total + _coins(observed, predicted), posterior=after)
 
 
 def _poses(

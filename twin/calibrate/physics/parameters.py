@@ -1,7 +1,7 @@
-"""What can be found out about contact, and what is believed of it before any data.
+"""What can be found out about contact, and its prior before any data.
 
 Everything is searched for in units of the prior: 0 is the nominal value, 1 is one standard
-deviation of the prior away from it. A posterior width is then a share of what was believed before.
+deviation of the prior away from it. A posterior width is then a share of the prior's.
 """
 
 from collections.abc import Mapping, Sequence

@@ -13,7 +13,8 @@ from bridge.episode import provenance, streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
-from bridge.task.robot import ARM_JOINTS
+from bridge.process_pool import default_size
+from bridge.robots.default import ARM_JOINTS
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.physics.cases import Case, read_cases
@@ -29,12 +30,9 @@ from twin.calibrate.physics.parameters import (
     rigid_parameters,
 )
 from twin.calibrate.physics.simulate import Evaluator
-from twin.crew.pool import default_size
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import ENGINE_VERSION
 from twin.scene.store.calibration import write_physics
-
-# --- How long after its command the arm gets where it was told to be.
 
 LONGEST_S = 0.5
 FIRST_S = 3.0
@@ -102,8 +100,6 @@ def mean_delay(delays_s: list[float]) -> Delay | None:
     return Delay(value_s=mean, low_s=mean - half, high_s=mean + half, num_episodes=len(values))
 
 
-# --- Keep a calibration of physics, and say it in a table.
-
 FIELDS = {
     FINGER_FRICTION: "finger_friction",
     SURFACE_FRICTION: "surface_friction",
@@ -141,7 +137,7 @@ def physics_record(
             "nominal": found.nominal.to_record(),
             "calibrated": found.calibrated.to_record(),
         },
-        "errors": found.calibrated_score.beliefs.most_likely(),
+        "errors": found.calibrated_score.posterior.most_likely(),
         "sources": {case.episode: {"kind": case.kind, "sha256": case.sha256} for case in cases},
         "skipped": dict(skipped),
         "num_evaluations": found.num_evaluations,

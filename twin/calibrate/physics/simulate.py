@@ -1,4 +1,4 @@
-"""Live one case through: the recorded arm, the commanded gripper, and parameters to be judged.
+"""Simulate cases: the recorded arm, the commanded gripper, and parameters to be judged.
 
 Only the gripper collides: the arm's own shapes touch nothing in a probe, and leaving them out makes
 an evaluation several times quicker.
@@ -12,8 +12,9 @@ from types import TracebackType
 import numpy as np
 from jaxtyping import Float
 
+from bridge.process_pool import Failed, ProcessPool
+from bridge.robots.default import GRIPPER_LINKS
 from bridge.task.predicate import Rollout, all_hold, evaluate_success
-from bridge.task.robot import GRIPPER_LINKS
 from twin.calibrate.physics.cases import Case, Prediction, planar
 from twin.calibrate.physics.parameters import (
     BIAS,
@@ -23,7 +24,6 @@ from twin.calibrate.physics.parameters import (
     shifted,
     values_of,
 )
-from twin.crew.pool import Crew, Failed
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.physics.world import World
@@ -137,10 +137,10 @@ def _settle(
     stamps: list[int] = []
     poses: dict[str, list[Float[np.ndarray, "4 4"]]] = {key: [] for key in case.objects}
     touches: dict[str, list[bool]] = {key: [] for key in case.objects}
-    still = np.zeros(len(joints_rad))
+    at_rest = np.zeros(len(joints_rad))
     before: Float[np.ndarray, "num_objects 7"] | None = None
     for step in range(round(SETTLE_S * rate)):
-        world.command(joints_rad, still, width_m)
+        world.command(joints_rad, at_rest, width_m)
         world.step()
         if case.success is None and step % round(REST_S * rate) == 0:
             now = np.array([world.object_pose(key) for key in case.objects])
@@ -175,18 +175,16 @@ def gripper_only(urdf: str) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-# --- Live many cases through at many points, in one process or several; the order changes nothing.
-
 Piece = tuple[int, Case, Mapping[str, float], PhysicsConfig, int]
 """Its number, and what ``predict`` takes."""
 
 
 class LostPieceError(TwinError):
-    """A case could not be lived through, although it was tried again."""
+    """A case could not be simulated, although it was tried again."""
 
 
 class Evaluator:
-    """Predictions of cases at points in units of the prior. A context manager: it owns a crew."""
+    """Predictions of cases at points in units of the prior. A context manager."""
 
     def __init__(
         self,
@@ -210,7 +208,7 @@ class Evaluator:
         self._parameters = list(parameters)
         self._config = config
         self.num_samples = num_samples
-        self._crew = Crew(workers) if workers > 1 else None
+        self._pool = ProcessPool(workers) if workers > 1 else None
 
     def predict(
         self, points: Float[np.ndarray, "num_points num_parameters"], chosen: Sequence[int]
@@ -222,10 +220,10 @@ class Evaluator:
         """
         pairs = [(x, index) for x in points for index in chosen]
         pieces = [self._piece(number, *pair) for number, pair in enumerate(pairs)]
-        if self._crew is None:
+        if self._pool is None:
             flat = [_predict(piece) for piece in pieces]
         else:
-            flat = _side_by_side(self._crew, pieces)
+            flat = _side_by_side(self._pool, pieces)
         size = len(chosen)
         return [flat[k * size : (k + 1) * size] for k in range(len(points))]
 
@@ -244,14 +242,14 @@ class Evaluator:
         traceback: TracebackType | None,
     ) -> None:
         """End the processes; what is being done is lost."""
-        if self._crew is not None:
-            self._crew.__exit__()
+        if self._pool is not None:
+            self._pool.__exit__()
 
 
-def _side_by_side(crew: Crew, pieces: Sequence[Piece]) -> list[Prediction]:
+def _side_by_side(pool: ProcessPool, pieces: Sequence[Piece]) -> list[Prediction]:
     """Predict, and put the answers back into order."""
     answers: dict[int, Prediction] = {}
-    for (number, case, *_), answer in crew.run(_predict, pieces, _cost):
+    for (number, case, *_), answer in pool.run(_predict, pieces, _cost):
         if isinstance(answer, Failed):
             raise _error_of(case, answer)
         answers[number] = answer
@@ -269,7 +267,7 @@ def _error_of(case: Case, failed: Failed) -> Exception:
 
 
 def _cost(piece: Piece) -> float:
-    """Count the living-throughs."""
+    """Count the simulations."""
     _, case, _, _, num_samples = piece
     return 1.0 if case.success is None else 1.0 + num_samples
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry.box import box_corners
-from bridge.task.robot import GRIPPER_LINKS
+from bridge.robots.default import GRIPPER_LINKS
 from bridge.task.task_file import ObjectModel
 from twin.replay._clearance import Bounds
 from twin.robot.collision import RobotHulls, convex_hull
@@ -81,8 +81,7 @@ def placed_panels(
     return placed
 
 
-# --- Pairs of convex bodies with a lower bound of their distance, nearest first.
-#
+# Pairs of convex bodies with a lower bound of their distance, nearest first.
 # A body is at least as far away as the box and the sphere that hold it. Where boxes are turned
 # against each other this is nearly exact, so most pairs need no distance (tests/parity compares).
 
@@ -150,8 +149,7 @@ def own_links(hulls: RobotHulls) -> OwnLinks:
     return OwnLinks(hulls)
 
 
-# --- Distances of soft bodies, which are given by their nodes.
-#
+# Distances of soft bodies, which are given by their nodes.
 # A node inside a convex piece lies behind all of its planes; outside, the largest height over a
 # plane is a lower bound of the distance, exact over the faces. Between nodes nothing is known: a
 # body is as large as its nodes say.

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int32
 from scipy.spatial import ConvexHull, cKDTree
 
-from bridge.task.robot import GRIPPER_LINKS
+from bridge.robots.default import GRIPPER_LINKS
 from twin.replay._clearance import nearest
 from twin.replay.clearance.distance_grid import GridLookup
 from twin.robot.collision import RobotHulls
@@ -50,16 +50,16 @@ class BoundingSphereTree:
 class BoundingSpheres:
     """Pieces that are asked for together."""
 
-    def __init__(self, shells: list[BoundingSphereTree]) -> None:
+    def __init__(self, trees: list[BoundingSphereTree]) -> None:
         """Put their trees into one."""
-        self._points = np.concatenate([shell.points_m for shell in shells])
-        self._radius = np.concatenate([shell.radius_m for shell in shells])
-        starts = np.concatenate([[0], np.cumsum([len(shell.points_m) for shell in shells])])
-        children = [shell.children + start for shell, start in zip(shells, starts, strict=False)]
+        self._points = np.concatenate([tree.points_m for tree in trees])
+        self._radius = np.concatenate([tree.radius_m for tree in trees])
+        starts = np.concatenate([[0], np.cumsum([len(tree.points_m) for tree in trees])])
+        children = [tree.children + start for tree, start in zip(trees, starts, strict=False)]
         self._children = np.concatenate(children).astype(np.int32)
-        ends = starts[:-1] + [shell.num_roots for shell in shells]
+        ends = starts[:-1] + [tree.num_roots for tree in trees]
         self._roots = np.stack([starts[:-1], ends], axis=1).astype(np.int32)
-        self._cover = np.array([shell.cover_m for shell in shells])
+        self._cover = np.array([tree.cover_m for tree in trees])
 
     def distances_m(
         self,
@@ -94,19 +94,19 @@ def bounding_spheres_of(
     hull = ConvexHull(corners_m)
     # A triangle with edges of at most e leaves nothing farther from its corners than e / sqrt(3).
     levels = [_divided(corners_m[hull.simplices], fine_m * np.sqrt(3.0))]
-    owners: list[Int[np.ndarray, " num_points"]] = []
+    parents: list[Int[np.ndarray, " num_points"]] = []
     for radius in reversed(PATCHES_M):
         chosen = levels[0][_spread(levels[0], radius)]
-        owners.insert(0, cKDTree(chosen).query(levels[0])[1])
+        parents.insert(0, cKDTree(chosen).query(levels[0])[1])
         levels.insert(0, chosen)
     order = np.arange(len(levels[0]))
     begin, starts = 0, []
-    for level, owner in enumerate(owners):
+    for level, parent in enumerate(parents):
         # Each level goes into the order of the one above it.
         rank = np.empty(len(order), dtype=np.int64)
         rank[order] = np.arange(len(order))
         levels[level] = levels[level][order]
-        below = rank[owner]
+        below = rank[parent]
         begin += len(order)
         starts.append(begin + np.searchsorted(np.sort(below), np.arange(len(order) + 1)))
         order = np.argsort(below, kind="stable")

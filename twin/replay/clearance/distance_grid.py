@@ -77,8 +77,6 @@ def _blend(
     low += high
 
 
-# --- How far many proposed poses of one thing stay from the static scene.
-
 _BATCH = 12_000
 """Points looked up at once: what fits the cache beside the grid."""
 

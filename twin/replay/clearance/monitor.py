@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
+from bridge.robots.default import ARM_JOINTS, FINGER_LINKS
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan, Stage
 from bridge.task.predicate import Contact
-from bridge.task.robot import ARM_JOINTS, FINGER_LINKS
 from twin.replay.clearance.bodies import GRIPPER, group_of, placement_of, planes_of
 from twin.replay.clearance.surroundings import Pair, Surroundings
 from twin.replay.config import ReplayConfig
@@ -28,8 +28,7 @@ from twin.replay.failure import Failure
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, signed_distance
 
-# --- What may have happened between two states: how far anything moved, and the state half way.
-#
+# What may have happened between two states: how far anything moved, and the state half way.
 # A point that travels s between two instants is never farther than s / 2 from where it was at one
 # of them. Two bodies that were d0 and d1 apart and travelled s together therefore kept at least
 # (d0 + d1 - s) / 2. Where that is not enough, the state half way is looked at, and so on.

@@ -15,8 +15,7 @@ from twin.robot.collision import RobotHulls
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid
 from twin.scene.shape.static import OBJECT_MARGIN_VOXELS, StaticSdf
 
-# --- The static scene without what has a name: the table, the containers, the robot's own foot.
-#
+# The static scene without what has a name: the table, the containers, the robot's own foot.
 # A scene's grid shows the table and, where one was not recognised, a container as well. Those are
 # bodies with exact shapes here, so what the grid shows within 1.5 voxels of them is taken out and
 # distances are made anew; otherwise every allowed contact with the table would be a forbidden one
@@ -228,11 +227,11 @@ def stationary_links(hulls: RobotHulls) -> tuple[frozenset[str], Foot | None]:
             ]
         )
     lowest = np.array([[points[:, 2].min() for points in posture] for posture in corners])
-    still = np.flatnonzero(np.ptp(lowest, axis=0) < _STILL_M)
-    if not len(still):
+    stationary = np.flatnonzero(np.ptp(lowest, axis=0) < _STILL_M)
+    if not len(stationary):
         return frozenset(), None
-    held = np.concatenate([posture[index] for posture in corners for index in still])
+    held = np.concatenate([posture[index] for posture in corners for index in stationary])
     foot = Foot(
         radius_m=float(np.hypot(held[:, 0], held[:, 1]).max()), top_m=float(held[:, 2].max())
     )
-    return frozenset(hulls.hulls[index].link for index in still), foot
+    return frozenset(hulls.hulls[index].link for index in stationary), foot

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.geometry.box import box_corners
-from bridge.task.robot import GRIPPER_LINKS, MAX_WIDTH_M
+from bridge.robots.default import GRIPPER_LINKS, MAX_WIDTH_M
 from twin.replay.clearance.bodies import (
     SCENE,
     TABLE,
@@ -84,10 +84,10 @@ class Surroundings:
                 Ts_panel_base[:, :3, 3],
             )
             self._half_m = np.stack([extents / 2 for _, _, (_, extents) in self._panels])
-        self.standing = static_obstacles(self._panels, scene.table_height_m)
+        self.static = static_obstacles(self._panels, scene.table_height_m)
         self._pairings: dict[tuple[tuple[str, ...], tuple[str, ...]], _Pairing] = {}
-        standing, foot = stationary_links(hulls)
-        self._mobile = [i for i, hull in enumerate(hulls.hulls) if hull.link not in standing]
+        stationary, foot = stationary_links(hulls)
+        self._mobile = [i for i, hull in enumerate(hulls.hulls) if hull.link not in stationary]
         self.links = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
         self.objects = {
             name: box_solid(name, np.array(scene.task.objects[name].size_m))
@@ -98,11 +98,11 @@ class Surroundings:
             panels = [panel for _, _, panel in self._panels]
             grid = unmodelled_obstacles(scene.static_sdf, scene.table_height_m, foot, panels)
             self.lookup = None if grid is None else GridLookup(grid)
-        self._shells: BoundingSpheres | None = None
-        self._object_shells: dict[str, BoundingSpheres] = {}
+        self._link_spheres: BoundingSpheres | None = None
+        self._object_spheres: dict[str, BoundingSpheres] = {}
         if self.lookup is not None:
-            self._shells = robot_bounding_spheres(hulls, standing)
-            self._object_shells = {
+            self._link_spheres = robot_bounding_spheres(hulls, stationary)
+            self._object_spheres = {
                 name: _box_spheres(scene.task.objects[name].size_m)
                 for name in scene.movable()
                 if scene.task.objects[name].soft is None
@@ -170,11 +170,11 @@ class Surroundings:
         solids = [
             *self.links,
             *(self.objects[name] for name in known),
-            *(item.solid for item in self.standing),
+            *(item.solid for item in self.static),
         ]
         names: list[Pair] = []
         bodies: list[tuple[int, int]] = []
-        for other, item in enumerate(self.standing, start=first):
+        for other, item in enumerate(self.static, start=first):
             links = self._mobile if item.body == TABLE else range(num_links)
             for index in (*links, *movers):
                 piece = index if index < num_links else -1
@@ -184,14 +184,14 @@ class Surroundings:
             names += [(link.body, index, name, 0) for index, link in enumerate(self.links)]
             bodies += [(index, other) for index in range(num_links)]
         near = NearPairs(solids, bodies)
-        for index, item in enumerate(self.standing, start=first):
+        for index, item in enumerate(self.static, start=first):
             near.R[index], near.t[index] = item.T[:3, :3], item.T[:3, 3]
         pairing = _Pairing(
             near=near,
             names=names,
             bodies=bodies,
             shapes=[solid.shape for solid in solids],
-            placements=[None] * first + [placement_of(item.T) for item in self.standing],
+            placements=[None] * first + [placement_of(item.T) for item in self.static],
         )
         self._pairings[known, moved] = pairing
         return pairing
@@ -227,21 +227,21 @@ class Surroundings:
         return found
 
     def _to_scene(self, moved: Sequence[str], Ts_base_object: Poses) -> dict[Pair, float]:
-        """Distances to the unnamed scene: of every link that moves, and of moved objects."""
-        if self.lookup is None or self._shells is None:
+        """Distances to the unmodelled scene: of every link that moves, and of moved objects."""
+        if self.lookup is None or self._link_spheres is None:
             return {}
         R, t = self._hulls.rotations, self._hulls.translations
-        links = self._shells.distances_m(self.lookup, R[self._mobile], t[self._mobile])
+        links = self._link_spheres.distances_m(self.lookup, R[self._mobile], t[self._mobile])
         found: dict[Pair, float] = {
             (self.links[index].body, index, SCENE, 0): distance
             for index, distance in zip(self._mobile, links.tolist(), strict=True)
         }
         for name in moved:
-            shell = self._object_shells.get(name)
-            if shell is not None:
+            spheres = self._object_spheres.get(name)
+            if spheres is not None:
                 T = Ts_base_object[name][None]
                 R, t = np.ascontiguousarray(T[:, :3, :3]), np.ascontiguousarray(T[:, :3, 3])
-                found[name, -1, SCENE, 0] = float(shell.distances_m(self.lookup, R, t)[0])
+                found[name, -1, SCENE, 0] = float(spheres.distances_m(self.lookup, R, t)[0])
         return found
 
 
@@ -250,13 +250,10 @@ def _box_spheres(size_m: tuple[float, float, float]) -> BoundingSpheres:
     return BoundingSpheres([bounding_spheres_of(box_corners(np.array(size_m)))])
 
 
-# --- Which postures of the arm touch: what the choice between branches of a path asks.
-
-
 def posture_clearance(
     scene: ReplayScene, hulls: RobotHulls, config: ReplayConfig
 ) -> Callable[[Float[np.ndarray, "num_postures num_joints"]], Float[np.ndarray, " num_postures"]]:
-    """Return a function that says how much room postures leave: negative when links touch.
+    """Return a function that says how far postures stay from contact: negative when links touch.
 
     The arm against itself and against what stands still, with ``eps_col_m`` taken off. The gripper
     is where the path says, whatever the arm does, so it is left out; so are objects.
@@ -264,7 +261,7 @@ def posture_clearance(
     around = Surroundings(scene, hulls, config.eps_col_m)
     links = own_links(hulls)
 
-    def room_m(
+    def margin_m(
         joints_rad: Float[np.ndarray, "num_postures num_joints"],
     ) -> Float[np.ndarray, " num_postures"]:
         return np.array([one(row) for row in joints_rad])
@@ -282,4 +279,4 @@ def posture_clearance(
         arm = [d for (body, *_), d in distances.items() if body not in GRIPPER_LINKS]
         return min(arm, default=np.inf) - config.eps_col_m
 
-    return room_m
+    return margin_m

@@ -61,14 +61,14 @@ class Confidence:
 
 
 def depth_errors(
-    views: Sequence[RobotView], surfaces: Sequence[PosedSurface], place: ScenePose
+    views: Sequence[RobotView], surfaces: Sequence[PosedSurface], pose: ScenePose
 ) -> DepthErrors:
     """Compare every third pixel of each view with the depth at which it should see the robot."""
     errors = [np.zeros(0)]
     for view, surface in zip(views, surfaces, strict=True):
         rays = view.camera.rays()[::STRIDE_PX, ::STRIDE_PX]
-        expected = surface.depth_along(rays, place.T_base_source @ view.T_source_camera)
-        measured = view.depth_m[::STRIDE_PX, ::STRIDE_PX] * place.depth_scale
+        expected = surface.depth_along(rays, pose.T_base_source @ view.T_source_camera)
+        measured = view.depth_m[::STRIDE_PX, ::STRIDE_PX] * pose.depth_scale
         both = np.isfinite(expected) & (measured > 0)
         errors.append(np.minimum(np.abs(measured[both] - expected[both]), ERROR_CAP_M))
     return DepthErrors(errors_m=np.concatenate(errors).astype(np.float64))
@@ -124,7 +124,7 @@ PER_PLANE = 8
 
 @dataclass(frozen=True, kw_only=True)
 class Hypothesis:
-    """A rough guess of the robot's place."""
+    """A rough guess of the robot's pose."""
 
     T_base_source: Float[np.ndarray, "4 4"]
     score: float
@@ -332,7 +332,7 @@ class RobotNotAlignedError(TwinError):
 
 @dataclass(frozen=True, kw_only=True)
 class _Candidate:
-    place: ScenePose
+    pose: ScenePose
     looked: DepthErrors
     equations: Equations
 
@@ -364,21 +364,27 @@ def align_robot(
             found="there is no depth image", hint="Record the camera while the robot stands still."
         )
     surfaces = [PosedSurface(robot, view.posture) for view in views]
-    starts = _starts(views, robot) if start is None else _near(views, robot, start)
-    coarse = [_refined(views, surfaces, place, config, fine=False) for place in starts]
+    if start is None:
+        starts = _starts(views, robot)
+    else:  # nearest points alone get stuck beside the start: the best of what lies around it, too
+        around = search_near(views, robot, start)
+        starts = [ScenePose(T_base_source=T) for T in (start, around.T_base_source)]
+    coarse = [_refined(views, surfaces, pose, config, fine=False) for pose in starts]
     best, others = _ranked(coarse)
-    finals = [_refined(views, surfaces, item.place, config, fine=True) for item in (best, *others)]
+    finals = [_refined(views, surfaces, item.pose, config, fine=True) for item in (best, *others)]
     best, others = _ranked(finals)
     margin = None
     if start is None:
-        margin = _costs(finals)[1] / max(_costs(finals)[0], 1e-9) if others else float("inf")
+        least = max(len(item.looked.errors_m) for item in finals) // 2
+        costs = sorted(item.looked.cost_m(least) for item in finals)
+        margin = costs[1] / max(costs[0], 1e-9) if others else float("inf")
     _accept(best, margin, len(views), config)
     surface_m = np.concatenate(
         [sample_surface(robot, view.posture, NUM_SURFACE, seed=config.seed) for view in views]
     )
     return Alignment(
-        T_base_source=best.place.T_base_source,
-        depth_scale=best.place.depth_scale,
+        T_base_source=best.pose.T_base_source,
+        depth_scale=best.pose.depth_scale,
         fitness=best.looked.fitness,
         residual_m=best.equations.residual_m(),
         margin=margin,
@@ -399,18 +405,10 @@ def _starts(views: Sequence[RobotView], robot: RobotModel) -> list[ScenePose]:
     return [ScenePose(T_base_source=item.T_base_source) for item in found[:MAX_COARSE]]
 
 
-def _near(
-    views: Sequence[RobotView], robot: RobotModel, start: Float[np.ndarray, "4 4"]
-) -> list[ScenePose]:
-    """The start, and the best of what lies around it: nearest points alone get stuck beside it."""
-    polished = search_near(views, robot, start)
-    return [ScenePose(T_base_source=T) for T in (start, polished.T_base_source)]
-
-
 def _refined(
     views: Sequence[RobotView],
     surfaces: Sequence[PosedSurface],
-    place: ScenePose,
+    pose: ScenePose,
     config: AlignConfig,
     *,
     fine: bool,
@@ -419,21 +417,15 @@ def _refined(
     refined, equations = refine(
         views,
         surfaces,
-        place,
+        pose,
         stages=FINE if fine else COARSE,
         num_points=config.num_points if fine else COARSE_POINTS,
         with_scale=fine and config.with_scale,
         seed=config.seed,
     )
     return _Candidate(
-        place=refined, looked=depth_errors(views, surfaces, refined), equations=equations
+        pose=refined, looked=depth_errors(views, surfaces, refined), equations=equations
     )
-
-
-def _costs(candidates: Sequence[_Candidate]) -> list[float]:
-    """Ascending; see ``Looked.cost_m``."""
-    least = max(len(item.looked.errors_m) for item in candidates) // 2
-    return sorted(item.looked.cost_m(least) for item in candidates)
 
 
 def _ranked(candidates: Sequence[_Candidate]) -> tuple[_Candidate, list[_Candidate]]:
@@ -441,7 +433,7 @@ def _ranked(candidates: Sequence[_Candidate]) -> tuple[_Candidate, list[_Candida
     least = max(len(item.looked.errors_m) for item in candidates) // 2
     ordered = sorted(candidates, key=lambda item: item.looked.cost_m(least))
     best = ordered[0]
-    others = [item for item in ordered[1:] if _differ(item.place, best.place)]
+    others = [item for item in ordered[1:] if _differ(item.pose, best.pose)]
     return best, others[:1]
 
 
@@ -468,7 +460,7 @@ def _accept(best: _Candidate, margin: float | None, num_views: int, config: Alig
             f"{config.max_residual_m * 1e3:.0f} mm)",
             hint="Check depth calibration, joint zero positions and the description's meshes.",
         )
-    scale = best.place.depth_scale
+    scale = best.pose.depth_scale
     if abs(scale - 1.0) > config.max_scale_error:
         raise RobotNotAlignedError(
             found=f"the best place found needs the depth scaled by {scale:.3f}, more than the "

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int64
 from bridge.geometry import se3
 from twin.robot.surface import PosedSurface
 from twin.scene.align.view import RobotView, ViewCloud
+from twin.scene.least_squares import tukey_weights
 
 FACING = 0.5
 """Cosine between the measured normal and the description's, below which a match is none."""
@@ -93,35 +94,35 @@ def refine(
         The place, and the equations of the last iteration.
     """
     rng = np.random.default_rng(seed)
-    place = start
+    pose = start
     equations = None
     for stage in stages:
         clouds = [
-            _choose(view, surface, place, stage.gate_m, num_points // len(views), rng)
+            _choose(view, surface, pose, stage.gate_m, num_points // len(views), rng)
             for view, surface in zip(views, surfaces, strict=True)
         ]
         for _ in range(stage.iterations):
-            equations = _equations(views, clouds, surfaces, place, stage.gate_m)
-            place, step = _stepped(place, equations, with_scale)
+            equations = _equations(views, clouds, surfaces, pose, stage.gate_m)
+            pose, step = _stepped(pose, equations, with_scale)
             if np.abs(step).max() < STOP:
                 break
     if equations is None:
         message = "refining needs at least one stage of one iteration"
         raise ValueError(message)
-    return place, equations
+    return pose, equations
 
 
 def _choose(
     view: RobotView,
     surface: PosedSurface,
-    place: ScenePose,
+    pose: ScenePose,
     gate_m: float,
     count: int,
     rng: np.random.Generator,
 ) -> ViewCloud:
     """Measured points near the robot: proportional to visible area, but enough of each link."""
     cloud = view.cloud
-    p = se3.apply(place.T_base_source @ view.T_source_camera, place.depth_scale * cloud.p_m)
+    p = se3.apply(pose.T_base_source @ view.T_source_camera, pose.depth_scale * cloud.p_m)
     near = surface.near_box(p, gate_m)
     near = near[rng.permutation(len(near))[: 4 * count]]
     found = surface.nearest(p[near])
@@ -140,11 +141,11 @@ def _equations(
     views: Sequence[RobotView],
     clouds: Sequence[ViewCloud],
     surfaces: Sequence[PosedSurface],
-    place: ScenePose,
+    pose: ScenePose,
     gate_m: float,
 ) -> Equations:
     rows = [
-        _rows(view, cloud, surface, place, gate_m)
+        _rows(view, cloud, surface, pose, gate_m)
         for view, cloud, surface in zip(views, clouds, surfaces, strict=True)
     ]
     J, r, w = (np.concatenate([row[k] for row in rows]) for k in range(3))
@@ -168,16 +169,16 @@ def _equations(
 
 
 def _rows(
-    view: RobotView, cloud: ViewCloud, surface: PosedSurface, place: ScenePose, gate_m: float
+    view: RobotView, cloud: ViewCloud, surface: PosedSurface, pose: ScenePose, gate_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Int64[np.ndarray, " num_points"]]:
     """Jacobian (shift, turn, scale), distance, weight and block of each point."""
-    T = place.T_base_source @ view.T_source_camera
-    p = se3.apply(T, place.depth_scale * cloud.p_m)
+    T = pose.T_base_source @ view.T_source_camera
+    p = se3.apply(T, pose.depth_scale * cloud.p_m)
     found = surface.nearest(p)
     n = found.normals
     r = np.einsum("ij,ij->i", n, p - found.p_m)
     facing = np.abs(np.einsum("ij,ij->i", n, cloud.normals @ T[:3, :3].T))
-    w = np.where(found.distance_m < gate_m, (1 - (found.distance_m / gate_m) ** 2) ** 2, 0.0)
+    w = tukey_weights(found.distance_m, gate_m)
     w[(facing < FACING) | (np.abs(p[:, 2]) < TABLE_M)] = 0.0
     stretch = np.einsum("ij,ij->i", n, cloud.p_m @ T[:3, :3].T)
     J = np.concatenate([n, np.cross(p, n), stretch[:, None]], axis=1)
@@ -187,13 +188,13 @@ def _rows(
 
 
 def _stepped(
-    place: ScenePose, equations: Equations, with_scale: bool
+    pose: ScenePose, equations: Equations, with_scale: bool
 ) -> tuple[ScenePose, Float[np.ndarray, "7"]]:
     H, g = equations.H.sum(axis=0), equations.g.sum(axis=0)
     if with_scale:
         prior = max(equations.residual_m(), 1e-4) ** 2 / SCALE_SIGMA**2
         H[6, 6] += prior
-        g[6] += prior * (place.depth_scale - 1.0)
+        g[6] += prior * (pose.depth_scale - 1.0)
     else:
         H[6], H[:, 6], g[6], H[6, 6] = 0.0, 0.0, 0.0, 1.0
     step = -np.linalg.lstsq(H, g, rcond=1e-12)[0]
@@ -201,6 +202,6 @@ def _stepped(
     T[:3, :3] = se3.rotation_from_vector(step[3:6])
     T[:3, 3] = step[:3]
     moved = ScenePose(
-        T_base_source=T @ place.T_base_source, depth_scale=float(place.depth_scale + step[6])
+        T_base_source=T @ pose.T_base_source, depth_scale=float(pose.depth_scale + step[6])
     )
     return moved, step

@@ -22,6 +22,7 @@ from scipy import ndimage
 from bridge.geometry import se3
 from twin.scene.frames.camera_poses import same_pose
 from twin.scene.frames.rgbd import PointSet, Target, TrainingView
+from twin.scene.frames.selection import spread
 
 VOXEL_M = 0.02
 """Points are judged in groups of this size."""
@@ -239,8 +240,7 @@ def _from_other_places(views: Sequence[TrainingView]) -> list[TrainingView]:
             for other in kept
         ):
             kept.append(view)
-    places = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), MAX_VIEWS)).round())
-    return [kept[int(place)] for place in places]
+    return [kept[index] for index in spread(np.arange(len(kept)), MAX_VIEWS)]
 
 
 def _blurred(target: Target) -> Float32[np.ndarray, "3 height width"]:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
@@ -17,7 +17,8 @@ from bridge.terminal import Output
 from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import PointSet, TrainingView
 from twin.scene.frames.selection import FrameChoice
-from twin.scene.gaussians import GaussianCloud
+from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.least_squares import normal_equations, tukey_weights
 from twin.scene.settings import InitialiseConfig
 
 ROUNDS = 3
@@ -213,16 +214,14 @@ def _solve(
     """One Gauss-Newton step, turning about the camera; returns the motion in the root frame."""
     centre = (T_new_old @ view.T_base_color)[:3, 3]
     residual = ((p - q) * normals).sum(axis=1)
-    weight = np.clip(1.0 - np.square(residual / tukey_m), 0.0, None) ** 2
-    weight *= INDEPENDENT / DEPTH_SIGMA_M**2
+    weight = tukey_weights(residual, tukey_m) * (INDEPENDENT / DEPTH_SIGMA_M**2)
     J = np.concatenate([np.cross(p - centre, normals), normals], axis=1)
     prior = np.repeat([1 / PRIOR_RAD**2, 1 / PRIOR_M**2], 3)
     so_far = np.concatenate(
         [se3.vector_from_rotation(T_new_old[:3, :3]), _camera_shift(T_new_old, view)]
     )
-    A = (J * weight[:, None]).T @ J + np.diag(prior)
-    b = (J * weight[:, None]).T @ residual + prior * so_far
-    x = -np.linalg.solve(A, b)
+    H, gradient = normal_equations(J, residual, weight)
+    x = -np.linalg.solve(H + np.diag(prior), gradient + prior * so_far)
     step = np.eye(4)
     step[:3, :3] = se3.rotation_from_vector(x[:3])
     step[:3, 3] = centre + x[3:] - step[:3, :3] @ centre
@@ -245,10 +244,6 @@ def _frame_points(T_base_camera: np.ndarray) -> Float[np.ndarray, "4 3"]:
 def _moved_points(points: PointSet, T: np.ndarray) -> PointSet:
     return replace(
         points,
-        p_m=_float32(se3.apply(T, points.p_m.astype(np.float64))),
-        normals=_float32(points.normals.astype(np.float64) @ T[:3, :3].T),
+        p_m=as_float32(se3.apply(T, points.p_m.astype(np.float64))),
+        normals=as_float32(points.normals.astype(np.float64) @ T[:3, :3].T),
     )
-
-
-def _float32(values: np.ndarray) -> Float32[np.ndarray, "num_points 3"]:
-    return np.ascontiguousarray(values, dtype=np.float32)

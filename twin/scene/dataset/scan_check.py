@@ -18,7 +18,7 @@ from bridge.geometry import se3
 from twin.errors import TwinError
 from twin.scene.frames.downscaled import DownscaledDepth, Meeting, meet
 from twin.scene.frames.rgbd import NEAR_M
-from twin.scene.frames.selection import FrameChoice
+from twin.scene.frames.selection import FrameChoice, spread
 from twin.scene.settings import FrameConfig
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -281,8 +281,7 @@ def check_between(own: Sequence[DownscaledDepth], others: Sequence[DownscaledDep
         camera see what the others saw: it may look at another place.
     """
     first = next((image for image in own if image.depth_m.any()), None)
-    places = np.unique(np.linspace(0, len(others) - 1, min(len(others), MAX_OTHERS)).round())
-    chosen = [others[int(place)] for place in places]
+    chosen = [others[index] for index in spread(np.arange(len(others)), MAX_OTHERS)]
     if first is None or not chosen:
         return PoseReport(num_pairs=0, agreement=None, overlap=0.0)
     T_base_first = first.T_base_depth

@@ -68,9 +68,6 @@ class Appearance:
     """The outcome of one closed-form solution."""
 
     cloud: GaussianCloud
-    mse_before: float | None
-    """Mean squared colour error of the start, over the pixels that count; None when there was no
-    time to look at all of them."""
     steps: int
     """Conjugate gradient steps done; 0: the cloud is as it was."""
 
@@ -102,14 +99,14 @@ def solve_appearance(
     affordable = model.affordable_passes(start) - 1  # one pass sets the equations up
     equations = None if affordable < min(steps, LEAST_STEPS) else model.right_side(start)
     if equations is None:
-        return Appearance(cloud=cloud, mse_before=None, steps=0)
-    right, diagonal, mse = equations
+        return Appearance(cloud=cloud, steps=0)
+    right, diagonal = equations
     change, done = conjugate_gradients(
         model.normal, right, diagonal, steps=int(min(steps, affordable))
     )
     solved = start + change
     painted = replace(cloud, colors=as_float32(solved[:, 0]), harmonics=as_float32(solved[:, 1:]))
-    return Appearance(cloud=painted, mse_before=mse, steps=done)
+    return Appearance(cloud=painted, steps=done)
 
 
 def solve_gains(
@@ -211,14 +208,13 @@ class _ImageModel:
         took_s = max(self._allowance.clock() - began_s, 1e-9) * len(self._observations)
         return float(np.floor(self._allowance.left_s() / took_s))
 
-    def right_side(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
-        """Pull of all images on the start, the preconditioner, and the mean squared error.
+    def right_side(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Pull of all images on the start, and the preconditioner.
 
         None when the time is over before all images were drawn.
         """
         right, diagonal = np.zeros_like(start), np.zeros_like(start)
         diagonal += self._ridge
-        error, count = 0.0, 0
         for item in self._observations:
             if self._allowance.is_over():
                 return None
@@ -227,14 +223,12 @@ class _ImageModel:
             basis = self._basis(item)
             planes = self._draw(start, item)
             missing = (item.target.image() - gain * planes[:3]) * mask
-            error += float(np.square(missing, dtype=np.float64).sum())
-            count += 3 * int(mask.sum())
             maps = np.concatenate([gain * missing, (planes[4] * mask)[None]])
             lifted = self._rasteriser.lift(maps)
             right += basis[:, :, None] * lifted[:, None, :3]
             squared = np.square(item.gain).astype(np.float32) * lifted[:, 3:]
             diagonal += np.square(basis)[:, :, None] * squared[:, None, :]
-        return right, diagonal, error / max(count, 1)
+        return right, diagonal
 
     def normal(self, x: np.ndarray) -> np.ndarray | None:
         """Carry a change of colours into all images and back: (A^T A + ridge) x; None: no time."""
@@ -318,22 +312,6 @@ def solve_features(
     whole = np.broadcast_to(diagonal, right.shape)
     change, _ = conjugate_gradients(normal, right, np.ascontiguousarray(whole), steps=steps)
     return np.asarray(begin + change[:, 0])
-
-
-def feature_loss(
-    cloud: GaussianCloud,
-    features: Float32[np.ndarray, "num_splats num_features"],
-    observations: Sequence[FeatureObservation],
-    rasteriser: Rasteriser,
-) -> float:
-    """Mean squared difference of drawn and given features where they are valid (Eq. 3)."""
-    total, count = 0.0, 0
-    for item in observations:
-        drawn = _draw(cloud, features, item, rasteriser)
-        wrong = (drawn - item.values)[:, item.valid_mask]
-        total += float(np.square(wrong, dtype=np.float64).sum())
-        count += wrong.size
-    return total / max(count, 1)
 
 
 def _draw(

@@ -1,6 +1,6 @@
 """Small corrections of camera poses by what the images say, with the gauge fixed."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32, Int64
@@ -21,10 +21,6 @@ PRIOR_WEIGHT = 1e-3
 BETA_1, BETA_2 = 0.9, 0.99
 ALIGN_COARSE_STEPS, ALIGN_FINE_STEPS = 40, 20
 ALIGN_DECAY = 0.03
-
-
-def _rates() -> np.ndarray:
-    return np.array([TURN_RATE_RAD] * 3 + [SHIFT_RATE_M] * 3)
 
 
 def corrected_pose(
@@ -97,7 +93,8 @@ def _adam(gradient: np.ndarray, first: np.ndarray, second: np.ndarray, count: in
     first += (1 - BETA_1) * (gradient - first)
     second += (1 - BETA_2) * (np.square(gradient) - second)
     mean, square = first / (1 - BETA_1**count), second / (1 - BETA_2**count)
-    return np.asarray(_rates() * mean / (np.sqrt(square) + 1e-15))
+    rates = np.array([TURN_RATE_RAD] * 3 + [SHIFT_RATE_M] * 3)
+    return np.asarray(rates * mean / (np.sqrt(square) + 1e-15))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,20 +105,6 @@ class AlignedView:
     gain: Float[np.ndarray, "3"]
     image: Float32[np.ndarray, "3 height width"]
     """Drawn from there, with the gain, not clipped."""
-
-
-@dataclass(kw_only=True)
-class _Search:
-    """The pose of one image on the way to its best."""
-
-    T_base_camera: np.ndarray
-    value: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    first: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    second: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    count: int = 0
-
-    def pose(self) -> np.ndarray:
-        return corrected_pose(self.T_base_camera, self.value)
 
 
 def align_view(
@@ -136,21 +119,21 @@ def align_view(
     Numbers made after this are not strictly held out: they tell how good the scene is where pose
     and exposure are known, and must be named as aligned.
     """
-    search = _Search(T_base_camera=T_base_camera)
+    value, first, second = np.zeros((3, 6))
     total = ALIGN_COARSE_STEPS + ALIGN_FINE_STEPS
     for step in range(total):
+        T = corrected_pose(T_base_camera, value)
         target = half if step < ALIGN_COARSE_STEPS else full
-        planes = rasteriser.draw_planes(cloud, target.camera, search.pose())
+        planes = rasteriser.draw_planes(cloud, target.camera, T)
         gain = gain_between(planes[:3], target).astype(np.float32)[:, None, None]
         difference = (gain * planes[:3] - target.image()) * target.static_mask
         gradients = np.zeros_like(planes)
         gradients[:3] = gain * difference * np.float32(2 / difference.size)
         pulled = rasteriser.pull_back(planes, gradients).T_camera_base
-        search.count += 1
-        gradient = correction_gradient(pulled, search.pose())
-        change = _adam(gradient, search.first, search.second, search.count)
-        search.value = search.value - 2 * ALIGN_DECAY ** (step / total) * change
-    planes = rasteriser.draw_planes(cloud, full.camera, search.pose())
+        change = _adam(correction_gradient(pulled, T), first, second, step + 1)
+        value = value - 2 * ALIGN_DECAY ** (step / total) * change
+    T = corrected_pose(T_base_camera, value)
+    planes = rasteriser.draw_planes(cloud, full.camera, T)
     fitted = gain_between(planes[:3], full)
     image = fitted.astype(np.float32)[:, None, None] * planes[:3]
-    return AlignedView(T_base_camera=search.pose(), gain=fitted, image=image)
+    return AlignedView(T_base_camera=T, gain=fitted, image=image)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from twin.errors import TwinError
+from twin.errors import UnreadableFileError
 
 MAX_BYTES = 1 << 30
 MAX_JSON_BYTES = 64_000_000
@@ -29,16 +29,13 @@ _TYPES: dict[int, np.dtype[Any]] = {
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
-class UnreadableGlbError(TwinError):
+class UnreadableGlbError(UnreadableFileError):
     """The file is no binary glTF that we read."""
 
-    def __init__(self, *, path: Path, found: str) -> None:
-        """Remember the file."""
-        self.path = path
-        super().__init__(
-            f"{path}: {found}. Expected a whole binary glTF 2.0 (.glb) with triangles, without "
-            "compression and without files beside it."
-        )
+    hint = (
+        "Expected a whole binary glTF 2.0 (.glb) with triangles, without compression and without "
+        "files beside it."
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ import importlib
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,7 +84,9 @@ def check_folder(folder: Path, kind: WeightsKind) -> dict[str, Any]:
         raise WeightsError(folder=folder, found=found, kind=kind)
     for path in weight_files(folder, kind):
         _check_safetensors(path, folder, kind)
-    if kind.speaks and not _has_tokenizer(folder):
+    tokenizers = (("tokenizer.json",), ("vocab.json", "merges.txt"))
+    has_tokenizer = any(all((folder / name).is_file() for name in names) for names in tokenizers)
+    if kind.speaks and not has_tokenizer:
         raise WeightsError(folder=folder, found="there is no tokenizer.json", kind=kind)
     _check_sums(folder, kind)
     return config
@@ -140,11 +142,6 @@ def _json(path: Path, folder: Path, kind: WeightsKind) -> dict[str, Any]:
     return content
 
 
-def _has_tokenizer(folder: Path) -> bool:
-    pair = all((folder / name).is_file() for name in ("vocab.json", "merges.txt"))
-    return (folder / "tokenizer.json").is_file() or pair
-
-
 def _check_safetensors(path: Path, folder: Path, kind: WeightsKind) -> None:
     """Compare a file's size with its header: 8 bytes of length, JSON, then the numbers."""
     size = path.stat().st_size
@@ -159,18 +156,16 @@ def _check_safetensors(path: Path, folder: Path, kind: WeightsKind) -> None:
             raise WeightsError(folder=folder, found=found, kind=kind)
         try:
             header = json.loads(stream.read(length))
-            promised = 8 + length + _end_of_tensors(header)
+            ends = [
+                about["data_offsets"][1] for key, about in header.items() if key != "__metadata__"
+            ]
+            promised = 8 + length + max((int(end) for end in ends), default=0)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             found = f"the header of {path.name} is broken"
             raise WeightsError(folder=folder, found=found, kind=kind) from error
     if promised != size:
         found = f"{path.name} has {size} bytes where its header promises {promised}"
         raise WeightsError(folder=folder, found=found, kind=kind)
-
-
-def _end_of_tensors(header: Mapping[str, Any]) -> int:
-    ends = [int(item["data_offsets"][1]) for key, item in header.items() if key != "__metadata__"]
-    return max(ends, default=0)
 
 
 def _check_sums(folder: Path, kind: WeightsKind) -> None:

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from twin.errors import TwinError
+from twin.scene.least_squares import tukey_weights
 
 
 class MetricFitError(TwinError):
@@ -216,7 +217,13 @@ def fit_metric(
     problem = _problem(vertices, faces, points_m, camera_centres_m, support_z_m, config)
     guess = _Similarity(R=T_base_shape[:3, :3], t=T_base_shape[:3, 3], scale=scale)
     pivot = guess.apply(problem.samples).mean(axis=0)
-    rough = _thinned(problem, 4)
+    few = len(problem.samples) // 4  # they stand in random order
+    rough = replace(
+        problem,
+        samples=problem.samples[:few],
+        normals=problem.normals[:few],
+        spacing=problem.spacing * 2.0,
+    )
     coarse = []
     for yaw in config.yaw_starts_rad:
         start = guess.after(np.array([0.0, 0.0, yaw]), np.zeros(3), 0.0, pivot)
@@ -257,17 +264,6 @@ def _problem(
         support_z_m=support_z_m,
         extent_m=float(np.linalg.norm(high - low)),
         config=config,
-    )
-
-
-def _thinned(problem: _Problem, factor: int) -> _Problem:
-    """The same with fewer samples; they stand in random order."""
-    count = len(problem.samples) // factor
-    return replace(
-        problem,
-        samples=problem.samples[:count],
-        normals=problem.normals[:count],
-        spacing=problem.spacing * float(np.sqrt(factor)),
     )
 
 
@@ -323,10 +319,10 @@ def _step(
     gap = ((surface[near] - problem.points) * normals[near]).sum(axis=1)
     # Between samples a point lies on the surface all the same: only the gap counts.
     is_near = distance < reach + 2.0 * problem.spacing * current.scale
-    weight = _tukey(gap, reach) * is_near / len(problem.points)
+    weight = tukey_weights(gap, reach) * is_near / len(problem.points)
     _add(H, g, surface[near] - pivot, normals[near], gap, weight)
     distance, near = problem.points_tree.query(surface)
-    weight = _tukey(distance, reach) / len(surface)
+    weight = tukey_weights(distance, reach) / len(surface)
     for axis in np.eye(3):  # point to point: the outline holds the size
         gap = (surface - problem.points[near]) @ axis
         _add(H, g, surface - pivot, np.broadcast_to(axis, surface.shape), gap, pull * weight)
@@ -340,7 +336,7 @@ def _step(
             (lowest - pivot)[None],
             up,
             gap,
-            _tukey(np.abs(gap), 2 * problem.config.max_snap_m),
+            tukey_weights(np.abs(gap), 2 * problem.config.max_snap_m),
         )
     # Angles count in radians, shifts in metres: the extent makes them alike.
     unit = np.array([1.0] * 3 + [problem.extent_m] * 3 + [1.0])
@@ -368,11 +364,6 @@ def _add(
     J = np.concatenate([np.cross(arm, direction), direction, along], axis=1)
     H += J.T @ (J * weight[:, None])
     g += J.T @ (gap * weight)
-
-
-def _tukey(distance: np.ndarray, cut: float) -> np.ndarray:
-    """Weights of Tukey's biweight (Beaton and Tukey 1974)."""
-    return np.asarray(np.maximum(1.0 - (distance / cut) ** 2, 0.0) ** 2)
 
 
 def _lowest(moved: np.ndarray) -> np.ndarray:

@@ -167,21 +167,16 @@ def _run(command: Sequence[str], work: Path, config: GeneratorConfig) -> None:
                 found = f"was stopped because it wrote more than {config.max_output_bytes} bytes"
             else:
                 time.sleep(_POLL_S)
-    finally:
-        _end_group(process)
+    finally:  # end what is left of the program and of all it started
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
     if not found and process.returncode < 0:
         found = f"was ended by signal {-process.returncode}"
     elif not found and process.returncode > 0:
         found = f"ended with exit code {process.returncode}"
     if found:
         raise GeneratorError(found=found, stderr=_tail(written))
-
-
-def _end_group(process: "subprocess.Popen[bytes]") -> None:
-    """Kill what is left of the program and of all it started."""
-    with contextlib.suppress(ProcessLookupError, PermissionError):  # nothing is left of it
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
 
 
 def _folder_bytes(folder: Path) -> int:
@@ -224,7 +219,7 @@ def _tail(path: Path) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPose:
-    """Where the generator believes its object to be."""
+    """Where the generator puts its object."""
 
     T_camera_shape: Float[np.ndarray, "4 4"]
     """In OpenCV's camera axes; the shape has z up; scale first."""

@@ -1,6 +1,6 @@
 """What ``rebuild`` asks the models: masks and features of training frames, vectors of things."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,10 +25,8 @@ from twin.scene.foundation.models import (
     FEATURES,
     SEGMENTERS,
     ClipEmbedder,
+    DinoFeatures,
     Sam3Segmenter,
-    open_clip,
-    open_features,
-    open_segmenter,
     split_spec,
 )
 from twin.scene.gaussians import GaussianCloud
@@ -125,7 +123,7 @@ def ask_models(
 
     Args:
         config: Which models.
-        frames: Training frames, see ``spread``.
+        frames: Training frames.
         cloud: The Gaussians that features are lifted to, in the frames' root frame.
         task: Names what to look for when no prompts are given.
         threads: For lifting; 0: all cores.
@@ -138,14 +136,20 @@ def ask_models(
     placement = Placement(device=config.device)
     masks: list[tuple[Viewpoint, MaskSet]] = []
     if config.segmenter:
-        segmenter = open_segmenter(config.segmenter, placement)
-        for done, item in enumerate(_segmented(segmenter, frames, prompts_of(config, task)), 1):
-            masks.append(item)
+        _, folder = split_spec(config.segmenter, "--segmenter", SEGMENTERS)
+        segmenter = Sam3Segmenter.load(folder, placement)
+        prompts = prompts_of(config, task)
+        for done, frame in enumerate(frames, 1):
+            found = segmenter.segment(
+                frame.image_u8, prompts, camera_id=frame.camera_id, stamp_ns=frame.stamp_ns
+            )
+            masks.append((viewpoint_of(frame), found))
             advance(done, segmenter.source)
         del segmenter
     features = None
     if config.features and frames:
-        source = open_features(config.features, placement)
+        _, folder = split_spec(config.features, "--features", FEATURES)
+        source = DinoFeatures.load(folder, placement)
         maps = []
         for done, frame in enumerate(frames, 1):
             maps += source.features([frame.image_u8], stride=config.feature_stride)
@@ -155,16 +159,6 @@ def ask_models(
         rasteriser = Rasteriser(RasterConfig(threads=threads))
         features = lift_reduced(rasteriser, cloud, pairs, basis, source=source.source)
     return ModelFindings(masks=masks, features=features)
-
-
-def _segmented(
-    segmenter: Sam3Segmenter, frames: Sequence[RgbdFrame], prompts: Sequence[str]
-) -> Iterable[tuple[Viewpoint, MaskSet]]:
-    for frame in frames:
-        found = segmenter.segment(
-            frame.image_u8, prompts, camera_id=frame.camera_id, stamp_ns=frame.stamp_ns
-        )
-        yield viewpoint_of(frame), found
 
 
 def embed_things(
@@ -199,7 +193,8 @@ def embed_things(
     if not config.clip:
         message = "no folder of CLIP is named; give --clip FOLDER."
         raise UsageError(message)
-    embedder = open_clip(Path(config.clip), Placement(device=config.device))
+    placement = Placement(device=config.device)
+    embedder = ClipEmbedder.load(Path(config.clip).expanduser(), placement)
     rasteriser = Rasteriser(RasterConfig(threads=threads))
     vectors, shown = thing_vectors(embedder, scene, cloud, frames, rasteriser, advance)
     held = features or _no_features(len(cloud))
@@ -258,12 +253,6 @@ def thing_vectors(
 def viewpoint_of(frame: RgbdFrame) -> Viewpoint:
     """Where a frame's colour camera stood."""
     return Viewpoint(camera=frame.color_camera, T_base_camera=frame.T_base_color)
-
-
-def spread(stamps_ns: Sequence[int], count: int) -> list[int]:
-    """At most ``count`` of some stamps, evenly, first and last included."""
-    chosen = np.linspace(0, len(stamps_ns) - 1, min(count, len(stamps_ns))).round().astype(int)
-    return [stamps_ns[index] for index in dict.fromkeys(chosen.tolist())]
 
 
 def _no_features(num_splats: int) -> SceneFeatures:

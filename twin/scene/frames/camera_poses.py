@@ -18,7 +18,7 @@ from bridge.episode.cdr.messages import FrameTransform, transforms_from_cdr
 from bridge.episode.reader import Episode
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
-from bridge.task.robot import BASE_FRAME
+from bridge.robots.default import BASE_FRAME
 from bridge.terminal import Output
 from twin.scene.frames.odometry import CameraPath, TrackConfig, follow_camera
 from twin.scene.frames.pairing import UnusableCameraError, name_of, paired_stamps_ns
@@ -209,9 +209,9 @@ def find_poses(
             camera is, or ``/tf`` does not connect its colour and depth frames.
         LostError: When the odometry cannot follow the camera.
     """
-    place = None if calibration is None else calibration.cameras.get(camera_id)
-    if config.poses == "auto" and calibration is not None and place is not None:
-        poses = calibrated_poses(episode, camera_id, place, stamps_ns)
+    mount = None if calibration is None else calibration.cameras.get(camera_id)
+    if config.poses == "auto" and calibration is not None and mount is not None:
+        poses = calibrated_poses(episode, camera_id, mount, stamps_ns)
         _say_unposed(poses, episode, camera_id, stamps_ns, output)
         return replace(poses, quality={"calibration_id": calibration.calibration_id})
     tree = base_tree(episode)
@@ -262,7 +262,7 @@ def check_connected(tree: TransformTree, episode: Episode, camera_id: str) -> No
 def calibrated_poses(
     episode: Episode,
     camera_id: str,
-    place: MountedCamera,
+    mount: MountedCamera,
     stamps_ns: Int[np.ndarray, " num_frames"],
 ) -> CameraPoses:
     """Pose a camera's images as ``robot-gst calibrate`` says it is mounted.
@@ -272,17 +272,17 @@ def calibrated_poses(
         RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
     return CameraPoses(
-        tree=calibrated_tree(episode, camera_id, place, stamps_ns),
+        tree=calibrated_tree(episode, camera_id, mount, stamps_ns),
         source="hand-eye",
-        unposed_ns=without_joints(episode, place, stamps_ns),
-        depth_scale=place.depth_scale,
+        unposed_ns=without_joints(episode, mount, stamps_ns),
+        depth_scale=mount.depth_scale,
     )
 
 
 def calibrated_tree_at(
     episode: Episode,
     camera_id: str,
-    place: MountedCamera,
+    mount: MountedCamera,
     stamps_ns: Int[np.ndarray, " num_stamps"],
 ) -> TransformTree:
     """Pose a calibrated camera at its images and at some more instants, where joints are known.
@@ -292,9 +292,9 @@ def calibrated_tree_at(
         RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
     stamps = np.unique(np.concatenate([paired_stamps_ns(episode, camera_id), stamps_ns]))
-    lost = without_joints(episode, place, stamps)
+    lost = without_joints(episode, mount, stamps)
     known = np.array([t for t in stamps.tolist() if t not in lost], dtype=np.int64)
-    return calibrated_tree(episode, camera_id, place, known)
+    return calibrated_tree(episode, camera_id, mount, known)
 
 
 def _say_unposed(

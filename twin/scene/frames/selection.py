@@ -179,8 +179,7 @@ def _shortlist(members: np.ndarray, smear_px: np.ndarray) -> Sequence[int]:
     """Frames of one stretch that are still enough, a few of them."""
     limit = max(SMEAR_PX, MOTION_SLACK * float(smear_px[members].min()))
     calm = members[smear_px[members] <= limit]
-    places = np.unique(np.linspace(0, len(calm) - 1, min(MAX_LOOKS, len(calm))).round())
-    return [int(calm[int(place)]) for place in places]
+    return [int(index) for index in spread(calm, MAX_LOOKS)]
 
 
 def _around(values: np.ndarray) -> np.ndarray:
@@ -197,6 +196,8 @@ QUIET = Output(quiet=True)
 
 class NoFramesError(TwinError):
     """There is nothing to rebuild from."""
+
+    exit_code = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -286,13 +287,6 @@ def choose_frames(
     config: FrameConfig,
     output: Output = QUIET,
     calibration: Calibration | None = None,
-) -> list[FrameChoice]:
-    """The choices of ``choose_with_reasons``; raises as it does."""
-    return choose_with_reasons(sources, config, output, calibration).choices
-
-
-def choose_with_reasons(
-    sources: Sources, config: FrameConfig, output: Output, calibration: Calibration | None
 ) -> Chosen:
     """Hold out every n-th frame of each camera, then choose training frames from the others.
 

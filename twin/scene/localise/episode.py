@@ -16,7 +16,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import LOCALISATION, cell_topic, object_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError
-from bridge.task.robot import BASE_FRAME
+from bridge.robots.default import BASE_FRAME
 from bridge.task.task_file import Task
 from twin.scene.frames.selection import rgbd_camera_ids
 from twin.scene.localise.mesh_fit import MeshSurface, ScannedSurfaces, scanned_surfaces

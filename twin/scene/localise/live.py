@@ -84,7 +84,7 @@ class LiveCell:
     """What is known at one moment of where things are."""
 
     tree: TransformTree
-    places: Mapping[str, MountedCamera]
+    mounts: Mapping[str, MountedCamera]
     joints: Sequence[bytes]
     urdf: str | None
 
@@ -103,14 +103,14 @@ class LiveCell:
         self, camera_id: str, color: str, depth: str, stamps_ns: Int[np.ndarray, " num_stamps"]
     ) -> CameraPoses:
         """Where a camera was: where it was calibrated, else where ``/tf`` says."""
-        place = self.places.get(camera_id)
-        if place is None:
+        mount = self.mounts.get(camera_id)
+        if mount is None:
             known = set(self.tree.frames())
             unknown = [frame for frame in (color, depth) if frame not in known]
             if unknown:
                 raise CameraNotReadyError(f"no transform to {unknown[0]}")
             return CameraPoses(tree=self.tree, source="tf")
-        track = None if place.fixed else self.track
+        track = None if mount.fixed else self.track
         # Around each image too: between far images a motion of the hand would not show.
         window = np.array([-STATIONARY_WINDOW_NS, 0, STATIONARY_WINDOW_NS])
         instants = np.unique(stamps_ns[:, None] + window)
@@ -119,10 +119,10 @@ class LiveCell:
             raise CameraNotReadyError("no joint states around its images, and it is in the hand")
         posed = np.array([t for t in instants.tolist() if t not in lost], dtype=np.int64)
         return CameraPoses(
-            tree=mounted_tree(place, (color, depth), self.tree, posed, track),
+            tree=mounted_tree(mount, (color, depth), self.tree, posed, track),
             source="hand-eye",
             unposed_ns=lost,
-            depth_scale=place.depth_scale,
+            depth_scale=mount.depth_scale,
         )
 
 
@@ -303,7 +303,7 @@ class LiveView:
     @property
     def needs_joints(self) -> bool:
         """Whether a camera was calibrated in the hand."""
-        return any(not place.fixed for place in self._places.values())
+        return any(not mount.fixed for mount in self._places.values())
 
     def cameras_from(self) -> str:
         """By what the cameras are posed, in words."""
@@ -361,7 +361,7 @@ class LiveView:
             )
         cell = LiveCell(
             tree=TransformTree(rooted_in_base(transforms)),
-            places=self._places,
+            mounts=self._places,
             joints=joints,
             urdf=urdf,
         )

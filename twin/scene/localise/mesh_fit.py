@@ -21,6 +21,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import SCANNED, ObjectModel, Task
+from twin.scene.least_squares import normal_equations, tukey_weights
 from twin.scene.localise.points import CameraView, Cluster
 from twin.scene.localise.shape_fit import ShapeFitConfig
 from twin.scene.shape.files import MESH, TASK_SHAPE
@@ -355,7 +356,7 @@ def _derivatives(
     return np.asarray(-np.stack(columns, axis=1))
 
 
-def _normal_equations(
+def _pose_equations(
     T: Float[np.ndarray, "4 4"],
     shifts: Float[np.ndarray, "num_views 2"],
     problem: _Problem,
@@ -368,11 +369,9 @@ def _normal_equations(
     J[:, :_POSE] = J8[:, :_POSE]
     for axis in range(_PER_VIEW):
         J[np.arange(len(r)), _POSE + _PER_VIEW * ids + axis] = J8[:, _POSE + axis]
-    ratio = r / bound_m
-    weight = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
-    weight = weight / problem.fit.point_sigma_m**2 / problem.fit.shared_error
-    H = (J * weight[:, None]).T @ J + np.diag(np.concatenate([damping, problem.prior]))
-    gradient = (J * weight[:, None]).T @ r
+    weight = tukey_weights(r, bound_m) / problem.fit.point_sigma_m**2 / problem.fit.shared_error
+    H, gradient = normal_equations(J, r, weight)
+    H += np.diag(np.concatenate([damping, problem.prior]))
     gradient[_POSE:] += problem.prior * shifts.ravel()
     # Roll and pitch: the vertical of the object should stay near the base's.
     information = 1 / problem.tilt_sigma_rad**2
@@ -390,7 +389,7 @@ def _icp(
     damping = 1 / np.array([0.03, 0.03, 0.03, 0.3, 0.3, 0.3]) ** 2
     for iteration in range(iterations):
         bound = problem.fit.tukey_m * max(1.0, wide * (1 - iteration / max(iterations - 2, 1)))
-        H, gradient, _ = _normal_equations(T, shifts, problem, bound, damping)
+        H, gradient, _ = _pose_equations(T, shifts, problem, bound, damping)
         step = np.clip(-np.linalg.solve(H, gradient), -0.3, 0.3)
         T = T.copy()
         T[:3, :3] = Rotation.from_rotvec(step[3:6]).as_matrix() @ T[:3, :3]
@@ -424,7 +423,7 @@ def _choose(
     others = [(other[0], _turn(T[:3, :3].T @ other[2][:3, :3], period_rad)) for other in scored[1:]]
     rivals = [(value, angle) for value, angle in others if angle > np.radians(30)]
     weak = 1 / np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0]) ** 2
-    H, _, r = _normal_equations(T, shifts, problem, problem.fit.tukey_m, weak)
+    H, _, r = _pose_equations(T, shifts, problem, problem.fit.tukey_m, weak)
     covariance = np.linalg.inv(H)[:_POSE, :_POSE].copy()
     covariance[2, 2] += problem.fit.camera_sigma_m**2
     for value, angle in rivals:

@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from bridge.episode.streams import RgbdFrame
 from bridge.task.task_file import SCANNED, ObjectModel, Task
+from twin.scene.least_squares import normal_equations, tukey_weights
 from twin.scene.localise.mesh_fit import MeshFitConfig, MeshSurface, fit_mesh, known_surface
 from twin.scene.localise.points import (
     CameraView,
@@ -38,7 +39,7 @@ from twin.scene.localise.result import (
 )
 from twin.scene.localise.shape_fit import ShapeFitConfig, fit_shape
 from twin.scene.localise.soft import SoftConfig, SoftFit, fit_toys
-from twin.scene.shape.known import rest_height_m, yaw_period_rad
+from twin.scene.shape.known import yaw_period_rad
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,10 +150,9 @@ def fit_table(
         residual = p_base[:, 2] + A @ x
         centred = residual - np.median(residual)
         spread = 1.4826 * float(np.median(np.abs(centred)))
-        ratio = centred / max(6.0 * spread, 1e-3)
-        robust = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0) * weight
-        H = (A * robust[:, None]).T @ A + np.diag(1 / sigma**2)
-        x = np.linalg.solve(H, -(A * robust[:, None]).T @ p_base[:, 2])
+        robust = tukey_weights(centred, max(6.0 * spread, 1e-3)) * weight
+        H, gradient = normal_equations(A, p_base[:, 2], robust)
+        x = -np.linalg.solve(H + np.diag(1 / sigma**2), gradient)
     slope = np.linalg.lstsq(
         np.column_stack([p_base[:, :2] - p_base[:, :2].mean(axis=0), np.ones(len(d))]),
         p_base[:, 2],
@@ -210,14 +210,6 @@ class LocaliseConfig:
     """Nearer than this to standing on the table counts as standing on it."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Localisation:
-    """All objects of a task, and what the table told about each camera."""
-
-    objects: dict[str, LocalisedObject]
-    tables: dict[str, TableFit]
-
-
 def localise_objects(
     frames: Sequence[RgbdFrame],
     task: Task,
@@ -240,17 +232,6 @@ def localise_objects(
         One entry per object of the task; ``found`` is False, with a reason, where it was not
         seen. Never a guess.
     """
-    return localise(frames, task, config, last_seen_m, surfaces).objects
-
-
-def localise(
-    frames: Sequence[RgbdFrame],
-    task: Task,
-    config: LocaliseConfig | None = None,
-    last_seen_m: Mapping[str, Float[np.ndarray, "3"]] | None = None,
-    surfaces: Mapping[str, MeshSurface] | None = None,
-) -> Localisation:
-    """Like ``localise_objects``, and keep what the table said of the cameras."""
     config = LocaliseConfig() if config is None else config
     views = fuse_stills(frames, config.max_frames, config.max_views, task, config.points)
     views, tables = correct_for_table(views, task, config.table, config.points, config.colour)
@@ -260,16 +241,13 @@ def localise(
         if model.soft is None or not views
     }
     if views:
-        expected_m = _start_middles(task) | dict(last_seen_m or {})
+        starts_m = {
+            key: np.array([np.mean(s.x_m), np.mean(s.y_m), task.objects[key].rest_height_m])
+            for key, s in task.start.items()
+        }
+        expected_m = starts_m | dict(last_seen_m or {})
         objects |= _localise_toys(views, task, config, tables, objects, expected_m)
-    return Localisation(objects={key: objects[key] for key in task.objects}, tables=tables)
-
-
-def _start_middles(task: Task) -> dict[str, Float[np.ndarray, "3"]]:
-    return {
-        key: np.array([np.mean(s.x_m), np.mean(s.y_m), rest_height_m(task.objects[key])])
-        for key, s in task.start.items()
-    }
+    return {key: objects[key] for key in task.objects}
 
 
 def _localise_toys(

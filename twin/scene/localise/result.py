@@ -15,7 +15,6 @@ from twin.scene.localise.shape_fit import ShapeFit
 from twin.scene.shape.known import (
     pose_of,
     rectangle_yaw_rad,
-    rest_height_m,
     surface_distances,
     yaw_period_rad,
 )
@@ -98,7 +97,7 @@ def found_by_mesh(
 ) -> LocalisedObject:
     """Turn a fitted mesh into a result; what nearly stands on the table stands on it."""
     T = fit.T_base_object.copy()
-    lift_m = float(T[2, 3]) - rest_height_m(model)
+    lift_m = float(T[2, 3]) - model.rest_height_m
     detail |= {
         "residual_m": fit.residual_m,
         "seen_through_fraction": fit.seen_through,
@@ -107,7 +106,7 @@ def found_by_mesh(
     reason = None
     stands = bool(T[2, 2] > UPRIGHT) and abs(lift_m) <= rest_tolerance_m
     if stands:
-        T[2, 3] = rest_height_m(model)
+        T[2, 3] = model.rest_height_m
     else:
         tilt = np.degrees(np.arccos(np.clip(T[2, 2], -1, 1)))
         reason = (
@@ -139,11 +138,11 @@ def found_by_shape(
 ) -> LocalisedObject:
     """Turn a fitted shape into a result; what nearly stands on the table stands on it."""
     T = reduce_by_symmetry(fit.T_base_object, model)
-    lift_m = float(T[2, 3]) - rest_height_m(model)
+    lift_m = float(T[2, 3]) - model.rest_height_m
     detail["lift_m"] = lift_m
     reason = None
     if abs(lift_m) <= rest_tolerance_m:
-        T[2, 3] = rest_height_m(model)
+        T[2, 3] = model.rest_height_m
     else:
         reason = f"{model.id} is {lift_m * 1e3:+.0f} mm from standing on the table"
     return LocalisedObject(
@@ -179,7 +178,7 @@ def found_by_box(
     if (high - low)[0] < (high - low)[1] and model.size_m[0] > model.size_m[1]:
         yaw += np.pi / 2
     u, v = (low + high) / 2
-    T = pose_of(np.array([c * u - s * v, s * u + c * v, rest_height_m(model), yaw]))
+    T = pose_of(np.array([c * u - s * v, s * u + c * v, model.rest_height_m, yaw]))
     away, _ = surface_distances(points, model, T)
     half = np.array([*(high - low) / 2, model.size_m[2] / 2])
     spread = np.concatenate([half / 4, np.array([0.02, 0.02, 0.3])])

@@ -17,6 +17,7 @@ from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
+from twin.scene.least_squares import normal_equations, tukey_weights
 from twin.scene.localise.points import CameraView, Cluster, ColourConfig, likeness
 from twin.scene.shape.known import pose_of, starts, surface_distances
 
@@ -244,7 +245,10 @@ def fit_shape(
     candidates = [
         _solve(np.concatenate([state, free]), problem) for state in starts(cluster.p_base, model)
     ]
-    best = min(candidates, key=lambda state: _cost(state, problem))
+    best = min(
+        candidates,
+        key=lambda state: np.minimum(np.abs(_system(state, problem).r), config.tukey_m).mean(),
+    )
     for window_m in (2 * config.outline_window_m, config.outline_window_m):
         outlines = find_outlines(
             views,
@@ -325,7 +329,7 @@ def _system(state: Float[np.ndarray, " num_unknowns"], problem: _Problem) -> _Sy
     )
 
 
-def _normal_equations(
+def _pose_equations(
     state: Float[np.ndarray, " num_unknowns"],
     system: _System,
     weight: Float[np.ndarray, " num_residuals"],
@@ -335,9 +339,8 @@ def _normal_equations(
     """Return H and the gradient, with the views' priors and damping on the pose."""
     information = weight / system.sigma**2 / problem.config.shared_error
     prior = 1 / problem.prior_sigma.ravel() ** 2
-    H = (system.J * information[:, None]).T @ system.J
+    H, gradient = normal_equations(system.J, system.r, information)
     H += np.diag(np.concatenate([damping, prior]))
-    gradient = (system.J * information[:, None]).T @ system.r
     gradient[_POSE:] += prior * state[_POSE:]
     return H, gradient
 
@@ -350,19 +353,13 @@ def _solve(
     for iteration in range(problem.config.iterations):
         bound = problem.config.tukey_m * max(1.0, 3.0 - 0.5 * iteration)
         system = _system(state, problem)
-        ratio = system.r / bound
-        weight = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
-        H, gradient = _normal_equations(state, system, weight, problem, damping)
+        weight = tukey_weights(system.r, bound)
+        H, gradient = _pose_equations(state, system, weight, problem, damping)
         step = -np.linalg.solve(H, gradient)
         state = state + np.clip(step, -0.05, 0.05)
         if np.linalg.norm(step) < 1e-6:
             break
     return state
-
-
-def _cost(state: Float[np.ndarray, " num_unknowns"], problem: _Problem) -> float:
-    r = _system(state, problem).r
-    return float(np.mean(np.minimum(np.abs(r), problem.config.tukey_m)))
 
 
 def _summary(state: Float[np.ndarray, " num_unknowns"], problem: _Problem) -> ShapeFit:
@@ -371,7 +368,7 @@ def _summary(state: Float[np.ndarray, " num_unknowns"], problem: _Problem) -> Sh
     near = np.abs(system.r) < config.tukey_m
     on_points, on_edges = near[: system.num_points], near[system.num_points :]
     weak = 1 / np.array([0.05, 0.05, 0.05, 1.0]) ** 2
-    H, _ = _normal_equations(state, system, near.astype(np.float64), problem, weak)
+    H, _ = _pose_equations(state, system, near.astype(np.float64), problem, weak)
     covariance = np.zeros((6, 6))
     pose_ids = [0, 1, 2, 5]
     covariance[np.ix_(pose_ids, pose_ids)] = np.linalg.inv(H)[:_POSE, :_POSE]

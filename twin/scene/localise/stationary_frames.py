@@ -1,6 +1,6 @@
 """Frames taken while their camera stood still, posed in the robot's base."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
-from bridge.task.robot import BASE_FRAME
+from bridge.robots.default import BASE_FRAME
 from twin.scene.frames.camera_poses import (
     CameraPoses,
     base_tree,
@@ -83,7 +83,8 @@ def stationary_frames(
             continue
         stamps = np.array(item.stamps_ns, dtype=np.int64)
         chosen = spread(stamps, max_per_camera) if evenly else stamps[-max_per_camera:]
-        frames.extend(_frames_at(episode, camera_id, item.poses, chosen.tolist()))
+        found = frames_at(episode, camera_id, item.poses.tree, chosen.tolist())
+        frames.extend(with_true_depth(frame, item.poses) for frame in found)
     return frames
 
 
@@ -131,13 +132,6 @@ def _between(
     return [int(stamp) for stamp in stamps_ns[wanted]]
 
 
-def _frames_at(
-    episode: Episode, camera_id: str, poses: CameraPoses, stamps_ns: Collection[int]
-) -> Iterator[RgbdFrame]:
-    for frame in frames_at(episode, camera_id, poses.tree, stamps_ns):
-        yield with_true_depth(frame, poses)
-
-
 def common_root(roots: Sequence[str]) -> str | None:
     """The frame in which objects are looked for: the robot's base where a camera is posed in it."""
     return BASE_FRAME if BASE_FRAME in roots else next(iter(roots), None)
@@ -173,11 +167,11 @@ def calibrated_cameras(episode: Episode, calibration: Calibration | None) -> Pos
         EpisodeError: A camera in the hand, and no joint states.
         RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
-    places = {} if calibration is None else calibration.cameras
+    mounts = {} if calibration is None else calibration.cameras
     return {
         camera_id: calibrated_poses(
-            episode, camera_id, places[camera_id], paired_stamps_ns(episode, camera_id)
+            episode, camera_id, mounts[camera_id], paired_stamps_ns(episode, camera_id)
         )
         for camera_id in rgbd_camera_ids(episode)
-        if camera_id in places
+        if camera_id in mounts
     }

@@ -29,7 +29,7 @@ from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FIT_STATE, Checkpoint, FitResult, fit
 from twin.scene.foundation.complete import complete_shapes
 from twin.scene.foundation.stage import check_models
-from twin.scene.frames.selection import FrameChoice, Sources, choose_with_reasons, find_sources
+from twin.scene.frames.selection import FrameChoice, Sources, choose_frames, find_sources
 from twin.scene.gaussians import (
     GaussianCloud,
     as_float32,
@@ -106,7 +106,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         output.say("the scene is up to date (same episodes, same settings); --force redoes it")
         return done
     clock = _Clock()
-    chosen = choose_with_reasons(sources, config.frames, output, calibration)
+    chosen = choose_frames(sources, config.frames, output, calibration)
     training = read_training_set(chosen.choices, config, output)
     clock.end("read")
     run.scene_dir.mkdir(parents=True, exist_ok=True)

@@ -1,19 +1,18 @@
 """Semantics as a stage of ``rebuild``: ask the models, find what is what, write it down."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from bridge.episode.streams import RgbdFrame
 from bridge.task.task_file import Task
 from bridge.terminal import Advance, Output
-from twin.scene.foundation.stage import ModelFindings, ask_models, embed_things, spread
+from twin.scene.foundation.stage import ModelFindings, ask_models, embed_things
 from twin.scene.frames.rgbd import TrainingView
-from twin.scene.frames.selection import FrameChoice, load
+from twin.scene.frames.selection import FrameChoice, load, spread
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
 from twin.scene.objects.decompose import Decomposition
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
@@ -76,7 +75,8 @@ def add_semantics(
             scene = scene_from_masks(cloud, masks, rasteriser, advance=advance)
         else:
             step = -(-len(viewpoints) // MAX_VIEWPOINTS) or 1
-            known = {key: _rows(rows, key) for key in objects}
+            sizes = list(rows.values())
+            known = {key: np.repeat([name == key for name in rows], sizes) for key in objects}
             scene = scene_by_default(
                 cloud,
                 viewpoints[::step],
@@ -106,59 +106,6 @@ def add_semantics(
     return record
 
 
-def _rows(rows: Mapping[str, int], key: str) -> Bool[np.ndarray, " num_splats"]:
-    """Which Gaussians of the whole scene are one part's."""
-    return np.repeat([name == key for name in rows], list(rows.values()))
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelAnswers:
-    """What the models said, and what they will be asked again."""
-
-    config: ModelConfig
-    frames: list[RgbdFrame]
-    """Training frames that were looked at; empty when no model is named."""
-    findings: ModelFindings
-
-    def give_vectors(
-        self,
-        folder: Path,
-        rows: Mapping[str, int],
-        cloud: GaussianCloud,
-        output: Output,
-        *,
-        threads: int = 0,
-    ) -> dict[str, Any]:
-        """Write the CLIP vectors of the things that ``semantics.npz`` holds.
-
-        Args:
-            folder: The scene folder, its semantics written.
-            rows: Gaussians of the background and of each object, as they were written.
-            cloud: All of them, in that order.
-            output: Shows how far it is.
-            threads: For drawing; 0: all cores.
-
-        Returns:
-            What ``scene.json`` says about it, under ``vectors``; nothing without CLIP.
-        """
-        if not self.config.clip:
-            return {}
-        scene = read_semantics(folder, rows)
-        features = self.findings.features
-        with output.progress("give things vectors", len(scene.instances)) as advance:
-            about = embed_things(
-                folder,
-                scene,
-                cloud,
-                self.frames,
-                features,
-                self.config,
-                threads=threads,
-                advance=advance,
-            )
-        return {"vectors": about}
-
-
 def ask_models_about(
     config: ModelConfig,
     choices: Sequence[FrameChoice],
@@ -167,7 +114,7 @@ def ask_models_about(
     output: Output,
     *,
     threads: int = 0,
-) -> ModelAnswers:
+) -> tuple[list[RgbdFrame], ModelFindings]:
     """Ask segmenter and feature model about training frames; nothing when none is named.
 
     Args:
@@ -178,27 +125,29 @@ def ask_models_about(
         output: Shows how far it is.
         threads: For lifting; 0: all cores.
 
+    Returns:
+        The frames they looked at, and what they found.
+
     Raises:
         UsageError: When a folder, prompt or device cannot be used.
         MissingDependencyError: When the extra ``foundation`` is not installed.
     """
     num_models = bool(config.segmenter) + bool(config.features)
     if not num_models and not config.clip:
-        nothing = ModelFindings(masks=[], features=None)
-        return ModelAnswers(config=config, frames=[], findings=nothing)
+        return [], ModelFindings(masks=[], features=None)
     frames = training_frames(choices, config.model_frames)
     with output.progress("ask the models", num_models * len(frames)) as advance:
         findings = ask_models(config, frames, cloud, task, threads=threads, advance=advance)
     num_masks = sum(len(masks.masks) for _, masks in findings.masks)
     if config.segmenter:
         output.say(f"{num_masks} masks in {len(frames)} frames")
-    return ModelAnswers(config=config, frames=frames, findings=findings)
+    return frames, findings
 
 
 def training_frames(choices: Sequence[FrameChoice], count: int) -> list[RgbdFrame]:
     """Read at most ``count`` training frames, spread evenly over episodes, cameras and time."""
     numbered = [(index, ns) for index, each in enumerate(choices) for ns in sorted(each.train_ns)]
-    chosen = {numbered[place] for place in spread(range(len(numbered)), count)}
+    chosen = {numbered[index] for index in spread(np.arange(len(numbered)), count)}
     frames: list[RgbdFrame] = []
     for index, each in enumerate(choices):
         frames += load(each, frozenset(ns for owner, ns in chosen if owner == index))
@@ -238,22 +187,35 @@ def write_scene_semantics(
     placed = {key: moved_cloud(item.cloud, item.T_base_object) for key, item in objects.items()}
     cloud = concatenate([decomposed.background, *placed.values()])
     output.say(f"name what is in the scene: {len(cloud)} Gaussians, {len(objects)} objects known")
-    asked = ask_models_about(models or ModelConfig(), choices, cloud, task, output, threads=threads)
+    models = models or ModelConfig()
+    frames, found = ask_models_about(models, choices, cloud, task, output, threads=threads)
     with output.progress("name things", 100) as advance:
         record = add_semantics(
             folder,
             decomposed.background,
             placed,
             [Viewpoint(camera=v.half.camera, T_base_camera=v.T_base_color) for v in views],
-            masks=asked.findings.masks,
-            features=asked.findings.features,
+            masks=found.masks,
+            features=found.features,
             surfaces_m=decomposed.surfaces_m(),
             threads=threads,
             advance=advance,
         )
     rows = {BACKGROUND_KEY: len(decomposed.background)}
     rows |= {key: len(part) for key, part in placed.items()}
-    record |= asked.give_vectors(folder, rows, cloud, output, threads=threads)
+    if models.clip:
+        scene = read_semantics(folder, rows)
+        with output.progress("give things vectors", len(scene.instances)) as advance:
+            record["vectors"] = embed_things(
+                folder,
+                scene,
+                cloud,
+                frames,
+                found.features,
+                models,
+                threads=threads,
+                advance=advance,
+            )
     labels = ", ".join(item["label"] for item in record["instances"])
     output.say(
         f"{len(record['instances'])} things ({record['source']}): {labels}"

@@ -259,7 +259,8 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
         aligned = None
         if job.align:
             fitted = align_view(cloud, recorded.half, recorded.full, T, rasteriser)
-            aligned = _u8(np.moveaxis(fitted.image, 0, -1))
+            image = np.clip(np.moveaxis(fitted.image, 0, -1), 0.0, 1.0)
+            aligned = np.rint(image * 255.0).astype(np.uint8)
         yield HeldOutViews(
             choice=choice,
             frame=frame,
@@ -317,18 +318,9 @@ def _write_view(writer: EpisodeWriter, item: HeldOutViews) -> None:
     if one_camera(frame):
         depth("recorded/depth", np.nan_to_num(frame.depth_m, posinf=0.0))
     else:
-        depth("recorded/depth_in_color", training_depth(item))
+        depth("recorded/depth_in_color", item.recorded.full.depth_m)
     for name, mask in item.masks.items():
         if not mask.all():
             png(f"mask/{name}", np.repeat(mask[..., None], 3, axis=2).astype(np.uint8) * 255)
     if item.aligned_u8 is not None:
         png("pose_aligned/image", item.aligned_u8)
-
-
-def training_depth(item: HeldOutViews) -> np.ndarray:
-    """Recorded depth as the colour camera sees it; 0 where unknown or where something moved."""
-    return item.recorded.full.depth_m
-
-
-def _u8(image: np.ndarray) -> np.ndarray:
-    return np.asarray(np.rint(np.clip(image, 0.0, 1.0) * 255.0), dtype=np.uint8)

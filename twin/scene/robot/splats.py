@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Float, Float64, Int64
 
 from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder, check_episode_id
@@ -37,7 +37,7 @@ def bind(
 
     Args:
         cloud: Gaussians in the robot's base frame.
-        joints_rad: Where the arm was, in the order of ``bridge.task.robot.ARM_JOINTS``.
+        joints_rad: Where the arm was, in the order of ``bridge.robots.default.ARM_JOINTS``.
         urdf: The robot's description.
         width_m: Opening of the gripper.
 
@@ -118,16 +118,12 @@ def surface_links(
     gap = p_base[near] - found.p_m
     along = np.einsum("ij,ij->i", gap, normals[near])
     aside = np.linalg.norm(gap - along[:, None] * normals[near], axis=1)
-    never = _never_moves(robot, surface)[found.link_ids]
+    fixed = fixed_links(robot)
+    never = np.array([link in fixed for link in surface.links], dtype=bool)[found.link_ids]
     close &= ~never | (aside < ASIDE_M)
     owner = np.full(len(p_base), -1, dtype=np.int64)
     owner[near[close]] = found.link_ids[close]
     return owner
-
-
-def _never_moves(robot: RobotModel, surface: PosedSurface) -> Bool[np.ndarray, " num_shapes"]:
-    stationary = fixed_links(robot)
-    return np.array([link in stationary for link in surface.links], dtype=bool)
 
 
 def _nearest(surface: PosedSurface, p_base: Float64[np.ndarray, "num_points 3"]) -> tuple[Any, Any]:

@@ -57,7 +57,7 @@ def smooth_shares(
     spread = csr_matrix((weight.ravel(), (rows, near.ravel())), shape=(len(told), len(p)))
     state = share.astype(np.float64).T
     first = state[told].copy()
-    # Frames that agree are believed; where they do not, the neighbours decide.
+    # Frames that agree decide; where they do not, the neighbours decide.
     agreed = np.abs(2.0 * first.max(axis=1, keepdims=True) - 1.0) ** 2
     keep = np.maximum(config.keep, agreed)
     for _ in range(config.num_steps):
@@ -112,8 +112,6 @@ class Association:
     """Largest first."""
     labels: UInt16[np.ndarray, " num_splats"]
     """Index of the track plus one; 0 is the background."""
-    num_dropped: int
-    """Candidates with too little support."""
 
 
 def associate(
@@ -262,7 +260,7 @@ def _association(
     final = np.zeros(len(labels), dtype=np.uint16)
     for number, item in enumerate(tracks):
         final[item.mask] = number + 1
-    return Association(tracks=tuple(tracks), labels=final, num_dropped=len(hits) - len(tracks))
+    return Association(tracks=tuple(tracks), labels=final)
 
 
 def _names(

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from twin.scene.semantics.colour import lab_from_srgb, without_shading
-from twin.scene.semantics.shape_descriptors import find_height_map_cavity, height_map, measure_form
+from twin.scene.semantics.shape_descriptors import find_height_map_cavity, height_map, measure_shape
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,7 +261,7 @@ def _belong_together(
     gap = np.maximum(a.min(axis=0), b.min(axis=0)) - np.minimum(a.max(axis=0), b.max(axis=0))
     if max(gap[:2]) > 2 * voxel_m:
         return False
-    return measure_form(np.concatenate([a, b]), voxel_m).cavity is not None
+    return measure_shape(np.concatenate([a, b]), voxel_m).cavity is not None
 
 
 def _first_dependent(

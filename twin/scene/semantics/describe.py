@@ -30,7 +30,7 @@ from twin.scene.semantics.shape_descriptors import (
     SupportConfig,
     SupportPlane,
     find_support,
-    measure_form,
+    measure_shape,
 )
 
 CELL_M = 0.004
@@ -227,19 +227,19 @@ def describe(
     p = cloud.means_m[ids].astype(np.float64)
     up = np.array([0.0, 0.0, _ground_m(p, plane)])
     xyh = p - up
-    form = measure_form(xyh, CELL_M)
+    measured = measure_shape(xyh, CELL_M)
     color = np.clip(np.rint(np.median(cloud.colors[ids], axis=0) * 255), 0, 255)
     if key:
-        label = label_of(key, colour_name(color / 255), is_open=form.cavity is not None)
-    is_nameless_container = kind_of(label) == "other" and form.word == CONTAINER
+        label = label_of(key, colour_name(color / 255), is_open=measured.cavity is not None)
+    is_nameless_container = kind_of(label) == "other" and measured.word == CONTAINER
     called = CONTAINER if is_nameless_container else label
     parts = _parts_of(xyh, called, None if surface_m is None else surface_m - up)
     T = np.eye(4)
     T[:2, :2] = [
-        [np.cos(form.yaw_rad), -np.sin(form.yaw_rad)],
-        [np.sin(form.yaw_rad), np.cos(form.yaw_rad)],
+        [np.cos(measured.yaw_rad), -np.sin(measured.yaw_rad)],
+        [np.sin(measured.yaw_rad), np.cos(measured.yaw_rad)],
     ]
-    T[:3, 3] = form.centre_m + up
+    T[:3, 3] = measured.centre_m + up
     return Instance(
         id=number,
         label=label,
@@ -250,7 +250,7 @@ def describe(
         source=source,
         color_srgb=(int(color[0]), int(color[1]), int(color[2])),
         T_base_instance=T,
-        size_m=form.size_m,
+        size_m=measured.size_m,
         parts={name: _among(ids, part, len(cloud)) for name, part in parts.masks.items()},
         keypoints_m={name: point + up for name, point in parts.keypoints.items()},
     )

@@ -1,7 +1,6 @@
 """Features of images on Gaussians: fewer dimensions first, then lifted, then stored."""
 
 import io
-import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from bridge.errors import PathNotFoundError
 from bridge.whole_file import write_whole
 from twin.scene.fit.appearance import FeatureObservation, solve_features
 from twin.scene.gaussians import GaussianCloud, as_float32
@@ -19,21 +17,10 @@ from twin.scene.semantics.result import FeatureMap, SemanticsError
 
 FEATURES_FILE = "features.npz"
 FORMAT_VERSION = 1
-MAX_BYTES = 8 << 30
-"""Unpacked; a file that claims more is refused."""
 FEATURE_STEPS = 2
 """Conjugate gradient steps on the feature term; later ones gain nothing on held-out maps."""
 MAX_SAMPLES = 200_000
 """Cells the basis is computed from."""
-
-
-class UnreadableFeaturesError(SemanticsError):
-    """``features.npz`` is damaged, or was made for another scene."""
-
-    def __init__(self, *, path: Path, found: str) -> None:
-        """Remember the file."""
-        self.path = path
-        super().__init__(f"{path}: {found}. Make it again: robot-gst rebuild RUN --force.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,83 +149,3 @@ def save_features(folder: Path, features: SceneFeatures) -> Path:
     path = folder / FEATURES_FILE
     write_whole(path, buffer.getvalue())
     return path
-
-
-def load_features(path: Path, num_splats: int) -> SceneFeatures:
-    """Read ``features.npz`` of a scene with this many Gaussians; never unpickles.
-
-    Raises:
-        PathNotFoundError: When the file is not there.
-        UnreadableFeaturesError: When it is damaged or of another scene.
-    """
-    if not path.is_file():
-        hint = "A rebuild with a feature model makes it."
-        raise PathNotFoundError(path=path, what="feature file", hint=hint)
-    try:
-        arrays = read_npz(path)
-        found = _features_from(arrays)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile, EOFError) as error:
-        raise UnreadableFeaturesError(path=path, found=f"unreadable ({error})") from error
-    if len(found.features) != num_splats:
-        told = f"features of {len(found.features)} Gaussians for a scene of {num_splats}"
-        raise UnreadableFeaturesError(path=path, found=told)
-    return found
-
-
-def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """Read an archive of plain arrays, refusing pickles and bombs.
-
-    Raises:
-        ValueError: When it unpacks to more than 8 GiB, or holds anything but plain arrays.
-        OSError, zipfile.BadZipFile, EOFError: When it is damaged.
-    """
-    with zipfile.ZipFile(path) as archive:
-        size = sum(item.file_size for item in archive.infolist())
-    if size > MAX_BYTES:
-        message = f"claims {size} bytes"
-        raise ValueError(message)
-    with np.load(path, allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    foreign = [name for name, values in arrays.items() if not isinstance(values, np.ndarray)]
-    if foreign:
-        message = f"{foreign[0]} is no array"
-        raise ValueError(message)
-    return arrays
-
-
-def _features_from(arrays: dict[str, np.ndarray]) -> SceneFeatures:
-    version = int(arrays["version"])
-    if version != FORMAT_VERSION:
-        message = f"format version {version}, this program knows {FORMAT_VERSION}"
-        raise ValueError(message)
-    mean, components = arrays["mean"], arrays["components"]
-    features, weight = arrays["features"], arrays["weight"]
-    ids, embeddings = arrays["instance_ids"], arrays["instance_embeddings"]
-    fits = (
-        mean.ndim == 1
-        and components.ndim == features.ndim == embeddings.ndim == 2
-        and components.shape[1] == len(mean)
-        and features.shape[1] == len(components)
-        and weight.shape == features.shape[:1]
-        and ids.shape == embeddings.shape[:1]
-    )
-    if not fits:
-        shapes = {name: values.shape for name, values in arrays.items()}
-        message = f"arrays that do not fit together: {shapes}"
-        raise ValueError(message)
-    for name, values in arrays.items():
-        if values.dtype.kind == "f" and not np.isfinite(values).all():
-            message = f"{name} holds values that are not finite"
-            raise ValueError(message)
-    return SceneFeatures(
-        basis=FeatureBasis(
-            mean=as_float32(mean),
-            components=as_float32(components),
-            explained_fraction=float(arrays["explained_fraction"]),
-        ),
-        features=as_float32(features),
-        weight=as_float32(weight),
-        instance_ids=np.asarray(ids, dtype=np.int32),
-        instance_embeddings=as_float32(embeddings),
-        source=arrays["source"].astype(np.uint8).tobytes().decode("utf-8", "replace"),
-    )

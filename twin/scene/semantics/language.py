@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32, UInt16
 from twin.scene.semantics.colour import COLOUR_NAMES
 from twin.scene.semantics.result import Instance, SemanticScene, SemanticsError
 
-FORMS = {
+SHAPE_WORDS = {
     "open container": (
         "container", "basket", "box", "bin", "tray", "bowl", "bucket", "crate", "cup", "mug",
         "pot",
@@ -27,7 +27,7 @@ FORMS = {
     "ball": ("ball", "sphere", "orange", "apple"),
     "toy": ("toy", "animal", "plush", "figure", "duck", "sloth", "teddy", "bear", "doll"),
 }  # fmt: skip
-"""What a form may be called."""
+"""What a thing of a shape may be called."""
 ANY_THING = ("object", "thing", "item", "stuff")
 ANIMALS = ("toy", "animal", "plush", "figure", "duck", "sloth", "teddy", "bear", "doll")
 KIND_NAMES = {"container": ("container",), "animal": ("toy", "animal"), "other": ()}
@@ -39,7 +39,7 @@ TYPICAL_COLOURS = {
     "orange": ("orange",),
     "apple": ("red", "green"),
 }
-"""A form alone does not tell a duck from a sloth; its colour may."""
+"""A shape alone does not tell a duck from a sloth; its colour may."""
 PART_WORDS = {
     "rim": ("rim", "edge", "lip"),
     "floor": ("floor", "bottom", "inside", "cavity"),
@@ -90,27 +90,27 @@ def spoken_name(key: str) -> str:
     return re.sub(r"[_\d]+", " ", key).strip()
 
 
-def form_in(label: str) -> str | None:
-    """The longest form whose name ends a label of the default segmenter, or None.
+def shape_in(label: str) -> str | None:
+    """The longest shape whose name ends a label of the default segmenter, or None.
 
     What is called open, and may be a container, is one.
     """
     words = words_of(label)
-    if "open" in words and words[-1] in FORMS["open container"]:
+    if "open" in words and words[-1] in SHAPE_WORDS["open container"]:
         return "open container"
-    ends = [form for form in FORMS if label == form or label.endswith(" " + form)]
+    ends = [shape for shape in SHAPE_WORDS if label == shape or label.endswith(" " + shape)]
     return max(ends, key=len, default=None)
 
 
 def names_of(label: str) -> set[str]:
-    """Nouns that a label answers to: its own words, its kind, what its form may be called."""
+    """Nouns that a label answers to: its own words, its kind, what its shape may be called."""
     names = set(words_of(label)) | set(ANY_THING) | set(KIND_NAMES[kind_of(label)])
-    form = form_in(label)
-    if form is not None:
+    shape = shape_in(label)
+    if shape is not None:
         colours = {colour_of(word) for word in words_of(label)} - {None}
         names |= {
             name
-            for name in FORMS[form]
+            for name in SHAPE_WORDS[shape]
             if name not in TYPICAL_COLOURS or not colours or colours & set(TYPICAL_COLOURS[name])
         }
     return names
@@ -118,16 +118,18 @@ def names_of(label: str) -> set[str]:
 
 def known_words() -> set[str]:
     """Every noun the lexicon has."""
-    nouns: Iterable[tuple[str, ...]] = (*FORMS.values(), ANY_THING, ANIMALS)
+    nouns: Iterable[tuple[str, ...]] = (*SHAPE_WORDS.values(), ANY_THING, ANIMALS)
     return {name for group in nouns for name in group}
 
 
 def kind_of(label: str) -> str:
     """Which parts to look for: "container", "animal" or "other"."""
-    form, words = form_in(label), words_of(label)
-    if form == "open container" or (form is None and _any_of(words, FORMS["open container"])):
+    shape, words = shape_in(label), words_of(label)
+    if shape == "open container" or (
+        shape is None and _any_of(words, SHAPE_WORDS["open container"])
+    ):
         return "container"
-    if form == "toy" or (form is None and _any_of(words, ANIMALS)):
+    if shape == "toy" or (shape is None and _any_of(words, ANIMALS)):
         return "animal"
     return "other"
 
@@ -198,7 +200,11 @@ def label_of(key: str, colour: str, *, is_open: bool) -> str:
     """
     name = spoken_name(key)
     words = words_of(name)
-    either = bool(words) and words[-1] in FORMS["box"] and words[-1] in FORMS["open container"]
+    either = (
+        bool(words)
+        and words[-1] in SHAPE_WORDS["box"]
+        and words[-1] in SHAPE_WORDS["open container"]
+    )
     if is_open and either and "open" not in words:
         name = f"open {name}"
     if any(colour_of(word) is not None for word in words):

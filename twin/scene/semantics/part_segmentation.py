@@ -182,7 +182,7 @@ def _label_cells(
     smooth = _smooth(thickness)
     most = float(smooth.max())
     ball = protrusion_ratio * most
-    thick = solid & _grown(smooth > ball, ball)
+    thick = solid & (ndimage.distance_transform_edt(smooth <= ball) <= ball + 0.7)
     pieces = _pieces(solid & ~thick, int(solid.sum()))
     parts = np.where(solid, BODY, 0)
     owner, touches, head = _find_head(solid, thick, pieces, most)
@@ -248,7 +248,9 @@ def _find_head(
         ]
         if not cores:  # above what is thick only a tail or an antenna is left
             break
-        owner = _nearest_core(cores, thick)
+        # For each thick cell the core whose ball reaches it best, from 1; 0 elsewhere.
+        gaps = [ndimage.distance_transform_edt(~core.region) - core.level for core in cores]
+        owner = np.where(thick, np.argmin(gaps, axis=0) + 1, 0)
         touches = [_touched(piece, owner, len(cores)) for piece in pieces]
         if len(cores) < 2 and not found:
             return owner, touches, -1
@@ -296,10 +298,6 @@ def _highest_ball(
     return owner
 
 
-def _grown(core: np.ndarray, radius: float) -> np.ndarray:
-    return np.asarray(ndimage.distance_transform_edt(~core) <= radius + 0.7)
-
-
 def find_cores(thickness: Float[np.ndarray, "num_x num_y num_z"]) -> list[Core]:
     """Thick places that necks separate, thickest first.
 
@@ -312,7 +310,7 @@ def find_cores(thickness: Float[np.ndarray, "num_x num_y num_z"]) -> list[Core]:
     for level in LEVELS:
         cells, num = ndimage.label(thickness > level * most, structure=CONNECTED)
         unmet: list[tuple[tuple[int, ...], Core]] = []
-        taken = {int(cells[_inside(core)]) for core in done}
+        taken = {int(cells[core.region].flat[0]) for core in done}
         for number in range(1, num + 1):
             region = cells == number
             own = [item for item in growing if cells[item[0]] == number]
@@ -327,16 +325,6 @@ def find_cores(thickness: Float[np.ndarray, "num_x num_y num_z"]) -> list[Core]:
         growing = unmet
     cores = done + [core for peak, core in growing if thickness[peak] > 0.6 * most]
     return sorted(cores, key=lambda core: -float(thickness[core.region].max()))
-
-
-def _inside(core: Core) -> tuple[int, ...]:
-    return tuple(int(k) for k in np.argwhere(core.region)[0])
-
-
-def _nearest_core(cores: list[Core], thick: np.ndarray) -> Int[np.ndarray, "num_x num_y num_z"]:
-    """For each thick cell the core whose ball reaches it best, from 1; 0 elsewhere."""
-    gaps = [ndimage.distance_transform_edt(~core.region) - core.level for core in cores]
-    return np.where(thick, np.argmin(gaps, axis=0) + 1, 0)
 
 
 def _pieces(rest: np.ndarray, num_solid: int) -> list[np.ndarray]:
@@ -391,12 +379,9 @@ def _keypoints(
         cells = solid.centres_m(protrusion)
         away = np.linalg.norm(cells - points["body"], axis=1)
         tips.append(cells[away >= np.quantile(away, 0.9)].mean(axis=0))
-    around = sorted(tips, key=lambda tip: _bearing(tip - points["body"]))
+    x, y = points["body"][:2]
+    around = sorted(tips, key=lambda tip: float(np.arctan2(tip[1] - y, tip[0] - x)))
     return points | {f"limb {number}": tip for number, tip in enumerate(around, start=1)}
-
-
-def _bearing(away: np.ndarray) -> float:
-    return float(np.arctan2(away[1], away[0]))
 
 
 MAX_HANDLE = 0.45

@@ -4,19 +4,14 @@ Things are what stands on the largest level plane and hangs together, cut where 
 says that two things touch. Works on the points of one RGB-D view and on a fused cloud.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt16
-from scipy import ndimage
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
-from twin.scene.frames.rgbd import DepthLimits, FrameSurface
 from twin.scene.gaussians import GaussianCloud
-from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.semantics.cluster import (
     SurfacePoints,
     ValleySplitConfig,
@@ -29,14 +24,12 @@ from twin.scene.semantics.cluster import (
     split_by_valleys,
 )
 from twin.scene.semantics.colour import colour_name, lab_from_srgb, without_shading
-from twin.scene.semantics.lift import Viewpoint, render_labels
-from twin.scene.semantics.result import Mask, MaskSet
 from twin.scene.semantics.shape_descriptors import (
     ShapeDescriptors,
     SupportConfig,
     SupportPlane,
     find_support,
-    measure_form,
+    measure_shape,
 )
 
 SOURCE = "default segmenter"
@@ -78,8 +71,8 @@ class Thing:
     """One thing the default segmenter found."""
 
     label: str
-    """Colour and form, for example "red cube"."""
-    form: ShapeDescriptors
+    """Colour and shape, for example "red cube"."""
+    shape: ShapeDescriptors
     score: float
     """Share of its points that are firmly above the plane, 0..1."""
 
@@ -131,15 +124,15 @@ def segment_points(
         _thing(points.take(labels == number), height[labels == number], voxel_m, config)
         for number in range(1, int(labels.max(initial=0)) + 1)
     )
-    remark = "" if things else _nothing(plane, len(above))
-    return Segmentation(labels=labels, things=things, plane=plane, remark=remark)
-
-
-def _nothing(plane: SupportPlane, num_above: int) -> str:
-    return (
-        f"nothing stands on the level plane at z = {plane.offset_m / plane.normal[2]:.3f} m "
-        f"({num_above} points above it, none hang together as a thing of 1 to 45 cm)"
+    remark = (
+        ""
+        if things
+        else (
+            f"nothing stands on the level plane at z = {plane.offset_m / plane.normal[2]:.3f} m "
+            f"({len(above)} points above it, none hang together as a thing of 1 to 45 cm)"
+        )
     )
+    return Segmentation(labels=labels, things=things, plane=plane, remark=remark)
 
 
 def _spacing(p_m: np.ndarray) -> float:
@@ -263,19 +256,15 @@ def _thing(
     points: SurfacePoints, height_m: np.ndarray, voxel_m: float, config: SegmentConfig
 ) -> Thing:
     xyh = np.concatenate([points.p_m[:, :2], height_m[:, None]], axis=1)
-    form = measure_form(xyh, voxel_m)
+    shape = measure_shape(xyh, voxel_m)
     color = np.median(points.colors, axis=0).astype(np.float64)
     firm = float((height_m > 2 * config.min_height_m).mean())
-    return Thing(label=f"{colour_name(color)} {form.word}", form=form, score=firm)
+    return Thing(label=f"{colour_name(color)} {shape.word}", shape=shape, score=firm)
 
 
 MIN_OPACITY = 0.3
 MAX_SPLAT_M = 0.04
 """Larger Gaussians are walls or fog."""
-MIN_MASK_PX = 20
-SILHOUETTE_M = 0.012
-"""A measured point this near to a trusted one belongs to the same surface."""
-VIEW_LIMITS = DepthLimits(max_depth_m=3.0, flying_fraction=0.03)
 
 
 def solid_splats(cloud: GaussianCloud) -> np.ndarray:
@@ -303,80 +292,3 @@ def points_of(cloud: GaussianCloud) -> SurfacePoints:
         normals=normals,
         colors=np.clip(cloud.colors, 0.0, 1.0).astype(np.float64),
     )
-
-
-def segment_frame(
-    frame: RgbdFrame,
-    config: SegmentConfig | None = None,
-    robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
-) -> MaskSet:
-    """Segment one RGB-D frame without knowing anything else.
-
-    Raises:
-        NoSupportError: When no level plane is in view.
-    """
-    surface = FrameSurface(frame, VIEW_LIMITS)
-    cloud = surface.points()
-    points = SurfacePoints(
-        p_m=cloud.p_m.astype(np.float64),
-        normals=cloud.normals.astype(np.float64),
-        colors=cloud.colors.astype(np.float64),
-    )
-    found = segment_points(points, config or SegmentConfig(), robot_m)
-    painted = _painted(frame, points, found.labels)
-    masks = []
-    for number, thing in enumerate(found.things, start=1):
-        image = painted == number
-        # Depth has holes, and it may be coarser than colour.
-        image = ndimage.binary_fill_holes(ndimage.binary_closing(image, iterations=2) | image)
-        masks.append(Mask(image=np.asarray(image), label=thing.label, score=thing.score))
-    return MaskSet(
-        camera_id=frame.camera_id, stamp_ns=frame.stamp_ns, masks=tuple(masks), source=SOURCE
-    )
-
-
-def _painted(
-    frame: RgbdFrame, points: SurfacePoints, labels: Int[np.ndarray, " num_points"]
-) -> Int[np.ndarray, "height width"]:
-    """Label of each colour pixel: every depth pixel takes that of the trusted point beside it.
-
-    Silhouettes have no trusted points, because their normals would mix two surfaces.
-    """
-    camera = frame.color_camera
-    depth = np.where(np.isfinite(frame.depth_m), frame.depth_m, 0.0).astype(np.float64)
-    measured = (depth > 0) & (depth < VIEW_LIMITS.max_depth_m)
-    p = se3.apply(frame.T_base_depth, frame.depth_camera.unproject(depth)[measured])
-    gap, nearest = cKDTree(points.p_m).query(p, distance_upper_bound=SILHOUETTE_M)
-    near = np.isfinite(gap)
-    near[near] = labels[nearest[near]] > 0
-    p_camera = se3.apply(se3.invert(frame.T_base_color), p[near])
-    uv, _ = camera.project(p_camera)
-    column, row = np.floor(uv).astype(np.int64).T
-    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    painted = np.zeros((camera.height, camera.width), dtype=np.int64)
-    painted[row[inside], column[inside]] = labels[nearest[near]][inside]
-    return painted
-
-
-def masks_from_labels(
-    rasteriser: Rasteriser,
-    cloud: GaussianCloud,
-    labels: UInt16[np.ndarray, " num_splats"],
-    names: Sequence[str],
-    viewpoint: Viewpoint,
-    *,
-    camera_id: str = "",
-    stamp_ns: int = 0,
-    source: str = SOURCE,
-) -> MaskSet:
-    """Masks of one frame rendered from labelled Gaussians; ``names[label - 1]`` is the label.
-
-    Things that cover less than 20 pixels are left out.
-    """
-    ids = render_labels(rasteriser, cloud, labels, viewpoint)
-    masks = []
-    for number, name in enumerate(names, start=1):
-        image = ids == number
-        if int(image.sum()) >= MIN_MASK_PX:
-            masks.append(Mask(image=image, label=name))
-    return MaskSet(camera_id=camera_id, stamp_ns=stamp_ns, masks=tuple(masks), source=source)

@@ -278,7 +278,7 @@ def find_height_map_cavity(
     return HeightMapCavity(mask=pool, rim_m=rim, floor_m=floor, volume_m3=volume)
 
 
-def measure_form(xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float) -> ShapeDescriptors:
+def measure_shape(xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float) -> ShapeDescriptors:
     """Measure a thing from the points of its visible surface.
 
     Args:

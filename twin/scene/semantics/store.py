@@ -2,7 +2,6 @@
 
 import io
 import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,21 +13,19 @@ from bridge.episode import provenance
 from bridge.errors import PathNotFoundError
 from bridge.geometry import se3
 from bridge.whole_file import write_whole
-from twin.scene.semantics.features import read_npz
+from twin.errors import UnreadableFileError
 from twin.scene.semantics.result import Instance, SemanticScene, SemanticsError
+from twin.scene.store.npz import UnreadableArraysError, read_npz
 
 SEMANTICS_FILE = "semantics.npz"
 FORMAT_VERSION = 1
+MAX_BYTES = 8 << 30
+"""Unpacked; a file that claims more is refused."""
 BACKGROUND_KEY = "background"
 
 
-class UnreadableSemanticsError(SemanticsError):
+class UnreadableSemanticsError(UnreadableFileError, SemanticsError):
     """``semantics.npz`` is damaged, or was made for another scene."""
-
-    def __init__(self, *, path: Path, found: str) -> None:
-        """Remember the file."""
-        self.path = path
-        super().__init__(f"{path}: {found}. Make it again: robot-gst rebuild RUN --force.")
 
 
 def write_semantics(folder: Path, scene: SemanticScene, rows: Mapping[str, int]) -> dict[str, Any]:
@@ -122,7 +119,7 @@ def read_semantics(folder: Path, rows: Mapping[str, int]) -> SemanticScene:
             path=path, what="semantics", hint="Make them: robot-gst rebuild RUN."
         )
     try:
-        arrays = read_npz(path)
+        arrays = read_npz(path, ("labels", "parts", "about"), MAX_BYTES)
         table = json.loads(arrays["about"].astype(np.uint8).tobytes())
         if table["version"] != FORMAT_VERSION:
             message = f"format version {table['version']}, this program knows {FORMAT_VERSION}"
@@ -138,7 +135,9 @@ def read_semantics(folder: Path, rows: Mapping[str, int]) -> SemanticScene:
             message = f"parts of type {codes.dtype} and shape {codes.shape}"
             raise ValueError(message)
         instances = tuple(_instance(item, labels, codes) for item in table["instances"])
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except UnreadableArraysError as error:
+        raise UnreadableSemanticsError(path=path, found=f"unreadable ({error.found})") from error
+    except (ValueError, KeyError, TypeError) as error:
         raise UnreadableSemanticsError(path=path, found=f"unreadable ({error})") from error
     return SemanticScene(
         instances=instances,

@@ -230,7 +230,7 @@ def _cut_up(shape: ObjectShape, config: CollisionConfig) -> tuple[ConvexPart, ..
                 break
         else:
             break
-    return tuple(_placed(piece.hull, corner, grid.voxel_m) for piece in pieces)
+    return tuple(hull_of_points(corner + grid.voxel_m * piece.hull.vertices_m) for piece in pieces)
 
 
 def _worth_it(piece: _Piece, cut: list[_Piece], num_voxels: int) -> bool:
@@ -300,8 +300,3 @@ def _connected(voxels: np.ndarray, least: float) -> list[np.ndarray]:
     label = labels[tuple((voxels - low).T)]
     sizes = np.bincount(label, minlength=count + 1)
     return [voxels[label == n] for n in range(1, count + 1) if sizes[n] >= least]
-
-
-def _placed(hull: ConvexPart, corner_m: np.ndarray, voxel_m: float) -> ConvexPart:
-    """From voxels to metres."""
-    return hull_of_points(corner_m + voxel_m * hull.vertices_m)

@@ -17,11 +17,6 @@ def pose_of(state: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4 4"]:
     return T
 
 
-def rest_height_m(model: ObjectModel) -> float:
-    """Height of the object's origin when it stands on the table [m]."""
-    return model.rest_height_m
-
-
 def yaw_period_rad(model: ObjectModel) -> float:
     """Turn after which the footprint looks the same: a quarter with equal sides, else a half.
 
@@ -36,7 +31,7 @@ def starts(
     points: Float[np.ndarray, "num_points 3"], model: ObjectModel
 ) -> list[Float[np.ndarray, "4"]]:
     """Candidate states: where a side is cut off, the known size is laid along either end."""
-    z = rest_height_m(model)
+    z = model.rest_height_m
     if model.origin_at_centre:
         z = float(np.percentile(points[:, 2], 95)) - model.size_m[2] / 2
     yaw = rectangle_yaw_rad(points[:, :2])

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bridge.errors import PathNotFoundError
-from twin.errors import TwinError
+from twin.errors import UnreadableFileError
 
 Vertices = Float[np.ndarray, "num_vertices 3"]
 Faces = Int[np.ndarray, "num_faces 3"]
@@ -17,16 +17,13 @@ MAX_BYTES = 500_000_000
 _FACE = np.dtype([("count", "u1"), ("ids", "<i4", 3)])
 
 
-class UnreadableMeshError(TwinError):
+class UnreadableMeshError(UnreadableFileError):
     """The file is no triangle mesh of the kind we write."""
 
-    def __init__(self, *, path: Path, found: str) -> None:
-        """Remember the file."""
-        self.path = path
-        super().__init__(
-            f"{path}: {found}. Expected a binary little-endian PLY with float x, y, z and "
-            "triangles. Make it again: robot-gst rebuild RUN --force."
-        )
+    hint = (
+        "Expected a binary little-endian PLY with float x, y, z and triangles. "
+        "Make it again: robot-gst rebuild RUN --force."
+    )
 
 
 def is_watertight(faces: Faces) -> bool:

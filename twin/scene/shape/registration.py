@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
+from twin.scene.least_squares import normal_equations
 from twin.scene.shape.carve import MaskedView
 
 MAX_POINTS = 500
@@ -316,7 +317,7 @@ def _agreement(surfaces: Sequence[SeenSurface], state: _State) -> tuple[np.ndarr
         same = (state.sensors[owner[rows]] == sensor).astype(np.float64)
         part = weight * (state.sensors[owner[index]] == sensor)
         J[:, state.columns(sensor)] = same[:, None] * mine - np.einsum("nk,nkc->nc", part, theirs)
-    return _normal_equations(J, distance)
+    return _robust_equations(J, distance)
 
 
 def slope_by_sensor(
@@ -346,14 +347,13 @@ def _on_plane(
     up = np.tile([0.0, 0.0, 1.0], (len(arm), 1))
     shared = slope_by_sensor(up @ T[:3, :3], p_camera[near])
     J = np.concatenate([up, np.cross(arm, up), shared], axis=1)
-    return _normal_equations(J, height[near])
+    return _robust_equations(J, height[near])
 
 
-def _normal_equations(J: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _robust_equations(J: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Robustly weighted (Cauchy) sums over rows."""
     if len(distance) == 0:
         return np.zeros((J.shape[1], J.shape[1])), np.zeros(J.shape[1])
     scale = max(float(np.median(np.abs(distance))), 1e-4)
     weight = 1.0 / (1.0 + (distance / (2 * scale)) ** 2) / (POINT_SIGMA_M**2 * SHARED_ERROR)
-    weighted = J * weight[:, None]
-    return weighted.T @ J, weighted.T @ distance
+    return normal_equations(J, distance, weight)

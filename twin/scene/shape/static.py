@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from bridge.errors import refuse_outside
 from twin.scene.frames.rgbd import TrainingView
-from twin.scene.shape.carve import Evidence, MaskedView, ShapeError, VoxelBox, gather
+from twin.scene.frames.selection import spread
+from twin.scene.shape.carve import MaskedView, ShapeError, VoxelBox, gather
 from twin.scene.shape.sdf import MAX_VOXELS, SdfGrid, distances_of_solid
 from twin.scene.store.npz import UnreadableArraysError, read_npz, write_npz
 
@@ -159,16 +160,21 @@ def static_sdf(
         ShapeError: When the views measured next to nothing.
     """
     config = StaticConfig() if config is None else config
-    masked = [_everything(view) for view in _thinned(views, config.max_views)]
+    masked = [_everything(views[k]) for k in spread(np.arange(len(views)), config.max_views)]
     box = _box(masked, table_z_m, config)
     truncation = config.truncation_voxels * box.voxel_m
     evidence = gather(box, masked, truncation, min_free_views=2)
     free = evidence.empty.ravel()
-    _clear_objects(box, free, objects)
+    taken = np.flatnonzero(~free if objects else [])
+    places = box.centres_m(taken)
+    for distance in objects:
+        free[taken[distance(places) < OBJECT_MARGIN_VOXELS * box.voxel_m]] = True
     free = free.reshape(box.counts)
+    surface = evidence.weight > 0
     if table_z_m is not None:
-        free[:, :, box.axis_m(2) < table_z_m] = False
-    surface = ~free & _is_surface(box, evidence, table_z_m)
+        below = box.axis_m(2) < table_z_m
+        free[:, :, below], surface[:, :, below] = False, True
+    surface &= ~free
     state = np.where(free, FREE, np.where(surface, SURFACE, UNSEEN)).astype(np.uint8)
     return StaticSdf(
         conservative=_grid(box, state != FREE),
@@ -177,11 +183,6 @@ def static_sdf(
         truncation_m=truncation,
         table_z_m=table_z_m,
     )
-
-
-def _thinned(views: Sequence[TrainingView], max_views: int) -> list[TrainingView]:
-    ids = np.linspace(0, len(views) - 1, min(len(views), max_views)).round().astype(int)
-    return [views[index] for index in np.unique(ids)]
 
 
 def _everything(view: TrainingView) -> MaskedView:
@@ -193,26 +194,6 @@ def _everything(view: TrainingView) -> MaskedView:
         depth_m=depth,
         mask=np.ones(depth.shape, dtype=bool),
     )
-
-
-def _is_surface(
-    box: VoxelBox, evidence: Evidence, table_z_m: float | None
-) -> Bool[np.ndarray, "num_x num_y num_z"]:
-    surface = evidence.weight > 0
-    if table_z_m is not None:
-        surface[:, :, box.axis_m(2) < table_z_m] = True
-    return np.asarray(surface)
-
-
-def _clear_objects(
-    box: VoxelBox, free: Bool[np.ndarray, " num_voxels"], objects: Sequence[Distance]
-) -> None:
-    if not objects:
-        return
-    taken = np.flatnonzero(~free)
-    places = box.centres_m(taken)
-    for distance in objects:
-        free[taken[distance(places) < OBJECT_MARGIN_VOXELS * box.voxel_m]] = True
 
 
 def _box(views: Sequence[MaskedView], table_z_m: float | None, config: StaticConfig) -> VoxelBox:

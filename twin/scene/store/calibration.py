@@ -8,7 +8,6 @@ reason. ``physics`` holds every parameter, and under ``identified`` what replays
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,9 +19,9 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
-from bridge.task.robot import BASE_FRAME
+from bridge.robots.default import BASE_FRAME
 from bridge.whole_file import write_whole
-from twin.errors import TwinError
+from twin.errors import UnreadableFileError
 from twin.robot.model import load_robot
 from twin.robot.posture import PostureTrack, posture_track
 
@@ -32,15 +31,10 @@ UNNAMED = ("calibration_id", "software", "physics_history")
 """What does not change what a calibration does, and so not its name."""
 
 
-class UnreadableCalibrationError(TwinError):
+class UnreadableCalibrationError(UnreadableFileError):
     """``calibration.json`` is damaged or from a newer version."""
 
-    def __init__(self, *, path: Path, found: str) -> None:
-        """Remember the file."""
-        self.path = path
-        super().__init__(
-            f"{path}: {found}. Remove it, or make it again: robot-gst calibrate RUN --cameras."
-        )
+    hint = "Remove it, or make it again: robot-gst calibrate RUN --cameras."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,13 +92,13 @@ def read_calibration(run: RunFolder) -> Calibration | None:
         if version != CALIBRATION_VERSION:
             found = f"schema version {version!r}, this program knows {CALIBRATION_VERSION}"
             raise UnreadableCalibrationError(path=path, found=found)
-        cameras = {key: _place(value) for key, value in record["cameras"].items()}
+        cameras = {key: _mount(value) for key, value in record["cameras"].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UnreadableCalibrationError(path=path, found=f"no calibration ({error!r})") from error
     return Calibration(record=record, cameras=cameras)
 
 
-def _place(record: Mapping[str, Any]) -> MountedCamera:
+def _mount(record: Mapping[str, Any]) -> MountedCamera:
     pose = record["T_link_camera"]
     q, p = np.array(pose["q_wxyz"], dtype=np.float64), np.array(pose["p_m"], dtype=np.float64)
     if q.shape != (4,) or p.shape != (3,) or not np.isfinite([*q, *p]).all() or not q.any():
@@ -185,7 +179,7 @@ def _store(run: RunFolder, content: Mapping[str, Any]) -> dict[str, Any]:
 def calibrated_tree(
     episode: Episode,
     camera_id: str,
-    place: MountedCamera,
+    mount: MountedCamera,
     stamps_ns: Int[np.ndarray, " num_frames"],
 ) -> TransformTree:
     """Pose a camera's colour and depth frames in the robot's base at some instants.
@@ -200,12 +194,12 @@ def calibrated_tree(
     color = streams.camera_info(episode, camera_id).frame_id
     has_depth = streams.find_camera_topic(episode, camera_id, "depth/info") is not None
     depth = streams.camera_info(episode, camera_id, "depth").frame_id if has_depth else color
-    track = None if place.fixed else posture_track(episode)
-    return mounted_tree(place, (color, depth), streams.transform_tree(episode), stamps_ns, track)
+    track = None if mount.fixed else posture_track(episode)
+    return mounted_tree(mount, (color, depth), streams.transform_tree(episode), stamps_ns, track)
 
 
 def mounted_tree(
-    place: MountedCamera,
+    mount: MountedCamera,
     frames: tuple[str, str],
     tree: TransformTree,
     stamps_ns: Int[np.ndarray, " num_frames"],
@@ -214,7 +208,7 @@ def mounted_tree(
     """Pose a camera in the robot's base as it is mounted, recorded or live.
 
     Args:
-        place: How it is mounted.
+        mount: How it is mounted.
         frames: Its colour and its depth frame.
         tree: Knows how they lie to each other, or does not: then they count as aligned.
         stamps_ns: The instants.
@@ -226,10 +220,10 @@ def mounted_tree(
     if known and tree.root_of(color) == tree.root_of(depth):
         at = int(stamps_ns[0]) if len(stamps_ns) else 0
         T_color_depth = se3.invert(tree.T_root_frame(color, at)) @ tree.T_root_frame(depth, at)
-    T_camera_color = np.eye(4) if place.stream == "color" else se3.invert(T_color_depth)
+    T_camera_color = np.eye(4) if mount.stream == "color" else se3.invert(T_color_depth)
     edges = []
-    for stamp, T_base_link in zip(stamps_ns, _links(place, stamps_ns, track), strict=True):
-        T_base_color = T_base_link @ place.T_link_camera @ T_camera_color
+    for stamp, T_base_link in zip(stamps_ns, _links(mount, stamps_ns, track), strict=True):
+        T_base_color = T_base_link @ mount.T_link_camera @ T_camera_color
         edges.append(_edge(color, T_base_color, int(stamp)))
         if color != depth:
             edges.append(_edge(depth, T_base_color @ T_color_depth, int(stamp)))
@@ -237,16 +231,16 @@ def mounted_tree(
 
 
 def _links(
-    place: MountedCamera, stamps_ns: Int[np.ndarray, " num_frames"], track: PostureTrack | None
+    mount: MountedCamera, stamps_ns: Int[np.ndarray, " num_frames"], track: PostureTrack | None
 ) -> list[np.ndarray]:
     if track is None:
         return [np.eye(4)] * len(stamps_ns)
     robot = load_robot(track.urdf)
-    return [robot.T_base_link(place.link, track.at(int(stamp)).joints_rad) for stamp in stamps_ns]
+    return [robot.T_base_link(mount.link, track.at(int(stamp)).joints_rad) for stamp in stamps_ns]
 
 
 def without_joints(
-    episode: Episode, place: MountedCamera, stamps_ns: Int[np.ndarray, " num_frames"]
+    episode: Episode, mount: MountedCamera, stamps_ns: Int[np.ndarray, " num_frames"]
 ) -> frozenset[int]:
     """Those of some instants at which nobody recorded where the hand that carries a camera was.
 
@@ -254,7 +248,7 @@ def without_joints(
         EpisodeError: A camera in the hand, and no joint states.
         RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
-    return unknown_postures(None if place.fixed else posture_track(episode), stamps_ns)
+    return unknown_postures(None if mount.fixed else posture_track(episode), stamps_ns)
 
 
 def unknown_postures(

@@ -15,7 +15,7 @@ from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.errors import PathNotFoundError, UsageError
 from bridge.whole_file import write_whole
-from twin.errors import TwinError
+from twin.errors import UnreadableFileError
 from twin.scene.gaussians import GaussianCloud, UnreadablePlyError, read_ply, write_ply
 
 SCENE_VERSION = 1
@@ -27,14 +27,8 @@ HASH_DIGITS = 12
 """Hexadecimal digits of the SHA-256 of ``background.ply`` that name a scene."""
 
 
-class UnreadableSceneError(TwinError):
+class UnreadableSceneError(UnreadableFileError):
     """``scene.json`` is damaged or from a newer version."""
-
-    def __init__(self, *, path: Path, found: str, hint: str = "") -> None:
-        """Remember the file."""
-        self.path = path
-        hint = hint or "Make it again: robot-gst rebuild RUN --force."
-        super().__init__(f"{path}: {found}. {hint}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,19 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from bridge.whole_file import write_whole
-from twin.errors import TwinError
+from twin.errors import UnreadableFileError
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """The earliest time a zip file can say; the real one would change the file's hash."""
 
 
-class UnreadableArraysError(TwinError):
+class UnreadableArraysError(UnreadableFileError):
     """An npz file is damaged, too large, or not what was expected."""
-
-    def __init__(self, *, path: Path, found: str) -> None:
-        """Remember the file."""
-        self.path = path
-        super().__init__(f"{path}: {found}. Make it again: robot-gst rebuild RUN --force.")
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:

@@ -20,8 +20,8 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import JointTrack
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
+from bridge.robots.default import ARM_JOINTS
 from bridge.task.plan import Plan, Waypoint
-from bridge.task.robot import ARM_JOINTS
 from bridge.task.task_file import Task
 from twin.calibrate.physics import cases as cases_module
 from twin.calibrate.physics import run as physics_run
@@ -330,5 +330,5 @@ def test_widths_that_are_no_numbers_teach_nothing(
         names=("gripper_width",), stamps_ns=np.arange(3), position=np.array([[0.0], [np.nan], [0]])
     )
     monkeypatch.setattr(cases_module.streams, "joint_track", lambda *_: track)
-    with pytest.raises(UnusableCaseError, match="gripper widths hold what is no number"):
+    with pytest.raises(UnusableCaseError, match="gripper widths hold what is not a number"):
         widths_of(Episode.open(run.episodes()[0]), 0)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
+from bridge.robots.default import MAX_WIDTH_M, ROBOT
 from bridge.sources.standin.cell_file import load_cell
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.probes import plan_probe
 from bridge.task.plan import Plan
-from bridge.task.robot import MAX_WIDTH_M, ur5_with_gripper_urdf
 from bridge.task.task_file import load_task
 from twin.calibrate.physics import simulate
 from twin.calibrate.physics.cases import Case, Prediction, planar
@@ -71,7 +71,7 @@ def case_of(kind: str, T: np.ndarray, number: int = 0) -> Case:
         sha256=f"{number:064x}",
         kind=kind,
         task=TASK,
-        urdf=ur5_with_gripper_urdf(),
+        urdf=ROBOT.urdf_text(),
         joint_times_s=times_s,
         joints_rad=np.array([w.joints_rad for w in plan.tau], dtype=np.float64),
         # A width holds for the time before its waypoint, as the cell executes it.
@@ -177,7 +177,7 @@ def test_friction_of_simulated_slides_is_recovered_within_its_interval_in_proces
 
 
 def test_only_the_gripper_collides() -> None:
-    text = gripper_only(ur5_with_gripper_urdf())
+    text = gripper_only(ROBOT.urdf_text())
     assert text.count("<collision") == 3
     assert "<visual" not in text
 
@@ -191,10 +191,8 @@ def test_a_process_that_is_killed_while_it_simulates_costs_nothing(slide: Case) 
     alone = Evaluator([slide], parameters, CONFIG, num_samples=0).predict(points, [0])
     with Evaluator([slide], parameters, CONFIG, num_samples=0, workers=2) as evaluator:
         evaluator.predict(points[:2], [0])
-        assert evaluator._crew is not None
-        first, second = [worker.pid for worker in evaluator._crew._idle]
-        assert first is not None
-        assert second is not None
+        assert evaluator._pool is not None
+        first, second = [worker.pid for worker in evaluator._pool.workers]
         os.kill(first, signal.SIGKILL)
         killer = threading.Timer(0.05, os.kill, (second, signal.SIGKILL))
         killer.start()

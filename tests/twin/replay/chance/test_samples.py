@@ -20,7 +20,7 @@ from twin.replay.config import ReplayConfig, ReplayRunConfig, VariationConfig
 from twin.replay.monte_carlo import (
     Sample,
     draw_variation,
-    given_standing,
+    given_upright,
     replay_samples,
     sample_rng,
     with_probability,
@@ -96,7 +96,7 @@ def test_given_standing_is_the_conditional_distribution() -> None:
     rng = np.random.default_rng(3)
     root = rng.normal(size=(6, 6)) * 1e-2
     covariance = root @ root.T
-    left = given_standing(covariance)
+    left = given_upright(covariance)
     precision = np.linalg.inv(covariance)
     keep = [0, 1, 5]  # a conditional covariance is the inverse of that block of the precision
     np.testing.assert_allclose(

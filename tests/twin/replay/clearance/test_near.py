@@ -48,7 +48,7 @@ def every_distance(
         *((link.body, link.shape, p) for link, p in zip(around.links, hulls.placements)),  # noqa: B905
         *((name, *cube) for name, cube in cubes.items()),
     ]
-    for item in around.standing:
+    for item in around.static:
         for body, shape, placed in movers:
             if item.body == TABLE and body in ("base_link", "shoulder_link"):
                 continue

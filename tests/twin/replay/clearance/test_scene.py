@@ -158,32 +158,32 @@ def test_lookups_are_those_of_the_grid_and_beyond_it_never_too_large() -> None:
     assert np.sum(~alike) > 50, "below the table: solid goes on there"
 
 
-def test_no_point_of_a_hull_is_farther_from_its_shell_than_is_subtracted(
+def test_no_point_of_a_hull_is_farther_from_its_tree_than_is_subtracted(
     hulls: RobotHulls,
 ) -> None:
     from scipy.spatial import ConvexHull, cKDTree
 
     rng = np.random.default_rng(5)
     for hull in hulls.hulls[3:]:
-        shell = bounding_spheres_of(hull.points_m, 0.004)
+        tree = bounding_spheres_of(hull.points_m, 0.004)
         corners = hull.points_m[ConvexHull(hull.points_m).simplices]
         weights = rng.dirichlet(np.ones(3), size=len(corners))
         points = np.einsum("nk,nkj->nj", weights, corners)
-        assert cKDTree(shell.finest_m()).query(points)[0].max() <= shell.cover_m + 1e-9
+        assert cKDTree(tree.finest_m()).query(points)[0].max() <= tree.cover_m + 1e-9
 
 
-def test_everything_below_a_point_of_a_shell_is_within_its_radius() -> None:
-    shell = bounding_spheres_of(np.random.default_rng(6).uniform(-0.05, 0.05, (30, 3)))
-    parent = np.full(len(shell.points_m), -1)
-    for index, (begin, end) in enumerate(shell.children):
+def test_everything_below_a_point_of_a_tree_is_within_its_radius() -> None:
+    tree = bounding_spheres_of(np.random.default_rng(6).uniform(-0.05, 0.05, (30, 3)))
+    parent = np.full(len(tree.points_m), -1)
+    for index, (begin, end) in enumerate(tree.children):
         assert np.all(parent[begin:end] == -1)
         parent[begin:end] = index
-    assert np.flatnonzero(parent == -1).tolist() == list(range(shell.num_roots))
-    for index in np.flatnonzero(shell.children[:, 0] == shell.children[:, 1]):
+    assert np.flatnonzero(parent == -1).tolist() == list(range(tree.num_roots))
+    for index in np.flatnonzero(tree.children[:, 0] == tree.children[:, 1]):
         above = parent[index]
         while above >= 0:
-            away = np.linalg.norm(shell.points_m[index] - shell.points_m[above])
-            assert away + shell.cover_m <= shell.radius_m[above] + 1e-9
+            away = np.linalg.norm(tree.points_m[index] - tree.points_m[above])
+            assert away + tree.cover_m <= tree.radius_m[above] + 1e-9
             above = parent[above]
 
 

@@ -25,7 +25,7 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import decode_color
-from bridge.task.robot import ARM_JOINTS
+from bridge.robots.default import ARM_JOINTS
 from bridge.task.verdict import Factor, Verdict
 from twin.physics.soft import SoftModel
 from twin.replay.images import RATE_HZ, render_replay

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from bridge.task.robot import ur5_with_gripper_urdf
+from bridge.robots.default import ROBOT
 from twin.physics.config import PhysicsConfig
 from twin.physics.world import Attachment, World
 from twin.replay.config import ReplayConfig
@@ -21,7 +21,7 @@ SIZE = np.array([0.04, 0.04, 0.04])
 
 def held(tied: bool) -> tuple[float, float]:
     """How far a cube without friction falls from between the fingers, closed and then open."""
-    with World(with_absolute_meshes(ur5_with_gripper_urdf()), {}, SLIPPERY) as world:
+    with World(with_absolute_meshes(ROBOT.urdf_text()), {}, SLIPPERY) as world:
         world.reset_robot(HOME, 0.045)
         T = world.T_base_link("tcp")
         world.add_free("cube", SIZE, 0.05, T)
@@ -45,7 +45,7 @@ def test_an_attached_cube_does_not_slip_and_is_let_go_when_the_fingers_open() ->
 
 
 def test_an_attached_cube_keeps_its_place_in_the_hand() -> None:
-    with World(with_absolute_meshes(ur5_with_gripper_urdf()), {}, SLIPPERY) as world:
+    with World(with_absolute_meshes(ROBOT.urdf_text()), {}, SLIPPERY) as world:
         world.reset_robot(HOME, 0.045)
         world.add_free("cube", SIZE, 0.05, world.T_base_link("tcp"))
         tie = Attachment(world)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bridge.episode.streams import JointTrack
-from bridge.task.robot import ARM_JOINTS
+from bridge.robots.default import ARM_JOINTS
 from twin.replay.config import ReplayConfig
 from twin.replay.execution import (
     check_covers,

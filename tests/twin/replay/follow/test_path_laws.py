@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bridge.episode.streams import JointTrack
-from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
+from bridge.robots.default import ARM_JOINTS, ROBOT
 from twin.replay.config import ReplayConfig
 from twin.replay.execution import cut_track
 from twin.replay.path import JointPath, jumps
@@ -17,7 +17,7 @@ STEP_NS = 8_000_000
 
 @pytest.fixture(scope="module")
 def robot() -> RobotModel:
-    return load_robot(ur5_with_gripper_urdf())
+    return load_robot(ROBOT.urdf_text())
 
 
 def path_with(steps_rad: dict[tuple[int, int], float], count: int = 20) -> np.ndarray:

@@ -10,8 +10,8 @@ import pytest
 
 from bridge.errors import GstError
 from bridge.geometry import se3
+from bridge.robots.default import ROBOT, ROBOT_NAME
 from bridge.task.plan import Plan, Waypoint
-from bridge.task.robot import ROBOT_NAME, ur5_with_gripper_urdf
 from twin.replay.config import ReplayConfig
 from twin.replay.path import (
     MAX_WAYPOINTS,
@@ -73,7 +73,7 @@ def test_a_missing_mesh_is_named(script: SimpleNamespace) -> None:
 
 
 def test_a_mimicking_finger_moves_with_the_one_it_mimics() -> None:
-    urdf = ur5_with_gripper_urdf().replace("gripper_right_finger_joint", "other_finger_joint")
+    urdf = ROBOT.urdf_text().replace("gripper_right_finger_joint", "other_finger_joint")
     plain = RobotModel(urdf)
     mimic = '<mimic joint="gripper_left_finger_joint" multiplier="0.5" offset="0.001"/>'
     following = RobotModel(
@@ -98,7 +98,7 @@ def test_a_joint_that_mimics_nothing_is_refused_by_name(mimic: str, found: str) 
     urdf = re.sub(
         r'(<joint name="gripper_right_finger_joint".*?)(</joint>)',
         rf"\g<1>{mimic}\g<2>",
-        ur5_with_gripper_urdf(),
+        ROBOT.urdf_text(),
     )
     with pytest.raises(RobotDescriptionError, match=rf"gripper_right_finger_joint.*{found}"):
         RobotModel(urdf)
@@ -106,7 +106,7 @@ def test_a_joint_that_mimics_nothing_is_refused_by_name(mimic: str, found: str) 
 
 def test_an_endless_joint_is_refused_by_name() -> None:
     urdf = re.sub(
-        r'(<joint name="wrist_3_joint" type=")revolute', r"\g<1>continuous", ur5_with_gripper_urdf()
+        r'(<joint name="wrist_3_joint" type=")revolute', r"\g<1>continuous", ROBOT.urdf_text()
     )
     with pytest.raises(RobotDescriptionError, match=r"wrist_3_joint.*without end"):
         RobotModel(urdf)
@@ -117,10 +117,10 @@ def changed(joint: str, before: str, after: str) -> str:
     urdf = re.sub(
         rf'(<joint name="{joint}"(?:(?!</joint>).)*?){before}',
         rf"\g<1>{after}",
-        ur5_with_gripper_urdf(),
+        ROBOT.urdf_text(),
         flags=re.DOTALL,
     )
-    assert urdf != ur5_with_gripper_urdf()
+    assert urdf != ROBOT.urdf_text()
     return urdf
 
 
@@ -174,7 +174,7 @@ def test_a_joint_that_mimics_one_without_a_position_is_refused(leader: str) -> N
         f'<child link="flap"/><axis xyz="0 0 1"/><mimic joint="{leader}"/>'
         '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
     )
-    urdf = ur5_with_gripper_urdf().replace("</robot>", more)
+    urdf = ROBOT.urdf_text().replace("</robot>", more)
     with pytest.raises(RobotDescriptionError, match=rf"'flap_joint' mimic '{leader}'.*is fixed or"):
         RobotModel(urdf)
 
@@ -189,7 +189,7 @@ def test_a_pose_that_is_not_a_number_is_refused(script: SimpleNamespace) -> None
 
 def test_numbers_no_plan_can_mean_are_refused_in_a_sentence() -> None:
     """JSON has no largest integer, and a quaternion too long to be squared has no direction."""
-    robot = load_robot(ur5_with_gripper_urdf())
+    robot = load_robot(ROBOT.urdf_text())
     plan = plan_through(robot.Ts_base_tcp(np.stack([HOME, HOME + 0.1])))
     first, second = plan.tau
 
@@ -233,14 +233,14 @@ def test_descriptions_that_would_end_the_process_are_refused(
     before: str, after: str, found: str
 ) -> None:
     """PyBullet and coal do not raise: they take every other replay with them."""
-    urdf = re.sub(r" +/>", "/>", ur5_with_gripper_urdf())
+    urdf = re.sub(r" +/>", "/>", ROBOT.urdf_text())
     assert before in urdf
     with pytest.raises(RobotDescriptionError, match=found):
         RobotHulls(RobotModel(urdf.replace(before, after)))
 
 
 def test_a_pose_that_is_no_number_is_not_reached() -> None:
-    robot = load_robot(ur5_with_gripper_urdf())
+    robot = load_robot(ROBOT.urdf_text())
     T = np.eye(4)
     T[:3, :3] = np.nan
     assert not solve_ik(robot, T, IkConfig(restarts=1)).reached
@@ -248,7 +248,7 @@ def test_a_pose_that_is_no_number_is_not_reached() -> None:
 
 def test_straight_motion_through_a_wrist_singularity_is_a_named_jump() -> None:
     """The tool passes just beside the pose where its axis is along the fourth: the wrist flips."""
-    robot = load_robot(ur5_with_gripper_urdf())
+    robot = load_robot(ROBOT.urdf_text())
     start = HOME.copy()
     start[4] = -0.35
     end = HOME.copy()
@@ -269,7 +269,7 @@ def test_straight_motion_through_a_wrist_singularity_is_a_named_jump() -> None:
 
 
 def test_a_plan_of_poses_keeps_its_branch_all_along() -> None:
-    robot = load_robot(ur5_with_gripper_urdf())
+    robot = load_robot(ROBOT.urdf_text())
     wanted = HOME + np.linspace(0, 1, 40)[:, None] * np.array([0.8, 0.2, -0.2, 0.1, 0.3, 0.5])
     path, failures, _ = path_of_plan(plan_through(robot.Ts_base_tcp(wanted)), robot, ReplayConfig())
     assert not failures
@@ -281,7 +281,7 @@ def test_a_plan_of_poses_keeps_its_branch_all_along() -> None:
 
 def test_a_branch_that_touches_is_not_taken_where_another_is_free() -> None:
     """Somebody stands where the elbow would be."""
-    robot = load_robot(ur5_with_gripper_urdf())
+    robot = load_robot(ROBOT.urdf_text())
     wanted = HOME + np.linspace(0, 1, 10)[:, None] * np.array([0.3, 0.1, -0.1, 0.1, 0.1, 0.1])
     plan = plan_through(robot.Ts_base_tcp(wanted))
     up, _, _ = path_of_plan(plan, robot, ReplayConfig())
@@ -300,7 +300,7 @@ def test_every_failure_along_a_path_names_its_first_instant() -> None:
     """Limit, jump and self-collision, each put in on purpose at a known time."""
     from twin.replay.path import JointPath
 
-    robot = load_robot(ur5_with_gripper_urdf())
+    robot = load_robot(ROBOT.urdf_text())
     hulls = hulls_of(robot)
     times = np.arange(0, 2_000_000_001, 40_000_000, dtype=np.int64)
 

@@ -44,19 +44,19 @@ def telling(side: str, *, late_s: float = 0.0) -> Trace:
 def found(*traces: Trace, **more: object) -> list[tuple[tuple[str, str], str, str]]:
     divergence = diverge("p", traces, CONFIG, **more)
     divergence.to_record()
-    return [(item.between, item.quantity, item.attribution) for item in divergence.partings]
+    return [(item.between, item.quantity, item.attribution) for item in divergence.quantities]
 
 
 def test_the_same_telling_three_times_parts_nowhere() -> None:
     sides = [telling(side) for side in ("planned", "executed", "recorded")]
     divergence = diverge("p", sides, CONFIG)
     assert divergence.first is None
-    assert divergence.partings == ()
+    assert divergence.quantities == ()
     assert divergence.lag_s == 0.0
 
 
 @pytest.mark.parametrize("late_s", [0.03, 0.11, 0.4])
-def test_a_constant_lag_is_found_and_is_no_parting(late_s: float) -> None:
+def test_a_constant_lag_is_found_and_is_no_divergence(late_s: float) -> None:
     planned, recorded = telling("planned"), telling("recorded", late_s=late_s)
     assert lag_s(planned, recorded) == pytest.approx(late_s, abs=0.011)
     divergence = diverge("p", [planned, recorded], CONFIG)
@@ -103,9 +103,9 @@ def test_an_object_never_touched_in_one_telling_is_perception_against_the_record
 def test_an_object_that_is_lost_earlier_is_contact_and_says_where() -> None:
     dropped = replace(telling("recorded"), touches={"cube": (ns(1.0), ns(2.2))})
     divergence = diverge("p", [telling("executed"), dropped], CONFIG)
-    assert [item.attribution for item in divergence.partings] == ["contact"]
-    assert "let go of 0.80 s earlier in the recording" in divergence.partings[0].detail
-    assert divergence.partings[0].first_t_ns == ns(2.2)
+    assert [item.attribution for item in divergence.quantities] == ["contact"]
+    assert "let go of 0.80 s earlier in the recording" in divergence.quantities[0].detail
+    assert divergence.quantities[0].first_t_ns == ns(2.2)
 
 
 def test_fingers_that_hold_another_width_hold_another_part() -> None:
@@ -125,11 +125,11 @@ def test_an_object_that_lies_elsewhere_after_all_else_agreed_is_contact() -> Non
     p = end.p_m + np.array([[0, 0, 0], [0.05, 0, 0]])
     rolled = replace(trace, objects={"cube": replace(end, p_m=p)})
     divergence = diverge("p", [telling("planned"), rolled], CONFIG)
-    (parting,) = divergence.partings
-    assert (parting.quantity, parting.attribution, parting.body) == (
+    (found,) = divergence.quantities
+    assert (found.quantity, found.attribution, found.body) == (
         "object_position", "contact", "cube"
     )  # fmt: skip
-    assert parting.size == pytest.approx(0.05)
+    assert found.size == pytest.approx(0.05)
 
 
 def test_what_parts_later_carries_the_name_of_what_parted_first() -> None:

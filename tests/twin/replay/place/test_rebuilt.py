@@ -68,7 +68,7 @@ def test_the_lattice_of_the_scene_is_taken_and_named(run: RunFolder) -> None:
     assert place.shape_sources["sloth"].startswith("lattice of the scene")
     body = SoftModel.from_lattice(place.lattices["sloth"], TASK.objects["sloth"])
     assert len(body.nodes_m) == len(SoftModel.from_task(TASK.objects["sloth"]).nodes_m)
-    assert any("sdf.npz" in remark for remark in place.remarks)
+    assert any("sdf.npz" in note for note in place.notes)
 
 
 def test_a_mesh_that_is_not_watertight_is_not_believed(run: RunFolder) -> None:
@@ -90,7 +90,7 @@ def test_a_damaged_lattice_is_passed_over_with_the_reason(run: RunFolder) -> Non
     place = read_rebuilt_scene(run, TASK)
     assert not place.lattices
     assert "soft.npz" in place.shape_sources["sloth"]
-    assert any("sloth: shape of the task file" in remark for remark in place.remarks)
+    assert any("sloth: shape of the task file" in note for note in place.notes)
 
 
 def write_distances(run: RunFolder, observed_m: float) -> None:

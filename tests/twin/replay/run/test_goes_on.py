@@ -17,8 +17,8 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
+from bridge.robots.default import ARM_JOINTS
 from bridge.task.plan import Plan
-from bridge.task.robot import ARM_JOINTS
 from bridge.terminal import Output
 from twin.replay import runner
 from twin.replay.config import ReplayConfig, ReplayRunConfig

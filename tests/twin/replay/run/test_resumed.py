@@ -17,8 +17,8 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import MissingDependencyError, UsageError
+from bridge.process_pool import Failed
 from bridge.task.record import parse_record
-from twin.crew.pool import Failed
 from twin.replay import runner, workers
 from twin.replay.config import ReplayConfig
 from twin.replay.job import ReplayJob, row_of_existing, run_job

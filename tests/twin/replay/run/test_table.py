@@ -1,4 +1,4 @@
-"""The tables at the end of a replay: counts, planned and executed against recorded, partings."""
+"""The tables at the end of a replay: counts, planned and executed against recorded, divergence."""
 
 from typing import Any
 
@@ -51,9 +51,9 @@ def summary() -> dict[str, Any]:
 def test_an_executed_plan_has_one_line_with_every_side() -> None:
     first, second = executions_of(ROWS, LABELS)
     assert (first["recorded"], first["recorded_predicates"]) == ("success", True)
-    assert (first["planned"], first["executed"], first["apart"]) == (True, True, None)
+    assert (first["planned"], first["executed"], first["divergence"]) == (True, True, None)
     assert (second["planned"], second["executed"]) == (True, False)
-    assert second["apart"]["attribution"] == "perception"
+    assert second["divergence"]["attribution"] == "perception"
 
 
 def test_a_plan_that_was_never_executed_is_in_no_cross_table() -> None:

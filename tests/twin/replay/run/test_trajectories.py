@@ -17,10 +17,10 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
+from bridge.process_pool import ProcessPool, Serial
 from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
 from twin import cli
-from twin.crew.pool import Alone, Crew
 from twin.replay import job as job_module
 from twin.replay import runner as runner_module
 from twin.replay import workers
@@ -123,7 +123,7 @@ def test_every_plan_and_every_execution_becomes_one_episode(
     (path,) = run.derived("trial_0001.replay.executed.dynamic.*")
     record = divergence_of(Episode.open(path))
     assert record is not None
-    assert all(item["between"] != ["planned", "executed"] for item in record["partings"])
+    assert all(item["between"] != ["planned", "executed"] for item in record["quantities"])
 
     stamps = {path: path.stat().st_mtime_ns for path in run.derived()}
     again = replay_run(run, ReplayRunConfig(replay=QUICK), QUIET)
@@ -179,12 +179,12 @@ def _check_file(run: RunFolder, pattern: str) -> None:
     assert np.linalg.norm(cube.p_m[-1] - cube.p_m[0]) > 0.2
 
 
-class CrewForReplays(Crew):
+class PoolForReplays(ProcessPool):
     """Lists jobs in this process, where the fixture localises; replays in the others."""
 
     def run(self, function: Any, items: Any, cost: Any) -> Any:
-        """See ``Crew``."""
-        runner = Alone() if function is runner_module.jobs_of else super()
+        """See ``ProcessPool``."""
+        runner = Serial() if function is runner_module.jobs_of else super()
         return runner.run(function, items, cost)
 
 
@@ -195,7 +195,7 @@ def test_two_processes_say_what_one_process_says(
     config = ReplayRunConfig(replay=QUICK)
     replay_run(run, config, QUIET)
     before = {path.name: _messages(path) for path in run.derived("*.replay.*")}
-    monkeypatch.setattr(workers, "Crew", CrewForReplays)
+    monkeypatch.setattr(workers, "ProcessPool", PoolForReplays)
     summary = replay_run(run, replace(config, workers=2, force=True), QUIET)
     assert not any(row["skipped"] or row["error"] for row in summary["rows"])
     assert {path.name: _messages(path) for path in run.derived("*.replay.*")} == before
@@ -262,7 +262,7 @@ def test_a_run_without_plans_says_so(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_is_no_run_is_refused_and_stays_as_it_is(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="is not a run: it holds no folder episodes"):
+    with pytest.raises(UsageError, match="no episodes in"):
         cli.replay(tmp_path)
     assert not list(tmp_path.iterdir())
 

@@ -86,7 +86,6 @@ def test_a_loaded_machine_gives_the_same_verdict(tmp_path: Path, script: SimpleN
     with TwinProcess(run.path, scene.task, config, Output(quiet=True)) as twin:
         idle = twin.replay(plan, found, scene.urdf, soon(300))
         assert twin._worker is not None
-        assert twin._worker.pid is not None
         with slowed(twin._worker.pid):
             loaded = twin.replay(plan, found, scene.urdf, soon(300))
     assert idle.p_success is not None

@@ -7,10 +7,10 @@ from functools import cache
 import numpy as np
 
 from bridge.geometry import se3
+from bridge.robots.default import ROBOT
 from bridge.sources.standin.cell_file import load_cell, nominal_hidden
 from bridge.sources.standin.render import Renderer, measure_depth
 from bridge.sources.standin.surfaces import object_surfaces, robot_surfaces, room_surfaces
-from bridge.task.robot import ur5_with_gripper_urdf
 from bridge.task.task_file import load_task
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import Posture
@@ -38,7 +38,7 @@ class CellErrors:
 
 
 def robot() -> RobotModel:
-    return load_robot(ur5_with_gripper_urdf())
+    return load_robot(ROBOT.urdf_text())
 
 
 @cache

@@ -83,7 +83,7 @@ def test_a_fixed_camera_elsewhere_is_said_and_one_read_wrongly_is_refused(
 ) -> None:
     run = RunFolder.create(tmp_path_factory.mktemp("run"))
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=8)
-    choice = choose_frames(find_sources(run), CONFIG)[0]
+    choice = choose_frames(find_sources(run), CONFIG).choices[0]
     wrist = CameraCheck(choice=choice, images=thumbs(), trusted=[1.0] * NUM)
     still = replace(choice, camera_id="side", stationary=True)
 

@@ -32,7 +32,7 @@ CONFIG = FrameConfig()
 def choice(tmp_path_factory: pytest.TempPathFactory) -> FrameChoice:
     run = RunFolder.create(tmp_path_factory.mktemp("run"))
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=8)
-    return choose_frames(find_sources(run), CONFIG)[0]
+    return choose_frames(find_sources(run), CONFIG).choices[0]
 
 
 def camera(choice: FrameChoice, *, count: int = 8, depth_times: float = 1.0) -> CameraCheck:
@@ -144,7 +144,7 @@ def test_frames_whose_pose_is_not_a_number_are_left_out(
     run = RunFolder.create(tmp_path)
     for _ in spoilt_transforms(monkeypatch, bad):
         textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=12)
-    (choice,) = choose_frames(find_sources(run), CONFIG, Output())
+    (choice,) = choose_frames(find_sources(run), CONFIG, Output()).choices
     used = choice.train_ns | choice.holdout_ns
     assert not used & bad.keys()
     assert len(choice.train_ns) >= 7
@@ -161,7 +161,7 @@ def test_a_camera_that_tf_knows_nothing_of_is_followed_by_its_images(
     run = RunFolder.create(tmp_path)
     for _ in spoilt_transforms(monkeypatch, None):
         textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=24)
-    (choice,) = choose_frames(find_sources(run), CONFIG)
+    (choice,) = choose_frames(find_sources(run), CONFIG).choices
     assert choice.poses.source == "odometry"
     assert root_frame(choice) == "odometry_scan_wrist"
     assert choice.poses.quality["agreement"] > 0.8

@@ -1,7 +1,10 @@
+from collections.abc import Sequence
+
 import numpy as np
 import textured_room
+from jaxtyping import Float32
 
-from twin.scene.fit.appearance import FeatureObservation, feature_loss, solve_features
+from twin.scene.fit.appearance import FeatureObservation, solve_features
 from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface
 from twin.scene.gaussians import GaussianCloud
@@ -10,6 +13,23 @@ from twin.scene.settings import InitialiseConfig
 
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 NUM_FEATURES = 7
+
+
+def feature_loss(
+    cloud: GaussianCloud,
+    features: Float32[np.ndarray, "num_splats num_features"],
+    observations: Sequence[FeatureObservation],
+    rasteriser: Rasteriser,
+) -> float:
+    """Mean squared difference of drawn and given features where they are valid (Eq. 3)."""
+    total, count = 0.0, 0
+    for item in observations:
+        rasteriser.draw_planes(cloud, item.camera, item.T_base_camera)
+        drawn = rasteriser.draw_features(np.ascontiguousarray(features))
+        wrong = (drawn - item.values)[:, item.valid_mask]
+        total += float(np.square(wrong, dtype=np.float64).sum())
+        count += wrong.size
+    return total / max(count, 1)
 
 
 def room_with_features() -> tuple[GaussianCloud, np.ndarray, list[FeatureObservation]]:

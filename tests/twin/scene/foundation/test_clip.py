@@ -8,7 +8,7 @@ import pytest
 from model_inputs import CPU, picture
 
 from bridge.errors import UsageError
-from twin.scene.foundation.models import ClipEmbedder, masked_crop, open_clip
+from twin.scene.foundation.models import ClipEmbedder, masked_crop
 
 pytest.importorskip("transformers", reason="the extra [foundation] is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_network")]
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_network")]
 def test_clip_gives_unit_vectors_and_a_batch_is_as_good_as_one_by_one(
     saved: Callable[[str], Path],
 ) -> None:
-    embedder = open_clip(saved("clip"), CPU)
+    embedder = ClipEmbedder.load(saved("clip"), CPU)
     texts = embedder.encode(["red cube", "a yellow duck", "robot"])
     assert texts.shape == (3, embedder.num_channels) == (3, 16)
     np.testing.assert_allclose(np.linalg.norm(texts, axis=1), 1.0, atol=1e-5)

@@ -8,7 +8,7 @@ import pytest
 from model_inputs import CPU, picture
 
 from bridge.errors import UsageError
-from twin.scene.foundation.models import DinoFeatures, open_features
+from twin.scene.foundation.models import DinoFeatures
 
 pytest.importorskip("transformers", reason="the extra [foundation] is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_network")]
@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_network")]
 def test_dino_maps_cover_the_image_and_a_batch_is_as_good_as_one_by_one(
     saved: Callable[[str], Path], name: str, cell: int
 ) -> None:
-    source = open_features(f"dinov3:{saved(name)}", CPU)
+    source = DinoFeatures.load(saved(name), CPU)
     images = [picture(96, 128, seed) for seed in range(3)]
     maps = source.features(images)
     for image, found in zip(images, maps, strict=True):

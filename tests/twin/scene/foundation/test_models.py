@@ -16,12 +16,12 @@ from bridge.errors import MissingDependencyError, UsageError
 from twin.scene.foundation import loading
 from twin.scene.foundation.loading import Placement, WeightsError
 from twin.scene.foundation.models import (
+    FEATURES,
+    SEGMENTERS,
     ClipEmbedder,
     DinoFeatures,
     Sam3Segmenter,
-    open_clip,
-    open_features,
-    open_segmenter,
+    split_spec,
 )
 
 pytest.importorskip("transformers", reason="the extra [foundation] is not installed")
@@ -37,7 +37,7 @@ def test_weights_of_another_model_or_without_some_numbers_are_refused(
     from safetensors.torch import load_file, save_file
 
     with pytest.raises(WeightsError, match="type 'clip', not 'sam3'"):
-        open_segmenter(f"sam3:{saved('clip')}", CPU)
+        Sam3Segmenter.load(saved("clip"), CPU)
     for path in saved("dino_vit").iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     tensors = load_file(tmp_path / "model.safetensors")
@@ -45,7 +45,7 @@ def test_weights_of_another_model_or_without_some_numbers_are_refused(
     del tensors[lost]
     save_file(tensors, tmp_path / "model.safetensors", metadata={"format": "pt"})
     with pytest.raises(WeightsError, match="parameters have no values"):
-        open_features(f"dinov3:{tmp_path}", CPU)
+        DinoFeatures.load(tmp_path, CPU)
 
 
 def test_code_in_a_folder_is_never_run(saved: Callable[[str], Path], tmp_path: Path) -> None:
@@ -59,18 +59,18 @@ def test_code_in_a_folder_is_never_run(saved: Callable[[str], Path], tmp_path: P
         content["auto_map"] = {"AutoModel": "evil.Model", "AutoTokenizer": ["evil.T", "evil.T"]}
         (tmp_path / name).write_text(json.dumps(content))
     with contextlib.suppress(WeightsError):  # refusing them is as good as ignoring the code
-        open_clip(tmp_path, CPU).encode(["duck"])
+        ClipEmbedder.load(tmp_path, CPU).encode(["duck"])
     assert not (tmp_path / "ran").exists()
 
 
 def test_what_is_written_on_the_command_line_is_explained_when_it_is_wrong(tmp_path: Path) -> None:
     for spec in ("sam3", "sam3:", "sam2:folder", ""):
         with pytest.raises(UsageError, match="write sam3:FOLDER"):
-            open_segmenter(spec)
+            split_spec(spec, "--segmenter", SEGMENTERS)
     with pytest.raises(UsageError, match="write dinov3:FOLDER"):
-        open_features("sam3:folder")
+        split_spec("sam3:folder", "--features", FEATURES)
     with pytest.raises(WeightsError, match="no such folder"):
-        open_clip(tmp_path / "nothing")
+        ClipEmbedder.load(tmp_path / "nothing")
     with pytest.raises(UsageError, match="number type 'int8'"):
         Placement(dtype="int8").resolve()
     with pytest.raises(UsageError, match="device 'toaster'"):

@@ -8,7 +8,7 @@ import pytest
 from model_inputs import ALL_QUERIES, CPU, picture
 
 from bridge.errors import UsageError
-from twin.scene.foundation.models import Sam3Config, Sam3Segmenter, open_segmenter
+from twin.scene.foundation.models import Sam3Config, Sam3Segmenter
 
 pytest.importorskip("transformers", reason="the extra [foundation] is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_network")]
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_network")]
 def test_sam3_gives_masks_of_the_image_s_size_with_scores_from_0_to_1(
     saved: Callable[[str], Path],
 ) -> None:
-    segmenter = open_segmenter(f"sam3:{saved('sam3')}", CPU, ALL_QUERIES)
+    segmenter = Sam3Segmenter.load(saved("sam3"), CPU, ALL_QUERIES)
     found = segmenter.segment(picture(), ["red cube", "duck"], camera_id="wrist", stamp_ns=7)
     assert (found.camera_id, found.stamp_ns, found.source) == ("wrist", 7, "SAM 3")
     assert len(found.masks) == 20  # ten queries each

@@ -23,16 +23,14 @@ from twin.scene.foundation.stage import (
     check_models,
     embed_things,
     prompts_of,
-    spread,
     thing_vectors,
     viewpoint_of,
 )
-from twin.scene.frames.selection import choose_frames, find_sources
+from twin.scene.frames.selection import choose_frames, find_sources, spread
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.rebuild.run import rebuild
 from twin.scene.rebuild.semantics import ask_models_about, training_frames
-from twin.scene.semantics.features import load_features
 from twin.scene.semantics.language import query
 from twin.scene.semantics.result import Instance, SemanticScene
 from twin.scene.settings import FitConfig, FrameConfig, InitialiseConfig, ModelConfig, RebuildConfig
@@ -143,10 +141,10 @@ def test_prompts_are_those_given_or_the_names_of_the_task_s_objects() -> None:
 
 
 def test_frames_are_spread_evenly() -> None:
-    assert spread(list(range(100)), 5) == [0, 25, 50, 74, 99]
-    assert spread([7, 8], 5) == [7, 8]
-    assert spread([], 5) == []
-    assert spread([3], 1) == [3]
+    assert spread(np.arange(100), 5).tolist() == [0, 25, 50, 74, 99]
+    assert spread(np.array([7, 8]), 5).tolist() == [7, 8]
+    assert spread(np.zeros(0), 5).tolist() == []
+    assert spread(np.array([3]), 1).tolist() == [3]
 
 
 def test_bad_options_are_refused_before_anything_slow(tmp_path: Path) -> None:
@@ -204,38 +202,38 @@ def test_all_three_models_are_asked_and_what_they_say_is_kept(
     scene = things(labels)
     record = embed_things(tmp_path, scene, cloud, frames, found.features, config)
     assert record["never_shown"] == ["hidden thing"]
-    again = load_features(tmp_path / "features.npz", len(cloud))
-    assert again.instance_ids.tolist() == [1, 2, 9]
-    assert again.instance_embeddings.shape == (3, 16)
-    assert again.source == "DINOv3, CLIP"
+    with np.load(tmp_path / "features.npz") as written:
+        again = dict(written)
+    assert again["instance_ids"].tolist() == [1, 2, 9]
+    assert again["instance_embeddings"].shape == (3, 16)
+    assert again["source"].tobytes() == b"DINOv3, CLIP"
     answer = query(
         scene,
         "red duck",
-        embeddings=again.instance_embeddings,
+        embeddings=again["instance_embeddings"],
         encoder=ClipEmbedder.load(saved("clip")),
     )
     assert answer.source == "CLIP"
     assert all(0.0 <= value <= 1.0 for value in answer.objects.values())
     alone = embed_things(tmp_path, scene, cloud, frames, None, config)
     assert alone["source"] == "CLIP"
-    assert load_features(tmp_path / "features.npz", len(cloud)).features.shape == (len(cloud), 0)
+    with np.load(tmp_path / "features.npz") as written:
+        assert written["features"].shape == (len(cloud), 0)
     with pytest.raises(UsageError, match="--clip FOLDER"):
         embed_things(tmp_path, scene, cloud, frames, None, replace(config, clip=""))
 
 
 def test_without_any_model_nothing_is_read_or_asked() -> None:
-    consulted = ask_models_about(ModelConfig(), [], heaps()[0], None, Output(quiet=True))
-    assert (consulted.frames, consulted.findings.masks) == ([], [])
-    assert consulted.findings.features is None
-    assert consulted.give_vectors(Path("nowhere"), {}, heaps()[0], Output(quiet=True)) == {}
+    frames, found = ask_models_about(ModelConfig(), [], heaps()[0], None, Output(quiet=True))
+    assert (frames, found.masks, found.features) == ([], [], None)
 
 
-def test_training_frames_are_spread_over_what_is_learnt_from(tmp_path: Path) -> None:
+def test_training_frames_are_spread_over_those_of_the_fit(tmp_path: Path) -> None:
     import textured_room  # beside the tests one folder up, see conftest there
 
     run = RunFolder.create(tmp_path)
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=16)
-    choices = choose_frames(find_sources(run), FrameConfig(holdout_every=4))
+    choices = choose_frames(find_sources(run), FrameConfig(holdout_every=4)).choices
     stamps = sorted(choices[0].train_ns)
     found = [frame.stamp_ns for frame in training_frames(choices, 4)]
     assert len(found) == 4

@@ -11,7 +11,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import JointTrack
 from bridge.errors import GstError
-from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
+from bridge.robots.default import ARM_JOINTS, ROBOT
 from bridge.terminal import Output
 from twin.robot.posture import PostureTrack
 from twin.scene.frames.selection import choose_frames, find_sources
@@ -38,7 +38,7 @@ def run(tmp_path: Path) -> RunFolder:
 
 def joints_at(monkeypatch: pytest.MonkeyPatch, stamps_ns: np.ndarray, position: np.ndarray) -> None:
     arm = JointTrack(names=tuple(ARM_JOINTS), stamps_ns=stamps_ns, position=position)
-    track = PostureTrack(urdf=ur5_with_gripper_urdf(), arm=arm, widths=None)
+    track = PostureTrack(urdf=ROBOT.urdf_text(), arm=arm, widths=None)
     answer: Callable[[Episode], PostureTrack] = lambda _episode: track  # noqa: E731
     monkeypatch.setattr(calibration_module, "posture_track", answer)
 
@@ -51,7 +51,9 @@ def test_images_without_joints_around_them_are_left_out_and_counted(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     joints_at(monkeypatch, np.arange(1 * S, 2 * S, S // 100), moving(100))
-    (choice,) = choose_frames(find_sources(run), FrameConfig(), Output(), read_calibration(run))
+    (choice,) = choose_frames(
+        find_sources(run), FrameConfig(), Output(), read_calibration(run)
+    ).choices
     assert choice.poses.source == "hand-eye"
     assert max(choice.train_ns | choice.holdout_ns) < 2.5 * S
     assert "frames of camera wrist are left out: joints" in " ".join(
@@ -68,7 +70,7 @@ def test_joints_that_are_no_numbers_place_no_camera(
     joints_at(monkeypatch, stamps, position)
     (choice,) = choose_frames(
         find_sources(run), FrameConfig(), Output(quiet=True), read_calibration(run)
-    )
+    ).choices
     assert max(choice.train_ns | choice.holdout_ns) < 2 * S
 
 

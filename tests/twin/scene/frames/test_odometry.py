@@ -28,8 +28,8 @@ def test_a_real_camera_is_followed_to_a_few_centimetres(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path)
     messages = (m for frame in folder_messages(read_index(KITCHEN), config, None) for m in frame)
     write_scan(run, EpisodeInfo(id="scan", kind="scan", cell=config.cell), messages, source={})
-    (given,) = choose_frames(find_sources(run), FrameConfig(poses="tf"))
-    (followed,) = choose_frames(find_sources(run), FrameConfig(poses="odometry"))
+    (given,) = choose_frames(find_sources(run), FrameConfig(poses="tf")).choices
+    (followed,) = choose_frames(find_sources(run), FrameConfig(poses="odometry")).choices
     assert followed.poses.source == "odometry"
     assert not followed.poses.unposed_ns
     stamps = np.array(sorted(followed.train_ns | followed.holdout_ns))

@@ -99,7 +99,7 @@ def test_turning_counts_as_path_and_standing_still_hardly_does() -> None:
 def test_smear_is_focal_length_times_angular_speed_times_exposure(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path)
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9)
-    (choice,) = choose_frames(find_sources(run), FrameConfig())
+    (choice,) = choose_frames(find_sources(run), FrameConfig()).choices
     stamps = np.array([1_400_000_000])
     (found,) = smear_px(choice.poses.tree, "wrist_color_optical", stamps, 60.0)
     a, b = textured_room.camera_pose(3, 9), textured_room.camera_pose(5, 9)
@@ -115,7 +115,7 @@ def test_a_fixed_protocol_learns_from_every_fifth_and_holds_out_the_one_two_afte
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=20)
     (choice,) = choose_frames(
         find_sources(run), FrameConfig(train_every=5, holdout_every=5, holdout_offset=2)
-    )
+    ).choices
     index = {1_000_000_000 + 100_000_000 * k: k for k in range(20)}
     assert sorted(index[s] for s in choice.train_ns) == [0, 5, 10, 15]
     assert sorted(index[s] for s in choice.holdout_ns) == [2, 7, 12, 17]
@@ -125,7 +125,7 @@ def test_the_choice_is_the_same_every_time(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path)
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=24)
     config = FrameConfig(max_train_frames=9)
-    first, second = (choose_frames(find_sources(run), config)[0] for _ in range(2))
+    first, second = (choose_frames(find_sources(run), config).choices[0] for _ in range(2))
     assert first.train_ns == second.train_ns
     assert len(first.train_ns) <= 9
     assert not first.train_ns & first.holdout_ns

@@ -69,7 +69,7 @@ def test_frames_after_the_last_pose_are_left_out_and_counted(
         lambda items: [item for item in items if item.stamp_ns < 2 * SECOND],
         num_frames=30,
     )
-    (choice,) = choose_frames(find_sources(run), FrameConfig(), Output())
+    (choice,) = choose_frames(find_sources(run), FrameConfig(), Output()).choices
     assert max(choice.train_ns | choice.holdout_ns) <= 1.9 * SECOND + 0.5 * SECOND
     said = " ".join(capsys.readouterr().err.split())
     assert "15 of 30 frames of camera wrist are left out: /tf says nothing within 0.5 s" in said
@@ -86,7 +86,7 @@ def test_a_camera_that_stands_still_may_say_so_once(
         ]
 
     write(run, monkeypatch, first_pose)
-    (choice,) = choose_frames(find_sources(run), FrameConfig(), QUIET)
+    (choice,) = choose_frames(find_sources(run), FrameConfig(), QUIET).choices
     assert choice.stationary
     assert not choice.poses.unposed_ns
 
@@ -159,7 +159,7 @@ def test_one_camera_that_cannot_be_used_is_named_and_the_others_are_kept(
 ) -> None:
     other_info(monkeypatch, run, lambda c: replace(c, width=128, height=96))
     textured_room.write_episode(run.episodes_dir / "scan_2.mcap", num_frames=6)
-    (choice,) = choose_frames(find_sources(run), FrameConfig(), Output())
+    (choice,) = choose_frames(find_sources(run), FrameConfig(), Output()).choices
     assert choice.episode.info.id == "scan_2"
     assert "left out: camera wrist of episode scan " in " ".join(capsys.readouterr().err.split())
 
@@ -207,7 +207,7 @@ def test_what_hangs_on_a_world_frame_is_given_in_the_robots_base(
         return [*items, world, room]
 
     write(run, monkeypatch, hang)
-    (choice,) = choose_frames(find_sources(run), FrameConfig(), QUIET)
+    (choice,) = choose_frames(find_sources(run), FrameConfig(), QUIET).choices
     assert root_frame(choice) == "base_link"
     for frame in load(choice, choice.train_ns):
         index = round((frame.stamp_ns - SECOND) / 100_000_000)
@@ -229,13 +229,13 @@ def test_a_base_that_drives_about_is_not_the_root(
         ]
 
     write(run, monkeypatch, drive)
-    (choice,) = choose_frames(find_sources(run), FrameConfig(), QUIET)
+    (choice,) = choose_frames(find_sources(run), FrameConfig(), QUIET).choices
     assert root_frame(choice) == "odom"
 
 
 def test_the_wanted_frames_are_those_that_reading_all_of_them_gives(run: RunFolder) -> None:
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9)
-    (choice,) = choose_frames(find_sources(run), FrameConfig(), QUIET)
+    (choice,) = choose_frames(find_sources(run), FrameConfig(), QUIET).choices
     wanted = choice.train_ns
     episode = Episode.open(run.episodes_dir / "scan.mcap")
     expected = [f for f in streams.rgbd_frames(episode, "wrist") if f.stamp_ns in wanted]

@@ -4,8 +4,9 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from reference_loss import Loss
 
-from twin.scene.raster.rasteriser import Loss, psnr_db
+from twin.scene.raster.rasteriser import psnr_db
 
 Kind = Literal["3dgs", "paper"]
 

@@ -4,6 +4,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from reference_loss import Loss
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
@@ -11,7 +12,6 @@ from twin.scene.frames.rgbd import Target
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32
 from twin.scene.raster.rasteriser import (
     FitSession,
-    Loss,
     RasterConfig,
     Rasteriser,
     available_isas,

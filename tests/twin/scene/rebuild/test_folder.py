@@ -169,7 +169,7 @@ def test_objects_are_not_looked_for_in_held_out_frames(
     monkeypatch.setattr(parts_module, "localise_episode", localise)
     monkeypatch.setattr(Episode, "info", EpisodeInfo(id="s", kind="scan", task="cube_into_box"))
     sources = find_sources(room)
-    choices = choose_frames(sources, FrameConfig(holdout_every=3))
+    choices = choose_frames(sources, FrameConfig(holdout_every=3)).choices
     cloud = fuse(
         [FrameSurface(textured_room.frame(0, 9), LIMITS).points()], InitialiseConfig(max_splats=50)
     )
@@ -185,7 +185,7 @@ def test_objects_are_not_cut_out_of_a_scene_in_a_frame_of_its_own(
     monkeypatch.setattr(parts_module, "localise_episode", lambda *a, **k: pytest.fail("localised"))
     monkeypatch.setattr(Episode, "info", EpisodeInfo(id="s", kind="scan", task="cube_into_box"))
     sources = find_sources(room)
-    (choice,) = choose_frames(sources, FrameConfig())
+    (choice,) = choose_frames(sources, FrameConfig()).choices
     followed = replace(choice, poses=replace(choice.poses, source="odometry"))
     cloud = fuse(
         [FrameSurface(textured_room.frame(0, 9), LIMITS).points()], InitialiseConfig(max_splats=50)

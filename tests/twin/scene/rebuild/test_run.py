@@ -43,7 +43,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 
 def test_held_out_frames_are_never_learnt_from(room: RunFolder) -> None:
-    (choice,) = choose_frames(find_sources(room), FrameConfig(holdout_every=4))
+    (choice,) = choose_frames(find_sources(room), FrameConfig(holdout_every=4)).choices
     assert len(choice.holdout_ns) == 4
     assert len(choice.train_ns) == 12
     assert not choice.holdout_ns & choice.train_ns
@@ -179,7 +179,7 @@ def test_scans_are_preferred_and_their_absence_is_said(tmp_path: Path) -> None:
 def test_a_camera_that_stands_still_is_known_as_such(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path)
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=24, still=True)
-    (choice,) = choose_frames(find_sources(run), FrameConfig())
+    (choice,) = choose_frames(find_sources(run), FrameConfig()).choices
     assert choice.stationary
     assert len(choice.train_ns) == 4
     assert len(choice.holdout_ns) == 2

@@ -15,7 +15,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.geometry import se3
 from bridge.media.color import decode_color
-from bridge.task.robot import ur5_with_gripper_urdf
+from bridge.robots.default import ROBOT
 from twin.scene import render as compose_module
 from twin.scene.gaussians import (
     GaussianCloud,
@@ -141,7 +141,7 @@ def with_robot(room: RunFolder, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
     scene = read_scene(room)
     links = {"base_link": blob(1), "tool0": blob(2)}
     write_record(room, {**scene.record, "robot": {"links": write_links(room, links)}})
-    urdf = ur5_with_gripper_urdf()
+    urdf = ROBOT.urdf_text()
     monkeypatch.setattr(compose_module.streams, "robot_description", lambda _episode: urdf)
     return room
 

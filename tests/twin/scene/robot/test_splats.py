@@ -15,7 +15,7 @@ from bridge.episode.streams import RgbdFrame
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
+from bridge.robots.default import ARM_JOINTS, ROBOT
 from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture, posture_track
 from twin.robot.surface import PosedSurface, sample_surface
@@ -25,7 +25,7 @@ from twin.scene.robot.extraction import RobotFrames, robot_mask
 from twin.scene.robot.splats import bind, posed, read_links, write_links
 from twin.scene.settings import InitialiseConfig
 
-URDF = ur5_with_gripper_urdf()
+URDF = ROBOT.urdf_text()
 HOME = np.array([-0.26, -1.71, 1.37, -1.23, -1.57, 1.31])
 AWAY = np.array([1.3, -1.30, 1.10, -1.60, -1.20, 0.40])
 WIDTH_M = 0.04
@@ -174,10 +174,10 @@ def episode(tmp_path_factory: pytest.TempPathFactory) -> Episode:
 
 def test_postures_know_when_the_robot_stood_still(episode: Episode) -> None:
     track = posture_track(episode)
-    assert track.is_still(SECOND)
-    assert not track.is_still(2 * SECOND)
-    assert track.is_still(3 * SECOND)
-    assert not track.is_still(30 * SECOND)
+    assert track.is_stationary(SECOND)
+    assert not track.is_stationary(2 * SECOND)
+    assert track.is_stationary(3 * SECOND)
+    assert not track.is_stationary(30 * SECOND)
     np.testing.assert_allclose(track.at(3 * SECOND).joints_rad, AWAY, atol=1e-9)
     assert track.at(SECOND).width_m == pytest.approx(WIDTH_M)
 

@@ -21,7 +21,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.media.color import encode_png
-from bridge.task.robot import ARM_JOINTS, ur5_with_gripper_urdf
+from bridge.robots.default import ARM_JOINTS, ROBOT
 from bridge.terminal import Output
 from twin.scene.dataset.training_set import read_training_set
 from twin.scene.frames.selection import choose_frames, find_sources
@@ -53,7 +53,7 @@ def write_scan(path: Path, root: str, T_root_base: np.ndarray, *, with_joints: b
 
         writer.describe(EpisodeInfo(id=path.stem, kind="scan", cell="c", stand_in=True))
         put("/tf_static", transforms_to_cdr([pose]), schema.TF_MESSAGE, 1)
-        put("/robot_description", string_to_cdr(ur5_with_gripper_urdf()), schema.STRING, 1)
+        put("/robot_description", string_to_cdr(ROBOT.urdf_text()), schema.STRING, 1)
         for stream in ("color", "depth"):
             put(f"/c/cam/side/{stream}/info", info, schema.CAMERA_INFO, 1)
         for index, joints in enumerate(cell_views.POSTURES):
@@ -87,7 +87,7 @@ def run(tmp_path: Path) -> RunFolder:
 
 def test_in_the_robots_own_frame_its_links_are_collected(run: RunFolder) -> None:
     write_scan(run.episodes_dir / "scan.mcap", "base_link", np.eye(4))
-    choices = choose_frames(find_sources(run), FrameConfig(), QUIET)
+    choices = choose_frames(find_sources(run), FrameConfig(), QUIET).choices
     training = read_training_set(choices, RebuildConfig(), QUIET)
     assert training.robot.alignment is None
     assert training.robot.remark == ""
@@ -103,7 +103,7 @@ def test_in_the_robots_own_frame_its_links_are_collected(run: RunFolder) -> None
 def test_in_a_foreign_frame_the_robot_is_found_by_what_it_looks_like(run: RunFolder) -> None:
     T_root_base = cell_views.anywhere(3)
     write_scan(run.episodes_dir / "scan.mcap", "room", T_root_base)
-    choices = choose_frames(find_sources(run), FrameConfig(), QUIET)
+    choices = choose_frames(find_sources(run), FrameConfig(), QUIET).choices
     found = find_robot(choices, QUIET)
     assert found.alignment is not None
     change = found.frames.T_base_root @ T_root_base
@@ -116,7 +116,7 @@ def test_in_a_foreign_frame_the_robot_is_found_by_what_it_looks_like(run: RunFol
 
 def test_without_joints_everything_stays_and_the_record_says_why(run: RunFolder) -> None:
     write_scan(run.episodes_dir / "scan.mcap", "room", np.eye(4), with_joints=False)
-    choices = choose_frames(find_sources(run), FrameConfig(), QUIET)
+    choices = choose_frames(find_sources(run), FrameConfig(), QUIET).choices
     found = find_robot(choices, QUIET)
     assert found.alignment is None
     assert "joint states" in found.remark

@@ -5,12 +5,11 @@ from table_scene import BLUE, GREEN, RED, World, box, duck, ellipsoid, iou, make
 
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default
+from twin.scene.semantics.lift import render_labels
 from twin.scene.semantics.segment import (
     Segmentation,
     SegmentConfig,
-    masks_from_labels,
     points_of,
-    segment_frame,
     segment_points,
 )
 from twin.scene.semantics.shape_descriptors import NoSupportError
@@ -40,28 +39,16 @@ def test_everything_on_the_table_is_found_and_named(tabletop: World) -> None:
     assert len(found.things) == 4
 
 
-def test_one_view_is_enough_for_masks(tabletop: World) -> None:
-    shot = tabletop.train[0]
-    masks = segment_frame(shot.frame)
-    assert masks.source == "default segmenter"
-    for number, name in tabletop.names.items():
-        truth = shot.instance == number
-        # Of an open box one camera sees two halves with nothing in between.
-        least = 0.5 if "container" in name else 0.85
-        assert max(iou(mask.image, truth) for mask in masks.masks) > least
-
-
 def test_the_fused_scene_gives_masks_of_every_frame(tabletop: World) -> None:
     rasteriser = Rasteriser(RasterConfig(threads=1))
     viewpoints = [shot.viewpoint for shot in tabletop.train]
     scene = scene_by_default(tabletop.cloud, viewpoints, rasteriser)
     assert all(item.support == len(viewpoints) for item in scene.instances)
-    names = [item.label for item in scene.instances]
     shot = tabletop.held_out[0]
-    masks = masks_from_labels(rasteriser, tabletop.cloud, scene.labels, names, shot.viewpoint)
-    for mask in masks.masks:
-        number = next(k for k, name in tabletop.names.items() if name == mask.label)
-        assert iou(mask.image, shot.instance == number) > 0.8
+    ids = render_labels(rasteriser, tabletop.cloud, scene.labels, shot.viewpoint)
+    for index, item in enumerate(scene.instances, start=1):
+        number = next(k for k, name in tabletop.names.items() if name == item.label)
+        assert iou(ids == index, shot.instance == number) > 0.8
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from twin.scene.semantics.shape_descriptors import find_height_map_cavity, height_map, measure_form
+from twin.scene.semantics.shape_descriptors import find_height_map_cavity, height_map, measure_shape
 
 CELL_M = 0.003
 
@@ -33,12 +33,12 @@ def test_an_open_box_has_its_cavity() -> None:
     x, y = grid()
     reach = np.maximum(np.abs(x), np.abs(y))
     height = np.where(reach > 0.054, 0.05, 0.006)
-    form = measure_form(from_above(height), CELL_M)
-    assert form.word == "open container"
-    assert form.cavity is not None
-    assert form.cavity.rim_m == pytest.approx(0.05, abs=0.002)
-    assert form.cavity.floor_m == pytest.approx(0.006, abs=0.002)
-    assert form.cavity.volume_m3 == pytest.approx(0.108**2 * 0.044, rel=0.12)
+    measured = measure_shape(from_above(height), CELL_M)
+    assert measured.word == "open container"
+    assert measured.cavity is not None
+    assert measured.cavity.rim_m == pytest.approx(0.05, abs=0.002)
+    assert measured.cavity.floor_m == pytest.approx(0.006, abs=0.002)
+    assert measured.cavity.volume_m3 == pytest.approx(0.108**2 * 0.044, rel=0.12)
 
 
 def test_a_gap_of_one_cell_does_not_drain_the_cavity() -> None:
@@ -46,7 +46,7 @@ def test_a_gap_of_one_cell_does_not_drain_the_cavity() -> None:
     reach = np.maximum(np.abs(x), np.abs(y))
     height = np.where(reach > 0.052, 0.05, 0.006)
     height[:6, 40:42] = 0.006
-    assert measure_form(from_above(height), CELL_M).word == "open container"
+    assert measure_shape(from_above(height), CELL_M).word == "open container"
 
 
 def test_a_missing_wall_does() -> None:
@@ -54,7 +54,7 @@ def test_a_missing_wall_does() -> None:
     reach = np.maximum(np.abs(x), np.abs(y))
     height = np.where(reach > 0.052, 0.05, 0.006)
     height[-8:] = 0.006
-    assert measure_form(from_above(height), CELL_M).cavity is None
+    assert measure_shape(from_above(height), CELL_M).cavity is None
 
 
 @pytest.mark.parametrize(
@@ -64,10 +64,10 @@ def test_a_missing_wall_does() -> None:
 def test_boxes_are_told_by_their_proportions(word: str, size_m: tuple[float, float, float]) -> None:
     x, y = grid(161)
     height = np.where((np.abs(x) < size_m[0] / 2) & (np.abs(y) < size_m[1] / 2), size_m[2], 0.0)
-    form = measure_form(from_above(height), CELL_M)
-    assert form.word == word
-    np.testing.assert_allclose(form.size_m, size_m, atol=0.004)
-    assert 0.7 < form.hull_ratio < 1.2
+    measured = measure_shape(from_above(height), CELL_M)
+    assert measured.word == word
+    np.testing.assert_allclose(measured.size_m, size_m, atol=0.004)
+    assert 0.7 < measured.hull_ratio < 1.2
 
 
 def test_the_box_turns_with_the_thing() -> None:
@@ -76,20 +76,20 @@ def test_the_box_turns_with_the_thing() -> None:
     yaw = 0.5
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     turned = np.column_stack([p[:, :2] @ turn.T + [0.3, -0.1], p[:, 2]])
-    form = measure_form(turned, CELL_M)
-    assert form.yaw_rad == pytest.approx(yaw, abs=0.05)
-    np.testing.assert_allclose(form.centre_m[:2], [0.3, -0.1], atol=0.003)
-    np.testing.assert_allclose(form.size_m, [0.1, 0.04, 0.03], atol=0.003)
+    measured = measure_shape(turned, CELL_M)
+    assert measured.yaw_rad == pytest.approx(yaw, abs=0.05)
+    np.testing.assert_allclose(measured.centre_m[:2], [0.3, -0.1], atol=0.003)
+    np.testing.assert_allclose(measured.size_m, [0.1, 0.04, 0.03], atol=0.003)
 
 
 def test_a_ball_is_a_ball_and_a_cylinder_is_not() -> None:
     rng = np.random.default_rng(1)
     p = rng.normal(size=(4000, 3))
     p = 0.03 * p / np.linalg.norm(p, axis=1, keepdims=True) + [0, 0, 0.03]
-    assert measure_form(p[p[:, 2] > 0.012], CELL_M).word == "ball"
+    assert measure_shape(p[p[:, 2] > 0.012], CELL_M).word == "ball"
     x, y = grid(161)
     can = np.where(np.hypot(x, y) < 0.033, 0.09, 0.0)
-    assert measure_form(from_above(can), CELL_M).word == "cylinder"
+    assert measure_shape(from_above(can), CELL_M).word == "cylinder"
 
 
 def test_the_height_map_keeps_the_highest_and_fills_what_is_enclosed() -> None:

@@ -10,22 +10,24 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import closing
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from twin.crew import pool
-from twin.crew import pool as crew_worker
-from twin.crew.pool import (
+from bridge import process_pool
+from bridge.process_pool import (
     ATTEMPTS,
-    Alone,
-    Crew,
+    MOST,
     Failed,
     NoProcessError,
+    ProcessPool,
+    Serial,
     TimeIsUpError,
     Worker,
     WorkerDiedError,
+    default_size,
 )
 
 KILL_ITSELF = "__import__('os').kill(__import__('os').getpid(), 9)"
@@ -38,7 +40,7 @@ def run(runner: Any, items: Sequence[str], cost: Any = len) -> dict[str, Any]:
 
 def test_every_piece_comes_back_with_its_answer_from_another_process() -> None:
     items = [f"({k} ** 2, __import__('os').getpid())" for k in range(6)]
-    answers = run(Crew(2), items)
+    answers = run(ProcessPool(2), items)
     assert [answers[item][0] for item in items] == [k**2 for k in range(6)]
     pids = {pid for _, pid in answers.values()}
     assert len(pids) <= 2
@@ -46,11 +48,11 @@ def test_every_piece_comes_back_with_its_answer_from_another_process() -> None:
 
 
 def test_one_process_gives_the_same_answers_in_order() -> None:
-    with Alone() as runner:
+    with Serial() as runner:
         assert list(runner.run(eval, ["1 + 1", "2 + 2"], len)) == [("1 + 1", 2), ("2 + 2", 4)]
 
 
-@pytest.mark.parametrize("runner", [Alone(), Crew(2)])
+@pytest.mark.parametrize("runner", [Serial(), ProcessPool(2)])
 def test_what_goes_wrong_with_one_piece_is_its_answer_and_the_others_go_on(runner: Any) -> None:
     answers = run(runner, ["1 / 0", "2 + 2", "nonsense"])
     assert answers["2 + 2"] == 4
@@ -64,7 +66,7 @@ def test_what_goes_wrong_with_one_piece_is_its_answer_and_the_others_go_on(runne
 
 def test_a_disk_that_refuses_is_no_bug_and_a_missing_file_of_ours_is() -> None:
     full = "(_ for _ in ()).throw(OSError(28, 'No space left on device', '/run/derived/a.mcap'))"
-    answers = run(Alone(), [f"next({full})", "open('/nowhere/at/all')"])
+    answers = run(Serial(), [f"next({full})", "open('/nowhere/at/all')"])
     refused, missing = answers[f"next({full})"], answers["open('/nowhere/at/all')"]
     assert refused.message == "the disk refuses at /run/derived/a.mcap: No space left on device"
     assert refused.known
@@ -75,7 +77,7 @@ def test_a_killed_process_costs_only_what_it_was_doing(tmp_path: Path) -> None:
     """What dies each time is tried once more and then named; all others are answered."""
     log = tmp_path / "log"
     deadly = f"open({str(log)!r}, 'a').write('x') and {KILL_ITSELF}"
-    answers = run(Crew(2), [deadly, *(f"{k}" for k in range(8))])
+    answers = run(ProcessPool(2), [deadly, *(f"{k}" for k in range(8))])
     assert [answers[f"{k}"] for k in range(8)] == list(range(8))
     failed = answers[deadly]
     assert isinstance(failed, Failed)
@@ -88,19 +90,19 @@ def test_what_died_by_accident_is_done_at_the_second_try(tmp_path: Path) -> None
     flag = tmp_path / "was here"
     item = f"(__import__('pathlib').Path({str(flag)!r}).exists() or open({str(flag)!r}, 'x') and "
     item += f"{KILL_ITSELF}) and 'done'"
-    assert run(Crew(1), [item, "1"]) == {item: "done", "1": 1}
+    assert run(ProcessPool(1), [item, "1"]) == {item: "done", "1": 1}
 
 
 def test_a_process_killed_while_it_was_idle_is_replaced() -> None:
-    with Crew(1) as crew:
-        ((_, pid),) = crew.run(eval, ["__import__('os').getpid()"], len)
+    with ProcessPool(1) as pool:
+        ((_, pid),) = pool.run(eval, ["__import__('os').getpid()"], len)
         os.kill(pid, signal.SIGKILL)
         ends = time.monotonic() + 5
         while time.monotonic() < ends and Path(f"/proc/{pid}/cmdline").exists():
             if not Path(f"/proc/{pid}/cmdline").read_bytes():  # a zombie: dead, not yet collected
                 break
             time.sleep(0.01)
-        assert list(crew.run(eval, ["40 + 2"], len)) == [("40 + 2", 42)]
+        assert list(pool.run(eval, ["40 + 2"], len)) == [("40 + 2", 42)]
 
 
 def test_where_the_system_gives_no_more_processes_the_others_do_all(
@@ -108,20 +110,20 @@ def test_where_the_system_gives_no_more_processes_the_others_do_all(
 ) -> None:
     left = [Worker]
 
-    def scarce() -> Worker:
+    def scarce(**_: bool) -> Worker:
         if not left:
             raise BlockingIOError(11, "Resource temporarily unavailable")
         return left.pop()()
 
-    monkeypatch.setattr(pool, "Worker", scarce)
-    assert run(Crew(4), [f"{k}" for k in range(6)]) == {f"{k}": k for k in range(6)}
+    monkeypatch.setattr(process_pool, "Worker", scarce)
+    assert run(ProcessPool(4), [f"{k}" for k in range(6)]) == {f"{k}": k for k in range(6)}
     with pytest.raises(NoProcessError, match=r"\(Resource temporarily unavailable\).*--workers 1"):
-        run(Crew(4), ["1"])
+        run(ProcessPool(4), ["1"])
 
 
 def test_the_longest_are_begun_first() -> None:
-    with Crew(1) as crew:
-        order = [item for item, _ in crew.run(eval, ["1", "333", "22"], len)]
+    with ProcessPool(1) as pool:
+        order = [item for item, _ in pool.run(eval, ["1", "333", "22"], len)]
     assert order == ["333", "22", "1"]
 
 
@@ -130,7 +132,7 @@ def test_processes_have_one_thread_each_and_this_one_keeps_its_settings(
 ) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     item = "[__import__('os').environ.get(n) for n in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS')]"
-    assert run(Crew(1), [item]) == {item: ["1", "1"]}
+    assert run(ProcessPool(1), [item]) == {item: ["1", "1"]}
     assert os.environ["OMP_NUM_THREADS"] == "7"
     assert "OPENBLAS_NUM_THREADS" not in os.environ
 
@@ -138,14 +140,14 @@ def test_processes_have_one_thread_each_and_this_one_keeps_its_settings(
 def test_processes_end_with_their_owner_also_when_it_is_killed() -> None:
     code = (
         "import os, sys\n"
-        "from twin.crew.pool import Crew\n"
+        "from bridge.process_pool import ProcessPool\n"
         "if __name__ == '__main__':\n"
-        "    crew = Crew(1)\n"
-        "    ((_, pid),) = crew.run(eval, ['__import__(\"os\").getpid()'], len)\n"
+        "    pool = ProcessPool(1)\n"
+        "    ((_, pid),) = pool.run(eval, ['__import__(\"os\").getpid()'], len)\n"
         "    print(pid, flush=True)\n"
         "    sys.stdin.read()\n"
     )
-    root = Path(__file__).parents[3]
+    root = Path(__file__).parents[2]
     owner = subprocess.Popen(
         [sys.executable, "-c", code],
         stdin=subprocess.PIPE,
@@ -198,7 +200,6 @@ def test_a_worker_that_stops_listening_is_noticed_and_ended(size: int) -> None:
     with closing(Worker()) as worker:
         worker.begin(len, b"")
         assert worker.finish(60.0) == 0
-        assert worker.pid is not None
         os.kill(worker.pid, signal.SIGSTOP)
         with pytest.raises(TimeIsUpError):
             _ask(worker, bytes(size), 0.1)
@@ -210,11 +211,21 @@ def _ask(worker: Worker, item: bytes, timeout_s: float) -> None:
 
 
 def test_half_an_answer_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crew_worker, "WHOLE_S", 0.1)
+    monkeypatch.setattr(process_pool, "PATIENCE_S", 0.1)
     with closing(Worker()) as worker:
         worker.begin(bytes, 3_000_000)
-        assert worker.pipe.poll(60)
-        assert worker.pid is not None
+        assert wait([worker.outlet], 60)
         os.kill(worker.pid, signal.SIGSTOP)  # a socket holds less than that
         with pytest.raises(TimeIsUpError):
             worker.finish(60.0)
+
+
+@pytest.mark.parametrize(("cores", "size"), [(1, 1), (2, 2), (64, MOST)])
+def test_each_core_that_may_be_used_has_a_process_up_to_a_limit(
+    monkeypatch: pytest.MonkeyPatch, cores: int, size: int
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    assert default_size() == size
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    assert default_size() == size

@@ -180,7 +180,9 @@ def test_the_fingers_before_a_real_wrist_camera_are_found_and_the_shelf_is_not(
     tmp_path: Path,
 ) -> None:
     import_rgbd(SHELF, tmp_path / "run", output=QUIET)
-    choices = choose_frames(find_sources(RunFolder.open(tmp_path / "run")), FrameConfig(), QUIET)
+    choices = choose_frames(
+        find_sources(RunFolder.open(tmp_path / "run")), FrameConfig(), QUIET
+    ).choices
     training = read_training_set(choices, RebuildConfig(), QUIET)
     mask = training.ego_masks[0]
     for columns in (slice(18, 60), slice(258, 300)):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from bridge.errors import UsageError
 
-_CHECKOUT = Path(__file__).resolve().parents[2] / "datasets"
+_CHECKOUT = Path(__file__).resolve().parents[1] / "datasets"
 _INSTALLED = Path(__file__).resolve().parent / "_datasets"
 
 

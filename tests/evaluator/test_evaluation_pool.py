@@ -16,22 +16,24 @@ from typing import Any
 import pytest
 from other_processes import ended_within
 
+from bridge import process_pool
+from bridge.process_pool import ProcessPool
 from bridge.terminal import Output
-from evaluator import workers
 from evaluator.cache import FOLDER, SummaryCache
 from evaluator.compare import compare_run, run
+from evaluator.compare.summaries import evaluation_pool
 from evaluator.result import write_results
 from evaluator.run_reader.contents import READ_S
-from evaluator.workers import Workers
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def begun(pool: Workers, number: int) -> Workers:
+def begun(pool: ProcessPool, number: int) -> ProcessPool:
     """Start processes, and wait until they can work."""
-    pool._start(number)
-    for worker in pool.started:
-        assert worker.is_ready or wait([worker.outlet], 30)
+    while len(pool.workers) < number:
+        pool._start()
+    for worker in pool.workers:
+        assert worker not in pool._preparing or wait([worker.outlet], 30)
     return pool
 
 
@@ -45,13 +47,13 @@ def jobs() -> Iterator[ModuleType]:
 
 
 @pytest.fixture(scope="module")
-def pool(jobs: ModuleType) -> Iterator[Workers]:
-    with Workers(2) as pool:
+def pool(jobs: ModuleType) -> Iterator[ProcessPool]:
+    with evaluation_pool(2) as pool:
         yield pool
 
 
 @pytest.fixture
-def two(pool: Workers) -> Workers:
+def two(pool: ProcessPool) -> ProcessPool:
     """This process and one beside it."""
     return begun(pool, 1)
 
@@ -61,26 +63,26 @@ def nobody(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     """Count processes instead of starting them."""
     started: list[bool] = []
 
-    def refuse() -> None:
+    def refuse(**_: bool) -> None:
         started.append(True)
         raise BlockingIOError(11, "Resource temporarily unavailable")
 
-    monkeypatch.setattr(workers, "_Worker", refuse)
+    monkeypatch.setattr(process_pool, "Worker", refuse)
     return started
 
 
 @pytest.mark.slow
-def test_two_processes_share_a_list_and_keep_its_order(two: Workers, jobs: ModuleType) -> None:
+def test_two_processes_share_a_list_and_keep_its_order(two: ProcessPool, jobs: ModuleType) -> None:
     found = list(two.map(jobs.where, range(100), each_s=0.002))
     assert [number for number, _ in found] == list(range(100))
-    assert {pid for _, pid in found} == {os.getpid(), two.started[0].process.pid}
+    assert {pid for _, pid in found} == {os.getpid(), two.workers[0].process.pid}
     again = list(two.map(jobs.surroundings, range(100), each_s=0.002))
     (beside,) = {about for about in again if about[0] != os.getpid()}
-    assert beside == (two.started[0].process.pid, False, "1")
+    assert beside == (two.workers[0].process.pid, False, "1")
 
 
 @pytest.mark.slow
-def test_what_would_be_printed_is_told_here(two: Workers, jobs: ModuleType) -> None:
+def test_what_would_be_printed_is_told_here(two: ProcessPool, jobs: ModuleType) -> None:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         assert list(two.map(jobs.warn, range(30), each_s=0.002)) == list(range(30))
@@ -96,17 +98,17 @@ def spoil(folder: Path, derived: Path) -> None:
 
 @pytest.mark.slow
 def test_results_are_the_same_bytes_with_and_without_processes(
-    two: Workers, six_trials: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    two: ProcessPool, six_trials: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spoil(six_trials.run.episodes_dir, six_trials.run.derived("b1.replay.planned*")[0])
     taken: list[int] = []
     after: list[Callable[[], object]] = []
-    take = workers._List.take
+    take = process_pool._Shared.take
 
-    def noting(self: Any, answer: Any) -> None:
-        take(self, answer)
-        if answer is not None and answer[1] is not None:
-            taken.append(len(answer[1]))
+    def noting(self: Any, worker: Any, answer: Any) -> None:
+        take(self, worker, answer)
+        if isinstance(answer, list):
+            taken.append(len(answer))
             for act in after:
                 act()
 
@@ -117,41 +119,41 @@ def test_results_are_the_same_bytes_with_and_without_processes(
         assert "a1.mcap" in named
         return write_results(comparison.results(), tmp_path / name / "results.json").read_bytes()
 
-    monkeypatch.setattr(workers._List, "take", noting)
+    monkeypatch.setattr(process_pool._Shared, "take", noting)
     alone = results("alone")
     assert taken == []
-    monkeypatch.setattr(run, "Workers", lambda: nullcontext(two))
+    monkeypatch.setattr(run, "evaluation_pool", lambda: nullcontext(two))
     assert results("two") == alone
     assert sum(taken) > 2
     taken.clear()
-    after.append(two.started[0].process.kill)
+    after.append(two.workers[0].process.kill)
     assert results("killed") == alone
-    assert len(taken) <= workers.AHEAD
-    assert two.started == []
+    assert len(taken) <= process_pool.AHEAD
+    assert two.workers == []
 
 
 @pytest.mark.slow
 def test_a_process_that_dies_or_hangs_costs_nothing(
     jobs: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(workers, "MAX_WAIT_S", 0.3)
-    with begun(Workers(3), 2) as pool:
-        processes = [worker.process for worker in pool.started]
+    monkeypatch.setattr(process_pool, "PATIENCE_S", 0.3)
+    with begun(evaluation_pool(3), 2) as pool:
+        processes = [worker.process for worker in pool.workers]
         processes[0].send_signal(signal.SIGSTOP)
         work = partial(jobs.signal_elsewhere, os.getpid(), signal.SIGKILL)  # the other one
         assert list(pool.map(work, range(60), each_s=0.002)) == list(range(60))
-        assert pool.started == []
+        assert pool.workers == []
     assert [process.returncode for process in processes] == [-signal.SIGKILL] * 2
 
 
 @pytest.mark.slow
-def test_an_exception_nobody_expected_is_raised_here(two: Workers, jobs: ModuleType) -> None:
+def test_an_exception_nobody_expected_is_raised_here(two: ProcessPool, jobs: ModuleType) -> None:
     found = []
     with pytest.raises(LookupError, match="item 37") as caught:
         found.extend(two.map(jobs.fail, range(100), each_s=0.002))
     assert any(entry.name == "fail" for entry in caught.traceback)
     assert found == list(range(len(found)))
-    assert all(not worker.asked for worker in two.started)
+    assert all(not worker.busy for worker in two.workers)
 
 
 INTERRUPTED = """
@@ -159,7 +161,9 @@ import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in a background
 import robot_gst
 from multiprocessing.connection import wait
-from evaluator.compare import contents, workers
+from bridge import process_pool
+from evaluator.compare import summaries
+from evaluator.run_reader import contents
 
 def read_recorded(*_):
     (worker,) = told
@@ -168,14 +172,14 @@ def read_recorded(*_):
     time.sleep(20)
 
 told = []
-class Told(workers._Worker):
-    def __init__(self):
-        super().__init__()
+class Told(process_pool.Worker):
+    def __init__(self, **settings):
+        super().__init__(**settings)
         told.append(self)
         print(self.process.pid, flush=True)
 
-workers.WORTH_S, workers._Worker, contents.read_recorded = 1e-3, Told, read_recorded
-workers._cores = lambda: 2
+process_pool.WORTH_S, process_pool.Worker = 1e-3, Told
+contents.read_recorded, summaries.cores = read_recorded, lambda: 2
 sys.exit(robot_gst.run(["evaluate", sys.argv[1]]))
 """
 
@@ -203,16 +207,18 @@ def test_few_files_start_nothing(six_trials: Any, nobody: list[bool]) -> None:
     with SummaryCache(six_trials.run.results_dir / FOLDER) as cache:
         compare_run(six_trials.run, cache=cache, output=Output(quiet=True))
     assert nobody == []
-    enough = round(workers.WORTH_S / READ_S)
-    assert list(Workers(2).map(abs, range(enough - 1), each_s=READ_S)) == list(range(enough - 1))
+    enough = round(process_pool.WORTH_S / READ_S)
+    assert list(evaluation_pool(2).map(abs, range(enough - 1), each_s=READ_S)) == list(
+        range(enough - 1)
+    )
     assert nobody == []
-    assert list(Workers(1).map(abs, range(enough), each_s=READ_S)) == list(range(enough))
+    assert list(evaluation_pool(1).map(abs, range(enough), each_s=READ_S)) == list(range(enough))
     assert nobody == []
 
 
 def test_without_a_further_process_all_is_done_here(nobody: list[bool]) -> None:
-    pool = Workers(2)
-    assert list(pool.map(abs, range(9), each_s=workers.WORTH_S)) == list(range(9))
+    pool = evaluation_pool(2)
+    assert list(pool.map(abs, range(9), each_s=process_pool.WORTH_S)) == list(range(9))
     assert nobody == [True]
-    assert list(pool.map(abs, range(9), each_s=workers.WORTH_S)) == list(range(9))
+    assert list(pool.map(abs, range(9), each_s=process_pool.WORTH_S)) == list(range(9))
     assert nobody == [True]  # it is not asked for again

@@ -1,0 +1,599 @@
+"""Processes that may die or hang: each message has a deadline, and a death costs one item.
+
+``Worker`` is one process, ``ProcessPool`` several. A pool does work in two ways: ``run`` leaves it
+all to the processes (simulation, which may take its process down), ``map`` shares it with them
+(reading and comparing, which this process can do as well). Neither pool of the standard library
+will do: ``concurrent.futures`` breaks as a whole when one process is killed, and with Python 3.11
+waits for ever when that happens while another one is being started; ``multiprocessing.Pool`` waits
+for what a dead process had.
+
+A process is a new interpreter, for threads and simulators' memory must not be forked, and the
+program's own main module stays unloaded there. It talks over its own standard streams alone, so it
+ends with the object that stands for it and with the program that holds that object, however that
+ends: the stream it listens to closes.
+"""
+
+import errno
+import os
+import pickle
+import queue
+import selectors
+import signal
+import subprocess
+import sys
+import threading
+import time
+import traceback
+import weakref
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import wait
+from typing import Any, BinaryIO, Generic, Protocol, TypeVar, runtime_checkable
+
+from bridge.errors import BridgeError, GstError
+
+ONE_THREAD: Mapping[str, str] = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OMP_WAIT_POLICY": "passive",
+}
+"""Side by side, libraries that start a thread for each core only get in each other's way."""
+REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
+"""What a disk says that is full, or may not be written; everything else is a bug here."""
+LENGTH_BYTES = 8
+"""Before each message: how long it is."""
+PATIENCE_S = 60.0
+"""Without a byte of a message that has begun, or with work that should take a tenth of a second."""
+JOIN_S = 5.0
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Answer = Any
+Function = Callable[[Any], Answer]
+
+
+class WorkerLostError(BridgeError):
+    """There will be no answer from a process."""
+
+
+class WorkerDiedError(WorkerLostError):
+    """The process that did the work is gone."""
+
+    def __init__(self, *, status: int | None) -> None:
+        """Remember its exit code, or minus the number of the signal that ended it."""
+        self.status = status
+        super().__init__(f"the process that did it ended {_ending(status)}")
+
+
+class TimeIsUpError(WorkerLostError):
+    """The work was not done in time."""
+
+
+class NoProcessError(BridgeError):
+    """The system gives no process to work in."""
+
+    def __init__(self, error: OSError) -> None:
+        """Name the reason it gave."""
+        super().__init__(
+            f"the system gives no further process ({error.strerror or error}). End other programs, "
+            "or work in this one: --workers 1."
+        )
+
+
+def _ending(status: int | None) -> str:
+    if status is None:
+        return "without a word"
+    if status >= 0:
+        return f"with exit code {status}"
+    try:
+        name = signal.Signals(-status).name
+    except ValueError:
+        name = f"signal {-status}"
+    memory = ", perhaps by a machine short of memory" if name == "SIGKILL" else ""
+    return f"by {name}{memory}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failed:
+    """An exception, as far as it crosses between processes."""
+
+    message: str
+    known: bool
+    """A ``GstError``, whose message a user can act on; anything else is a bug."""
+    trace: str = ""
+
+
+def do(function: Function, item: Any) -> Answer | Failed:
+    """Do one piece of work; whatever goes wrong with it is its answer."""
+    try:
+        return function(item)
+    except GstError as error:
+        return Failed(message=str(error), known=True)
+    except Exception as error:  # noqa: BLE001  # one bad item does not stop a thousand
+        if isinstance(error, OSError) and error.errno in REFUSED:
+            where = f" at {error.filename}" if error.filename else ""
+            return Failed(message=f"the disk refuses{where}: {error.strerror}", known=True)
+        message = f"internal error: {type(error).__name__}: {error}"
+        return Failed(message=message, known=False, trace=traceback.format_exc())
+
+
+class Worker:
+    """A process that does one piece of work after another, in the order they were begun."""
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        """Start it; what it imports, it imports with the first piece of work.
+
+        Args:
+            quiet: Drop what it prints as errors; what it prints otherwise is always dropped.
+
+        Raises:
+            OSError: When the system gives no further process.
+        """
+        places = os.pathsep.join(place or os.getcwd() for place in sys.path)  # noqa: PTH109
+        self.process = subprocess.Popen(
+            [sys.executable, "-P", "-c", f"from {__name__} import _serve; _serve()"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL if quiet else None,
+            bufsize=0,
+            env={**os.environ, **ONE_THREAD, "PYTHONPATH": places},
+        )
+        assert self.process.stdin is not None  # noqa: S101  # for the type checker
+        self.outlet: Any = self.process.stdout
+        """Becomes readable with an answer, and when the process ends."""
+        os.set_blocking(self.process.stdin.fileno(), False)
+        self._close = weakref.finalize(self, _end, self.process)
+        self._num_begun = 0
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self.process.pid
+
+    @property
+    def busy(self) -> bool:
+        """Whether an answer is still to come."""
+        return self._num_begun > 0
+
+    def begin(self, function: Function, item: Any, timeout_s: float | None = None) -> None:
+        """Give it a piece of work; the function is one of a module that can be imported.
+
+        Args:
+            function: What to do.
+            item: With what.
+            timeout_s: For handing it over; ``PATIENCE_S`` for each part of it without a number.
+
+        Raises:
+            WorkerDiedError: When it is gone already.
+            TimeIsUpError: When it has not taken the piece in time; it was ended.
+        """
+        assert self.process.stdin is not None  # noqa: S101  # for the type checker
+        left = memoryview(_packed((function, item)))
+        ends_s = None if timeout_s is None else time.monotonic() + timeout_s
+        with selectors.DefaultSelector() as selector:
+            try:
+                inlet = self.process.stdin.fileno()
+                selector.register(inlet, selectors.EVENT_WRITE)
+                while left:
+                    patience_s = PATIENCE_S if ends_s is None else ends_s - time.monotonic()
+                    if not selector.select(max(0.0, patience_s)):
+                        self.process.kill()
+                        limit_s = PATIENCE_S if timeout_s is None else timeout_s
+                        raise TimeIsUpError(f"it took no more for {limit_s:g} s")
+                    left = left[os.write(inlet, left) :]
+            except (OSError, ValueError) as error:  # it ended, or was closed meanwhile
+                raise WorkerDiedError(status=self._status()) from error
+        self._num_begun += 1
+
+    def finish(self, timeout_s: float | None = None) -> Answer | Failed:
+        """Wait for the next answer.
+
+        Raises:
+            WorkerDiedError: When the process ended before it answered.
+            TimeIsUpError: When it has not begun to answer yet; it goes on working. One that
+                stopped in the middle of its answer was ended.
+        """
+        try:
+            if not wait([self.outlet], timeout_s):
+                raise TimeIsUpError(f"no answer within {timeout_s:g} s")
+            data = _receive(self._read)
+        except (EOFError, OSError, ValueError) as error:
+            raise WorkerDiedError(status=self._status()) from error
+        self._num_begun -= 1
+        return pickle.loads(data)
+
+    def _read(self, size: int) -> bytes | None:
+        if not wait([self.outlet], PATIENCE_S):
+            self.process.kill()
+            raise TimeIsUpError(f"it said no more for {PATIENCE_S:g} s")
+        found: bytes | None = self.outlet.read(size)
+        return found
+
+    def _status(self) -> int | None:
+        with suppress(subprocess.TimeoutExpired):
+            return self.process.wait(JOIN_S)
+        return None
+
+    def close(self) -> None:
+        """End it, also in the middle of something: it then leaves no finished file."""
+        self._close()
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    process.kill()
+    with suppress(OSError):
+        process.wait()  # before the pipes close: another thread may still listen
+    with suppress(OSError), process:
+        pass
+
+
+def _packed(message: object) -> bytes:
+    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    return len(data).to_bytes(LENGTH_BYTES, "big") + data
+
+
+def _receive(read: Callable[[int], bytes | None]) -> bytes:
+    """Read one message, and not a byte beyond it."""
+    return _exactly(read, int.from_bytes(_exactly(read, LENGTH_BYTES), "big"))
+
+
+def _exactly(read: Callable[[int], bytes | None], size: int) -> bytes:
+    found = bytearray()
+    while len(found) < size:
+        more = read(size - len(found))
+        if not more:  # nobody is left to speak
+            raise EOFError
+        found += more
+    return bytes(found)
+
+
+def _serve() -> None:
+    """Work in a process of its own, until its owner is gone."""
+    # The owner decides when to stop; Ctrl-C reaches every process of the terminal.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    to_owner = os.dup(1)
+    with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
+        os.dup2(nowhere.fileno(), 1)  # a library that prints must not speak to the owner
+    arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    with open(0, "rb", closefd=False) as inbox, open(to_owner, "wb") as outbox:  # noqa: PTH123
+        threading.Thread(target=_listen, args=(inbox, arrived), daemon=True).start()
+        while True:
+            function, item = pickle.loads(arrived.get())
+            outbox.write(_packed(do(function, item)))
+            outbox.flush()
+
+
+def _listen(inbox: BinaryIO, arrived: "queue.SimpleQueue[bytes]") -> None:
+    with suppress(EOFError, OSError):
+        while True:
+            arrived.put(_receive(inbox.read))
+    os._exit(0)  # in the middle of anything: nobody waits for it
+
+
+ATTEMPTS = 2
+"""What died twice is not tried again."""
+WORTH_S = 3.0
+"""Work for which ``map`` starts one more process: it needs about one second until it can begin."""
+CHUNK_S = 0.1
+"""Work that ``map`` hands over at once: short, so that none waits long for another at the end."""
+MAX_CHUNK = 100
+AHEAD = 2
+"""Chunks handed over before the first is back, so that nobody waits for the next."""
+LOOK_S = 0.02
+"""A look at what the others have found takes a tenth as long as reading a file."""
+MOST = 8
+"""Processes by default: each takes up to half a gigabyte; more are used when asked for."""
+
+
+@runtime_checkable
+class Runner(Protocol):
+    """Does a function for many items; a context manager that ends what it started."""
+
+    def run(
+        self, function: Function, items: Sequence[Item], cost: Callable[[Item], float]
+    ) -> Iterator[tuple[Item, Answer | Failed]]:
+        """Yield every item with what came out, in any order.
+
+        Args:
+            function: Of a module that can be imported; what it raises becomes ``Failed``.
+            items: Records that can be pickled.
+            cost: How long an item takes, in any unit; the longest are begun first.
+        """
+
+    def __enter__(self) -> "Runner":
+        """Use as a context manager."""
+
+    def __exit__(self, *_: object) -> None:
+        """End what was started."""
+
+
+class Serial:
+    """One after another in this process, in the order they came."""
+
+    def run(
+        self, function: Function, items: Sequence[Item], cost: Callable[[Item], float]
+    ) -> Iterator[tuple[Item, Answer | Failed]]:
+        """See ``Runner``."""
+        for item in items:
+            yield item, do(function, item)
+
+    def map(
+        self, work: Callable[[Item], Result], items: Sequence[Item], *, each_s: float
+    ) -> Iterator[Result]:
+        """See ``ProcessPool``."""
+        return map(work, items)
+
+    def __enter__(self) -> "Serial":
+        """Nothing was started."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing to end."""
+
+
+SERIAL = Serial()
+
+
+@dataclass
+class _Piece:
+    item: Any
+    attempts: int = 0
+
+
+class ProcessPool:
+    """Processes side by side; they start once there is work and stay until the end."""
+
+    def __init__(self, size: int, *, prepare: Function | None = None, quiet: bool = False) -> None:
+        """Start nothing yet.
+
+        Args:
+            size: Processes beside this one, at most.
+            prepare: Called with None in each before all else, for what takes long to import.
+            quiet: See ``Worker``.
+        """
+        self._size, self._prepare, self._quiet = size, prepare, quiet
+        self.workers: list[Worker] = []
+        self._preparing: set[Worker] = set()
+
+    def _start(self) -> Worker:
+        worker = Worker(quiet=self._quiet)
+        self.workers.append(worker)
+        if self._prepare is not None:
+            self._preparing.add(worker)
+            with suppress(WorkerLostError):  # found out when it should answer
+                worker.begin(self._prepare, None)
+        return worker
+
+    def _lose(self, worker: Worker) -> None:
+        worker.close()
+        self.workers.remove(worker)
+        self._preparing.discard(worker)
+
+    def _has_prepared(self, worker: Worker) -> bool:
+        """Take the answer to ``prepare``, which is the first one; say whether it was that."""
+        if worker not in self._preparing:
+            return False
+        worker.finish()
+        self._preparing.remove(worker)
+        return True
+
+    def run(
+        self, function: Function, items: Sequence[Item], cost: Callable[[Item], float]
+    ) -> Iterator[tuple[Item, Answer | Failed]]:
+        """See ``Runner``; an item whose process died is tried once more after all others.
+
+        The longest go first, so that no process is left with a long one at the end (Graham 1969).
+
+        Raises:
+            NoProcessError: When the system gives none at all; with fewer than asked for it goes on.
+        """
+        todo = deque(_Piece(item) for item in sorted(items, key=cost, reverse=True))
+        at_work: dict[Worker, _Piece] = {}
+        try:
+            while todo or at_work:
+                while todo and len(at_work) < self._size:
+                    self._begin(function, todo, at_work)
+                outlets = {worker.outlet: worker for worker in at_work}
+                for outlet in wait(list(outlets)):
+                    worker = outlets[outlet]
+                    try:
+                        if self._has_prepared(worker):
+                            continue
+                        piece, answer = at_work[worker], worker.finish()
+                        del at_work[worker]
+                    except WorkerLostError as error:
+                        self._lose(worker)
+                        piece = at_work.pop(worker)
+                        if piece.attempts < ATTEMPTS:
+                            todo.append(piece)
+                            continue
+                        answer = lost(str(error))
+                    yield piece.item, answer
+        finally:
+            for worker in at_work:
+                self._lose(worker)
+
+    def _begin(
+        self, function: Function, todo: deque[_Piece], at_work: dict[Worker, _Piece]
+    ) -> None:
+        """Give a free process the next piece."""
+        worker = next((worker for worker in self.workers if worker not in at_work), None)
+        idle = worker is not None
+        try:
+            worker = worker or self._start()
+        except OSError as error:
+            if not at_work:
+                raise NoProcessError(error) from error
+            self._size = len(at_work)
+            return
+        try:
+            worker.begin(function, todo[0].item)
+        except WorkerLostError:
+            if idle:  # it ended while it had nothing to do: not the piece's fault
+                self._lose(worker)
+                return
+        at_work[worker] = todo.popleft()
+        at_work[worker].attempts += 1
+
+    def map(
+        self, work: Callable[[Item], Result], items: Sequence[Item], *, each_s: float
+    ) -> Iterator[Result]:
+        """Yield what ``work`` returns for each item, in the order of the items.
+
+        This process works too, and does whatever another one did not do: it was killed, hung, ran
+        out of memory, or met an exception, which is then raised here, where it always was.
+
+        Args:
+            work: A function of a module that can be imported; follows from the item alone.
+            items: What to work on; they and the results cross between processes.
+            each_s: About how long one takes here [s].
+        """
+        try:
+            while len(self.workers) < min(self._size, int(len(items) * each_s / WORTH_S)):
+                self._start()
+        except OSError:  # the system gives no further process
+            self._size = len(self.workers)
+        if not self.workers:
+            yield from map(work, items)
+            return
+        shared = _Shared(work, items)
+        next_look_s = 0.0
+        try:
+            for number in range(len(items)):
+                while number not in shared.found:
+                    if not shared.is_more or time.monotonic() >= next_look_s:
+                        self._exchange(shared)
+                        next_look_s = time.monotonic() + LOOK_S
+                    shared.do_one()
+                yield shared.found.pop(number)
+        finally:
+            for worker, chunks in shared.asked.items():
+                if chunks:
+                    self._lose(worker)
+
+    def _exchange(self, shared: "_Shared[Any, Any]") -> None:
+        """Take what the others have found, and hand out more; wait only with nothing to do here."""
+        outlets = {worker.outlet: worker for worker in self.workers}
+        patience_s = 0.0 if shared.is_more else PATIENCE_S
+        spoke = wait(list(outlets), patience_s) if outlets else []
+        silent = outlets.values() if patience_s and not spoke else []
+        failed = list(silent)
+        for outlet in spoke:
+            worker = outlets[outlet]
+            try:
+                if not self._has_prepared(worker):
+                    shared.take(worker, worker.finish())
+            except (WorkerLostError, pickle.UnpicklingError, AttributeError, ImportError):
+                failed.append(worker)  # it ended, or came to load newer code than ours
+        for worker in self.workers:
+            try:
+                while self._may_have_more(worker, shared):
+                    shared.ask(worker, 1 + len(self.workers))
+            except WorkerLostError:
+                failed.append(worker)
+        for worker in set(failed):
+            self._lose(worker)
+            shared.give_back(worker)
+
+    def _may_have_more(self, worker: Worker, shared: "_Shared[Any, Any]") -> bool:
+        is_ready = worker not in self._preparing
+        return is_ready and shared.is_fresh and len(shared.asked.get(worker, ())) < AHEAD
+
+    def __enter__(self) -> "ProcessPool":
+        """Use as a context manager."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End all of them at once; what is being done is lost."""
+        for worker in self.workers:
+            worker.process.kill()
+        for worker in list(self.workers):
+            self._lose(worker)
+
+
+class _Shared(Generic[Item, Result]):
+    """A list that several processes share: what is to be done, was handed out, and was found."""
+
+    def __init__(self, work: Callable[[Item], Result], items: Sequence[Item]) -> None:
+        self.work, self.items = work, items
+        self.found: dict[int, Result] = {}
+        self.asked: dict[Worker, deque[range]] = {}
+        self._next = 0
+        """The first item that nobody has had."""
+        self._again: deque[int] = deque()
+        """Items that another process did not do."""
+        self._done, self._spent_s = 0, 0.0
+
+    @property
+    def is_fresh(self) -> bool:
+        """Whether there is an item nobody has had."""
+        return self._next < len(self.items)
+
+    @property
+    def is_more(self) -> bool:
+        """Whether this process has something to do."""
+        return self.is_fresh or bool(self._again)
+
+    def do_one(self) -> None:
+        """Do the next item here, if there is one."""
+        if not self.is_more:
+            return
+        number = self._again.popleft() if self._again else self._chunk_of(1)[0]
+        began_s = time.monotonic()
+        self.found[number] = self.work(self.items[number])
+        self._spent_s += time.monotonic() - began_s
+        self._done += 1
+
+    def ask(self, worker: Worker, processes: int) -> None:
+        """Hand over what will last for a moment, judging by what it took here."""
+        chunk = self._chunk_of(1) if not self._done else self._chunk_of(self._lasting(processes))
+        self.asked.setdefault(worker, deque()).append(chunk)
+        worker.begin(_do_chunk, (self.work, [self.items[number] for number in chunk]))
+
+    def _lasting(self, processes: int) -> int:
+        lasts = int(CHUNK_S * self._done / max(self._spent_s, 1e-6))
+        fair = (len(self.items) - self._next) // (AHEAD * processes)
+        return max(1, min(lasts, fair, MAX_CHUNK))
+
+    def _chunk_of(self, size: int) -> range:
+        self._next += size
+        return range(self._next - size, self._next)
+
+    def take(self, worker: Worker, answer: list[Result] | Failed) -> None:
+        """Note what another process found, or that it did not."""
+        chunk = self.asked[worker].popleft()
+        if isinstance(answer, Failed):  # this process will meet it too, and say so
+            self._again.extend(chunk)
+        else:
+            self.found.update(zip(chunk, answer, strict=True))
+
+    def give_back(self, worker: Worker) -> None:
+        """Do here what a lost process had."""
+        for chunk in self.asked.pop(worker, ()):
+            self._again.extend(chunk)
+
+
+def _do_chunk(work_and_items: tuple[Callable[[Any], Any], Sequence[Any]]) -> list[Any]:
+    work, items = work_and_items
+    return [work(item) for item in items]
+
+
+def lost(reason: str) -> Failed:
+    """What an item comes to whose process died each time."""
+    return Failed(message=f"{reason}, {ATTEMPTS} times", known=True)
+
+
+def cores() -> int:
+    """Processors that this program may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on this system
+        return os.cpu_count() or 1
+
+
+def default_size() -> int:
+    """One process for each core, and no more than ``MOST``, where nobody said a number."""
+    return min(MOST, cores())

@@ -1,0 +1,20 @@
+"""The robot that is meant where nobody names another: a UR5 with a parallel gripper of our own.
+
+Nothing of the UR5 is copied into this project: its URDF is read from the installed data package,
+and the gripper (``datasets/robots/parallel_gripper.urdf``) is hung on ``tool0``.
+"""
+
+from bridge.robots.robot import read_robot
+
+ROBOT = read_robot("ur5_parallel_gripper")
+ROBOT_NAME = ROBOT.name
+BASE_FRAME = ROBOT.base_frame
+TCP_FRAME = ROBOT.tool_frame
+ARM_JOINTS = ROBOT.joints
+FINGER_JOINTS = tuple(finger.joint for finger in ROBOT.gripper.fingers)
+FINGER_LINKS = ROBOT.gripper.finger_links
+GRIPPER = ROBOT.gripper.name
+GRIPPER_LINKS = ROBOT.gripper.links
+MAX_WIDTH_M = ROBOT.gripper.max_width_m
+GRIPPER_WIDTH = "gripper_width"
+"""The one joint in the messages of a gripper's state: the distance between its pads [m]."""

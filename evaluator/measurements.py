@@ -1,0 +1,804 @@
+"""Every measurement: its id, unit, definition, which way is better, and what computes it.
+
+An id is a pattern: ``gain.pp.{side}.{task}.{policy}``. ``Quantity.of`` fills in the parts and gives
+what a ``Measurement`` is made with, so no other module spells an id. docs/metrics.md holds the
+table that ``markdown`` writes: ``python -m evaluator.measurements docs/metrics.md`` renews it.
+"""
+
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+from evaluator.metrics import image, state, trajectory
+from evaluator.metrics.image_protocol import ImageMetric
+from evaluator.metrics.image_scores import METRICS, score_image
+from evaluator.statistics import (
+    agreement,
+    differences,
+    funnel,
+    gate,
+    intervals,
+    power,
+    prediction_powered,
+    sequential,
+)
+
+Better = Literal["higher", "lower", "none"]
+"""Which way a value is better; ``none`` where it describes and does not judge."""
+
+# ruff: noqa: E501  # one line for each definition
+
+
+def slug(text: str) -> str:
+    """Return text usable as one part of a measurement id.
+
+    Letters beyond ASCII are written as their code points, so that names in any script stay apart.
+    Blanks and signs become ``_``, so that names may still share one: ``refuse_alike``.
+    """
+    plain = text if text.isascii() else "".join(c if c.isascii() else _code(c) for c in text)
+    return re.sub(r"[^A-Za-z0-9_+-]+", "_", plain) or "-"
+
+
+def _code(letter: str) -> str:
+    return f"+{ord(letter):04x}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Defined:
+    """What one measurement is: the part of it that its quantity decides."""
+
+    id: str
+    unit: str
+    definition: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quantity:
+    """One kind of measurement."""
+
+    id: str
+    """With the names of its variable parts in braces."""
+    unit: str
+    definition: str
+    """With words of the single measurement in braces."""
+    better: Better
+    computed_by: Callable[..., Any] | None
+    """None for plain counts."""
+
+    def of(self, **words: object) -> Defined:
+        """Name one measurement.
+
+        Args:
+            words: The parts of its id, which are made fit for ids, and of its definition.
+        """
+        parts = {name: slug(str(word)) for name, word in words.items() if f"{{{name}}}" in self.id}
+        return Defined(
+            id=self.id.format(**parts),
+            unit=self.unit,
+            definition=self.definition.format(**words),
+        )
+
+    @cached_property
+    def pattern(self) -> re.Pattern[str]:
+        """Matches the ids of this quantity, with their parts as groups."""
+        parts = re.split(r"\{(\w+)\}", self.id)
+        ends = [re.escape(text) for text in parts[::2]]
+        names = [rf"(?P<{name}>[A-Za-z0-9_+-]+)" for name in parts[1::2]]
+        return re.compile("".join(a + b for a, b in zip(ends, [*names, ""], strict=True)))
+
+
+REGISTRY: list[Quantity] = []
+"""In the order of docs/metrics.md."""
+
+
+def quantity_of(measurement_id: str) -> Quantity | None:
+    """Return the quantity an id belongs to, the one with the fewest variable parts."""
+    found = [q for q in REGISTRY if q.pattern.fullmatch(measurement_id)]
+    return min(found, key=lambda q: q.id.count("{"), default=None)
+
+
+def _new(
+    id: str,  # the word everywhere
+    unit: str,
+    better: Better,
+    computed_by: Callable[..., Any] | None,
+    definition: str,
+) -> Quantity:
+    quantity = Quantity(
+        id=id, unit=unit, definition=definition, better=better, computed_by=computed_by
+    )
+    REGISTRY.append(quantity)
+    return quantity
+
+
+# Success rates.
+
+_SIDES = {
+    "recorded": "successes / trials as labelled by the operator",
+    "sim_planned": "successes / trials in the twin: the plan actually sent, planned trajectory, dynamic replay; with replanning the twin itself selected these plans",
+    "sim_executed": "successes / trials in the twin: the executed joints re-lived dynamically; diagnosis only, never part of r",
+    "verdict": "plans accepted / plans judged: the gate's verdict on the plan actually sent, before motion; without replanning it was recorded and not obeyed, with replanning it selected these plans",
+}
+RATES = {
+    side: _new(
+        f"rate.{side}.{{task}}.{{condition}}.{{policy}}", "1", "higher", intervals.wilson, words
+    )
+    for side, words in _SIDES.items()
+}
+RATES_IN_COMMON = {
+    side: _new(
+        f"rate_common.{side}.{{task}}.{{condition}}.{{policy}}",
+        "1",
+        "higher",
+        intervals.wilson,
+        f"{_SIDES[side]}; over the trials where both sides are known",
+    )
+    for side in ("recorded", "sim_planned")
+}
+RATE_BY_UNIT = _new(
+    "rate.recorded_{unit}.{task}.{condition}.{policy}",
+    "1",
+    "higher",
+    intervals.wilson,
+    "successes / {unit}s as labelled; {unit}s of one trial are not independent, so the interval is narrower than the trials justify",
+)
+RATE_AS_GIVEN = _new(
+    "rate.{side}.{task}.{condition}.-",
+    "1",
+    "higher",
+    intervals.wilson,
+    "successes / {unit}s, as given{where}",
+)
+RATE_VARIED = _new(
+    "rate.sim_varied.{task}.{condition}.{policy}",
+    "1",
+    "higher",
+    None,
+    "mean over trials of the share of varied planned replays of the plan actually sent that succeed: start, friction, forces, masses, stiffness and timing drawn anew, no draw that the gate used",
+)
+SELECTION_BIAS = _new(
+    "bias.selection.{task}.{condition}.{policy}",
+    "pp",
+    "none",
+    None,
+    "sim - sim estimated again, over the trials that have varied replays",
+)
+AVERAGE_MACRO = _new(
+    "average.macro.{side}.{condition}",
+    "1",
+    "higher",
+    agreement.mean_rate,
+    "mean of the unrounded {side} rates of {over} {condition}: every cell counts the same",
+)
+AVERAGE_POOLED = _new(
+    "average.pooled.{side}.{condition}",
+    "1",
+    "higher",
+    intervals.wilson,
+    "successes / {unit}s over {over} {condition} ({side}): every trial counts the same",
+)
+NEVER_SENT = _new(
+    "plans.never_sent",
+    "count",
+    "none",
+    None,
+    "plans that were published and never executed, of all plans published; they are part of no rate",
+)
+STAGE = _new(
+    "stage.{task}.{condition}.{stage}",
+    "1",
+    "higher",
+    funnel.funnel,
+    "trials that passed stage {stage} of {task} / trials that reached it and whose ending is known",
+)
+
+# Gains with replanning.
+
+GAIN_POINTS = _new(
+    "gain.pp.{side}.{task}.{policy}",
+    "pp",
+    "higher",
+    differences.newcombe_difference,
+    "gain with replanning in percentage points ({side}): {words}",
+)
+GAIN_RELATIVE = _new(
+    "gain.relative.{side}.{task}.{policy}",
+    "1",
+    "higher",
+    intervals.relative_gain,
+    "relative gain with replanning ({side}), (with - without) / without: {words}; not percentage points",
+)
+GAIN_POINTS_AVERAGE = _new(
+    "gain.pp.{side}.average",
+    "pp",
+    "higher",
+    agreement.mean_rate,
+    "gain with replanning in percentage points of the unrounded mean rates of {count} tasks ({side})",
+)
+GAIN_RELATIVE_AVERAGE = _new(
+    "gain.relative.{side}.average",
+    "1",
+    "higher",
+    intervals.relative_gain,
+    "relative gain with replanning of the unrounded mean rates of {count} tasks ({side}); not percentage points",
+)
+BOSCHLOO = _new(
+    "unpaired.boschloo_p.{side}.{task}.{policy}",
+    "1",
+    "none",
+    differences.boschloo,
+    "two-sided p of Boschloo's exact test, starts not paired: {about}",
+)
+BOSCHLOO_POOLED = _new(
+    "unpaired.boschloo_p.{side}.pooled",
+    "1",
+    "none",
+    differences.boschloo,
+    "two-sided p of Boschloo's exact test over the pooled trials of {count} tasks ({side}), starts not paired",
+)
+TRIALS_NEEDED = _new(
+    "power.trials_needed.{side}.{task}.{policy}",
+    "count",
+    "none",
+    power.trials_needed,
+    "per condition, to show a gain as large as {about} with {power}",
+)
+POWER_UNPAIRED = _new(
+    "power.this_large.{side}.{task}.{policy}",
+    "1",
+    "none",
+    power.power_unpaired,
+    "chance that {arm} per condition show a gain as large as {about}, were it true; two-sided at {alpha:g}, normal approximation",
+)
+DETECTABLE_RATE = _new(
+    "power.detectable_rate.{side}.{task}.{policy}",
+    "1",
+    "none",
+    power.detectable_rate,
+    "smallest better rate that {arm} per condition tell from {percent:.0f} % with {power} ({side})",
+)
+PAIRED_GAIN = _new(
+    "paired.gain_pp.{side}",
+    "pp",
+    "higher",
+    differences.tango_difference,
+    "gain with replanning in percentage points over paired starts: {words}",
+)
+PAIRED_POWER = _new(
+    "power.paired.{side}",
+    "1",
+    "none",
+    power.power_paired,
+    "chance that McNemar's exact test on {count} pairs is significant at 0.05 if these shares are true: {words}",
+)
+MCNEMAR = {
+    kind: _new(
+        f"paired.mcnemar_p_{kind}.{{side}}",
+        "1",
+        "none",
+        differences.mcnemar,
+        f"two-sided McNemar test, {test}: {{words}}",
+    )
+    for kind, test in (("exact", "exact binomial"), ("mid", "mid-p"))
+}
+START_DISTANCE = {
+    kind: _new(
+        f"paired.start_distance_{kind}_m",
+        "m",
+        "lower",
+        None,
+        f"{kind} over paired starts of the largest distance between the localised objects of both trials; pairs beyond {{limit_mm:.0f}} mm are excluded, {{unknown}} of {{count}} pairs were not localised and are kept",
+    )
+    for kind in ("mean", "max")
+}
+
+# Agreement over groups. ``{what}`` says over which.
+
+
+def _agreement(
+    name: str, unit: str, better: Better, computed_by: Callable[..., Any], definition: str
+) -> Quantity:
+    return _new(f"agreement.{name}", unit, better, computed_by, f"{definition}{{resampled}}")
+
+
+PEARSON_R = _agreement(
+    "pearson_r",
+    "1",
+    "higher",
+    agreement.pearson,
+    "Pearson r of the twin's and the recorded success rates {what}",
+)
+PEARSON_R_OF_CONDITION = _new(
+    "agreement.pearson_r.{condition}", "1", "higher", agreement.pearson, PEARSON_R.definition
+)
+PEARSON_R_REMEASURED = _new(
+    "agreement.pearson_r_remeasured",
+    "1",
+    "higher",
+    agreement.pearson,
+    "the same r {what}; its band is where r would fall if the same cells were measured again with as many trials",
+)
+SPEARMAN = _agreement(
+    "spearman_rho",
+    "1",
+    "higher",
+    agreement.spearman,
+    "Spearman rank correlation of the same rates {what}; average ranks",
+)
+KENDALL = _agreement(
+    "kendall_tau_b", "1", "higher", agreement.kendall, "Kendall's tau-b of the same rates {what}"
+)
+BIAS = _agreement(
+    "bias_pp",
+    "pp",
+    "none",
+    agreement.bias,
+    "mean of sim rate - recorded rate {what}; above 0 the twin is optimistic",
+)
+MAE = _agreement(
+    "mae_pp", "pp", "lower", agreement.mean_absolute_error, "mean |sim rate - recorded rate| {what}"
+)
+RMSE = _agreement(
+    "rmse_pp",
+    "pp",
+    "lower",
+    agreement.root_mean_square_error,
+    "square root of the mean (sim rate - recorded rate)^2 {what}",
+)
+CALIBRATION_SLOPE = _agreement(
+    "calibration_slope",
+    "1",
+    "none",
+    agreement.calibration_line,
+    "slope of recorded = a + b x sim, least squares {what}; 1 is calibrated, noise pulls it towards 0",
+)
+CALIBRATION_INTERCEPT = _agreement(
+    "calibration_intercept_pp",
+    "pp",
+    "none",
+    agreement.calibration_line,
+    "intercept of the same line {what}",
+)
+ORDER_ACCURACY = _agreement(
+    "order_accuracy",
+    "1",
+    "higher",
+    agreement.order_accuracy,
+    "pairs of cells that the twin orders as the recorded rates do / pairs whose recorded rates differ; a tie in the twin counts 1/2; {what}",
+)
+MMRV_RECORDED = _agreement(
+    "mmrv_recorded_gap",
+    "1",
+    "lower",
+    agreement.mmrv,
+    "mean maximum rank violation {what}; convention: gap of recorded rates (SIMPLER equation 1); it grows with the number of cells",
+)
+MMRV_SIM = _agreement(
+    "mmrv_sim_gap",
+    "1",
+    "lower",
+    agreement.mmrv,
+    "mean maximum rank violation {what}; convention: gap of sim rates (arguments swapped, as some published code does); it grows with the number of cells",
+)
+LARGEST_GAP = _new(
+    "agreement.largest_gap_pp",
+    "pp",
+    "lower",
+    agreement.largest_gap,
+    "largest |sim rate - recorded rate| {what}",
+)
+DECISIONS = {
+    name: _new(
+        f"decision.{name}",
+        "1",
+        "higher",
+        agreement.choose,
+        f"tasks in which {words} (best: highest rate, ties together) / tasks with a choice of condition or policy",
+    )
+    for name, words in (
+        ("surely_right", "every choice that is best in the twin is among the recorded best"),
+        ("possibly_right", "one choice that is best in the twin is among the recorded best"),
+    )
+}
+REGRET = _new(
+    "decision.regret_pp",
+    "pp",
+    "lower",
+    agreement.choose,
+    "recorded success lost by choosing what is best in the twin, the worst of a tie, mean over tasks with a choice",
+)
+
+# Trial by trial: the replay, the verdict, the gate. ``{by}`` is sim_planned, verdict and so on.
+
+AGREED = _new(
+    "agreement.{by}.rate",
+    "1",
+    "higher",
+    intervals.wilson,
+    "trials where {words} and the labelled outcome say the same / trials",
+)
+PHI = _new(
+    "agreement.{by}.phi",
+    "1",
+    "higher",
+    gate.phi,
+    "phi coefficient of {words} and the labelled outcome over trials",
+)
+KAPPA = _new(
+    "agreement.{by}.kappa",
+    "1",
+    "higher",
+    gate.kappa,
+    "Cohen's kappa of {words} and the labelled outcome over trials",
+)
+PPV = _new(
+    "agreement.{by}.ppv",
+    "1",
+    "higher",
+    intervals.wilson,
+    "positive predictive value: trials that succeeded / trials where {words} said success",
+)
+NPV = _new(
+    "agreement.{by}.npv",
+    "1",
+    "higher",
+    intervals.wilson,
+    "negative predictive value: trials that failed / trials where {words} said failure",
+)
+BREAK_EVEN_PRICE = _new(
+    "gate.break_even_price",
+    "1",
+    "higher",
+    gate.break_even,
+    "bad executions avoided / good plans refused, by verdicts that were not obeyed: what refusing a good plan may cost, in bad executions, for the gate to pay",
+)
+FACTOR_NPV = _new(
+    "gate.clause.{clause}.npv",
+    "1",
+    "higher",
+    intervals.wilson,
+    "trials that failed / trials where planned-in-twin failed first in {clause}",
+)
+CLAUSE_REFUSED = _new(
+    "gate.clause.{by}.{clause}.refused",
+    "1",
+    "none",
+    intervals.wilson,
+    "trials in which {name} said no / trials in which it was decided ({side})",
+)
+CLAUSE_RIGHT = _new(
+    "gate.clause.{by}.{clause}.right",
+    "1",
+    "higher",
+    intervals.wilson,
+    "trials that failed / trials in which {name} said no ({side})",
+)
+_WHOSE = "the probability is the planned replay's, where it has none the verdict's before motion; with replanning the twin selected these plans"
+BRIER = _new(
+    "reliability.brier",
+    "1",
+    "lower",
+    gate.brier,
+    f"Brier score: mean of (sampled success probability - outcome)^2; {_WHOSE}",
+)
+BRIER_OF_BASE_RATE = _new(
+    "reliability.brier_of_base_rate",
+    "1",
+    "none",
+    gate.brier_of_base_rate,
+    "Brier score of always saying the observed success rate; above it the probability is worth nothing",
+)
+ECE = _new(
+    "reliability.ece",
+    "1",
+    "lower",
+    gate.expected_calibration_error,
+    f"expected calibration error: {gate.NUM_BINS} bins of equal width, sum of n_bin / n x |mean probability - success rate|; biased upwards for few trials; {_WHOSE}",
+)
+LABEL_AGREED = _new(
+    "label.localised.rate",
+    "1",
+    "higher",
+    intervals.wilson,
+    "trials{where} where the operator's label and the success predicate on the poses localised after the execution say the same / trials where both are known{without}",
+)
+LABEL_AGREED_OF_TASK = _new(
+    "label.localised.{task}.rate", "1", "higher", intervals.wilson, LABEL_AGREED.definition
+)
+LABEL_OBJECTS = _new(
+    "label.objects.rate",
+    "1",
+    "higher",
+    intervals.wilson,
+    "trials where the operator counted as many objects as the predicate on the localised poses / trials labelled by object where both are known",
+)
+
+# Prediction-powered estimates and confidence sequences.
+
+_PROXY = "proxy.{name}.{{task}}.{{condition}}.{{policy}}"
+PROXY_RATE = _new(
+    _PROXY.format(name="recorded_rate"),
+    "1",
+    "higher",
+    prediction_powered.post_stratified,
+    "recorded success rate with the twin's help: strata of the twin's answer, each with a Beta(1/2, 1/2) prior; {many}",
+)
+PROXY_RATE_PPI = _new(
+    _PROXY.format(name="recorded_rate_ppi"),
+    "1",
+    "higher",
+    prediction_powered.ppi_plus_plus,
+    "the same by PPI++ (normal approximation); {many}",
+)
+TRIALS_SAVED = _new(
+    _PROXY.format(name="trials_saved"),
+    "count",
+    "higher",
+    prediction_powered.trials_saved,
+    "further trials Wilson's interval would need; {many}",
+)
+RANDOM_STARTS_P = _new(
+    _PROXY.format(name="random_starts_p"),
+    "1",
+    "none",
+    prediction_powered.applicability,
+    "p of Boschloo's test that the twin succeeds as often on the tried starts as on the others: small forbids the estimates; {many}",
+)
+STARTS_ALIKE_P = _new(
+    _PROXY.format(name="starts_alike_p"),
+    "1",
+    "none",
+    prediction_powered.starts_alike,
+    "p of the permutation test on the energy distance that the starts with a robot trial and those only the twin has were drawn alike: small forbids the estimates{compared}",
+)
+STARTS_COVERED = _new(
+    _PROXY.format(name="starts_covered"),
+    "1",
+    "higher",
+    prediction_powered.starts_covered,
+    "share of the starts only the twin has that lie no further from a tried start than tried starts lie from their neighbours; alike, n tried ones cover about n / (n + 1){compared}",
+)
+SEQUENCE = _new(
+    "sequence.recorded.{task}.{condition}.{policy}",
+    "1",
+    "higher",
+    sequential.sequence_of,
+    "successes / trials as labelled, with a betting confidence sequence in the order in which they were recorded (of a table: its rows): it may be looked at after every one, to stop or to continue",
+)
+SEQUENCE_GAIN = _new(
+    "sequence.gain_pp.recorded",
+    "pp",
+    "higher",
+    sequential.pairs_sequence,
+    "recorded gain with replanning over paired starts, with a betting confidence sequence in the order in which pairs became complete: it may be looked at after every one",
+)
+REPLANNING_EVIDENCE = _new(
+    "sequence.replanning_evidence.recorded",
+    "1",
+    "none",
+    sequential.capital_log,
+    "what a bettor against 'replanning changes nothing' made of 1, over {improved} improved and {worsened} worsened pairs; {enough:.0f} or more: stop, it is shown at {alpha:g}, however often one looked; {most:g} stands for all that is more",
+)
+
+# Motions, repeated runs, final states.
+
+TOOL = "tool centre point"
+MOTIONS = {
+    name: _new(
+        f"motion.{{against}}.{name}",
+        unit,
+        "none" if name == "lag_s" else "lower",
+        computed_by,
+        f"{what}, {{meaning}}: {words}, mean over trials; aligned by {{how}}",
+    )
+    for name, unit, what, words, computed_by in (
+        ("position_mean_m", "m", TOOL, "mean distance over time", trajectory.pose_errors),
+        ("position_max_m", "m", TOOL, "largest distance over time", trajectory.pose_errors),
+        ("end_point_m", "m", TOOL, "distance at the last common instant", trajectory.pose_errors),
+        ("rotation_mean_rad", "rad", TOOL, "mean angle over time", trajectory.pose_errors),
+        ("rotation_max_rad", "rad", TOOL, "largest angle over time", trajectory.pose_errors),
+        ("end_point_rad", "rad", TOOL, "angle at the last common instant", trajectory.pose_errors),
+        (
+            "lag_s",
+            "s",
+            TOOL,
+            "delay of least distance, a rigid motion apart",
+            trajectory.find_lag_s,
+        ),
+        (
+            "without_lag_mean_m",
+            "m",
+            TOOL,
+            "mean distance after that delay is taken out",
+            trajectory.position_errors,
+        ),
+        (
+            "without_offset_mean_m",
+            "m",
+            TOOL,
+            "mean distance after delay and best rigid motion are taken out",
+            trajectory.without_rigid_motion,
+        ),
+        (
+            "relative_mean_m",
+            "m",
+            TOOL,
+            "mean difference of what both do within one second",
+            trajectory.relative_errors,
+        ),
+        ("joint_rms_rad", "rad", "joints", "root mean square error", trajectory.joint_errors),
+        ("joint_max_rad", "rad", "joints", "largest error of any joint", trajectory.joint_errors),
+    )
+}
+"""By the field of ``MotionSummary`` they are the mean of."""
+
+_DISTANCES = (
+    (
+        "mean_over_pairs_m",
+        "m",
+        "distance over normalised time, mean over all (recorded, simulated) pairs of runs",
+    ),
+    ("between_mean_curves_m", "m", "distance of the two mean curves, mean over normalised time"),
+    ("max_between_mean_curves_m", "m", "largest distance of the two mean curves"),
+    ("end_point_over_pairs_m", "m", "distance of the end points, mean over all pairs of runs"),
+    ("end_point_between_means_m", "m", "distance of the mean end points"),
+    (
+        "turned_over_pairs_rad",
+        "rad",
+        "angle between what both turned since they began, over normalised time, mean over all (recorded, simulated) pairs of runs",
+    ),
+)
+WHOLE = "whole recordings, waiting at their ends included"
+MOVING = f"the moving part only, from leaving the start to arriving at the end, each within {trajectory.MOVING_THRESHOLD_M * 1000:.0f} mm"
+_PARTS = (("", WHOLE), ("moving_", MOVING))
+_BAND = "bands.{task}.{engine}."
+BAND_DISTANCES = {
+    prefix: {
+        name: _new(
+            f"{_BAND}{prefix}{name}",
+            unit,
+            "lower",
+            trajectory.band_distance,
+            f"{{what}}: {words}; {part}",
+        )
+        for name, unit, words in _DISTANCES
+    }
+    for prefix, part in _PARTS
+}
+"""By ``moving_`` or nothing, then by the field of ``BandDistance``."""
+BAND_MEDIAN = {
+    prefix: _new(
+        f"{_BAND}{prefix}median_over_recorded_m",
+        "m",
+        "lower",
+        trajectory.band_distance,
+        f"{{what}}: median over recorded runs of the mean distance to these simulated runs, so where another recorded run would lie; {part}",
+    )
+    for prefix, part in _PARTS
+}
+BAND_ALONG_PATH = _new(
+    f"{_BAND}moving_along_path_m",
+    "m",
+    "lower",
+    trajectory.path_distance_m,
+    f"{{what}}: distance at equal shares of the way, whatever the speed, mean over all (recorded, simulated) pairs of runs; {MOVING}",
+)
+BAND_WITHOUT_OFFSET = _new(
+    f"{_BAND}moving_without_offset_m",
+    "m",
+    "lower",
+    trajectory.without_rigid_motion,
+    f"{{what}}: distance of the two mean curves after the best rigid motion is taken out, mean over normalised time; {MOVING}",
+)
+BAND_WIDTH = 2.0
+"""The recorded band reaches this many of its root mean square distances from its mean curve."""
+INSIDE_BAND = _new(
+    f"{_BAND}moving_inside_band",
+    "1",
+    "higher",
+    trajectory.band_distance,
+    f"share of normalised time in which the simulated mean curve is nearer to the recorded one than {BAND_WIDTH:g} root mean square distances of the recorded runs from it; {MOVING}",
+)
+REPEATABILITY = {
+    name: _new(
+        f"repeatability.{{task}}.{{side}}.{name}",
+        "m",
+        "lower",
+        trajectory.repeatability,
+        f"end effector, spread of {{count}} {{side}} runs: {words}",
+    )
+    for name, words in (
+        ("mean_m", "root mean square distance from the mean curve, mean over normalised time"),
+        ("worst_m", "root mean square distance from the mean curve at its worst instant"),
+        ("end_point_m", "root mean square distance from the mean end point"),
+    )
+}
+"""By the field of ``Repeatability``."""
+
+_STATE = "state.{{by}}_to_{{against}}.{{task}}.{{condition}}.{name}"
+_STATE_WORDS = "{{quantity}} after its last stage, {{who}} against {{other}}, in {{where}}: {kind} over {{count}} episodes of each one's mean over its objects"
+STATES = {
+    (name, kind): _new(
+        _STATE.format(name=f"{name}_{kind}_{unit}"),
+        unit,
+        "lower",
+        computed_by,
+        _STATE_WORDS.format(kind=kind),
+    )
+    for name, kind, unit, computed_by in (
+        ("position", "median", "m", None),
+        ("position", "mean", "m", None),
+        ("rotation", "median", "rad", state.turn_between_rad),
+        ("extents", "median", "m", state.extents_apart_m),
+    )
+}
+
+# Images. A mean over views, before and after an alignment or a mask (``{variant}``).
+
+
+def _image(images: str, metric: ImageMetric, variant: str) -> Quantity:
+    return _new(
+        f"{images}.{metric.named(variant)}",
+        metric.unit,
+        "higher" if metric.higher_is_better else "lower",
+        score_image,
+        f"{metric.definition}{{protocol}}",
+    )
+
+
+_IMAGES = ("views.{part}", "image.{method}")
+VIEWS, RENDERS = (
+    {(name, raw): _image(images, metric, "raw" if raw else "{variant}")
+     for name, metric in METRICS.items() for raw in (True, False)}
+    for images in _IMAGES
+)  # fmt: skip
+"""By the metric, and whether the images were compared as they are stored."""
+LPIPS_MISSING = _new(
+    "views.{part}.lpips", "1", "lower", score_image, "learned perceptual image patch similarity"
+)
+DEPTHS = {
+    name: _new(
+        f"views.{{part}}.depth_{name}",
+        "m",
+        "lower",
+        image.score_depth,
+        f"{words} depth error, {image.DEPTH_PROTOCOL}; {{after}}",
+    )
+    for name, words in (
+        ("mean_abs_m", "mean absolute"),
+        ("median_abs_m", "median absolute"),
+        ("rmse_m", "root mean square"),
+    )
+}
+"""By the field of ``DepthScore``."""
+
+
+HEADING = "## Every measurement\n"
+
+
+def markdown() -> str:
+    """Write the last chapter of docs/metrics.md."""
+    lines = [
+        HEADING,
+        "Made by `python -m evaluator.measurements docs/metrics.md`. Parts in braces are names of",
+        "tasks, conditions, policies and so on; *words* are filled in by each measurement.",
+        "",
+        "| id | unit | better | computed by | definition |",
+        "|---|---|---|---|---|",
+    ]
+    for quantity in REGISTRY:
+        by = quantity.computed_by
+        name = "" if by is None else f"`{by.__module__.removeprefix('evaluator.')}.{by.__name__}`"
+        better = "" if quantity.better == "none" else quantity.better
+        words = re.sub(r"\{(\w+)[^}]*\}", r"*\1*", quantity.definition).replace("|", r"\|")
+        lines.append(f"| `{quantity.id}` | {quantity.unit} | {better} | {name} | {words} |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    page = Path(sys.argv[1])
+    page.write_text(page.read_text().partition(HEADING)[0] + markdown())

@@ -1,0 +1,255 @@
+"""The demo goes on where it was interrupted, and never ends well with nothing measured."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+import robot_gst
+from bridge.episode.metadata import EpisodeInfo, Outcome, to_strings
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import UsageError
+from bridge.terminal import Output
+from dashboards import demo
+from dashboards.demo import DemoConfig, look
+from dashboards.errors import DashboardError
+
+TASK = "cube_into_box"
+QUICK = DemoConfig(quick=True, serve=False)
+QUIET = Output(quiet=True)
+STARTS = [
+    (1000, "without_replanning"),
+    (1000, "with_replanning"),
+    (1001, "without_replanning"),
+    (1001, "with_replanning"),
+]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    return RunFolder.create(tmp_path / "run")
+
+
+def record(
+    run: RunFolder,
+    name: str,
+    *,
+    start: tuple[int, str] = (1000, ""),
+    outcome: Outcome | None = None,
+    stopped_by: str = "command",
+    stand_in: bool = True,
+) -> Path:
+    """Leave an episode behind as the recorder does."""
+    path = run.episodes_dir / f"{name}.mcap"
+    with EpisodeWriter(path) as writer:
+        info = EpisodeInfo(
+            id=name,
+            kind=name.split("_")[0],
+            task=TASK,
+            start_seed=start[0],
+            condition=start[1],
+            stand_in=stand_in,
+        )
+        writer.describe(info)
+        writer.add_metadata("recorder", {"stopped_by": json.dumps(stopped_by)})
+        if outcome is not None:
+            writer.add_metadata("outcome", to_strings(outcome))
+    return path
+
+
+def record_all(run: RunFolder) -> None:
+    record(run, "scan_0001")
+    for number, start in enumerate(STARTS, start=1):
+        record(run, f"trial_{number:04d}", start=start, outcome=Outcome(result="success", k=1))
+
+
+def without_commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Note the commands instead of running them."""
+    asked: list[list[str]] = []
+
+    def command(words: list[str]) -> list[str]:
+        asked.append(words)
+        return [sys.executable, "-c", "print('ready', flush=True); import time; time.sleep(0.2)"]
+
+    monkeypatch.setattr(demo, "_command", command)
+    monkeypatch.setattr(demo, "_answers", lambda *_: True)
+    monkeypatch.setattr(demo.Background, "check", lambda _: None)
+    return asked
+
+
+def test_a_whole_recording_is_kept_and_what_is_missing_is_named(run: RunFolder) -> None:
+    record_all(run)
+    assert look(run, QUICK) == demo.Recorded(has_scan=True, num_known=4)
+    (run.episodes_dir / "trial_0003.mcap").unlink()
+    found = look(run, QUICK)
+    assert found.missing == [STARTS[2]]
+    more = look(run, DemoConfig())
+    assert more.missing == [STARTS[2], (1002, "with_replanning"), (1002, "without_replanning")]
+
+
+@pytest.mark.parametrize(
+    ("stopped_by", "outcome"),
+    [
+        ("the recorder was stopped", None),
+        ("disk: No space left on device", None),
+        ("command", Outcome(result="unknown", detail="interrupted")),
+    ],
+)
+def test_a_scan_that_was_cut_short_is_recorded_anew(
+    run: RunFolder, stopped_by: str, outcome: Outcome | None
+) -> None:
+    path = record(run, "scan_0001", stopped_by=stopped_by, outcome=outcome)
+    found = look(run, QUICK)
+    assert not found.has_scan
+    assert list(found.unusable) == [path]
+
+
+def test_what_a_killed_recorder_left_is_recorded_anew(run: RunFolder) -> None:
+    part = run.episodes_dir / "trial_0001.mcap.part"
+    part.write_bytes(b"\x89MCAP0\r\n")
+    assert look(run, QUICK).unusable == {part: "its recorder was killed"}
+
+
+def test_a_folder_that_is_being_recorded_into_is_refused(run: RunFolder) -> None:
+    writer = EpisodeWriter(run.episodes_dir / "trial_0001.mcap")
+    with pytest.raises(UsageError, match="is being written"):
+        look(run, QUICK)
+    writer.abandon()
+
+
+@pytest.mark.parametrize(
+    ("config", "named"),
+    [
+        (DemoConfig(seed=2), "--seed 1"),
+        (DemoConfig(task="sloth_into_basket"), f"--task {TASK}"),
+    ],
+)
+def test_another_demo_does_not_record_into_the_same_folder(
+    run: RunFolder, config: DemoConfig, named: str
+) -> None:
+    record_all(run)
+    with pytest.raises(UsageError, match=named):
+        look(run, config)
+
+
+def test_real_recordings_are_not_mixed_with_simulated_ones(run: RunFolder) -> None:
+    record(run, "trial_0001", stand_in=False)
+    with pytest.raises(UsageError, match="not from the stand-in cell"):
+        look(run, QUICK)
+
+
+def test_a_trial_set_aside_takes_its_label_and_its_replays_along(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record_all(run)
+    path = run.episodes_dir / "trial_0002.mcap"
+    path.unlink()
+    record(run, "trial_0002", start=STARTS[1], outcome=Outcome(result="unknown", detail="no gate"))
+    run.derived_dir.mkdir()
+    (run.derived_dir / "trial_0002.replay.planned.mcap").write_bytes(b"")
+    asked = without_commands(monkeypatch)
+    with pytest.raises(DashboardError, match=r"1 of 4 trials .* Start the demo again"):
+        demo.run_demo(run.path, QUICK, QUIET)
+    moved = [each.name for each in run.notes_dir.rglob("trial_0002*")]
+    assert sorted(moved) == ["trial_0002.mcap", "trial_0002.replay.planned.mcap"]
+    assert [words[0] for words in asked] == ["record", "rebuild", "gate", "publish"]
+    assert "--missing" in asked[3]
+    assert "--no-scan" in asked[3]
+
+
+def test_every_interrupted_step_leads_to_the_steps_after_it(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = without_commands(monkeypatch)
+    with pytest.raises(DashboardError, match="there is no scan"):
+        demo.run_demo(run.path, QUICK, QUIET)
+    assert [words[0] for words in asked] == ["record", "publish", "rebuild", "gate", "publish"]
+    record_all(run)
+    asked.clear()
+    with pytest.raises(FileNotFoundError):  # nobody evaluated
+        demo.run_demo(run.path, QUICK, QUIET)
+    assert [words[0] for words in asked] == ["rebuild", "replay", "evaluate"]
+    assert "--iterations" in asked[0]
+    run.scene_dir.mkdir()
+    (run.scene_dir / "scene.json").write_text('{"fit": {}}')
+    asked.clear()
+    with pytest.raises(FileNotFoundError):
+        demo.run_demo(run.path, QUICK, QUIET)
+    assert [words[0] for words in asked] == ["replay", "evaluate"]
+
+
+@pytest.mark.parametrize(
+    ("replays", "value", "named"), [(0, 0.5, "no replay"), (1, None, "no trial"), (1, 0.5, "")]
+)
+def test_nothing_measured_is_not_done(
+    run: RunFolder,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    replays: int,
+    value: float | None,
+    named: str,
+) -> None:
+    record_all(run)
+    without_commands(monkeypatch)
+    for folder in (run.derived_dir, run.results_dir):
+        folder.mkdir()
+    for number in range(replays):
+        (run.derived_dir / f"trial_000{number}.replay.planned.mcap").write_bytes(b"")
+    measurements = [{"value": value, "reason_if_undefined": "no trial"}]
+    (run.results_dir / "results.json").write_text(json.dumps({"measurements": measurements}))
+    code = robot_gst.run(["demo", str(run.path), "--quick", "--quiet"])
+    printed = capsys.readouterr()
+    assert code == (1 if named else 0)
+    assert ("Done" in printed.out) == (not named)
+    assert named in printed.err
+
+
+def test_a_trial_without_outcome_stands_in_the_end_with_its_cause(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record_all(run)
+    monkeypatch.setattr(demo, "_step", lambda *_, **__: None)
+    monkeypatch.setattr(demo, "_record", lambda *_: None)
+    monkeypatch.setattr(demo, "_refuse_nothing", lambda *_: None)
+    (run.episodes_dir / "trial_0002.mcap").unlink()
+    void = Outcome(result="unknown", detail="nothing executed, no verdict (cube not found)")
+    record(run, "trial_0002", start=STARTS[1], outcome=void)
+    run.scene_dir.mkdir()
+    fit = {"fit": {"iterations": 120, "underfitted": True}}
+    (run.scene_dir / "scene.json").write_text(json.dumps(fit))
+    assert demo.run_demo(run.path, QUICK, Output()) == 0
+    printed = capsys.readouterr().out
+    assert "trial_0002 has no outcome: nothing executed, no verdict (cube not found)." in printed
+    assert "underfitted: its time limit struck after 120 of 1000 images" in printed
+
+
+def test_ctrl_c_says_how_to_go_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def interrupt(*_: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo, "run_demo", interrupt)
+    path = str(tmp_path / "my run")
+    assert robot_gst.run(["demo", path, "--quick"]) == 130
+    expected = f"robot-gst: interrupted; continue with: robot-gst demo '{path}' --quick\n"
+    assert capsys.readouterr().err == expected
+
+
+@pytest.mark.parametrize("found", [None, "/usr/bin/robot-gst"])
+def test_no_advice_names_a_folder_that_the_user_did_not_name(
+    run: RunFolder,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    found: str | None,
+) -> None:
+    monkeypatch.setattr("bridge.terminal.shutil.which", lambda _: found)
+    monkeypatch.chdir(run.path)
+    demo._close(run, QUICK, Output(), 1.0)
+    printed = capsys.readouterr().out.replace(str(run.path), "RUN")
+    assert ".." not in printed
+    assert "/" not in printed.replace("RUN/results/report.html", "").replace("RUN", "")
+    assert ("activate" in printed) == (found is None)
+    assert all(len(line) <= 80 for line in printed.splitlines()[2:])

@@ -1,1 +1,0 @@
-"""Processes that do pieces of work, and may die without harm."""
