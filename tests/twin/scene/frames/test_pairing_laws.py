@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.episode import schema, streams
+from bridge.episode import streams, topics
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
@@ -45,7 +45,7 @@ def episode(tmp_path: Path) -> Episode:
     with EpisodeWriter(path) as writer:
 
         def write(topic: str, data: bytes, stamp_ns: int) -> None:
-            kind = schema.type_of_topic(topic) or ""
+            kind = topics.type_of_topic(topic) or ""
             writer.write(topic, data, type_name=kind, log_time_ns=stamp_ns)
 
         for name in ("color", "depth"):
