@@ -11,6 +11,8 @@ from scripted_plans import joints_over
 
 from bridge.geometry import se3
 from bridge.task.plan import Stage
+from bridge.robots.default import ROBOT
+from twin.replay.clearance.bodies import planes_of
 from twin.replay.clearance.monitor import ClearanceMonitor, State, allowed_pairs, object_travel_m
 from twin.replay.config import ReplayConfig
 from twin.robot.collision import hulls_of
@@ -83,3 +85,38 @@ def test_what_was_let_go_of_may_stay_where_it_was_put_and_the_gripper_may_not(
     lies = frozenset(("cube", "box"))
     assert allowed_pairs((put, leave), 5) == {lies, frozenset(("gripper", "cube"))}
     assert allowed_pairs((put, leave), 15) == ({lies} if releases else set())
+
+
+def test_corners_of_a_placed_hull_lie_on_it_and_its_middle_inside() -> None:
+    """Whatever way it is turned; and a point moved outwards is as far away as it was moved."""
+    rng = np.random.default_rng(4)
+    hulls = hulls_of(load_robot(ROBOT.urdf_text()))
+    for hull, planes in zip(hulls.hulls, planes_of(hulls), strict=True):
+        R = se3.rotation_from_quaternion(rng.normal(size=4))
+        t = rng.normal(size=3)
+        for corner in hull.points_m[::7]:
+            found = planes.distance_m((R @ corner + t)[None], R, t)
+            assert found == pytest.approx(0.0, abs=1e-6)
+        middle = hull.points_m.mean(axis=0)
+        assert planes.distance_m((R @ middle + t)[None], R, t) < 0
+        normal, offset = planes.normals[0], planes.offsets_m[0]
+        face = middle - (normal @ middle + offset) * normal  # above the face, seen from the middle
+        outside = R @ (face + 0.05 * normal) + t
+        assert planes.distance_m(outside[None], R, t) >= 0.05 - 1e-9
+
+
+@pytest.mark.parametrize(
+    ("gap_m", "causes"), [(0.001, []), (0.0, []), (-0.006, ["pre_grasp_penetration"])]
+)
+def test_before_the_grasp_fingers_beside_an_object_are_not_in_it(
+    script: SimpleNamespace, gap_m: float, causes: list[str]
+) -> None:
+    """On both sides of a cube of 40 mm, a millimetre away from it, or six deep."""
+    scene = script.scene()
+    T = se3.transform_from(np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.5, -0.15, 0.02]))
+    scene = replace(scene, Ts_base_object={**scene.Ts_base_object, "cube": T})
+    monitor = ClearanceMonitor(
+        scene, script.plan(scene), hulls_of(load_robot(scene.urdf)), ReplayConfig()
+    )
+    monitor.check_pre_grasp(0, joints_over(scene, 0.5, -0.15, 0.02), 0.04 + 2 * gap_m)
+    assert [failure.cause for failure in monitor.failures] == causes

@@ -1,0 +1,45 @@
+"""Statistics of agreement against SciPy where sides tie, and MMRV worked out by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from scipy import stats
+
+from evaluator.statistics.agreement import fisher_interval, kendall, mmrv, pearson
+
+RATES = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 6)), min_size=4, max_size=12)
+
+
+def sides(cells: list[tuple[int, int]]) -> tuple[list[float], list[float]]:
+    recorded, sim = [a / 4 for a, _ in cells], [b / 8 for _, b in cells]  # exact in binary
+    assume(len(set(recorded)) > 1)
+    assume(len(set(sim)) > 1)
+    return recorded, sim
+
+
+@given(RATES)
+def test_kendalls_tau_is_that_of_scipy_with_ties_on_either_side(
+    cells: list[tuple[int, int]],
+) -> None:
+    recorded, sim = sides(cells)
+    assert kendall(recorded, sim) == pytest.approx(stats.kendalltau(recorded, sim).statistic)
+
+
+@given(RATES, st.sampled_from([0.8, 0.95]))
+def test_fishers_interval_is_that_of_scipy(cells: list[tuple[int, int]], level: float) -> None:
+    recorded, sim = sides(cells)
+    r = pearson(recorded, sim)
+    assume(abs(r) < 1 - 1e-9)
+    found = fisher_interval(r, len(recorded), level=level)
+    expected = stats.pearsonr(recorded, sim).confidence_interval(level)
+    assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=1e-9)
+
+
+def test_where_the_twin_ties_only_the_better_cell_is_violated() -> None:
+    """Recorded 0, 0.1 and 1, all alike in the twin: gaps of 0, 0.1 and 1 to what is worse."""
+    recorded, sim = [0.0, 0.1, 1.0], [0.5, 0.5, 0.5]
+    assert mmrv(recorded=recorded, sim=sim) == pytest.approx((0.0 + 0.1 + 1.0) / 3)
+    order = np.array([2, 0, 1])
+    shuffled = [recorded[index] for index in order]
+    assert mmrv(recorded=shuffled, sim=sim) == pytest.approx(1.1 / 3)
