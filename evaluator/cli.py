@@ -164,4 +164,4 @@ def _missed_text(item: "Missed") -> str:
 
 def _finding_text(item: "Finding") -> str:
     where = "" if item.row is None else f"row {item.row}: "
-    return f"{where}{item.what}: {item.verdict}. {item.remark}".strip()
+    return f"{where}{item.what}: {item.verdict}. {item.note}".strip()

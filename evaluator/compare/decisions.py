@@ -125,14 +125,15 @@ def _leave_one_out(usable: Sequence[RateCell]) -> tuple[Table, ...]:
         kept = [cell for cell in usable if cell.task in others]
         recorded, sim = sides(kept)
         bias = 100 * agreement.bias(recorded=recorded, sim=sim)
+        r, why = None, None
         try:
-            r: float | str = round(agreement.pearson(recorded, sim), 3)
+            r = round(agreement.pearson(recorded, sim), 3)
         except UndefinedStatisticError as error:
-            r = f"undefined: {error.reason}"
-        rows.append((task, len(kept), r, round(bias, 1)))
+            why = error.reason
+        rows.append((task, len(kept), r, round(bias, 1), why))
     note = "An agreement that one task carries alone is none."
     title = "Without one task"
-    columns = ("task left out", "cells", "Pearson r", "bias (pp)")
+    columns = ("task left out", "groups", "Pearson r", "bias (pp)", "why undefined")
     return (
         Table(id="leave_one_task_out", title=title, columns=columns, rows=tuple(rows), note=note),
     )

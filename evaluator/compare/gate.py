@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from evaluator.compare.measure import measured, proportion, vouched_rate
+from evaluator.compare.measure import ends, measured, proportion, vouched_rate
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import WITH, WITHOUT, Answer, names_of
 from evaluator.errors import UndefinedStatisticError
@@ -126,29 +126,24 @@ def _line(counts: Confusion) -> tuple[Cell, ...]:
         counts.n,
         counts.said_failure,
         counts.true_negative,
-        _rate(counts.true_negative, counts.said_failure),
+        *_rate(counts.true_negative, counts.said_failure),
         counts.false_negative,
-        _rate(counts.true_negative, failed),
+        failed,
+        *_rate(counts.true_negative, failed),
         _price(counts),
     )
 
 
-def _rate(k: int, n: int) -> str | None:
-    """Write a share with its interval; None where it has no denominator."""
-    if not n:
-        return None
-    interval, _ = vouched_rate(k, n, "wilson")
-    text = f"{k}/{n} = {100 * k / n:.0f} %"
-    if interval is None:
-        return text
-    return f"{text} [{100 * interval.low:.0f}, {100 * interval.high:.0f}]"
+def _rate(k: int, n: int) -> tuple[Cell, ...]:
+    """Return a share with its interval; unknown where it has no denominator."""
+    return (k / n, *ends(vouched_rate(k, n, "wilson")[0])) if n else (None, None, None)
 
 
-def _price(counts: Confusion) -> Cell:
+def _price(counts: Confusion) -> float | None:
     try:
         return round(break_even(counts), 3)
     except UndefinedStatisticError:
-        return "any" if counts.true_negative else None
+        return None
 
 
 def _costs(counts: Confusion) -> tuple[Cell, ...]:
@@ -164,15 +159,9 @@ def _table(lines: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
             id="gate_clauses",
             title="What each clause of the verdict is worth",
             columns=(
-                "said by",
-                "clause",
-                "trials",
-                "said no",
-                "of them failed",
-                "right to say no",
-                "good plans refused",
-                "failures it found",
-                "pays up to a price of",
+                *("verdict of", "clause", "trials", "refused", "refused and failed"),
+                *("right", "right low", "right high", "good plans refused"),
+                *("failed", "found", "found low", "found high", "pays up to a price of"),
             ),
             rows=tuple(lines),
             note="Trials with a known outcome in which the clause was decided. A clause that says "

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from evaluator.errors import AlikeNamesError, UndefinedStatisticError
 from evaluator.measurements import Defined, slug
-from evaluator.result import Exclusion, Interval, Measurement, Table
+from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.statistics.coverage.stored import Size, vouch
 from evaluator.statistics.intervals import RATE_INTERVALS
 
@@ -32,11 +32,20 @@ def milliseconds(value_s: float | None) -> float | None:
     return _rounded(value_s, 1e3)
 
 
-def millimetre_ends(interval: Interval | None) -> str | None:
-    """Return both ends of an interval of a length [mm]."""
-    if interval is None:
-        return None
-    return f"[{1e3 * interval.low:.1f}, {1e3 * interval.high:.1f}]"
+def ends(interval: Interval | None, factor: float = 1.0) -> tuple[float | None, float | None]:
+    """Return both ends of an interval, in another unit by ``factor``; unknown without one."""
+    return (None, None) if interval is None else (factor * interval.low, factor * interval.high)
+
+
+RATE_COLUMNS = ("k", "n", "rate", "low", "high", "interval")
+"""Columns of a table that ``rate_row`` fills: a share from 0 to 1 with its interval's method."""
+
+
+def rate_row(rate: Measurement) -> tuple[Cell, ...]:
+    """Lay one rate out in columns; unknown is None."""
+    method = None if rate.interval is None else rate.interval.method
+    counts = (None, None) if rate.value is None and not rate.n else (rate.k, rate.n)
+    return (*counts, rate.value, *ends(rate.interval), method)
 
 
 def average(items: Sequence[Item], read: Callable[[Item], float | None]) -> float | None:

@@ -32,20 +32,20 @@ def notes(cells: Sequence[RateCell], measurements: Sequence[Measurement]) -> lis
 
 
 def notes_table(found: Iterable[Note]) -> tuple[Table, ...]:
-    """Lay remarks out as a table; none without remarks."""
+    """Lay notes out as a table; none without notes."""
     rows = tuple(dict.fromkeys(found))
     if not rows:
         return ()
-    return (Table(id="remarks", title="Remarks", columns=("about", "remark"), rows=rows),)
+    return (Table(id="notes", title="Notes", columns=("about", "note"), rows=rows),)
 
 
 def with_notes(tables: Iterable[Table], found: Iterable[Note]) -> tuple[Table, ...]:
-    """Put remarks before those that are among some tables already."""
+    """Put notes before those that are among some tables already."""
     kept, found = list(tables), list(found)
     if not found:
         return tuple(kept)
-    old = [(str(a), str(b)) for table in kept if table.id == "remarks" for a, b in table.rows]
-    others = [table for table in kept if table.id != "remarks"]
+    old = [(str(a), str(b)) for table in kept if table.id == "notes" for a, b in table.rows]
+    others = [table for table in kept if table.id != "notes"]
     return (*others, *notes_table([*found, *old]))
 
 

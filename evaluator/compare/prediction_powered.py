@@ -304,12 +304,11 @@ def stopping_table(rows: Sequence[TrialRow], goal: float | None) -> tuple[Table,
         try:
             sequence = sequence_of([bool(row.recorded) for row in known])
         except UndefinedStatisticError as error:
-            lines.append((task, condition, policy, len(known), None, error.reason, None))
+            lines.append((task, condition, policy, goal, len(known), *[None] * 5, error.reason))
             continue
         advice = stop_or_continue(sequence, goal)
-        ends = f"[{100 * sequence.low:.1f}, {100 * sequence.high:.1f}] %"
-        words = f"stop: {advice.answer} {100 * goal:g} %" if advice.stop else "continue"
-        lines.append((task, condition, policy, sequence.n, ends, words, advice.more_trials))
+        found = (sequence.low, sequence.high, advice.stop, advice.answer or None)
+        lines.append((task, condition, policy, goal, sequence.n, *found, advice.more_trials, None))
     return (
         Table(
             id="stopping",
@@ -318,10 +317,14 @@ def stopping_table(rows: Sequence[TrialRow], goal: float | None) -> tuple[Table,
                 "task",
                 "condition",
                 "policy",
+                "goal",
                 "trials",
-                "interval at any time",
-                "advice",
+                "low",
+                "high",
+                "stop",
+                "answer",
                 "more trials at this rate",
+                "why undefined",
             ),
             rows=tuple(lines),
             note="Betting confidence sequences at 95 %: the answer holds however often one looked.",

@@ -24,7 +24,7 @@ from bridge.exchange.trials_rates import (
     read_rate,
 )
 from evaluator.compare.agreement import sides, usable_cells
-from evaluator.compare.notes import notes_table
+from evaluator.compare.notes import with_notes
 from evaluator.compare.rates import compare_records
 from evaluator.compare.rows import Comparison, RateCell
 from evaluator.compare.success import WITH, WITHOUT
@@ -59,9 +59,12 @@ class Finding:
     """As a spreadsheet numbers it; None for what the table does not print."""
     what: str
     printed: str
-    recomputed: str
+    recomputed: float | None
+    """None where the rows give none, or several."""
     verdict: str
-    remark: str = ""
+    note: str = ""
+    instead: str = ""
+    """What stands in the place of a number that is not there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,11 +118,8 @@ def check_published(path: Path, *, method: str = "wilson") -> PublishedCheck:
     cells = usable_cells(comparison.cells)
     findings += [_judge(claim, cells, claims) for claim in claims]
     findings += _not_printed(cells, claims)
-    about = [(f.what, f.remark) for f in findings if f.remark]
-    shown = [t for t in comparison.tables if t.id != "remarks"]
-    old = [t.rows for t in comparison.tables if t.id == "remarks"]
-    about += [(str(a), str(b)) for rows in old for a, b in rows]
-    tables = (_table(findings), *shown, *notes_table(about))
+    about = [(f.what, f.note) for f in findings if f.note]
+    tables = (_table(findings), *with_notes(comparison.tables, about))
     return PublishedCheck(comparison=replace(comparison, tables=tables), findings=tuple(findings))
 
 
@@ -154,9 +154,9 @@ def _read(row: SourceRow) -> tuple[RateRecord, Finding | None]:
     try:
         return read_rate(row), None
     except ImpossibleRateError as error:
-        refusal, recomputed, verdict = error, f"{k}/{n}" if k else f"no count of {n}", IMPOSSIBLE
+        refusal, instead, verdict = error, f"{k}/{n}" if k else f"no count of {n}", IMPOSSIBLE
     except AmbiguousRateError as error:
-        refusal, recomputed, verdict = error, f"several counts of {n}", AMBIGUOUS
+        refusal, instead, verdict = error, f"several counts of {n}", AMBIGUOUS
     printed = printed_rate(row)
     if printed is None:
         raise refusal
@@ -165,9 +165,10 @@ def _read(row: SourceRow) -> tuple[RateRecord, Finding | None]:
         row=row.row,
         what=" ".join(name for name in names if name),
         printed=row.text("rate_percent") or row.text("rate"),
-        recomputed=recomputed,
+        recomputed=None,
         verdict=verdict,
-        remark=str(refusal).partition(f" row {row.row}: ")[2],
+        note=str(refusal).partition(f" row {row.row}: ")[2],
+        instead=instead,
     )
     return _as_printed(row, printed[0]), finding
 
@@ -198,26 +199,27 @@ def _judge(claim: _Claim, cells: Sequence[RateCell], claims: Sequence[_Claim]) -
             row=claim.row.row,
             what=what,
             printed=printed,
-            recomputed=f"undefined: {error.reason}",
+            recomputed=None,
             verdict=UNDEFINED,
-            remark=f"printed {printed}, but the rows do not give it: {error.reason}",
+            instead=f"undefined: {error.reason}",
+            note=f"printed {printed}, but the rows do not give it: {error.reason}",
         )
     shown = f"{value:.4g}" if abs(value) < 1 else f"{value:.2f}"
     if _fits(value, claim):
-        verdict, remark = AS_PRINTED, ""
+        verdict, note = AS_PRINTED, ""
     else:
-        verdict, remark = DIFFERS, f"printed {printed}, the rows give {shown}"
+        verdict, note = DIFFERS, f"printed {printed}, the rows give {shown}"
         from_rounded = _from_rounded(claim, claims)
         if from_rounded is not None and _fits(from_rounded, claim):
             verdict = ROUNDED
-            remark = f"{printed} comes from the rounded averages; unrounded it is {shown}"
+            note = f"{printed} comes from the rounded averages; unrounded it is {shown}"
     return Finding(
         row=claim.row.row,
         what=what,
         printed=printed,
-        recomputed=shown,
+        recomputed=value,
         verdict=verdict,
-        remark=remark,
+        note=note,
     )
 
 
@@ -269,18 +271,20 @@ def _not_printed(cells: Sequence[RateCell], claims: Sequence[_Claim]) -> list[Fi
     for condition in conditions:
         if condition in printed:
             continue
+        value, instead = None, ""
         try:
-            shown = f"{_value('pearson_r', '', condition, cells):.3f}"
+            value = _value("pearson_r", "", condition, cells)
         except UndefinedStatisticError as error:
-            shown = f"undefined: {error.reason}"
+            instead = f"undefined: {error.reason}"
         num = sum(condition in ("", cell.condition) for cell in cells)
         findings.append(
             Finding(
                 row=None,
-                what=f"pearson_r {condition or 'all cells'} (n = {num})",
+                what=f"pearson_r {condition or 'all groups'} (n = {num})",
                 printed="",
-                recomputed=shown,
+                recomputed=value,
                 verdict=NOT_PRINTED,
+                instead=instead,
             )
         )
     return findings
@@ -290,9 +294,12 @@ def _table(findings: Sequence[Finding]) -> Table:
     return Table(
         id="published",
         title="Printed figures, recomputed from the table's own rows",
-        columns=("row", "figure", "printed", "recomputed", "verdict", "remark"),
+        columns=("row", "figure", "printed", "recomputed", "instead", "verdict", "note"),
         rows=tuple(
-            (f.row, f.what, f.printed or None, f.recomputed, f.verdict, f.remark or None)
+            (
+                *(f.row, f.what, f.printed or None, f.recomputed, f.instead or None),
+                *(f.verdict, f.note or None),
+            )
             for f in findings
         ),
         note="A figure fits when it rounds to what is printed. Ambiguous: several counts round to "

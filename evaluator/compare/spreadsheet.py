@@ -159,11 +159,11 @@ def _from_benchmark(
     """Enter outcomes of closed-loop rollouts on the sim side, and say what they are."""
     rows = [row_from_record(record) for record in records]
     base = compare_rows(rows, run=path.stem, source="trials", stand_in=None, method=method)
-    remark = (
+    note = (
         f"{name} results are rollouts of a policy in that simulator, entered on the sim side: no "
         "plan was sent and nothing was replayed. Add real trials of the same starts to compare"
     )
-    base = replace(base, tables=with_notes(base.tables, [(name, remark)]))
+    base = replace(base, tables=with_notes(base.tables, [(name, note)]))
     return _with_source(base, path, ())
 
 

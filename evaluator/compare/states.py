@@ -13,9 +13,9 @@ from evaluator.compare.known_task import known_task
 from evaluator.compare.measure import (
     Part,
     degrees,
+    ends,
     interval_or_reason,
     measured,
-    millimetre_ends,
     millimetres,
 )
 from evaluator.errors import UndefinedStatisticError
@@ -198,7 +198,7 @@ def final_table(keys: Sequence[Group], by_id: dict[str, Measurement]) -> Table:
                 key[1],
                 position.n,
                 millimetres(position.value),
-                millimetre_ends(position.interval),
+                *(millimetres(end) for end in ends(position.interval)),
                 millimetres(by_id[_defined(key, "position", "mean").id].value),
                 None if rotation is None else degrees(rotation.value),
                 None if extents is None else millimetres(extents.value),
@@ -214,7 +214,8 @@ def final_table(keys: Sequence[Group], by_id: dict[str, Measurement]) -> Table:
             "against",
             "objects",
             "median distance (mm)",
-            "interval (mm)",
+            "low (mm)",
+            "high (mm)",
             "mean distance (mm)",
             "median rotation (deg)",
             "median extents (mm)",

@@ -322,10 +322,12 @@ def _line(
     task, condition, policy = key
     return (
         task,
-        condition.replace("_", " "),
+        condition,
         policy,
-        f"{_nominal(rows)}/{decided}",
-        f"{100 * (again.value or 0.0):.1f} % (n = {len(rows)})",
+        _nominal(rows),
+        decided,
+        again.value,
+        len(rows),
         None if gap.value is None else round(gap.value, 1),
     )
 
@@ -334,7 +336,10 @@ def _table(lines: Sequence[tuple[Cell, ...]]) -> Table:
     return Table(
         id="sim_varied",
         title="Sim estimated again with fresh seeds",
-        columns=("task", "condition", "policy", "sim", "sim, fresh seeds", "difference (pp)"),
+        columns=(
+            *("task", "condition", "policy", "sim k", "sim n"),
+            *("rate with fresh seeds", "trials with fresh seeds", "difference (pp)"),
+        ),
         rows=tuple(lines),
         note="sim: nominal planned replays of the plans sent, in trials that have varied replays. "
         "Fresh seeds: the share of each plan's varied replays that succeed, averaged over trials; "

@@ -34,7 +34,7 @@ SECTIONS: tuple[Section, ...] = (
         title="Success rates",
         lead="How often a task succeeded in the twin and as labelled. Sim is planned-in-twin: the "
         "plan actually sent, replayed with physics.",
-        tables=("success", "layout", "remarks"),
+        tables=("success", "layout", "notes"),
         figures=("success",),
     ),
     Section(

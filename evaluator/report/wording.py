@@ -1,9 +1,9 @@
 """How numbers are written for people: rounding happens here and nowhere earlier."""
 
 import math
-from collections.abc import Sequence
 
-from evaluator.result import Cell, Measurement, Results
+from evaluator.report.views import Shown
+from evaluator.result import Measurement, Results
 
 HEADLINES: tuple[tuple[str, str], ...] = (
     ("agreement.sim_planned.rate", "Sim and outcome agree"),
@@ -158,15 +158,10 @@ def stand_in_sentence(results: Results) -> str | None:
     )
 
 
-def cell_text(cell: Cell) -> str:
+def cell_text(cell: Shown) -> str:
     """Write one table cell; unknown is a dash."""
     if cell is None:
         return "–"
     if isinstance(cell, bool):
         return "yes" if cell else "no"
     return f"{cell + 0.0:g}" if isinstance(cell, float) else str(cell)  # -0.0 is 0
-
-
-def texts(row: Sequence[Cell]) -> list[str]:
-    """Write one table row."""
-    return [cell_text(cell) for cell in row]
