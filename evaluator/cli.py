@@ -48,7 +48,7 @@ def evaluate(
         check_published: A published table (a rates CSV with printed figures): recompute it from
             its rows, and exit with 3 when a figure does not follow from them.
         interval: Interval of success rates.
-        goal: A success rate from 0 to 1: say for each cell whether its trials settle that it lies
+        goal: A success rate from 0 to 1: say for each group whether its trials settle that it lies
             above or below, at any time, or how many more that may take.
         force: Read every file of the run again, whatever RUN/results/cache remembers.
         images: Renders to compare, and backbones of LPIPS.

@@ -172,7 +172,7 @@ AVERAGE_MACRO = _new(
     "1",
     "higher",
     agreement.mean_rate,
-    "mean of the unrounded {side} rates of {over} {condition}: every cell counts the same",
+    "mean of the unrounded {side} rates of {over} {condition}: every group counts the same",
 )
 AVERAGE_POOLED = _new(
     "average.pooled.{side}.{condition}",
@@ -320,7 +320,7 @@ PEARSON_R_REMEASURED = _new(
     "1",
     "higher",
     agreement.pearson,
-    "the same r {what}; its band is where r would fall if the same cells were measured again with as many trials",
+    "the same r {what}; its band is where r would fall if the same groups were measured again with as many trials",
 )
 SPEARMAN = _agreement(
     "spearman_rho",
@@ -368,21 +368,21 @@ ORDER_ACCURACY = _agreement(
     "1",
     "higher",
     agreement.order_accuracy,
-    "pairs of cells that the twin orders as the recorded rates do / pairs whose recorded rates differ; a tie in the twin counts 1/2; {what}",
+    "pairs of groups that the twin orders as the recorded rates do / pairs whose recorded rates differ; a tie in the twin counts 1/2; {what}",
 )
 MMRV_RECORDED = _agreement(
     "mmrv_recorded_gap",
     "1",
     "lower",
     agreement.mmrv,
-    "mean maximum rank violation {what}; convention: gap of recorded rates (SIMPLER equation 1); it grows with the number of cells",
+    "mean maximum rank violation {what}; convention: gap of recorded rates (SIMPLER equation 1); it grows with the number of groups",
 )
 MMRV_SIM = _agreement(
     "mmrv_sim_gap",
     "1",
     "lower",
     agreement.mmrv,
-    "mean maximum rank violation {what}; convention: gap of sim rates (arguments swapped, as some published code does); it grows with the number of cells",
+    "mean maximum rank violation {what}; convention: gap of sim rates (arguments swapped, as some published code does); it grows with the number of groups",
 )
 LARGEST_GAP = _new(
     "agreement.largest_gap_pp",

@@ -51,7 +51,7 @@ class Measurement:
     """Successes, where the value is k/n."""
     n: int | None = None
     counted: str | None = None
-    """What ``n`` counts: trial, object, pair, cell, image, run."""
+    """What ``n`` counts: trial, object, pair, group, image, run."""
     reason_if_undefined: str | None = None
     """Set exactly when ``value`` is None."""
     reason_without_interval: str | None = None

@@ -102,7 +102,7 @@ class StartOverlap:
     """Whether the twin's other starts lie where those with a robot trial do."""
 
     def __init__(self, tried: Sequence[TrialRow], others: Sequence[TrialRow]) -> None:
-        """Take the trials of one cell; nothing is computed before somebody asks."""
+        """Take the trials of one group; nothing is computed before somebody asks."""
         self._tried = tried
         self._others = others
 
@@ -157,9 +157,9 @@ MOST_LOG = math.log(MOST)
 
 
 def assisted_rates(rows: Sequence[TrialRow]) -> list[Measurement]:
-    """Estimate each cell's recorded rate from its robot trials and the starts only the twin has.
+    """Estimate each group's recorded rate from its robot trials and the starts only the twin has.
 
-    Cells without a start of the twin's own are left out: there the twin adds nothing.
+    Groups without a start of the twin's own are left out: there the twin adds nothing.
     """
     measurements = []
     for key, members in group_rows(rows).items():
@@ -173,7 +173,7 @@ def assisted_rates(rows: Sequence[TrialRow]) -> list[Measurement]:
 
 @dataclass(frozen=True)
 class _Assisted:
-    """One cell's rate by the trials in which the twin was tried, and by what it says of others."""
+    """One group's rate by the trials in which the twin was tried, and by what it says of others."""
 
     counts: Confusion
     """What the twin said of the tried starts, against their outcomes."""
@@ -224,36 +224,38 @@ class _Assisted:
 def _assisted_rate(
     key: Key, paired: Sequence[TrialRow], alone: Sequence[TrialRow]
 ) -> list[Measurement]:
-    cell = _Assisted(
+    assisted = _Assisted(
         counts=confusion_of(paired, lambda row: row.sim_planned),
         alone_k=trials_in(row for row in alone if row.sim_planned),
         alone_n=trials_in(alone),
         overlap=StartOverlap(paired, alone),
     )
-    many = f"{cell.counts.n} trials with an outcome and {cell.alone_n} starts that only the "
+    many = (
+        f"{assisted.counts.n} trials with an outcome and {assisted.alone_n} starts that only the "
+    )
     many += "twin has"
 
     measurements = [
         measured(
             of_group(quantity, key, many=many),
             compute,
-            n=cell.counts.n,
+            n=assisted.counts.n,
             counted="trial",
             reason_without_interval="a count or a p-value",
             episodes=names_of(paired),
         )
         for quantity, compute in (
-            (PROXY_RATE, cell.rate),
-            (PROXY_RATE_PPI, cell.rate_ppi),
-            (TRIALS_SAVED, cell.saved),
-            (RANDOM_STARTS_P, cell.p_random),
+            (PROXY_RATE, assisted.rate),
+            (PROXY_RATE_PPI, assisted.rate_ppi),
+            (TRIALS_SAVED, assisted.saved),
+            (RANDOM_STARTS_P, assisted.p_random),
         )
     ]
-    return [*measurements, *cell.overlap.measurements(key)]
+    return [*measurements, *assisted.overlap.measurements(key)]
 
 
 def sequences(rows: Sequence[TrialRow], pairs: Sequence[StartPair]) -> list[Measurement]:
-    """Say what holds however often somebody looked: each cell's rate, and the paired gain."""
+    """Say what holds however often somebody looked: each group's rate, and the paired gain."""
     measurements = []
     for key, members in group_rows(rows).items():
         known = _in_order([row for row in members if row.recorded is not None])
@@ -293,7 +295,7 @@ def _sequence(key: Key, known: Sequence[TrialRow]) -> Measurement:
 
 
 def stopping_table(rows: Sequence[TrialRow], goal: float | None) -> tuple[Table, ...]:
-    """Say for each cell whether its recorded rate is settled against a goal; none without one."""
+    """Say for each group whether its recorded rate is settled against a goal; none without one."""
     if goal is None:
         return ()
     lines: list[tuple[Cell, ...]] = []

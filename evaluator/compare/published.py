@@ -23,10 +23,10 @@ from bridge.exchange.trials_rates import (
     printed_rate,
     read_rate,
 )
-from evaluator.compare.agreement import sides, usable_cells
+from evaluator.compare.agreement import sides, usable_groups
 from evaluator.compare.notes import with_notes
 from evaluator.compare.rates import compare_records
-from evaluator.compare.rows import Comparison, RateCell
+from evaluator.compare.rows import Comparison, RateGroup
 from evaluator.compare.success import WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Table
@@ -115,9 +115,9 @@ def check_published(path: Path, *, method: str = "wilson") -> PublishedCheck:
         records.append(record)
         findings += [] if finding is None else [finding]
     comparison = compare_records(records, path, method=method)
-    cells = usable_cells(comparison.cells)
-    findings += [_judge(claim, cells, claims) for claim in claims]
-    findings += _not_printed(cells, claims)
+    groups = usable_groups(comparison.groups)
+    findings += [_judge(claim, groups, claims) for claim in claims]
+    findings += _not_printed(groups, claims)
     about = [(f.what, f.note) for f in findings if f.note]
     tables = (_table(findings), *with_notes(comparison.tables, about))
     return PublishedCheck(comparison=replace(comparison, tables=tables), findings=tuple(findings))
@@ -187,13 +187,13 @@ def _as_printed(row: SourceRow, rate: Fraction) -> RateRecord:
     )
 
 
-def _judge(claim: _Claim, cells: Sequence[RateCell], claims: Sequence[_Claim]) -> Finding:
+def _judge(claim: _Claim, groups: Sequence[RateGroup], claims: Sequence[_Claim]) -> Finding:
     parts = (claim.statistic, claim.task, claim.side, claim.condition)
     what = " ".join(part for part in parts if part)
-    cells = [cell for cell in cells if claim.task in ("", cell.task)]
+    groups = [group for group in groups if claim.task in ("", group.task)]
     printed = str(claim.value)
     try:
-        value = _value(claim.statistic, claim.side, claim.condition, cells)
+        value = _value(claim.statistic, claim.side, claim.condition, groups)
     except UndefinedStatisticError as error:
         return Finding(
             row=claim.row.row,
@@ -227,15 +227,15 @@ def _fits(value: float, claim: _Claim) -> bool:
     return abs(Fraction(value) - Fraction(claim.value)) <= claim.half + Fraction(1, 10**9)
 
 
-def _value(statistic: str, side: str, condition: str, cells: Sequence[RateCell]) -> float:
-    """Recompute one statistic from the cells, over one condition or all."""
-    chosen = [cell for cell in cells if condition in ("", cell.condition)]
+def _value(statistic: str, side: str, condition: str, groups: Sequence[RateGroup]) -> float:
+    """Recompute one statistic from the groups, over one condition or all."""
+    chosen = [group for group in groups if condition in ("", group.condition)]
     recorded, sim = sides(chosen)
     if statistic == "average_percent":
         return 100 * mean_rate(sim if side == "sim" else recorded)
     if statistic in ("gain_pp", "gain_relative_percent"):
-        before = _value("average_percent", side, WITHOUT, cells)
-        after = _value("average_percent", side, WITH, cells)
+        before = _value("average_percent", side, WITHOUT, groups)
+        after = _value("average_percent", side, WITH, groups)
         return after - before if statistic == "gain_pp" else 100 * relative_gain(before, after)
     if statistic == "pearson_r":
         return pearson(recorded, sim)
@@ -263,20 +263,20 @@ def _from_rounded(claim: _Claim, claims: Sequence[_Claim]) -> float | None:
     return 100 * relative_gain(before, after)
 
 
-def _not_printed(cells: Sequence[RateCell], claims: Sequence[_Claim]) -> list[Finding]:
+def _not_printed(groups: Sequence[RateGroup], claims: Sequence[_Claim]) -> list[Finding]:
     """The correlation that a success table of both sides invites, where it is not printed."""
     printed = {claim.condition for claim in claims if claim.statistic == "pearson_r"}
-    conditions = [*dict.fromkeys(cell.condition for cell in cells), ""]
+    conditions = [*dict.fromkeys(group.condition for group in groups), ""]
     findings = []
     for condition in conditions:
         if condition in printed:
             continue
         value, instead = None, ""
         try:
-            value = _value("pearson_r", "", condition, cells)
+            value = _value("pearson_r", "", condition, groups)
         except UndefinedStatisticError as error:
             instead = f"undefined: {error.reason}"
-        num = sum(condition in ("", cell.condition) for cell in cells)
+        num = sum(condition in ("", group.condition) for group in groups)
         findings.append(
             Finding(
                 row=None,

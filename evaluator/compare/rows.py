@@ -115,7 +115,7 @@ def is_streamed(rows: Iterable[TrialRow]) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RateCell:
+class RateGroup:
     """Success rates of one task, condition and policy, recorded and in the twin."""
 
     task: str
@@ -159,7 +159,7 @@ class Comparison:
     """run, trials, rates or images."""
     stand_in: bool | None
     rows: tuple[TrialRow, ...] = ()
-    cells: tuple[RateCell, ...] = ()
+    groups: tuple[RateGroup, ...] = ()
     measurements: tuple[Measurement, ...] = ()
     tables: tuple[Table, ...] = ()
     exclusions: tuple[Exclusion, ...] = ()

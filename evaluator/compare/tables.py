@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from evaluator.compare.gate import confusion_of, heeded_verdict, unheeded_verdict
 from evaluator.compare.measure import RATE_COLUMNS, ends, rate_row
-from evaluator.compare.rows import RateCell, TrialRow
+from evaluator.compare.rows import RateGroup, TrialRow
 from evaluator.compare.success import WITH, WITHOUT
 from evaluator.measurements import (
     AVERAGE_MACRO,
@@ -47,22 +47,22 @@ def _brackets(shown: Sequence[Measurement]) -> str:
     return said
 
 
-def success_table(cells: Sequence[RateCell], word: str, sim_note: str = SIM_NOTE) -> Table:
+def success_table(groups: Sequence[RateGroup], word: str, sim_note: str = SIM_NOTE) -> Table:
     """Success without and with replanning, in the twin and recorded."""
-    shown = [side for cell in cells for side in (cell.sim, cell.recorded)]
+    shown = [side for group in groups for side in (group.sim, group.recorded)]
     rows = tuple(
         (
-            cell.task,
-            cell.condition,
-            cell.policy,
+            group.task,
+            group.condition,
+            group.policy,
             side,
-            cell.unit,
+            group.unit,
             *rate_row(rate),
-            _gap(cell),
+            _gap(group),
             rate.reason_if_undefined,
         )
-        for cell in cells
-        for side, rate in (("sim", cell.sim), (word, cell.recorded))
+        for group in groups
+        for side, rate in (("sim", group.sim), (word, group.recorded))
     )
     return Table(
         id="success",
@@ -77,10 +77,10 @@ def success_table(cells: Sequence[RateCell], word: str, sim_note: str = SIM_NOTE
     )
 
 
-def _gap(cell: RateCell) -> float | None:
-    if cell.sim_rate is None or cell.recorded_rate is None:
+def _gap(group: RateGroup) -> float | None:
+    if group.sim_rate is None or group.recorded_rate is None:
         return None
-    return round(float(100 * (cell.sim_rate - cell.recorded_rate)), 1)
+    return round(float(100 * (group.sim_rate - group.recorded_rate)), 1)
 
 
 def gains_table(gains: Sequence[Measurement], word: str) -> tuple[Table, ...]:
@@ -127,19 +127,19 @@ def gains_table(gains: Sequence[Measurement], word: str) -> tuple[Table, ...]:
 
 
 def layout_table(
-    cells: Sequence[RateCell], measurements: Sequence[Measurement], word: str
+    groups: Sequence[RateGroup], measurements: Sequence[Measurement], word: str
 ) -> tuple[Table, ...]:
     """Lay rates out as papers print them: a row per task, sim and recorded without and with."""
-    conditions = [name for name in (WITHOUT, WITH) if any(c.condition == name for c in cells)]
+    conditions = [name for name in (WITHOUT, WITH) if any(c.condition == name for c in groups)]
     if len(conditions) < 2:
         return ()
-    found = {(c.task, c.policy, c.condition): c for c in cells}
+    found = {(c.task, c.policy, c.condition): c for c in groups}
     rows = []
-    for task, policy in dict.fromkeys((c.task, c.policy) for c in cells):
+    for task, policy in dict.fromkeys((c.task, c.policy) for c in groups):
         line: list[Cell] = [task, policy]
         for condition in conditions:
-            cell = found.get((task, policy, condition))
-            line += [cell.sim.value, cell.recorded.value] if cell else [None, None]
+            group = found.get((task, policy, condition))
+            line += [group.sim.value, group.recorded.value] if group else [None, None]
         rows.append(tuple(line))
     by_id = {measurement.id: measurement for measurement in measurements}
     for kind, average in (("macro", AVERAGE_MACRO), ("pooled", AVERAGE_POOLED)):

@@ -47,7 +47,7 @@ def outcome_word(trial: LiveTrial) -> str:
 
 
 def label(task: str, condition: str, policy: str) -> str:
-    """Return a cell in a reader's words."""
+    """Return a group in a reader's words."""
     return ", ".join(part.replace("_", " ") for part in (task, condition, policy) if part)
 
 
@@ -76,7 +76,7 @@ def advice_words(advice: Advice | None, changed: str, stop: str) -> str:
 
 
 def rate_words(rate: RateSummary, goal: float | None) -> str:
-    """One cell's rate, its interval at any time, and what follows."""
+    """One group's rate, its interval at any time, and what follows."""
     percent = 0.0 if goal is None else 100 * goal
     answer = rate.advice.answer if rate.advice else ""
     words = advice_words(rate.advice, rate.changed, f"{answer} {percent:g} %")
@@ -103,8 +103,8 @@ def next_words(proposal: NextStart | None) -> str:
     if proposal is None:
         return "next: nothing, every question is settled"
     start = "a start not tried yet" if proposal.start_id is None else f"start {proposal.start_id}"
-    cell = label(proposal.task, proposal.condition, proposal.policy)
-    return f"next: {cell}, {start} ({proposal.reason})"
+    group = label(proposal.task, proposal.condition, proposal.policy)
+    return f"next: {group}, {start} ({proposal.reason})"
 
 
 def change_line(
@@ -122,7 +122,7 @@ def change_line(
 def state_lines(
     standing: SessionSummary, proposal: NextStart | None, goal: float | None
 ) -> list[str]:
-    """Everything that is known, one line for each cell and gain."""
+    """Everything that is known, one line for each group and gain."""
     if not standing.rates:
         return [f"no trial with a known outcome yet ({standing.unknown} without)"]
     lines = [rate_words(rate, goal) for rate in standing.rates]
@@ -149,7 +149,7 @@ def record(
         stamp_ns: When [ns].
         text: The line that is printed.
         change: The trial it is about; None for the state at the start and at the end.
-        standing: All cells and gains.
+        standing: All groups and gains.
         proposal: What to run next.
         goal: The success rate asked about.
     """

@@ -103,14 +103,14 @@ class Ledger:
         return changes, gone
 
 
-# --- What the trials so far have settled: each cell's success rate, and the gain with replanning.
+# --- What the trials so far have settled: each group's success rate, and the gain with replanning.
 
 Key = tuple[str, str, str]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RateSummary:
-    """One cell's recorded success rate, at any time."""
+    """One group's recorded success rate, at any time."""
 
     task: str
     condition: str
@@ -156,7 +156,7 @@ class SessionSummary:
     """Trials without a known outcome: part of nothing."""
 
     def rate(self, key: Key) -> RateSummary | None:
-        """Return one cell."""
+        """Return one group."""
         return next((r for r in self.rates if (r.task, r.condition, r.policy) == key), None)
 
     def gain(self, task: str, policy: str) -> GainSummary | None:
@@ -172,13 +172,13 @@ def summarise_session(trials: Sequence[LiveTrial], goal: float | None) -> Sessio
         goal: Success rate that is asked about.
     """
     known = [trial for trial in trials if trial.recorded is not None]
-    cells: dict[Key, list[bool]] = {}
+    groups: dict[Key, list[bool]] = {}
     for trial in known:
-        cells.setdefault(trial.key, []).append(bool(trial.recorded))
+        groups.setdefault(trial.key, []).append(bool(trial.recorded))
     groups = dict.fromkeys((trial.task, trial.policy) for trial in known)
     gains = (_gain(task, policy, changes_of(known, task, policy)) for task, policy in groups)
     return SessionSummary(
-        rates=tuple(_rate(key, outcomes, goal) for key, outcomes in sorted(cells.items())),
+        rates=tuple(_rate(key, outcomes, goal) for key, outcomes in sorted(groups.items())),
         gains=tuple(gain for gain in gains if gain is not None),
         unknown=len(trials) - len(known),
     )
@@ -264,7 +264,7 @@ def next_start(trials: Sequence[LiveTrial], standing: SessionSummary) -> NextSta
     The task and policy with the fewest known outcomes comes first. There a start that was tried in
     one condition is tried in the other; with none left, a new start begins with the condition that
     has begun fewer starts, so that neither always meets the fresher objects. Where only one
-    condition was ever run, the cell goes on with it.
+    condition was ever run, the group goes on with it.
 
     Args:
         trials: In the order in which they were recorded; those without an outcome count as tried

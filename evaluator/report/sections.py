@@ -39,7 +39,7 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="agreement",
-        title="Agreement over cells",
+        title="Agreement over groups",
         lead="Whether the twin's rates move with the labelled ones, and how far off they are. A "
         "high r does not show that the right decision follows, nor that there is no bias.",
         numbers=(
@@ -55,7 +55,7 @@ SECTIONS: tuple[Section, ...] = (
             ("agreement.largest_gap_pp", "Largest gap"),
             ("agreement.calibration_slope", "Calibration line, slope"),
             ("agreement.calibration_intercept_pp", "Calibration line, intercept"),
-            ("agreement.order_accuracy", "Pairs of cells in the right order"),
+            ("agreement.order_accuracy", "Pairs of groups in the right order"),
             ("agreement.mmrv_recorded_gap", "MMRV, gap of recorded rates"),
             ("agreement.mmrv_sim_gap", "MMRV, gap of sim rates (swapped)"),
             ("decision.*", ""),

@@ -11,7 +11,7 @@ HEADLINES: tuple[tuple[str, str], ...] = (
     ("agreement.sim_planned.ppv", "Success when sim says success (PPV)"),
     ("agreement.sim_planned.npv", "Failure when sim says failure (NPV)"),
     ("agreement.verdict.ppv", "Success when the gate accepted (PPV)"),
-    ("agreement.pearson_r", "Pearson r over cells"),
+    ("agreement.pearson_r", "Pearson r over groups"),
     ("agreement.pearson_r.without_replanning", "Pearson r without replanning"),
     ("agreement.pearson_r.with_replanning", "Pearson r with replanning"),
     ("agreement.bias_pp", "Bias of sim"),
@@ -90,7 +90,7 @@ def value_text(measurement: Measurement) -> str:
 
 
 def count_text(measurement: Measurement) -> str:
-    """Write what the value rests on: ``5/6 trials`` or ``6 cells``."""
+    """Write what the value rests on: ``5/6 trials`` or ``6 groups``."""
     if measurement.n is None:
         return ""
     counted = measurement.counted or ""

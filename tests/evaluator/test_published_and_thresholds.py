@@ -230,8 +230,8 @@ def test_a_rate_that_several_counts_give_accuses_nobody(
     assert found[2].verdict == "ambiguous"
     assert "2 counts of 150 round to 0.67" in found[2].note
     assert [finding.row for finding in check.failed] == [3]
-    assert check.comparison.cells[0].sim.value == 0.67
-    assert check.comparison.cells[0].sim.n is None
+    assert check.comparison.groups[0].sim.value == 0.67
+    assert check.comparison.groups[0].sim.n is None
 
 
 def test_a_printed_figure_that_the_rows_do_not_give_does_not_pass(

@@ -13,7 +13,7 @@ from evaluator.statistics import agreement
 from evaluator.statistics.bootstrap import (
     METHODS,
     SCALES,
-    CellSample,
+    GroupSample,
     bootstrap_interval,
     expanded_tail,
     remeasure_counts,
@@ -48,7 +48,7 @@ def test_every_statistic_has_a_plain_twin_and_a_scale() -> None:
 
 
 @pytest.mark.parametrize("statistic", PLAIN)
-def test_counting_cells_several_times_is_repeating_them(statistic: str) -> None:
+def test_counting_groups_several_times_is_repeating_them(statistic: str) -> None:
     rng = np.random.default_rng(4)
     recorded, sim = rng.integers(0, 6, (2, 7)) / 5  # few values, so that there are ties
     counts = rng.multinomial(7, np.full(7, 1 / 7), size=40)
@@ -82,7 +82,7 @@ def test_an_exact_bootstrap_is_the_bootstrap_of_all_ordered_draws(statistic: str
         for draw in itertools.product(range(5), repeat=5)
     )
     values = [value for value in found if value is not None]
-    # Sets with fewer than three different cells are undefined for the plain forms in other places.
+    # Sets with fewer than three different groups are undefined for the plain forms in other places.
     interval = bootstrap_interval(
         statistic, recorded=recorded, sim=sim, rng=np.random.default_rng(0)
     )
@@ -95,7 +95,7 @@ def test_a_jackknife_of_a_mean_is_students_interval() -> None:
     from evaluator.statistics.bootstrap import student_interval
 
     recorded, sim = [0.1, 0.5, 0.6, 0.9, 0.3], [0.2, 0.4, 0.9, 0.8, 0.35]
-    sample = CellSample(recorded=recorded, sim=sim, rng=np.random.default_rng(0))
+    sample = GroupSample(recorded=recorded, sim=sim, rng=np.random.default_rng(0))
     mine = sample.interval("bias", "jackknife")
     theirs = student_interval([s - r for r, s in zip(recorded, sim, strict=True)])
     assert (mine.low, mine.high) == pytest.approx((theirs.low, theirs.high), abs=1e-12)
@@ -107,7 +107,7 @@ def test_an_expanded_bootstrap_is_wider_and_tends_to_the_plain_one() -> None:
     assert expanded_tail(0.025, 10_000) == pytest.approx(0.025, abs=1e-4)
     rng = np.random.default_rng(1)
     recorded, sim = rng.random((2, 8)).tolist()
-    sample = CellSample(recorded=recorded, sim=sim, rng=rng)
+    sample = GroupSample(recorded=recorded, sim=sim, rng=rng)
     plain_one, wide = (sample.interval("mae", method) for method in METHODS[:2])
     assert wide.low <= plain_one.low
     assert wide.high >= plain_one.high
@@ -115,7 +115,7 @@ def test_an_expanded_bootstrap_is_wider_and_tends_to_the_plain_one() -> None:
 
 def test_no_interval_is_given_at_the_end_of_a_range_or_without_variation() -> None:
     up = [0.1, 0.2, 0.3, 0.4, 0.5]
-    sample = CellSample(recorded=up, sim=up, rng=np.random.default_rng(0))
+    sample = GroupSample(recorded=up, sim=up, rng=np.random.default_rng(0))
     for statistic, why in (
         ("kendall", "no width"),
         ("mae", "no width"),
@@ -134,7 +134,7 @@ def test_thousands_of_resamples_take_well_under_a_second() -> None:
     recorded, sim = (rng.integers(0, 11, (2, 24)) / 10).tolist()
     clusters = [i // 3 for i in range(24)]  # 8 policies: 6,435 resamples, all visited
     start_s = time.perf_counter()
-    sample = CellSample(recorded=recorded, sim=sim, rng=rng, clusters=clusters)
+    sample = GroupSample(recorded=recorded, sim=sim, rng=rng, clusters=clusters)
     for statistic in STATISTICS:
         sample.interval(statistic, "bootstrap")
     assert time.perf_counter() - start_s < 5  # about 0.3 s on an idle core
