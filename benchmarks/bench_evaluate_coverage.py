@@ -1,8 +1,8 @@
 """Make the coverage map of every interval, and compare it with the one the package ships.
 
 ``COVERAGE_WRITE=1`` replaces the shipped map. ``COVERAGE_DRAWS`` (200) sets the draws of the
-simulated methods; ``COVERAGE_METHODS=tango,jeffreys,groups`` picks some: ``groups``, ``policies`` and
-``remeasurement`` stand for every statistic of agreement.
+simulated methods; ``COVERAGE_METHODS=tango,jeffreys,groups`` picks some: ``groups``, ``policies``
+and ``remeasurement`` stand for every statistic of agreement.
 """
 
 import json
@@ -170,7 +170,7 @@ def post_stratified(pairs: Any, sim_k: int, sim_n: int) -> Any:
 def ppi(pairs: Any, sim_k: int, sim_n: int) -> Any:
     real = [True] * pairs.true_positive + [False] * pairs.false_positive
     real += [True] * pairs.false_negative + [False] * pairs.true_negative
-    said = [1.0] * pairs.said_success + [0.0] * pairs.said_failure
+    said = [1.0] * pairs.predicted_success + [0.0] * pairs.predicted_failure
     alone = [1.0] * sim_k + [0.0] * (sim_n - sim_k)
     return prediction_powered.ppi_plus_plus(real, said, alone).interval
 

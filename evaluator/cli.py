@@ -62,7 +62,7 @@ def evaluate(
     from evaluator.thresholds import missed, parse_thresholds
 
     if goal is not None and not 0 < goal < 1:
-        message = f"--goal {goal} is no success rate between 0 and 1, for example 0.8."
+        message = f"--goal {goal} is not a success rate between 0 and 1, for example 0.8."
         raise UsageError(message)
     if live.live:
         return _follow(source, live, goal, output)

@@ -1,4 +1,4 @@
-"""Over groups: do the twin's success rates move with the recorded ones, and how far off are they?"""
+"""Do the twin's success rates of groups follow the recorded ones, and how far off are they?"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -211,7 +211,7 @@ def interval_table(
             note="95 %. Two questions: where the number would be for other groups of the same "
             "kind, and where it would fall if these were measured again with as many trials. "
             "The method is the one with the best coverage in the stored map; least coverage is "
-            "its worst case there.",
+            "the least in it.",
         ),
     )
 

@@ -103,7 +103,7 @@ def _decision_tables(found: dict[str, Decision], usable: Sequence[RateGroup]) ->
                         task,
                         " or ".join(sorted(d.sim_best)),
                         " or ".join(sorted(d.recorded_best)),
-                        "yes" if d.surely_right else ("perhaps" if d.possibly_right else "no"),
+                        "yes" if d.confident else ("perhaps" if d.possibly_right else "no"),
                         round(float(100 * d.regret), 1),
                     )
                     for task, d in found.items()

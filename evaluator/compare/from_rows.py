@@ -48,7 +48,7 @@ class _Found:
     gains: list[Measurement]
     again_tables: tuple[Table, ...]
     gate_tables: tuple[Table, ...]
-    """What the gate is worth, and whether its success probability can be relied on."""
+    """What the gate is scorecard, and whether its success probability can be relied on."""
     stage_tables: tuple[Table, ...]
     decision_tables: tuple[Table, ...]
 
@@ -97,7 +97,7 @@ def _measure(rows: Sequence[TrialRow], method: str) -> _Found:
     groups = rate_groups(rows, rates, method=method)
     gains = replanning_gains(groups, method=method)
     pairs, unpaired = pair_starts(rows)
-    worth, worth_tables = gate_scorecard(rows)
+    scorecard, scorecard_tables = gate_scorecard(rows)
     kept, kept_tables = reliability(rows)
     again, again_tables = varied_sim(rows)
     stages, stage_tables, other_stages = stage_results(rows)
@@ -114,7 +114,7 @@ def _measure(rows: Sequence[TrialRow], method: str) -> _Found:
         *paired_gain(pairs),
         *start_distances(pairs),
         *never_sent(rows),
-        *worth,
+        *scorecard,
         *kept,
         *stages,
         *chosen,
@@ -127,7 +127,7 @@ def _measure(rows: Sequence[TrialRow], method: str) -> _Found:
         exclusions=(*unpaired, *other_stages),
         gains=gains,
         again_tables=again_tables,
-        gate_tables=(*worth_tables, *kept_tables),
+        gate_tables=(*scorecard_tables, *kept_tables),
         stage_tables=stage_tables,
         decision_tables=decision_tables,
     )

@@ -18,17 +18,17 @@ DEGREES = math.degrees(1.0)
 
 
 def millimetres(value_m: float | None) -> float | None:
-    """Return a length [mm]; None stays None, and so does what is no number."""
+    """Return a length [mm]; None stays None, and so does what is not a number."""
     return _rounded(value_m, 1e3)
 
 
 def degrees(value_rad: float | None) -> float | None:
-    """Return an angle [deg]; None stays None, and so does what is no number."""
+    """Return an angle [deg]; None stays None, and so does what is not a number."""
     return _rounded(value_rad, DEGREES)
 
 
 def milliseconds(value_s: float | None) -> float | None:
-    """Return a duration [ms]; None stays None, and so does what is no number."""
+    """Return a duration [ms]; None stays None, and so does what is not a number."""
     return _rounded(value_s, 1e3)
 
 
@@ -87,9 +87,9 @@ def refuse_alike(kind: str, named: Iterable[tuple[str, str]]) -> None:
     places: dict[str, str] = {}
     for name, where in named:
         places.setdefault(name, where)
-    owners: dict[str, str] = {}
+    first_with: dict[str, str] = {}
     for name, where in places.items():
-        owner = owners.setdefault(slug(name), name)
+        owner = first_with.setdefault(slug(name), name)
         if owner != name:
             raise AlikeNamesError(kind=kind, names=(owner, name), places=(places[owner], where))
 

@@ -1,4 +1,4 @@
-"""What a reader should know before believing a number, said in sentences."""
+"""What a reader should know before using a number."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -58,8 +58,8 @@ def _units(groups: Sequence[RateGroup]) -> list[Note]:
         notes.append(
             (
                 task,
-                f"counted in {group.unit}s{count}, not in trials: {group.unit}s of one trial are not "
-                "independent, so intervals and tests claim more than the trials justify",
+                f"counted in {group.unit}s{count}, not in trials: {group.unit}s of one trial are "
+                "not independent, so intervals and tests claim more than the trials justify",
             )
         )
     units = sorted({group.unit for group in groups})
@@ -86,8 +86,8 @@ def _hidden_bias(by_id: dict[str, Measurement]) -> list[Note]:
         return []
     if r.value < HIGH_R or abs(bias.value) < LARGE_BIAS_PP:
         return []
-    said = "optimistic" if bias.value > 0 else "pessimistic"
-    text = f"r = {r.value:.3f} does not show that the twin is {said} by {bias.value:+.1f} pp"
+    direction = "optimistic" if bias.value > 0 else "pessimistic"
+    text = f"r = {r.value:.3f} does not show that the twin is {direction} by {bias.value:+.1f} pp"
     return [("agreement.pearson_r", text)]
 
 

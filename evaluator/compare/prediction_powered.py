@@ -1,4 +1,4 @@
-"""Fewer robot trials: the recorded rate with the twin's help, and when to stop."""
+"""Prediction-powered estimates: the recorded rate with the twin's help, and when to stop."""
 
 import math
 from collections import Counter
@@ -183,7 +183,9 @@ class _Assisted:
     overlap: StartOverlap
 
     def p_random(self) -> float:
-        return applicability(self.counts.said_success, self.counts.n, self.alone_k, self.alone_n)
+        return applicability(
+            self.counts.predicted_success, self.counts.n, self.alone_k, self.alone_n
+        )
 
     def rate(self) -> tuple[float, Interval | None]:
         self._check()
@@ -195,9 +197,9 @@ class _Assisted:
         counts = self.counts
         real = [True] * counts.true_positive + [False] * counts.false_positive
         real += [True] * counts.false_negative + [False] * counts.true_negative
-        said = [1.0] * counts.said_success + [0.0] * counts.said_failure
+        predicted = [1.0] * counts.predicted_success + [0.0] * counts.predicted_failure
         further = [1.0] * self.alone_k + [0.0] * (self.alone_n - self.alone_k)
-        estimate = ppi_plus_plus(real, said, further)
+        estimate = ppi_plus_plus(real, predicted, further)
         return estimate.value, estimate.interval
 
     def saved(self) -> float:
@@ -370,5 +372,5 @@ def _evidence(pairs: Sequence[StartPair]) -> Measurement:
         lambda: math.exp(min(MOST_LOG, capital_log(improved, improved + worsened, GOAL))),
         n=len(answers),
         counted="pair",
-        reason_without_interval="evidence, not an estimate",
+        reason_without_interval="an e-value (anytime-valid)",
     )

@@ -133,14 +133,14 @@ def _claim(row: SourceRow) -> _Claim:
         value = Decimal("NaN")
     if not is_figure(value):
         raise row.refuse(f"printed is {row.text('printed')!r}", "Give a number")
-    said = row.text("side")
-    if said not in SIDES and (said or statistic in OF_ONE_SIDE):
-        raise row.refuse(f"side of {statistic} is {said!r}", f"Sides: {', '.join(SIDES)}")
+    side = row.text("side")
+    if side not in SIDES and (side or statistic in OF_ONE_SIDE):
+        raise row.refuse(f"side of {statistic} is {side!r}", f"Sides: {', '.join(SIDES)}")
     return _Claim(
         row=row,
         statistic=statistic,
         task=row.text("task"),
-        side="sim" if said == "sim" else "recorded",
+        side="sim" if side == "sim" else "recorded",
         condition=row.text("condition"),
         value=value,
         half=half_digit(value),

@@ -22,7 +22,7 @@ def compare_rates(path: Path, *, method: str = "wilson") -> Comparison:
     """Compare printed rates: r over groups, gains, intervals where n is known.
 
     Raises:
-        TableError: Naming the row that cannot be believed.
+        TableError: Naming the row that contradicts itself.
     """
     return compare_records(read_rates(path), path, method=method)
 

@@ -65,7 +65,7 @@ class TrialRow:
     sim_planned: bool | None = None
     """Headline sim: the sent plan, planned trajectory, dynamic, in the twin."""
     sim_executed: bool | None = None
-    """Diagnosis only: the executed joints re-lived dynamically. Never enters r."""
+    """Diagnosis only: the executed joints replayed dynamically. Never enters r."""
     verdict: bool | None = None
     """The gate's verdict on the sent plan, made before its execution started."""
     p_success: float | None = None

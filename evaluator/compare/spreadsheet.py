@@ -53,7 +53,7 @@ def imported_rows(
     """Read the run's imported trials; one that was recorded too is left out and named.
 
     Raises:
-        TableError: When somebody has changed the file so that a row cannot be believed.
+        TableError: When somebody has changed the file so that a row contradicts itself.
     """
     path = trials_path(run)
     if not path.is_file():
@@ -82,7 +82,7 @@ def compare_csv(path: Path, *, method: str = "wilson", goal: float | None = None
     ``eval_results.csv`` of PolaRiS, ``eval_info.json`` of LeRobot, and a folder of SIMPLER videos.
 
     Raises:
-        TableError: Naming the row that cannot be believed.
+        TableError: Naming the row that contradicts itself.
         UsageError: When it is none of these.
     """
     found = _compare(path, method, goal)

@@ -9,7 +9,7 @@ from evaluator.measurements import STAGE
 from evaluator.result import Cell, Exclusion, Measurement, Table
 from evaluator.statistics.funnel import (
     CurvePoint,
-    Stage,
+    StageCount,
     failure_taxonomy,
     funnel,
     success_curve,
@@ -73,7 +73,7 @@ def stage_results(
     return measurements, _tables(funnel_rows, curve_rows), left_out
 
 
-def _measure(task: str, condition: str, stage: Stage, episodes: list[str]) -> Measurement:
+def _measure(task: str, condition: str, stage: StageCount, episodes: list[str]) -> Measurement:
     return proportion(
         STAGE.of(task=task, condition=condition, stage=stage.name),
         stage.passed,
@@ -84,7 +84,7 @@ def _measure(task: str, condition: str, stage: Stage, episodes: list[str]) -> Me
     )
 
 
-def _survival(stages: Sequence[Stage]) -> list[CurvePoint]:
+def _survival(stages: Sequence[StageCount]) -> list[CurvePoint]:
     """Trials in which every control step up to this one succeeded; a stage is a control step.
 
     Trials whose ending is unknown somewhere on the way cannot be counted as either.

@@ -41,10 +41,10 @@ def _brackets(shown: Sequence[Measurement]) -> str:
     """Name the intervals that stand in brackets, and say that some are left out if they are."""
     found = [m.interval.method for m in shown if m.interval is not None]
     names = " and ".join(METHOD_NAMES.get(name, name) for name in dict.fromkeys(found))
-    said = f"Brackets: 95 % {names} intervals." if found else "There are no intervals."
+    text = f"Brackets: 95 % {names} intervals." if found else "There are no intervals."
     if any("; use " in (m.reason_without_interval or "") for m in shown):
-        said += " One that would cover too little is left out; measurements say which to use."
-    return said
+        text += " One that would cover too little is left out; measurements say which to use."
+    return text
 
 
 def success_table(groups: Sequence[RateGroup], word: str, sim_note: str = SIM_NOTE) -> Table:
@@ -209,14 +209,14 @@ def trials_table(rows: Sequence[TrialRow], word: str) -> Table:
 def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
     """What the twin said against what happened, counted over trials."""
     lines = []
-    for name, said in (
+    for name, answer_of in (
         ("sim planned", lambda row: row.sim_planned),
         ("verdict before motion", lambda row: row.verdict),
         ("verdict, not obeyed (without replanning)", unheeded_verdict),
         ("verdict, obeyed (with replanning)", heeded_verdict),
         ("sim executed (diagnosis)", lambda row: row.sim_executed),
     ):
-        counts = confusion_of(rows, said)
+        counts = confusion_of(rows, answer_of)
         lines.append(
             (
                 name,
@@ -229,20 +229,20 @@ def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
         )
     return Table(
         id="confusion",
-        title="What the twin said, and what happened",
+        title="Prediction of the twin against the outcome",
         columns=(
             "twin",
-            f"said success, {word} success",
-            f"said success, {word} failure",
-            f"said failure, {word} success",
-            f"said failure, {word} failure",
+            f"predicted success, {word} success",
+            f"predicted success, {word} failure",
+            f"predicted failure, {word} success",
+            f"predicted failure, {word} failure",
             "trials",
         ),
         rows=tuple(lines),
-        note="Trials with a known outcome in which a plan was executed. Said failure by a verdict "
-        "before motion: the gate refused the plan and it was executed anyway, because its answer "
-        "was only recorded. With replanning refused plans are not executed, so the gate's misses "
-        "there show and its false refusals cannot.",
+        note="Trials with a known outcome in which a plan was executed. A verdict before motion that "
+        "predicted failure refused the plan; it was executed anyway, because the answer was only "
+        "recorded. With replanning refused plans are not executed, so the gate's misses there show "
+        "and its false refusals cannot.",
     )
 
 

@@ -86,7 +86,7 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="gate",
-        title="Trial by trial: what the gate is worth",
+        title="Trial by trial: the gate's scorecard",
         lead="What the twin said of each plan against how it ended, and what obeying it costs "
         "and avoids.",
         numbers=(
@@ -166,8 +166,8 @@ SECTIONS: tuple[Section, ...] = (
         figures=("views",),
     ),
     Section(
-        id="fewer",
-        title="Fewer robot trials",
+        id="prediction_powered",
+        title="Prediction-powered estimates",
         lead="What the twin adds to few robot trials, and whether enough were made.",
         numbers=(
             ("proxy.*", ""),

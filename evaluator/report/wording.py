@@ -121,7 +121,7 @@ def method_text(measurement: Measurement) -> str:
     if interval is None:
         return ""
     known = interval.worst_coverage
-    worst = "" if known is None else f", worst case {100 * known:.1f} %"
+    worst = "" if known is None else f"; guaranteed coverage at this n: {100 * known:.1f} %"
     return f"{100 * interval.level:.0f} % {interval.method}{worst}"
 
 

@@ -69,7 +69,8 @@ def varying(
         if len(set(side)) == 1:
             raise UndefinedStatisticError(
                 statistic=statistic,
-                reason=f"the {name} side is constant ({float(side[0]):g} in all {len(side)} groups)",
+                reason=f"the {name} side is constant "
+                f"({float(side[0]):g} in all {len(side)} groups)",
             )
     return x, y
 
@@ -336,7 +337,7 @@ class Decision:
     recorded_best: frozenset[str]
     possibly_right: bool
     """One of the twin's best is among the recorded best."""
-    surely_right: bool
+    confident: bool
     """Every one of the twin's best is."""
     regret: Fraction
     """Best recorded rate minus that of the twin's choice, the worst of a tie."""
@@ -376,7 +377,7 @@ def choose(*, recorded: Mapping[str, Number], sim: Mapping[str, Number]) -> Deci
         sim_best=sim_best,
         recorded_best=recorded_best,
         possibly_right=bool(sim_best & recorded_best),
-        surely_right=sim_best <= recorded_best,
+        confident=sim_best <= recorded_best,
         regret=max(losses),
         regret_if_lucky=min(losses),
     )

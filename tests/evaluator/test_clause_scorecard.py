@@ -1,4 +1,4 @@
-"""The gate's worth clause by clause, out of what the verdicts' predicates said."""
+"""The gate's scorecard clause by clause, out of what the verdicts' predicates said."""
 
 from dataclasses import replace
 from typing import Any

@@ -73,7 +73,7 @@ def test_confusion_counts_said_against_happened() -> None:
     found = Confusion.count(pairs)
     assert (found.true_positive, found.false_positive) == (1, 2)
     assert (found.false_negative, found.true_negative) == (1, 1)
-    assert (found.n, found.agreed, found.said_success, found.said_failure) == (5, 2, 3, 2)
+    assert (found.n, found.agreed, found.predicted_success, found.predicted_failure) == (5, 2, 3, 2)
 
 
 @settings(max_examples=40, deadline=None)
@@ -139,7 +139,7 @@ def test_a_perfect_twin_violates_no_rank(recorded: list[Fraction]) -> None:
 
 
 def test_mmrv_by_hand_in_both_conventions() -> None:
-    # Groups 1 and 2 are swapped: gaps 0.2 on the recorded side, 0.5 on the twin's; group 3 is right.
+    # Groups 1 and 2 are swapped: gaps 0.2 recorded, 0.5 on the twin's side; group 3 is right.
     recorded, sim = [0.2, 0.4, 0.9], [0.6, 0.1, 0.95]
     assert agreement.mmrv(recorded=recorded, sim=sim) == pytest.approx(0.4 / 3)
     assert agreement.mmrv(recorded=recorded, sim=sim, gap="sim") == pytest.approx(1.0 / 3)

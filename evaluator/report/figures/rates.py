@@ -234,8 +234,8 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
     return Drawing(
         id="scatter",
         title=f"Success in the twin against {word} success",
-        caption="One mark per group (task, condition, policy), over the trials where both sides are "
-        "known; bars are 95 % intervals of both rates. Below the dashed line the twin is "
+        caption="One mark per group (task, condition, policy), over the trials where both sides "
+        "are known; bars are 95 % intervals of both rates. Below the dashed line the twin is "
         "optimistic. Marks that coincide are set apart.",
         alt=f"Scatter of {counted_groups(len(drawn))}: "
         + listed([f"{c.label}: twin {_text(c.pair[0])}, {word} {_text(c.pair[1])}" for c in drawn]),

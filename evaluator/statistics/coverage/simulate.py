@@ -37,7 +37,7 @@ class Population:
 
     @property
     def name(self) -> str:
-        """What the map says about a worst case."""
+        """What the map says of the truth that is covered least."""
         return f"r = {self.correlation:g}, {self.trials} trials per group"
 
     def draw(
