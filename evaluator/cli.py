@@ -48,7 +48,7 @@ def evaluate(
         check_published: A published table (a rates CSV with printed figures): recompute it from
             its rows, and exit with 3 when a figure does not follow from them.
         interval: Interval of success rates.
-        goal: A success rate from 0 to 1: say for each cell whether its trials settle that it lies
+        goal: A success rate from 0 to 1: say for each group whether its trials settle that it lies
             above or below, at any time, or how many more that may take.
         force: Read every file of the run again, whatever RUN/results/cache remembers.
         images: Renders to compare, and backbones of LPIPS.
@@ -62,7 +62,7 @@ def evaluate(
     from evaluator.thresholds import missed, parse_thresholds
 
     if goal is not None and not 0 < goal < 1:
-        message = f"--goal {goal} is no success rate between 0 and 1, for example 0.8."
+        message = f"--goal {goal} is not a success rate between 0 and 1, for example 0.8."
         raise UsageError(message)
     if live.live:
         return _follow(source, live, goal, output)
@@ -167,4 +167,4 @@ def _missed_text(item: "Missed") -> str:
 
 def _finding_text(item: "Finding") -> str:
     where = "" if item.row is None else f"row {item.row}: "
-    return f"{where}{item.what}: {item.verdict}. {item.remark}".strip()
+    return f"{where}{item.what}: {item.verdict}. {item.note}".strip()

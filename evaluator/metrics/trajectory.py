@@ -193,10 +193,10 @@ def relative_errors(
     for track in (recorded, replayed):
         Ts = track.transforms()
         moved.append(se3.invert(Ts[:-step]) @ Ts[step:])
-    apart = se3.invert(moved[0]) @ moved[1]
+    difference = se3.invert(moved[0]) @ moved[1]
     return (
-        np.asarray(np.linalg.norm(apart[:, :3, 3], axis=1)),
-        se3.rotation_angle_rad(apart[:, :3, :3]),
+        np.asarray(np.linalg.norm(difference[:, :3, 3], axis=1)),
+        se3.rotation_angle_rad(difference[:, :3, :3]),
     )
 
 

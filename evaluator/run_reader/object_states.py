@@ -157,7 +157,7 @@ def _state_at(
     try:
         T = PoseSample.from_cdr(track[place].data).T_frame_body
         if not np.isfinite(T).all():
-            return ObjectState(reason="its replayed pose is no number")
+            return ObjectState(reason="its replayed pose is not a number")
         if model is None or model.soft is None:
             return _posed(T)
         return _soft_state(replay, track[0], track[place], T, model)

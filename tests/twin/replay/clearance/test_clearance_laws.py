@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scripted_plans import joints_over
 
 from bridge.geometry import se3
-from bridge.task.plan import Stage
 from bridge.robots.default import ROBOT
+from bridge.task.plan import Stage
 from twin.replay.clearance.bodies import planes_of
 from twin.replay.clearance.monitor import ClearanceMonitor, State, allowed_pairs, object_travel_m
 from twin.replay.config import ReplayConfig
