@@ -32,8 +32,6 @@ from bridge.errors import GstError, MissingDependencyError, PathNotFoundError
 from bridge.task.record import check_record, parse_record
 from bridge.whole_file import write_whole
 
-# --- The catalogue as a Parquet table, for DuckDB, pandas and spreadsheets.
-
 
 def write_parquet(entries: Sequence[Entry], path: Path) -> None:
     """Write one row per episode; columns are the fields of ``Entry``, times in ns.
@@ -65,10 +63,6 @@ def write_parquet(entries: Sequence[Entry], path: Path) -> None:
     parquet.write_table(table, sink, compression="zstd")
     write_whole(path, sink.getvalue().to_pybytes())
 
-
-# --- Answers from the catalogue after bringing it up to date.
-#
-# The modules that open episodes are imported only when there is something to open.
 
 Advance = Callable[[int, int], None]
 """Called as ``advance(done, total)`` while files are read."""
@@ -139,9 +133,6 @@ def _change(store: CatalogueStore, rows: list[tuple[Entry, str]], gone: Iterable
         store.change(rows, gone)
 
 
-# --- Labels given after the fact: a sidecar under ``notes/``; no episode is rewritten.
-
-
 def sidecar_path(run: RunFolder, episode_id: str) -> Path:
     """Where the label of an episode is kept."""
     return run.notes_dir / f"{check_episode_id(episode_id)}{LABEL_SUFFIX}"
@@ -175,8 +166,6 @@ def write_label(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:
     write_whole(path, (json.dumps(record, indent=1) + "\n").encode())
     return path
 
-
-# --- Opens an episode and sums it up in one line of the catalogue.
 
 _LARGEST = 2**63 - 1
 
@@ -241,8 +230,6 @@ def _fit(number: int) -> int:
     """Clamp to what a database column holds; other programs write what they like."""
     return max(-_LARGEST, min(_LARGEST, number))
 
-
-# --- List all of a run, label an episode, enter a finished one.
 
 EVERYTHING = CatalogueQuery()
 NOTE_BUSY_S = 0.2

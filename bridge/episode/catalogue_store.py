@@ -1,4 +1,4 @@
-"""The catalogue's cache: one SQLite file per run, made from the episodes and safe to delete.
+"""The catalogue's entries, queries and cache: one SQLite file per run, safe to delete.
 
 Several processes may use it at once: changes are short immediate transactions. Whatever is wrong
 with the file, the answer comes from the episodes themselves; only the next one takes longer.
@@ -18,10 +18,6 @@ from typing import Any, Literal
 
 from bridge.episode.run_folder import RunFolder, grouped_parts, part_paths
 from bridge.errors import UsageError, refuse_outside
-
-# --- One line of the catalogue, and the traces by which a change of its files is noticed.
-#
-# Opens no file, so that listing what is known costs no more than a look at the folder.
 
 UNLABELLED = "nobody labelled it"
 """Why the outcome of a trial is unknown that has no label."""
@@ -143,8 +139,6 @@ def printable(text: str) -> str:
     """Spell out what is no valid Unicode, so that it can be stored and shown."""
     return text.encode("utf-8", "backslashreplace").decode()
 
-
-# --- Which episodes to list, and in what order.
 
 Order = Literal["name", "start", "duration", "size", "messages", "lost", "task", "outcome"]
 _COLUMNS: dict[str, str] = {

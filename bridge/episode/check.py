@@ -1,4 +1,4 @@
-"""Is an episode whole? Every CRC, every index, every stream, and what it declares lost.
+"""Verify an episode: every CRC, index and stream, and list the messages that were dropped.
 
 Broken is what contradicts itself: damage, indexes and counts that disagree with the data, messages
 that are not what they promise, parts that are missing. Lost is another matter: a ledger that lists
@@ -22,8 +22,6 @@ from bridge.episode.run_folder import part_name
 from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import LIBRARY
 from bridge.errors import BridgeError, MissingDependencyError
-
-# --- A second opinion: Rerun's own MCAP checker.
 
 TIMEOUT_S = 3600
 

@@ -44,8 +44,6 @@ from bridge.episode.mcap.walk import (
     walk,
 )
 
-# --- Compare what the summary of an MCAP file says with what a walk through its data found.
-
 
 @dataclass(kw_only=True)
 class Seen:

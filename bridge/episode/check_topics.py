@@ -30,8 +30,6 @@ from bridge.task.plan import Plan
 from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
 
-# --- Decode every message of a kind this project knows, as strictly as the file promised.
-
 
 class Decoder:
     """Reads messages and forgets them, but for the ledger and the sizes of depth images.

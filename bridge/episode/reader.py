@@ -1,4 +1,4 @@
-"""Read one episode: metadata, topics, raw messages; ``streams`` decodes them."""
+"""Read one episode, split or whole: metadata, topics, raw messages; ``streams`` decodes them."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -25,8 +25,6 @@ from bridge.episode.provenance import hash_files
 from bridge.episode.run_folder import EPISODE_ID, part_name
 from bridge.episode.topics import is_truth
 from bridge.errors import EpisodeError, PathNotFoundError, SchemaVersionError
-
-# --- Find the files of a split episode: ``<id>.mcap``, ``<id>.2.mcap``, ``<id>.3.mcap`` ...
 
 _NAME = re.compile(rf"({EPISODE_ID.pattern})(?:\.([1-9][0-9]{{0,5}}))?\.mcap")
 
@@ -135,8 +133,6 @@ def _was_cut_off(file: McapFile) -> bool:
     return any(record.name == "recovered" for record in file.metadata)
 
 
-# --- Gather the payloads of whole topics at once, in the order in which ``merge`` yields them.
-#
 # A message that passes through as an object of its own costs three microseconds, and a motion has
 # thousands. What is wanted of a chunk is cut out of it in one go; the chunk is then forgotten.
 

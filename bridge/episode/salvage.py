@@ -27,8 +27,6 @@ from bridge.episode.mcap.scan import (
 )
 from bridge.episode.metadata import from_strings
 
-# --- Count what recovery kept and what it lost, and say so in the file and to the caller.
-
 RECORD_NAME = "recovered"
 MAX_REASONS = 8
 
@@ -365,8 +363,6 @@ def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
     )
 
 
-# --- Finish a broken MCAP file where it lies, for a disk without room for a copy.
-#
 # Only the end of the file is touched: what is whole stays, the torn rest is cut off, and the
 # closing part is written. Killed at any moment, it can be done again.
 

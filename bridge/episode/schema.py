@@ -7,8 +7,6 @@ from importlib import resources
 
 from bridge.episode import protobuf
 
-# --- Field lists of the ROS 2 messages an episode holds (interface facts, without their comments).
-#
 # ``rosbags`` carries the same definitions; ``tests/parity`` compares ours with them.
 
 SEPARATOR = "=" * 80
@@ -93,9 +91,6 @@ def _dependencies(name: str) -> list[str]:
                 found.append(full_name(type_name))
                 queue.append(full_name(type_name))
     return found
-
-
-# --- A message on its way into an episode, whether over the wire or straight into a file.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -48,7 +48,6 @@ DEPTH_IMAGE = "/depth/image"
 DEPTH_INFO = "/depth/info"
 TARGET_POSE = "/target/pose"
 """Of a calibration target in the frame of the camera."""
-RECORDED_IMAGE = "/recorded/image"
 RENDERED_IMAGE = "/rendered/image"
 
 COLOR_TOPIC = re.compile(r"/cam/([^/]+)/color/image$")

@@ -19,8 +19,6 @@ from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChun
 from bridge.episode.mcap.format import Buffer, Payload, num_bytes
 from bridge.episode.mcap.part_file import BackgroundSync, cannot_write, open_part
 
-# --- The channels of a file being written: one for each topic and schema, numbered as they come.
-
 
 class Channel:
     """One topic with one schema, and the chunk its messages go to."""
@@ -89,8 +87,6 @@ class Channels:
         return self._schemas[key]
 
 
-# --- Which messages share a chunk, and which chunks are worth compressing.
-#
 # A reader of one small topic must not unpack images, and bytes that are packed already (JPEG,
 # PNG, H.264) cost CPU time without getting smaller. So each large stream has chunks of its own
 # and all small topics share theirs (the recorder study, sections 1.1 and 1.6).

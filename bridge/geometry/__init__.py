@@ -1,1 +1,1 @@
-"""Frames, SE(3), trajectories and camera models; NumPy only."""
+"""SE(3), trajectories, signals, meshes and camera models; NumPy only."""

@@ -1,1 +1,1 @@
-"""Colour and depth codecs."""
+"""Colour, depth and video codecs, and how much one image is like another."""

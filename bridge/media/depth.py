@@ -1,4 +1,4 @@
-"""16-bit depth PNG files and the rules that turn stored numbers into millimetres."""
+"""Depth images: 16-bit PNG files, ROS's compressed depth (RVL, PNG), numbers to millimetres."""
 
 import struct
 from collections.abc import Iterable
@@ -39,8 +39,6 @@ def to_millimetres(
     return np.where(invalid | (millimetres > 65535), 0, millimetres).astype(np.uint16)
 
 
-# --- The compressed depth images of ROS (``compressed_depth_image_transport``): RVL and PNG.
-#
 # Every image starts with 12 bytes that matter to 32-bit depth only (an int32 and two float32).
 # RVL then states its columns and rows (int32) before the nibble stream; PNG follows as a file.
 
@@ -57,14 +55,8 @@ except ImportError:
 PNG_MAGIC = b"\x89PNG"
 _EXPECTED = "16-bit depth as PNG or RVL"
 RVL_FORMAT = "16UC1; compressedDepth rvl"
-PNG_FORMAT = "16UC1; compressedDepth png"
 _CONFIG = struct.pack("<iff", 0, 0.0, 0.0)
 _RVL_FRONT_BYTES = len(_CONFIG) + 8
-
-
-def is_compressed_depth(image_format: str) -> bool:
-    """Say whether a CompressedImage of this format holds depth."""
-    return "compressedDepth" in image_format
 
 
 def pack_rvl(rows: UInt8[np.ndarray, "height row"], *, swap_bytes: bool = False) -> list[bytes]:

@@ -15,8 +15,6 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task
 
-# --- Who came close to whom, and when: what clearance and the contact predicate speak of.
-
 
 @dataclass(frozen=True, kw_only=True)
 class Contact:

@@ -15,8 +15,6 @@ import operator
 import re
 from collections.abc import Callable, Sequence, Sized
 
-# --- A quick look whether a record fits its JSON Schema: yes, or not sure.
-#
 # ``jsonschema`` takes a quarter of a millisecond for a record of twenty fields, which is most of
 # the time an episode's outcome takes to read. What is compiled here from the same schema says yes
 # only where jsonschema finds nothing wrong (``test_quick_check`` compares the two); who hears no

@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bridge.media import rvl
-from bridge.media.depth import PNG_FORMAT, unpack
+from bridge.media.depth import unpack
 
 native = pytest.importorskip("bridge.media._depth")
 pytestmark = pytest.mark.parity
@@ -157,4 +157,4 @@ def test_the_extension_takes_whole_pixels_only() -> None:
 def test_depth_png_of_opencv_is_read(depth: np.ndarray) -> None:
     cv2 = pytest.importorskip("cv2")
     data = bytes(12) + cv2.imencode(".png", depth)[1].tobytes()
-    np.testing.assert_array_equal(unpack(PNG_FORMAT, data), depth)
+    np.testing.assert_array_equal(unpack("16UC1; compressedDepth png", data), depth)

@@ -1,4 +1,4 @@
-"""Read many messages of one topic at once: one publisher's differ in stamps and numbers only.
+"""Read and write many messages of a topic at once: they differ in stamps and numbers only.
 
 The first is read as any other; of the rest only the bytes that may differ are looked at. What is
 not alike is left to be read one by one, with the same result (tests compare them). ``repeated``
@@ -16,8 +16,6 @@ from bridge.episode.cdr.messages import JointSample, PoseSample
 from bridge.errors import BridgeError
 from bridge.geometry import se3
 
-# --- Many messages of one topic at once: they differ in their stamp and in some numbers only.
-#
 # One message is serialised as any other; the rest are copies of its bytes with other stamps and
 # numbers. The bytes are those that one by one would give (tests compare them).
 

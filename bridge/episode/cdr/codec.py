@@ -15,8 +15,6 @@ import numpy as np
 from bridge.episode.schema import DEFINITIONS, full_name
 from bridge.errors import BridgeError
 
-# --- How to walk each message type, worked out once: cdr.py decodes and checks by these plans.
-#
 # A plan is a chain of small functions. Neighbouring fields of fixed size are read by one
 # ``struct`` call; as padding depends on where such a run begins, there is one layout for each of
 # the eight positions modulo 8. Positions count from the start of the message, 4 bytes before the

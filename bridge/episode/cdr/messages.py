@@ -26,8 +26,6 @@ from bridge.media import depth
 from bridge.media.color import decode_color
 from bridge.media.video import VIDEO_FORMAT
 
-# --- The preview stream of a camera: H.264 frames as ``foxglove.CompressedVideo`` in protobuf.
-
 
 @dataclass(frozen=True, kw_only=True)
 class VideoFrame:
@@ -453,8 +451,6 @@ def joint_trajectory_to_cdr(
     message = {"header": _header(stamp_ns, ""), "joint_names": list(names), "points": points}
     return codec.encode(schema.JOINT_TRAJECTORY, message)
 
-
-# --- Clouds of points: sensor_msgs/PointCloud2 with x, y and z as float32, and nothing else.
 
 FLOAT32 = 7
 """PointField's number for this type."""

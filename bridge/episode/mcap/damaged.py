@@ -1,4 +1,4 @@
-"""Read MCAP records whose bytes may be anything: every length is checked before it is believed."""
+"""Read MCAP records and chunks whose bytes may be anything: lengths are checked before use."""
 
 import os
 import struct
@@ -20,8 +20,6 @@ from bridge.episode.mcap.format import (
     crc32,
 )
 from bridge.errors import MissingDependencyError
-
-# --- Read pieces of an MCAP file, and tell whether its closing part is right.
 
 BLOCK_BYTES = 1 << 20
 
@@ -95,8 +93,6 @@ def finished_data_end(file: RecordFile) -> int | None:
     return end if crc in (0, file.crc(0, end)) else None
 
 
-# --- Room that one chunk after another is read and unpacked into.
-#
 # A megabyte asked of the system for every chunk costs 256 page faults, a third of the time a
 # recovery takes; room that is used again costs none.
 

@@ -1,4 +1,4 @@
-"""Append records to an MCAP file and book each in the summary, for the writer and for recovery."""
+"""The data section of an MCAP file being written: records, chunks, and the summary at its end."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,8 +17,6 @@ from bridge.episode.mcap.format import (
     joined_crc,
 )
 from bridge.episode.mcap.part_file import PartFile
-
-# --- Gather what the summary at the end of an MCAP file says, while the file grows.
 
 
 class Summary:
@@ -103,8 +101,6 @@ class Summary:
         )
         return mcap_format.summary_section(groups, start)
 
-
-# --- Chunks being filled: messages of one group, until the group is written as one MCAP record.
 
 ZSTD_LEVEL = 1
 """Level 3 packs noisy depth 20 % tighter at twice the CPU time (the recorder study, section 2)."""

@@ -37,8 +37,6 @@ from bridge.episode.mcap.walk import (
 )
 from bridge.errors import EpisodeError
 
-# --- Build the summary a file lacks from its data, as other writers may leave it out.
-
 
 def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
     """Read the whole data section once; every chunk is unpacked and its CRC checked.

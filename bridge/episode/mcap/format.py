@@ -216,8 +216,6 @@ def summary_section(groups: Iterable[tuple[int, bytes]], start: int) -> bytes:
     return body + head + struct.pack("<I", crc) + MAGIC
 
 
-# --- CRC-32 as fast as the machine can, and of two pieces without reading them again.
-#
 # The CRC of a whole file is wanted beside the CRC of every chunk; reading each image twice would
 # cost as much as writing it. A CRC-32 is a remainder of polynomials over GF(2): appending n bytes
 # multiplies the first remainder by x^(8n). Bit 31 of the reflected form is the coefficient of x^0.

@@ -38,8 +38,6 @@ from bridge.episode.mcap.walk import (
     walk,
 )
 
-# --- Where the messages of an unpacked chunk lie: by its message index, as far as that is right.
-#
 # Walking from record to record takes a microsecond each, and a chunk of joints and poses holds
 # thousands. The index behind the chunk says where they begin. It is only a hint: each record it
 # names is looked at, and with what lies between them they must fill the chunk. Where they do not,

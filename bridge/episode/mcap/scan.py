@@ -27,8 +27,6 @@ from bridge.episode.mcap.damaged import (
     walk_records,
 )
 
-# --- What a walk through an MCAP file can find, and where.
-
 
 @dataclass(frozen=True, kw_only=True)
 class Span:

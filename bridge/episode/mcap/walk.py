@@ -259,11 +259,6 @@ def _attachment_crc(
     return crc, pieces
 
 
-# --- What lies packed in a chunk: its records, and the messages among them.
-#
-# Like ``walk`` it believes no length and no size that is claimed. A chunk may grow to
-# ``MAX_CHUNK_BYTES`` when it is unpacked.
-
 MAX_CHUNK_BYTES = 1 << 30
 """No chunk may unpack to more: a few bytes of zstd can claim terabytes."""
 

@@ -121,8 +121,6 @@ def _corner(
     return np.asarray(outside + np.minimum(np.maximum(first, second), 0.0))
 
 
-# --- Triangles from sampled signed distances: naive surface nets, then projected onto the surface.
-#
 # Source: Gibson, "Constrained elastic surface nets" (1998), without the relaxation: one vertex in
 # each grid cell that the surface crosses, one quadrangle around each grid edge that it crosses.
 # Every inner edge has four cells around it, so a surface that stays inside the grid is closed.

@@ -168,8 +168,6 @@ DESIGNS: dict[str, Design] = {
 }
 
 
-# --- A basket: woven walls with a rim bead, two handles over the short sides, and its solid parts.
-#
 # Frame: origin under the middle of the floor, z up, as for an open box.
 
 CORNER_M = 0.035

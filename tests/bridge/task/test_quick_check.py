@@ -76,7 +76,9 @@ def like(draw: st.DrawFn, schema: Any, root: Any, *, odd: bool) -> Any:
 
 @st.composite
 def _object(draw: st.DrawFn, schema: Any, root: Any, *, odd: bool) -> dict[str, Any]:
-    needed = schema.get("required", ())
+    needed = set(schema.get("required", ()))
+    if "anyOf" in schema:
+        needed |= set(draw(st.sampled_from(schema["anyOf"]))["required"])
     found = {
         name: draw(like(inner, root, odd=odd))
         for name, inner in schema.get("properties", {}).items()

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.episode import streams, topics
+from bridge.episode import streams
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
@@ -15,6 +15,7 @@ from bridge.episode.cdr.messages import (
 )
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
+from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
@@ -45,7 +46,7 @@ def episode(tmp_path: Path) -> Episode:
     with EpisodeWriter(path) as writer:
 
         def write(topic: str, data: bytes, stamp_ns: int) -> None:
-            kind = topics.type_of_topic(topic) or ""
+            kind = type_of_topic(topic) or ""
             writer.write(topic, data, type_name=kind, log_time_ns=stamp_ns)
 
         for name in ("color", "depth"):
