@@ -12,7 +12,9 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.terminal import Output
 from evaluator.cli import evaluate
@@ -168,7 +170,11 @@ def test_a_threshold_in_percent_is_refused(six_trials: Any) -> None:
         evaluate(six_trials.run.path, fail_under=80.0)
 
 
-def test_an_empty_run_still_gets_a_report(maker: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_without_trials_still_gets_a_report(
+    maker: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with EpisodeWriter(maker.run.episodes_dir / "scan.mcap") as writer:
+        writer.describe(EpisodeInfo(id="scan", kind="scan"))
     assert evaluate(maker.run.path) == 0
     assert "the run holds no recorded trial" in capsys.readouterr().out
     assert "no recorded trial" in (maker.run.results_dir / "report.html").read_text()

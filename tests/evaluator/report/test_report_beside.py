@@ -13,6 +13,8 @@ from other_processes import ended_within, is_running
 
 import robot_gst
 from bridge import process_pool
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.writer import EpisodeWriter
 from evaluator.compare import Comparison, compare_csv
 from evaluator.report.figures import beside as module
 from evaluator.report.figures.beside import MIN_FILES, Beside, beside
@@ -147,10 +149,16 @@ sys.exit(robot_gst.run(["evaluate", sys.argv[1]]))
 """
 
 
-def test_an_interrupt_reaches_both_and_neither_leaves_a_trace(tmp_path: Path) -> None:
+def make_run(path: Path) -> None:
+    """A run with one scan and nothing else."""
     for name in ("episodes", "derived"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "episodes" / "one.mcap").touch()
+        (path / name).mkdir()
+    with EpisodeWriter(path / "episodes" / "scan.mcap") as writer:
+        writer.describe(EpisodeInfo(id="scan", kind="scan"))
+
+
+def test_an_interrupt_reaches_both_and_neither_leaves_a_trace(tmp_path: Path) -> None:
+    make_run(tmp_path)
     with subprocess.Popen(
         [sys.executable, "-c", INTERRUPTED, str(tmp_path)],
         stdout=subprocess.PIPE,
@@ -164,8 +172,8 @@ def test_an_interrupt_reaches_both_and_neither_leaves_a_trace(tmp_path: Path) ->
         assert process.stdout.readline() == "comparing\n"
         os.killpg(process.pid, signal.SIGINT)
         out, said = process.communicate(timeout=20)
-    told = f"robot-gst: interrupted; continue with: robot-gst evaluate {tmp_path}\n"
-    assert (process.returncode, out, said) == (130, "", told)
+    again = f"robot-gst: interrupted; continue with: robot-gst evaluate {tmp_path}\n"
+    assert (process.returncode, out, said) == (130, "", again)
     assert ended_within(pid, 10.0)
 
 
@@ -182,9 +190,7 @@ def test_an_evaluation_that_fails_leaves_no_process(
     monkeypatch.setattr(module, "MIN_FILES", 0)
     monkeypatch.setattr(module, "Beside", Watched)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    for name in ("episodes", "derived"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "episodes" / "one.mcap").touch()
+    make_run(tmp_path)
     blocked = tmp_path / "blocked"
     blocked.write_text("a file, not a folder")
     assert robot_gst.run(["evaluate", str(tmp_path), "--out", str(blocked)]) == 1

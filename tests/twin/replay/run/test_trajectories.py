@@ -256,7 +256,7 @@ def test_distances_that_cannot_be_read_leave_everything_not_evaluated(
 
 
 def test_a_run_without_plans_says_so(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run")
+    run = RunFolder.create(tmp_path / "scanned")
     with EpisodeWriter(run.episodes_dir / "scan.mcap") as writer:
         writer.describe(EpisodeInfo(id="scan", kind="scan"))
     summary = replay_run(run, ReplayRunConfig(), QUIET)

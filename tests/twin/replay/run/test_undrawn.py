@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.writer import EpisodeWriter
 from bridge.errors import PathNotFoundError
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
@@ -14,7 +16,8 @@ from twin.replay.workers import replay_run
 
 def test_pictures_without_a_scene_are_refused_before_anything_is_replayed(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path / "run")
-    (run.episodes_dir / "never_read.mcap").touch()
+    with EpisodeWriter(run.episodes_dir / "scan.mcap") as writer:
+        writer.describe(EpisodeInfo(id="scan", kind="scan"))
     with pytest.raises(PathNotFoundError, match=r"--render draws it.*robot-gst rebuild RUN"):
         replay_run(run, ReplayRunConfig(render=True), Output(quiet=True))
 
