@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scripted_plans import joints_over
 
 from bridge.geometry import se3
+from bridge.robots.default import ROBOT
 from bridge.task.plan import Stage
-from bridge.task.robot import ur5_with_gripper_urdf
 from twin.replay.clearance import ClearanceMonitor
 from twin.replay.clearance.bodies import planes_of
 from twin.replay.clearance.monitor import State, allowed_pairs, object_travel_m
@@ -91,7 +91,7 @@ def test_what_was_let_go_of_may_stay_where_it_was_put_and_the_gripper_may_not(
 def test_corners_of_a_placed_hull_lie_on_it_and_its_middle_inside() -> None:
     """Whatever way it is turned; and a point moved outwards is as far away as it was moved."""
     rng = np.random.default_rng(4)
-    hulls = hulls_of(load_robot(ur5_with_gripper_urdf()))
+    hulls = hulls_of(load_robot(ROBOT.urdf_text()))
     for hull, planes in zip(hulls.hulls, planes_of(hulls), strict=True):
         R = se3.rotation_from_quaternion(rng.normal(size=4))
         t = rng.normal(size=3)
