@@ -1,4 +1,4 @@
-"""The front door: the command ``robot-gst``, which only lists the commands of the rooms.
+"""The command ``robot-gst``, which only lists the commands of the packages.
 
 Everything is lazy: a command's module is imported when the command runs.
 """
@@ -18,142 +18,140 @@ from rich.console import Console
 from bridge.errors import GstError, PathNotFoundError, UsageError
 
 HELP = (
-    "Record a robot cell over zenoh, rebuild it as a Gaussian-splat twin, re-live every plan and "
-    "execution, and say how far the twin can be trusted."
+    "Record a robot cell over zenoh, rebuild it as a Gaussian-splat twin, replay every plan and "
+    "execution in it, and say how far the twin can be trusted."
 )
-
 RESUMED = ("demo", "rebuild", "replay", "evaluate")
 """Commands that keep what they did when they are interrupted, and go on from there."""
 
-EPISODES, LIVE, IMPORTS = "bridge.cli.episodes", "bridge.cli.publish", "bridge.cli.exchange"
-RECORDING = "bridge.cli.recording"
-DEVICES = "bridge.cli.publish"
-EXCHANGE = "bridge.cli.exchange"
-CATALOGUE = "bridge.cli.episodes"
+EPISODES, PUBLISH = "bridge.cli.episodes", "bridge.cli.publish"
+RECORDING, EXCHANGE = "bridge.cli.recording", "bridge.cli.exchange"
 
-COMMANDS: tuple[tuple[str, str, str, str], ...] = (
-    ("demo", "dashboards.cli:demo", "The whole loop on a stand-in cell, in minutes.", "runs/demo"),
+Command = tuple[str, str, str, str]
+"""Name, function, what it does, and an example of what follows its name."""
+COMMANDS: tuple[Command, ...] = (
+    (
+        "demo",
+        "dashboards.cli:demo",
+        "Run the whole loop on the stand-in cell, in minutes.",
+        "runs/demo",
+    ),
     ("record", f"{RECORDING}:record", "Record episodes live over zenoh.", "runs/monday"),
     (
         "ctl",
         f"{RECORDING}:ctl",
-        "Start, stop, mark or label from anywhere.",
+        "Start, stop, mark or label from another terminal.",
         "start --id trial_1",
     ),
-    ("info", f"{EPISODES}:info", "What an episode holds.", "runs/demo/episodes/scan.mcap"),
-    (
-        "check",
-        f"{EPISODES}:check",
-        "Whether an episode is whole, and what it lost.",
-        "runs/demo",
-    ),
+    ("info", f"{EPISODES}:info", "Show what an episode holds.", "runs/demo/episodes/scan.mcap"),
+    ("check", f"{EPISODES}:check", "Verify an episode and list dropped messages.", "runs/demo"),
     (
         "recover",
-        "bridge.cli.episodes:recover",
-        "Finish what a killed recorder left, and say what was lost.",
+        f"{EPISODES}:recover",
+        "Repair what a killed recorder left; report what is lost.",
         "runs/demo",
     ),
-    ("ls", f"{CATALOGUE}:ls", "List the episodes of a run.", "runs/demo --outcome failure"),
+    ("ls", f"{EPISODES}:ls", "List the episodes of a run.", "runs/demo --outcome failure"),
     (
         "label",
-        f"{CATALOGUE}:label",
-        "Say after the fact how an episode ended.",
+        f"{EPISODES}:label",
+        "Set the outcome of a recorded episode.",
         "runs/demo trial_1 --result failure",
     ),
     (
         "rebuild",
         "twin.cli:rebuild",
-        "Episodes to a Gaussian-splat scene with held-out renders.",
+        "Fit a Gaussian-splat scene; render held-out views.",
         "runs/monday --budget 60s",
     ),
     ("render", "twin.cli:render", "Render the rebuilt scene to PNG.", "runs/monday"),
     (
         "calibrate",
         "twin.cli:calibrate",
-        "Where the cameras are and how contact works, from episodes.",
+        "Calibrate cameras or physics from recorded episodes.",
         "runs/monday --cameras",
     ),
     (
         "replay",
         "twin.cli:replay",
-        "Re-live every planned and executed trajectory.",
+        "Replay every planned and executed trajectory in the twin.",
         "runs/monday --workers 2",
     ),
-    ("gate", "twin.cli:gate", "Live verdicts over zenoh, before the robot moves.", "runs/monday"),
+    (
+        "gate",
+        "twin.cli:gate",
+        "Judge plans over zenoh before the robot moves.",
+        "runs/monday",
+    ),
     (
         "evaluate",
         "evaluator.cli:evaluate",
-        "Success rates, agreement, image quality; a report.",
+        "Compute success rates and agreement; write a report.",
         "runs/monday",
     ),
     (
         "dashboard",
         "dashboards.cli:dashboard",
-        "Review pages on the loopback address.",
+        "Serve review pages on the loopback address.",
         "runs/monday",
     ),
     (
         "view",
         "dashboards.cli:view",
-        "An episode and its replays in Rerun's 3D viewer.",
+        "Open an episode and its replays in Rerun's 3D viewer.",
         "runs/monday",
     ),
     (
         "doctor",
         f"{EPISODES}:doctor",
-        "What is installed, what is missing, how to get it.",
+        "Show what is installed, what is missing and how to get it.",
         "--json",
     ),
 )
 
-GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
+GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
     "publish": (
-        "Speak on the wire: cameras, a robot, an RGB-D folder, the stand-in cell.",
+        "Publish sensor and robot data over zenoh.",
         (
             (
                 "folder",
-                f"{LIVE}:publish_folder",
+                f"{PUBLISH}:publish_folder",
                 "Play an RGB-D folder as a live camera.",
                 "DIR --episode scan",
             ),
             (
                 "realsense",
-                f"{DEVICES}:publish_realsense",
+                f"{PUBLISH}:publish_realsense",
                 "RealSense cameras: colour, depth, calibration.",
                 "--cell lab --camera side=123622270224",
             ),
             (
                 "ur",
-                f"{DEVICES}:publish_ur",
+                f"{PUBLISH}:publish_ur",
                 "A UR arm: joints, tool, gripper, modes.",
                 "192.168.1.10 --cell lab",
             ),
             (
                 "standin",
-                f"{LIVE}:publish_standin",
+                f"{PUBLISH}:publish_standin",
                 "The stand-in cell: a simulated laboratory.",
                 "--trials 3 --seed 1",
             ),
         ),
     ),
     "import": (
-        "Bring other people's recordings into a run.",
+        "Import recordings of other programs into a run.",
         (
             (
                 "rgbd",
-                f"{IMPORTS}:import_rgbd",
+                f"{EXCHANGE}:import_rgbd",
                 "An RGB-D folder: scene.json, TUM, 7-Scenes.",
                 "DIR runs/x",
             ),
-            (
-                "kinova",
-                f"{IMPORTS}:import_kinova",
-                "The Kinova reality-gap runs.",
-                "DIR runs/x",
-            ),
+            ("kinova", f"{EXCHANGE}:import_kinova", "The Kinova reality-gap runs.", "DIR runs/x"),
             (
                 "rosbag2",
-                f"{IMPORTS}:import_rosbag2",
+                f"{EXCHANGE}:import_rosbag2",
                 "A rosbag2 recording in MCAP, byte for byte.",
                 "BAG runs/x",
             ),
@@ -178,7 +176,7 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
         ),
     ),
     "export": (
-        "Write episodes for other people's programs.",
+        "Export episodes to formats of other programs.",
         (
             (
                 "rrd",
@@ -206,7 +204,7 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, str, str, str], ...]]] = {
             ),
             (
                 "catalogue",
-                f"{CATALOGUE}:export_catalogue",
+                f"{EPISODES}:export_catalogue",
                 "The list of a run's episodes as a Parquet table.",
                 "runs/monday monday.parquet",
             ),
@@ -280,7 +278,7 @@ def main() -> None:
 
 
 def _prepare_streams() -> None:
-    """Have all three standard streams, and let none of them end a command for a sign it lacks.
+    """Open closed standard streams, and replace characters that a stream cannot encode.
 
     Where one was closed, the next file to be opened would get its number, and whatever a library
     prints would end up in that file.
@@ -322,14 +320,14 @@ def _take_config(tokens: list[str]) -> tuple[list[str], Path | None]:
 
 
 def _check_tables(path: Path) -> None:
-    """Refuse a table that is named like no command: nobody would ever read what stands in it.
+    """Refuse a table that is not named after a command: nobody would read it.
 
     Raises:
         UsageError: Naming it, and the names there are.
     """
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except ValueError:  # which whoever reads the settings says better
+    except ValueError:  # cyclopts reports it better
         return
     known: dict[str, set[str]] = {name: set() for name, *_ in COMMANDS}
     known |= {group: {name for name, *_ in members} for group, (_, members) in GROUPS.items()}
@@ -339,7 +337,7 @@ def _check_tables(path: Path) -> None:
             wrong = [f"{name}.{member}" for member in table if member not in known[name]]
         if wrong:
             there = ", ".join(known if name not in known else sorted(known[name]))
-            message = f"{path} has [{wrong[0]}], which no command is called. There are: {there}."
+            message = f"{path} has [{wrong[0]}], but no command has that name. There are: {there}."
             raise UsageError(message)
 
 

@@ -1,8 +1,8 @@
 """Make the coverage map of every interval, and compare it with the one the package ships.
 
 ``COVERAGE_WRITE=1`` replaces the shipped map. ``COVERAGE_DRAWS`` (200) sets the draws of the
-simulated methods; ``COVERAGE_METHODS=tango,jeffreys,cells`` picks some: ``cells``, ``policies`` and
-``remeasurement`` stand for every statistic of agreement.
+simulated methods; ``COVERAGE_METHODS=tango,jeffreys,groups`` picks some: ``groups``, ``policies``
+and ``remeasurement`` stand for every statistic of agreement.
 """
 
 import json
@@ -38,7 +38,7 @@ SHIPPED = ROOT / "evaluator" / "statistics" / "coverage" / stored.MAP
 SEED = 7
 ALL_N = list(range(1, 101))
 SOME_N = [*range(1, 21), 25, 30, 40, 50, 75, 100]
-CELLS = [4, 6, 8, 10, 15, 20, 50]
+GROUPS = [4, 6, 8, 10, 15, 20, 50]
 CLUSTERS = [4, 6, 8, 10, 15, 20, 40]
 BANDS = [3, 4, 6, 10, 20, 50]
 PAIRS = [5, 10, 20, 40, 100]
@@ -46,8 +46,8 @@ PPI_PAIRS = [100, 200, 400]
 LENGTHS = [3, 4, 5, 6, 8, 10, 15, 20, 30, 50, 100, 200]
 RATES = "p = 0.05, 0.06 .. 0.95"
 TWO_RATES = "both p = 0.05, 0.10 .. 0.95"
-OVER_CELLS = "r = 0, 0.5, 0.9 of the cells' true rates (0.05 to 0.95), 10 and 50 trials per cell"
-OVER_CLUSTERED = f"{OVER_CELLS}; policies of 3 cells that share half of the variance"
+OVER_GROUPS = "r = 0, 0.5, 0.9 of the groups' true rates (0.05 to 0.95), 10 and 50 trials per group"
+OVER_CLUSTERED = f"{OVER_GROUPS}; policies of 3 groups that share half of the variance"
 TWINS = "p = 0.05 .. 0.95, four twins from good to useless, 10 starts in the twin per robot trial"
 
 
@@ -92,15 +92,15 @@ def exact_methods() -> dict[str, Callable[[], dict[str, Any]]]:
 def simulated_methods() -> dict[str, Callable[[], dict[str, Any]]]:
     how = f"simulated, {DRAWS} draws of each truth, 5 times as many again of the worst"
 
-    def cells(
+    def groups(
         make: Callable[..., Any], statistic: str, sizes: Sequence[int], *, clustered: bool
     ) -> dict[str, Any]:
         rng = np.random.default_rng(SEED)
         populations = CLUSTERED if clustered else POPULATIONS
         points = [
-            simulate.of_cells(make, statistic, n, populations, draws=DRAWS, rng=rng) for n in sizes
+            simulate.of_groups(make, statistic, n, populations, draws=DRAWS, rng=rng) for n in sizes
         ]
-        over, axis = (OVER_CLUSTERED, "policies") if clustered else (OVER_CELLS, "cells")
+        over, axis = (OVER_CLUSTERED, "policies") if clustered else (OVER_GROUPS, "groups")
         return entry(how, over, axis, points)
 
     def proxies(make: Callable[..., Any], sizes: Sequence[int]) -> dict[str, Any]:
@@ -116,9 +116,9 @@ def simulated_methods() -> dict[str, Callable[[], dict[str, Any]]]:
         return entry(f"simulated, {draws} draws of each distribution", over, "values", points)
 
     return {
-        "fisher-z": partial(cells, fisher, "pearson", CELLS, clustered=False),
-        "student-t:bias": partial(cells, student, "bias", CELLS, clustered=False),
-        "student-t:cluster-bias": partial(cells, student, "bias", CLUSTERS, clustered=True),
+        "fisher-z": partial(groups, fisher, "pearson", GROUPS, clustered=False),
+        "student-t:bias": partial(groups, student, "bias", GROUPS, clustered=False),
+        "student-t:cluster-bias": partial(groups, student, "bias", CLUSTERS, clustered=True),
         "post-stratified-beta": partial(proxies, post_stratified, PAIRS),
         "ppi++": partial(proxies, ppi, PPI_PAIRS),
         "student-t:length": means,
@@ -134,13 +134,13 @@ def families() -> dict[str, Callable[[], dict[str, dict[str, Any]]]]:
         rng = np.random.default_rng(SEED)
         populations = CLUSTERED if clustered else POPULATIONS
         found = [of_agreement(n, populations, draws=draws, rng=rng) for n in sizes]
-        over, axis = (OVER_CLUSTERED, "policies") if clustered else (OVER_CELLS, "cells")
+        over, axis = (OVER_CLUSTERED, "policies") if clustered else (OVER_GROUPS, "groups")
         return by_method(found, over, axis)
 
     def bands() -> dict[str, dict[str, Any]]:
         rng = np.random.default_rng(SEED)
         found = [of_remeasurements(n, POPULATIONS, draws=draws, rng=rng) for n in BANDS]
-        return by_method(found, f"the statistic of a second measurement; {OVER_CELLS}", "cells")
+        return by_method(found, f"the statistic of a second measurement; {OVER_GROUPS}", "groups")
 
     def by_method(
         found: Sequence[dict[str, exact.Coverage]], over: str, axis: str
@@ -149,17 +149,17 @@ def families() -> dict[str, Callable[[], dict[str, dict[str, Any]]]]:
 
     return {
         "remeasurement": bands,
-        "cells": partial(agreement, CELLS, clustered=False),
+        "groups": partial(agreement, GROUPS, clustered=False),
         "policies": partial(agreement, CLUSTERS, clustered=True),
     }
 
 
-def fisher(cells: simulate.Cells, per_cluster: int, rng: np.random.Generator) -> Any:
-    return agreement_module.fisher_interval(agreement_module.pearson(*cells), len(cells[0]))
+def fisher(groups: simulate.Groups, per_cluster: int, rng: np.random.Generator) -> Any:
+    return agreement_module.fisher_interval(agreement_module.pearson(*groups), len(groups[0]))
 
 
-def student(cells: simulate.Cells, per_cluster: int, rng: np.random.Generator) -> Any:
-    gaps = np.subtract(cells[1], cells[0]).reshape(-1, per_cluster)
+def student(groups: simulate.Groups, per_cluster: int, rng: np.random.Generator) -> Any:
+    gaps = np.subtract(groups[1], groups[0]).reshape(-1, per_cluster)
     return bootstrap.student_interval(gaps.mean(axis=1).tolist())
 
 
@@ -170,7 +170,7 @@ def post_stratified(pairs: Any, sim_k: int, sim_n: int) -> Any:
 def ppi(pairs: Any, sim_k: int, sim_n: int) -> Any:
     real = [True] * pairs.true_positive + [False] * pairs.false_positive
     real += [True] * pairs.false_negative + [False] * pairs.true_negative
-    said = [1.0] * pairs.said_success + [0.0] * pairs.said_failure
+    said = [1.0] * pairs.predicted_success + [0.0] * pairs.predicted_failure
     alone = [1.0] * sim_k + [0.0] * (sim_n - sim_k)
     return prediction_powered.ppi_plus_plus(real, said, alone).interval
 
@@ -252,7 +252,7 @@ def main() -> None:
                 limit=1e-6,
             ),
             Target(
-                what="statistics of agreement without a method that holds at 20 cells",
+                what="statistics of agreement without a method that holds at 20 groups",
                 measured=float(unheld(made, "points", 20)),
                 limit=0.0,
             ),

@@ -57,10 +57,9 @@ def ssim_row(pairs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[list[Target], 
     import torch
     from torchmetrics.functional.image import structural_similarity_index_measure as their_ssim
 
+    from bridge.media.image_quality import as_float, ssim, ssim_maps
     from evaluator.compare.images.scores import spread
-    from evaluator.metrics.image import as_float
     from evaluator.metrics.image_scores import score_image
-    from evaluator.metrics.ssim import ssim, ssim_maps
 
     def theirs(batch: int) -> list[float]:
         found = []

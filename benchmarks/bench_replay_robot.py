@@ -47,9 +47,9 @@ def inverse_rows(num_poses: int) -> list[Target]:
         raise SystemExit("the default robot is no UR any more")
     rng = np.random.default_rng(SEED)
     Ts = robot.Ts_base_tcp(rng.uniform(-np.pi, np.pi, (num_poses, 6)))
-    joints, valid = inverse.all_branches(Ts)
+    joints, valid, _ = inverse.solve(Ts)
     worst = max(pose_error(robot, joints[i, b], Ts[i])[0] for i, b in np.argwhere(valid).tolist())
-    batch_us = cpu_us(lambda: inverse.all_branches(Ts), repeats=9, each=num_poses)
+    batch_us = cpu_us(lambda: inverse.solve(Ts), repeats=9, each=num_poses)
     few = Ts[: max(num_poses // 10, 10)]
     solved = []
     cold_us = cpu_us(

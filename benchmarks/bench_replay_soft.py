@@ -81,11 +81,11 @@ def digest() -> str:
         velocities = np.diff(targets, axis=0) * trial.physics.rate_hz
         world.reset_robot(targets[0], float(widths[0]))
         for step in range(DIGEST_STEPS):
-            world.command(targets[step + 1], velocities[step], float(widths[step]))
+            world.robot.command(targets[step + 1], velocities[step], float(widths[step]))
             world.step()
             if step % 8 == 0:
-                found.update(world.soft_nodes_m("duck_1").tobytes())
-                found.update(world.joints_rad().tobytes())
+                found.update(world.soft.nodes_m("duck_1").astype(np.float32).tobytes())
+                found.update(world.robot.joints_rad().tobytes())
     return found.hexdigest()
 
 

@@ -39,7 +39,7 @@ def measure(
     from bridge.sources.standin.cell_file import load_cell
     from bridge.task.task_file import load_task
     from twin.scene.localise.objects import LocaliseConfig, localise_objects
-    from twin.scene.localise.points import fuse_stills, object_points
+    from twin.scene.localise.points import fuse_stationary, object_points
     from twin.scene.shape.known import yaw_period_rad
 
     config = LocaliseConfig()
@@ -51,7 +51,7 @@ def measure(
         before = time.monotonic()
         found = localise_objects(start.frames, start.task, config)
         seconds.append(time.monotonic() - before)
-        views = fuse_stills(start.frames, 3, 8, start.task, config.points)
+        views = fuse_stationary(start.frames, 3, 8, start.task, config.points)
         for key, T_true in start.Ts_base_object.items():
             model, item = start.task.objects[key], found[key]
             groups = object_points(views, model, config.points, config.colour)

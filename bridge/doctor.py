@@ -24,7 +24,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 OPTIONAL = ("foundation", "lpips", "gpu", "cluster")
 """Nothing is wrong without these: all works on one machine's CPU and without weights of others."""
 NATIVE = (
-    ("splat rasteriser", "twin.scene._splat", "no place can be rebuilt"),
+    ("splat rasteriser", "twin.scene._splat", "no scene can be rebuilt"),
     ("depth codec", "bridge.media._depth", "slow fallback, for playing back only"),
     ("checksum", "bridge.episode._crc32", "slower fallback (zlib)"),
 )

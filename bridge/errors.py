@@ -95,6 +95,16 @@ class SchemaVersionError(EpisodeError):
         )
 
 
+class UndefinedStatisticError(GstError):
+    """A statistic has no value on this data; the reason is the message."""
+
+    def __init__(self, *, statistic: str, reason: str) -> None:
+        """Remember the statistic's name and the reason."""
+        self.statistic = statistic
+        self.reason = reason
+        super().__init__(f"{statistic} is undefined: {reason}.")
+
+
 class InvalidRecordError(BridgeError):
     """A JSON record (plan, verdict, event ...) does not fit its schema."""
 

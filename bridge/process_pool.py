@@ -337,12 +337,6 @@ class Serial:
 SERIAL = Serial()
 
 
-@dataclass
-class _Piece:
-    item: Any
-    attempts: int = 0
-
-
 class ProcessPool:
     """Processes side by side; they start once there is work and stay until the end."""
 
@@ -390,8 +384,8 @@ class ProcessPool:
         Raises:
             NoProcessError: When the system gives none at all; with fewer than asked for it goes on.
         """
-        todo = deque(_Piece(item) for item in sorted(items, key=cost, reverse=True))
-        at_work: dict[Worker, _Piece] = {}
+        todo = deque((item, ATTEMPTS) for item in sorted(items, key=cost, reverse=True))
+        at_work: dict[Worker, tuple[Item, int]] = {}
         try:
             while todo or at_work:
                 while todo and len(at_work) < self._size:
@@ -402,24 +396,27 @@ class ProcessPool:
                     try:
                         if self._has_prepared(worker):
                             continue
-                        piece, answer = at_work[worker], worker.finish()
-                        del at_work[worker]
+                        answer = worker.finish()
+                        item, _ = at_work.pop(worker)
                     except WorkerLostError as error:
                         self._lose(worker)
-                        piece = at_work.pop(worker)
-                        if piece.attempts < ATTEMPTS:
-                            todo.append(piece)
+                        item, attempts = at_work.pop(worker)
+                        if attempts > 1:
+                            todo.append((item, attempts - 1))
                             continue
                         answer = lost(str(error))
-                    yield piece.item, answer
+                    yield item, answer
         finally:
             for worker in at_work:
                 self._lose(worker)
 
     def _begin(
-        self, function: Function, todo: deque[_Piece], at_work: dict[Worker, _Piece]
+        self,
+        function: Function,
+        todo: deque[tuple[Item, int]],
+        at_work: dict[Worker, tuple[Item, int]],
     ) -> None:
-        """Give a free process the next piece."""
+        """Give a free process the next item."""
         worker = next((worker for worker in self.workers if worker not in at_work), None)
         idle = worker is not None
         try:
@@ -430,13 +427,12 @@ class ProcessPool:
             self._size = len(at_work)
             return
         try:
-            worker.begin(function, todo[0].item)
+            worker.begin(function, todo[0][0])
         except WorkerLostError:
-            if idle:  # it ended while it had nothing to do: not the piece's fault
+            if idle:  # it ended while it had nothing to do: not the item's fault
                 self._lose(worker)
                 return
         at_work[worker] = todo.popleft()
-        at_work[worker].attempts += 1
 
     def map(
         self, work: Callable[[Item], Result], items: Sequence[Item], *, each_s: float
@@ -479,8 +475,7 @@ class ProcessPool:
         outlets = {worker.outlet: worker for worker in self.workers}
         patience_s = 0.0 if shared.is_more else PATIENCE_S
         spoke = wait(list(outlets), patience_s) if outlets else []
-        silent = outlets.values() if patience_s and not spoke else []
-        failed = list(silent)
+        failed = list(outlets.values()) if patience_s and not spoke else []
         for outlet in spoke:
             worker = outlets[outlet]
             try:
@@ -490,17 +485,13 @@ class ProcessPool:
                 failed.append(worker)  # it ended, or came to load newer code than ours
         for worker in self.workers:
             try:
-                while self._may_have_more(worker, shared):
+                while worker not in self._preparing and shared.wants_more(worker):
                     shared.ask(worker, 1 + len(self.workers))
             except WorkerLostError:
                 failed.append(worker)
         for worker in set(failed):
             self._lose(worker)
             shared.give_back(worker)
-
-    def _may_have_more(self, worker: Worker, shared: "_Shared[Any, Any]") -> bool:
-        is_ready = worker not in self._preparing
-        return is_ready and shared.is_fresh and len(shared.asked.get(worker, ())) < AHEAD
 
     def __enter__(self) -> "ProcessPool":
         """Use as a context manager."""
@@ -528,14 +519,13 @@ class _Shared(Generic[Item, Result]):
         self._done, self._spent_s = 0, 0.0
 
     @property
-    def is_fresh(self) -> bool:
-        """Whether there is an item nobody has had."""
-        return self._next < len(self.items)
-
-    @property
     def is_more(self) -> bool:
         """Whether this process has something to do."""
-        return self.is_fresh or bool(self._again)
+        return self._next < len(self.items) or bool(self._again)
+
+    def wants_more(self, worker: Worker) -> bool:
+        """Whether there is an item nobody has had, for a process that has few."""
+        return self._next < len(self.items) and len(self.asked.get(worker, ())) < AHEAD
 
     def do_one(self) -> None:
         """Do the next item here, if there is one."""
@@ -549,14 +539,11 @@ class _Shared(Generic[Item, Result]):
 
     def ask(self, worker: Worker, processes: int) -> None:
         """Hand over what will last for a moment, judging by what it took here."""
-        chunk = self._chunk_of(1) if not self._done else self._chunk_of(self._lasting(processes))
-        self.asked.setdefault(worker, deque()).append(chunk)
-        worker.begin(_do_chunk, (self.work, [self.items[number] for number in chunk]))
-
-    def _lasting(self, processes: int) -> int:
         lasts = int(CHUNK_S * self._done / max(self._spent_s, 1e-6))
         fair = (len(self.items) - self._next) // (AHEAD * processes)
-        return max(1, min(lasts, fair, MAX_CHUNK))
+        chunk = self._chunk_of(max(1, min(lasts, fair, MAX_CHUNK)))
+        self.asked.setdefault(worker, deque()).append(chunk)
+        worker.begin(_do_chunk, (self.work, [self.items[number] for number in chunk]))
 
     def _chunk_of(self, size: int) -> range:
         self._next += size

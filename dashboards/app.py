@@ -14,9 +14,10 @@ from starlette.responses import FileResponse, HTMLResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from dashboards import wording
-from dashboards.comparison import judge
+from dashboards.comparison import agrees, judge
 from dashboards.episode_page import build_page
 from dashboards.errors import NotHereError
 from dashboards.frames import read_frame
@@ -72,7 +73,8 @@ def _environment() -> Environment:
         wording.condition_word,
         wording.image_title,
         wording.percent,
-        wording.chance,
+        wording.success_share,
+        agrees,
     ):
         environment.filters[function.__name__] = function
     environment.filters["quoted"] = lambda path: shlex.quote(str(path))
@@ -93,6 +95,15 @@ def _seconds(request: Request) -> float | None:
     except ValueError:
         return None
     return value if value is not None and abs(value) < 1e9 else None
+
+
+def _image(data: bytes, media_type: str) -> Response:
+    headers = {"Cache-Control": "private, max-age=600"}
+    return Response(data, media_type=media_type, headers=headers)
+
+
+def _download(path: Path) -> Response:
+    return FileResponse(path, media_type="application/octet-stream", filename=path.name)
 
 
 class Pages:
@@ -116,15 +127,18 @@ class Pages:
         )
         return HTMLResponse(text, status_code=status)
 
+    def _run(self, request: Request) -> RunFolder:
+        return self._library.pick(request.query_params.get("run"))
+
     def overview(self, request: Request) -> Response:
-        """``/``: how far twin and recording agree, and every trial."""
-        _, run = self._library.pick(request.query_params.get("run"))
+        """``/``: agreement of twin and recording, and every trial."""
+        run = self._run(request)
         selection = Selection.of(request.query_params)
         return self._page("overview.html", request, page=build_overview(run, judge(run), selection))
 
     def episode(self, request: Request) -> Response:
         """``/episode/<id>``: one trial and its replays."""
-        _, run = self._library.pick(request.query_params.get("run"))
+        run = self._run(request)
         episode_id = request.path_params["id"]
         judgement = judge(run)
         page = build_page(run, episode_id, judgement.row(episode_id), _seconds(request))
@@ -136,34 +150,28 @@ class Pages:
 
     def frame(self, request: Request) -> Response:
         """``/episode/<id>/frame/<camera>?t=``: the nearest camera image, as recorded."""
-        _, run = self._library.pick(request.query_params.get("run"))
-        path = episode_path(run, request.path_params["id"])
+        path = episode_path(self._run(request), request.path_params["id"])
         clock = PageClock.of(read_recording(path))
         stamp_ns = clock.stamp_ns(clock.clamp(_seconds(request) or 0.0))
         data, media_type = read_frame(path, request.path_params["camera"], stamp_ns)
-        headers = {"Cache-Control": "private, max-age=600"}
-        return Response(data, media_type=media_type, headers=headers)
+        return _image(data, media_type)
 
     def episode_file(self, request: Request) -> Response:
         """``/episode/<id>/file``: the recorded file itself."""
-        _, run = self._library.pick(request.query_params.get("run"))
-        path = episode_path(run, request.path_params["id"])
-        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+        return _download(episode_path(self._run(request), request.path_params["id"]))
 
     def derived_file(self, request: Request) -> Response:
         """``/derived/<file>/file``: a derived episode."""
-        _, run = self._library.pick(request.query_params.get("run"))
-        path = derived_path(run, request.path_params["name"])
-        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+        return _download(derived_path(self._run(request), request.path_params["name"]))
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""
-        _, run = self._library.pick(request.query_params.get("run"))
+        run = self._run(request)
         return self._page("twin.html", request, page=build_twin(run, judge(run)))
 
     def twin_image(self, request: Request) -> Response:
         """``/twin/<file>/<side>/<camera>?stamp=``: one held-out image."""
-        _, run = self._library.pick(request.query_params.get("run"))
+        run = self._run(request)
         path = derived_path(run, request.path_params["name"])
         stamp = request.query_params.get("stamp", "0")
         if not stamp.isascii() or not stamp.isdigit() or len(stamp) > 19:
@@ -172,13 +180,12 @@ class Pages:
         data, media_type = view_image(
             run, path, request.path_params["side"], request.path_params["camera"], int(stamp)
         )
-        headers = {"Cache-Control": "private, max-age=600"}
-        return Response(data, media_type=media_type, headers=headers)
+        return _image(data, media_type)
 
     def failed(self, request: Request, error: Exception) -> Response:
         """Show one of our errors as a page."""
         missing = isinstance(error, NotHereError)
-        title = "Not here" if missing else "This cannot be read"
+        title = "Not found" if missing else "This cannot be read"
         return self._page(
             "error.html", request, 404 if missing else 500, title=title, message=str(error)
         )
@@ -186,6 +193,6 @@ class Pages:
     def http_failed(self, request: Request, error: Exception) -> Response:
         """Show a wrong address as a page."""
         status = error.status_code if isinstance(error, HTTPException) else 500
-        title = "Not here" if status == 404 else f"Request refused ({status})"
-        message = "The address does not lead to a page of this dashboard."
+        title = "Not found" if status == 404 else f"Request refused ({status})"
+        message = "No page of this dashboard has that address."
         return self._page("error.html", request, status, title=title, message=message)

@@ -1,4 +1,4 @@
-"""Commands of the room ``dashboards``; imports stay late so that --help is quick."""
+"""Commands of the package ``dashboards``; imports stay late so that --help is quick."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,8 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bridge.terminal import Output
-from dashboards.config import DashboardConfig
-from dashboards.demo import DemoConfig
+from dashboards.config import DashboardConfig, DemoConfig
 
 OUTPUT = Output()
 DASHBOARD = DashboardConfig()
@@ -51,7 +50,7 @@ def demo(run: Path, /, *, config: DemoConfig = DEMO, output: Output = OUTPUT) ->
     Example: robot-gst demo runs/demo --quick
 
     Args:
-        run: Run folder; made where needed. Episodes already there are kept and used.
+        run: Run folder; made where needed. The same command again goes on where it was stopped.
         config: How much to do.
         output: How to talk.
     """
@@ -66,7 +65,7 @@ def export_rrd(episode: Path, /, *, out: Path, output: Output = OUTPUT) -> int:
     Example: robot-gst export rrd runs/monday/episodes/trial_0001.mcap --out trial_0001.rrd
 
     Args:
-        episode: An episode file; of one inside a run, the replays and the rebuilt place come along.
+        episode: An episode file; of one inside a run, the replays and the rebuilt scene come along.
         out: The .rrd file to write; an older one is replaced.
         output: How to talk.
     """

@@ -1,4 +1,4 @@
-"""What the evaluator says of a run: ``results.json`` where it is, and the rows behind it."""
+"""What the evaluator measured in a run: ``results.json`` where there is one, and the trials."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -46,18 +46,18 @@ class Judgement:
         return None
 
     def outdated(self) -> tuple[Measurement | None, Measurement | None] | None:
-        """Return the first number that the files of the run give otherwise than ``results.json``.
+        """Return the first number that differs between ``results.json`` and the files of the run.
 
         Returns:
-            As it is there and as it would be now; None on a side that does not have it. None when
-            all numbers hold, or when there is nothing to hold them against.
+            The stored value and the present one; None on a side that does not have it. None when
+            all numbers are up to date, or when there is nothing to compare them with.
         """
         if self.results is None or self.comparison is None:
             return None
-        said, now = (_from_trials(side.measurements) for side in (self.results, self.comparison))
-        for name in dict.fromkeys((*said, *now)):
-            if _counts(said.get(name)) != _counts(now.get(name)):
-                return said.get(name), now.get(name)
+        stored, now = (_from_trials(side.measurements) for side in (self.results, self.comparison))
+        for name in dict.fromkeys((*stored, *now)):
+            if _counts(stored.get(name)) != _counts(now.get(name)):
+                return stored.get(name), now.get(name)
         return None
 
     def row(self, episode_id: str) -> TrialRow | None:
@@ -82,7 +82,7 @@ def _counts(measurement: Measurement | None) -> tuple[float | None, int | None, 
 
 
 def agrees(row: TrialRow) -> bool | None:
-    """Say whether the planned replay foretold the recorded outcome; None when either is unknown."""
+    """Say whether the planned replay predicted the recorded outcome; None when one is unknown."""
     if row.sim_planned is None or row.recorded is None:
         return None
     return row.sim_planned == row.recorded

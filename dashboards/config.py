@@ -1,6 +1,8 @@
-"""Settings of the review pages."""
+"""Settings of the review pages and of the demo; imports nothing heavy."""
 
 from dataclasses import dataclass
+
+from cyclopts import Parameter
 
 from bridge.errors import refuse_outside
 
@@ -19,3 +21,48 @@ class DashboardConfig:
     def __post_init__(self) -> None:
         """Refuse a port that no machine has."""
         refuse_outside(self, PORTS)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class DemoConfig:
+    """What the demo does."""
+
+    quick: bool = False
+    """Two trials per condition and a short fit."""
+    full: bool = False
+    """Ten trials per condition, the number the paper used, and a longer fit."""
+    seed: int = 1
+    """Start positions and grasp errors of the trials; the cell's hidden parameters too."""
+    task: str = "cube_into_box"
+    """Task of the trials: cube_into_box, sloth_into_basket or five_ducks_into_basket."""
+    serve: bool | None = None
+    """Keep the dashboard running until Ctrl-C. Default: only on a terminal."""
+    port: int = 0
+    """Port of the dashboard; 0 takes a free one."""
+
+    def __post_init__(self) -> None:
+        """Refuse now what would end the demo after minutes."""
+        refuse_outside(self, PORTS)
+
+    @property
+    def trials(self) -> int:
+        """Trials per condition."""
+        return 10 if self.full else 2 if self.quick else 3
+
+    @property
+    def iterations(self) -> int:
+        """Images that the scene is fitted to: 15, 40 and 90 s on two idle cores."""
+        return 7000 if self.full else 1000 if self.quick else 3000
+
+    @property
+    def limit(self) -> str:
+        """Time after which the fit ends all the same, and is reported as underfitted."""
+        return "60min" if self.full else "15min" if self.quick else "30min"
+
+    @property
+    def samples(self) -> int:
+        """Varied replays behind each verdict; toys take seconds for each, and have none."""
+        from bridge.task.task_file import load_task  # noqa: PLC0415  # not for --help
+
+        return 0 if self.quick or load_task(self.task).soft_objects else 8

@@ -19,65 +19,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from cyclopts import Parameter
-
 from bridge.episode.catalogue import outcome_of, sidecar_path
 from bridge.episode.mcap.part_file import lock_dead
 from bridge.episode.metadata import Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import GstError, UsageError, refuse_outside
+from bridge.errors import GstError, UsageError
 from bridge.sources.standin.settings import CONDITIONS, INTERRUPTED, SEEDS_PER_SESSION
 from bridge.task.task_file import load_task
 from bridge.terminal import Output, how_to_activate
-from dashboards.config import PORTS
+from dashboards.config import DemoConfig
 from dashboards.errors import DashboardError
 
 START_TIMEOUT_S = 300.0
 STOP_TIMEOUT_S = 60.0
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class DemoConfig:
-    """What the demo does."""
-
-    quick: bool = False
-    """Two trials per condition and a short fit."""
-    full: bool = False
-    """Ten trials per condition, the number the paper used, and a longer fit."""
-    seed: int = 1
-    """Start positions and grasp errors of the trials; the cell's hidden parameters too."""
-    task: str = "cube_into_box"
-    """Task of the trials: cube_into_box, sloth_into_basket or five_ducks_into_basket."""
-    serve: bool | None = None
-    """Keep the dashboard running until Ctrl-C. Default: only on a terminal."""
-    port: int = 0
-    """Port of the dashboard; 0 takes a free one."""
-
-    def __post_init__(self) -> None:
-        """Refuse now what would end the demo after minutes."""
-        refuse_outside(self, PORTS)
-
-    @property
-    def trials(self) -> int:
-        """Trials per condition."""
-        return 10 if self.full else 2 if self.quick else 3
-
-    @property
-    def iterations(self) -> int:
-        """Images that the scene is fitted to: 15, 40 and 90 s on two idle cores."""
-        return 7000 if self.full else 1000 if self.quick else 3000
-
-    @property
-    def limit(self) -> str:
-        """Time after which the fit ends all the same, and is reported as underfitted."""
-        return "60min" if self.full else "15min" if self.quick else "30min"
-
-    @property
-    def samples(self) -> int:
-        """Varied replays behind each verdict; toys take seconds for each, and have none."""
-        return 0 if self.quick or load_task(self.task).soft_objects else 8
 
 
 class StepFailedError(DashboardError):
@@ -305,7 +260,6 @@ def _record_trials(
 ) -> None:
     log = run.notes_dir / "logs" / "gate.log"
     judge = ["gate", str(run.path), "--connect", endpoint, "--task", config.task]
-    judge += ["--deadline", "5min"]  # the last resort: the cell waits, its clock is its own
     label = f"4/6 {count} trials, {config.trials} starts without and with replanning"
     with _running(judge, log) as gate:
         gate.wait_until(lambda: "ready" in log.read_text(errors="replace"))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +13,14 @@ from bridge.episode.metadata import Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import JointTrack
+from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan
 from bridge.task.verdict import Factor, Verdict
-from dashboards.comparison import agrees
 from dashboards.figures import Signal, Span, StageChart, TimePlot, stage_chart, time_plot
 from dashboards.frames import CameraTrack
 from dashboards.library import derived_paths, episode_path
 from dashboards.recording import PageClock, Problems, Recording, read_recording
 from evaluator.compare import TrialRow
-
-# --- Signals of an episode and its replays, laid out over the page's time.
 
 RECORDED, PLANNED = "recorded", "planned"
 REPLAY_STYLES = {"planned": "twin-planned", "executed": "twin-executed"}
@@ -29,6 +28,11 @@ LEAST_SPAN = {"m": 0.02, "mm": 5.0, "rad": 0.05}
 """A value axis covers at least this much of its unit."""
 MARGIN_SETTING = "eps_col_m"
 """The replay setting that holds the safety distance."""
+MM = 1000.0
+"""Millimetres per metre."""
+
+Samples = tuple[np.ndarray, np.ndarray]
+"""Stamps [ns] and values."""
 
 
 def episode_stages(
@@ -61,15 +65,8 @@ def _planned_stages(recording: Recording, clock: PageClock) -> list[Span]:
             if start is None or end is None:
                 continue
             title = f"{stage.id}: {stage.text} ({start:.2f} s to {end:.2f} s, plan {plan.id})"
-            spans.append(
-                Span(
-                    start_s=start,
-                    end_s=end,
-                    label=stage.id,
-                    style=f"stage-{index % 4}",
-                    title=title,
-                )
-            )
+            style = f"stage-{index % 4}"
+            spans.append(Span(start_s=start, end_s=end, label=stage.id, style=style, title=title))
     return spans
 
 
@@ -84,14 +81,9 @@ def _recorded_stages(recording: Recording, clock: PageClock) -> list[Span]:
         if event["type"] == "stage_started":
             begun[stage_id] = clock.seconds(event["stamp_ns"])
         elif event["type"] == "stage_ended" and stage_id in begun:
-            spans.append(
-                Span(
-                    start_s=begun.pop(stage_id),
-                    end_s=clock.seconds(event["stamp_ns"]),
-                    label=stage_id,
-                    style=f"stage-{order.get(stage_id, 0) % 4}",
-                )
-            )
+            start, end = begun.pop(stage_id), clock.seconds(event["stamp_ns"])
+            style = f"stage-{order.get(stage_id, 0) % 4}"
+            spans.append(Span(start_s=start, end_s=end, label=stage_id, style=style))
     return spans
 
 
@@ -104,11 +96,13 @@ def main_plots(
 ) -> tuple[TimePlot, ...]:
     """Tool error, tool position, gripper, clearance and objects; only those that have data."""
     shown = _shown_replays(replays, sent_plan)
-    plots = [_error_plot(row, clock)]
-    plots.append(_clearance_plot(shown, clock))
-    plots += [_tool_plot(recording, shown, axis, clock) for axis in range(3)]
-    plots.append(_width_plot(recording, shown, clock))
-    plots += _object_plots(shown, clock)
+    plots = [
+        _error_plot(row, clock),
+        _clearance_plot(shown, clock),
+        *(_tool_plot(recording, shown, axis, clock) for axis in range(3)),
+        _width_plot(recording, shown, clock),
+        *_object_plots(shown, clock),
+    ]
     return tuple(plot for plot in plots if plot is not None)
 
 
@@ -127,51 +121,30 @@ def _shown_replays(replays: Sequence[Recording], sent_plan: Plan | None) -> dict
 
 
 def _error_plot(row: TrialRow | None, clock: PageClock) -> TimePlot | None:
-    if row is None or row.plan_id is None:
-        return None
-    start = clock.of_plan_time(row.plan_id, 0)
-    if start is None:
+    start = None if row is None or row.plan_id is None else clock.of_plan_time(row.plan_id, 0)
+    if row is None or start is None:
         return None
     signals = [
         Signal(
             name=f"to twin, {series.against}",
             style=REPLAY_STYLES.get(series.against, "twin-executed"),
             t_s=series.t_s + start,
-            values=1000 * series.position_m,
+            values=MM * series.position_m,
         )
         for series in row.tcp_errors
     ]
-    return time_plot(
-        "Tool: recorded to replayed distance",
-        "mm",
-        signals,
-        span_s=clock.span_s,
-        level=0.0,
-        least_span=LEAST_SPAN["mm"],
-        note="computed by the evaluator",
-    )
+    title, note = "Tool: recorded to replayed distance", "computed by the evaluator"
+    return _plot(title, "mm", signals, clock, level=0.0, note=note)
 
 
 def _tool_plot(
     recording: Recording, shown: dict[str, Recording], axis: int, clock: PageClock
 ) -> TimePlot | None:
-    signals = [_plan_signal(recording, clock, lambda plan: plan.positions_m()[:, axis])]
-    for trajectory, replay in shown.items():
-        if replay.tcp is not None:
-            signals.append(
-                _replay_signal(
-                    trajectory, replay, replay.tcp.stamps_ns, replay.tcp.p_m[:, axis], clock
-                )
-            )
-    if recording.tcp is not None:
-        signals.append(
-            Signal(
-                name="recorded",
-                style=RECORDED,
-                t_s=clock.all_seconds(recording.tcp.stamps_ns),
-                values=recording.tcp.p_m[:, axis],
-            )
-        )
+    signals = [
+        _plan_signal(recording, clock, lambda plan: plan.positions_m()[:, axis]),
+        *_twin_signals(shown, clock, lambda replay: _position(replay.tcp, axis)),
+        _recorded_signal(_position(recording.tcp, axis), clock),
+    ]
     return _plot(f"Tool {'xyz'[axis]}", "m", signals, clock)
 
 
@@ -179,39 +152,25 @@ def _width_plot(
     recording: Recording, shown: dict[str, Recording], clock: PageClock
 ) -> TimePlot | None:
     def widths(plan: Plan) -> np.ndarray:
-        return np.array([np.nan if w.width_m is None else 1000 * w.width_m for w in plan.tau])
+        return np.array([np.nan if w.width_m is None else MM * w.width_m for w in plan.tau])
 
-    signals = [_plan_signal(recording, clock, widths)]
-    for trajectory, replay in shown.items():
-        if replay.widths is not None:
-            track = replay.widths
-            signals.append(
-                _replay_signal(
-                    trajectory, replay, track.stamps_ns, 1000 * track.position[:, 0], clock
-                )
-            )
-    if recording.widths is not None:
-        signals.append(_track_signal(recording.widths, 0, clock, scale=1000.0))
+    signals = [
+        _plan_signal(recording, clock, widths),
+        *_twin_signals(shown, clock, lambda replay: _column(replay.widths, scale=MM)),
+        _recorded_signal(_column(recording.widths, scale=MM), clock),
+    ]
     return _plot("Gripper opening", "mm", signals, clock)
 
 
 def _clearance_plot(shown: dict[str, Recording], clock: PageClock) -> TimePlot | None:
-    signals: list[Signal | None] = []
-    margin = None
-    for trajectory, replay in shown.items():
-        if replay.clearance is None:
-            continue
-        track = replay.clearance
-        signals.append(
-            _replay_signal(trajectory, replay, track.stamps_ns, 1000 * track.position[:, 0], clock)
-        )
-        margin = _margin_m(replay) if margin is None else margin
+    margins = (_margin_m(replay) for replay in shown.values() if replay.clearance is not None)
+    margin = next((margin for margin in margins if margin is not None), None)
     return _plot(
         "Smallest clearance in the twin",
         "mm",
-        signals,
+        _twin_signals(shown, clock, lambda replay: _column(replay.clearance, scale=MM)),
         clock,
-        level=0.0 if margin is None else 1000 * margin,
+        level=0.0 if margin is None else MM * margin,
         level_label="contact" if margin is None else "safety distance",
     )
 
@@ -227,54 +186,48 @@ def _margin_m(replay: Recording) -> float | None:
 
 
 def _object_plots(shown: dict[str, Recording], clock: PageClock) -> list[TimePlot | None]:
-    names = dict.fromkeys(name for replay in shown.values() for name in replay.objects)
     plots = []
-    for name in names:
-        signals = [
-            _replay_signal(
-                trajectory,
-                replay,
-                replay.objects[name].stamps_ns,
-                1000 * replay.objects[name].p_m[:, 2],
-                clock,
-            )
-            for trajectory, replay in shown.items()
-            if name in replay.objects
-        ]
-        moving = any(s is not None and np.ptp(s.values) > 1e-6 for s in signals)
-        if moving:
+    for name in dict.fromkeys(name for replay in shown.values() for name in replay.objects):
+        heights = partial(_height, name=name)
+        signals = _twin_signals(shown, clock, heights)
+        if any(np.ptp(signal.values) > 1e-6 for signal in signals):
             plots.append(_plot(f"Height of {name} in the twin", "mm", signals, clock))
     return plots
+
+
+def _height(replay: Recording, name: str) -> Samples | None:
+    return _position(replay.objects.get(name), 2, scale=MM)
 
 
 def plots_of_joints(recording: Recording, clock: PageClock) -> tuple[TimePlot, ...]:
     """Draw one small plot per joint: planned and recorded."""
     track = recording.joints
-    names = track.names if track is not None else _planned_joint_names(recording)
+    planned = (plan.joint_names for _, plan in recording.plans if plan.joint_names)
+    names = next(planned, ()) if track is None else track.names
     plots = []
     for index, name in enumerate(names):
-        signals = [_plan_joint_signal(recording, clock, name)]
-        if track is not None:
-            signals.append(_track_signal(track, index, clock))
+        signals = [
+            _plan_signal(recording, clock, partial(_planned_joint, name=name)),
+            _recorded_signal(_column(track, index), clock),
+        ]
         title = name.removesuffix("_joint").replace("_", " ")
         plots.append(_plot(title, "rad", signals, clock, width=370, height=150))
     return tuple(plot for plot in plots if plot is not None)
 
 
-def _planned_joint_names(recording: Recording) -> tuple[str, ...]:
-    return next((plan.joint_names for _, plan in recording.plans if plan.joint_names), ())
+def _planned_joint(plan: Plan, name: str) -> np.ndarray:
+    if name not in plan.joint_names:
+        return np.full(len(plan.tau), np.nan)
+    column = plan.joint_names.index(name)
+    return np.array([np.nan if w.joints_rad is None else w.joints_rad[column] for w in plan.tau])
 
 
-def _plan_joint_signal(recording: Recording, clock: PageClock, name: str) -> Signal | None:
-    def joint(plan: Plan) -> np.ndarray:
-        if name not in plan.joint_names:
-            return np.full(len(plan.tau), np.nan)
-        column = plan.joint_names.index(name)
-        return np.array(
-            [np.nan if w.joints_rad is None else w.joints_rad[column] for w in plan.tau]
-        )
+def _position(track: PoseTrajectory | None, axis: int, scale: float = 1.0) -> Samples | None:
+    return None if track is None else (track.stamps_ns, scale * track.p_m[:, axis])
 
-    return _plan_signal(recording, clock, joint)
+
+def _column(track: JointTrack | None, column: int = 0, scale: float = 1.0) -> Samples | None:
+    return None if track is None else (track.stamps_ns, scale * track.position[:, column])
 
 
 def _plan_signal(
@@ -295,50 +248,38 @@ def _plan_signal(
     )
 
 
-def _track_signal(track: JointTrack, column: int, clock: PageClock, scale: float = 1.0) -> Signal:
-    return Signal(
-        name="recorded",
-        style=RECORDED,
-        t_s=clock.all_seconds(track.stamps_ns),
-        values=scale * track.position[:, column],
-    )
-
-
-def _replay_signal(
-    trajectory: str,
-    replay: Recording,
-    stamps_ns: np.ndarray,
-    values: np.ndarray,
-    clock: PageClock,
-) -> Signal | None:
-    t_s = clock.replay_seconds(replay, stamps_ns)
-    if t_s is None:
+def _recorded_signal(samples: Samples | None, clock: PageClock) -> Signal | None:
+    if samples is None:
         return None
-    style = REPLAY_STYLES.get(trajectory, "twin-executed")
-    return Signal(name=f"twin, {trajectory}", style=style, t_s=t_s, values=values)
+    stamps_ns, values = samples
+    return Signal(name="recorded", style=RECORDED, t_s=clock.all_seconds(stamps_ns), values=values)
+
+
+def _twin_signals(
+    shown: dict[str, Recording], clock: PageClock, samples_of: Callable[[Recording], Samples | None]
+) -> list[Signal]:
+    """Draw one line per replay that has the samples and a time on this page."""
+    signals = []
+    for trajectory, replay in shown.items():
+        samples = samples_of(replay)
+        t_s = None if samples is None else clock.replay_seconds(replay, samples[0])
+        if samples is not None and t_s is not None:
+            style = REPLAY_STYLES.get(trajectory, "twin-executed")
+            name = f"twin, {trajectory}"
+            signals.append(Signal(name=name, style=style, t_s=t_s, values=samples[1]))
+    return signals
 
 
 def _plot(
-    title: str,
-    unit: str,
-    signals: Sequence[Signal | None],
-    clock: PageClock,
-    *,
-    level: float | None = None,
-    level_label: str = "",
-    width: int = 560,
-    height: int = 190,
+    title: str, unit: str, signals: Sequence[Signal | None], clock: PageClock, **options: Any
 ) -> TimePlot | None:
     return time_plot(
         title,
         unit,
         [signal for signal in signals if signal is not None],
         span_s=clock.span_s,
-        level=level,
-        level_label=level_label,
         least_span=LEAST_SPAN[unit],
-        width=width,
-        height=height,
+        **options,
     )
 
 
@@ -364,7 +305,7 @@ class VerdictView:
     file: str
     of_sent_plan: bool
     counts: bool
-    """False of a replay that was made again since, with other settings or in another scene."""
+    """False for a replay that was redone since, with other settings or in another scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -394,7 +335,6 @@ class EpisodePage:
     row: TrialRow | None
     label: Outcome | None
     """How it ended; a label given after the fact counts."""
-    agrees: bool | None
     verdicts: tuple[VerdictView, ...]
     gated: bool
     """The plan that was sent had a verdict before motion."""
@@ -434,15 +374,16 @@ def build_page(
     sent_plan = _sent_plan(recording)
     clock = PageClock.of(recording)
     verdicts = _verdicts(recording, replays, sent_plan, clock)
-    telling = (view for view in verdicts if view.of_sent_plan and view.counts)
-    failure_t_s = next((f.t_s for view in telling for f in view.factors if _fails(f)), None)
-    cursor = clock.clamp(_first_known(t_s, failure_t_s, clock.end_s))
+    factors = [f for view in verdicts if view.of_sent_plan and view.counts for f in view.factors]
+    failures_s = [f.t_s for f in factors if f.factor.value is False and f.t_s is not None]
+    failure_t_s = next(iter(failures_s), None)
+    first_s = clock.end_s if failure_t_s is None else failure_t_s
+    cursor = clock.clamp(first_s if t_s is None else t_s)
     return EpisodePage(
         recording=recording,
         replays=replays,
         row=row,
         label=problems.attempt(lambda: outcome_of(run, Episode.open(path)), recording.outcome),
-        agrees=None if row is None else agrees(row),
         verdicts=verdicts,
         gated=any(view.title == GATE_BEFORE and view.of_sent_plan for view in verdicts),
         stages=episode_stages(recording, clock, failure_t_s),
@@ -458,21 +399,13 @@ def build_page(
     )
 
 
-def _first_known(*values: float | None) -> float:
-    return next(value for value in values if value is not None)
-
-
-def _fails(view: FactorView) -> bool:
-    return view.factor.value is False and view.t_s is not None
-
-
 def _read_replays(
     paths: Sequence[Path], recording: Recording, problems: Problems
 ) -> tuple[Recording, ...]:
-    """Read what was made of a recording, in the order in which it was made.
+    """Read the replays of a recording in the order in which they were made.
 
-    What was made of other bytes than the file holds now comes first. Of several replays of one
-    trajectory the last counts, for the evaluator as here.
+    Replays of other bytes than the file holds now come first. Of several replays of one trajectory
+    the last counts, as in the evaluator.
     """
     found = []
     for path in sorted(paths, key=lambda path: (path.stat().st_mtime_ns, path.name)):
@@ -480,12 +413,8 @@ def _read_replays(
         if replay is not None:
             found.append(replay)
             problems.texts.extend(replay.problems)
-    found.sort(key=lambda replay: _source_of(replay) == recording.sha256)
+    found.sort(key=lambda r: r.derived is not None and r.derived.source_sha256 == recording.sha256)
     return tuple(found)
-
-
-def _source_of(replay: Recording) -> str | None:
-    return None if replay.derived is None else replay.derived.source_sha256
 
 
 def _trajectory_of(replay: Recording) -> tuple[str | None, ...]:
@@ -518,7 +447,7 @@ def _verdicts(
         counts = last[_trajectory_of(replay)] is replay
         for _, verdict in replay.verdicts:
             title = f"{verdict.trajectory.capitalize()} in the twin"
-            subtitle = verdict.mode if counts else f"{verdict.mode}, made again since"
+            subtitle = verdict.mode if counts else f"{verdict.mode}, redone since"
             views.append(_view(title, subtitle, verdict, replay, sent_id, clock, counts=counts))
     order = {"Planned in the twin": 1, "Executed in the twin": 2}
     views.sort(key=lambda view: (not view.of_sent_plan, not view.counts, order.get(view.title, 0)))

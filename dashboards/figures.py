@@ -154,10 +154,10 @@ def _labels(values: Sequence[float]) -> list[str]:
 
 
 def axis(low: float, high: float, px_low: float, px_high: float, wanted: int = 5) -> Axis:
-    """Build an axis with round ticks; a single value gets room around it."""
+    """Build an axis with round ticks; a single value gets a margin."""
     if high - low < 1e-12:
-        room = max(abs(low) * 0.1, 1e-3)
-        low, high = low - room, high + room
+        margin = max(abs(low) * 0.1, 1e-3)
+        low, high = low - margin, high + margin
     bare = Axis(low=low, high=high, px_low=px_low, px_high=px_high)
     values = nice_ticks(low, high, wanted)
     ticks = tuple(
@@ -222,9 +222,9 @@ def time_plot(
     high = max(float(values.max()) for values in finite)
     if level is not None:
         low, high = min(low, level), max(high, level)
-    room = max((high - low) * 0.06, (least_span - (high - low)) / 2)
+    margin = max((high - low) * 0.06, (least_span - (high - low)) / 2)
     x = axis(span_s[0], span_s[1], 46, width - 8, wanted=7)
-    y = axis(low - room, high + room, height - 24, 10, wanted=4)
+    y = axis(low - margin, high + margin, height - 24, 10, wanted=4)
     lines = tuple(
         Line(name=signal.name, style=signal.style, pieces=_pieces(*_thin(signal), x, y))
         for signal in signals
@@ -293,19 +293,17 @@ def _bar(span: Span, x: Axis) -> Bar:
     )
 
 
-# --- Layout of the scatter of twin against recorded success rates.
-
 SIZE = 360
 MARKERS = ("circle", "square", "diamond", "triangle")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cell:
-    """One cell (task, condition, policy) with both rates, as the evaluator measured them."""
+class RateGroup:
+    """One group (task, condition, policy) with both rates, as the evaluator measured them."""
 
     label: str
-    group: str
-    """Cells of one group are joined by a line: the same task and policy."""
+    series: str
+    """Groups of one series are joined by a line: the same task and policy."""
     task: str
     condition: str
     policy: str
@@ -317,9 +315,9 @@ class Cell:
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """A drawn cell [px]; interval ends are None where there is none."""
+    """A drawn group [px]; interval ends are None where there is none."""
 
-    cell: Cell
+    group: RateGroup
     x: float
     y: float
     marker: str
@@ -327,8 +325,6 @@ class Point:
     x_high: float | None
     y_low: float | None
     y_high: float | None
-    shift: float
-    """Points that coincide are drawn side by side [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -340,57 +336,50 @@ class Scatter:
     axis_y: Axis
     points: tuple[Point, ...]
     joins: tuple[str, ...]
-    groups: tuple[tuple[str, str], ...]
-    """Group name and its marker."""
+    series: tuple[tuple[str, str], ...]
+    """Name of a series and its marker."""
 
 
-def scatter(cells: Sequence[Cell]) -> Scatter | None:
-    """Lay out the cells that have both rates; None when there is none."""
-    drawable = [c for c in cells if c.replayed.value is not None and c.recorded.value is not None]
+def scatter(groups: Sequence[RateGroup]) -> Scatter | None:
+    """Lay out the groups that have both rates; None when there is none."""
+    drawable = [g for g in groups if g.replayed.value is not None and g.recorded.value is not None]
     if not drawable:
         return None
     axis_x = axis(0.0, 1.0, 44, SIZE - 12)
     axis_y = axis(0.0, 1.0, SIZE - 44, 12)
-    groups = list(dict.fromkeys(cell.group for cell in drawable))
-    markers = {group: MARKERS[index % len(MARKERS)] for index, group in enumerate(groups)}
+    series = list(dict.fromkeys(group.series for group in drawable))
+    markers = {name: MARKERS[index % len(MARKERS)] for index, name in enumerate(series)}
     taken: dict[tuple[float, float], int] = {}
     points = []
-    for cell in drawable:
-        place = (axis_x.px(_value(cell.replayed)), axis_y.px(_value(cell.recorded)))
-        count = taken.get(place, 0)
-        taken[place] = count + 1
-        points.append(_point(cell, axis_x, axis_y, markers[cell.group], shift=7.0 * count))
+    for group in drawable:
+        x, y = axis_x.px(group.replayed.value or 0.0), axis_y.px(group.recorded.value or 0.0)
+        count = taken.get((x, y), 0)
+        taken[x, y] = count + 1
+        across, upright = group.replayed.interval, group.recorded.interval
+        points.append(
+            Point(
+                group=group,
+                x=x + 7.0 * count,  # points that coincide are drawn side by side
+                y=y,
+                marker=markers[group.series],
+                x_low=None if across is None else axis_x.px(across.low),
+                x_high=None if across is None else axis_x.px(across.high),
+                y_low=None if upright is None else axis_y.px(upright.low),
+                y_high=None if upright is None else axis_y.px(upright.high),
+            )
+        )
     return Scatter(
         size=SIZE,
         axis_x=axis_x,
         axis_y=axis_y,
         points=tuple(points),
-        joins=tuple(_join(points, group) for group in groups),
-        groups=tuple(markers.items()),
+        joins=tuple(_join(points, name) for name in series),
+        series=tuple(markers.items()),
     )
 
 
-def _value(measurement: Measurement) -> float:
-    return 0.0 if measurement.value is None else measurement.value
-
-
-def _point(cell: Cell, axis_x: Axis, axis_y: Axis, marker: str, *, shift: float) -> Point:
-    across, upright = cell.replayed.interval, cell.recorded.interval
-    return Point(
-        cell=cell,
-        x=axis_x.px(_value(cell.replayed)) + shift,
-        y=axis_y.px(_value(cell.recorded)),
-        marker=marker,
-        x_low=None if across is None else axis_x.px(across.low),
-        x_high=None if across is None else axis_x.px(across.high),
-        y_low=None if upright is None else axis_y.px(upright.low),
-        y_high=None if upright is None else axis_y.px(upright.high),
-        shift=shift,
+def _join(points: Sequence[Point], series: str) -> str:
+    joined = sorted(
+        (point for point in points if point.group.series == series), key=lambda p: p.group.filled
     )
-
-
-def _join(points: Sequence[Point], group: str) -> str:
-    of_group = sorted(
-        (point for point in points if point.cell.group == group), key=lambda p: p.cell.filled
-    )
-    return " ".join(f"{point.x:g},{point.y:g}" for point in of_group)
+    return " ".join(f"{point.x:g},{point.y:g}" for point in joined)

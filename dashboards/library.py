@@ -28,14 +28,14 @@ class Library:
             runs[name] = run
         return Library(runs)
 
-    def pick(self, name: str | None) -> tuple[str, RunFolder]:
+    def pick(self, name: str | None) -> RunFolder:
         """Return the named run, or the first one without a name."""
         if not name:
-            return next(iter(self.runs.items()))
+            return next(iter(self.runs.values()))
         if name not in self.runs:
-            message = f"no run named {name!r} is being shown. Runs: {', '.join(self.runs)}."
+            message = f"no run is named {name!r}. Runs shown: {', '.join(self.runs)}."
             raise NotHereError(message)
-        return name, self.runs[name]
+        return self.runs[name]
 
 
 def episode_path(run: RunFolder, episode_id: str) -> Path:

@@ -1,10 +1,14 @@
-"""What the overview shows: headline numbers, rates per cell, and every trial."""
+"""What the overview shows: headline numbers, success rates of each group, and every trial.
+
+Measurements are chosen by id; nothing is computed. Rates are ``rate.<side>.<group>`` with side
+``recorded`` or one of the twin's, and group ``<task>.<condition>`` or
+``<task>.<condition>.<policy>``.
+"""
 
 import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
@@ -12,15 +16,10 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from dashboards import wording
 from dashboards.comparison import Judgement, agrees
-from dashboards.figures import Cell, Scatter, scatter
+from dashboards.figures import RateGroup, Scatter, scatter
 from evaluator.compare import TrialRow
 from evaluator.measurements import slug
 from evaluator.result import Exclusion, Measurement
-
-# --- Which of the evaluator's numbers go where on the overview. Chooses by id; computes nothing.
-#
-# Rates are ``rate.<side>.<cell>`` with side ``recorded`` or one of the twin's, and the cell
-# ``<task>.<condition>`` or ``<task>.<condition>.<policy>``.
 
 NO_NAME = "-"
 """Stands in an id for an empty name."""
@@ -34,7 +33,7 @@ SIDE_WORDS = {
     "verdict": "gate accepted",
 }
 CARDS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
-    ("Twin foretells the outcome", r"agreement\.sim_planned\.rate", ()),
+    ("Twin predicts the outcome", r"agreement\.sim_planned\.rate", ()),
     ("Success rates, correlation r", r"agreement\.pearson_r", (r"agreement\.bias_pp",)),
     (
         "Gain with replanning, recorded",
@@ -63,7 +62,7 @@ class Card:
 
 @dataclass(frozen=True, kw_only=True)
 class RateRow:
-    """One cell of the rate table: what was measured on each side."""
+    """One group of the table of rates: what was measured on each side."""
 
     task: str
     condition: str
@@ -84,7 +83,7 @@ class GainRow:
 
 @dataclass(frozen=True, kw_only=True)
 class RateTable:
-    """Success rates: a row per cell, a column per side."""
+    """Success rates: a row per group, a column per side."""
 
     sides: tuple[str, ...]
     rows: tuple[RateRow, ...]
@@ -92,7 +91,7 @@ class RateTable:
 
 
 def headline_cards(judgement: Judgement) -> tuple[Card, ...]:
-    """Choose the headline numbers; one that is not there says missing."""
+    """Choose the headline numbers; one that is not in the results is marked missing."""
     return tuple(_card(title, pattern, below, judgement) for title, pattern, below in CARDS)
 
 
@@ -132,7 +131,7 @@ def _small(measurement: Measurement) -> str:
 def _rates(
     measurements: Sequence[Measurement], start: str = "rate"
 ) -> dict[str, dict[str, Measurement]]:
-    """Map cell to side to measurement, in file order."""
+    """Map group to side to measurement, in file order."""
     rates: dict[str, dict[str, Measurement]] = {}
     for measurement in measurements:
         parts = measurement.id.split(".", 2)
@@ -141,14 +140,14 @@ def _rates(
     return rates
 
 
-def _cell_parts(cell: str) -> tuple[str, str, str]:
-    parts = [*cell.split(".", 2), "", ""]
+def _names_of(group: str) -> tuple[str, str, str]:
+    parts = [*group.split(".", 2), "", ""]
     task, condition, policy = ("" if part == NO_NAME else part for part in parts[:3])
     return task, condition, policy
 
 
 def rate_table(measurements: Sequence[Measurement]) -> RateTable | None:
-    """Arrange all rates by cell and side; None when there are none."""
+    """Arrange all rates by group and side; None when there are none."""
     rates = _rates(measurements)
     if not rates:
         return None
@@ -156,8 +155,8 @@ def rate_table(measurements: Sequence[Measurement]) -> RateTable | None:
     known = [side for side in SIDE_WORDS if side in present]
     sides = [*known, *(side for side in present if side not in known)]
     rows = []
-    for cell, by_side in rates.items():
-        task, condition, policy = _cell_parts(cell)
+    for group, by_side in rates.items():
+        task, condition, policy = _names_of(group)
         rows.append(
             RateRow(
                 task=task,
@@ -173,18 +172,18 @@ def rate_table(measurements: Sequence[Measurement]) -> RateTable | None:
     )
 
 
-def scatter_cells(measurements: Sequence[Measurement], rows: Sequence[TrialRow]) -> list[Cell]:
-    """Collect the cells that have both rates; over the same trials where trials are known."""
+def rate_groups(measurements: Sequence[Measurement]) -> list[RateGroup]:
+    """Collect the groups that have both rates; over the same trials where trials are known."""
     found = []
     over_same_trials = _rates(measurements, "rate_common")
-    for cell, by_side in (over_same_trials or _rates(measurements)).items():
+    for group, by_side in (over_same_trials or _rates(measurements)).items():
         if "recorded" not in by_side or SIM_SIDE not in by_side:
             continue
-        task, condition, policy = _cell_parts(cell)
+        task, condition, policy = _names_of(group)
         found.append(
-            Cell(
+            RateGroup(
                 label=", ".join(p.replace("_", " ") for p in (task, condition, policy) if p),
-                group=" ".join(p.replace("_", " ") for p in (task, policy) if p),
+                series=" ".join(p.replace("_", " ") for p in (task, policy) if p),
                 task=task,
                 condition=condition,
                 policy=policy,
@@ -197,7 +196,7 @@ def scatter_cells(measurements: Sequence[Measurement], rows: Sequence[TrialRow])
 
 
 def gain_rows(measurements: Sequence[Measurement]) -> tuple[GainRow, ...]:
-    """Arrange every gain with replanning by cell and side, points beside relative."""
+    """Arrange every gain with replanning by group and side, points beside relative."""
     found: dict[tuple[str, str], dict[str, Measurement]] = {}
     for measurement in measurements:
         parts = measurement.id.split(".", 3)
@@ -262,8 +261,8 @@ class Selection:
         names = Selection.__dataclass_fields__
         return {name: changes.get(name, getattr(self, name)) for name in names}
 
-    def takes_cell(self, task: str, condition: str, policy: str) -> bool:
-        """Say whether a cell is selected."""
+    def takes_group(self, task: str, condition: str, policy: str) -> bool:
+        """Say whether a group is selected."""
         return (
             self.task in ("", slug(task))
             and self.condition in ("", slug(condition))
@@ -272,7 +271,7 @@ class Selection:
 
     def takes(self, row: TrialRow) -> bool:
         """Say whether a trial is selected."""
-        if not self.takes_cell(row.task, row.condition, row.policy):
+        if not self.takes_group(row.task, row.condition, row.policy):
             return False
         if self.show == "disagree":
             return agrees(row) is False
@@ -289,16 +288,8 @@ class Facet:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
-    """One line of the episode list."""
-
-    row: TrialRow
-    agrees: bool | None
-
-
-@dataclass(frozen=True, kw_only=True)
 class OtherFile:
-    """A recording that is no trial: a scan, a probe, an import."""
+    """A recording that is not a trial: a scan, a probe, an import."""
 
     id: str
     info: EpisodeInfo
@@ -321,12 +312,12 @@ class Overview:
     stand_in: bool | None
     cards: tuple[Card, ...]
     has_headline: bool
-    """At least one card has something to say."""
+    """Whether at least one card has a value or a reason."""
     scatter: Scatter | None
     rates: RateTable | None
     gains: tuple[GainRow, ...]
     gain_methods: str
-    trials: tuple[Trial, ...]
+    trials: tuple[TrialRow, ...]
     num_trials: int
     facets: tuple[Facet, ...]
     others: tuple[OtherFile, ...]
@@ -336,7 +327,7 @@ class Overview:
     missing: tuple[str, ...]
     notices: tuple[str, ...]
     outdated: str | None
-    """That the numbers are older than the run, and which of them shows it."""
+    """A message that the numbers are older than the run, naming the first that differs."""
     next_command: str | None
 
 
@@ -360,7 +351,6 @@ def neighbours(
 def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -> Overview:
     """Gather the overview of one run."""
     rows = ordered(judgement.rows)
-    cells = scatter_cells(judgement.measurements, rows)
     others, broken = _files(run, {row.episode for row in rows})
     cards = headline_cards(judgement)
     gains = gain_rows(judgement.measurements)
@@ -369,11 +359,11 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         stand_in=judgement.stand_in,
         cards=cards,
         has_headline=any(card.state != "missing" for card in cards),
-        scatter=scatter(cells),
+        scatter=scatter(rate_groups(judgement.measurements)),
         rates=rate_table(judgement.measurements),
         gains=gains,
         gain_methods=methods(judgement.measurements, "gain."),
-        trials=tuple(Trial(row=row, agrees=agrees(row)) for row in rows if selection.takes(row)),
+        trials=tuple(row for row in rows if selection.takes(row)),
         num_trials=len(rows),
         facets=_facets(rows),
         others=others,
@@ -400,12 +390,11 @@ def _outdated(judgement: Judgement) -> str | None:
     found = judgement.outdated()
     if found is None:
         return None
-    said, now = found
     name = next(side.id for side in found if side is not None)
-    was, would_be = (wording.headline(m) if m else "not measured" for m in (said, now))
+    was, now = (wording.headline(m) if m else "not measured" for m in found)
     return (
-        f"The numbers on this page are older than the run: {name} was {was} and is {would_be} by "
-        "the recordings, labels and replays that lie there now."
+        f"The numbers on this page are older than the run: {name} was {was} and is now {now}, "
+        "computed from the present recordings, labels and replays."
     )
 
 
@@ -443,13 +432,9 @@ def _files(run: RunFolder, known: set[str]) -> tuple[tuple[OtherFile, ...], tupl
                     OtherFile(id=path.stem, info=episode.info, duration_s=episode.duration_s)
                 )
         except GstError as error:
-            broken.append(BrokenFile(name=_name(run, path), reason=str(error)))
+            broken.append(BrokenFile(name=str(path.relative_to(run.path)), reason=str(error)))
+    reason = "not finished: still being recorded, or its recorder was stopped"
     for folder in (run.episodes_dir, run.derived_dir):
-        for path in sorted(folder.glob("*.mcap.part")):
-            reason = "not finished: still being written, or its writer was stopped"
-            broken.append(BrokenFile(name=_name(run, path), reason=reason))
+        parts = sorted(folder.glob("*.mcap.part"))
+        broken += [BrokenFile(name=str(p.relative_to(run.path)), reason=reason) for p in parts]
     return tuple(others), tuple(broken)
-
-
-def _name(run: RunFolder, path: Path) -> str:
-    return str(path.relative_to(run.path))

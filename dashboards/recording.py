@@ -25,7 +25,7 @@ Part = TypeVar("Part")
 
 @dataclass
 class Problems:
-    """What could not be read, in words."""
+    """Messages about what could not be read."""
 
     texts: list[str] = field(default_factory=list)
 
@@ -136,12 +136,9 @@ def _read(path: Path, _mtime_ns: int, size: int) -> Recording:
     )
 
 
-# --- The page's time: seconds of source time since the first sample of an episode.
-
-
 @dataclass(frozen=True, kw_only=True)
 class PageClock:
-    """From source stamps [ns] to seconds on the page and back."""
+    """Convert source stamps [ns] to the page's time (seconds since the first sample) and back."""
 
     zero_ns: int
     end_s: float
@@ -199,9 +196,9 @@ class PageClock:
     def replay_seconds(
         self, replay: Recording, stamps_ns: Int[np.ndarray, " num_samples"]
     ) -> Float[np.ndarray, " num_samples"] | None:
-        """Place a replay's stamps: its own clock starts with the plan unless it kept ours.
+        """Return a replay's page times; its clock starts with the plan or is the recording's.
 
-        None when the replayed plan was never executed, so that it has no place on this axis.
+        None when the replayed plan was never executed: it has no time on this axis.
         """
         first = replay.first_stamp_ns()
         if first is None:

@@ -1,4 +1,4 @@
-"""Camera images, depth and poses of an episode, as Rerun shows them."""
+"""What Rerun shows: the scene's splats, objects, the robot and the cameras of an episode."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
@@ -22,12 +22,10 @@ from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.robots.default import BASE_FRAME, ROBOT
 from bridge.robots.robot import resolve_mesh
-from bridge.task.task_file import ObjectModel, Task
+from bridge.task.task_file import Task
 from dashboards.errors import DashboardError
 from dashboards.frames import media_type
 from dashboards.rerun_file import RerunFile
-
-# --- The rebuilt place as Gaussian splats, and task objects as boxes.
 
 BACKGROUND = "background.ply"
 MAX_SPLATS = 300_000
@@ -67,15 +65,15 @@ def read_splats(path: Path) -> Float[np.ndarray, "num_splats 14"]:
 
 
 def log_splats(file: RerunFile, scene_dir: Path) -> bool:
-    """Log the rebuilt place under ``scene/background``; return whether there is one."""
+    """Log the rebuilt scene under ``scene/background``; return whether there is one."""
     path = scene_dir / BACKGROUND
     if not path.is_file():
-        file.note("no rebuilt place: the run has no scene (robot-gst rebuild RUN)")
+        file.note("no scene: rebuild it first (robot-gst rebuild RUN)")
         return False
     try:
         table = read_splats(path)
     except DashboardError as error:
-        file.note(f"the rebuilt place is not shown: {error}")
+        file.note(f"the rebuilt scene is not shown: {error}")
         return False
     opacity = 1 / (1 + np.exp(-table[:, 6].astype(np.float64)))
     scales = np.exp(table[:, 7:10])
@@ -102,14 +100,13 @@ def log_object(
     file: RerunFile,
     entity: str,
     track: PoseTrajectory,
-    model: ObjectModel | None,
-    *,
-    solid: bool,
+    task: Task | None,
 ) -> None:
-    """Log an object's poses and, where the task knows its shape, its boxes.
+    """Log an object's poses from its first one on and, where the task knows its shape, its boxes.
 
-    It appears with its first pose: before, nobody said where it is.
+    Its id in the task is the last part of ``entity``.
     """
+    model = None if task is None else task.objects.get(entity.rpartition("/")[2])
     file.poses(entity, track)
     first = track.stamps_ns[:1]
     if model is None:
@@ -122,16 +119,9 @@ def log_object(
         colors=[model.color_srgb] * len(panels),
     ).partition([len(panels)])
     file.rows(entity, first, columns)
-    mode = rr.components.FillMode.Solid if solid else rr.components.FillMode.MajorWireframe
-    file.always(entity, rr.Boxes3D.from_fields(fill_mode=mode))
+    wireframe = rr.components.FillMode.MajorWireframe
+    file.always(entity, rr.Boxes3D.from_fields(fill_mode=wireframe))
 
-
-def model_of(task: Task | None, object_id: str) -> ObjectModel | None:
-    """Return an object's shape if the task is known and has it."""
-    return None if task is None else task.objects.get(object_id)
-
-
-# --- The recorded robot, moved by its recorded joints: a URDF as Rerun loads it.
 
 ROOT_FRAME = "tf#/"
 """Rerun's name for the frame of the entity ``/``, which is the robot's root frame here."""
@@ -174,7 +164,7 @@ def log_robot(
     root = f"{prefix}/{tree.root_link().name}"
     file.always(f"{prefix}/robot_root", rr.Transform3D(parent_frame=ROOT_FRAME, child_frame=root))
     if joints is None:
-        file.note("the robot stands still: no joint states")
+        file.note("the robot does not move: no joint states")
         return True
     for index, name in enumerate(joints.names):
         _move(file, tree, prefix, name, joints, joints.position[:, index])
@@ -195,7 +185,7 @@ def _move(
 ) -> None:
     joint = tree.get_joint_by_name(name)
     if joint is None:
-        file.note(f"joint {name!r} is not in the robot description; it does not move the drawing")
+        file.note(f"joint {name!r} is not in the robot description and is not shown")
         return
     columns = joint.compute_transform_columns(values.tolist(), clamp=False)
     file.rows(f"{prefix}/robot_joints/{name}", track.stamps_ns, columns)
@@ -289,7 +279,7 @@ def log_cameras(file: RerunFile, episode: Episode, prefix: str, start_ns: int) -
                 _log_pinhole(file, info, entity)
                 _log_pose(file, tree, info.frame_id, entity, [start_ns, *stamps])
             except GstError as error:
-                file.note(f"{entity} has no place in 3D: {error}")
+                file.note(f"{entity} is not shown in 3D: {error}")
     return ids
 
 
@@ -370,7 +360,7 @@ def _log_pose(
 ) -> None:
     stamps = np.unique(np.array(stamps_ns, dtype=np.int64))
     Ts = np.stack([tree.T_root_frame(frame, int(stamp)) for stamp in stamps])
-    if np.array_equal(Ts, np.broadcast_to(Ts[0], Ts.shape)):  # a camera that stands still
+    if np.array_equal(Ts, np.broadcast_to(Ts[0], Ts.shape)):  # a stationary camera
         stamps, Ts = stamps[:1], Ts[:1]
     q, p = se3.split(Ts)
     file.poses(entity, PoseTrajectory(stamps, p, q))

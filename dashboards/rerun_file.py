@@ -34,7 +34,7 @@ class RerunFile:
         self._part = path.with_name(path.name + ".part")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._part.write_bytes(b"")  # say now, in one sentence, if it cannot be written
+            self._part.write_bytes(b"")  # fail now, not after the export, if it cannot be written
         except OSError as error:
             message = f"cannot write {self._part}: {error.strerror}. Choose another with --out."
             raise DashboardError(message) from error
@@ -46,15 +46,15 @@ class RerunFile:
         self.stream.send_recording_name(name)
 
     def _unwritten(self, error: RuntimeError) -> DashboardError:
-        """Remove what there is, and say why there is no more."""
+        """Remove the partial file and return the error to raise."""
         self._part.unlink(missing_ok=True)
         return DashboardError(
             f"cannot write {self._part}: {error}. Is the disk full? Make space, or choose another "
-            "place with --out."
+            "file with --out."
         )
 
     def note(self, text: str) -> None:
-        """Remember something that is not shown, once."""
+        """Add a note about something that is not shown, once."""
         if text not in self.notes:
             self.notes.append(text)
 

@@ -2,13 +2,14 @@
 
 ``/recorded/...`` is the episode, ``/replayed/<planned|executed>/<dynamic|kinematic>/...`` what the
 twin made of it, ``/localised/...`` where it found the objects, ``/scene/background`` the rebuilt
-place. Stand-in truth is never shown.
+scene. Stand-in truth is never shown.
 """
 
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -23,16 +24,152 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.task_file import Task, load_task
+from bridge.task.verdict import Verdict
 from dashboards.recording import PageClock, Recording, read_recording
-from dashboards.rerun_entities import log_cameras, log_object, log_robot, log_splats, model_of
+from dashboards.rerun_entities import log_cameras, log_object, log_robot, log_splats
 from dashboards.rerun_file import TIMELINE, RerunFile
-from dashboards.rerun_side import MIN_CLEARANCE, Side, log_side
-from dashboards.wording import condition_word, outcome_word
-
-# --- How the view opens: the place in 3D, the cameras, the series, and what was said.
+from dashboards.wording import condition_word, factor_word, outcome_word, verdict_word
 
 EYE_M, TARGET_M = (1.5, -1.1, 0.9), (0.35, 0.0, 0.15)
 """Looking at the table in front of the robot from its left."""
+GOOD, WARN = "INFO", "WARN"
+MIN_CLEARANCE = "clearance_m"
+PATH_RADIUS_M = 0.0025
+AXES_M = 0.05
+RECORDED_WIDTH, REPLAYED_WIDTH = 3.0, 1.5
+"""Points; a replay stays visible on the recorded line."""
+JOINT_COLORS = (
+    *((31, 119, 180), (255, 127, 14), (44, 160, 44)),
+    *((214, 39, 40), (148, 103, 189), (140, 86, 75)),
+)
+NOT_IN_A_PATH = r"[^A-Za-z0-9_.-]"
+RECORDED = (128, 137, 153)
+REPLAYED = {"planned": (29, 100, 216), "executed": (217, 115, 13)}
+"""As on the review pages, with a grey that shows on dark and light ground."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Side:
+    """Where one recording goes in the view."""
+
+    prefix: str
+    """Its entities start with this: ``recorded``, ``replayed/planned/dynamic``."""
+    recording: Recording
+    color: tuple[int, int, int]
+    place_ns: Callable[[Int[np.ndarray, " num_stamps"]], Int[np.ndarray, " num_stamps"]]
+    """Converts its stamps to the recorded cell's source time [ns]."""
+
+    @property
+    def name(self) -> str:
+        """What a legend says: ``recorded``, ``planned dynamic``."""
+        return self.prefix.removeprefix("replayed/").replace("/", " ")
+
+    @property
+    def width(self) -> float:
+        """Width of its lines [points]."""
+        return RECORDED_WIDTH if self.recording.derived is None else REPLAYED_WIDTH
+
+
+def log_side(file: RerunFile, side: Side, task: Task | None) -> None:
+    """Log everything of one recording that is a number over time, a pose or a line of text."""
+    _log_series(file, side)
+    _log_tool(file, side)
+    for name, track in side.recording.objects.items():
+        entity = f"{side.prefix}/objects/{name}"
+        log_object(file, entity, _placed(side, track), task)
+    _log_events(file, side)
+    for problem in side.recording.problems:
+        file.note(f"{side.recording.path.name}: {problem}")
+
+
+def _log_series(file: RerunFile, side: Side) -> None:
+    recording, prefix = side.recording, side.prefix
+    if recording.joints is not None:
+        stamps = side.place_ns(recording.joints.stamps_ns)
+        for index, name in enumerate(recording.joints.names):
+            file.scalars(
+                f"{prefix}/joints/{name}",
+                stamps,
+                recording.joints.position[:, index],
+                name=f"{name}, {side.name}",
+                color=JOINT_COLORS[index % len(JOINT_COLORS)],
+                width=side.width,
+            )
+    for leaf, track in (
+        ("gripper_width_m", recording.widths),
+        (MIN_CLEARANCE, recording.clearance),
+    ):
+        if track is not None:
+            file.scalars(
+                f"{prefix}/{leaf}",
+                side.place_ns(track.stamps_ns),
+                track.position[:, 0],
+                name=side.name,
+                color=side.color,
+                width=side.width,
+            )
+
+
+def _log_tool(file: RerunFile, side: Side) -> None:
+    if side.recording.tcp is None:
+        return
+    track = _placed(side, side.recording.tcp)
+    entity = f"{side.prefix}/tcp"
+    file.poses(entity, track)
+    file.rows(entity, track.stamps_ns[:1], rr.TransformAxes3D.columns(axis_length=[AXES_M]))
+    strip = rr.LineStrips3D([track.p_m], radii=[PATH_RADIUS_M], colors=[side.color])
+    file.always(f"{side.prefix}/tcp_path", strip)
+
+
+def _placed(side: Side, track: PoseTrajectory) -> PoseTrajectory:
+    return PoseTrajectory(side.place_ns(track.stamps_ns), track.p_m, track.q_wxyz)
+
+
+def _log_events(file: RerunFile, side: Side) -> None:
+    recording, prefix = side.recording, side.prefix
+    events = [(int(event["stamp_ns"]), event_text(event), GOOD) for event in recording.events]
+    _log_text(file, side, f"{prefix}/events", events)
+    verdicts = [
+        (stamp, verdict_text(verdict), GOOD if verdict.accepted else WARN)
+        for stamp, verdict in recording.verdicts
+    ]
+    _log_text(file, side, f"{prefix}/verdicts", verdicts)
+    started = [e for e in recording.events if e["type"] == "stage_started" and e.get("stage_id")]
+    ended = [e for e in recording.events if e["type"] == "execution_ended"]
+    if started:
+        changes = sorted([*started, *ended], key=lambda event: event["stamp_ns"])
+        stamps = side.place_ns(np.array([e["stamp_ns"] for e in changes], dtype=np.int64))
+        names = [e["stage_id"] if e["type"] == "stage_started" else "ended" for e in changes]
+        file.rows(f"{prefix}/stage", stamps, rr.StateChange.columns(state=names))
+
+
+def _log_text(file: RerunFile, side: Side, entity: str, lines: list[tuple[int, str, str]]) -> None:
+    if lines:
+        stamps_ns, texts, levels = (list(column) for column in zip(*lines, strict=True))
+        columns = rr.TextLog.columns(text=texts, level=levels)
+        file.rows(entity, side.place_ns(np.array(stamps_ns, dtype=np.int64)), columns)
+
+
+def event_text(event: dict[str, Any]) -> str:
+    """Write an event as one line: what happened, to which stage and plan, and the note."""
+    parts = [str(event["type"]).replace("_", " ")]
+    parts += [str(event[name]) for name in ("stage_id", "plan_id") if event.get(name)]
+    text = ", ".join(parts)
+    return f"{text}: {event['text']}" if event.get("text") else text
+
+
+def verdict_text(verdict: Verdict) -> str:
+    """Write a verdict as one line, with the first factor that fails and why."""
+    text = f"{verdict_word(verdict.accepted)}: {verdict.plan_id}, {verdict.trajectory}"
+    text += f", {verdict.mode}, {verdict.engine}"
+    name = verdict.first_failing
+    if name is not None:
+        factor = getattr(verdict, name)
+        why = factor.detail or factor.cause
+        text += f"; {name} {factor_word(factor)}" + (f" ({why})" if why else "")
+    elif verdict.accepted is None and verdict.reason:
+        text += f"; {verdict.reason}"
+    return text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,10 +199,10 @@ def layout(shown: Shown) -> rrb.Blueprint:
     if shown.stages:
         contents = [f"+ /{side}/stage" for side in shown.sides]
         right.append(rrb.StateTimelineView(origin="/", contents=contents, name="stages"))
-    said = [f"+ /{side}/{leaf}" for side in shown.sides for leaf in ("events", "verdicts")]
+    texts = [f"+ /{side}/{leaf}" for side in shown.sides for leaf in ("events", "verdicts")]
     right.append(
         rrb.Tabs(
-            rrb.TextLogView(origin="/", contents=said, name="events and verdicts"),
+            rrb.TextLogView(origin="/", contents=texts, name="events and verdicts"),
             rrb.TextDocumentView(origin="/about", name="about"),
         )
     )
@@ -86,15 +223,13 @@ def _space(shown: Shown) -> rrb.Spatial3DView:
     """Show all poses; depth as points only where there are no splats, which show the same."""
     contents = ["+ /**"]
     if shown.splats:
-        contents += [f"- /{entity}/**" for entity in shown.camera_entities if _is_depth(entity)]
+        contents += [
+            f"- /{entity}/**" for entity in shown.camera_entities if entity.endswith("/depth")
+        ]
     eye = rrb.EyeControls3D(position=EYE_M, look_target=TARGET_M, eye_up=(0.0, 0.0, 1.0))
     return rrb.Spatial3DView(
         origin="/", contents=contents, name=shown.name, eye_controls=eye if shown.robot else None
     )
-
-
-def _is_depth(entity: str) -> bool:
-    return entity.endswith("/depth")
 
 
 def _image(entity: str) -> rrb.Spatial2DView:
@@ -107,12 +242,6 @@ def _series(name: str, entities: Sequence[str], *, legend: bool = True) -> rrb.T
     return rrb.TimeSeriesView(
         origin="/", contents=contents, name=name, plot_legend=rrb.PlotLegend(visible=legend)
     )
-
-
-NOT_IN_A_PATH = r"[^A-Za-z0-9_.-]"
-RECORDED = (128, 137, 153)
-REPLAYED = {"planned": (29, 100, 216), "executed": (217, 115, 13)}
-"""As on the review pages, with a grey that shows on dark and light ground."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +263,7 @@ def export_rrd(episode_path: Path, out: Path, run: RunFolder | None = None) -> E
     Args:
         episode_path: A recorded episode, or one replay.
         out: The ``.rrd`` file to write; an older one is replaced.
-        run: Where to look for replays and the rebuilt place; see ``run_of``.
+        run: Where to look for replays and the rebuilt scene; see ``run_of``.
 
     Raises:
         GstError: When the episode cannot be opened, or ``out`` not be written.
@@ -161,7 +290,7 @@ def export_rrd(episode_path: Path, out: Path, run: RunFolder | None = None) -> E
         )
         splats = run is not None and log_splats(file, run.scene_dir)
         if run is None:
-            file.note("no replays and no rebuilt place: the episode does not lie in a run folder")
+            file.note("no replays and no rebuilt scene: the episode is not in a run folder")
         for side in sides:
             log_side(file, side, task)
         _localised(file, recording, task, run)
@@ -225,7 +354,7 @@ def _replays(
             continue
         derived = replay.derived
         if derived is None or replay.first_stamp_ns() is None:
-            file.note(f"{path.name} is not shown: it holds no replay")
+            file.note(f"{path.name} is not shown: it is not a replay")
             continue
         prefix = f"replayed/{derived.trajectory}/{derived.mode}"
         if derived.plan_id != last_plan:
@@ -234,7 +363,7 @@ def _replays(
         if prefix in taken:
             file.note(f"{path.name} is not shown: there is a newer one")
         elif place is None:
-            file.note(f"{path.name} is not shown: its plan was never executed, it has no time here")
+            file.note(f"{path.name} is not shown: its plan was never executed")
         else:
             taken.add(prefix)
             color = _color(derived.trajectory)
@@ -244,7 +373,7 @@ def _replays(
 def _placer(
     clock: PageClock, replay: Recording
 ) -> Callable[[Int[np.ndarray, " num_stamps"]], Int[np.ndarray, " num_stamps"]] | None:
-    """Return what carries a replay's stamps to the recorded source time."""
+    """Return what converts a replay's stamps to the recorded source time."""
     first = replay.first_stamp_ns()
     moved = None if first is None else clock.replay_seconds(replay, np.array([first]))
     if first is None or moved is None:
@@ -266,7 +395,7 @@ def _task(file: RerunFile, recording: Recording) -> Task | None:
 def _localised(
     file: RerunFile, recording: Recording, task: Task | None, run: RunFolder | None
 ) -> None:
-    """Log where the twin found the objects, from the moment it looked on."""
+    """Log where the twin found the objects, from the moment of localisation on."""
     if run is None or recording.derived is not None:
         return
     paths = run.derived(f"{recording.info.id}.localised.*")
@@ -287,8 +416,7 @@ def _localised(
         track = PoseTrajectory(
             np.array([record["stamp_ns"]]), np.array([pose["p_m"]]), np.array([pose["q_wxyz"]])
         )
-        model = model_of(task, record["object"])
-        log_object(file, f"localised/{record['object']}", track, model, solid=False)
+        log_object(file, f"localised/{record['object']}", track, task)
 
 
 def _camera_entities(episode: Episode, prefix: str, cameras: list[str]) -> Iterator[str]:

@@ -120,8 +120,7 @@ def _are_at_work(threads: set[threading.Thread]) -> bool:
 
 def _ask_ahead(library: Library) -> None:
     """Let the evaluator read the first run while the reader is still opening the page."""
-    _, run = library.pick(None)
-    judge(run)
+    judge(library.pick(None))
 
 
 @contextmanager

@@ -110,7 +110,7 @@ def _source_of(run: RunFolder, path: Path) -> Path | None:
 
 
 def _scores(judgement: Judgement, stem: str) -> dict[tuple[Cell, Cell], dict[str, Cell]]:
-    """Map camera and stamp to the evaluator's row about that image."""
+    """Map camera and stamp to the evaluator's row for that image."""
     tables: tuple[Table, ...] = judgement.results.tables if judgement.results else ()
     scores = {}
     for table in tables:

@@ -155,7 +155,7 @@ def short_evidence(measurement: Measurement | None) -> str:
     return ", ".join(parts)
 
 
-def chance(p_success: Mapping[str, float]) -> str:
+def success_share(p_success: Mapping[str, float]) -> str:
     """Print how many varied replays succeeded, and the interval of that share."""
     low, high = (round(100 * p_success[name]) for name in ("low", "high"))
     counts = f"{p_success['k']:g} of {p_success['n']:g} varied replays succeed"

@@ -220,7 +220,7 @@ class SummaryCache:
         Args:
             folder: None keeps nothing.
             fresh: Believe nothing that was kept, and keep what is made now.
-            say: Called with one sentence about whatever makes the evaluation take longer.
+            say: Called about whatever makes the evaluation take longer.
             monotonic: The clock of periodic saving [s].
         """
         self._folder = None if folder is None else CacheFolder(folder, say)

@@ -153,11 +153,11 @@ def read_summaries(path: Path, kind: type[Summary], version: str) -> dict[str, t
     """
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
-            said = dict(file.schema_arrow.metadata or {})
-            if said.get(_KIND) != kind.__name__.encode():
+            stamp = dict(file.schema_arrow.metadata or {})
+            if stamp.get(_KIND) != kind.__name__.encode():
                 message = "another program wrote it"
                 raise UnusableFileError(message)
-            if said.get(_VERSION) != version.encode():
+            if stamp.get(_VERSION) != version.encode():
                 message = "another version of this program wrote it"
                 raise UnusableFileError(message)
             with without_collecting():

@@ -48,7 +48,7 @@ def evaluate(
         check_published: A published table (a rates CSV with printed figures): recompute it from
             its rows, and exit with 3 when a figure does not follow from them.
         interval: Interval of success rates.
-        goal: A success rate from 0 to 1: say for each cell whether its trials settle that it lies
+        goal: A success rate from 0 to 1: say for each group whether its trials settle that it lies
             above or below, at any time, or how many more that may take.
         force: Read every file of the run again, whatever RUN/results/cache remembers.
         images: Renders to compare, and backbones of LPIPS.
@@ -62,7 +62,7 @@ def evaluate(
     from evaluator.thresholds import missed, parse_thresholds
 
     if goal is not None and not 0 < goal < 1:
-        message = f"--goal {goal} is no success rate between 0 and 1, for example 0.8."
+        message = f"--goal {goal} is not a success rate between 0 and 1, for example 0.8."
         raise UsageError(message)
     if live.live:
         return _follow(source, live, goal, output)
@@ -107,6 +107,7 @@ def _compare(
 ) -> "tuple[Comparison, Path]":
     from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError
+    from bridge.exchange.trials_csv import trials_path
     from evaluator.cache import FOLDER, SummaryCache
     from evaluator.compare import compare_csv, compare_run
 
@@ -119,7 +120,7 @@ def _compare(
             raise UsageError(message)
         return compare_csv(source, method=interval, goal=goal), beside
     run = RunFolder.open(source)
-    if not (run.notes_dir / "trials.csv").is_file():  # outcomes that were imported
+    if not trials_path(run).is_file():
         run.refuse_empty()
     with SummaryCache(run.results_dir / FOLDER, fresh=force, say=output.say) as cache:
         comparison = compare_run(
@@ -166,4 +167,4 @@ def _missed_text(item: "Missed") -> str:
 
 def _finding_text(item: "Finding") -> str:
     where = "" if item.row is None else f"row {item.row}: "
-    return f"{where}{item.what}: {item.verdict}. {item.remark}".strip()
+    return f"{where}{item.what}: {item.verdict}. {item.note}".strip()

@@ -120,7 +120,7 @@ def _new(
 _SIDES = {
     "recorded": "successes / trials as labelled by the operator",
     "sim_planned": "successes / trials in the twin: the plan actually sent, planned trajectory, dynamic replay; with replanning the twin itself selected these plans",
-    "sim_executed": "successes / trials in the twin: the executed joints re-lived dynamically; diagnosis only, never part of r",
+    "sim_executed": "successes / trials in the twin: the executed joints replayed dynamically; diagnosis only, never part of r",
     "verdict": "plans accepted / plans judged: the gate's verdict on the plan actually sent, before motion; without replanning it was recorded and not obeyed, with replanning it selected these plans",
 }
 RATES = {
@@ -172,7 +172,7 @@ AVERAGE_MACRO = _new(
     "1",
     "higher",
     agreement.mean_rate,
-    "mean of the unrounded {side} rates of {over} {condition}: every cell counts the same",
+    "mean of the unrounded {side} rates of {over} {condition}: every group counts the same",
 )
 AVERAGE_POOLED = _new(
     "average.pooled.{side}.{condition}",
@@ -320,7 +320,7 @@ PEARSON_R_REMEASURED = _new(
     "1",
     "higher",
     agreement.pearson,
-    "the same r {what}; its band is where r would fall if the same cells were measured again with as many trials",
+    "the same r {what}; its band is where r would fall if the same groups were measured again with as many trials",
 )
 SPEARMAN = _agreement(
     "spearman_rho",
@@ -368,21 +368,21 @@ ORDER_ACCURACY = _agreement(
     "1",
     "higher",
     agreement.order_accuracy,
-    "pairs of cells that the twin orders as the recorded rates do / pairs whose recorded rates differ; a tie in the twin counts 1/2; {what}",
+    "pairs of groups that the twin orders as the recorded rates do / pairs whose recorded rates differ; a tie in the twin counts 1/2; {what}",
 )
 MMRV_RECORDED = _agreement(
     "mmrv_recorded_gap",
     "1",
     "lower",
     agreement.mmrv,
-    "mean maximum rank violation {what}; convention: gap of recorded rates (SIMPLER equation 1); it grows with the number of cells",
+    "mean maximum rank violation {what}; convention: gap of recorded rates (SIMPLER equation 1); it grows with the number of groups",
 )
 MMRV_SIM = _agreement(
     "mmrv_sim_gap",
     "1",
     "lower",
     agreement.mmrv,
-    "mean maximum rank violation {what}; convention: gap of sim rates (arguments swapped, as some published code does); it grows with the number of cells",
+    "mean maximum rank violation {what}; convention: gap of sim rates (arguments swapped, as some published code does); it grows with the number of groups",
 )
 LARGEST_GAP = _new(
     "agreement.largest_gap_pp",
@@ -393,15 +393,23 @@ LARGEST_GAP = _new(
 )
 DECISIONS = {
     name: _new(
-        f"decision.{name}",
+        f"decision.{part}",
         "1",
         "higher",
         agreement.choose,
         f"tasks in which {words} (best: highest rate, ties together) / tasks with a choice of condition or policy",
     )
-    for name, words in (
-        ("surely_right", "every choice that is best in the twin is among the recorded best"),
-        ("possibly_right", "one choice that is best in the twin is among the recorded best"),
+    for name, part, words in (
+        (
+            "confident",
+            "surely_right",
+            "every choice that is best in the twin is among the recorded best",
+        ),
+        (
+            "possibly_right",
+            "possibly_right",
+            "one choice that is best in the twin is among the recorded best",
+        ),
     )
 }
 REGRET = _new(
@@ -440,14 +448,14 @@ PPV = _new(
     "1",
     "higher",
     intervals.wilson,
-    "positive predictive value: trials that succeeded / trials where {words} said success",
+    "positive predictive value: trials that succeeded / trials where {words} predicted success",
 )
 NPV = _new(
     "agreement.{by}.npv",
     "1",
     "higher",
     intervals.wilson,
-    "negative predictive value: trials that failed / trials where {words} said failure",
+    "negative predictive value: trials that failed / trials where {words} predicted failure",
 )
 BREAK_EVEN_PRICE = _new(
     "gate.break_even_price",
@@ -733,7 +741,7 @@ STATES = {
         ("position", "median", "m", None),
         ("position", "mean", "m", None),
         ("rotation", "median", "rad", state.turn_between_rad),
-        ("extents", "median", "m", state.extents_apart_m),
+        ("extents", "median", "m", state.extents_difference_m),
     )
 }
 

@@ -45,13 +45,13 @@ class Measurement:
     unit: str
     """``1`` for fractions and coefficients, ``pp``, ``m``, ``rad``, ``dB``, ``count``."""
     definition: str
-    """One sentence: what was counted or computed, from what."""
+    """What was counted or computed, from what."""
     interval: Interval | None = None
     k: int | None = None
     """Successes, where the value is k/n."""
     n: int | None = None
     counted: str | None = None
-    """What ``n`` counts: trial, object, pair, cell, image, run."""
+    """What ``n`` counts: trial, object, pair, group, image, run."""
     reason_if_undefined: str | None = None
     """Set exactly when ``value`` is None."""
     reason_without_interval: str | None = None
@@ -267,11 +267,11 @@ def _measurement(record: Mapping[str, Any], lists: list[tuple[str, ...]]) -> Mea
     interval = record.get("interval")
     values = dict(record)
     values["interval"] = None if interval is None else Interval(**interval)
-    said = record["episodes"]
-    if isinstance(said, int) and said >= len(lists):
-        message = f"{record['id']} names list {said} of {len(lists)} lists of episodes"
+    episodes = record["episodes"]
+    if isinstance(episodes, int) and episodes >= len(lists):
+        message = f"{record['id']} names list {episodes} of {len(lists)} lists of episodes"
         raise ValueError(message)
-    values["episodes"] = lists[said] if isinstance(said, int) else tuple(said)
+    values["episodes"] = lists[episodes] if isinstance(episodes, int) else tuple(episodes)
     return Measurement(**values)
 
 

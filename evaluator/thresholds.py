@@ -45,7 +45,7 @@ def parse_thresholds(text: str | float) -> list[Threshold]:
     """Read ``0.8``, ``r=0.8`` or ``r=0.8,ppv=0.9``; a bare number is the agreement of trials.
 
     Raises:
-        UsageError: For what is no number, or a fraction outside 0..1.
+        UsageError: For what is not a number, or a fraction outside 0..1.
     """
     return [_parse(part.strip()) for part in str(text).split(",")]
 
@@ -56,7 +56,7 @@ def _parse(part: str) -> Threshold:
     try:
         limit = float(number)
     except ValueError as error:
-        message = f"--fail-under {part!r} is no number; write 0.8, r=0.8 or ID=0.8."
+        message = f"--fail-under {part!r} is not a number; write 0.8, r=0.8 or ID=0.8."
         raise UsageError(message) from error
     if not math.isfinite(limit):
         message = f"--fail-under {part!r} is no limit that anything can reach or miss."

@@ -8,8 +8,6 @@ Run: python examples/replay_plan.py runs/demo/episodes/trial_0001.mcap
 import sys
 from pathlib import Path
 
-import numpy as np
-
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.geometry import se3
@@ -26,10 +24,7 @@ def main(path: Path) -> None:
     urdf = streams.robot_description(episode)
     if urdf is None:
         sys.exit(f"{path} holds no robot description")
-    poses = {
-        name: se3.transform_from(np.array(pose["q_wxyz"]), np.array(pose["p_m"]))
-        for name, pose in plan.entities.items()
-    }
+    poses = {name: se3.pose_from_record(pose) for name, pose in plan.entities.items()}
     scene = ReplayScene(task=load_task(plan.task), Ts_base_object=poses, urdf=urdf)
     result = replay_plan(plan, scene, ReplayConfig())
 

@@ -1,1 +1,1 @@
-"""Commands of the room ``bridge``, lazily imported; imports stay late so that --help is quick."""
+"""Commands of the package ``bridge``; their imports stay late so that --help is quick."""

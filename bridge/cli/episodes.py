@@ -52,7 +52,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         f"{opened.duration_s:.1f} s, {sum(item.count for item in topics.values())} messages, "
         f"{sum(path.stat().st_size for path in opened.parts) / 1e6:.1f} MB"
         + (f" in {len(opened.parts)} parts" if len(opened.parts) > 1 else ""),
-        f"  outcome: {_outcome(about.kind, outcome)}",
+        f"  outcome: {_outcome('replay' if opened.derived else about.kind, outcome)}",
     ]
     if opened.derived:
         derived = opened.derived
@@ -83,9 +83,9 @@ def _outcome(kind: str, outcome: "Outcome | None") -> str:
 
 
 def check(episodes: list[Path], /, *, rerun: bool = False, output: Output = OUTPUT) -> int:
-    """Check that episodes are whole: CRCs, indexes, counts, decoding, and losses they declare.
+    """Verify episodes (CRCs, indexes, counts, decoding) and list dropped messages.
 
-    Exit code 0 clean, 3 losses, 1 broken. Example: robot-gst check runs/demo
+    Exit code 0: clean, 3: messages were dropped, 1: broken. Example: robot-gst check runs/demo
 
     Args:
         episodes: Episode files, or folders to search for them; parts go with their episode.
@@ -128,7 +128,7 @@ def check(episodes: list[Path], /, *, rerun: bool = False, output: Output = OUTP
 
 
 def doctor(*, output: Output = OUTPUT) -> int:
-    """Say what is installed, what is missing, and how to get it.
+    """Show what is installed, what is missing, and how to get it.
 
     Example: robot-gst doctor
 
@@ -138,23 +138,24 @@ def doctor(*, output: Output = OUTPUT) -> int:
     from bridge.doctor import examine
 
     findings = examine()
-    lines = [
-        f"{'ok  ' if item.ok else 'MISS'} {item.what:<28} {item.found:<12} {item.advice}".rstrip()
-        for item in findings
-    ]
+    lines = []
+    for item in findings:
+        line = f"{'ok  ' if item.ok else 'MISS'} {item.what:<28} {item.found:<12}"
+        apart = "\n     " if len(line) + len(item.advice) >= 80 else " "
+        lines.append(f"{line.rstrip()}{apart}{item.advice}".rstrip())
     output.result({"findings": [asdict(item) for item in findings]}, "\n".join(lines))
     return 0 if all(item.ok for item in findings) else 1
 
 
 def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OUTPUT) -> int:
-    """Make readable episodes of files whose writer was killed, and say what was lost.
+    """Repair files whose writer was killed, and report what was lost.
 
-    Exit code 0 recovered, 1 when nothing could be read in one of them.
+    Exit code 0: repaired, 1: nothing could be read in one of them.
     Example: robot-gst recover runs/monday
 
     Args:
         paths: Files of any MCAP writer, or folders to search for ``*.mcap.part``.
-        in_place: Finish the file itself; without it a copy is made where the disk has room.
+        in_place: Finish the file itself; without it a copy is made where the disk has space.
         output: How to talk.
     """
     from bridge.episode import recover as recovery
@@ -220,7 +221,7 @@ def ls(
         output: How to talk.
     """
     entries = _find(run, query, output)
-    lines = _table(entries) if entries else [f"no episode in {run} passes these filters"]
+    lines = episode_table(entries) if entries else [f"no episode in {run} passes these filters"]
     output.result({"episodes": [vars(entry) for entry in entries]}, "\n".join(lines))
     return 1 if any(entry.error for entry in entries) else 0
 
@@ -248,10 +249,12 @@ WIDEST = 26
 """Of an episode's name beside the other columns; a longer one has a line of its own."""
 
 
-WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}
+WRAPPED = textwrap.TextWrapper(
+    80, initial_indent="    ", subsequent_indent="    ", break_long_words=False
+)
 
 
-def _table(entries: "list[Entry]") -> list[str]:
+def episode_table(entries: "list[Entry]") -> list[str]:
     """A header, a row for each episode within 80 columns, and below it what is special about it."""
     rows = [COLUMNS, *(_row(entry) for entry in entries)]
     widths = [
@@ -269,8 +272,7 @@ def _table(entries: "list[Entry]") -> list[str]:
         cells += [text.rjust(width) for text, width in zip(row[4:], widths[4:], strict=True)]
         lines.append("  ".join(cells).rstrip())
         if entry is not None:
-            notes = textwrap.wrap(_notes(entry, is_named=not all_stand_in), 76, **WHOLE_WORDS)
-            lines += [f"    {note}" for note in notes]
+            lines += WRAPPED.wrap(_notes(entry, is_named=not all_stand_in))
     return lines
 
 
@@ -317,7 +319,7 @@ def label(
     detail: str | None = None,
     output: Output = OUTPUT,
 ) -> int:
-    """Say after the fact how an episode ended; kept in notes/, the episode is not rewritten.
+    """Set the outcome of a recorded episode; kept in notes/, the episode is not rewritten.
 
     Example: robot-gst label runs/monday trial_0003 --result failure --detail "slipped"
 

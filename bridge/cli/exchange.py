@@ -213,8 +213,6 @@ def import_trials(
     return 0
 
 
-# --- Commands that bring other people's recordings into a run.
-
 FOLDER = FolderConfig()
 
 

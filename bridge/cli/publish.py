@@ -1,9 +1,6 @@
-"""Commands that publish: an RGB-D folder, the stand-in cell."""
+"""Commands that publish: an RGB-D folder, the stand-in cell, RealSense cameras, a UR arm."""
 
 import contextlib
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -51,8 +48,8 @@ def publish_folder(
     from bridge.errors import GstError
     from bridge.record.control import RecorderClient
     from bridge.record.status import describe_answer
-    from bridge.sources.folder.messages import num_frames, read_index
-    from bridge.sources.folder.publish import publish_folder_frames
+    from bridge.sources.folder.messages import read_index
+    from bridge.sources.folder.publish import FolderSource
     from bridge.wire.config import WireConfig
     from bridge.wire.session import open_session
 
@@ -66,10 +63,7 @@ def publish_folder(
             info = {"kind": "scan", "cell": config.cell, "tags": [f"folder:{index.name}"]}
             client.start(episode, info)
         try:
-            with output.progress("publish", num_frames(index, config)) as advance:
-                sent = publish_folder_frames(
-                    session, index, config, fast=fast, should_stop=stop.is_set, advance=advance
-                )
+            sent = FolderSource(index, config, fast).run(session, stop, output)
         except GstError:
             if episode is not None:  # a part of a folder is no scan
                 with contextlib.suppress(GstError):  # the first error is the one to show
@@ -106,18 +100,15 @@ def publish_standin(
         zenoh_config: zenoh configuration (JSON5).
         output: How to talk.
     """
-    from bridge.sources.standin.session import describe, run_session
+    from bridge.sources.source import run_source
+    from bridge.sources.standin.session import StandinSource, describe
     from bridge.wire.config import WireConfig
-    from bridge.wire.session import open_session
 
     wire = WireConfig(connect=connect, config=zenoh_config)
-    with stop_signals() as stop, open_session(wire) as session:
-        summary = run_session(session, config, output, should_stop=stop.is_set)
+    summary = run_source(StandinSource(config), wire, output)
     output.result(summary, describe(summary))
     return 0
 
-
-# --- Commands that publish hardware: RealSense cameras and UR arms.
 
 REALSENSE = RealSenseConfig()
 UR = UrConfig()
@@ -147,23 +138,20 @@ def publish_realsense(
         output: How to talk.
     """
     from bridge.sources.realsense.device import describe_device
-    from bridge.sources.realsense.publish import attached_devices, choose_cameras, publish_cameras
+    from bridge.sources.realsense.publish import RealSenseSource, attached_devices
+    from bridge.sources.source import run_source
     from bridge.wire.config import WireConfig
-    from bridge.wire.session import open_session
 
     list_devices = attached_devices()
     if list:
         found = [describe_device(device) for device in list_devices()]
         output.result({"cameras": found}, "\n".join(found) or "no RealSense camera is attached")
         return 0
-    choose_cameras(config, list_devices)
+    source = RealSenseSource(config, list_devices)
     wire = WireConfig(
         connect=connect, config=zenoh_config, shared_memory_mb=config.shared_memory_mb
     )
-    with _stopping(duration_s) as stop, open_session(wire) as session:
-        counts = publish_cameras(
-            session, config, stop=stop, output=output, list_devices=list_devices
-        )
+    counts = run_source(source, wire, output, duration_s=duration_s)
     lines = [
         f"{camera}: {sent['color_frames']} colour and {sent['depth_frames']} depth frames sent, "
         f"{sent['color_lost']} and {sent['depth_lost']} lost on the way from the camera"
@@ -196,27 +184,11 @@ def publish_ur(
         zenoh_config: zenoh configuration (JSON5).
         output: How to talk.
     """
-    from bridge.sources.ur.publish import describe_counts, publish_arm
+    from bridge.sources.source import run_source
+    from bridge.sources.ur.publish import UrSource, describe_counts
     from bridge.wire.config import WireConfig
-    from bridge.wire.session import open_session
 
     wire = WireConfig(connect=connect, config=zenoh_config)
-    with _stopping(duration_s) as stop, open_session(wire) as session:
-        counts = publish_arm(session, host, config, stop=stop, output=output)
+    counts = run_source(UrSource(host, config), wire, output, duration_s=duration_s)
     output.result(counts, describe_counts(counts))
     return 0
-
-
-@contextmanager
-def _stopping(duration_s: float | None) -> Iterator[threading.Event]:
-    """An event that is set by a signal, or when the time is over."""
-    with stop_signals() as stop:
-        timer = None if duration_s is None else threading.Timer(duration_s, stop.set)
-        if timer is not None:
-            timer.daemon = True
-            timer.start()
-        try:
-            yield stop
-        finally:
-            if timer is not None:
-                timer.cancel()

@@ -1,6 +1,5 @@
 """Commands that record, and that control a recorder from anywhere."""
 
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -111,7 +110,7 @@ def ctl(
     """
     from bridge.errors import UsageError
     from bridge.record.control import RecorderClient
-    from bridge.record.status import describe_answer, describe_list, describe_status
+    from bridge.record.status import describe_answer, describe_status
     from bridge.wire.config import WireConfig
     from bridge.wire.session import open_session
 
@@ -135,8 +134,19 @@ def ctl(
         )
     with open_session(WireConfig(connect=connect, config=zenoh_config)) as session:
         answer = RecorderClient(session, recorder).ask(action, requests[action])
-    describe: Callable[[dict[str, Any]], str] = describe_answer
-    if action in ("status", "list"):
-        describe = describe_status if action == "status" else describe_list
+    describe = {"status": describe_status, "list": _describe_list}.get(action, describe_answer)
     output.result(answer, describe(answer))
     return 0
+
+
+def _describe_list(answer: dict[str, Any]) -> str:
+    from bridge.cli.episodes import episode_table
+    from bridge.episode.catalogue_store import Entry
+    from bridge.episode.metadata import build
+
+    entries = [build(Entry, item) for item in answer["episodes"]]
+    if not entries:
+        return "no episode has been recorded yet"
+    left_out = answer["of"] - len(entries)
+    more = [f"({left_out} more before these)"] if left_out else []
+    return "\n".join([*more, *episode_table(entries)])

@@ -21,7 +21,7 @@ from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
 from bridge.terminal import Advance
 
-# --- The CSV files of ``export csv``: which columns each has, what they mean, and their rows.
+# The CSV files of ``export csv``: which columns each has, what they mean, and their rows.
 #
 # RFC 4180: comma, CRLF, quotes doubled. Times are whole nanoseconds and, beside them, seconds
 # with nine decimals. Numbers are the shortest decimals that read back as the same 64-bit number.

@@ -14,8 +14,6 @@ from bridge.episode.provenance import hash_file, software
 from bridge.episode.reader import Episode
 from bridge.errors import BridgeError, EpisodeError, UsageError
 
-# --- Errors about a message say which one of which topic of which file it was.
-
 
 @contextmanager
 def message_named(episode: Episode, topic: str, number: int) -> Iterator[None]:

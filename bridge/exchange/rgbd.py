@@ -30,7 +30,7 @@ from bridge.geometry.camera import Camera
 from bridge.media.color import JPEG_MAGIC
 from bridge.terminal import Advance
 
-# --- An episode's cameras as folders of the TUM RGB-D layout.
+# An episode's cameras as folders of the TUM RGB-D layout.
 #
 # Colour is written as it was recorded (JPEG bytes) or as PNG; depth as 16-bit PNG with 5000 per
 # metre, so that whole millimetres survive exactly up to 13.107 m. Stamps keep nine decimals.

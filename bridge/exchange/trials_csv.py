@@ -96,7 +96,7 @@ class SourceRow:
         return number
 
     def _number(self, name: str) -> float | None:
-        """Return the number in a field, None when it is empty, -1 when it is no number."""
+        """Return the number in a field, None when it is empty, -1 when it is not a number."""
         text = self.text(name)
         try:
             return float(text) if text else None
@@ -297,10 +297,6 @@ def _field(name: str, value: object) -> str:
         words = ("true", "false") if name == "stand_in" else ("success", "failure")
         return words[0] if value else words[1]
     return "" if value is None else str(value)
-
-
-# --- Trials kept in a spreadsheet become part of a run: ``notes/trials.csv``, which evaluate
-# reads.
 
 
 def trials_path(run: RunFolder) -> Path:

@@ -127,7 +127,7 @@ def printed_rate(row: SourceRow) -> tuple[Fraction, Fraction] | None:
     """Return the rate as printed and half a unit of its last digit, both as fractions of 1.
 
     Raises:
-        TableError: For what is no rate.
+        TableError: For what is not a rate.
     """
     texts = {name: row.text(name) for name in ("rate", "rate_percent")}
     given = {name: text for name, text in texts.items() if text}

@@ -4,8 +4,12 @@ Quaternions are ``wxyz``, scalar first, with w >= 0. Storage is quaternion plus 
 matrices exist only in memory.
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
+
+from bridge.errors import InvalidRecordError
 
 
 def transform_from(
@@ -163,3 +167,59 @@ def vector_from_rotation(
     angle = 2.0 * np.arctan2(sine, q[..., :1])
     tiny = sine < 1e-12
     return np.asarray(q[..., 1:] * np.where(tiny, 2.0, angle / np.where(tiny, 1.0, sine)))
+
+
+def nearest_rotation(M: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Return the rotation R that maximises trace(R^T M): Kabsch (1976)."""
+    left, _, right = np.linalg.svd(M)
+    left[..., 2] *= np.where(np.linalg.det(left @ right) < 0, -1.0, 1.0)[..., None]
+    return np.asarray(left @ right)
+
+
+def align_rigid(
+    p_source_m: Float[np.ndarray, "num_points 3"],
+    p_target_m: Float[np.ndarray, "num_points 3"],
+    weights: Float[np.ndarray, " num_points"] | None = None,
+) -> Float[np.ndarray, "4 4"]:
+    """Find ``T_target_source``, the rigid motion that best lays one point list over another.
+
+    Least squares without scale. Source points on a line leave the turn about it open.
+
+    Args:
+        p_source_m: Points in the source frame.
+        p_target_m: The same points in the target frame.
+        weights: Of the squared distances; None: all alike.
+    """
+    if weights is None:
+        source, target = p_source_m.mean(axis=0), p_target_m.mean(axis=0)
+        cross = (p_target_m - target).T @ (p_source_m - source)
+    else:
+        share = weights / weights.sum()
+        source, target = share @ p_source_m, share @ p_target_m
+        cross = ((p_target_m - target) * share[:, None]).T @ (p_source_m - source)
+    T = np.eye(4)
+    T[:3, :3] = nearest_rotation(cross)
+    T[:3, 3] = target - T[:3, :3] @ source
+    return T
+
+
+def pose_record(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
+    """Position [m] and quaternion of a pose, as JSON records hold them."""
+    q, p = split(T)
+    return {"p_m": p.tolist(), "q_wxyz": q.tolist()}
+
+
+def pose_from_record(record: Any) -> Float[np.ndarray, "4 4"]:
+    """Read what ``pose_record`` made.
+
+    Raises:
+        InvalidRecordError: When it is not three and four finite numbers, not all of the four 0.
+    """
+    try:
+        q = np.array(record["q_wxyz"], dtype=np.float64)
+        p = np.array(record["p_m"], dtype=np.float64)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InvalidRecordError(name="pose", where="", found=repr(error)) from error
+    if q.shape != (4,) or p.shape != (3,) or not np.isfinite([*q, *p]).all() or not q.any():
+        raise InvalidRecordError(name="pose", where="", found=str(record))
+    return transform_from(q, p)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from bridge.errors import BridgeError, MissingDependencyError
 
@@ -20,6 +20,11 @@ JPEG_QUALITY = 90
 JPEG_MAGIC = b"\xff\xd8"
 MAX_PIXELS = 64_000_000
 """Refuse larger images: a few bytes of PNG can claim gigabytes."""
+
+
+def linear_from_srgb(srgb: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Undo the sRGB curve (IEC 61966-2-1): linear light of 0 to 1."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 class UnreadableImageError(BridgeError):

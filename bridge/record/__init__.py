@@ -1,1 +1,1 @@
-"""From the wire to the episode: queue, ledger of losses, lifecycle, control."""
+"""Record what comes over zenoh: queue, drop log, episode recording, control."""

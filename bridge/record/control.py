@@ -17,8 +17,6 @@ from bridge.task.record import check_record
 from bridge.wire.errors import WireError
 from bridge.wire.session import Service, WireSession
 
-# --- Asking a recorder from another process.
-
 
 def control_key(recorder: str, verb: str) -> str:
     """The key that one command of a recorder is sent to."""

@@ -30,8 +30,6 @@ from bridge.record.inspection import GOOD, MessageState, fits, inspect
 from bridge.record.queue import REDUCED_QUALITY, Item, LoadShedding
 from bridge.wire.session import WireSample
 
-# --- H.264 beside the pictures: one ``.../preview`` topic for each colour stream, for people only.
-
 RATE_HZ = 30.0
 """What the encoder plans with; the true rate may differ."""
 _ORDER = {"BGR": [2, 1, 0], "RGBA": [0, 1, 2], "BGRA": [2, 1, 0], "GRAY": [0, 0, 0]}

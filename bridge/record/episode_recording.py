@@ -23,8 +23,6 @@ from bridge.record.queue import Command, Dropped, Item, second_of
 from bridge.wire.rmw import ros_schema, type_hash_of
 from bridge.wire.session import WireSample
 
-# --- Which schema each message of an episode is written with, and how it is looked at.
-
 HASH_PREFIX = "RIHS01_"
 _SHOWN = len(HASH_PREFIX) + 12
 
@@ -135,9 +133,6 @@ def _from_ros(type_name: str, type_hash: str, folder: Path | None) -> schema.Sch
         return ros_schema(type_name, type_hash=type_hash, folder=folder)
     except MissingDependencyError:
         return None
-
-
-# --- The files of one episode: one, or several when it is split by size or time.
 
 
 class EpisodeFiles:
@@ -379,11 +374,11 @@ class EpisodeRecording:
         )
 
     def tick(self, now_ns: int, health: dict[str, int]) -> None:
-        """Write what has waited long enough, and the ledger of the seconds that are over.
+        """Write what has waited long enough, and the drop log of the seconds that are over.
 
         Args:
             now_ns: The recorder's clock.
-            health: Numbers that go into each ledger record.
+            health: Numbers that go into each drop record.
         """
         # A message may wait in the queue while its second ends: give it one second more.
         before = second_of(now_ns) - 1

@@ -26,8 +26,6 @@ from bridge.record.queue import (
     LatchedTopics,
 )
 
-# --- Space held back on the disk, so that an episode can be finished when everything else is full.
-
 
 class DiskReserve:
     """An allocated file without a name: it vanishes with the process, whatever ends it."""
@@ -81,9 +79,6 @@ def free_bytes(folder: Path) -> int:
     """What an ordinary user may still write there."""
     found = os.statvfs(folder)
     return found.f_bavail * found.f_frsize
-
-
-# --- The last seconds before a start, kept in memory: bounded in seconds and in bytes.
 
 
 class PreRoll:

@@ -41,8 +41,6 @@ from bridge.wire.qos import Qos
 from bridge.wire.rmw import read_definitions
 from bridge.wire.session import Subscriber, WireSample, WireSession, open_session
 
-# --- Small pictures of the cameras on ``rec/<recorder>/preview/<camera>``, while someone looks.
-
 WIDTH = 320
 QUALITY = 70
 MAX_PREVIEWS = 64
@@ -139,7 +137,7 @@ def small_picture(sample: WireSample) -> CompressedColor | None:
     return CompressedColor(stamp_ns=stamp_ns, frame_id=frame_id, format="jpeg", data=data)
 
 
-# --- Notices publishers that left, so that nothing they said is repeated in later episodes.
+# Notices publishers that left, so that nothing they said is repeated in later episodes.
 #
 # A source of ours declares ``<prefix>/alive``; with it go the latched messages under
 # ``/<prefix>/``. A ROS 2 publisher has a token; with the last one of a topic go that topic's
@@ -213,7 +211,9 @@ class LiveRecorder:
         reports = recover_parts(run)
         for report in reports:
             say(_describe_recovery(report))
-        previews = Previews(session, config.recorder, config.preview_hz, lambda: core.intake.shed)
+        previews = Previews(
+            session, config.recorder, config.preview_hz, lambda: core.input_queue.shed
+        )
         core = self.core = Recorder(
             run, now_ns=session.now_ns, config=config, preview=previews.show
         )
@@ -245,7 +245,9 @@ class LiveRecorder:
     def _tell(self) -> None:
         while not self._ended.wait(STATUS_PERIOD_S):
             with contextlib.suppress(WireError):  # the session is closing
-                self.core.intake.watched = self._previews.look(self.core.intake.image_topics())
+                self.core.input_queue.watched = self._previews.look(
+                    self.core.input_queue.image_topics()
+                )
                 self._say_status()
 
     def _say_status(self) -> None:
@@ -272,7 +274,7 @@ class LiveRecorder:
 
         Raises:
             UsageError: When the id or a field is wrong, or another episode is open.
-            BridgeError: When the disk has no room.
+            BridgeError: When the disk has no space.
         """
         return self.core.start(parse_info(episode_id, about))
 

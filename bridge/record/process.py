@@ -24,8 +24,6 @@ from bridge.wire.config import WireConfig
 from bridge.wire.errors import is_loopback
 from bridge.wire.session import open_session
 
-# --- Keys on a terminal: start, stop, mark and label without another window.
-
 HELP = (
     "keys: s start, x stop, p pause or resume, m mark, y success, n failure, "
     "w write the pre-roll; Ctrl-C ends"

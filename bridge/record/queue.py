@@ -22,8 +22,6 @@ from bridge.record.inspection import MessageState, resolve_type
 from bridge.record.sequence import SequenceTracker, Step
 from bridge.wire.session import WireSample
 
-# --- Remembers the messages a late listener needs: static transforms, the URDF, calibrations.
-
 MAX_LATCHED = 1000
 MAX_LATCHED_BYTES = 256_000_000
 """Maps are large; a file that begins with more than this of the past is refused the rest."""
@@ -98,7 +96,7 @@ def _children(sample: WireSample) -> frozenset[str]:
         return frozenset()
 
 
-# --- What is left out first when images come faster than they can be written.
+# What is left out first when images come faster than they can be written.
 #
 # The order is fixed: previews, then the quality of colour, then every other colour image, then
 # every other depth image. Joints, plans and all other small messages are never shed.
@@ -139,8 +137,6 @@ def keep_every(level: LoadShedding, kind: str) -> int:
     return 1
 
 
-# --- What goes through the recorder's queues: messages, counts of what was left out, commands.
-
 MAX_WARNINGS = 1000
 
 
@@ -158,7 +154,7 @@ class Item:
     size: int
     """Bytes as they came over the wire."""
     is_bulk: bool
-    """Takes room from the budget of images, not from that of small messages."""
+    """Takes space from the budget of images, not from that of small messages."""
     finding: MessageState | None = None
     """None when nobody has looked yet."""
     reduced: bool = False
@@ -318,7 +314,7 @@ class InputQueue:
             size = len(sample.data)
             is_bulk = flow.is_image or size >= BULK_BYTES
             cost = size + OVERHEAD_BYTES
-            if not self._has_room(flow, sample, step, cost=cost, is_bulk=is_bulk):
+            if not self._fits(flow, sample, step, cost=cost, is_bulk=is_bulk):
                 return
             item = Item(sample, step, ticket, flow.type_name, size, is_bulk)
             if is_bulk:
@@ -346,7 +342,7 @@ class InputQueue:
         self._flows[sample.topic, sample.type_name] = flow
         return flow
 
-    def _has_room(
+    def _fits(
         self, flow: Flow, sample: WireSample, step: Step, *, cost: int, is_bulk: bool
     ) -> bool:
         """Say whether a message may be taken in; count it if not."""
@@ -362,13 +358,13 @@ class InputQueue:
             self._drop(sample, step, "messages of anybody but the recorder")
         elif is_bulk and self._is_shed(flow):
             self._drop(sample, step, None)
-        elif cost > self._room(is_bulk=is_bulk):
+        elif cost > self._free_bytes(is_bulk=is_bulk):
             self._drop(sample, step, "")
         else:
             return True
         return False
 
-    def _room(self, *, is_bulk: bool) -> int:
+    def _free_bytes(self, *, is_bulk: bool) -> int:
         if is_bulk:
             return self._bulk_budget - self._bulk_bytes
         return self._small_budget - (self._small_in - self._small_out)
@@ -388,7 +384,7 @@ class InputQueue:
         Args:
             sample: The message.
             step: Its place in its stream.
-            limit: The limit it broke, "" for want of room, None for shedding.
+            limit: The limit it broke, "" for want of space, None for shedding.
         """
         if self._dropped is None:
             self._dropped = Dropped(ticket=self._ticket - 1, received_ns=sample.received_ns)
@@ -450,7 +446,7 @@ class InputQueue:
         return entries, images
 
     def release(self, item: Item) -> None:
-        """Give back the room of a message that was dealt with; called by the writer thread."""
+        """Give back the space of a message that was dealt with; called by the writer thread."""
         cost = len(item.sample.data) + OVERHEAD_BYTES
         if item.is_bulk:
             with self._lock:
@@ -464,7 +460,7 @@ class InputQueue:
             self._is_quiet = self._commands == after
 
 
-# --- Puts small messages, encoded images and commands back in order for the writer.
+# Puts small messages, encoded images and commands back in order for the writer.
 #
 # Small messages never wait for images. A barrier command (start, stop ...) waits until every
 # image received before it has come out of its encoder, and holds back everything received after
@@ -472,7 +468,7 @@ class InputQueue:
 
 
 class Merge:
-    """Fed with what the intake gives; yields what may be dealt with now."""
+    """Fed with what the input_queue gives; yields what may be dealt with now."""
 
     def __init__(self) -> None:
         """Start empty."""

@@ -60,19 +60,19 @@ class Recorder:
         self.failed = threading.Event()
         self._now_ns = now_ns
         self._run = run
-        encoder = ImageEncoder(self.config, lambda: self.intake.shed)
+        encoder = ImageEncoder(self.config, lambda: self.input_queue.shed)
         self._encoders = EncoderThreads(encoder, self._take_back, preview)
-        self.intake = InputQueue(self.config.queues, self._encoders.submit, encoder.kinds)
+        self.input_queue = InputQueue(self.config.queues, self._encoders.submit, encoder.kinds)
         self._merge = Merge()
         self._life = Lifecycle(
-            run, self.config, lambda: self.intake.queued_bytes, self.intake.latched
+            run, self.config, lambda: self.input_queue.queued_bytes, self.input_queue.latched
         )
-        self._status = Status(run, self.config, self.intake, self._life, now_ns)
+        self._status = Status(run, self.config, self.input_queue, self._life, now_ns)
         self._steps = StepWatch(now_ns, wall_ns=wall_ns)
         self._tell: Callable[[Path], None] = lambda path: None
         self._next_second_s = 0.0
         if self._life.is_quiet:
-            self.intake.be_quiet(0)
+            self.input_queue.be_quiet(0)
         self._thread = threading.Thread(target=self._work, name="episode writer", daemon=True)
         self._thread.start()
 
@@ -93,10 +93,10 @@ class Recorder:
 
     def receive(self, sample: WireSample) -> None:
         """Take a message from the network; never waits."""
-        self.intake.put(sample)
+        self.input_queue.put(sample)
 
     def _take_back(self, item: Item, saved: int) -> None:
-        self.intake.put_image(item, saved)
+        self.input_queue.put_image(item, saved)
 
     def start(self, info: metadata.EpisodeInfo) -> Answer:
         """Begin an episode, with the pre-roll if there is one.
@@ -169,7 +169,7 @@ class Recorder:
         self, name: str | None, text: str, outcome: metadata.Outcome | None
     ) -> Answer:
         if name is None:
-            raise LifecycleError("there is no episode to label yet. Record one, or name one.")
+            raise LifecycleError("no episode has been recorded yet. Record one, or name one.")
         if outcome is None:
             raise LifecycleError(
                 f"episode {name!r} is finished; only a result can be added to it. "
@@ -189,7 +189,7 @@ class Recorder:
 
     def declare_latched(self, topic: str) -> None:
         """Begin later episodes with the last message of a topic; its publisher says so."""
-        self.intake.latched.declare(topic)
+        self.input_queue.latched.declare(topic)
 
     def forget(self, prefix: str) -> None:
         """Repeat no latched message of topics that begin so: their publisher has gone."""
@@ -197,7 +197,7 @@ class Recorder:
         def act(command: Command) -> None:
             self._life.latched.forget(prefix)
 
-        self.intake.put_command(Command(action=act, received_ns=0, is_barrier=False))
+        self.input_queue.put_command(Command(action=act, received_ns=0, is_barrier=False))
 
     def note_recovered(self, reports: list[Answer]) -> None:
         """Show in the status what was found cut off when the recorder began."""
@@ -226,7 +226,7 @@ class Recorder:
             with contextlib.suppress(LifecycleError, DiskError):  # somebody was quicker
                 answer = self.stop(reason=reason)
         self._life.is_closing = True
-        self.intake.put_command(Command(action=lambda command: None, received_ns=0))  # wake up
+        self.input_queue.put_command(Command(action=lambda command: None, received_ns=0))  # wake up
         self._thread.join(timeout=self.config.command_timeout_s)
         self._encoders.close()
         return answer
@@ -248,7 +248,7 @@ class Recorder:
             except Exception as error:  # noqa: BLE001  # a bug: tell the caller, keep recording
                 future.set_exception(error)
 
-        self.intake.put_command(
+        self.input_queue.put_command(
             Command(action=action, received_ns=self._now_ns(), is_barrier=is_barrier)
         )
         try:
@@ -267,8 +267,8 @@ class Recorder:
                 poll_s = BARRIER_POLL_S
             else:
                 poll_s = IDLE_POLL_S if self._life.is_quiet else POLL_S
-            self.intake.wait(poll_s)
-            entries, images = self.intake.take()
+            self.input_queue.wait(poll_s)
+            entries, images = self.input_queue.take()
             is_over = self._life.is_closing and not entries and not self._merge.is_waiting
             self._merge.feed(entries, images)
             self._drain()
@@ -283,7 +283,7 @@ class Recorder:
             if isinstance(entry, Command):
                 entry.action(entry)
                 if self._life.is_quiet:
-                    self.intake.be_quiet(entry.number)
+                    self.input_queue.be_quiet(entry.number)
                 continue
             try:
                 self._life.receive(entry)
@@ -292,7 +292,7 @@ class Recorder:
             except Exception:  # noqa: BLE001  # a bug in one message, not the end
                 traceback.print_exc()
             if isinstance(entry, Item):
-                self.intake.release(entry)
+                self.input_queue.release(entry)
 
     def _guard(self, act: Callable[[], None]) -> None:
         try:
@@ -324,7 +324,7 @@ class Recorder:
             self.failed.set()
 
         self._status.failing = cause
-        self.intake.put_command(Command(action=act, received_ns=self._now_ns()))
+        self.input_queue.put_command(Command(action=act, received_ns=self._now_ns()))
 
     def _fail(self, error: OSError) -> DiskError:
         cause = error.strerror or str(error)
@@ -340,7 +340,7 @@ class Recorder:
         """What was received and not yet written, images in the encoders included."""
         end_s = time.monotonic() + LAST_IMAGES_S
         while True:
-            self._merge.feed(*self.intake.take())
-            if self._merge.images_seen == self.intake.images_in or time.monotonic() > end_s:
+            self._merge.feed(*self.input_queue.take())
+            if self._merge.images_seen == self.input_queue.images_in or time.monotonic() > end_s:
                 return self._merge.rest()
             time.sleep(BARRIER_POLL_S)

@@ -21,7 +21,7 @@ class Status:
         self,
         run: RunFolder,
         config: RecorderConfig,
-        intake: InputQueue,
+        input_queue: InputQueue,
         life: Lifecycle,
         now_ns: Callable[[], int],
     ) -> None:
@@ -35,7 +35,7 @@ class Status:
         """What others have to say, by name."""
         self._run = run
         self._config = config
-        self._intake = intake
+        self._input_queue = input_queue
         self._life = life
         self._now_ns = now_ns
         self._beat_s = time.monotonic()
@@ -49,7 +49,7 @@ class Status:
     def second(self, now_ns: int) -> None:
         """Work out the rates since the last call; called about once a second."""
         before_ns, before = self._counted
-        seen = self._intake.seen()
+        seen = self._input_queue.seen()
         span_s = max(1e-9, s_from_ns(now_ns - before_ns))
         self._rates_hz = {
             topic: round((count - before.get(topic, 0)) / span_s, 1)
@@ -71,14 +71,14 @@ class Status:
             "error": error,
             "episode": take.info.id if take else None,
             "last_episode": life.last_episode,
-            "queue_bytes": self._intake.queued_bytes,
+            "queue_bytes": self._input_queue.queued_bytes,
             "disk_free_bytes": life.free_bytes,
-            "shedding": self._intake.shed.name.lower(),
+            "shedding": self._input_queue.shed.name.lower(),
             "stalled_s": round(stalled_s, 1) if stalled_s > STALLED_S else 0.0,
             "clock_steps": self.clock_steps,
             "preroll_s": round(life.ring.seconds(self._now_ns()), 1),
             "recovered": self.recovered,
-            "seen": self._intake.seen(),
+            "seen": self._input_queue.seen(),
             "rates_hz": self._rates_hz,
         }
         answer.update({name: ask() for name, ask in self.others.items()})
@@ -126,14 +126,3 @@ def describe_answer(answer: dict[str, Any]) -> str:
             f"{answer['undecodable']} undecodable, {answer['duration_s']:.1f} s"
         )
     return f"{answer['episode']}: ok"
-
-
-def describe_list(answer: dict[str, Any]) -> str:
-    """One line for each episode."""
-    lines = [
-        f"{item['id']:<24} {item['kind']:<8} {item['outcome']:<8} {item['duration_s']:>7.1f} s  "
-        f"{item['task'] or item['error']}"
-        for item in answer["episodes"]
-    ]
-    left_out = answer["of"] - len(lines)
-    return "\n".join([*([f"({left_out} more before these)"] if left_out else []), *lines])

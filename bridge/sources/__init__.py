@@ -1,1 +1,1 @@
-"""Who speaks on the wire: an RGB-D folder and the stand-in cell."""
+"""Publish sensor and robot data over zenoh: RGB-D folders, cameras, arms, the stand-in cell."""

@@ -13,7 +13,7 @@ from bridge.errors import GstError
 from bridge.wire.qos import Qos
 from bridge.wire.session import WirePublisher, WireSession
 
-# --- When did a device with a clock of its own take a sample, in this host's time?
+# When did a device with a clock of its own take a sample, in this host's time?
 #
 # A sample cannot arrive before it was taken, so the smallest (arrival - device stamp) of a while
 # is the offset between the clocks plus the shortest way the samples took. Queues and stalls only
@@ -86,8 +86,6 @@ class HostClock:
         return min(smallest for _, smallest in self._minima)
 
 
-# --- Publishing with the numbers a device gives its samples, so that what it dropped is counted.
-
 MAX_GAP = 10_000_000
 """A larger step is a counter that was set anew, not a loss."""
 
@@ -95,7 +93,7 @@ MAX_GAP = 10_000_000
 class NumberedPublisher:
     """Sends samples of one stream; numbers left out by the device become gaps on the wire.
 
-    The recorder enters gaps of sequence numbers in its ledger of losses, wherever they arose.
+    The recorder enters gaps of sequence numbers in its drop log, wherever they arose.
     """
 
     def __init__(self, publisher: WirePublisher) -> None:

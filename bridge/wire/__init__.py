@@ -1,1 +1,1 @@
-"""Zenoh sessions, keys and encodings; the only room that imports zenoh."""
+"""Zenoh sessions, keys and encodings; the only package that imports zenoh."""

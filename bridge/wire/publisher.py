@@ -11,7 +11,7 @@ from typing import Any
 from bridge.wire.errors import WireConfigError, WireError, cause_of
 from bridge.wire.zenoh_config import zenoh, zenoh_shm
 
-# --- The attachment each message carries: sequence number, source time and publisher identity.
+# The attachment each message carries: sequence number, source time and publisher identity.
 #
 # The bytes are those of rmw_zenoh, so that native and ROS 2 publishers look alike: int64
 # sequence, int64 source time [ns], length 16 and a 16-byte publisher id, little endian, 33 bytes.
@@ -90,7 +90,7 @@ class SharedPool:
         self._policy = zenoh_shm.Defragment(zenoh_shm.GarbageCollect())
 
     def place(self, data: bytes | bytearray) -> Any | None:
-        """Copy a message into the pool; None when there is no room now."""
+        """Copy a message into the pool; None when there is no space now."""
         try:
             buffer = self._pool.alloc(len(data), self._policy)
         except zenoh.ZError:

@@ -16,7 +16,7 @@ class Qos:
     name: str
     """What the preset is called in tables and errors."""
     block: bool
-    """Wait for room when the network is behind; otherwise the message is lost and the receiver
+    """Wait for space when the network is behind; otherwise the message is lost and the receiver
     sees a gap in the numbers."""
     priority: str
     """Which of zenoh's queues carries it, by its name there; a full queue delays no other one."""

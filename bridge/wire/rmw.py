@@ -16,7 +16,7 @@ from bridge.episode.schema import Schema
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.wire import keys
 
-# --- Texts and hashes of ROS 2 message types, without ROS 2: the definitions come with rosbags.
+# Texts and hashes of ROS 2 message types, without ROS 2: the definitions come with rosbags.
 #
 # A type may differ between ROS 2 releases; its RIHS01 hash says which definition a publisher was
 # built with. Releases are searched newest first.

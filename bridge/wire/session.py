@@ -39,8 +39,6 @@ from bridge.wire.publisher import WirePublisher as WirePublisher
 from bridge.wire.qos import Qos
 from bridge.wire.zenoh_config import zenoh, zenoh_config
 
-# --- Answering requests on one key.
-
 MAX_WAITING = 32
 """Requests that wait for one service; each may hold a whole plan."""
 CLOSE_S = 5.0
@@ -107,9 +105,6 @@ class Service:
         ends_s = time.monotonic() + CLOSE_S
         for thread in self._threads:
             thread.join(timeout=max(0.0, ends_s - time.monotonic()))
-
-
-# --- A message as it arrived, copied out of the network's own memory at once.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -319,7 +314,7 @@ class WireSession:
         ``max_mb`` [MB], for nobody knows what a cache holds.
         """
         answers: list[WireSample] = []
-        room = max_mb * BYTES_PER_MB
+        left = max_mb * BYTES_PER_MB
         try:
             replies = self._inner.get(
                 key_expression,
@@ -331,8 +326,8 @@ class WireSession:
             for reply in replies:
                 if reply.ok is None:
                     continue
-                room -= len(reply.ok.payload)
-                if room < 0:
+                left -= len(reply.ok.payload)
+                if left < 0:
                     break
                 answers.append(copy_sample(reply.ok, self._clock.now_ns()))
         except zenoh.ZError as error:

@@ -9,8 +9,6 @@ from bridge.errors import MissingDependencyError
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import WireConfigError, cause_of, public
 
-# --- The zenoh library, or one sentence on how to get it.
-
 NETWORK_THREADS = "(rx: (worker_threads: 1), acc: (handover: rx))"
 """One thread both waits for the network and reads it (zenoh's ``ZENOH_RUNTIME``).
 

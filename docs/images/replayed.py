@@ -2,13 +2,16 @@
 
 Example: .venv/bin/python docs/images/replayed.py runs/toys docs/images/replayed.jpg --camera side
 Needs robot-gst replay RUN --render. Columns: recorded, planned in the twin, executed in the twin.
-Of a plan that was never executed there is one column, and no recording beside it.
+Of a plan that was never executed there is one column, and no recording beside it. The picture of
+the README (twin.jpg): --episode trial_0002 --trajectory executed --at 0.35 0.65 --headings, after
+robot-gst rebuild RUN --iterations 600 of the quick demo.
 """
 
 import argparse
 from pathlib import Path
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 from side_by_side import GAP_PX, write_rows
 
 from bridge.episode.reader import Episode
@@ -20,11 +23,13 @@ FIRST, LAST = 0.12, 0.98
 """Where in the replayed time the first and the last row are, as fractions."""
 
 
-def columns(run: RunFolder, episode_id: str, camera_id: str) -> list[dict[int, bytes]]:
+def columns(
+    run: RunFolder, episode_id: str, camera_id: str, trajectories: list[str]
+) -> list[dict[int, bytes]]:
     """Images by stamp: as recorded, then of each dynamic replay that was rendered."""
     source = Episode.open(run.episodes_dir / f"{episode_id}.mcap")
     found = [read_images(source).color[RECORDED]]
-    for trajectory in ("planned", "executed"):
+    for trajectory in trajectories:
         paths = run.derived(f"{episode_id}.replay.{trajectory}.dynamic.*")
         paths.sort(key=lambda path: path.stat().st_mtime_ns)
         newest = {path.name.split(".")[-4]: path for path in paths}  # by plan
@@ -36,21 +41,31 @@ def columns(run: RunFolder, episode_id: str, camera_id: str) -> list[dict[int, b
     return [of for of in mine if of]
 
 
-def rows(images: list[dict[int, bytes]], count: int) -> list[np.ndarray]:
-    """One picture per instant that all columns have; a replay that shares none stands alone.
+def rows(images: list[dict[int, bytes]], fractions: list[float]) -> list[np.ndarray]:
+    """One picture per instant (fraction of the replayed time); a replay that shares none is alone.
 
     Plans that were never executed share none with the recording and are left out beside others.
     """
     beside = [images[0], *(of for of in images[1:] if of.keys() & images[0].keys())]
     images = beside if len(beside) > 1 else images[-1:]
     common = sorted(set.intersection(*map(set, images)))
-    places = np.linspace(FIRST, LAST, count) * (len(common) - 1)
+    places = np.array(fractions) * (len(common) - 1)
     pictures = []
     for stamp in (common[place] for place in places.round().astype(int).tolist()):
         shown = [decode_color(of[stamp]) for of in images]
         gap = np.full((shown[0].shape[0], GAP_PX, 3), 255, dtype=np.uint8)
         pictures.append(np.hstack([part for image in shown for part in (image, gap)][:-1]))
     return pictures
+
+
+def headings(texts: list[str], width: int) -> np.ndarray:
+    """A white row with one text above each column."""
+    image = Image.new("RGB", (width, 26), "white")
+    draw = ImageDraw.Draw(image)
+    for column, text in enumerate(texts):
+        middle = (column + 0.5) * width / len(texts)
+        draw.text((middle, 13), text, fill="black", anchor="mm", font=ImageFont.load_default(15))
+    return np.asarray(image)
 
 
 def main() -> None:
@@ -61,11 +76,21 @@ def main() -> None:
     parser.add_argument("--episode", default="trial_0001")
     parser.add_argument("--camera", default="side")
     parser.add_argument("--rows", type=int, default=3, help="how many instants")
+    parser.add_argument("--at", type=float, nargs="+", help="instants, 0 to 1, instead of --rows")
+    parser.add_argument("--trajectory", nargs="+", default=["planned", "executed"])
+    parser.add_argument("--headings", action="store_true", help="name the columns")
     given = parser.parse_args()
-    images = columns(RunFolder.open(given.run), given.episode, given.camera)
+    run = RunFolder.open(given.run)
+    images = columns(run, given.episode, given.camera, given.trajectory)
     if not images:
         parser.error(f"{given.episode} has no images of a camera {given.camera!r}")
-    write_rows(rows(images, given.rows), given.out)
+    pictures = rows(images, given.at or np.linspace(FIRST, LAST, given.rows).tolist())
+    if given.headings:
+        is_stand_in = Episode.open(run.episodes_dir / f"{given.episode}.mcap").info.stand_in
+        texts = ["recorded" + (", stand-in cell" if is_stand_in else "")]
+        texts += [f"twin, {trajectory}" for trajectory in given.trajectory]
+        pictures = [headings(texts, pictures[0].shape[1]), *pictures]
+    write_rows(pictures, given.out)
 
 
 if __name__ == "__main__":

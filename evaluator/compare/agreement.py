@@ -1,4 +1,4 @@
-"""Over cells: do the twin's success rates move with the recorded ones, and how far off are they?"""
+"""Do the twin's success rates of groups follow the recorded ones, and how far off are they?"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from evaluator.compare.measure import measured
-from evaluator.compare.rows import RateCell
+from evaluator.compare.rows import RateGroup
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import (
     BIAS,
@@ -29,9 +29,9 @@ from evaluator.measurements import (
 )
 from evaluator.result import Cell, Interval, Measurement, Table
 from evaluator.statistics import agreement
-from evaluator.statistics.agreement import Number, counted_cells, fisher_interval, pearson
+from evaluator.statistics.agreement import Number, counted_groups, fisher_interval, pearson
 from evaluator.statistics.bootstrap import (
-    CellSample,
+    GroupSample,
     Remeasured,
     refuse_no_width,
     remeasure_counts,
@@ -40,22 +40,22 @@ from evaluator.statistics.bootstrap import (
 )
 from evaluator.statistics.coverage.stored import Choice, choose_method, vouch
 
-# --- Over cells: which interval each statistic of agreement has, or why it has none.
+# --- Over groups: which interval each statistic of agreement has, or why it has none.
 
 SEED = 0
-"""Resampling is seeded: the same cells give the same interval."""
+"""Resampling is seeded: the same groups give the same interval."""
 MIN_CLUSTERS = 4
 
 
-def usable_cells(cells: Sequence[RateCell]) -> list[RateCell]:
-    """Return the cells with both rates."""
-    return [c for c in cells if c.recorded_rate is not None and c.sim_rate is not None]
+def usable_groups(groups: Sequence[RateGroup]) -> list[RateGroup]:
+    """Return the groups with both rates."""
+    return [c for c in groups if c.recorded_rate is not None and c.sim_rate is not None]
 
 
-def sides(cells: Sequence[RateCell]) -> tuple[list[Fraction], list[Fraction]]:
-    """Return recorded and sim rates of usable cells."""
-    recorded = [c.recorded_rate for c in cells if c.recorded_rate is not None]
-    return recorded, [c.sim_rate for c in cells if c.sim_rate is not None]
+def sides(groups: Sequence[RateGroup]) -> tuple[list[Fraction], list[Fraction]]:
+    """Return recorded and sim rates of usable groups."""
+    recorded = [c.recorded_rate for c in groups if c.recorded_rate is not None]
+    return recorded, [c.sim_rate for c in groups if c.sim_rate is not None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,28 +66,28 @@ class Found:
     reason: str
     choice: Choice
     num_units: int
-    """Cells or clusters of cells: what coverage depends on."""
+    """Groups or clusters of groups: what coverage depends on."""
 
 
-class CellIntervals:
-    """The intervals of some cells: what belongs together is found once, resamples drawn once."""
+class GroupIntervals:
+    """The intervals of some groups: what belongs together is found once, resamples drawn once."""
 
-    def __init__(self, cells: Sequence[RateCell]) -> None:
+    def __init__(self, groups: Sequence[RateGroup]) -> None:
         """Prepare; nothing is drawn before the first interval.
 
         Args:
-            cells: With both rates.
+            groups: With both rates.
         """
-        self._cells = list(cells)
-        self.num_cells = len(self._cells)
-        self._recorded, self._sim = sides(cells)
-        self._clusters, self.num_units, self.unit = clusters_of(cells)
-        self._sample: CellSample | None = None
+        self._groups = list(groups)
+        self.num_groups = len(self._groups)
+        self._recorded, self._sim = sides(groups)
+        self._clusters, self.num_units, self.unit = clusters_of(groups)
+        self._sample: GroupSample | None = None
 
     @property
     def kind(self) -> str:
-        """Points where cells are independent, else clusters."""
-        return "points" if self.unit == "cells" else "clusters"
+        """Points where groups are independent, else clusters."""
+        return "points" if self.unit == "groups" else "clusters"
 
     def of(self, statistic: str) -> Found:
         """Return the interval by the method whose stored coverage is best.
@@ -110,11 +110,11 @@ class CellIntervals:
 
     def _make(self, statistic: str, choice: Choice) -> Interval:
         if choice.method == "fisher-z":
-            return fisher_interval(pearson(self._recorded, self._sim), len(self._cells))
+            return fisher_interval(pearson(self._recorded, self._sim), len(self._groups))
         if choice.method == "student-t":
             return student_interval(self._means())
         if self._sample is None:
-            self._sample = CellSample(
+            self._sample = GroupSample(
                 recorded=self._recorded,
                 sim=self._sim,
                 rng=np.random.default_rng(SEED),
@@ -132,60 +132,60 @@ class CellIntervals:
         return [sum(gaps, Fraction(0)) / len(gaps) for gaps in members.values()]
 
     def _too_few(self, method: str) -> str:
-        if self.unit == "cells":
-            name = "Fisher's interval" if method == "fisher-z" else "an interval over cells"
-            return f"{counted_cells(self.num_units)}; {name} needs {MIN_CLUSTERS}"
-        why = "cells share tasks across conditions" if _is_shared(self._cells) else ""
-        why = why or "cells share policies or tasks"
+        if self.unit == "groups":
+            name = "Fisher's interval" if method == "fisher-z" else "an interval over groups"
+            return f"{counted_groups(self.num_units)}; {name} needs {MIN_CLUSTERS}"
+        why = "groups share tasks across conditions" if _is_shared(self._groups) else ""
+        why = why or "groups share policies or tasks"
         return (
             f"{why}, and {self.num_units} {self.unit} are too few to resample ({MIN_CLUSTERS} are "
-            "needed); an interval of independent cells would claim too much"
+            "needed); an interval of independent groups would claim too much"
         )
 
     def again(self) -> Remeasured:
-        """Draw the trials of every cell anew.
+        """Draw the trials of every group anew.
 
         Raises:
-            UndefinedStatisticError: When the number of trials of a cell is not known.
+            UndefinedStatisticError: When the number of trials of a group is not known.
         """
         rng = np.random.default_rng(SEED)
-        tables = [cell.trial_table for cell in self._cells if cell.trial_table is not None]
-        if self._cells and len(tables) == len(self._cells):
+        tables = [group.trial_table for group in self._groups if group.trial_table is not None]
+        if self._groups and len(tables) == len(self._groups):
             return remeasure_paired(tables, rng=rng)
-        pairs = [cell.pair for cell in self._cells]
+        pairs = [group.pair for group in self._groups]
         sim = [(s.k, s.n) for s, _ in pairs if s.k is not None and s.n]
         recorded = [(r.k, r.n) for _, r in pairs if r.k is not None and r.n]
-        if self._cells and len(sim) == len(recorded) == len(self._cells):
+        if self._groups and len(sim) == len(recorded) == len(self._groups):
             return remeasure_counts(recorded, sim, rng=rng)
         raise UndefinedStatisticError(
-            statistic="remeasured", reason="the number of trials of a cell is not known"
+            statistic="remeasured", reason="the number of trials of a group is not known"
         )
 
 
-def _is_shared(cells: Sequence[RateCell]) -> bool:
-    return len({(c.task, c.policy) for c in cells}) < len(cells)
+def _is_shared(groups: Sequence[RateGroup]) -> bool:
+    return len({(c.task, c.policy) for c in groups}) < len(groups)
 
 
-def clusters_of(cells: Sequence[RateCell]) -> tuple[list[str], int, str]:
-    """Return what each cell belongs to, how many of those there are, and their name."""
-    policies, tasks = [c.policy for c in cells], [c.task for c in cells]
-    if not _is_shared(cells) and len(set(policies)) in (1, len(cells)):
-        return [str(i) for i in range(len(cells))], len(cells), "cells"
+def clusters_of(groups: Sequence[RateGroup]) -> tuple[list[str], int, str]:
+    """Return what each group belongs to, how many of those there are, and their name."""
+    policies, tasks = [c.policy for c in groups], [c.task for c in groups]
+    if not _is_shared(groups) and len(set(policies)) in (1, len(groups)):
+        return [str(i) for i in range(len(groups))], len(groups), "groups"
     if len(set(policies)) >= MIN_CLUSTERS or len(set(policies)) > len(set(tasks)):
         return policies, len(set(policies)), "policies"
     return tasks, len(set(tasks)), "tasks"
 
 
-OTHERS, AGAIN = "other {} like these", "the same cells measured again"
+OTHERS, AGAIN = "other {} like these", "the same groups measured again"
 
 
 def interval_table(
-    intervals: CellIntervals, statistics: Sequence[tuple[str, str, float]]
+    intervals: GroupIntervals, statistics: Sequence[tuple[str, str, float]]
 ) -> tuple[Table, ...]:
-    """Lay out both intervals of every statistic; none without cells.
+    """Lay out both intervals of every statistic; none without groups.
 
     Args:
-        intervals: Of the cells.
+        intervals: Of the groups.
         statistics: Words, name and factor to the printed unit.
     """
     if intervals.num_units == 0:
@@ -208,10 +208,10 @@ def interval_table(
             title="How certain is the agreement?",
             columns=("statistic", "over", "low", "high", "method", "least coverage", "reason"),
             rows=tuple(rows),
-            note="95 %. Two questions: where the number would be for other cells of the same "
+            note="95 %. Two questions: where the number would be for other groups of the same "
             "kind, and where it would fall if these were measured again with as many trials. "
             "The method is the one with the best coverage in the stored map; least coverage is "
-            "its worst case there.",
+            "the least in it.",
         ),
     )
 
@@ -229,7 +229,7 @@ def _band(
     statistic: str,
     factor: float,
     unknown: str,
-    intervals: CellIntervals,
+    intervals: GroupIntervals,
 ) -> tuple[Cell, ...]:
     if again is None:
         return _shown(None, unknown, factor)
@@ -238,7 +238,7 @@ def _band(
     except UndefinedStatisticError as error:
         return _shown(None, error.reason, factor)
     key = f"remeasurement:{statistic}".removesuffix(":pearson")
-    kept, refusal = vouch(band, intervals.num_cells, key=key)
+    kept, refusal = vouch(band, intervals.num_groups, key=key)
     return _shown(kept, refusal, factor)
 
 
@@ -266,12 +266,12 @@ TABLE: tuple[tuple[str, str, float], ...] = (
 """Words, name of the statistic, and factor to the printed unit."""
 
 
-def cell_agreement(cells: Sequence[RateCell]) -> list[Measurement]:
-    """Measure over cells: r, ranks, bias, errors, calibration line, MMRV in both conventions."""
-    usable = usable_cells(cells)
-    intervals = CellIntervals(usable)
-    units = sorted({cell.unit for cell in usable})
-    what = f"over cells (task x condition x policy), n = {len(usable)}"
+def group_agreement(groups: Sequence[RateGroup]) -> list[Measurement]:
+    """Measure over groups: r, ranks, bias, errors, calibration line, MMRV in both conventions."""
+    usable = usable_groups(groups)
+    intervals = GroupIntervals(usable)
+    units = sorted({group.unit for group in usable})
+    what = f"over groups (task x condition x policy), n = {len(usable)}"
     what += f", rates counted in different units ({', '.join(units)})" if len(units) > 1 else ""
     make = partial(_measure, usable, intervals, what)
     return [
@@ -283,30 +283,30 @@ def cell_agreement(cells: Sequence[RateCell]) -> list[Measurement]:
             LARGEST_GAP.of(what=what),
             lambda: 100 * agreement.largest_gap(**_both(usable)),
             n=len(usable),
-            counted="cell",
-            reason_without_interval="a largest value grows with the number of cells",
+            counted="group",
+            reason_without_interval="a largest value grows with the number of groups",
             episodes=_episodes(usable),
         ),
     ]
 
 
-def agreement_intervals(cells: Sequence[RateCell]) -> tuple[Table, ...]:
-    """Lay out the interval of every statistic, over other cells and over a new measurement."""
-    return interval_table(CellIntervals(usable_cells(cells)), TABLE)
+def agreement_intervals(groups: Sequence[RateGroup]) -> tuple[Table, ...]:
+    """Lay out the interval of every statistic, over other groups and over a new measurement."""
+    return interval_table(GroupIntervals(usable_groups(groups)), TABLE)
 
 
-def _both(cells: Sequence[RateCell]) -> dict[str, list[Number]]:
-    recorded, sim = sides(cells)
+def _both(groups: Sequence[RateGroup]) -> dict[str, list[Number]]:
+    recorded, sim = sides(groups)
     return {"recorded": [*recorded], "sim": [*sim]}
 
 
-def _episodes(cells: Sequence[RateCell]) -> list[str]:
-    return [name for cell in cells for name in cell.episodes]
+def _episodes(groups: Sequence[RateGroup]) -> list[str]:
+    return [name for group in groups for name in group.episodes]
 
 
 def _measure(
-    cells: Sequence[RateCell],
-    intervals: CellIntervals,
+    groups: Sequence[RateGroup],
+    intervals: GroupIntervals,
     what: str,
     quantity: Quantity,
     statistic: str,
@@ -332,19 +332,19 @@ def _measure(
     return measured(
         quantity.of(what=what, resampled=resampled, **parts),
         compute,
-        n=len(cells),
-        counted="cell",
+        n=len(groups),
+        counted="group",
         reason_without_interval=found.reason,
-        episodes=_episodes(cells),
+        episodes=_episodes(groups),
         interval_n=found.num_units,
         coverage_key=found.choice.key,
         instead=found.choice.instead,
     )
 
 
-def _rest(cells: Sequence[RateCell], make: "partial[Measurement]") -> list[Measurement]:
+def _rest(groups: Sequence[RateGroup], make: "partial[Measurement]") -> list[Measurement]:
     """Ranks, errors, the calibration line, and MMRV in both conventions."""
-    both = _both(cells)
+    both = _both(groups)
     recorded, sim = both["recorded"], both["sim"]
     return [
         make(SPEARMAN, "spearman", lambda: agreement.spearman(recorded, sim)),
@@ -362,11 +362,13 @@ def _rest(cells: Sequence[RateCell], make: "partial[Measurement]") -> list[Measu
     ]
 
 
-def _pearson(cells: Sequence[RateCell], quantity: Quantity, what: str, **parts: str) -> Measurement:
-    recorded, sim = sides(cells)
+def _pearson(
+    groups: Sequence[RateGroup], quantity: Quantity, what: str, **parts: str
+) -> Measurement:
+    recorded, sim = sides(groups)
     return _measure(
-        cells,
-        CellIntervals(cells),
+        groups,
+        GroupIntervals(groups),
         what,
         quantity,
         "pearson",
@@ -375,23 +377,23 @@ def _pearson(cells: Sequence[RateCell], quantity: Quantity, what: str, **parts: 
     )
 
 
-def _pearson_by_condition(cells: Sequence[RateCell]) -> list[Measurement]:
-    conditions = list(dict.fromkeys(cell.condition for cell in cells))
+def _pearson_by_condition(groups: Sequence[RateGroup]) -> list[Measurement]:
+    conditions = list(dict.fromkeys(group.condition for group in groups))
     if len(conditions) < 2:
         return []
     return [
         _pearson(
-            [cell for cell in cells if cell.condition == condition],
+            [group for group in groups if group.condition == condition],
             PEARSON_R_OF_CONDITION,
-            f"over cells {condition} only",
+            f"over groups {condition} only",
             condition=condition,
         )
         for condition in conditions
     ]
 
 
-def _remeasured(cells: Sequence[RateCell], intervals: CellIntervals, what: str) -> Measurement:
-    recorded, sim = sides(cells)
+def _remeasured(groups: Sequence[RateGroup], intervals: GroupIntervals, what: str) -> Measurement:
+    recorded, sim = sides(groups)
 
     def compute() -> tuple[float, Interval | None]:
         r = agreement.pearson(recorded, sim)
@@ -404,9 +406,9 @@ def _remeasured(cells: Sequence[RateCell], intervals: CellIntervals, what: str) 
     return measured(
         PEARSON_R_REMEASURED.of(what=what),
         compute,
-        n=len(cells),
-        counted="cell",
+        n=len(groups),
+        counted="group",
         reason_without_interval="r is exactly 1 or -1, or no other outcome changes it",
-        episodes=_episodes(cells),
+        episodes=_episodes(groups),
         coverage_key="remeasurement",
     )

@@ -65,7 +65,7 @@ def band_row(task: str, engine: str, by_id: Mapping[str, Measurement]) -> tuple[
         degrees(of(moving["turned_over_pairs_rad"]).value),
         millimetres(recorded.value),
         millimetres(simulated.value),
-        None if inside is None else f"{100 * inside:.0f} %",
+        inside,
     )
 
 

@@ -1,12 +1,12 @@
-"""Over cells: what the twin would have chosen, and what hangs on one task alone."""
+"""Over groups: what the twin would have chosen, and what hangs on one task alone."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 
-from evaluator.compare.agreement import sides, usable_cells
+from evaluator.compare.agreement import sides, usable_groups
 from evaluator.compare.measure import measured, proportion
-from evaluator.compare.rows import RateCell
+from evaluator.compare.rows import RateGroup
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import DECISIONS, REGRET
 from evaluator.result import Measurement, Table
@@ -16,12 +16,12 @@ from evaluator.statistics.agreement import Decision, choose, over_tasks, without
 NO_SAMPLE = "the tasks are these, not a sample of others"
 
 
-def decisions(cells: Sequence[RateCell]) -> tuple[list[Measurement], tuple[Table, ...]]:
+def decisions(groups: Sequence[RateGroup]) -> tuple[list[Measurement], tuple[Table, ...]]:
     """Judge the choice the twin would have made among conditions and policies, task by task."""
-    usable = usable_cells(cells)
+    usable = usable_groups(groups)
     found: dict[str, Decision] = {}
-    for task in dict.fromkeys(cell.task for cell in usable):
-        members = [cell for cell in usable if cell.task == task]
+    for task in dict.fromkeys(group.task for group in usable):
+        members = [group for group in usable if group.task == task]
         try:
             found[task] = choose(
                 recorded={_candidate(c): c.recorded_rate or Fraction(0) for c in members},
@@ -67,13 +67,13 @@ def _mean_regret(found: dict[str, Decision], why: str) -> float:
     return float(100 * sum(d.regret for d in found.values()) / len(found))
 
 
-def _over_all(usable: Sequence[RateCell]) -> dict[str, Decision]:
+def _over_all(usable: Sequence[RateGroup]) -> dict[str, Decision]:
     """The one choice for all tasks, by mean rates of what every task has; nothing for one task."""
     by_task: dict[str, tuple[dict[str, Fraction], dict[str, Fraction]]] = {}
-    for cell in usable:
-        recorded, sim = by_task.setdefault(cell.task, ({}, {}))
-        recorded[_candidate(cell)] = cell.recorded_rate or Fraction(0)
-        sim[_candidate(cell)] = cell.sim_rate or Fraction(0)
+    for group in usable:
+        recorded, sim = by_task.setdefault(group.task, ({}, {}))
+        recorded[_candidate(group)] = group.recorded_rate or Fraction(0)
+        sim[_candidate(group)] = group.sim_rate or Fraction(0)
     if len(by_task) < 2:
         return {}
     try:
@@ -86,11 +86,11 @@ def _over_all(usable: Sequence[RateCell]) -> dict[str, Decision]:
     return {"all tasks, mean rate": decision}
 
 
-def _candidate(cell: RateCell) -> str:
-    return ", ".join(p.replace("_", " ") for p in (cell.condition, cell.policy) if p)
+def _candidate(group: RateGroup) -> str:
+    return ", ".join(p.replace("_", " ") for p in (group.condition, group.policy) if p)
 
 
-def _decision_tables(found: dict[str, Decision], usable: Sequence[RateCell]) -> tuple[Table, ...]:
+def _decision_tables(found: dict[str, Decision], usable: Sequence[RateGroup]) -> tuple[Table, ...]:
     tables = []
     if found:
         tables.append(
@@ -103,7 +103,7 @@ def _decision_tables(found: dict[str, Decision], usable: Sequence[RateCell]) -> 
                         task,
                         " or ".join(sorted(d.sim_best)),
                         " or ".join(sorted(d.recorded_best)),
-                        "yes" if d.surely_right else ("perhaps" if d.possibly_right else "no"),
+                        "yes" if d.confident else ("perhaps" if d.possibly_right else "no"),
                         round(float(100 * d.regret), 1),
                     )
                     for task, d in found.items()
@@ -115,24 +115,25 @@ def _decision_tables(found: dict[str, Decision], usable: Sequence[RateCell]) -> 
     return (*tables, *_leave_one_out(usable))
 
 
-def _leave_one_out(usable: Sequence[RateCell]) -> tuple[Table, ...]:
+def _leave_one_out(usable: Sequence[RateGroup]) -> tuple[Table, ...]:
     try:
-        left = without_each(list(dict.fromkeys(cell.task for cell in usable)))
+        left = without_each(list(dict.fromkeys(group.task for group in usable)))
     except UndefinedStatisticError:
         return ()
     rows = []
     for task, others in left.items():
-        kept = [cell for cell in usable if cell.task in others]
+        kept = [group for group in usable if group.task in others]
         recorded, sim = sides(kept)
         bias = 100 * agreement.bias(recorded=recorded, sim=sim)
+        r, why = None, None
         try:
-            r: float | str = round(agreement.pearson(recorded, sim), 3)
+            r = round(agreement.pearson(recorded, sim), 3)
         except UndefinedStatisticError as error:
-            r = f"undefined: {error.reason}"
-        rows.append((task, len(kept), r, round(bias, 1)))
+            why = error.reason
+        rows.append((task, len(kept), r, round(bias, 1), why))
     note = "An agreement that one task carries alone is none."
     title = "Without one task"
-    columns = ("task left out", "cells", "Pearson r", "bias (pp)")
+    columns = ("task left out", "groups", "Pearson r", "bias (pp)", "why undefined")
     return (
         Table(id="leave_one_task_out", title=title, columns=columns, rows=tuple(rows), note=note),
     )

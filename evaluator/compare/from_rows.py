@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from evaluator.compare.agreement import agreement_intervals, cell_agreement
+from evaluator.compare.agreement import agreement_intervals, group_agreement
 from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import (
     gain_tests,
@@ -16,14 +16,14 @@ from evaluator.compare.gate import agreement, gate_scorecard, reliability
 from evaluator.compare.measure import refuse_alike
 from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.prediction_powered import assisted_rates, sequences, stopping_table
-from evaluator.compare.rows import Comparison, RateCell, TrialRow, is_streamed
+from evaluator.compare.rows import Comparison, RateGroup, TrialRow, is_streamed
 from evaluator.compare.stages import failures_table, stage_results
 from evaluator.compare.success import (
     WITH,
     WITHOUT,
     averages,
     never_sent,
-    rate_cells,
+    rate_groups,
     side_rates,
     trials_in,
     varied_sim,
@@ -42,13 +42,13 @@ from evaluator.result import Exclusion, Measurement, Table
 class _Found:
     """What was measured, before it is laid out for readers."""
 
-    cells: tuple[RateCell, ...]
+    groups: tuple[RateGroup, ...]
     measurements: tuple[Measurement, ...]
     exclusions: tuple[Exclusion, ...]
     gains: list[Measurement]
     again_tables: tuple[Table, ...]
     gate_tables: tuple[Table, ...]
-    """What the gate is worth, and whether its success probability can be relied on."""
+    """What the gate is scorecard, and whether its success probability can be relied on."""
     stage_tables: tuple[Table, ...]
     decision_tables: tuple[Table, ...]
 
@@ -84,7 +84,7 @@ def compare_rows(
     return replace(
         empty,
         rows=tuple(rows),
-        cells=found.cells,
+        groups=found.groups,
         measurements=found.measurements,
         tables=_tables(rows, found, empty.recorded_word, goal),
         exclusions=found.exclusions,
@@ -94,27 +94,27 @@ def compare_rows(
 
 def _measure(rows: Sequence[TrialRow], method: str) -> _Found:
     rates = side_rates(rows, method=method)
-    cells = rate_cells(rows, rates, method=method)
-    gains = replanning_gains(cells, method=method)
+    groups = rate_groups(rows, rates, method=method)
+    gains = replanning_gains(groups, method=method)
     pairs, unpaired = pair_starts(rows)
-    worth, worth_tables = gate_scorecard(rows)
+    scorecard, scorecard_tables = gate_scorecard(rows)
     kept, kept_tables = reliability(rows)
     again, again_tables = varied_sim(rows)
     stages, stage_tables, other_stages = stage_results(rows)
-    chosen, decision_tables = decisions(cells)
+    chosen, decision_tables = decisions(groups)
     measurements = (
         *rates,
-        *(rate for cell in cells for rate in cell.pair),
-        *averages(cells, method=method),
+        *(rate for group in groups for rate in group.pair),
+        *averages(groups, method=method),
         *agreement(rows, method=method),
-        *cell_agreement(cells),
+        *group_agreement(groups),
         *gains,
-        *gain_tests(cells),
+        *gain_tests(groups),
         *again,
         *paired_gain(pairs),
         *start_distances(pairs),
         *never_sent(rows),
-        *worth,
+        *scorecard,
         *kept,
         *stages,
         *chosen,
@@ -122,12 +122,12 @@ def _measure(rows: Sequence[TrialRow], method: str) -> _Found:
         *sequences(rows, pairs),
     )
     return _Found(
-        cells=cells,
+        groups=groups,
         measurements=measurements,
         exclusions=(*unpaired, *other_stages),
         gains=gains,
         again_tables=again_tables,
-        gate_tables=(*worth_tables, *kept_tables),
+        gate_tables=(*scorecard_tables, *kept_tables),
         stage_tables=stage_tables,
         decision_tables=decision_tables,
     )
@@ -137,14 +137,14 @@ def _tables(
     rows: Sequence[TrialRow], found: _Found, word: str, goal: float | None
 ) -> tuple[Table, ...]:
     """Lay out what was found; ``word`` is what the recorded side is called."""
-    cells, measurements = found.cells, found.measurements
+    groups, measurements = found.groups, found.measurements
     return (
-        success_table(cells, word),
-        *layout_table(cells, measurements, word),
+        success_table(groups, word),
+        *layout_table(groups, measurements, word),
         *gains_table(found.gains, word),
         *found.again_tables,
-        *notes_table(notes(cells, measurements)),
-        *agreement_intervals(cells),
+        *notes_table(notes(groups, measurements)),
+        *agreement_intervals(groups),
         confusion_table(rows, word),
         *found.gate_tables,
         *found.stage_tables,

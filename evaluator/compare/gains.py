@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from evaluator.compare.measure import measured
-from evaluator.compare.rows import RateCell, TrialRow, is_streamed
+from evaluator.compare.rows import RateGroup, TrialRow, is_streamed
 from evaluator.compare.success import WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import (
@@ -243,9 +243,9 @@ class Change:
         return f"{first} without and {second} with replanning"
 
 
-def changes(cells: Sequence[RateCell]) -> list[Change]:
-    """Pair the cells of both conditions by task and policy."""
-    found = {(c.task, c.policy, c.condition): c for c in cells}
+def changes(groups: Sequence[RateGroup]) -> list[Change]:
+    """Pair the groups of both conditions by task and policy."""
+    found = {(c.task, c.policy, c.condition): c for c in groups}
     pairs = []
     for (task, policy, condition), before in found.items():
         after = found.get((task, policy, WITH))
@@ -257,17 +257,17 @@ def changes(cells: Sequence[RateCell]) -> list[Change]:
     return pairs
 
 
-def replanning_gains(cells: Sequence[RateCell], *, method: str = "wilson") -> list[Measurement]:
+def replanning_gains(groups: Sequence[RateGroup], *, method: str = "wilson") -> list[Measurement]:
     """Measure the gain with replanning per task and side: percentage points and relative."""
-    pairs = changes(cells)
+    pairs = changes(groups)
     measurements = [m for change in pairs for m in _gain(change, method)]
     measurements.extend(_average_gains(pairs))
     return measurements
 
 
-def gain_tests(cells: Sequence[RateCell]) -> list[Measurement]:
+def gain_tests(groups: Sequence[RateGroup]) -> list[Measurement]:
     """Test each gain as if the groups shared no starts, and say what so many trials can show."""
-    pairs = changes(cells)
+    pairs = changes(groups)
     measurements = []
     for side in SIDES:
         mine = [change for change in pairs if change.side == side]

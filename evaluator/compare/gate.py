@@ -1,9 +1,9 @@
-"""Trial by trial: does what the twin said agree with what happened, and what is the gate worth?"""
+"""Trial by trial: does what the twin said agree with what happened, and does the gate pay?"""
 
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from evaluator.compare.measure import measured, proportion, vouched_rate
+from evaluator.compare.measure import ends, measured, proportion, vouched_rate
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import WITH, WITHOUT, Answer, names_of
 from evaluator.errors import UndefinedStatisticError
@@ -35,7 +35,7 @@ from evaluator.statistics.gate import (
     reliability_bins,
 )
 
-# --- The gate's worth clause by clause: how often each refused, and how often it was right to.
+# --- The gate's scorecard clause by clause: how often each refused, and how often it was right to.
 
 PLANNED, GATE = "planned in twin", "verdict before motion, not obeyed"
 PRICES = (0.1, 0.5, 1.0)
@@ -55,14 +55,14 @@ def clause_scorecard(
     measurements: list[Measurement] = []
     lines: list[tuple[Cell, ...]] = []
     costs: list[tuple[Cell, ...]] = []
-    for side, name, members, said in (
+    for side, name, members, answer_of in (
         (PLANNED, "planned", known, _of_replay),
         (GATE, "verdict", list(not_obeyed), _of_gate),
     ):
-        for clause in _clauses_in(members, said):
-            asked = [row for row in members if _answer(said(row), clause) is not None]
-            counts = _confusion(asked, said, clause)
-            measurements += _measure(name, side, clause, asked, counts, said)
+        for clause in _clauses_in(members, answer_of):
+            asked = [row for row in members if _answer(answer_of(row), clause) is not None]
+            counts = _confusion(asked, answer_of, clause)
+            measurements += _measure(name, side, clause, asked, counts, answer_of)
             lines.append((side, clause, *_line(counts)))
             if name == "verdict":
                 costs.append((clause, *_costs(counts)))
@@ -77,9 +77,9 @@ def _of_gate(row: TrialRow) -> Clauses:
     return row.gate_clauses
 
 
-def _clauses_in(rows: Sequence[TrialRow], said: Callable[[TrialRow], Clauses]) -> list[str]:
+def _clauses_in(rows: Sequence[TrialRow], answer_of: Callable[[TrialRow], Clauses]) -> list[str]:
     """Clauses that were decided in some trial: the factors first, then predicates by name."""
-    found = {name for row in rows for name, _ in said(row)}
+    found = {name for row in rows for name, _ in answer_of(row)}
     return [*(n for n in FACTORS if n in found), *sorted(found - set(FACTORS))]
 
 
@@ -88,10 +88,10 @@ def _answer(clauses: Clauses, clause: str) -> bool | None:
 
 
 def _confusion(
-    rows: Sequence[TrialRow], said: Callable[[TrialRow], Clauses], clause: str
+    rows: Sequence[TrialRow], answer_of: Callable[[TrialRow], Clauses], clause: str
 ) -> Confusion:
     return Confusion.weigh(
-        (bool(_answer(said(row), clause)), bool(row.recorded), row.count) for row in rows
+        (bool(_answer(answer_of(row), clause)), bool(row.recorded), row.count) for row in rows
     )
 
 
@@ -101,9 +101,9 @@ def _measure(
     clause: str,
     asked: Sequence[TrialRow],
     counts: Confusion,
-    said: Callable[[TrialRow], Clauses],
+    answer_of: Callable[[TrialRow], Clauses],
 ) -> list[Measurement]:
-    refused = [row for row in asked if _answer(said(row), clause) is False]
+    refused = [row for row in asked if _answer(answer_of(row), clause) is False]
     return [
         proportion(
             quantity.of(by=name, clause=clause, name=clause, side=side),
@@ -114,8 +114,8 @@ def _measure(
             episodes=names_of(episodes),
         )
         for quantity, k, n, episodes in (
-            (CLAUSE_REFUSED, counts.said_failure, counts.n, asked),
-            (CLAUSE_RIGHT, counts.true_negative, counts.said_failure, refused),
+            (CLAUSE_REFUSED, counts.predicted_failure, counts.n, asked),
+            (CLAUSE_RIGHT, counts.true_negative, counts.predicted_failure, refused),
         )
     ]
 
@@ -124,31 +124,26 @@ def _line(counts: Confusion) -> tuple[Cell, ...]:
     failed = counts.false_positive + counts.true_negative
     return (
         counts.n,
-        counts.said_failure,
+        counts.predicted_failure,
         counts.true_negative,
-        _rate(counts.true_negative, counts.said_failure),
+        *_rate(counts.true_negative, counts.predicted_failure),
         counts.false_negative,
-        _rate(counts.true_negative, failed),
+        failed,
+        *_rate(counts.true_negative, failed),
         _price(counts),
     )
 
 
-def _rate(k: int, n: int) -> str | None:
-    """Write a share with its interval; None where it has no denominator."""
-    if not n:
-        return None
-    interval, _ = vouched_rate(k, n, "wilson")
-    text = f"{k}/{n} = {100 * k / n:.0f} %"
-    if interval is None:
-        return text
-    return f"{text} [{100 * interval.low:.0f}, {100 * interval.high:.0f}]"
+def _rate(k: int, n: int) -> tuple[Cell, ...]:
+    """Return a share with its interval; unknown where it has no denominator."""
+    return (k / n, *ends(vouched_rate(k, n, "wilson")[0])) if n else (None, None, None)
 
 
-def _price(counts: Confusion) -> Cell:
+def _price(counts: Confusion) -> float | None:
     try:
         return round(break_even(counts), 3)
     except UndefinedStatisticError:
-        return "any" if counts.true_negative else None
+        return None
 
 
 def _costs(counts: Confusion) -> tuple[Cell, ...]:
@@ -162,17 +157,11 @@ def _table(lines: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
     return (
         Table(
             id="gate_clauses",
-            title="What each clause of the verdict is worth",
+            title="Scorecard of each clause of the verdict",
             columns=(
-                "said by",
-                "clause",
-                "trials",
-                "said no",
-                "of them failed",
-                "right to say no",
-                "good plans refused",
-                "failures it found",
-                "pays up to a price of",
+                *("verdict of", "clause", "trials", "refused", "refused and failed"),
+                *("right", "right low", "right high", "good plans refused"),
+                *("failed", "found", "found low", "found high", "pays up to a price of"),
             ),
             rows=tuple(lines),
             note="Trials with a known outcome in which the clause was decided. A clause that says "
@@ -209,12 +198,12 @@ REFUSAL_PRICES = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)
 def agreement(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Measurement]:
     """Measure k/n agreement, phi, kappa and predictive values, of the replay and of the verdict."""
     measurements = []
-    for name, said, words in (
+    for name, answer_of, words in (
         ("sim_planned", lambda row: row.sim_planned, "planned-in-twin (dynamic, of the sent plan)"),
         ("verdict", lambda row: row.verdict, "the verdict before motion"),
         ("sim_executed", lambda row: row.sim_executed, "executed-in-twin (diagnosis only)"),
     ):
-        measurements.extend(_agreement_of(rows, name, said, words, method))
+        measurements.extend(_agreement_of(rows, name, answer_of, words, method))
     if any(unheeded_verdict(row) is not None for row in rows):
         words = "the verdict before motion, recorded and not obeyed (without replanning)"
         measurements.extend(
@@ -236,20 +225,20 @@ def heeded_verdict(row: TrialRow) -> bool | None:
     return row.verdict if row.condition == WITH else None
 
 
-def confusion_of(rows: Sequence[TrialRow], said: Answer) -> Confusion:
+def confusion_of(rows: Sequence[TrialRow], answer_of: Answer) -> Confusion:
     """Count what was said against what was labelled, over trials where both are known."""
     return Confusion.weigh(
         (answer, row.recorded, row.count)
         for row in rows
-        if (answer := said(row)) is not None and row.recorded is not None
+        if (answer := answer_of(row)) is not None and row.recorded is not None
     )
 
 
 def _agreement_of(
-    rows: Sequence[TrialRow], name: str, said: Answer, words: str, method: str
+    rows: Sequence[TrialRow], name: str, answer_of: Answer, words: str, method: str
 ) -> list[Measurement]:
-    seen = [row for row in rows if said(row) is not None and row.recorded is not None]
-    counts = confusion_of(seen, said)
+    seen = [row for row in rows if answer_of(row) is not None and row.recorded is not None]
+    counts = confusion_of(seen, answer_of)
     nothing = f"no trial has both {words} and a known outcome"
     make = partial(proportion, counted="trial", method=method)
     coefficient = partial(
@@ -272,16 +261,16 @@ def _agreement_of(
         make(
             PPV.of(by=name, words=words),
             counts.true_positive,
-            counts.said_success,
-            reason_if_undefined=nothing if not counts.n else "it never said success",
-            episodes=names_of(row for row in seen if said(row)),
+            counts.predicted_success,
+            reason_if_undefined=nothing if not counts.n else "it never predicted success",
+            episodes=names_of(row for row in seen if answer_of(row)),
         ),
         make(
             NPV.of(by=name, words=words),
             counts.true_negative,
-            counts.said_failure,
-            reason_if_undefined=nothing if not counts.n else "it never said failure",
-            episodes=names_of(row for row in seen if not said(row)),
+            counts.predicted_failure,
+            reason_if_undefined=nothing if not counts.n else "it never predicted failure",
+            episodes=names_of(row for row in seen if not answer_of(row)),
         ),
     ]
 
@@ -320,7 +309,7 @@ def _clauses(rows: Sequence[TrialRow]) -> list[Measurement]:
             proportion(
                 FACTOR_NPV.of(clause=clause),
                 counts.true_negative,
-                counts.said_failure,
+                counts.predicted_failure,
                 counted="trial",
                 reason_if_undefined=f"no trial with a known outcome failed in {clause} first",
                 episodes=names_of(blamed),
@@ -356,7 +345,7 @@ def reliability(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Tabl
     ]
     if not seen:
         return [], ()
-    said, happened = [p for _, p, _ in seen], [outcome for _, _, outcome in seen]
+    probabilities, happened = [p for _, p, _ in seen], [outcome for _, _, outcome in seen]
     make = partial(
         measured,
         n=len(seen),
@@ -365,16 +354,16 @@ def reliability(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Tabl
         reason_without_interval="the bins and their counts are in the reliability table",
     )
     measurements = [
-        make(BRIER.of(), lambda: brier(said, happened)),
+        make(BRIER.of(), lambda: brier(probabilities, happened)),
         make(BRIER_OF_BASE_RATE.of(), lambda: brier_of_base_rate(happened)),
-        make(ECE.of(), lambda: expected_calibration_error(said, happened)),
+        make(ECE.of(), lambda: expected_calibration_error(probabilities, happened)),
     ]
-    bins = reliability_bins(said, happened)
+    bins = reliability_bins(probabilities, happened)
     table = Table(
         id="reliability",
         title="Is the sampled success probability kept?",
         columns=("from", "to", "trials", "mean probability", "succeeded"),
-        rows=tuple((b.low, b.high, b.n, round(b.mean_said, 4), b.succeeded) for b in bins),
+        rows=tuple((b.low, b.high, b.n, round(b.mean_probability, 4), b.succeeded) for b in bins),
         note="Bins of equal width; empty ones are left out.",
     )
     return measurements, (table,)

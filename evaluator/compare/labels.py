@@ -1,4 +1,4 @@
-"""The second witness: what the task's success predicate says of the poses localised afterwards."""
+"""Operator's labels against the task's success predicate on the poses localised afterwards."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -100,7 +100,7 @@ def _rollout(recorded: Episode, localised: Episode, plan_id: str, task: Task) ->
         name, pose = str(record["object"]), record.get("T_base_object")
         if not record["found"] or pose is None:
             continue
-        T = se3.transform_from(np.array(pose["q_wxyz"]), np.array(pose["p_m"]))
+        T = se3.pose_from_record(pose)
         if (record.get("phase"), record.get("plan_id")) != (AFTER, plan_id):
             before[name] = T if not after else before.get(name, T)
             continue
@@ -157,19 +157,19 @@ Pair = tuple[TrialRow, PerceivedOutcome]
 
 
 def label_results(
-    witnesses: Sequence[PerceivedOutcome], rows: Sequence[TrialRow], *, method: str = "wilson"
+    perceived: Sequence[PerceivedOutcome], rows: Sequence[TrialRow], *, method: str = "wilson"
 ) -> Part:
     """Count the trials in which label and predicate say the same, and list the others.
 
     Args:
-        witnesses: What the predicate says, of trials that were localised afterwards.
+        perceived: What the predicate says, of trials that were localised afterwards.
         rows: The trials with their labels; these alone enter every other number.
         method: Interval of rates.
     """
-    if not witnesses:
+    if not perceived:
         reason = "no trial of a known task was localised after its execution"
         return Part(missing=(f"label against localised predicate: no data ({reason})",))
-    of_episode: Mapping[str, PerceivedOutcome] = {witness.episode: witness for witness in witnesses}
+    of_episode: Mapping[str, PerceivedOutcome] = {outcome.episode: outcome for outcome in perceived}
     pairs = [(row, of_episode[row.episode]) for row in rows if row.episode in of_episode]
     tasks = sorted({row.task for row, _ in pairs})
     measurements = [_rate("", pairs, method)]
@@ -193,8 +193,8 @@ def _known(pairs: Sequence[Pair]) -> list[Pair]:
 def _rate(task: str, pairs: Sequence[Pair], method: str) -> Measurement:
     """Measure the trials of one task, or of all when it is empty."""
     known = _known(pairs)
-    agreed = sum(row.recorded is witness.says for row, witness in known)
-    skipped = sorted({kind for _, witness in known for kind in witness.not_asked})
+    agreed = sum(row.recorded is outcome.says for row, outcome in known)
+    skipped = sorted({kind for _, outcome in known for kind in outcome.not_asked})
     without = f"; clauses that one look leaves open are not asked: {', '.join(skipped)}"
     quantity = LABEL_AGREED_OF_TASK if task else LABEL_AGREED
     where = f" of {task}" if task else ""
@@ -213,7 +213,7 @@ def _counts(pairs: Sequence[Pair], method: str) -> Measurement:
     known = [(r, w) for r, w in pairs if r.k is not None and w.objects_done is not None]
     return proportion(
         LABEL_OBJECTS.of(),
-        sum(row.k == witness.objects_done for row, witness in known),
+        sum(row.k == outcome.objects_done for row, outcome in known),
         len(known),
         counted="trial",
         reason_if_undefined="no trial labelled by object has a decided predicate of each object",
@@ -223,9 +223,9 @@ def _counts(pairs: Sequence[Pair], method: str) -> Measurement:
 
 
 def _cross_table(pairs: Sequence[Pair]) -> Table:
-    counts = {(label, said): 0 for label in NAMES for said in NAMES}
-    for row, witness in pairs:
-        counts[row.recorded, witness.says] += 1
+    counts = {(label, says): 0 for label in NAMES for says in NAMES}
+    for row, outcome in pairs:
+        counts[row.recorded, outcome.says] += 1
     return Table(
         id="label_predicate",
         title="Operator's label against the predicate on localised poses",
@@ -235,7 +235,7 @@ def _cross_table(pairs: Sequence[Pair]) -> Table:
             for label in NAMES
         ),
         note="The same predicate that judges replays, asked of the poses localised after the "
-        "execution. A second witness: headline numbers use the label.",
+        "execution. Headline numbers use the label.",
     )
 
 
@@ -246,11 +246,11 @@ def _disagreements(pairs: Sequence[Pair]) -> tuple[Table, ...]:
             row.task,
             row.condition.replace("_", " "),
             NAMES[row.recorded],
-            NAMES[witness.says],
-            witness.detail,
+            NAMES[outcome.says],
+            outcome.detail,
         )
-        for row, witness in _known(pairs)
-        if row.recorded is not witness.says
+        for row, outcome in _known(pairs)
+        if row.recorded is not outcome.says
     ]
     if not rows:
         return ()
@@ -269,8 +269,8 @@ def _disagreements(pairs: Sequence[Pair]) -> tuple[Table, ...]:
 def _left_out(pairs: Sequence[Pair]) -> list[Exclusion]:
     return [
         Exclusion(
-            episode=row.episode, scope="label against predicate", reason=f"{OPEN}: {witness.detail}"
+            episode=row.episode, scope="label against predicate", reason=f"{OPEN}: {outcome.detail}"
         )
-        for row, witness in pairs
-        if witness.says is None
+        for row, outcome in pairs
+        if outcome.says is None
     ]

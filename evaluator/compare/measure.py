@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from evaluator.errors import AlikeNamesError, UndefinedStatisticError
 from evaluator.measurements import Defined, slug
-from evaluator.result import Exclusion, Interval, Measurement, Table
+from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.statistics.coverage.stored import Size, vouch
 from evaluator.statistics.intervals import RATE_INTERVALS
 
@@ -18,25 +18,34 @@ DEGREES = math.degrees(1.0)
 
 
 def millimetres(value_m: float | None) -> float | None:
-    """Return a length [mm]; None stays None, and so does what is no number."""
+    """Return a length [mm]; None stays None, and so does what is not a number."""
     return _rounded(value_m, 1e3)
 
 
 def degrees(value_rad: float | None) -> float | None:
-    """Return an angle [deg]; None stays None, and so does what is no number."""
+    """Return an angle [deg]; None stays None, and so does what is not a number."""
     return _rounded(value_rad, DEGREES)
 
 
 def milliseconds(value_s: float | None) -> float | None:
-    """Return a duration [ms]; None stays None, and so does what is no number."""
+    """Return a duration [ms]; None stays None, and so does what is not a number."""
     return _rounded(value_s, 1e3)
 
 
-def millimetre_ends(interval: Interval | None) -> str | None:
-    """Return both ends of an interval of a length [mm]."""
-    if interval is None:
-        return None
-    return f"[{1e3 * interval.low:.1f}, {1e3 * interval.high:.1f}]"
+def ends(interval: Interval | None, factor: float = 1.0) -> tuple[float | None, float | None]:
+    """Return both ends of an interval, in another unit by ``factor``; unknown without one."""
+    return (None, None) if interval is None else (factor * interval.low, factor * interval.high)
+
+
+RATE_COLUMNS = ("k", "n", "rate", "low", "high", "interval")
+"""Columns of a table that ``rate_row`` fills: a share from 0 to 1 with its interval's method."""
+
+
+def rate_row(rate: Measurement) -> tuple[Cell, ...]:
+    """Lay one rate out in columns; unknown is None."""
+    method = None if rate.interval is None else rate.interval.method
+    counts = (None, None) if rate.value is None and not rate.n else (rate.k, rate.n)
+    return (*counts, rate.value, *ends(rate.interval), method)
 
 
 def average(items: Sequence[Item], read: Callable[[Item], float | None]) -> float | None:
@@ -78,9 +87,9 @@ def refuse_alike(kind: str, named: Iterable[tuple[str, str]]) -> None:
     places: dict[str, str] = {}
     for name, where in named:
         places.setdefault(name, where)
-    owners: dict[str, str] = {}
+    first_with: dict[str, str] = {}
     for name, where in places.items():
-        owner = owners.setdefault(slug(name), name)
+        owner = first_with.setdefault(slug(name), name)
         if owner != name:
             raise AlikeNamesError(kind=kind, names=(owner, name), places=(places[owner], where))
 

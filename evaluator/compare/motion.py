@@ -283,28 +283,28 @@ OVER_TIME = range(0, 101, 10)
 NUM_WORST = 3
 
 
-def cell_table(groups: Groups) -> Table:
+def group_table(groups: Groups) -> Table:
     """Means of each task and condition."""
     rows: list[tuple[Cell, ...]] = []
     for name, motions in groups.items():
-        cells: dict[tuple[str, str], list[MotionSummary]] = {}
+        of_group: dict[tuple[str, str], list[MotionSummary]] = {}
         for motion in motions:
-            cells.setdefault((motion.task, motion.condition), []).append(motion)
-        for task, condition in sorted(cells):
-            cell = cells[task, condition]
+            of_group.setdefault((motion.task, motion.condition), []).append(motion)
+        for task, condition in sorted(of_group):
+            members = of_group[task, condition]
             rows.append(
                 (
                     task,
                     condition.replace("_", " "),
                     name,
-                    len(cell),
-                    millimetres(average(cell, lambda m: m.position_mean_m)),
-                    millimetres(average(cell, lambda m: m.end_point_m)),
-                    degrees(average(cell, lambda m: m.rotation_mean_rad)),
-                    milliseconds(average(cell, lambda m: m.lag_s)),
-                    millimetres(average(cell, lambda m: m.without_lag_mean_m)),
-                    millimetres(average(cell, lambda m: m.without_offset_mean_m)),
-                    degrees(average(cell, lambda m: m.joint_rms_rad)),
+                    len(members),
+                    millimetres(average(members, lambda m: m.position_mean_m)),
+                    millimetres(average(members, lambda m: m.end_point_m)),
+                    degrees(average(members, lambda m: m.rotation_mean_rad)),
+                    milliseconds(average(members, lambda m: m.lag_s)),
+                    millimetres(average(members, lambda m: m.without_lag_mean_m)),
+                    millimetres(average(members, lambda m: m.without_offset_mean_m)),
+                    degrees(average(members, lambda m: m.joint_rms_rad)),
                 )
             )
     return Table(
@@ -421,7 +421,7 @@ def motion_results(motions: Sequence[MotionSummary]) -> Part:
     found = [m for name, members in groups.items() for m in _measure(name, members)]
     return Part(
         measurements=tuple(found),
-        tables=(cell_table(groups), over_time_table(groups), worst_table(groups)),
+        tables=(group_table(groups), over_time_table(groups), worst_table(groups)),
     )
 
 

@@ -1,11 +1,11 @@
-"""What a reader should know before believing a number, said in sentences."""
+"""What a reader should know before using a number."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain, groupby
 from typing import Any
 
-from evaluator.compare.rows import RateCell
+from evaluator.compare.rows import RateGroup
 from evaluator.compare.trial import Trial
 from evaluator.result import Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
@@ -13,18 +13,18 @@ from evaluator.run_reader.episodes import DerivedFile
 SIGNIFICANT = 0.05
 LARGE_BIAS_PP = 5.0
 HIGH_R = 0.8
-FEW_CELLS = 4
+FEW_GROUPS = 4
 
 Note = tuple[str, str]
 """About what, and the sentence."""
 
 
-def notes(cells: Sequence[RateCell], measurements: Sequence[Measurement]) -> list[Note]:
-    """Collect what follows from the cells and the numbers alone."""
+def notes(groups: Sequence[RateGroup], measurements: Sequence[Measurement]) -> list[Note]:
+    """Collect what follows from the groups and the numbers alone."""
     by_id = {measurement.id: measurement for measurement in measurements}
     return [
-        *_units(cells),
-        *_few_cells(by_id),
+        *_units(groups),
+        *_few_groups(by_id),
         *_hidden_bias(by_id),
         *_two_gains(by_id),
         *_power(by_id),
@@ -32,51 +32,51 @@ def notes(cells: Sequence[RateCell], measurements: Sequence[Measurement]) -> lis
 
 
 def notes_table(found: Iterable[Note]) -> tuple[Table, ...]:
-    """Lay remarks out as a table; none without remarks."""
+    """Lay notes out as a table; none without notes."""
     rows = tuple(dict.fromkeys(found))
     if not rows:
         return ()
-    return (Table(id="remarks", title="Remarks", columns=("about", "remark"), rows=rows),)
+    return (Table(id="notes", title="Notes", columns=("about", "note"), rows=rows),)
 
 
 def with_notes(tables: Iterable[Table], found: Iterable[Note]) -> tuple[Table, ...]:
-    """Put remarks before those that are among some tables already."""
+    """Put notes before those that are among some tables already."""
     kept, found = list(tables), list(found)
     if not found:
         return tuple(kept)
-    old = [(str(a), str(b)) for table in kept if table.id == "remarks" for a, b in table.rows]
-    others = [table for table in kept if table.id != "remarks"]
+    old = [(str(a), str(b)) for table in kept if table.id == "notes" for a, b in table.rows]
+    others = [table for table in kept if table.id != "notes"]
     return (*others, *notes_table([*found, *old]))
 
 
-def _units(cells: Sequence[RateCell]) -> list[Note]:
-    found = {cell.task: cell for cell in cells if cell.unit != "trial"}
+def _units(groups: Sequence[RateGroup]) -> list[Note]:
+    found = {group.task: group for group in groups if group.unit != "trial"}
     notes = []
-    for task, cell in found.items():
-        n = cell.recorded.n or cell.sim.n
+    for task, group in found.items():
+        n = group.recorded.n or group.sim.n
         count = f" (n = {n})" if n else ""
         notes.append(
             (
                 task,
-                f"counted in {cell.unit}s{count}, not in trials: {cell.unit}s of one trial are not "
-                "independent, so intervals and tests claim more than the trials justify",
+                f"counted in {group.unit}s{count}, not in trials: {group.unit}s of one trial are "
+                "not independent, so intervals and tests claim more than the trials justify",
             )
         )
-    units = sorted({cell.unit for cell in cells})
+    units = sorted({group.unit for group in groups})
     if len(units) > 1:
         words = f"averages and r mix rates counted in {' and in '.join(f'{u}s' for u in units)}"
         notes.append(("averages", words))
     return notes
 
 
-def _few_cells(by_id: dict[str, Measurement]) -> list[Note]:
+def _few_groups(by_id: dict[str, Measurement]) -> list[Note]:
     return [
-        (name, f"r over {m.n} cells has no interval: few points that rise together give a high r")
+        (name, f"r over {m.n} groups has no interval: few points that rise together give a high r")
         for name, m in by_id.items()
         if name.startswith("agreement.pearson_r")
         and not name.endswith("remeasured")
         and m.value is not None
-        and (m.n or 0) < FEW_CELLS
+        and (m.n or 0) < FEW_GROUPS
     ]
 
 
@@ -86,8 +86,8 @@ def _hidden_bias(by_id: dict[str, Measurement]) -> list[Note]:
         return []
     if r.value < HIGH_R or abs(bias.value) < LARGE_BIAS_PP:
         return []
-    said = "optimistic" if bias.value > 0 else "pessimistic"
-    text = f"r = {r.value:.3f} does not show that the twin is {said} by {bias.value:+.1f} pp"
+    direction = "optimistic" if bias.value > 0 else "pessimistic"
+    text = f"r = {r.value:.3f} does not show that the twin is {direction} by {bias.value:+.1f} pp"
     return [("agreement.pearson_r", text)]
 
 
@@ -108,9 +108,9 @@ def _power(by_id: dict[str, Measurement]) -> list[Note]:
     for name, p in by_id.items():
         if not name.startswith("unpaired.boschloo_p.recorded.") or name.endswith(".pooled"):
             continue
-        cell = name.removeprefix("unpaired.boschloo_p.recorded.")
-        needed = by_id.get(f"power.trials_needed.recorded.{cell}")
-        gain = by_id.get(f"gain.pp.recorded.{cell}")
+        group = name.removeprefix("unpaired.boschloo_p.recorded.")
+        needed = by_id.get(f"power.trials_needed.recorded.{group}")
+        gain = by_id.get(f"gain.pp.recorded.{group}")
         if p.value is None or p.value < SIGNIFICANT or gain is None or not gain.value:
             continue  # no gain at all is nothing that more trials would show
         change = "a gain" if gain.value > 0 else "a loss"
@@ -120,7 +120,7 @@ def _power(by_id: dict[str, Measurement]) -> list[Note]:
         )
         if needed is not None and needed.value is not None:
             text += f"; {needed.value:.0f} per condition would, with 80 % power"
-        found.append((cell.removesuffix(".-"), f"underpowered: {text}"))
+        found.append((group.removesuffix(".-"), f"underpowered: {text}"))
     return found
 
 

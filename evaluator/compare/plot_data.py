@@ -19,7 +19,7 @@ class ReliabilityPoint:
 
     low: float
     high: float
-    mean_said: float
+    mean_probability: float
     succeeded: int
     n: int
     rate: float
@@ -44,7 +44,7 @@ def reliability_points(rows: Sequence[TrialRow]) -> list[ReliabilityPoint]:
             ReliabilityPoint(
                 low=b.low,
                 high=b.high,
-                mean_said=b.mean_said,
+                mean_probability=b.mean_probability,
                 succeeded=b.succeeded,
                 n=b.n,
                 rate=b.succeeded / b.n,

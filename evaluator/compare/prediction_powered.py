@@ -1,4 +1,4 @@
-"""Fewer robot trials: the recorded rate with the twin's help, and when to stop."""
+"""Prediction-powered estimates: the recorded rate with the twin's help, and when to stop."""
 
 import math
 from collections import Counter
@@ -102,7 +102,7 @@ class StartOverlap:
     """Whether the twin's other starts lie where those with a robot trial do."""
 
     def __init__(self, tried: Sequence[TrialRow], others: Sequence[TrialRow]) -> None:
-        """Take the trials of one cell; nothing is computed before somebody asks."""
+        """Take the trials of one group; nothing is computed before somebody asks."""
         self._tried = tried
         self._others = others
 
@@ -157,9 +157,9 @@ MOST_LOG = math.log(MOST)
 
 
 def assisted_rates(rows: Sequence[TrialRow]) -> list[Measurement]:
-    """Estimate each cell's recorded rate from its robot trials and the starts only the twin has.
+    """Estimate each group's recorded rate from its robot trials and the starts only the twin has.
 
-    Cells without a start of the twin's own are left out: there the twin adds nothing.
+    Groups without a start of the twin's own are left out: there the twin adds nothing.
     """
     measurements = []
     for key, members in group_rows(rows).items():
@@ -173,7 +173,7 @@ def assisted_rates(rows: Sequence[TrialRow]) -> list[Measurement]:
 
 @dataclass(frozen=True)
 class _Assisted:
-    """One cell's rate by the trials in which the twin was tried, and by what it says of others."""
+    """One group's rate by the trials in which the twin was tried, and by what it says of others."""
 
     counts: Confusion
     """What the twin said of the tried starts, against their outcomes."""
@@ -183,7 +183,9 @@ class _Assisted:
     overlap: StartOverlap
 
     def p_random(self) -> float:
-        return applicability(self.counts.said_success, self.counts.n, self.alone_k, self.alone_n)
+        return applicability(
+            self.counts.predicted_success, self.counts.n, self.alone_k, self.alone_n
+        )
 
     def rate(self) -> tuple[float, Interval | None]:
         self._check()
@@ -195,9 +197,9 @@ class _Assisted:
         counts = self.counts
         real = [True] * counts.true_positive + [False] * counts.false_positive
         real += [True] * counts.false_negative + [False] * counts.true_negative
-        said = [1.0] * counts.said_success + [0.0] * counts.said_failure
+        predicted = [1.0] * counts.predicted_success + [0.0] * counts.predicted_failure
         further = [1.0] * self.alone_k + [0.0] * (self.alone_n - self.alone_k)
-        estimate = ppi_plus_plus(real, said, further)
+        estimate = ppi_plus_plus(real, predicted, further)
         return estimate.value, estimate.interval
 
     def saved(self) -> float:
@@ -224,36 +226,38 @@ class _Assisted:
 def _assisted_rate(
     key: Key, paired: Sequence[TrialRow], alone: Sequence[TrialRow]
 ) -> list[Measurement]:
-    cell = _Assisted(
+    assisted = _Assisted(
         counts=confusion_of(paired, lambda row: row.sim_planned),
         alone_k=trials_in(row for row in alone if row.sim_planned),
         alone_n=trials_in(alone),
         overlap=StartOverlap(paired, alone),
     )
-    many = f"{cell.counts.n} trials with an outcome and {cell.alone_n} starts that only the "
+    many = (
+        f"{assisted.counts.n} trials with an outcome and {assisted.alone_n} starts that only the "
+    )
     many += "twin has"
 
     measurements = [
         measured(
             of_group(quantity, key, many=many),
             compute,
-            n=cell.counts.n,
+            n=assisted.counts.n,
             counted="trial",
             reason_without_interval="a count or a p-value",
             episodes=names_of(paired),
         )
         for quantity, compute in (
-            (PROXY_RATE, cell.rate),
-            (PROXY_RATE_PPI, cell.rate_ppi),
-            (TRIALS_SAVED, cell.saved),
-            (RANDOM_STARTS_P, cell.p_random),
+            (PROXY_RATE, assisted.rate),
+            (PROXY_RATE_PPI, assisted.rate_ppi),
+            (TRIALS_SAVED, assisted.saved),
+            (RANDOM_STARTS_P, assisted.p_random),
         )
     ]
-    return [*measurements, *cell.overlap.measurements(key)]
+    return [*measurements, *assisted.overlap.measurements(key)]
 
 
 def sequences(rows: Sequence[TrialRow], pairs: Sequence[StartPair]) -> list[Measurement]:
-    """Say what holds however often somebody looked: each cell's rate, and the paired gain."""
+    """Say what holds however often somebody looked: each group's rate, and the paired gain."""
     measurements = []
     for key, members in group_rows(rows).items():
         known = _in_order([row for row in members if row.recorded is not None])
@@ -293,7 +297,7 @@ def _sequence(key: Key, known: Sequence[TrialRow]) -> Measurement:
 
 
 def stopping_table(rows: Sequence[TrialRow], goal: float | None) -> tuple[Table, ...]:
-    """Say for each cell whether its recorded rate is settled against a goal; none without one."""
+    """Say for each group whether its recorded rate is settled against a goal; none without one."""
     if goal is None:
         return ()
     lines: list[tuple[Cell, ...]] = []
@@ -304,12 +308,11 @@ def stopping_table(rows: Sequence[TrialRow], goal: float | None) -> tuple[Table,
         try:
             sequence = sequence_of([bool(row.recorded) for row in known])
         except UndefinedStatisticError as error:
-            lines.append((task, condition, policy, len(known), None, error.reason, None))
+            lines.append((task, condition, policy, goal, len(known), *[None] * 5, error.reason))
             continue
         advice = stop_or_continue(sequence, goal)
-        ends = f"[{100 * sequence.low:.1f}, {100 * sequence.high:.1f}] %"
-        words = f"stop: {advice.answer} {100 * goal:g} %" if advice.stop else "continue"
-        lines.append((task, condition, policy, sequence.n, ends, words, advice.more_trials))
+        found = (sequence.low, sequence.high, advice.stop, advice.answer or None)
+        lines.append((task, condition, policy, goal, sequence.n, *found, advice.more_trials, None))
     return (
         Table(
             id="stopping",
@@ -318,10 +321,14 @@ def stopping_table(rows: Sequence[TrialRow], goal: float | None) -> tuple[Table,
                 "task",
                 "condition",
                 "policy",
+                "goal",
                 "trials",
-                "interval at any time",
-                "advice",
+                "low",
+                "high",
+                "stop",
+                "answer",
                 "more trials at this rate",
+                "why undefined",
             ),
             rows=tuple(lines),
             note="Betting confidence sequences at 95 %: the answer holds however often one looked.",
@@ -365,5 +372,5 @@ def _evidence(pairs: Sequence[StartPair]) -> Measurement:
         lambda: math.exp(min(MOST_LOG, capital_log(improved, improved + worsened, GOAL))),
         n=len(answers),
         counted="pair",
-        reason_without_interval="evidence, not an estimate",
+        reason_without_interval="an e-value (anytime-valid)",
     )

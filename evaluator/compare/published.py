@@ -23,10 +23,10 @@ from bridge.exchange.trials_rates import (
     printed_rate,
     read_rate,
 )
-from evaluator.compare.agreement import sides, usable_cells
-from evaluator.compare.notes import notes_table
+from evaluator.compare.agreement import sides, usable_groups
+from evaluator.compare.notes import with_notes
 from evaluator.compare.rates import compare_records
-from evaluator.compare.rows import Comparison, RateCell
+from evaluator.compare.rows import Comparison, RateGroup
 from evaluator.compare.success import WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Table
@@ -59,9 +59,12 @@ class Finding:
     """As a spreadsheet numbers it; None for what the table does not print."""
     what: str
     printed: str
-    recomputed: str
+    recomputed: float | None
+    """None where the rows give none, or several."""
     verdict: str
-    remark: str = ""
+    note: str = ""
+    instead: str = ""
+    """What stands in the place of a number that is not there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,14 +115,11 @@ def check_published(path: Path, *, method: str = "wilson") -> PublishedCheck:
         records.append(record)
         findings += [] if finding is None else [finding]
     comparison = compare_records(records, path, method=method)
-    cells = usable_cells(comparison.cells)
-    findings += [_judge(claim, cells, claims) for claim in claims]
-    findings += _not_printed(cells, claims)
-    about = [(f.what, f.remark) for f in findings if f.remark]
-    shown = [t for t in comparison.tables if t.id != "remarks"]
-    old = [t.rows for t in comparison.tables if t.id == "remarks"]
-    about += [(str(a), str(b)) for rows in old for a, b in rows]
-    tables = (_table(findings), *shown, *notes_table(about))
+    groups = usable_groups(comparison.groups)
+    findings += [_judge(claim, groups, claims) for claim in claims]
+    findings += _not_printed(groups, claims)
+    about = [(f.what, f.note) for f in findings if f.note]
+    tables = (_table(findings), *with_notes(comparison.tables, about))
     return PublishedCheck(comparison=replace(comparison, tables=tables), findings=tuple(findings))
 
 
@@ -133,14 +133,14 @@ def _claim(row: SourceRow) -> _Claim:
         value = Decimal("NaN")
     if not is_figure(value):
         raise row.refuse(f"printed is {row.text('printed')!r}", "Give a number")
-    said = row.text("side")
-    if said not in SIDES and (said or statistic in OF_ONE_SIDE):
-        raise row.refuse(f"side of {statistic} is {said!r}", f"Sides: {', '.join(SIDES)}")
+    side = row.text("side")
+    if side not in SIDES and (side or statistic in OF_ONE_SIDE):
+        raise row.refuse(f"side of {statistic} is {side!r}", f"Sides: {', '.join(SIDES)}")
     return _Claim(
         row=row,
         statistic=statistic,
         task=row.text("task"),
-        side="sim" if said == "sim" else "recorded",
+        side="sim" if side == "sim" else "recorded",
         condition=row.text("condition"),
         value=value,
         half=half_digit(value),
@@ -154,9 +154,9 @@ def _read(row: SourceRow) -> tuple[RateRecord, Finding | None]:
     try:
         return read_rate(row), None
     except ImpossibleRateError as error:
-        refusal, recomputed, verdict = error, f"{k}/{n}" if k else f"no count of {n}", IMPOSSIBLE
+        refusal, instead, verdict = error, f"{k}/{n}" if k else f"no count of {n}", IMPOSSIBLE
     except AmbiguousRateError as error:
-        refusal, recomputed, verdict = error, f"several counts of {n}", AMBIGUOUS
+        refusal, instead, verdict = error, f"several counts of {n}", AMBIGUOUS
     printed = printed_rate(row)
     if printed is None:
         raise refusal
@@ -165,9 +165,10 @@ def _read(row: SourceRow) -> tuple[RateRecord, Finding | None]:
         row=row.row,
         what=" ".join(name for name in names if name),
         printed=row.text("rate_percent") or row.text("rate"),
-        recomputed=recomputed,
+        recomputed=None,
         verdict=verdict,
-        remark=str(refusal).partition(f" row {row.row}: ")[2],
+        note=str(refusal).partition(f" row {row.row}: ")[2],
+        instead=instead,
     )
     return _as_printed(row, printed[0]), finding
 
@@ -186,38 +187,39 @@ def _as_printed(row: SourceRow, rate: Fraction) -> RateRecord:
     )
 
 
-def _judge(claim: _Claim, cells: Sequence[RateCell], claims: Sequence[_Claim]) -> Finding:
+def _judge(claim: _Claim, groups: Sequence[RateGroup], claims: Sequence[_Claim]) -> Finding:
     parts = (claim.statistic, claim.task, claim.side, claim.condition)
     what = " ".join(part for part in parts if part)
-    cells = [cell for cell in cells if claim.task in ("", cell.task)]
+    groups = [group for group in groups if claim.task in ("", group.task)]
     printed = str(claim.value)
     try:
-        value = _value(claim.statistic, claim.side, claim.condition, cells)
+        value = _value(claim.statistic, claim.side, claim.condition, groups)
     except UndefinedStatisticError as error:
         return Finding(
             row=claim.row.row,
             what=what,
             printed=printed,
-            recomputed=f"undefined: {error.reason}",
+            recomputed=None,
             verdict=UNDEFINED,
-            remark=f"printed {printed}, but the rows do not give it: {error.reason}",
+            instead=f"undefined: {error.reason}",
+            note=f"printed {printed}, but the rows do not give it: {error.reason}",
         )
     shown = f"{value:.4g}" if abs(value) < 1 else f"{value:.2f}"
     if _fits(value, claim):
-        verdict, remark = AS_PRINTED, ""
+        verdict, note = AS_PRINTED, ""
     else:
-        verdict, remark = DIFFERS, f"printed {printed}, the rows give {shown}"
+        verdict, note = DIFFERS, f"printed {printed}, the rows give {shown}"
         from_rounded = _from_rounded(claim, claims)
         if from_rounded is not None and _fits(from_rounded, claim):
             verdict = ROUNDED
-            remark = f"{printed} comes from the rounded averages; unrounded it is {shown}"
+            note = f"{printed} comes from the rounded averages; unrounded it is {shown}"
     return Finding(
         row=claim.row.row,
         what=what,
         printed=printed,
-        recomputed=shown,
+        recomputed=value,
         verdict=verdict,
-        remark=remark,
+        note=note,
     )
 
 
@@ -225,15 +227,15 @@ def _fits(value: float, claim: _Claim) -> bool:
     return abs(Fraction(value) - Fraction(claim.value)) <= claim.half + Fraction(1, 10**9)
 
 
-def _value(statistic: str, side: str, condition: str, cells: Sequence[RateCell]) -> float:
-    """Recompute one statistic from the cells, over one condition or all."""
-    chosen = [cell for cell in cells if condition in ("", cell.condition)]
+def _value(statistic: str, side: str, condition: str, groups: Sequence[RateGroup]) -> float:
+    """Recompute one statistic from the groups, over one condition or all."""
+    chosen = [group for group in groups if condition in ("", group.condition)]
     recorded, sim = sides(chosen)
     if statistic == "average_percent":
         return 100 * mean_rate(sim if side == "sim" else recorded)
     if statistic in ("gain_pp", "gain_relative_percent"):
-        before = _value("average_percent", side, WITHOUT, cells)
-        after = _value("average_percent", side, WITH, cells)
+        before = _value("average_percent", side, WITHOUT, groups)
+        after = _value("average_percent", side, WITH, groups)
         return after - before if statistic == "gain_pp" else 100 * relative_gain(before, after)
     if statistic == "pearson_r":
         return pearson(recorded, sim)
@@ -261,26 +263,28 @@ def _from_rounded(claim: _Claim, claims: Sequence[_Claim]) -> float | None:
     return 100 * relative_gain(before, after)
 
 
-def _not_printed(cells: Sequence[RateCell], claims: Sequence[_Claim]) -> list[Finding]:
+def _not_printed(groups: Sequence[RateGroup], claims: Sequence[_Claim]) -> list[Finding]:
     """The correlation that a success table of both sides invites, where it is not printed."""
     printed = {claim.condition for claim in claims if claim.statistic == "pearson_r"}
-    conditions = [*dict.fromkeys(cell.condition for cell in cells), ""]
+    conditions = [*dict.fromkeys(group.condition for group in groups), ""]
     findings = []
     for condition in conditions:
         if condition in printed:
             continue
+        value, instead = None, ""
         try:
-            shown = f"{_value('pearson_r', '', condition, cells):.3f}"
+            value = _value("pearson_r", "", condition, groups)
         except UndefinedStatisticError as error:
-            shown = f"undefined: {error.reason}"
-        num = sum(condition in ("", cell.condition) for cell in cells)
+            instead = f"undefined: {error.reason}"
+        num = sum(condition in ("", group.condition) for group in groups)
         findings.append(
             Finding(
                 row=None,
-                what=f"pearson_r {condition or 'all cells'} (n = {num})",
+                what=f"pearson_r {condition or 'all groups'} (n = {num})",
                 printed="",
-                recomputed=shown,
+                recomputed=value,
                 verdict=NOT_PRINTED,
+                instead=instead,
             )
         )
     return findings
@@ -290,9 +294,12 @@ def _table(findings: Sequence[Finding]) -> Table:
     return Table(
         id="published",
         title="Printed figures, recomputed from the table's own rows",
-        columns=("row", "figure", "printed", "recomputed", "verdict", "remark"),
+        columns=("row", "figure", "printed", "recomputed", "instead", "verdict", "note"),
         rows=tuple(
-            (f.row, f.what, f.printed or None, f.recomputed, f.verdict, f.remark or None)
+            (
+                *(f.row, f.what, f.printed or None, f.recomputed, f.instead or None),
+                *(f.verdict, f.note or None),
+            )
             for f in findings
         ),
         note="A figure fits when it rounds to what is printed. Ambiguous: several counts round to "

@@ -6,12 +6,12 @@ from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
 from bridge.exchange.trials_rates import RateRecord, read_rates
-from evaluator.compare.agreement import agreement_intervals, cell_agreement
+from evaluator.compare.agreement import agreement_intervals, group_agreement
 from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import gain_tests, replanning_gains
 from evaluator.compare.measure import refuse_alike, vouched_rate
 from evaluator.compare.notes import notes, notes_table
-from evaluator.compare.rows import Comparison, RateCell
+from evaluator.compare.rows import Comparison, RateGroup
 from evaluator.compare.success import WITH, averages
 from evaluator.compare.tables import gains_table, layout_table, success_table
 from evaluator.measurements import RATE_AS_GIVEN
@@ -19,10 +19,10 @@ from evaluator.result import Exclusion, Measurement
 
 
 def compare_rates(path: Path, *, method: str = "wilson") -> Comparison:
-    """Compare printed rates: r over cells, gains, intervals where n is known.
+    """Compare printed rates: r over groups, gains, intervals where n is known.
 
     Raises:
-        TableError: Naming the row that cannot be believed.
+        TableError: Naming the row that contradicts itself.
     """
     return compare_records(read_rates(path), path, method=method)
 
@@ -40,31 +40,31 @@ def compare_records(
     sides = {record.side for record in records}
     # Rates of the twin alone say nothing of where the others would come from.
     stand_in = True if "stand-in" in sides else (False if "real" in sides else None)
-    cells, left_out = _rate_cells(records, method)
+    groups, left_out = _rate_groups(records, method)
     word = Comparison(run=path.stem, source="rates", stand_in=stand_in).recorded_word
-    gains = replanning_gains(cells, method=method)
-    chosen, decision_tables = decisions(cells)
+    gains = replanning_gains(groups, method=method)
+    chosen, decision_tables = decisions(groups)
     measurements = (
-        *(side for cell in cells for side in (cell.recorded, cell.sim)),
-        *averages(cells, method=method),
-        *cell_agreement(cells),
+        *(side for group in groups for side in (group.recorded, group.sim)),
+        *averages(groups, method=method),
+        *group_agreement(groups),
         *gains,
-        *gain_tests(cells),
+        *gain_tests(groups),
         *chosen,
     )
     return Comparison(
         run=path.stem,
         source="rates",
         stand_in=stand_in,
-        cells=cells,
+        groups=groups,
         measurements=measurements,
         tables=(
-            success_table(cells, word, "Rates as given."),
-            *layout_table(cells, measurements, word),
+            success_table(groups, word, "Rates as given."),
+            *layout_table(groups, measurements, word),
             *gains_table(gains, word),
-            *agreement_intervals(cells),
+            *agreement_intervals(groups),
             *decision_tables,
-            *notes_table(notes(cells, measurements)),
+            *notes_table(notes(groups, measurements)),
         ),
         exclusions=tuple(left_out),
         missing=("trial-level agreement: a table of rates does not say which trial succeeded",),
@@ -72,13 +72,13 @@ def compare_records(
     )
 
 
-def _rate_cells(
+def _rate_groups(
     records: Sequence[RateRecord], method: str
-) -> tuple[tuple[RateCell, ...], list[Exclusion]]:
+) -> tuple[tuple[RateGroup, ...], list[Exclusion]]:
     keys = list(dict.fromkeys((r.task, r.condition, r.unit) for r in records))
     tasks = list(dict.fromkeys(record.task for record in records))
     keys.sort(key=lambda key: (tasks.index(key[0]), key[1] == WITH))
-    cells, left_out = [], []
+    groups, left_out = [], []
     for task, condition, unit in keys:
         sides: dict[str, RateRecord] = {
             "sim" if r.side == "sim" else "recorded": r
@@ -88,9 +88,9 @@ def _rate_cells(
         for side in ("sim", "recorded"):
             if side not in sides:
                 reason = f"{task} {condition}: no {side} rate"
-                left_out.append(Exclusion(episode=task, scope="agreement of cells", reason=reason))
-        cells.append(
-            RateCell(
+                left_out.append(Exclusion(episode=task, scope="agreement of groups", reason=reason))
+        groups.append(
+            RateGroup(
                 task=task,
                 condition=condition,
                 policy="",
@@ -101,7 +101,7 @@ def _rate_cells(
                 sim_rate=_fraction(sides.get("sim")),
             )
         )
-    return tuple(cells), left_out
+    return tuple(groups), left_out
 
 
 def _fraction(record: RateRecord | None) -> Fraction | None:

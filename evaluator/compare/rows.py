@@ -65,7 +65,7 @@ class TrialRow:
     sim_planned: bool | None = None
     """Headline sim: the sent plan, planned trajectory, dynamic, in the twin."""
     sim_executed: bool | None = None
-    """Diagnosis only: the executed joints re-lived dynamically. Never enters r."""
+    """Diagnosis only: the executed joints replayed dynamically. Never enters r."""
     verdict: bool | None = None
     """The gate's verdict on the sent plan, made before its execution started."""
     p_success: float | None = None
@@ -115,7 +115,7 @@ def is_streamed(rows: Iterable[TrialRow]) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RateCell:
+class RateGroup:
     """Success rates of one task, condition and policy, recorded and in the twin."""
 
     task: str
@@ -159,7 +159,7 @@ class Comparison:
     """run, trials, rates or images."""
     stand_in: bool | None
     rows: tuple[TrialRow, ...] = ()
-    cells: tuple[RateCell, ...] = ()
+    groups: tuple[RateGroup, ...] = ()
     measurements: tuple[Measurement, ...] = ()
     tables: tuple[Table, ...] = ()
     exclusions: tuple[Exclusion, ...] = ()

@@ -76,7 +76,7 @@ def compare_run(
     parts = (
         motion_results(summaries.motions),
         state_results(summaries.states),
-        label_results(summaries.witnesses, rows, method=method),
+        label_results(summaries.perceived, rows, method=method),
         views,
         methods,
         bands,

@@ -53,7 +53,7 @@ def imported_rows(
     """Read the run's imported trials; one that was recorded too is left out and named.
 
     Raises:
-        TableError: When somebody has changed the file so that a row cannot be believed.
+        TableError: When somebody has changed the file so that a row contradicts itself.
     """
     path = trials_path(run)
     if not path.is_file():
@@ -82,7 +82,7 @@ def compare_csv(path: Path, *, method: str = "wilson", goal: float | None = None
     ``eval_results.csv`` of PolaRiS, ``eval_info.json`` of LeRobot, and a folder of SIMPLER videos.
 
     Raises:
-        TableError: Naming the row that cannot be believed.
+        TableError: Naming the row that contradicts itself.
         UsageError: When it is none of these.
     """
     found = _compare(path, method, goal)
@@ -159,11 +159,11 @@ def _from_benchmark(
     """Enter outcomes of closed-loop rollouts on the sim side, and say what they are."""
     rows = [row_from_record(record) for record in records]
     base = compare_rows(rows, run=path.stem, source="trials", stand_in=None, method=method)
-    remark = (
+    note = (
         f"{name} results are rollouts of a policy in that simulator, entered on the sim side: no "
         "plan was sent and nothing was replayed. Add real trials of the same starts to compare"
     )
-    base = replace(base, tables=with_notes(base.tables, [(name, remark)]))
+    base = replace(base, tables=with_notes(base.tables, [(name, note)]))
     return _with_source(base, path, ())
 
 

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 
 from evaluator.compare.known_task import known_task
-from evaluator.compare.measure import proportion
+from evaluator.compare.measure import RATE_COLUMNS, proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.measurements import STAGE
-from evaluator.result import Exclusion, Measurement, Table
+from evaluator.result import Cell, Exclusion, Measurement, Table
 from evaluator.statistics.funnel import (
     CurvePoint,
-    Stage,
+    StageCount,
     failure_taxonomy,
     funnel,
     success_curve,
@@ -45,7 +45,7 @@ def stage_results(
     measurements: list[Measurement] = []
     left_out: list[Exclusion] = []
     funnel_rows: list[tuple[str | int | None, ...]] = []
-    curve_rows: list[tuple[str | int, ...]] = []
+    curve_rows: list[tuple[Cell, ...]] = []
     for (task, condition), trials in groups.items():
         names = [name for name, _ in trials[0][1]]
         alike = [trial for trial in trials if [name for name, _ in trial[1]] == names]
@@ -68,14 +68,12 @@ def stage_results(
         ]
         curves = (("trials so far", _survival(found)), *_objects(task, names, ended))
         curve_rows += [
-            (task, words, counted, p.step, p.done, p.n, _band(p))
-            for counted, points in curves
-            for p in points
+            (task, words, counted, p.step, *_band(p)) for counted, points in curves for p in points
         ]
     return measurements, _tables(funnel_rows, curve_rows), left_out
 
 
-def _measure(task: str, condition: str, stage: Stage, episodes: list[str]) -> Measurement:
+def _measure(task: str, condition: str, stage: StageCount, episodes: list[str]) -> Measurement:
     return proportion(
         STAGE.of(task=task, condition=condition, stage=stage.name),
         stage.passed,
@@ -86,7 +84,7 @@ def _measure(task: str, condition: str, stage: Stage, episodes: list[str]) -> Me
     )
 
 
-def _survival(stages: Sequence[Stage]) -> list[CurvePoint]:
+def _survival(stages: Sequence[StageCount]) -> list[CurvePoint]:
     """Trials in which every control step up to this one succeeded; a stage is a control step.
 
     Trials whose ending is unknown somewhere on the way cannot be counted as either.
@@ -123,17 +121,17 @@ def _objects(
     return (("objects", success_curve(done_at, len(names))),) if done_at else ()
 
 
-def _band(point: CurvePoint) -> str:
+def _band(point: CurvePoint) -> tuple[Cell, ...]:
     if not point.n:
-        return "undefined: no trial with a known ending"
+        return (point.done, 0, None, None, None, None)
     interval = wilson(point.done, point.n)
-    rate = 100 * point.done / point.n
-    return f"{rate:.1f} % [{100 * interval.low:.1f}, {100 * interval.high:.1f}]"
+    rate = point.done / point.n
+    return (point.done, point.n, rate, interval.low, interval.high, interval.method)
 
 
 def _tables(
     funnel_rows: Sequence[tuple[str | int | None, ...]],
-    curve_rows: Sequence[tuple[str | int, ...]],
+    curve_rows: Sequence[tuple[Cell, ...]],
 ) -> tuple[Table, ...]:
     if not funnel_rows:
         return ()
@@ -149,7 +147,7 @@ def _tables(
         Table(
             id="success_curve",
             title="Success over control steps",
-            columns=("task", "condition", "counted", "control step", "succeeded", "of", "rate"),
+            columns=("task", "condition", "counted", "control step", *RATE_COLUMNS),
             rows=tuple(curve_rows),
             note="Trials so far: every control step up to this one succeeded. Objects: released "
             "where they belong up to this step, whatever happened to the others; those of which "

@@ -13,14 +13,14 @@ from evaluator.compare.known_task import known_task
 from evaluator.compare.measure import (
     Part,
     degrees,
+    ends,
     interval_or_reason,
     measured,
-    millimetre_ends,
     millimetres,
 )
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import STATES, Defined
-from evaluator.metrics.state import extents_apart_m, turn_between_rad, turns_alike
+from evaluator.metrics.state import extents_difference_m, turn_between_rad, turns_alike
 from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.run_reader.object_states import (
     ObjectState,
@@ -119,7 +119,7 @@ def summarise_states(
             )
             if first is None or second is None:
                 continue
-            position, rotation, extents, reason = _apart(first, second, model)
+            position, rotation, extents, reason = _differences(first, second, model)
             found.append(
                 StateSummary(
                     episode=info.id,
@@ -141,7 +141,7 @@ def summarise_states(
     return tuple(found)
 
 
-def _apart(
+def _differences(
     first: ObjectState, second: ObjectState, model: ObjectModel | None
 ) -> tuple[float | None, float | None, float | None, str | None]:
     """Return position, rotation and extents, as far as both sides know them, or why not."""
@@ -153,7 +153,7 @@ def _apart(
     if model is not None:
         rotation = turn_between_rad(T_first[:3, :3], T_second[:3, :3], turns_alike(model))
     if first.extents_m is not None and second.extents_m is not None:
-        extents = extents_apart_m(first.extents_m, second.extents_m)
+        extents = extents_difference_m(first.extents_m, second.extents_m)
     return float(np.linalg.norm(middle_first - middle_second)), rotation, extents, None
 
 
@@ -198,7 +198,7 @@ def final_table(keys: Sequence[Group], by_id: dict[str, Measurement]) -> Table:
                 key[1],
                 position.n,
                 millimetres(position.value),
-                millimetre_ends(position.interval),
+                *(millimetres(end) for end in ends(position.interval)),
                 millimetres(by_id[_defined(key, "position", "mean").id].value),
                 None if rotation is None else degrees(rotation.value),
                 None if extents is None else millimetres(extents.value),
@@ -214,7 +214,8 @@ def final_table(keys: Sequence[Group], by_id: dict[str, Measurement]) -> Table:
             "against",
             "objects",
             "median distance (mm)",
-            "interval (mm)",
+            "low (mm)",
+            "high (mm)",
             "mean distance (mm)",
             "median rotation (deg)",
             "median extents (mm)",

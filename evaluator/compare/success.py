@@ -6,7 +6,7 @@ from fractions import Fraction
 from bridge.episode.metadata import WITH as WITH
 from bridge.episode.metadata import WITHOUT as WITHOUT
 from evaluator.compare.measure import measured, proportion
-from evaluator.compare.rows import RateCell, TrialRow
+from evaluator.compare.rows import RateGroup, TrialRow
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import (
     AVERAGE_MACRO,
@@ -21,7 +21,7 @@ from evaluator.measurements import (
     Quantity,
 )
 from evaluator.result import Cell, Measurement, Table
-from evaluator.statistics.agreement import counted_cells, mean_rate
+from evaluator.statistics.agreement import counted_groups, mean_rate
 
 Key = tuple[str, str, str]
 """Task, condition, policy."""
@@ -77,7 +77,7 @@ def answered(
 
 
 def side_rates(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Measurement]:
-    """Measure every side of every cell, counted in trials; object counts beside them."""
+    """Measure every side of every group, counted in trials; object counts beside them."""
     measurements = []
     for key, members in group_rows(rows).items():
         for side, answer in SIDES.items():
@@ -134,12 +134,12 @@ def never_sent(rows: Sequence[TrialRow]) -> list[Measurement]:
     ]
 
 
-def rate_cells(
+def rate_groups(
     rows: Sequence[TrialRow], rates: Sequence[Measurement], *, method: str = "wilson"
-) -> tuple[RateCell, ...]:
-    """Lay the recorded and the headline sim rate of each cell side by side."""
+) -> tuple[RateGroup, ...]:
+    """Lay the recorded and the headline sim rate of each group side by side."""
     by_id = {measurement.id: measurement for measurement in rates}
-    cells = []
+    groups = []
     for key, members in group_rows(rows).items():
         both = [r for r in members if r.recorded is not None and r.sim_planned is not None]
         recorded_common, sim_common = (
@@ -152,8 +152,8 @@ def rate_cells(
             )
             for side, common in RATES_IN_COMMON.items()
         )
-        cells.append(
-            RateCell(
+        groups.append(
+            RateGroup(
                 task=key[0],
                 condition=key[1],
                 policy=key[2],
@@ -168,7 +168,7 @@ def rate_cells(
                 trial_table=_trial_table(both) if both else None,
             )
         )
-    return tuple(cells)
+    return tuple(groups)
 
 
 def fraction_of(measurement: Measurement) -> Fraction | None:
@@ -187,15 +187,15 @@ def _trial_table(both: Sequence[TrialRow]) -> tuple[int, int, int, int]:
     return table[0], table[1], table[2], table[3]
 
 
-def averages(cells: Sequence[RateCell], *, method: str = "wilson") -> list[Measurement]:
-    """Average over cells of a condition: macro (cells alike) and pooled (trials alike)."""
+def averages(groups: Sequence[RateGroup], *, method: str = "wilson") -> list[Measurement]:
+    """Average over groups of a condition: macro (groups alike) and pooled (trials alike)."""
     measurements = []
-    for condition in dict.fromkeys(cell.condition for cell in cells):
-        members = [cell for cell in cells if cell.condition == condition]
+    for condition in dict.fromkeys(group.condition for group in groups):
+        members = [group for group in groups if group.condition == condition]
         if len(members) < 2:
             continue
         for side in ("recorded", "sim_planned"):
-            rates = [cell.recorded if side == "recorded" else cell.sim for cell in members]
+            rates = [group.recorded if side == "recorded" else group.sim for group in members]
             measurements += _averages(side, condition, members, rates, method)
     return measurements
 
@@ -203,15 +203,15 @@ def averages(cells: Sequence[RateCell], *, method: str = "wilson") -> list[Measu
 def _averages(
     side: str,
     condition: str,
-    members: Sequence[RateCell],
+    members: Sequence[RateGroup],
     rates: Sequence[Measurement],
     method: str,
 ) -> list[Measurement]:
-    units = sorted({cell.unit for cell in members})
-    over = counted_cells(len(members))
+    units = sorted({group.unit for group in members})
+    over = counted_groups(len(members))
     countable = len(units) == 1 and all(rate.k is not None and rate.n for rate in rates)
-    why = f"cells are counted in different units ({', '.join(units)})"
-    why = why if len(units) > 1 else "the number of trials of a cell is not known"
+    why = f"groups are counted in different units ({', '.join(units)})"
+    why = why if len(units) > 1 else "the number of trials of a group is not known"
     words = {"side": side, "condition": condition, "over": over}
     episodes = [episode for rate in rates for episode in rate.episodes]
     return [
@@ -219,8 +219,8 @@ def _averages(
             AVERAGE_MACRO.of(**words),
             lambda: _macro(rates),
             n=len(members),
-            counted="cell",
-            reason_without_interval="the cells are these, not a sample of others",
+            counted="group",
+            reason_without_interval="the groups are these, not a sample of others",
             episodes=episodes,
         ),
         proportion(
@@ -322,10 +322,12 @@ def _line(
     task, condition, policy = key
     return (
         task,
-        condition.replace("_", " "),
+        condition,
         policy,
-        f"{_nominal(rows)}/{decided}",
-        f"{100 * (again.value or 0.0):.1f} % (n = {len(rows)})",
+        _nominal(rows),
+        decided,
+        again.value,
+        len(rows),
         None if gap.value is None else round(gap.value, 1),
     )
 
@@ -334,7 +336,10 @@ def _table(lines: Sequence[tuple[Cell, ...]]) -> Table:
     return Table(
         id="sim_varied",
         title="Sim estimated again with fresh seeds",
-        columns=("task", "condition", "policy", "sim", "sim, fresh seeds", "difference (pp)"),
+        columns=(
+            *("task", "condition", "policy", "sim k", "sim n"),
+            *("rate with fresh seeds", "trials with fresh seeds", "difference (pp)"),
+        ),
         rows=tuple(lines),
         note="sim: nominal planned replays of the plans sent, in trials that have varied replays. "
         "Fresh seeds: the share of each plan's varied replays that succeed, averaged over trials; "

@@ -39,7 +39,7 @@ class Summaries:
 
     motions: tuple[MotionSummary, ...] = ()
     states: tuple[StateSummary, ...] = ()
-    witnesses: tuple[PerceivedOutcome, ...] = ()
+    perceived: tuple[PerceivedOutcome, ...] = ()
     left_out: tuple[Exclusion, ...] = ()
     """Trials of which something could not be read."""
 
@@ -136,7 +136,7 @@ def sum_up(
     return Summaries(
         motions=_in_order(found[MotionSummary], trials),
         states=_in_order(found[StateSummary], trials),
-        witnesses=_in_order(found[PerceivedOutcome], trials),
+        perceived=_in_order(found[PerceivedOutcome], trials),
         left_out=tuple(left_out),
     )
 
@@ -169,7 +169,7 @@ def _states(files: _Files) -> tuple[StateSummary, ...]:
     return summarise_states(files.recorded, files.replays, files.localised, plan_id=files.plan_id)
 
 
-def _witness(files: _Files) -> tuple[PerceivedOutcome, ...]:
+def _perceived(files: _Files) -> tuple[PerceivedOutcome, ...]:
     if files.localised is None:
         return ()
     found = perceive_outcome(files.recorded, files.localised, plan_id=files.plan_id)
@@ -198,5 +198,5 @@ def _task_sha256(name: str) -> str:
 PARTS = (
     _Part(kind=MotionSummary, scope="motion", make=_motions, key=_replays_key),
     _Part(kind=StateSummary, scope="final states", make=_states, key=_states_key),
-    _Part(kind=PerceivedOutcome, scope="label", make=_witness, key=_localised_key),
+    _Part(kind=PerceivedOutcome, scope="label", make=_perceived, key=_localised_key),
 )

@@ -1,25 +1,22 @@
-"""The tables of a report, as plain rows; rounding and colours are left to the report."""
+"""The tables of a report as plain rows of numbers; the text made of them is left to the report."""
 
 from collections.abc import Sequence
 
 from evaluator.compare.gate import confusion_of, heeded_verdict, unheeded_verdict
-from evaluator.compare.rows import RateCell, TrialRow
+from evaluator.compare.measure import RATE_COLUMNS, ends, rate_row
+from evaluator.compare.rows import RateGroup, TrialRow
 from evaluator.compare.success import WITH, WITHOUT
-from evaluator.result import Measurement, Table
+from evaluator.measurements import (
+    AVERAGE_MACRO,
+    AVERAGE_POOLED,
+    GAIN_POINTS,
+    GAIN_POINTS_AVERAGE,
+    GAIN_RELATIVE,
+    GAIN_RELATIVE_AVERAGE,
+)
+from evaluator.result import Cell, Measurement, Table
 
-
-def shown_rate(measurement: Measurement) -> str:
-    """Write a rate with its count and interval: ``4/5 = 80.0 % [37.6, 96.4]``."""
-    if measurement.value is None:
-        return f"undefined: {measurement.reason_if_undefined}"
-    percent = f"{100 * measurement.value:.1f} %"
-    if measurement.k is None or measurement.n is None:
-        return f"{percent} (no n)"
-    text = f"{measurement.k}/{measurement.n} = {percent}"
-    if measurement.interval is not None:
-        low, high = 100 * measurement.interval.low, 100 * measurement.interval.high
-        text += f" [{low:.1f}, {high:.1f}]"
-    return text
+MEAN_OF_TASKS = "mean of tasks"
 
 
 SIM_NOTE = (
@@ -44,66 +41,84 @@ def _brackets(shown: Sequence[Measurement]) -> str:
     """Name the intervals that stand in brackets, and say that some are left out if they are."""
     found = [m.interval.method for m in shown if m.interval is not None]
     names = " and ".join(METHOD_NAMES.get(name, name) for name in dict.fromkeys(found))
-    said = f"Brackets: 95 % {names} intervals." if found else "There are no intervals."
+    text = f"Brackets: 95 % {names} intervals." if found else "There are no intervals."
     if any("; use " in (m.reason_without_interval or "") for m in shown):
-        said += " One that would cover too little is left out; measurements say which to use."
-    return said
+        text += " One that would cover too little is left out; measurements say which to use."
+    return text
 
 
-def success_table(cells: Sequence[RateCell], word: str, sim_note: str = SIM_NOTE) -> Table:
+def success_table(groups: Sequence[RateGroup], word: str, sim_note: str = SIM_NOTE) -> Table:
     """Success without and with replanning, in the twin and recorded."""
-    shown = [side for cell in cells for side in (cell.sim, cell.recorded)]
+    shown = [side for group in groups for side in (group.sim, group.recorded)]
     rows = tuple(
         (
-            cell.task,
-            cell.condition.replace("_", " "),
-            cell.policy,
-            cell.unit,
-            shown_rate(cell.sim),
-            shown_rate(cell.recorded),
-            _gap(cell),
+            group.task,
+            group.condition,
+            group.policy,
+            side,
+            group.unit,
+            *rate_row(rate),
+            _gap(group),
+            rate.reason_if_undefined,
         )
-        for cell in cells
+        for group in groups
+        for side, rate in (("sim", group.sim), (word, group.recorded))
     )
     return Table(
         id="success",
         title="Success",
-        columns=("task", "condition", "policy", "unit", "sim", word, f"sim - {word} (pp)"),
+        columns=(
+            *("task", "condition", "policy", "side", "unit"),
+            *(*RATE_COLUMNS, f"sim - {word} (pp)", "why undefined"),
+        ),
         rows=rows,
         note=f"{sim_note} {_brackets(shown)} The difference is over trials where both sides are "
         "known.",
     )
 
 
-def _gap(cell: RateCell) -> float | None:
-    if cell.sim_rate is None or cell.recorded_rate is None:
+def _gap(group: RateGroup) -> float | None:
+    if group.sim_rate is None or group.recorded_rate is None:
         return None
-    return round(float(100 * (cell.sim_rate - cell.recorded_rate)), 1)
+    return round(float(100 * (group.sim_rate - group.recorded_rate)), 1)
 
 
 def gains_table(gains: Sequence[Measurement], word: str) -> tuple[Table, ...]:
     """The replanning gain: percentage points and relative gain are two columns; none without."""
-    points = [m for m in gains if m.id.startswith("gain.pp.")]
-    relative = {m.id: m for m in gains if m.id.startswith("gain.relative.")}
-    if not points:
+    if not gains:
         return ()
-    rows = []
-    for gain in points:
-        side, name = gain.id.split(".", 3)[2:]
-        rows.append(
-            (
-                "mean of tasks"
-                if name == "average"
-                else name.removesuffix(".-").replace(".", ", "),
-                word if side == "recorded" else "sim",
-                _points(gain),
-                _relative(relative[gain.id.replace("gain.pp.", "gain.relative.")]),
-            )
+    by_id = {gain.id: gain for gain in gains}
+    found = []
+    for gain in gains:
+        for points, relative in (
+            (GAIN_POINTS, GAIN_RELATIVE),
+            (GAIN_POINTS_AVERAGE, GAIN_RELATIVE_AVERAGE),
+        ):
+            if parts := points.pattern.fullmatch(gain.id):
+                named = parts.groupdict()
+                found.append((named, gain, by_id[relative.id.format(**named)]))
+                break
+    rows = [
+        (
+            named.get("task", MEAN_OF_TASKS),
+            named.get("policy", "").removesuffix("-"),
+            word if named["side"] == "recorded" else "sim",
+            gain.value,
+            *ends(gain.interval),
+            None if gain.interval is None else gain.interval.method,
+            relative.value,
+            gain.reason_if_undefined or relative.reason_if_undefined,
         )
+        for named, gain, relative in found
+    ]
+    points = [gain for _, gain, _ in found]
     table = Table(
         id="gains",
         title="Gain with replanning",
-        columns=("task", "side", "percentage points", "relative gain"),
+        columns=(
+            *("task", "policy", "side", "gain (pp)", "low", "high", "interval"),
+            *("relative gain", "why undefined"),
+        ),
         rows=tuple(rows),
         note=f"Two different numbers. {_brackets(points)} Groups count as unpaired; an interval "
         "that reaches below 0 does not show a gain.",
@@ -112,29 +127,29 @@ def gains_table(gains: Sequence[Measurement], word: str) -> tuple[Table, ...]:
 
 
 def layout_table(
-    cells: Sequence[RateCell], measurements: Sequence[Measurement], word: str
+    groups: Sequence[RateGroup], measurements: Sequence[Measurement], word: str
 ) -> tuple[Table, ...]:
     """Lay rates out as papers print them: a row per task, sim and recorded without and with."""
-    conditions = [name for name in (WITHOUT, WITH) if any(c.condition == name for c in cells)]
+    conditions = [name for name in (WITHOUT, WITH) if any(c.condition == name for c in groups)]
     if len(conditions) < 2:
         return ()
-    found = {(c.task, c.policy, c.condition): c for c in cells}
+    found = {(c.task, c.policy, c.condition): c for c in groups}
     rows = []
-    for task, policy in dict.fromkeys((c.task, c.policy) for c in cells):
-        line: list[str | None] = [task, policy]
+    for task, policy in dict.fromkeys((c.task, c.policy) for c in groups):
+        line: list[Cell] = [task, policy]
         for condition in conditions:
-            cell = found.get((task, policy, condition))
-            line += [_percent(cell.sim), _percent(cell.recorded)] if cell else [None, None]
+            group = found.get((task, policy, condition))
+            line += [group.sim.value, group.recorded.value] if group else [None, None]
         rows.append(tuple(line))
     by_id = {measurement.id: measurement for measurement in measurements}
-    for kind in ("macro", "pooled"):
+    for kind, average in (("macro", AVERAGE_MACRO), ("pooled", AVERAGE_POOLED)):
         ids = [
-            f"average.{kind}.{side}.{condition}"
+            average.of(side=side, condition=condition, over="", unit="").id
             for condition in conditions
             for side in ("sim_planned", "recorded")
         ]
         if all(name in by_id for name in ids):
-            rows.append((f"average, {kind}", "", *(_percent(by_id[name]) for name in ids)))
+            rows.append((f"average, {kind}", "", *(by_id[name].value for name in ids)))
     columns = [
         f"{side}, {condition.replace('_', ' ')}"
         for condition in conditions
@@ -146,29 +161,10 @@ def layout_table(
             title="Success without and with replanning",
             columns=("task", "policy", *columns),
             rows=tuple(rows),
-            note="Percent. Macro: every task counts the same. Pooled: every trial counts the same; "
+            note="Macro: every task counts the same. Pooled: every trial counts the same; "
             "undefined where tasks are counted in different units.",
         ),
     )
-
-
-def _percent(measurement: Measurement) -> str:
-    return "undefined" if measurement.value is None else f"{100 * measurement.value:.1f} %"
-
-
-def _points(gain: Measurement) -> str:
-    if gain.value is None:
-        return f"undefined: {gain.reason_if_undefined}"
-    text = f"{gain.value:+.1f} pp"
-    if gain.interval is not None:
-        text += f" [{gain.interval.low:+.1f}, {gain.interval.high:+.1f}]"
-    return text
-
-
-def _relative(gain: Measurement) -> str:
-    if gain.value is None:
-        return f"undefined: {gain.reason_if_undefined}"
-    return f"{100 * gain.value:+.1f} %"
 
 
 def trials_table(rows: Sequence[TrialRow], word: str) -> Table:
@@ -213,14 +209,14 @@ def trials_table(rows: Sequence[TrialRow], word: str) -> Table:
 def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
     """What the twin said against what happened, counted over trials."""
     lines = []
-    for name, said in (
+    for name, answer_of in (
         ("sim planned", lambda row: row.sim_planned),
         ("verdict before motion", lambda row: row.verdict),
         ("verdict, not obeyed (without replanning)", unheeded_verdict),
         ("verdict, obeyed (with replanning)", heeded_verdict),
         ("sim executed (diagnosis)", lambda row: row.sim_executed),
     ):
-        counts = confusion_of(rows, said)
+        counts = confusion_of(rows, answer_of)
         lines.append(
             (
                 name,
@@ -233,20 +229,20 @@ def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
         )
     return Table(
         id="confusion",
-        title="What the twin said, and what happened",
+        title="Prediction of the twin against the outcome",
         columns=(
             "twin",
-            f"said success, {word} success",
-            f"said success, {word} failure",
-            f"said failure, {word} success",
-            f"said failure, {word} failure",
+            f"predicted success, {word} success",
+            f"predicted success, {word} failure",
+            f"predicted failure, {word} success",
+            f"predicted failure, {word} failure",
             "trials",
         ),
         rows=tuple(lines),
-        note="Trials with a known outcome in which a plan was executed. Said failure by a verdict "
-        "before motion: the gate refused the plan and it was executed anyway, because its answer "
-        "was only recorded. With replanning refused plans are not executed, so the gate's misses "
-        "there show and its false refusals cannot.",
+        note="Trials with a known outcome in which a plan was executed. A verdict before motion that "
+        "predicted failure refused the plan; it was executed anyway, because the answer was only "
+        "recorded. With replanning refused plans are not executed, so the gate's misses there show "
+        "and its false refusals cannot.",
     )
 
 

@@ -47,7 +47,7 @@ def outcome_word(trial: LiveTrial) -> str:
 
 
 def label(task: str, condition: str, policy: str) -> str:
-    """Return a cell in a reader's words."""
+    """Return a group in a reader's words."""
     return ", ".join(part.replace("_", " ") for part in (task, condition, policy) if part)
 
 
@@ -76,7 +76,7 @@ def advice_words(advice: Advice | None, changed: str, stop: str) -> str:
 
 
 def rate_words(rate: RateSummary, goal: float | None) -> str:
-    """One cell's rate, its interval at any time, and what follows."""
+    """One group's rate, its interval at any time, and what follows."""
     percent = 0.0 if goal is None else 100 * goal
     answer = rate.advice.answer if rate.advice else ""
     words = advice_words(rate.advice, rate.changed, f"{answer} {percent:g} %")
@@ -103,16 +103,16 @@ def next_words(proposal: NextStart | None) -> str:
     if proposal is None:
         return "next: nothing, every question is settled"
     start = "a start not tried yet" if proposal.start_id is None else f"start {proposal.start_id}"
-    cell = label(proposal.task, proposal.condition, proposal.policy)
-    return f"next: {cell}, {start} ({proposal.reason})"
+    group = label(proposal.task, proposal.condition, proposal.policy)
+    return f"next: {group}, {start} ({proposal.reason})"
 
 
 def change_line(
-    change: Change, standing: SessionSummary, proposal: NextStart | None, goal: float | None
+    change: Change, summary: SessionSummary, proposal: NextStart | None, goal: float | None
 ) -> str:
     """Return the line of one trial."""
     trial = change.trial
-    rate, gain = standing.rate(trial.key), standing.gain(trial.task, trial.policy)
+    rate, gain = summary.rate(trial.key), summary.gain(trial.task, trial.policy)
     parts = [what_happened(change)]
     parts += [rate_words(rate, goal)] if rate is not None else []
     parts += [gain_words(gain)] if gain is not None else []
@@ -120,15 +120,15 @@ def change_line(
 
 
 def state_lines(
-    standing: SessionSummary, proposal: NextStart | None, goal: float | None
+    summary: SessionSummary, proposal: NextStart | None, goal: float | None
 ) -> list[str]:
-    """Everything that is known, one line for each cell and gain."""
-    if not standing.rates:
-        return [f"no trial with a known outcome yet ({standing.unknown} without)"]
-    lines = [rate_words(rate, goal) for rate in standing.rates]
-    lines += [gain_words(gain) for gain in standing.gains]
-    if standing.unknown:
-        lines.append(f"{standing.unknown} trials without a known outcome are part of nothing")
+    """Everything that is known, one line for each group and gain."""
+    if not summary.rates:
+        return [f"no trial with a known outcome yet ({summary.unknown} without)"]
+    lines = [rate_words(rate, goal) for rate in summary.rates]
+    lines += [gain_words(gain) for gain in summary.gains]
+    if summary.unknown:
+        lines.append(f"{summary.unknown} trials without a known outcome are part of nothing")
     return [*lines, next_words(proposal)]
 
 
@@ -138,7 +138,7 @@ def record(
     stamp_ns: int,
     text: str,
     change: Change | None,
-    standing: SessionSummary,
+    summary: SessionSummary,
     proposal: NextStart | None,
     goal: float | None,
 ) -> dict[str, Any]:
@@ -149,7 +149,7 @@ def record(
         stamp_ns: When [ns].
         text: The line that is printed.
         change: The trial it is about; None for the state at the start and at the end.
-        standing: All cells and gains.
+        summary: All groups and gains.
         proposal: What to run next.
         goal: The success rate asked about.
     """
@@ -161,9 +161,9 @@ def record(
         "episode": None if change is None else change.trial.episode,
         "outcome": None if change is None else outcome_word(change.trial),
         "goal": goal,
-        "rates": [asdict(rate) for rate in standing.rates],
-        "gains": [asdict(gain) for gain in standing.gains],
-        "unknown": standing.unknown,
+        "rates": [asdict(rate) for rate in summary.rates],
+        "gains": [asdict(gain) for gain in summary.gains],
+        "unknown": summary.unknown,
         "next": None if proposal is None else asdict(proposal),
     }
 
@@ -233,7 +233,7 @@ class Update:
 
 
 class Follower:
-    """Keeps the ledger, and says what every change of it means. One thread calls ``step``."""
+    """Keeps all trials of a session, and says what each change means. One thread calls ``step``."""
 
     def __init__(
         self,
@@ -250,7 +250,7 @@ class Follower:
         self._ledger = Ledger()
         self._heard: queue.Queue[WireSample] = queue.Queue(MAX_WAITING)
         self._next_listing_s = 0.0
-        self._said: set[str] = set()
+        self._shown_once: set[str] = set()
 
     def hear(self, sample: WireSample) -> None:
         """Take a message on the network thread; never waits."""
@@ -281,15 +281,15 @@ class Follower:
         self._tell_state()
 
     def _take(self, sample: WireSample) -> None:
-        news = read_update(sample.data)
-        if news is None:
+        update = read_update(sample.data)
+        if update is None:
             self._once(f"a message on {sample.topic} cannot be read; it is left out")
             return
-        if not _same_folder(news.run, self._run.path):
-            self._once(f"the recorder writes to {news.run}, not to {self._run.path}; left out")
+        if not _same_folder(update.run, self._run.path):
+            self._once(f"the recorder writes to {update.run}, not to {self._run.path}; left out")
             return
-        change = None if news.trial is None else self._ledger.take(news.trial)
-        if change is not None and change.is_worth_saying:
+        change = None if update.trial is None else self._ledger.take(update.trial)
+        if change is not None and change.changes_numbers:
             self._tell([change])
 
     def _list(self, *, quiet: bool) -> None:
@@ -308,37 +308,37 @@ class Follower:
             return
         for trial in gone:
             self._output.say(f"{trial.episode} is no longer in the run folder; it counts no more")
-        self._tell([change for change in changes if change.is_worth_saying])
+        self._tell([change for change in changes if change.changes_numbers])
         if gone:
             self._tell_state()
 
     def _tell(self, changes: list[Change]) -> None:
         if not changes:
             return
-        standing, proposal = self._now()
+        summary, proposal = self._now()
         for change in changes:
-            text = change_line(change, standing, proposal, self._goal)
-            self._show(text, change, standing, proposal)
+            text = change_line(change, summary, proposal, self._goal)
+            self._show(text, change, summary, proposal)
 
     def _tell_state(self) -> None:
-        standing, proposal = self._now()
-        text = "\n".join(state_lines(standing, proposal, self._goal))
-        self._show(text, None, standing, proposal)
+        summary, proposal = self._now()
+        text = "\n".join(state_lines(summary, proposal, self._goal))
+        self._show(text, None, summary, proposal)
 
     def _now(self) -> tuple[SessionSummary, NextStart | None]:
         trials = self._ledger.trials
-        standing = summarise_session(trials, self._goal)
-        return standing, next_start(trials, standing)
+        summary = summarise_session(trials, self._goal)
+        return summary, next_start(trials, summary)
 
     def _show(
-        self, text: str, change: Change | None, standing: SessionSummary, proposal: NextStart | None
+        self, text: str, change: Change | None, summary: SessionSummary, proposal: NextStart | None
     ) -> None:
         data = record(
             run=self._run.path.resolve().name,
             stamp_ns=self._now_ns(),
             text=text,
             change=change,
-            standing=standing,
+            summary=summary,
             proposal=proposal,
             goal=self._goal,
         )
@@ -353,22 +353,22 @@ class Follower:
         except WireError as error:
             self._once(f"not published: {error}")
 
-    def _once(self, remark: str) -> None:
-        if remark not in self._said:
-            self._said.add(remark)
-            self._output.say(remark)
+    def _once(self, text: str) -> None:
+        if text not in self._shown_once:
+            self._shown_once.add(text)
+            self._output.say(text)
 
 
 def read_update(data: bytes) -> Update | None:
     """Read what a recorder said of one episode; None when it is not that."""
     try:
-        said = parse_record(data, name="entry", package="bridge.episode")
-        known = {name: said[name] for name in Entry.__dataclass_fields__ if name in said}
-        known["tags"] = tuple(said.get("tags", ()))
-        return Update(str(said["run"]), trial_of(Entry(**known)))
+        record = parse_record(data, name="entry", package="bridge.episode")
+        known = {name: record[name] for name in Entry.__dataclass_fields__ if name in record}
+        known["tags"] = tuple(record.get("tags", ()))
+        return Update(str(record["run"]), trial_of(Entry(**known)))
     except (GstError, TypeError, KeyError):
         return None
 
 
-def _same_folder(said: str, run: Path) -> bool:
-    return Path(said).resolve() == run.resolve()
+def _same_folder(folder: str, run: Path) -> bool:
+    return Path(folder).resolve() == run.resolve()

@@ -47,7 +47,7 @@ class Change:
     """None for a new trial."""
 
     @property
-    def is_worth_saying(self) -> bool:
+    def changes_numbers(self) -> bool:
         """Say whether it changes any number: a description of an unlabelled trial does not."""
         return self.trial.recorded is not None or (
             self.before is not None and self.before.recorded is not None
@@ -70,7 +70,7 @@ def trial_of(entry: Entry) -> LiveTrial | None:
 
 
 class Ledger:
-    """All trials by episode. Takes the same news any number of times, in any order."""
+    """All trials by episode. Takes the same update any number of times, in any order."""
 
     def __init__(self) -> None:
         """Begin without trials."""
@@ -103,14 +103,14 @@ class Ledger:
         return changes, gone
 
 
-# --- What the trials so far have settled: each cell's success rate, and the gain with replanning.
+# --- What the trials so far have settled: each group's success rate, and the gain with replanning.
 
 Key = tuple[str, str, str]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RateSummary:
-    """One cell's recorded success rate, at any time."""
+    """One group's recorded success rate, at any time."""
 
     task: str
     condition: str
@@ -156,7 +156,7 @@ class SessionSummary:
     """Trials without a known outcome: part of nothing."""
 
     def rate(self, key: Key) -> RateSummary | None:
-        """Return one cell."""
+        """Return one group."""
         return next((r for r in self.rates if (r.task, r.condition, r.policy) == key), None)
 
     def gain(self, task: str, policy: str) -> GainSummary | None:
@@ -172,13 +172,13 @@ def summarise_session(trials: Sequence[LiveTrial], goal: float | None) -> Sessio
         goal: Success rate that is asked about.
     """
     known = [trial for trial in trials if trial.recorded is not None]
-    cells: dict[Key, list[bool]] = {}
+    groups: dict[Key, list[bool]] = {}
     for trial in known:
-        cells.setdefault(trial.key, []).append(bool(trial.recorded))
+        groups.setdefault(trial.key, []).append(bool(trial.recorded))
     groups = dict.fromkeys((trial.task, trial.policy) for trial in known)
     gains = (_gain(task, policy, changes_of(known, task, policy)) for task, policy in groups)
     return SessionSummary(
-        rates=tuple(_rate(key, outcomes, goal) for key, outcomes in sorted(cells.items())),
+        rates=tuple(_rate(key, outcomes, goal) for key, outcomes in sorted(groups.items())),
         gains=tuple(gain for gain in gains if gain is not None),
         unknown=len(trials) - len(known),
     )
@@ -186,7 +186,7 @@ def summarise_session(trials: Sequence[LiveTrial], goal: float | None) -> Sessio
 
 def _rate(key: Key, outcomes: Sequence[bool], goal: float | None) -> RateSummary:
     task, condition, policy = key
-    standing = partial(
+    summary = partial(
         RateSummary,
         task=task,
         condition=condition,
@@ -197,9 +197,9 @@ def _rate(key: Key, outcomes: Sequence[bool], goal: float | None) -> RateSummary
     try:
         sequence = sequence_of(outcomes)
     except UndefinedStatisticError as error:
-        return standing(low=0.0, high=1.0, advice=None, changed=error.reason)
+        return summary(low=0.0, high=1.0, advice=None, changed=error.reason)
     advice = None if goal is None else stop_or_continue(sequence, goal)
-    return standing(low=sequence.low, high=sequence.high, advice=advice)
+    return summary(low=sequence.low, high=sequence.high, advice=advice)
 
 
 def changes_of(known: Sequence[LiveTrial], task: str, policy: str) -> list[int]:
@@ -224,7 +224,7 @@ def changes_of(known: Sequence[LiveTrial], task: str, policy: str) -> list[int]:
 def _gain(task: str, policy: str, changes: Sequence[int]) -> GainSummary | None:
     if not changes:
         return None
-    standing = partial(
+    summary = partial(
         GainSummary,
         task=task,
         policy=policy,
@@ -236,9 +236,9 @@ def _gain(task: str, policy: str, changes: Sequence[int]) -> GainSummary | None:
         interval = pairs_sequence(changes)
     except UndefinedStatisticError as error:
         advice = Advice(stop=False, answer="open", more_trials=None)
-        return standing(low=-1.0, high=1.0, advice=advice, changed=error.reason)
+        return summary(low=-1.0, high=1.0, advice=advice, changed=error.reason)
     advice = pairs_advice(changes, interval)
-    return standing(low=interval.low, high=interval.high, advice=advice)
+    return summary(low=interval.low, high=interval.high, advice=advice)
 
 
 # --- Which start and condition to run next, so that conditions stay balanced and pairs complete.
@@ -258,23 +258,23 @@ class NextStart:
     reason: str
 
 
-def next_start(trials: Sequence[LiveTrial], standing: SessionSummary) -> NextStart | None:
+def next_start(trials: Sequence[LiveTrial], summary: SessionSummary) -> NextStart | None:
     """Propose the next trial; None when every question is settled or nothing was tried yet.
 
     The task and policy with the fewest known outcomes comes first. There a start that was tried in
     one condition is tried in the other; with none left, a new start begins with the condition that
     has begun fewer starts, so that neither always meets the fresher objects. Where only one
-    condition was ever run, the cell goes on with it.
+    condition was ever run, the group goes on with it.
 
     Args:
         trials: In the order in which they were recorded; those without an outcome count as tried
             but not as known.
-        standing: What they have settled.
+        summary: What they have settled.
     """
     open_groups = [
         (sum(t.recorded is not None for t in members), place, key, members)
         for place, (key, members) in enumerate(_groups(trials).items())
-        if not _is_settled(key, members, standing)
+        if not _is_settled(key, members, summary)
     ]
     if not open_groups:
         return None
@@ -300,11 +300,11 @@ def _groups(trials: Sequence[LiveTrial]) -> dict[tuple[str, str], list[LiveTrial
 
 
 def _is_settled(
-    key: tuple[str, str], members: Sequence[LiveTrial], standing: SessionSummary
+    key: tuple[str, str], members: Sequence[LiveTrial], summary: SessionSummary
 ) -> bool:
     """Whether no question about this task and policy is open."""
-    rates = [standing.rate(trial_key) for trial_key in {trial.key for trial in members}]
-    gain = standing.gain(*key)
+    rates = [summary.rate(trial_key) for trial_key in {trial.key for trial in members}]
+    gain = summary.gain(*key)
     asked_of_rates = any(rate is not None and rate.advice is not None for rate in rates)
     rates_done = all(rate is not None and rate.is_settled for rate in rates)
     has_both = {trial.condition for trial in members} >= set(BOTH)

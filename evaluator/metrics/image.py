@@ -2,39 +2,17 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
+from bridge.media.image_quality import ImageShapeError, check_same_shape
 from evaluator.errors import EvaluatorError, UndefinedStatisticError
 
-Alignment = Literal["raw", "gain", "affine"]
-"""How a replayed image was brightened before it was scored."""
-ALIGNMENTS: dict[Alignment, str] = {
-    "raw": "no colour alignment",
-    "gain": (
-        "after one gain per image and channel (least squares on the recorded image, "
-        "then clipped to 0..1)"
-    ),
-    "affine": (
-        "after one gain and offset per image and channel (least squares on the recorded image, "
-        "then clipped to 0..1)"
-    ),
-}
-"""In words, for definitions. Alignment looks at the recorded image, so numbers are named by it."""
 SWAP_MARGIN_DB = 3.0
 """A render whose PSNR rises by this when red and blue change places has them swapped ..."""
 SWAP_LEAST_DB = 15.0
 """... if it then is a likeness at all."""
-
-
-class ImageShapeError(EvaluatorError):
-    """Two images that cannot be laid over each other."""
-
-    def __init__(self, *, found: str) -> None:
-        """Remember what did not fit."""
-        super().__init__(f"{found}. Compare images of the same camera and size.")
 
 
 class SwappedColourError(EvaluatorError):
@@ -46,70 +24,6 @@ class SwappedColourError(EvaluatorError):
             f"red and blue look swapped (PSNR {as_it_is_db:.1f} dB as it is, {swapped_db:.1f} dB "
             "with the channels reversed). Write it as RGB; OpenCV writes and reads BGR."
         )
-
-
-def as_float(
-    image: UInt8[np.ndarray, "height width 3"] | Float[np.ndarray, "height width 3"],
-) -> Float[np.ndarray, "height width 3"]:
-    """Scale an 8-bit image to 0..1, or take one that is; no gamma is undone."""
-    if image.dtype == np.uint8:
-        return np.asarray(np.divide(image, 255.0, dtype=np.float64))
-    return np.asarray(image, dtype=np.float64)
-
-
-def psnr_db(
-    recorded: Float[np.ndarray, "height width channels"],
-    replayed: Float[np.ndarray, "replayed_height replayed_width channels"],
-    *,
-    mask: Bool[np.ndarray, "height width"] | None = None,
-) -> float:
-    """Return the peak signal-to-noise ratio [dB]; with a mask, of its pixels only.
-
-    The replayed axes carry their own names, so that a wrong size gets our message.
-
-    Range: 0 dB and up for images in 0..1, higher is better. Undefined when: the images are equal.
-
-    Raises:
-        ImageShapeError: When the sizes differ.
-        UndefinedStatisticError: When the error is exactly zero, or the mask is empty.
-    """
-    check_same_shape(recorded, replayed)
-    squared = (recorded - replayed) ** 2
-    if mask is not None:
-        squared = squared[mask]
-    if squared.size == 0:
-        raise UndefinedStatisticError(statistic="PSNR", reason="the mask holds no pixel")
-    error = float(squared.mean())
-    if error == 0:
-        raise UndefinedStatisticError(statistic="PSNR", reason="the images are identical")
-    return -10.0 * math.log10(error)
-
-
-def aligned(
-    recorded_u8: UInt8[np.ndarray, "height width 3"] | Float[np.ndarray, "height width 3"],
-    replayed_u8: (
-        UInt8[np.ndarray, "replayed_height replayed_width 3"]
-        | Float[np.ndarray, "replayed_height replayed_width 3"]
-    ),
-    alignment: Alignment,
-) -> Float[np.ndarray, "height width 3"]:
-    """Brighten the replayed image, channel by channel, as near to the recorded one as it gets.
-
-    Raises:
-        ImageShapeError: When the sizes differ.
-    """
-    check_same_shape(recorded_u8, replayed_u8)
-    replayed = as_float(replayed_u8)
-    if alignment == "raw":
-        return replayed
-    recorded = as_float(recorded_u8)
-    channels = []
-    for a, b in zip(np.moveaxis(replayed, -1, 0), np.moveaxis(recorded, -1, 0), strict=True):
-        shift_a, shift_b = (a.mean(), b.mean()) if alignment == "affine" else (0.0, 0.0)
-        power = float(np.square(a - shift_a).sum())
-        gain = float(((a - shift_a) * (b - shift_b)).sum()) / power if power > 0 else 1.0
-        channels.append(gain * (a - shift_a) + shift_b)
-    return np.asarray(np.clip(np.stack(channels, axis=-1), 0.0, 1.0))
 
 
 def refuse_swapped(
@@ -132,18 +46,6 @@ def refuse_swapped(
         # An exact likeness has no PSNR; 100 dB is far below what 8 bits can tell.
         decibel = [-10.0 * math.log10(max(error, 1e-10)) for error in (as_it_is, swapped)]
         raise SwappedColourError(as_it_is_db=decibel[0], swapped_db=decibel[1])
-
-
-def check_same_shape(recorded: np.ndarray, replayed: np.ndarray) -> None:
-    """Refuse images of different size.
-
-    Raises:
-        ImageShapeError: With both sizes.
-    """
-    if recorded.shape != replayed.shape:
-        raise ImageShapeError(
-            found=f"the recorded image is {recorded.shape}, the replayed one {replayed.shape}"
-        )
 
 
 # --- How a rendered depth image differs from the recorded one.

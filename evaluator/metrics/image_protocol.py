@@ -90,7 +90,7 @@ class Stamp:
 
     def text(self) -> str:
         """Write everything in one line."""
-        return "; ".join(_said(name, value) for name, value in self._items())
+        return "; ".join(_written(name, value) for name, value in self._items())
 
     @property
     def key(self) -> str:
@@ -130,10 +130,10 @@ def common_text(stamps: Sequence[Stamp]) -> str:
     unstated = [name for name, value in shared.items() if value == UNSTATED]
     if "resolution" in unstated and shared.get("n") == "0":
         unstated.append("n")  # nobody counted
-    said = [_said(name, value) for name, value in shared.items() if name not in unstated]
+    written = [_written(name, value) for name, value in shared.items() if name not in unstated]
     if unstated:
-        said.append(f"{UNSTATED}: {', '.join(unstated)}")
-    parts = ["; ".join(said)]
+        written.append(f"{UNSTATED}: {', '.join(unstated)}")
+    parts = ["; ".join(written)]
     for column in columns:
         mine = [f"{name} {column[name]}" for name in own if column[name] != "none"]
         if mine:
@@ -141,7 +141,7 @@ def common_text(stamps: Sequence[Stamp]) -> str:
     return ". ".join(part for part in parts if part)
 
 
-def _said(name: str, value: str) -> str:
+def _written(name: str, value: str) -> str:
     return value if name in _PLAIN else f"{name} {value}"
 
 

@@ -7,20 +7,24 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.image import Alignment, aligned, as_float, gmsd, psnr_db
-from evaluator.metrics.image_protocol import ImageMetric, MaskMode
-from evaluator.metrics.lpips import LPIPS_METRICS, PerceptualNet
-from evaluator.metrics.ssim import (
+from bridge.media.image_quality import (
     MS_SSIM_MIN_PX,
     PADDINGS,
     SIGMA,
     WINDOW,
+    Alignment,
     Padding,
     SsimMaps,
+    aligned,
+    as_float,
     ms_ssim,
+    psnr_db,
     ssim_maps,
 )
+from evaluator.errors import UndefinedStatisticError
+from evaluator.metrics.image import gmsd
+from evaluator.metrics.image_protocol import ImageMetric, MaskMode
+from evaluator.metrics.lpips import LPIPS_METRICS, PerceptualNet
 
 GAUSSIAN = f"gaussian {WINDOW} x {WINDOW} sigma {SIGMA}"
 _SSIM = (
@@ -42,14 +46,14 @@ PLAIN_METRICS: tuple[ImageMetric, ...] = (
         column="PSNR (dB)",
         unit="dB",
         definition="PSNR, sRGB, data range 1, one mean squared error over all pixels and channels",
-        implementation="evaluator.metrics.image 1",
+        implementation="bridge.media.image_quality 1",
     ),
     *(
         ImageMetric(
             id=_IDS[padding],
             column=_COLUMNS[padding],
             definition=f"{_SSIM}{words} ({_USERS[padding]})",
-            implementation="evaluator.metrics.ssim 1",
+            implementation="bridge.media.image_quality 1",
             window=GAUSSIAN,
             padding=words,
         )
@@ -59,7 +63,7 @@ PLAIN_METRICS: tuple[ImageMetric, ...] = (
         id="ms_ssim",
         column="MS-SSIM",
         definition=f"MS-SSIM (Wang 2003), five scales from {MS_SSIM_MIN_PX} px on, {GAUSSIAN}",
-        implementation="evaluator.metrics.ssim 1",
+        implementation="bridge.media.image_quality 1",
         window=GAUSSIAN,
         padding=PADDINGS["valid"],
         by_pixel=False,

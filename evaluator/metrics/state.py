@@ -90,6 +90,8 @@ def soft_box(
     return se3.apply(T_base_object, shift), extents
 
 
-def extents_apart_m(first_m: Float[np.ndarray, "3"], second_m: Float[np.ndarray, "3"]) -> float:
+def extents_difference_m(
+    first_m: Float[np.ndarray, "3"], second_m: Float[np.ndarray, "3"]
+) -> float:
     """Return the largest difference of an extent [m]. Range: 0 m and up, 0 is perfect."""
     return float(np.abs(first_m - second_m).max())

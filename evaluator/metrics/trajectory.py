@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from bridge.clock import NS_PER_S
 from bridge.episode.streams import JointTrack
 from bridge.geometry import se3
+from bridge.geometry.signals import LAGS_S, lag_of_least_cost
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.errors import UndefinedStatisticError
 
@@ -18,12 +19,8 @@ from evaluator.errors import UndefinedStatisticError
 # A delay is the controller's, a rigid motion the calibration's; what remains of an error when
 # either is taken out belongs to neither.
 
-LAGS_S = np.arange(-20, 61) / 100
-"""Delays that are tried: -0.2 s to 0.6 s in steps of 10 ms."""
 MAX_INSTANTS = 200
 """Delays are compared at no more instants than this."""
-EQUAL_M = 1e-5
-"""Delays whose mean distances differ by less fit equally well."""
 NOT_FINITE = "the recorded or replayed data hold values that are not finite"
 FLAT = 1e-9
 """A second singular value below this share of the first: positions on a line."""
@@ -55,9 +52,7 @@ def find_lag_s(
     other = np.stack(
         [np.interp(asked, replayed.stamps_ns, replayed.p_m[:, axis]) for axis in range(3)], axis=-1
     )
-    costs = _left_over_m(other, p_recorded_m[ids])
-    near = LAGS_S[costs <= costs.min() + EQUAL_M]
-    return float(near[np.argmin(np.abs(near))])
+    return lag_of_least_cost(_left_over_m(other, p_recorded_m[ids]))
 
 
 def _left_over_m(
@@ -100,14 +95,13 @@ def align_rigid(
             statistic="rigid alignment",
             reason=NOT_FINITE,
         )
-    left, sizes, right = np.linalg.svd(covariance)
+    sizes = np.linalg.svd(covariance, compute_uv=False)
     if sizes[1] <= FLAT * max(sizes[0], FLAT):
         raise UndefinedStatisticError(
             statistic="rigid alignment",
             reason="the positions lie on a line, which any turn about it leaves as it is",
         )
-    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
-    R = left @ mirror @ right
+    R = se3.nearest_rotation(covariance)
     return R, middle_target - R @ middle_source
 
 
@@ -199,10 +193,10 @@ def relative_errors(
     for track in (recorded, replayed):
         Ts = track.transforms()
         moved.append(se3.invert(Ts[:-step]) @ Ts[step:])
-    apart = se3.invert(moved[0]) @ moved[1]
+    difference = se3.invert(moved[0]) @ moved[1]
     return (
-        np.asarray(np.linalg.norm(apart[:, :3, 3], axis=1)),
-        se3.rotation_angle_rad(apart[:, :3, :3]),
+        np.asarray(np.linalg.norm(difference[:, :3, 3], axis=1)),
+        se3.rotation_angle_rad(difference[:, :3, :3]),
     )
 
 

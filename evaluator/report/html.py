@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from html import escape
 
 from evaluator.report.figures.drawing import Drawing
-from evaluator.report.tables import is_number, used_columns
+from evaluator.report.views import Figures, Shown, is_number, used_columns, view
 from evaluator.report.wording import cell_text, count_text, ends_text, method_text, value_text
-from evaluator.result import Cell, Measurement, Table
+from evaluator.result import Measurement, Table
 
 SHOWN_ROWS = 200
 """Rows of a table on the page; the whole table lies beside it as CSV."""
@@ -16,9 +16,6 @@ SHOWN_NUMBERS = 16
 OPEN_ROWS = 14
 """A longer table is folded away: it is looked things up in, not read."""
 ALWAYS_OPEN = ("published", "success", "layout", "trials")
-
-_RATE = re.compile(r"^(\d+/\d+) = (-?[\d.]+ %)(?: \[(.*)\])?$")
-_VALUE = re.compile(r"^([+-]?[\d.]+(?: (?:%|pp|mm|dB))?)(?: \[(.*)\])?$")
 
 
 def table_html(
@@ -61,34 +58,24 @@ def table_html(
 
 def _grid(table: Table, rows: int) -> str:
     """Write head and body of a table; the first column names its rows unless it holds numbers."""
-    used = used_columns(table)
+    shown = view(table)
+    used = used_columns(shown)
+    right = {i: is_number(shown, i) for i in used}
     head = "".join(
-        f'<th scope="col"{_kind(table, index)}>{escape(table.columns[index])}</th>'
-        for index in used
+        f'<th scope="col"{_NUMBER * right[i]}>{escape(shown.columns[i])}</th>' for i in used
     )
-    right = {i: is_number(table, i) or _is_figures(table, i) for i in used}
     first = used[0] if used and not right[used[0]] else None
     body = "".join(
         f"<tr>{''.join(_td(row[i], i == first, right[i]) for i in used)}</tr>"
-        for row in table.rows[:rows]
+        for row in shown.rows[:rows]
     )
     return f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody>"
 
 
-def _kind(table: Table, index: int) -> str:
-    if is_number(table, index) or _is_figures(table, index):
-        return ' class="number"'
-    return ""
+_NUMBER = ' class="number"'
 
 
-def _is_figures(table: Table, index: int) -> bool:
-    """Say whether a column holds rates or values with their intervals, written as text."""
-    cells = [row[index] for row in table.rows[:SHOWN_ROWS] if row[index] is not None]
-    figures = [c for c in cells if isinstance(c, str) and (_RATE.match(c) or _VALUE.match(c))]
-    return 2 * len(figures) > len(cells)
-
-
-def _td(cell: Cell, is_head: bool, right: bool) -> str:
+def _td(cell: Shown, is_head: bool, right: bool) -> str:
     text = breakable(cell_text(cell))
     if is_head:
         return f'<th scope="row">{text}</th>'
@@ -99,18 +86,15 @@ def _td(cell: Cell, is_head: bool, right: bool) -> str:
         return f'<td class="{cell}">{mark} {text}</td>'
     if isinstance(cell, int | float) and not isinstance(cell, bool):
         return f'<td class="number">{minus(text)}</td>'
-    if isinstance(cell, str):
-        if found := _RATE.match(cell):
-            return f'<td class="number">{_parts(found[1], found[2], found[3])}</td>'
-        if found := _VALUE.match(cell):
-            return f'<td class="number">{_parts(None, found[1], found[2])}</td>'
+    if isinstance(cell, Figures):
+        return f'<td class="number">{_parts(cell)}</td>'
     return f"<td>{text}</td>"
 
 
-def _parts(count: str | None, value: str, ends: str | None) -> str:
-    counted = f'<span class="count">{escape(count)}</span> ' if count else ""
-    interval = f' <span class="ends">[{minus(escape(ends))}]</span>' if ends else ""
-    return f"{counted}<span>{minus(escape(value))}</span>{interval}"
+def _parts(figures: Figures) -> str:
+    counted = f'<span class="count">{escape(figures.count)}</span> ' if figures.count else ""
+    interval = f' <span class="ends">[{minus(escape(figures.ends))}]</span>' if figures.ends else ""
+    return f"{counted}<span>{minus(escape(figures.value))}</span>{interval}"
 
 
 def breakable(text: str) -> str:

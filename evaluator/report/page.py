@@ -31,7 +31,7 @@ SOURCES = {
 CARDS = (
     ("agreement.sim_planned.rate", "Sim and outcome agree"),
     ("agreement.verdict.ppv", "Succeeds when the gate accepts"),
-    ("agreement.pearson_r", "Pearson r over cells"),
+    ("agreement.pearson_r", "Pearson r over groups"),
     ("agreement.bias_pp", "Bias of sim"),
     ("gain.pp.recorded.average", "Gain with replanning"),
     ("motion.planned.position_mean_m", "Tool, recorded to planned"),

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 from bridge.exchange.trials_csv import TrialRecord
 from bridge.whole_file import part_of
 from evaluator.arrow_columns import ANSWER, NUMBER, TEXT, WHOLE, column_of
-from evaluator.result import Measurement
+from evaluator.result import Cell, Measurement, Table
 
 TRIAL_TYPES = {
     "trial_id": TEXT,
@@ -71,6 +71,20 @@ def write_measurements(path: Path, measurements: Sequence[Measurement]) -> Path:
         joined.setdefault(item.episodes, " ".join(item.episodes))
     columns["episodes"] = [joined[item.episodes] for item in measurements]
     return _write(path, columns, MEASUREMENT_TYPES)
+
+
+def write_table(path: Path, table: Table) -> Path:
+    """Write one row per row of a table, each column with the type of what it holds."""
+    columns = {name: [row[i] for row in table.rows] for i, name in enumerate(table.columns)}
+    types = {name: _type_of(values) for name, values in columns.items()}
+    return _write(path, columns, types)
+
+
+def _type_of(values: Sequence[Cell]) -> pa.DataType:
+    kinds = {type(value) for value in values if value is not None}
+    by_kind = ((bool, ANSWER), (int, WHOLE), (float, NUMBER))
+    found = next((arrow for kind, arrow in by_kind if kinds == {kind}), TEXT)
+    return NUMBER if kinds == {int, float} else found
 
 
 def _write(path: Path, columns: dict[str, list[Any]], types: dict[str, pa.DataType]) -> Path:

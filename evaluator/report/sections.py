@@ -34,12 +34,12 @@ SECTIONS: tuple[Section, ...] = (
         title="Success rates",
         lead="How often a task succeeded in the twin and as labelled. Sim is planned-in-twin: the "
         "plan actually sent, replayed with physics.",
-        tables=("success", "layout", "remarks"),
+        tables=("success", "layout", "notes"),
         figures=("success",),
     ),
     Section(
         id="agreement",
-        title="Agreement over cells",
+        title="Agreement over groups",
         lead="Whether the twin's rates move with the labelled ones, and how far off they are. A "
         "high r does not show that the right decision follows, nor that there is no bias.",
         numbers=(
@@ -55,7 +55,7 @@ SECTIONS: tuple[Section, ...] = (
             ("agreement.largest_gap_pp", "Largest gap"),
             ("agreement.calibration_slope", "Calibration line, slope"),
             ("agreement.calibration_intercept_pp", "Calibration line, intercept"),
-            ("agreement.order_accuracy", "Pairs of cells in the right order"),
+            ("agreement.order_accuracy", "Pairs of groups in the right order"),
             ("agreement.mmrv_recorded_gap", "MMRV, gap of recorded rates"),
             ("agreement.mmrv_sim_gap", "MMRV, gap of sim rates (swapped)"),
             ("decision.*", ""),
@@ -86,7 +86,7 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="gate",
-        title="Trial by trial: what the gate is worth",
+        title="Trial by trial: the gate's scorecard",
         lead="What the twin said of each plan against how it ended, and what obeying it costs "
         "and avoids.",
         numbers=(
@@ -166,8 +166,8 @@ SECTIONS: tuple[Section, ...] = (
         figures=("views",),
     ),
     Section(
-        id="fewer",
-        title="Fewer robot trials",
+        id="prediction_powered",
+        title="Prediction-powered estimates",
         lead="What the twin adds to few robot trials, and whether enough were made.",
         numbers=(
             ("proxy.*", ""),

@@ -11,25 +11,9 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from evaluator.report.wording import cell_text, texts
-from evaluator.result import Cell, Table
-
-
-def used_columns(table: Table) -> list[int]:
-    """Return the columns that say something in any row."""
-    return [
-        index
-        for index in range(len(table.columns))
-        if not table.rows or any(row[index] not in ("", None) for row in table.rows)
-    ]
-
-
-def is_number(table: Table, index: int) -> bool:
-    """Say whether a column holds nothing but numbers."""
-    cells = [row[index] for row in table.rows if row[index] is not None]
-    return bool(cells) and all(
-        isinstance(cell, int | float) and not isinstance(cell, bool) for cell in cells
-    )
+from evaluator.report.views import Shown, View, is_number, used_columns, view
+from evaluator.report.wording import cell_text
+from evaluator.result import Table
 
 
 def as_csv(table: Table) -> str:
@@ -44,13 +28,14 @@ def as_csv(table: Table) -> str:
 def as_markdown(table: Table) -> str:
     """Write a Markdown table with its title and note."""
     written = lru_cache(maxsize=None, typed=True)(_markdown_cell)
-    heads = [written(name) for name in table.columns]
+    shown = view(table)
+    heads = [written(name) for name in shown.columns]
     lines = [f"**{table.title}**", "", _bar(heads), _bar(["---"] * len(heads))]
-    lines += [_bar([written(cell) for cell in row]) for row in table.rows]
+    lines += [_bar([written(cell) for cell in row]) for row in shown.rows]
     return "\n".join(lines) + (f"\n\n{table.note}\n" if table.note else "\n")
 
 
-def _markdown_cell(cell: Cell) -> str:
+def _markdown_cell(cell: Shown) -> str:
     return " ".join(cell_text(cell).split()).replace("|", r"\|")  # a row is one line
 
 
@@ -61,11 +46,12 @@ def _bar(cells: list[str]) -> str:
 def as_text(table: Table, *, width: int | None = None) -> str:
     """Draw the table for a terminal, without the columns that are empty throughout."""
     drawn = RichTable(box=SIMPLE_HEAD, title=table.title, title_justify="left", padding=(0, 1))
-    used = used_columns(table)
+    shown = view(table)
+    used = used_columns(shown)
     for index in used:
-        drawn.add_column(Text(table.columns[index]), overflow="fold")
-    for row in table.rows:
-        drawn.add_row(*(Text(texts(row)[index]) for index in used))
+        drawn.add_column(Text(shown.columns[index]), overflow="fold")
+    for row in shown.rows:
+        drawn.add_row(*(Text(cell_text(row[index])) for index in used))
     stream = io.StringIO()
     width = width or shutil.get_terminal_size(fallback=(140, 24)).columns
     Console(file=stream, width=width, no_color=True, highlight=False).print(drawn)
@@ -138,11 +124,12 @@ def as_latex(table: Table) -> str:
     which shrinks it to the width of the text, and one longer than a page ``longtable``, which is
     set in a smaller size where it is wide. Sentences are broken over lines.
     """
-    used = used_columns(table)
-    align, characters = _columns(table, used)
-    head = " & ".join(latex(table.columns[index]) for index in used)
+    shown = view(table)
+    used = used_columns(shown)
+    align, characters = _columns(shown, used)
+    head = " & ".join(latex(shown.columns[index]) for index in used)
     written = lru_cache(maxsize=None, typed=True)(_cell)  # tables say the same again and again
-    body = [" & ".join([written(row[i]) for i in used]) + r" \\" for row in table.rows]
+    body = [" & ".join([written(row[i]) for i in used]) + r" \\" for row in shown.rows]
     columns = f"@{{}}{align}@{{}}"
     caption = rf"\caption{{{latex(table.title)}}}"
     label = rf"\label{{tab:{_NAME.sub('-', table.id)}}}"
@@ -191,9 +178,9 @@ SENTENCES = 0.6
 LONGEST_WORD = 20
 
 
-def _columns(table: Table, used: list[int]) -> tuple[str, float]:
+def _columns(table: View, used: list[int]) -> tuple[str, float]:
     """Return how columns are set, and how many characters lie beside each other."""
-    lines = [table.columns, *(texts(row) for row in table.rows)]
+    lines = [table.columns, *([cell_text(cell) for cell in row] for row in table.rows)]
     longest = {index: max(len(line[index]) for line in lines) for index in used}
     sentences = {
         index
@@ -221,7 +208,7 @@ def _fitting(characters: float) -> str:
     return rf"\{size}\setlength{{\tabcolsep}}{{2pt}}"
 
 
-def _cell(cell: Cell) -> str:
+def _cell(cell: Shown) -> str:
     return latex(cell_text(cell))
 
 

@@ -1,9 +1,9 @@
 """How numbers are written for people: rounding happens here and nowhere earlier."""
 
 import math
-from collections.abc import Sequence
 
-from evaluator.result import Cell, Measurement, Results
+from evaluator.report.views import Shown
+from evaluator.result import Measurement, Results
 
 HEADLINES: tuple[tuple[str, str], ...] = (
     ("agreement.sim_planned.rate", "Sim and outcome agree"),
@@ -11,7 +11,7 @@ HEADLINES: tuple[tuple[str, str], ...] = (
     ("agreement.sim_planned.ppv", "Success when sim says success (PPV)"),
     ("agreement.sim_planned.npv", "Failure when sim says failure (NPV)"),
     ("agreement.verdict.ppv", "Success when the gate accepted (PPV)"),
-    ("agreement.pearson_r", "Pearson r over cells"),
+    ("agreement.pearson_r", "Pearson r over groups"),
     ("agreement.pearson_r.without_replanning", "Pearson r without replanning"),
     ("agreement.pearson_r.with_replanning", "Pearson r with replanning"),
     ("agreement.bias_pp", "Bias of sim"),
@@ -90,7 +90,7 @@ def value_text(measurement: Measurement) -> str:
 
 
 def count_text(measurement: Measurement) -> str:
-    """Write what the value rests on: ``5/6 trials`` or ``6 cells``."""
+    """Write what the value rests on: ``5/6 trials`` or ``6 groups``."""
     if measurement.n is None:
         return ""
     counted = measurement.counted or ""
@@ -121,7 +121,7 @@ def method_text(measurement: Measurement) -> str:
     if interval is None:
         return ""
     known = interval.worst_coverage
-    worst = "" if known is None else f", worst case {100 * known:.1f} %"
+    worst = "" if known is None else f"; guaranteed coverage at this n: {100 * known:.1f} %"
     return f"{100 * interval.level:.0f} % {interval.method}{worst}"
 
 
@@ -158,15 +158,10 @@ def stand_in_sentence(results: Results) -> str | None:
     )
 
 
-def cell_text(cell: Cell) -> str:
+def cell_text(cell: Shown) -> str:
     """Write one table cell; unknown is a dash."""
     if cell is None:
         return "–"
     if isinstance(cell, bool):
         return "yes" if cell else "no"
     return f"{cell + 0.0:g}" if isinstance(cell, float) else str(cell)  # -0.0 is 0
-
-
-def texts(row: Sequence[Cell]) -> list[str]:
-    """Write one table row."""
-    return [cell_text(cell) for cell in row]

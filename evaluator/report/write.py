@@ -19,8 +19,11 @@ from evaluator.report.tables import as_csv, as_latex, as_markdown, as_text
 from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
 
-SHOWN = ("published", "success", "layout", "gains", "image_methods", "stopping", "remarks")
+SHOWN = ("published", "success", "layout", "gains", "image_methods", "stopping", "notes")
 """Tables a terminal shows; the others are in the report."""
+
+GROUPS = "success"
+"""The table of success rates; ``groups.parquet`` holds it too."""
 
 PARQUET_PACKAGES = ("pyarrow",)
 FIGURE_PACKAGES = ("matplotlib",)
@@ -149,6 +152,8 @@ def _old_files(folder: Path, results: Results) -> list[Path]:
     files = [folder / "tables" / f"{name}.{end}" for name in gone for end in ("csv", "md", "tex")]
     if TRIALS in gone:
         files += [folder / "trials.csv", folder / "trials.parquet"]
+    if GROUPS in gone:
+        files.append(folder / "groups.parquet")
     return files
 
 
@@ -171,11 +176,14 @@ def _write_parquet(
         if error.name not in PARQUET_PACKAGES:
             raise
         reason = (
-            f"trials.parquet, measurements.parquet not written: {error.name} is not installed "
+            f"trials, groups and measurements.parquet not written: {error.name} is not installed "
             f"({INSTALL})"
         )
         return [], reason
     written = [parquet.write_measurements(folder / "measurements.parquet", results.measurements)]
+    groups = next((table for table in results.tables if table.id == GROUPS), None)
+    if groups is not None:
+        written.append(parquet.write_table(folder / "groups.parquet", groups))
     if trials:
         written.append(parquet.write_trials(folder / "trials.parquet", trials))
     return written, None

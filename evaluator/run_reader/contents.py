@@ -187,5 +187,5 @@ def _read(
 
 def broken(name: str, error: Exception, *, scope: str = "everything") -> Exclusion:
     """Leave a file out of something, with what reading it raised."""
-    said = str(error) if isinstance(error, GstError) else f"{type(error).__name__}: {error}"
-    return Exclusion(episode=name, scope=scope, reason=said)
+    words = str(error) if isinstance(error, GstError) else f"{type(error).__name__}: {error}"
+    return Exclusion(episode=name, scope=scope, reason=words)

@@ -256,12 +256,12 @@ def _plan_id(data: bytes) -> str:
 
 
 def _note_verdict(log: _Log, message: RawMessage) -> None:
-    said = Verdict.from_json(message.data)
+    decided = Verdict.from_json(message.data)
     # It may arrive late over its own connection; its stamp is the cell's time.
-    started_ns = log.first_start_ns.get(said.plan_id)
+    started_ns = log.first_start_ns.get(decided.plan_id)
     in_time = started_ns is None or message.publish_time_ns < started_ns
-    if in_time and said.trajectory == "planned":
-        log.verdicts[said.plan_id] = said
+    if in_time and decided.trajectory == "planned":
+        log.verdicts[decided.plan_id] = decided
 
 
 def _note_event(log: _Log, event: Mapping[str, Any]) -> None:
@@ -372,7 +372,9 @@ def read_derived(path: Path) -> DerivedFacts:
     info = episode.info
     try:
         if _is_dynamic(derived):
-            mine = [said for _, said in verdicts(episode) if said.plan_id == derived.plan_id]
+            mine = [
+                decided for _, decided in verdicts(episode) if decided.plan_id == derived.plan_id
+            ]
             last = summarise_verdict(mine[-1]) if mine else None
             return DerivedFacts(info=info, derived=derived, verdict=last)
         if derived.kind == "localised":
@@ -420,16 +422,16 @@ class DerivedIndex:
             )
             return Replay(reason=reason)
         file = _newest(current)
-        said = file.facts.verdict
+        decided = file.facts.verdict
         if file.facts.broken:
             return Replay(file=file, reason=f"{file.path.name}: {file.facts.broken}")
-        if said is None:
+        if decided is None:
             return Replay(file=file, reason=f"{file.path.name} holds no verdict")
         undecided: str | None = None
-        if said.accepted is None:
-            why = said.why_undecided
+        if decided.accepted is None:
+            why = decided.why_undecided
             undecided = f"the twin could not decide the {trajectory} replay: {why}"
-        return Replay(file=file, verdict=said, reason=undecided)
+        return Replay(file=file, verdict=decided, reason=undecided)
 
     def localised(self, *, source: str, source_sha256: str) -> DerivedFile | None:
         """Find the newest localisation of a recorded episode."""

@@ -86,7 +86,7 @@ def read_sent(recorded: Episode, plan_id: str) -> Sent | None:
 def predicted_states(plan: Plan) -> dict[Key, ObjectState]:
     """The poses the planner wrote into the plan; it predicts no shapes."""
     return {
-        (stage.id, name): _posed(_transform(pose))
+        (stage.id, name): _posed(se3.pose_from_record(pose))
         for stage in plan.stages
         for name, pose in stage.predicted_objects.items()
     }
@@ -106,7 +106,7 @@ def recorded_states(sent: Sent, localised: Episode | None) -> dict[str, ObjectSt
             continue
         soft = record.get("soft_shape") or {}
         states[record["object"]] = _posed(
-            _transform(pose), middle=soft.get("centroid_m"), extents=soft.get("extents_m")
+            se3.pose_from_record(pose), middle=soft.get("centroid_m"), extents=soft.get("extents_m")
         )
     return states
 
@@ -157,7 +157,7 @@ def _state_at(
     try:
         T = PoseSample.from_cdr(track[place].data).T_frame_body
         if not np.isfinite(T).all():
-            return ObjectState(reason="its replayed pose is no number")
+            return ObjectState(reason="its replayed pose is not a number")
         if model is None or model.soft is None:
             return _posed(T)
         return _soft_state(replay, track[0], track[place], T, model)
@@ -202,8 +202,3 @@ def _posed(
         middle_m=T[:3, 3] if middle is None else np.array(middle, dtype=np.float64),
         extents_m=None if extents is None else np.array(extents, dtype=np.float64),
     )
-
-
-def _transform(pose: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
-    q = np.array(pose["q_wxyz"], dtype=np.float64)
-    return se3.transform_from(q, np.array(pose["p_m"], dtype=np.float64))

@@ -18,16 +18,16 @@ from evaluator.statistics.intervals import LEVEL, normal_quantile
 
 # --- Recorded and simulated success rates side by side, checked before anything is computed.
 
-MIN_CELLS = 3
+MIN_GROUPS = 3
 """Two points always lie on a line."""
 
 Number = Fraction | float | int
 """Rates as exact fractions where counts are known, so that ties are ties."""
 
 
-def counted_cells(count: int) -> str:
-    """Write how many cells there are: "1 cell", "2 cells"."""
-    return "1 cell" if count == 1 else f"{count} cells"
+def counted_groups(count: int) -> str:
+    """Write how many groups there are: "1 group", "2 groups"."""
+    return "1 group" if count == 1 else f"{count} groups"
 
 
 def exact(
@@ -36,7 +36,7 @@ def exact(
     """Return both sides as exact fractions.
 
     Raises:
-        UndefinedStatisticError: Below ``at_least`` cells.
+        UndefinedStatisticError: Below ``at_least`` groups.
         ValueError: When the sides differ in length.
     """
     if len(recorded) != len(sim):
@@ -44,9 +44,9 @@ def exact(
         raise ValueError(message)
     count = len(recorded)
     if count == 0:
-        raise UndefinedStatisticError(statistic=statistic, reason="there are no cells")
+        raise UndefinedStatisticError(statistic=statistic, reason="there are no groups")
     if count < at_least:
-        reason = f"{counted_cells(count)}; it needs at least {at_least}"
+        reason = f"{counted_groups(count)}; it needs at least {at_least}"
         raise UndefinedStatisticError(statistic=statistic, reason=reason)
     return [Fraction(v) for v in recorded], [Fraction(v) for v in sim]
 
@@ -54,27 +54,28 @@ def exact(
 def varying(
     statistic: str, recorded: Sequence[Number], sim: Sequence[Number]
 ) -> tuple[list[Fraction], list[Fraction]]:
-    """Return both sides, at least 3 cells of which not all are the same on either side.
+    """Return both sides, at least 3 groups of which not all are the same on either side.
 
     Raises:
         UndefinedStatisticError: With the reason.
     """
-    # No cells are too few cells here; exact() would word it as an absence.
+    # No groups are too few groups here; exact() would word it as an absence.
     if len(recorded) == len(sim) == 0:
         raise UndefinedStatisticError(
-            statistic=statistic, reason=f"0 cells; it needs at least {MIN_CELLS}"
+            statistic=statistic, reason=f"0 groups; it needs at least {MIN_GROUPS}"
         )
-    x, y = exact(statistic, recorded, sim, at_least=MIN_CELLS)
+    x, y = exact(statistic, recorded, sim, at_least=MIN_GROUPS)
     for name, side in (("recorded", x), ("twin", y)):
         if len(set(side)) == 1:
             raise UndefinedStatisticError(
                 statistic=statistic,
-                reason=f"the {name} side is constant ({float(side[0]):g} in all {len(side)} cells)",
+                reason=f"the {name} side is constant "
+                f"({float(side[0]):g} in all {len(side)} groups)",
             )
     return x, y
 
 
-def floats(values: Sequence[Number]) -> Float64[np.ndarray, " cells"]:
+def floats(values: Sequence[Number]) -> Float64[np.ndarray, " groups"]:
     """Return rates as an array."""
     return np.array([float(v) for v in values], dtype=np.float64)
 
@@ -95,7 +96,7 @@ def bias(*, recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     """Return mean(sim - recorded): above 0 the twin is optimistic. r does not see this.
 
     Raises:
-        UndefinedStatisticError: Without cells.
+        UndefinedStatisticError: Without groups.
     """
     gaps = _gaps("bias", recorded, sim)
     return float(sum(gaps) / len(gaps))
@@ -105,7 +106,7 @@ def mean_absolute_error(*, recorded: Sequence[Number], sim: Sequence[Number]) ->
     """Return mean |sim - recorded|; 0 is perfect.
 
     Raises:
-        UndefinedStatisticError: Without cells.
+        UndefinedStatisticError: Without groups.
     """
     gaps = _gaps("mean absolute error", recorded, sim)
     return float(sum(map(abs, gaps)) / len(gaps))
@@ -115,17 +116,17 @@ def root_mean_square_error(*, recorded: Sequence[Number], sim: Sequence[Number])
     """Return sqrt(mean (sim - recorded)^2); 0 is perfect, and never below the mean |gap|.
 
     Raises:
-        UndefinedStatisticError: Without cells.
+        UndefinedStatisticError: Without groups.
     """
     gaps = _gaps("RMSE", recorded, sim)
     return math.sqrt(sum(gap * gap for gap in gaps) / len(gaps))
 
 
 def largest_gap(*, recorded: Sequence[Number], sim: Sequence[Number]) -> float:
-    """Return max |sim - recorded| over cells.
+    """Return max |sim - recorded| over groups.
 
     Raises:
-        UndefinedStatisticError: Without cells.
+        UndefinedStatisticError: Without groups.
     """
     return float(max(map(abs, _gaps("largest gap", recorded, sim))))
 
@@ -145,15 +146,15 @@ def calibration_line(*, recorded: Sequence[Number], sim: Sequence[Number]) -> Ca
     it does not say what the physics would do.
 
     Raises:
-        UndefinedStatisticError: Below 3 cells, or when the sim side is constant.
+        UndefinedStatisticError: Below 3 groups, or when the sim side is constant.
     """
-    x, y = exact("calibration line", sim, recorded, at_least=MIN_CELLS)
+    x, y = exact("calibration line", sim, recorded, at_least=MIN_GROUPS)
     mean_x, mean_y = sum(x) / len(x), sum(y) / len(y)
     spread = sum((v - mean_x) ** 2 for v in x)
     if spread == 0:
         raise UndefinedStatisticError(
             statistic="calibration line",
-            reason=f"the twin side is constant ({float(x[0]):g} in all {len(x)} cells)",
+            reason=f"the twin side is constant ({float(x[0]):g} in all {len(x)} groups)",
         )
     slope = sum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / spread
     return CalibrationLine(slope=float(slope), intercept=float(mean_y - slope * mean_x))
@@ -162,7 +163,7 @@ def calibration_line(*, recorded: Sequence[Number], sim: Sequence[Number]) -> Ca
 def mmrv(*, recorded: Sequence[Number], sim: Sequence[Number], gap: str = "recorded") -> float:
     """Return the mean maximum rank violation (SIMPLER, Li et al. 2024, equation 1).
 
-    For each cell the largest gap to a cell whose order the twin got wrong, averaged over cells.
+    For each group the largest gap to a group whose order the twin got wrong, averaged over groups.
     ``gap`` names the convention: ``recorded`` measures the gap in recorded rates, as the
     equation does; ``sim`` measures it in the twin's rates, as some published code does by
     swapping the arguments. A tie on one side only is a violation. Exact on counts.
@@ -170,7 +171,7 @@ def mmrv(*, recorded: Sequence[Number], sim: Sequence[Number], gap: str = "recor
     Range: 0 to 1, 0 is perfect.
 
     Raises:
-        UndefinedStatisticError: Below 2 cells.
+        UndefinedStatisticError: Below 2 groups.
         ValueError: For a convention that does not exist.
     """
     x, y = exact("MMRV", recorded, sim, at_least=2)
@@ -179,11 +180,11 @@ def mmrv(*, recorded: Sequence[Number], sim: Sequence[Number], gap: str = "recor
         raise ValueError(message)
     judge, judged = (x, y) if gap == "recorded" else (y, x)
     worst = []
-    cells = range(len(judge))
-    for i in cells:
+    groups = range(len(judge))
+    for i in groups:
         violations = [
             abs(judge[i] - judge[j])
-            for j in cells
+            for j in groups
             if (judged[i] > judged[j]) != (judge[i] > judge[j])
         ]
         worst.append(max(violations, default=Fraction(0)))
@@ -192,7 +193,7 @@ def mmrv(*, recorded: Sequence[Number], sim: Sequence[Number], gap: str = "recor
 
 @dataclass(frozen=True, kw_only=True)
 class OrderAccuracy:
-    """Of the pairs of cells that differ on the recorded side, how many the twin orders so."""
+    """Of the pairs of groups that differ on the recorded side, how many the twin orders so."""
 
     right: Fraction
     """Pairs ordered as recorded; a tie in the twin counts one half."""
@@ -205,10 +206,10 @@ class OrderAccuracy:
 
 
 def order_accuracy(*, recorded: Sequence[Number], sim: Sequence[Number]) -> OrderAccuracy:
-    """Count the pairs of cells that the twin orders as the recorded rates do.
+    """Count the pairs of groups that the twin orders as the recorded rates do.
 
     Raises:
-        UndefinedStatisticError: Below 2 cells, or when no two recorded rates differ.
+        UndefinedStatisticError: Below 2 groups, or when no two recorded rates differ.
     """
     x, y = exact("pairwise order accuracy", recorded, sim, at_least=2)
     right, pairs = Fraction(0), 0
@@ -224,7 +225,7 @@ def order_accuracy(*, recorded: Sequence[Number], sim: Sequence[Number]) -> Orde
     if pairs == 0:
         raise UndefinedStatisticError(
             statistic="pairwise order accuracy",
-            reason=f"the recorded side is constant ({float(x[0]):g} in all {len(x)} cells)",
+            reason=f"the recorded side is constant ({float(x[0]):g} in all {len(x)} groups)",
         )
     return OrderAccuracy(right=right, pairs=pairs)
 
@@ -235,26 +236,26 @@ def _gaps(statistic: str, recorded: Sequence[Number], sim: Sequence[Number]) -> 
 
 
 def mean_rate(rates: Sequence[Number]) -> float:
-    """Return the macro average: every cell counts the same, however many trials it has.
+    """Return the macro average: every group counts the same, however many trials it has.
 
     Raises:
-        UndefinedStatisticError: Without cells.
+        UndefinedStatisticError: Without groups.
     """
     if not rates:
-        raise UndefinedStatisticError(statistic="mean rate", reason="there are no cells")
+        raise UndefinedStatisticError(statistic="mean rate", reason="there are no groups")
     return float(floats(rates).mean())
 
 
 # --- Do the twin's success rates move with the recorded ones? Pearson, Spearman, Kendall.
 
-MIN_CELLS_INTERVAL = 4
+MIN_GROUPS_INTERVAL = 4
 """Fisher's standard error is 1/sqrt(n - 3)."""
 
 
 def pearson(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
-    """Return Pearson's r over cells; exact on counts, so that rates on a line give 1 and not less.
+    """Return Pearson's r over groups; exact on counts, so that rates on a line give 1 and not less.
 
-    Range: -1 to 1. Undefined when: fewer than 3 cells, or one side is constant.
+    Range: -1 to 1. Undefined when: fewer than 3 groups, or one side is constant.
 
     Raises:
         UndefinedStatisticError: With the reason.
@@ -271,7 +272,7 @@ def pearson(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
 def spearman(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     """Return Spearman's rank correlation; ties share their average rank.
 
-    Range: -1 to 1. Undefined when: fewer than 3 cells, or one side is constant.
+    Range: -1 to 1. Undefined when: fewer than 3 groups, or one side is constant.
 
     Raises:
         UndefinedStatisticError: With the reason.
@@ -285,7 +286,7 @@ def kendall(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
 
     (C - D) / sqrt((pairs - pairs tied in recorded) (pairs - pairs tied in sim)).
 
-    Range: -1 to 1. Undefined when: fewer than 3 cells, or one side is constant.
+    Range: -1 to 1. Undefined when: fewer than 3 groups, or one side is constant.
 
     Raises:
         UndefinedStatisticError: With the reason.
@@ -298,23 +299,23 @@ def kendall(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     return concordance / math.sqrt(untied_x * untied_y)
 
 
-def fisher_interval(r: float, num_cells: int, *, level: float = LEVEL) -> Interval:
-    """Return Fisher's z interval of Pearson's r. The cells must be independent of each other.
+def fisher_interval(r: float, num_groups: int, *, level: float = LEVEL) -> Interval:
+    """Return Fisher's z interval of Pearson's r. The groups must be independent of each other.
 
     Raises:
-        UndefinedStatisticError: Below 4 cells, or when r is exactly 1 or -1.
+        UndefinedStatisticError: Below 4 groups, or when r is exactly 1 or -1.
     """
-    if num_cells < MIN_CELLS_INTERVAL:
+    if num_groups < MIN_GROUPS_INTERVAL:
         raise UndefinedStatisticError(
             statistic="Fisher interval of r",
-            reason=f"{num_cells} cells; it needs at least {MIN_CELLS_INTERVAL}",
+            reason=f"{num_groups} groups; it needs at least {MIN_GROUPS_INTERVAL}",
         )
     if abs(r) >= 1:
         raise UndefinedStatisticError(
             statistic="Fisher interval of r", reason=f"r is {r:+.0f} exactly"
         )
     z = math.atanh(r)
-    half = normal_quantile(0.5 + level / 2) / math.sqrt(num_cells - 3)
+    half = normal_quantile(0.5 + level / 2) / math.sqrt(num_groups - 3)
     return Interval(
         low=math.tanh(z - half), high=math.tanh(z + half), level=level, method="fisher-z"
     )
@@ -336,7 +337,7 @@ class Decision:
     recorded_best: frozenset[str]
     possibly_right: bool
     """One of the twin's best is among the recorded best."""
-    surely_right: bool
+    confident: bool
     """Every one of the twin's best is."""
     regret: Fraction
     """Best recorded rate minus that of the twin's choice, the worst of a tie."""
@@ -376,7 +377,7 @@ def choose(*, recorded: Mapping[str, Number], sim: Mapping[str, Number]) -> Deci
         sim_best=sim_best,
         recorded_best=recorded_best,
         possibly_right=bool(sim_best & recorded_best),
-        surely_right=sim_best <= recorded_best,
+        confident=sim_best <= recorded_best,
         regret=max(losses),
         regret_if_lucky=min(losses),
     )

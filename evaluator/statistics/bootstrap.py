@@ -1,7 +1,7 @@
-"""Uncertainty of agreement over cells: resampled cells, resampled policies, one left out.
+"""Uncertainty of agreement over groups: resampled groups, resampled policies, one left out.
 
-Points: other tasks of the same kind. Clusters: other policies, whose cells come together. What the
-same cells would give when measured again is another question: ``remeasure``.
+Points: other tasks of the same kind. Clusters: other policies, whose groups come together. What the
+same groups would give when measured again is another question: ``remeasure``.
 """
 
 import math
@@ -16,7 +16,7 @@ from scipy.special import gammaln, ndtr, stdtrit
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
-from evaluator.statistics.agreement import Number, counted_cells, exact, floats
+from evaluator.statistics.agreement import Number, counted_groups, exact, floats
 from evaluator.statistics.intervals import LEVEL
 from evaluator.statistics.weighted import EPSILON, STATISTICS, Values, values_of
 
@@ -123,9 +123,9 @@ NUM_RESAMPLES = 9_999
 MIN_UNITS = 4
 """Of three units, one resample in nine holds only one of them."""
 MAX_UNDEFINED = 0.05
-"""The part of the resamples that may leave the statistic undefined, as all the same cell does."""
+"""The part of the resamples that may leave the statistic undefined, as all the same group does."""
 METHODS = ("bootstrap", "bootstrap-expanded", "jackknife")
-"""What ``CellSample.interval`` knows, from the narrowest to the widest."""
+"""What ``GroupSample.interval`` knows, from the narrowest to the widest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,8 +171,8 @@ def _all_counts(num_units: int) -> Int64[np.ndarray, "resamples units"]:
     return np.asarray(np.diff(edges, axis=1) - 1)
 
 
-class CellSample:
-    """Cells, what they belong to, and the interval of each statistic over them.
+class GroupSample:
+    """Groups, what they belong to, and the interval of each statistic over them.
 
     Resamples are drawn once, when the first method asks for them, and shared by all statistics.
     """
@@ -190,10 +190,10 @@ class CellSample:
         """Prepare.
 
         Args:
-            recorded: Recorded rate of each cell.
+            recorded: Recorded rate of each group.
             sim: The twin's.
             rng: Draws the resamples where they are too many to visit.
-            clusters: What each cell belongs to, for example its policy; cells alone without.
+            clusters: What each group belongs to, for example its policy; groups alone without.
             max_exact: All resamples are visited up to this many.
             num_resamples: Random resamples beyond that.
         """
@@ -212,7 +212,7 @@ class CellSample:
         return resamples(self.num_units, self._rng, max_exact=max_exact, num_resamples=num)
 
     @cached_property
-    def _counts(self) -> Float64[np.ndarray, "resamples cells"]:
+    def _counts(self) -> Float64[np.ndarray, "resamples groups"]:
         return self._drawn.counts[:, self._members].astype(np.float64)
 
     def _resampled(self, statistic: str) -> Values:
@@ -278,14 +278,14 @@ def bootstrap_interval(
     max_exact: int = MAX_EXACT,
     num_resamples: int = NUM_RESAMPLES,
 ) -> Interval:
-    """Return the percentile interval of a statistic over resampled cells or clusters of cells.
+    """Return the percentile interval of a statistic over resampled groups or clusters of groups.
 
     Args:
         statistic: A name in ``weighted.STATISTICS``: pearson, mae, mmrv-recorded ...
-        recorded: Recorded rate of each cell.
+        recorded: Recorded rate of each group.
         sim: The twin's.
         rng: Draws the resamples where they are too many to visit.
-        clusters: What each cell belongs to, for example its policy; cells on their own without.
+        clusters: What each group belongs to, for example its policy; groups on their own without.
         level: Confidence level.
         max_exact: All resamples are visited up to this many.
         num_resamples: Random resamples beyond that.
@@ -298,7 +298,7 @@ def bootstrap_interval(
     if statistic not in STATISTICS:
         message = f"{statistic!r} has no bootstrap; there are: {', '.join(STATISTICS)}"
         raise ValueError(message)
-    sample = CellSample(
+    sample = GroupSample(
         recorded=recorded,
         sim=sim,
         rng=rng,
@@ -310,7 +310,7 @@ def bootstrap_interval(
 
 
 def student_interval(values: Sequence[Number], *, level: float = LEVEL) -> Interval:
-    """Return Student's t interval of a mean over independent cells, or over cluster means.
+    """Return Student's t interval of a mean over independent groups, or over cluster means.
 
     Raises:
         UndefinedStatisticError: Below 3 values, or when they are all the same: no interval of
@@ -370,27 +370,27 @@ def refuse_no_width(interval: Interval) -> Interval:
     return interval
 
 
-# --- Where each statistic of agreement would fall if the same cells were measured again.
+# --- Where each statistic of agreement would fall if the same groups were measured again.
 #
 # A band of measurement noise, not an interval of a true value: the noise itself pulls a
 # correlation towards 0 and errors away from it.
 
 NUM_DRAWS = 4_000
-MIN_CELLS = 3
+MIN_GROUPS = 3
 WHAT = "remeasurement band"
 
 
 @dataclass(frozen=True)
 class Remeasured:
-    """Measured rates of each cell, and rates as they might have come out."""
+    """Measured rates of each group, and rates as they might have come out."""
 
-    recorded: Float64[np.ndarray, " cells"]
-    sim: Float64[np.ndarray, " cells"]
-    recorded_again: Float64[np.ndarray, "draws cells"]
-    sim_again: Float64[np.ndarray, "draws cells"]
+    recorded: Float64[np.ndarray, " groups"]
+    sim: Float64[np.ndarray, " groups"]
+    recorded_again: Float64[np.ndarray, "draws groups"]
+    sim_again: Float64[np.ndarray, "draws groups"]
 
     @cached_property
-    def _every(self) -> Float64[np.ndarray, "draws cells"]:
+    def _every(self) -> Float64[np.ndarray, "draws groups"]:
         return np.ones_like(self.recorded_again)
 
     def band(self, statistic: str, *, level: float = LEVEL) -> Interval:
@@ -400,11 +400,11 @@ class Remeasured:
         found; on Fisher's scale for correlations and shares, on the logarithm for errors.
 
         Raises:
-            UndefinedStatisticError: Below 3 cells, when the statistic is undefined or at the end
+            UndefinedStatisticError: Below 3 groups, when the statistic is undefined or at the end
                 of its range, or when no redrawn rate changes it.
         """
-        if len(self.recorded) < MIN_CELLS:
-            reason = f"{counted_cells(len(self.recorded))}; it needs at least {MIN_CELLS}"
+        if len(self.recorded) < MIN_GROUPS:
+            reason = f"{counted_groups(len(self.recorded))}; it needs at least {MIN_GROUPS}"
             raise UndefinedStatisticError(statistic=WHAT, reason=reason)
         scale = SCALES[statistic]
         (value,), (known,) = values_of(statistic, self._every[:1], self.recorded, self.sim)
@@ -433,15 +433,15 @@ def remeasure_paired(
     rng: np.random.Generator,
     num_draws: int = NUM_DRAWS,
 ) -> Remeasured:
-    """Draw each cell's table of trials anew: both succeed, only sim, only recorded, neither.
+    """Draw each group's table of trials anew: both succeed, only sim, only recorded, neither.
 
     From a multinomial with the observed shares, 1/4 added to each count.
 
     Raises:
-        UndefinedStatisticError: When a cell has no trial.
+        UndefinedStatisticError: When a group has no trial.
     """
     if any(sum(table) == 0 for table in tables):
-        raise UndefinedStatisticError(statistic=WHAT, reason="a cell has no trial with both sides")
+        raise UndefinedStatisticError(statistic=WHAT, reason="a group has no trial with both sides")
     counts = np.array(tables, dtype=np.float64).reshape(-1, 4)
     totals = counts.sum(axis=1)
     recorded, sim = [], []

@@ -218,7 +218,7 @@ def _fisher(n_first: int, n_second: int) -> Float[np.ndarray, "first second"]:
     """Fisher's one-sided p of each pair of counts: few successes in the first group.
 
     They follow from the sizes of the groups alone, and a run has few: both sides of a test and the
-    cells of all tasks share them.
+    groups of all tasks share them.
     """
     first, second = _log_choose(n_first), _log_choose(n_second)
     both = _log_choose(n_first + n_second)

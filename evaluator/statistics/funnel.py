@@ -8,7 +8,7 @@ from evaluator.errors import UndefinedStatisticError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stage:
+class StageCount:
     """One stage of a task over all trials."""
 
     name: str
@@ -20,7 +20,7 @@ class Stage:
     """Of those, the trials in which nobody said how it ended; they go no further."""
 
 
-def funnel(trials: Sequence[Sequence[bool | None]], names: Sequence[str]) -> list[Stage]:
+def funnel(trials: Sequence[Sequence[bool | None]], names: Sequence[str]) -> list[StageCount]:
     """Count how far trials came, over stages in order.
 
     A stage after a failed one is not reached, even when it is labelled a success: a later success
@@ -46,7 +46,7 @@ def funnel(trials: Sequence[Sequence[bool | None]], names: Sequence[str]) -> lis
     for place, name in enumerate(names):
         answers = Counter(trial[place] for trial in going)
         stages.append(
-            Stage(name=name, reached=len(going), passed=answers[True], unknown=answers[None])
+            StageCount(name=name, reached=len(going), passed=answers[True], unknown=answers[None])
         )
         going = [trial for trial in going if trial[place]]
     return stages

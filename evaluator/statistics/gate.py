@@ -25,11 +25,11 @@ class ReliabilityBin:
     high: float
     """The last bin holds its upper end, the others do not."""
     n: int
-    mean_said: float
+    mean_probability: float
     succeeded: int
 
 
-def brier(said: Sequence[float], happened: Sequence[bool]) -> float:
+def brier(predicted: Sequence[float], happened: Sequence[bool]) -> float:
     """Return the mean of (p - outcome)^2 (Brier 1950).
 
     Range: 0 to 1, 0 is perfect; always saying 1/2 gives 1/4.
@@ -38,7 +38,7 @@ def brier(said: Sequence[float], happened: Sequence[bool]) -> float:
         UndefinedStatisticError: Without trials.
         ValueError: For probabilities outside 0..1.
     """
-    p = _checked("Brier score", said, happened)
+    p = _checked("Brier score", predicted, happened)
     return float(np.mean((p - np.array(happened, dtype=np.float64)) ** 2))
 
 
@@ -55,7 +55,7 @@ def brier_of_base_rate(happened: Sequence[bool]) -> float:
 
 
 def expected_calibration_error(
-    said: Sequence[float], happened: Sequence[bool], *, num_bins: int = NUM_BINS
+    predicted: Sequence[float], happened: Sequence[bool], *, num_bins: int = NUM_BINS
 ) -> float:
     """Return sum over bins of n_bin / n x |mean probability - success rate|.
 
@@ -68,12 +68,12 @@ def expected_calibration_error(
         UndefinedStatisticError: Without trials.
         ValueError: For probabilities outside 0..1.
     """
-    bins = reliability_bins(said, happened, num_bins=num_bins)
-    return sum(abs(b.mean_said * b.n - b.succeeded) for b in bins) / len(happened)
+    bins = reliability_bins(predicted, happened, num_bins=num_bins)
+    return sum(abs(b.mean_probability * b.n - b.succeeded) for b in bins) / len(happened)
 
 
 def reliability_bins(
-    said: Sequence[float], happened: Sequence[bool], *, num_bins: int = NUM_BINS
+    predicted: Sequence[float], happened: Sequence[bool], *, num_bins: int = NUM_BINS
 ) -> list[ReliabilityBin]:
     """Return the bins that hold trials, in order.
 
@@ -81,7 +81,7 @@ def reliability_bins(
         UndefinedStatisticError: Without trials.
         ValueError: For probabilities outside 0..1.
     """
-    p = _checked("reliability", said, happened)
+    p = _checked("reliability", predicted, happened)
     answers = np.array(happened, dtype=bool)
     places = np.minimum((p * num_bins).astype(int), num_bins - 1)
     return [
@@ -89,20 +89,20 @@ def reliability_bins(
             low=place / num_bins,
             high=(place + 1) / num_bins,
             n=int((places == place).sum()),
-            mean_said=float(p[places == place].mean()),
+            mean_probability=float(p[places == place].mean()),
             succeeded=int(answers[places == place].sum()),
         )
         for place in np.unique(places).tolist()
     ]
 
 
-def _checked(statistic: str, said: Sequence[float], happened: Sequence[bool]) -> np.ndarray:
-    if len(said) != len(happened):
-        message = f"{len(said)} probabilities but {len(happened)} outcomes"
+def _checked(statistic: str, predicted: Sequence[float], happened: Sequence[bool]) -> np.ndarray:
+    if len(predicted) != len(happened):
+        message = f"{len(predicted)} probabilities but {len(happened)} outcomes"
         raise ValueError(message)
-    if not len(said):
+    if not len(predicted):
         raise UndefinedStatisticError(statistic=statistic, reason="there are no trials")
-    p = np.array(said, dtype=np.float64)
+    p = np.array(predicted, dtype=np.float64)
     if not ((p >= 0) & (p <= 1)).all():
         message = "a success probability lies in 0..1"
         raise ValueError(message)
@@ -124,14 +124,14 @@ class Confusion:
     @staticmethod
     def count(pairs: Iterable[tuple[bool, bool]]) -> "Confusion":
         """Count pairs (said, happened)."""
-        return Confusion.weigh((said, happened, 1) for said, happened in pairs)
+        return Confusion.weigh((predicted, happened, 1) for predicted, happened in pairs)
 
     @staticmethod
     def weigh(pairs: Iterable[tuple[bool, bool, int]]) -> "Confusion":
         """Count triples (said, happened, how many trials it stands for)."""
         sums = {(True, True): 0, (True, False): 0, (False, True): 0, (False, False): 0}
-        for said, happened, count in pairs:
-            sums[bool(said), bool(happened)] += count
+        for predicted, happened, count in pairs:
+            sums[bool(predicted), bool(happened)] += count
         return Confusion(
             true_positive=sums[True, True],
             false_positive=sums[True, False],
@@ -150,12 +150,12 @@ class Confusion:
         return self.true_positive + self.true_negative
 
     @property
-    def said_success(self) -> int:
+    def predicted_success(self) -> int:
         """Denominator of the positive predictive value."""
         return self.true_positive + self.false_positive
 
     @property
-    def said_failure(self) -> int:
+    def predicted_failure(self) -> int:
         """Denominator of the negative predictive value."""
         return self.true_negative + self.false_negative
 
@@ -203,8 +203,8 @@ def kappa(confusion: Confusion) -> float:
     n = confusion.n
     if n == 0:
         raise UndefinedStatisticError(statistic="kappa", reason="there are no pairs")
-    said, happened = confusion.said_success, confusion.succeeded
-    by_chance = Fraction(said * happened + (n - said) * (n - happened), n * n)
+    predicted, happened = confusion.predicted_success, confusion.succeeded
+    by_chance = Fraction(predicted * happened + (n - predicted) * (n - happened), n * n)
     if by_chance == 1:
         raise UndefinedStatisticError(
             statistic="kappa", reason=f"both sides are the same in all {n} pairs"

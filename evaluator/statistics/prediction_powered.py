@@ -1,6 +1,6 @@
 """The real success rate from few robot trials and many in the twin.
 
-Needs robot trials whose starts are a random part of the twin's: an easier part would be believed.
+Needs robot trials whose starts are a random part of the twin's: an easier part would mislead.
 """
 
 import math
@@ -83,9 +83,9 @@ def starts_covered(
         UndefinedStatisticError: With fewer than two starts on a side.
     """
     _refuse_few(tried, others)
-    apart_m = _distances(tried, tried)
-    np.fill_diagonal(apart_m, np.inf)
-    reach_m = float(apart_m.min(axis=1).max())
+    between_m = _distances(tried, tried)
+    np.fill_diagonal(between_m, np.inf)
+    reach_m = float(between_m.min(axis=1).max())
     nearest_m = np.array([_distances(row[None], tried).min() for row in others])
     return int((nearest_m <= reach_m * (1 + ROUNDING)).sum()), len(others)
 
@@ -180,18 +180,18 @@ def post_stratified(pairs: Confusion, sim_k: int, sim_n: int, *, level: float = 
         )
     if sim_n:
         check_count(sim_k, sim_n)
-    said = pairs.said_success + sim_k
-    pi = _values(said, pairs.n + sim_n)
-    given_success = _values(pairs.true_positive, pairs.said_success)
-    given_failure = _values(pairs.false_negative, pairs.said_failure)
+    predicted = pairs.predicted_success + sim_k
+    pi = _values(predicted, pairs.n + sim_n)
+    given_success = _values(pairs.true_positive, pairs.predicted_success)
+    given_failure = _values(pairs.false_negative, pairs.predicted_failure)
     rates = (
         pi[:, None, None] * given_success[None, :, None]
         + (1 - pi)[:, None, None] * given_failure[None, None, :]
     ).ravel()
     low, high = np.quantile(rates, [(1 - level) / 2, (1 + level) / 2])
-    share = (said + PRIOR) / (pairs.n + sim_n + 2 * PRIOR)
-    value = share * (pairs.true_positive + PRIOR) / (pairs.said_success + 2 * PRIOR)
-    value += (1 - share) * (pairs.false_negative + PRIOR) / (pairs.said_failure + 2 * PRIOR)
+    share = (predicted + PRIOR) / (pairs.n + sim_n + 2 * PRIOR)
+    value = share * (pairs.true_positive + PRIOR) / (pairs.predicted_success + 2 * PRIOR)
+    value += (1 - share) * (pairs.false_negative + PRIOR) / (pairs.predicted_failure + 2 * PRIOR)
     interval = Interval(
         low=float(low), high=float(high), level=level, method="post-stratified-beta"
     )

@@ -1,8 +1,8 @@
-"""Every statistic of agreement over many weighted sets of cells at once, as resampling asks for.
+"""Every statistic of agreement over many weighted sets of groups at once, as resampling asks for.
 
-A resample counts each cell several times: ``recorded`` and ``sim`` hold one value per cell and
+A resample counts each group several times: ``recorded`` and ``sim`` hold one value per group and
 ``counts`` tells the sets apart. A new measurement has other rates in each set: then both sides are
-sets x cells and every count is one. The plain forms are in ``agreement`` and ``correlation``.
+sets x groups and every count is one. The plain forms are in ``agreement`` and ``correlation``.
 """
 
 from collections.abc import Callable
@@ -13,13 +13,13 @@ from jaxtyping import Bool, Float64
 EPSILON = 1e-12
 """A variance of rates below this is rounding, not variation."""
 CHUNK = 4_000_000
-"""Numbers of sets x cells x cells held at once [32 MB]."""
+"""Numbers of sets x groups x groups held at once [32 MB]."""
 
-Counts = Float64[np.ndarray, "sets cells"]
-Side = Float64[np.ndarray, "*cells"]
-"""Rates by cell, or by set and cell."""
+Counts = Float64[np.ndarray, "sets groups"]
+Side = Float64[np.ndarray, "*groups"]
+"""Rates by group, or by set and group."""
 Values = tuple[Float64[np.ndarray, " sets"], Bool[np.ndarray, " sets"]]
-"""A statistic of each set of cells, and where it is defined."""
+"""A statistic of each set of groups, and where it is defined."""
 Statistic = Callable[[Counts, Side, Side], Values]
 
 
@@ -28,7 +28,7 @@ def values_of(statistic: str, counts: Counts, recorded: Side, sim: Side) -> Valu
 
     Args:
         statistic: A name in ``STATISTICS``.
-        counts: How often each cell is in each set.
+        counts: How often each group is in each set.
         recorded: Recorded rates.
         sim: The twin's.
     """
@@ -73,7 +73,7 @@ def _spearman(counts: Counts, recorded: Side, sim: Side) -> Values:
 
 
 def _ranks(counts: Counts, side: Side) -> Counts:
-    """Average ranks in each set; a cell that is there three times takes three ranks."""
+    """Average ranks in each set; a group that is there three times takes three ranks."""
     if side.ndim == 2:
         fewer = (side[:, None, :] < side[:, :, None]).sum(axis=2)
         alike = (side[:, None, :] == side[:, :, None]).sum(axis=2)
@@ -88,7 +88,7 @@ def _signs(side: Side) -> np.ndarray:
 
 
 def _over_pairs(counts: Counts, of_pair: np.ndarray) -> Float64[np.ndarray, " sets"]:
-    """Sum over pairs of cells, each as often as it is in the set."""
+    """Sum over pairs of groups, each as often as it is in the set."""
     if of_pair.ndim == 3:
         return np.asarray(of_pair.sum(axis=(1, 2)) / 2)
     return np.asarray(((counts @ of_pair) * counts).sum(axis=1) / 2)
@@ -110,7 +110,7 @@ def _order(counts: Counts, recorded: Side, sim: Side) -> Values:
 
 
 def _mmrv(counts: Counts, judge: Side, judged: Side) -> Values:
-    """Mean over cells of the largest gap to a cell in the set whose order is wrong."""
+    """Mean over groups of the largest gap to a group in the set whose order is wrong."""
     above = judge[..., :, None] > judge[..., None, :]
     wrong = above != (judged[..., :, None] > judged[..., None, :])
     violations = wrong * np.abs(judge[..., :, None] - judge[..., None, :])
@@ -121,8 +121,8 @@ def _mmrv(counts: Counts, judge: Side, judged: Side) -> Values:
     return _weighted_mean(counts, worst)
 
 
-def _largest_there(counts: Counts, row: Float64[np.ndarray, " cells"]) -> np.ndarray:
-    """Largest violation of one cell against the cells that are in each set."""
+def _largest_there(counts: Counts, row: Float64[np.ndarray, " groups"]) -> np.ndarray:
+    """Largest violation of one group against the groups that are in each set."""
     order = np.argsort(-row, kind="stable")[: int((row > 0).sum())]
     if not len(order):
         return np.zeros(len(counts))

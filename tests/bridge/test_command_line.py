@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import robot_gst
+from bridge.cli import recording
 from bridge.episode.catalogue import label_episode, list_episodes
 from bridge.episode.metadata import EpisodeInfo, Outcome, to_strings
 from bridge.episode.run_folder import RunFolder, check_episode_id
@@ -100,6 +101,19 @@ def test_the_list_fits_eighty_columns_and_gives_the_cause_of_what_is_unknown(
     assert " unlabelled " in text
     robot_gst.run(["info", str(run_path / "episodes" / "t2.mcap")])
     assert f"outcome: unknown ({why})" in capsys.readouterr().out
+
+
+def test_what_a_recorder_lists_looks_like_what_ls_lists(
+    run_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entries = [dataclasses.asdict(entry) for entry in list_episodes(RunFolder.open(run_path))]
+    answer = json.loads(json.dumps({"ok": True, "of": 3, "episodes": entries}))
+    answer["episodes"][0]["what_later_versions_add"] = 1
+    more, *lines = recording._describe_list(answer).splitlines()
+    assert more == "(2 more before these)"
+    robot_gst.run(["ls", str(run_path)])
+    assert lines == capsys.readouterr().out.splitlines()
+    assert "no episode" in recording._describe_list({"of": 0, "episodes": []})
 
 
 def test_a_label_given_later_wins_and_leaves_the_episode_untouched(run_path: Path) -> None:

@@ -17,8 +17,11 @@ def settings(folder: Path, text: str) -> str:
 @pytest.mark.parametrize(
     ("table", "said"),
     [
-        ("replays", "has [replays], which no command is called. There are: demo, record"),
-        ("publish.stand-in", "has [publish.stand-in], which no command is called. There are: fol"),
+        ("replays", "has [replays], but no command has that name. There are: demo, record"),
+        (
+            "publish.stand-in",
+            "has [publish.stand-in], but no command has that name. There are:",
+        ),
     ],
 )
 def test_a_table_that_is_named_like_no_command_is_refused(

@@ -13,7 +13,8 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.terminal import Output
 from dashboards import demo
-from dashboards.demo import DemoConfig, look
+from dashboards.config import DemoConfig
+from dashboards.demo import look
 from dashboards.errors import DashboardError
 
 TASK = "cube_into_box"

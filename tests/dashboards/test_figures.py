@@ -5,7 +5,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dashboards.figures import Cell, Signal, Span, axis, nice_ticks, scatter, stage_chart, time_plot
+from dashboards.figures import (
+    RateGroup,
+    Signal,
+    Span,
+    axis,
+    nice_ticks,
+    scatter,
+    stage_chart,
+    time_plot,
+)
 from evaluator.result import Interval, Measurement
 
 
@@ -115,10 +124,10 @@ def rate(value: float, side: str) -> Measurement:
     )
 
 
-def cell(replayed: float, recorded: float) -> Cell:
-    return Cell(
+def group(replayed: float, recorded: float) -> RateGroup:
+    return RateGroup(
         label="a",
-        group="a",
+        series="a",
         task="a",
         condition="with_replanning",
         policy="",
@@ -128,8 +137,8 @@ def cell(replayed: float, recorded: float) -> Cell:
     )
 
 
-def test_a_cell_in_agreement_lies_on_the_identity_line() -> None:
-    drawn = scatter([cell(0.7, 0.7)])
+def test_a_group_in_agreement_lies_on_the_identity_line() -> None:
+    drawn = scatter([group(0.7, 0.7)])
     assert drawn is not None
     point = drawn.points[0]
     across = (point.x - drawn.axis_x.px(0)) / (drawn.axis_x.px(1) - drawn.axis_x.px(0))
@@ -138,7 +147,7 @@ def test_a_cell_in_agreement_lies_on_the_identity_line() -> None:
     assert across == pytest.approx(upright, abs=1e-3)
 
 
-def test_cells_that_coincide_are_drawn_apart() -> None:
-    drawn = scatter([cell(0.5, 0.5), cell(0.5, 0.5)])
+def test_groups_that_coincide_are_drawn_apart() -> None:
+    drawn = scatter([group(0.5, 0.5), group(0.5, 0.5)])
     assert drawn is not None
     assert drawn.points[0].x != drawn.points[1].x

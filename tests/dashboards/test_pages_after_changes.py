@@ -72,4 +72,4 @@ def test_of_a_trajectory_replayed_twice_the_last_replay_counts_on_the_page(
     assert copy.derived("trial_0002.replay.planned*")[0] == last  # by name it is the first
     text = words(synthetic.browser_of(copy).get("/episode/trial_0002").text)
     assert "Twin, planned ✓ success" in text
-    assert text.index("✓ accepted") < text.index("dynamic, made again since ✗ refused")
+    assert text.index("✓ accepted") < text.index("dynamic, redone since ✗ refused")

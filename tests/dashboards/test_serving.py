@@ -109,11 +109,10 @@ def test_every_listed_file_has_a_page_and_nothing_else_has(tmp_path: Path) -> No
 def test_a_terminated_demo_ends_what_it_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    left: list[demo.Background] = []
+    left: list[subprocess.Popen[bytes]] = []
 
-    def start(arguments: list[str], log: Path) -> demo.Background:
-        process = subprocess.Popen(["sleep", "60"])
-        left.append(demo.Background(command=arguments[0], process=process, log=log))
+    def start(arguments: list[str], **_: object) -> subprocess.Popen[bytes]:
+        left.append(subprocess.Popen(["sleep", "60"]))
         return left[-1]
 
     def answers(*_: object) -> bool:
@@ -128,7 +127,7 @@ def test_a_terminated_demo_ends_what_it_started(
         assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
     finally:
         signal.signal(signal.SIGTERM, before)
-    assert [item.process.poll() for item in left] == [-signal.SIGTERM]
+    assert [process.poll() for process in left] == [-signal.SIGTERM]
 
 
 def test_host_headers_are_split_from_their_port() -> None:

@@ -44,7 +44,7 @@ def test_a_mean_of_shares_is_a_percentage_like_the_rates_beside_it() -> None:
 
 def test_a_chance_of_success_is_counts_and_whole_percentages() -> None:
     said = {"value": 1.0, "low": 0.5101091635454027, "high": 1.0, "k": 4, "n": 4}
-    assert plain(wording.chance(said)) == "4 of 4 varied replays succeed, 51 to 100 %"
+    assert plain(wording.success_share(said)) == "4 of 4 varied replays succeed, 51 to 100 %"
 
 
 def test_a_rate_in_large_is_its_count_and_below_stands_its_interval() -> None:

@@ -31,10 +31,8 @@ pytestmark = pytest.mark.slow
 Gst = Callable[..., subprocess.CompletedProcess[str]]
 
 
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = tmp_path_factory.mktemp("demo") / "run"
-    done = subprocess.run(
+def short_demo(run: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
         [sys.executable, "-c", SHORT, str(run)],
         capture_output=True,
         text=True,
@@ -42,6 +40,12 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cwd=ROOT,
         check=False,
     )
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("demo") / "run"
+    done = short_demo(run)
     assert done.returncode == 0, done.stderr[-3000:]
     assert "stand-in" in done.stdout
     return run
@@ -105,8 +109,18 @@ def test_the_scene_opens_as_a_standard_splat_file(demo: Path) -> None:
         assert name in header
 
 
-def test_running_the_demo_again_keeps_the_episodes(demo: Path, gst: Gst) -> None:
+def test_running_the_demo_again_keeps_what_is_whole_and_adds_what_is_missing(demo: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in all_files(demo)}
-    done = gst("demo", str(demo), "--quick", "--no-serve")
+    done = short_demo(demo)
     assert done.returncode == 0, done.stderr[-2000:]
     assert {path: path.stat().st_mtime_ns for path in all_files(demo)} == before
+    lost = demo / "episodes" / "trial_0002.mcap"
+    lost.unlink()
+    done = short_demo(demo)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "4/6 1 trials" in done.stderr
+    assert Episode.open(lost).info.condition == "with_replanning"
+    kept = {path: path.stat().st_mtime_ns for path in all_files(demo)}
+    assert {path for path in before if kept.get(path) != before[path]} <= {
+        path for path in before if path.name.startswith(lost.stem)
+    }

@@ -1,4 +1,4 @@
-"""The gate's worth clause by clause, out of what the verdicts' predicates said."""
+"""The gate's scorecard clause by clause, out of what the verdicts' predicates said."""
 
 from dataclasses import replace
 from typing import Any
@@ -8,6 +8,7 @@ import pytest
 from bridge.task.verdict import Factor, Verdict
 from evaluator.compare.gate import clause_scorecard, gate_scorecard
 from evaluator.compare.rows import TrialRow
+from evaluator.report.views import view
 from evaluator.run_reader.episodes import clauses_of
 
 WITHOUT = "without_replanning"
@@ -92,10 +93,14 @@ def test_each_clause_is_judged_by_the_trials_in_which_it_was_decided() -> None:
     assert "ik never said no" in str(never.reason_if_undefined)
     lines = {line[1]: line for line in next(t for t in tables if t.id == "gate_clauses").rows}
     assert lines["terminal.inside"][2:5] == (5, 3, 2)
-    assert lines["terminal.inside"][6] == 1  # a good plan refused
+    assert lines["terminal.inside"][8] == 1  # a good plan refused
     assert lines["terminal.inside"][-1] == 2  # two bad executions avoided for it
-    assert lines["terminal.settled"][-1] == "any"
+    assert lines["terminal.settled"][-1] is None
     assert lines["ik"][-1] is None
+    shown = {line[1]: line for line in view(next(t for t in tables if t.id == "gate_clauses")).rows}
+    assert str(shown["terminal.inside"][5]).startswith("2/3 = 67 % [")
+    assert shown["terminal.settled"][-1] == "any"
+    assert shown["ik"][-1] is None
 
 
 def test_obeying_one_clause_costs_what_counting_says() -> None:

@@ -52,7 +52,7 @@ def test_a_point_of_the_scatter_compares_the_same_trials(six_trials: Any) -> Non
     assert (everyone.k, everyone.n) == (2, 4)
     assert (common.k, common.n) == (2, 3)
     assert set(common.episodes) == set(results.get(f"rate_common.sim_planned.{cell}").episodes)
-    with_replanning = next(c for c in comparison.cells if c.condition == "with_replanning")
+    with_replanning = next(c for c in comparison.groups if c.condition == "with_replanning")
     assert with_replanning.pair[1] == common
 
 

@@ -92,11 +92,11 @@ def test_coverage_counts_a_coin_by_hand() -> None:
 def test_simulated_coverage_of_fisher_is_the_stored_one() -> None:
     from evaluator.statistics import agreement
 
-    def make(cells: simulate.Cells, _: int, __: np.random.Generator) -> Interval:
-        return agreement.fisher_interval(agreement.pearson(*cells), len(cells[0]))
+    def make(groups: simulate.Groups, _: int, __: np.random.Generator) -> Interval:
+        return agreement.fisher_interval(agreement.pearson(*groups), len(groups[0]))
 
     rng = np.random.default_rng(1)
-    found = simulate.of_cells(make, "pearson", 10, POPULATIONS[:2], draws=100, rng=rng)
+    found = simulate.of_groups(make, "pearson", 10, POPULATIONS[:2], draws=100, rng=rng)
     known = stored.coverage_of("fisher-z", 10)
     assert known is not None
     assert abs(found.mean - known.mean) < 0.06  # 200 draws: 0.016, and fewer truths
@@ -126,11 +126,11 @@ def test_truths_of_what_is_known_by_hand() -> None:
     assert truth("mae", independent, 5) == pytest.approx(0.3, abs=0.01)
     assert truth("bias", independent, 5) == 0
     few, many = (truth("mmrv-recorded", independent, n) for n in (4, 20))
-    assert few < many  # it grows with the number of cells
+    assert few < many  # it grows with the number of groups
 
 
-def test_correlated_cells_are_drawn_as_they_are_described() -> None:
-    population = Population(correlation=0.9, trials=1000, cluster_share=0.5, cells_per_cluster=2)
+def test_correlated_groups_are_drawn_as_they_are_described() -> None:
+    population = Population(correlation=0.9, trials=1000, cluster_share=0.5, groups_per_cluster=2)
     x, y = population.draw(20_000, np.random.default_rng(2))
     assert np.corrcoef(x, y)[0, 1] == pytest.approx(0.89, abs=0.01)  # uniform marginals
     first, second = x.reshape(-1, 2).T
@@ -220,7 +220,7 @@ def test_no_other_method_would_have_covered_more(statistic: str, kind: str) -> N
             assert min(other.worst, 0.95) <= min(known.worst, 0.95) + 1e-12
 
 
-def test_a_refusal_names_how_many_cells_would_be_enough() -> None:
+def test_a_refusal_names_how_many_groups_would_be_enough() -> None:
     refused = [
         (statistic, n)
         for statistic in STATISTICS

@@ -286,9 +286,11 @@ def test_a_goal_is_answered_or_the_trials_it_may_take_are_named(
     assert evaluate(path, out=tmp_path / "out", goal=0.6) == 0
     table = next(t for t in compare_csv(path, goal=0.6).tables if t.id == "stopping")
     settled, still_open = table.rows
-    assert settled[5] == "stop: above 60 %"
-    assert still_open[5] == "continue"
-    assert still_open[6] > 20
+    assert settled[3] == 0.6
+    assert 0.6 < settled[5] < settled[6]
+    assert settled[7:9] == (True, "above")
+    assert still_open[7] is False
+    assert still_open[9] > 20
     assert "stop: above 60 %" in capsys.readouterr().out
     with pytest.raises(UsageError, match="--goal 60"):
         evaluate(path, goal=60.0)

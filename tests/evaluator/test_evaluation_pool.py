@@ -199,7 +199,8 @@ def test_an_interrupt_ends_all_processes(six_trials: Any) -> None:
         assert process.stdout.readline() == "reading\n"
         os.killpg(process.pid, signal.SIGINT)
         out, said = process.communicate(timeout=20)
-    assert (process.returncode, out, said) == (130, "", "")
+    told = f"robot-gst: interrupted; continue with: robot-gst evaluate {six_trials.run.path}\n"
+    assert (process.returncode, out, said) == (130, "", told)
     assert ended_within(pid, 10.0)
 
 

@@ -6,10 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.geometry.trajectory import PoseTrajectory
+from bridge.media.image_quality import ImageShapeError, psnr_db, ssim
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.image import ImageShapeError, psnr_db
 from evaluator.metrics.image_scores import score_image
-from evaluator.metrics.ssim import ssim
 from evaluator.metrics.trajectory import band_distance, moving_part, pose_errors, repeatability
 
 

@@ -52,7 +52,7 @@ def test_rates_of_two_tasks_of_one_id_are_refused_with_their_rows(
 def test_tasks_in_any_script_keep_their_own_rates(write_table: Callable[[str], Path]) -> None:
     lines = ["a,方块,c,success,success", "b,方块,c,success,success", "c,鸭子,c,failure,success"]
     comparison = compare_csv(write_table(HEADER + "\n".join(lines) + "\n"))
-    assert [(c.task, c.recorded.k, c.recorded.n) for c in comparison.cells] == [
+    assert [(c.task, c.recorded.k, c.recorded.n) for c in comparison.groups] == [
         ("方块", 2, 2),
         ("鸭子", 0, 1),
     ]

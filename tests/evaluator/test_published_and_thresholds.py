@@ -55,16 +55,16 @@ def test_the_papers_r_without_with_and_over_all_cells() -> None:
     assert results.get("agreement.bias_pp").value == pytest.approx(12.333, abs=5e-4)
 
 
-def test_the_remarks_say_that_the_paper_is_underpowered_and_optimistic() -> None:
-    rows = table_of(compare_csv(RATES).results(), "remarks").rows
-    remarks = {about: [str(text) for other, text in rows if other == about] for about, _ in rows}
+def test_the_notes_say_that_the_paper_is_underpowered_and_optimistic() -> None:
+    rows = table_of(compare_csv(RATES).results(), "notes").rows
+    notes = {about: [str(text) for other, text in rows if other == about] for about, _ in rows}
     assert (
         "gain of +40 pp (Boschloo p = 0.09); 23 per condition would"
-        in remarks["sloth_into_basket"][0]
+        in notes["sloth_into_basket"][0]
     )
-    assert "counted in objects (n = 50)" in remarks["ducks_into_basket"][0]
-    assert "optimistic by +12.3 pp" in " ".join(remarks["agreement.pearson_r"])
-    assert "+24.67 percentage points and +44.58 % relative" in remarks["gain"][0]
+    assert "counted in objects (n = 50)" in notes["ducks_into_basket"][0]
+    assert "optimistic by +12.3 pp" in " ".join(notes["agreement.pearson_r"])
+    assert "+24.67 percentage points and +44.58 % relative" in notes["gain"][0]
 
 
 def test_the_published_table_is_recomputed_figure_by_figure() -> None:
@@ -79,14 +79,18 @@ def test_the_published_table_is_recomputed_figure_by_figure() -> None:
         assert verdicts[f"average_percent {side} {condition}"].verdict == "as printed"
     relative = verdicts["gain_relative_percent recorded"]
     assert relative.verdict == "only from rounded figures"
-    assert relative.recomputed == "44.58"
-    assert "44.67 comes from the rounded averages" in relative.remark
+    assert relative.recomputed == pytest.approx(44.58, abs=0.005)
+    assert "44.67 comes from the rounded averages" in relative.note
     ducks = verdicts["ducks_into_basket without_replanning real"]
     assert ducks.verdict == "impossible"
-    assert "23 of 50 objects, not 10 trials" in ducks.remark
-    assert verdicts["pearson_r all cells (n = 6)"].recomputed == "0.929"
-    assert verdicts["pearson_r without_replanning (n = 3)"].recomputed == "0.990"
-    assert verdicts["pearson_r with_replanning (n = 3)"].recomputed == "0.866"
+    assert "23 of 50 objects, not 10 trials" in ducks.note
+    assert verdicts["pearson_r all groups (n = 6)"].recomputed == pytest.approx(0.929, abs=5e-4)
+    assert verdicts["pearson_r without_replanning (n = 3)"].recomputed == pytest.approx(
+        0.990, abs=5e-4
+    )
+    assert verdicts["pearson_r with_replanning (n = 3)"].recomputed == pytest.approx(
+        0.866, abs=5e-4
+    )
     assert verdicts["gain_pp sloth_into_basket sim"].verdict == "as printed"
     assert len(check.failed) == 2
 
@@ -224,10 +228,10 @@ def test_a_rate_that_several_counts_give_accuses_nobody(
     check = check_published(path)
     found = {finding.row: finding for finding in check.findings}
     assert found[2].verdict == "ambiguous"
-    assert "2 counts of 150 round to 0.67" in found[2].remark
+    assert "2 counts of 150 round to 0.67" in found[2].note
     assert [finding.row for finding in check.failed] == [3]
-    assert check.comparison.cells[0].sim.value == 0.67
-    assert check.comparison.cells[0].sim.n is None
+    assert check.comparison.groups[0].sim.value == 0.67
+    assert check.comparison.groups[0].sim.n is None
 
 
 def test_a_printed_figure_that_the_rows_do_not_give_does_not_pass(
@@ -236,7 +240,7 @@ def test_a_printed_figure_that_the_rows_do_not_give_does_not_pass(
     rows = "a,c,sim,trial,10,50,,\na,c,real,trial,10,40,,\n"
     check = check_published(write_table(f"{HEAD}{rows},,,,,,pearson_r,0.95\n"))
     assert [finding.verdict for finding in check.failed] == ["undefined"]
-    assert "printed 0.95, but the rows do not give it: 1 cell" in check.failed[0].remark
+    assert "printed 0.95, but the rows do not give it: 1 cell" in check.failed[0].note
 
 
 def test_the_count_behind_a_rate_of_a_billion_trials_is_not_searched_for(
@@ -291,5 +295,5 @@ def test_no_gain_at_all_is_not_called_underpowered(write_table: Callable[[str], 
         for side in ("sim", "real")
     ]
     comparison = check_published(write_table(HEAD + "\n".join(lines) + "\n")).comparison
-    remarks = [t for t in comparison.tables if t.id == "remarks"]
-    assert not any("underpowered" in str(row) for table in remarks for row in table.rows)
+    notes = [t for t in comparison.tables if t.id == "notes"]
+    assert not any("underpowered" in str(row) for table in notes for row in table.rows)

@@ -14,8 +14,8 @@ OLD, NEW = "0123456789ab", "ba9876543210"
 
 
 def said_of_replays(comparison: Comparison) -> list[str]:
-    """Return the remarks about replays."""
-    tables = [table for table in comparison.tables if table.id == "remarks"]
+    """Return the notes about replays."""
+    tables = [table for table in comparison.tables if table.id == "notes"]
     return [str(text) for table in tables for about, text in table.rows if about == "replays"]
 
 
@@ -104,8 +104,8 @@ def test_the_report_says_so_beside_the_rates_it_is_about(two: Any, tmp_path: Pat
     two.replay("a", scene_hash=OLD)
     two.replay("b", scene_hash=NEW)
     report = write_report(compare_run(two.run), tmp_path / "out").report.read_text()
-    rates, remark, cells = (
+    rates, note, cells = (
         report.index(text) for text in ('id="success"', f"1 in scene {OLD}", 'id="agreement"')
     )
-    assert rates < remark < cells
+    assert rates < note < cells
     assert "1 cells" not in report

@@ -73,7 +73,7 @@ def test_confusion_counts_said_against_happened() -> None:
     found = Confusion.count(pairs)
     assert (found.true_positive, found.false_positive) == (1, 2)
     assert (found.false_negative, found.true_negative) == (1, 1)
-    assert (found.n, found.agreed, found.said_success, found.said_failure) == (5, 2, 3, 2)
+    assert (found.n, found.agreed, found.predicted_success, found.predicted_failure) == (5, 2, 3, 2)
 
 
 @settings(max_examples=40, deadline=None)
@@ -120,14 +120,14 @@ def test_r_does_not_care_about_order_or_scale(
 
 
 def test_r_of_two_points_and_of_a_constant_side_is_refused() -> None:
-    with pytest.raises(UndefinedStatisticError, match="2 cells; it needs at least 3"):
+    with pytest.raises(UndefinedStatisticError, match="2 groups; it needs at least 3"):
         agreement.pearson([0.1, 0.2], [0.3, 0.4])
     with pytest.raises(UndefinedStatisticError, match=r"twin side is constant \(1 in all 3"):
         agreement.pearson([0.1, 0.2, 0.3], [1, 1, 1])
 
 
-def test_r_of_three_cells_has_no_interval() -> None:
-    with pytest.raises(UndefinedStatisticError, match="3 cells; it needs at least 4"):
+def test_r_of_three_groups_has_no_interval() -> None:
+    with pytest.raises(UndefinedStatisticError, match="3 groups; it needs at least 4"):
         agreement.fisher_interval(0.9, 3)
 
 
@@ -139,14 +139,14 @@ def test_a_perfect_twin_violates_no_rank(recorded: list[Fraction]) -> None:
 
 
 def test_mmrv_by_hand_in_both_conventions() -> None:
-    # Cells 1 and 2 are swapped: gaps 0.2 on the recorded side, 0.5 on the twin's; cell 3 is right.
+    # Groups 1 and 2 are swapped: gaps 0.2 recorded, 0.5 on the twin's side; group 3 is right.
     recorded, sim = [0.2, 0.4, 0.9], [0.6, 0.1, 0.95]
     assert agreement.mmrv(recorded=recorded, sim=sim) == pytest.approx(0.4 / 3)
     assert agreement.mmrv(recorded=recorded, sim=sim, gap="sim") == pytest.approx(1.0 / 3)
 
 
 def test_a_tie_on_one_side_only_counts_from_one_side() -> None:
-    # Equation 1 compares S_i > S_j with R_i > R_j: only the better recorded cell sees the tie.
+    # Equation 1 compares S_i > S_j with R_i > R_j: only the better recorded group sees the tie.
     assert agreement.mmrv(recorded=[0.2, 0.6], sim=[0.5, 0.5]) == pytest.approx(0.4 / 2)
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from evaluator.compare import compare_run
 from evaluator.compare.success import varied_sim
+from evaluator.report.views import view
 from evaluator.result import Table
 
 
@@ -32,8 +33,8 @@ def test_sim_is_estimated_again_beside_the_replay_that_chose_the_plan(maker: Any
     without = results.get(f"bias.selection.{task}.without_replanning.scripted")
     assert without.value == pytest.approx(0.0)
     lines = {row[1]: row[3:] for row in table_of(maker).rows}
-    assert lines["with replanning"] == ("3/3", "62.5 % (n = 3)", 37.5)
-    assert lines["without replanning"] == ("0/1", "0.0 % (n = 1)", 0.0)
+    assert lines["with_replanning"] == (3, 3, pytest.approx(0.625), 3, 37.5)
+    assert lines["without_replanning"] == (0, 1, 0.0, 1, 0.0)
 
 
 def test_the_shares_a_gate_drew_are_not_those_of_fresh_seeds(maker: Any) -> None:
@@ -61,4 +62,5 @@ def test_varied_replays_beside_a_plain_one_are_found(maker: Any) -> None:
     maker.trial("a")
     maker.replay("a", tag="a")
     maker.replay("a", tag="b", varied=(1, 4))
-    assert table_of(maker).rows[0][4] == "25.0 % (n = 1)"
+    assert table_of(maker).rows[0][5:7] == (0.25, 1)
+    assert view(table_of(maker)).rows[0][4] == "25.0 % (n = 1)"

@@ -12,9 +12,10 @@ from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
+from bridge.media.image_quality import ImageShapeError, aligned
 from evaluator.compare.run import compare_run
 from evaluator.errors import EvaluatorError, UndefinedStatisticError
-from evaluator.metrics.image import ImageShapeError, aligned, score_depth
+from evaluator.metrics.image import score_depth
 from evaluator.metrics.image_protocol import ImageOptions
 from evaluator.metrics.image_scores import score_image
 

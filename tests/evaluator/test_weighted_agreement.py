@@ -12,7 +12,7 @@ from evaluator.statistics import agreement, bootstrap
 from evaluator.statistics.bootstrap import (
     METHODS,
     SCALES,
-    CellSample,
+    GroupSample,
     bootstrap_interval,
     expanded_tail,
     remeasure_counts,
@@ -47,7 +47,7 @@ def test_every_statistic_has_a_plain_twin_and_a_scale() -> None:
 
 
 @pytest.mark.parametrize("statistic", PLAIN)
-def test_counting_cells_several_times_is_repeating_them(statistic: str) -> None:
+def test_counting_groups_several_times_is_repeating_them(statistic: str) -> None:
     rng = np.random.default_rng(4)
     recorded, sim = rng.integers(0, 6, (2, 7)) / 5  # few values, so that there are ties
     counts = rng.multinomial(7, np.full(7, 1 / 7), size=40)
@@ -81,7 +81,7 @@ def test_an_exact_bootstrap_is_the_bootstrap_of_all_ordered_draws(statistic: str
         for draw in itertools.product(range(5), repeat=5)
     )
     values = [value for value in found if value is not None]
-    # Sets with fewer than three different cells are undefined for the plain forms in other places.
+    # Sets with fewer than three different groups are undefined for the plain forms in other places.
     interval = bootstrap_interval(
         statistic, recorded=recorded, sim=sim, rng=np.random.default_rng(0)
     )
@@ -94,7 +94,7 @@ def test_a_jackknife_of_a_mean_is_students_interval() -> None:
     from evaluator.statistics.bootstrap import student_interval
 
     recorded, sim = [0.1, 0.5, 0.6, 0.9, 0.3], [0.2, 0.4, 0.9, 0.8, 0.35]
-    sample = CellSample(recorded=recorded, sim=sim, rng=np.random.default_rng(0))
+    sample = GroupSample(recorded=recorded, sim=sim, rng=np.random.default_rng(0))
     mine = sample.interval("bias", "jackknife")
     theirs = student_interval([s - r for r, s in zip(recorded, sim, strict=True)])
     assert (mine.low, mine.high) == pytest.approx((theirs.low, theirs.high), abs=1e-12)
@@ -106,7 +106,7 @@ def test_an_expanded_bootstrap_is_wider_and_tends_to_the_plain_one() -> None:
     assert expanded_tail(0.025, 10_000) == pytest.approx(0.025, abs=1e-4)
     rng = np.random.default_rng(1)
     recorded, sim = rng.random((2, 8)).tolist()
-    sample = CellSample(recorded=recorded, sim=sim, rng=rng)
+    sample = GroupSample(recorded=recorded, sim=sim, rng=rng)
     plain_one, wide = (sample.interval("mae", method) for method in METHODS[:2])
     assert wide.low <= plain_one.low
     assert wide.high >= plain_one.high
@@ -114,7 +114,7 @@ def test_an_expanded_bootstrap_is_wider_and_tends_to_the_plain_one() -> None:
 
 def test_no_interval_is_given_at_the_end_of_a_range_or_without_variation() -> None:
     up = [0.1, 0.2, 0.3, 0.4, 0.5]
-    sample = CellSample(recorded=up, sim=up, rng=np.random.default_rng(0))
+    sample = GroupSample(recorded=up, sim=up, rng=np.random.default_rng(0))
     for statistic, why in (
         ("kendall", "no width"),
         ("mae", "no width"),
@@ -143,7 +143,7 @@ def test_thousands_of_resamples_are_drawn_once_for_all_statistics(
     rng = np.random.default_rng(2)
     recorded, sim = (rng.integers(0, 11, (2, 24)) / 10).tolist()
     clusters = [i // 3 for i in range(24)]  # 8 policies: 6,435 resamples, all visited
-    sample = CellSample(recorded=recorded, sim=sim, rng=rng, clusters=clusters)
+    sample = GroupSample(recorded=recorded, sim=sim, rng=rng, clusters=clusters)
     for statistic in STATISTICS:
         sample.interval(statistic, "bootstrap")
     assert [len(found.weights) for found in drawn] == [6_435]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from bridge.geometry.box import box_corners
+from bridge.geometry.mesh import box_corners
 from twin.replay import _clearance
 from twin.replay.clearance.bodies import NearPairs, half_space_solid, solid_of
 from twin.replay.clearance.bounding_spheres import FINE_M, BoundingSpheres, bounding_spheres_of

@@ -12,8 +12,8 @@ from scipy.signal import convolve2d
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch.nn import functional
 
-from evaluator.metrics.image import gmsd, psnr_db
-from evaluator.metrics.ssim import ms_ssim, ssim, ssim_maps
+from bridge.media.image_quality import ms_ssim, psnr_db, ssim, ssim_maps
+from evaluator.metrics.image import gmsd
 
 pytestmark = pytest.mark.parity
 EXACT = 1e-9

@@ -1,11 +1,27 @@
-"""Every command stands in the table of commands."""
+"""Every command stands in the table of commands, and every documented command line parses."""
 
 import re
+import shlex
 from pathlib import Path
 
+import pytest
+
+import robot_gst
 from robot_gst import COMMANDS, GROUPS
 
-PAGE = (Path(__file__).parents[2] / "docs" / "cli.md").read_text()
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "cli.md").read_text()
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def command_lines() -> list[str]:
+    """Lines of the documents' code blocks that call ``robot-gst``."""
+    texts = [path.read_text().replace("\\\n", " ") for path in DOCUMENTS]
+    blocks = [block for text in texts for block in re.findall(r"```\n(.*?)```", text, re.DOTALL)]
+    lines = [line for block in blocks for line in block.splitlines()]
+    return sorted(
+        {line for line in lines if line.startswith("robot-gst ") and "COMMAND" not in line}
+    )
 
 
 def test_every_command_stands_in_the_table_of_commands() -> None:
@@ -13,3 +29,15 @@ def test_every_command_stands_in_the_table_of_commands() -> None:
     names += [f"{group} {name}" for group, (_, members) in GROUPS.items() for name, *_ in members]
     missing = [name for name in names if not re.search(rf"`{name}[ `]", PAGE)]
     assert missing == []
+
+
+@pytest.mark.parametrize("line", command_lines())
+def test_a_documented_command_is_understood(line: str) -> None:
+    for command in line.split(" && "):
+        tokens = shlex.split(command.rstrip("& "), comments=True)[1:]
+        app = robot_gst.build_app()
+        if "--config" in tokens:  # taken by the front door before the command is parsed
+            at = tokens.index("--config")
+            del tokens[at : at + 2]
+        found, *_ = app.parse_args(tokens, print_error=False, exit_on_error=False)
+        assert callable(found)

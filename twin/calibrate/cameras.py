@@ -1,4 +1,8 @@
-"""``robot-gst calibrate RUN --cameras``: each camera by what was recorded of it."""
+"""``robot-gst calibrate RUN --cameras``: each camera from what was recorded of it.
+
+From pose pairs of a target where there are some; otherwise, when it stands still, from the robot
+in its depth images.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -120,10 +124,7 @@ def find_fixed_camera(
     nominal = _nominal_pose(chosen[0], camera_id)
     config = AlignConfig(seed=seed)
     try:
-        if nominal is None:
-            alignment = align_robot(views, robot, config=config)
-        else:
-            alignment = align_robot(views, robot, start=nominal, config=config)
+        alignment = align_robot(views, robot, start=nominal, config=config)
     except RobotNotAlignedError:
         if nominal is None:
             raise
@@ -283,8 +284,8 @@ def target_record(found: TargetCamera, pairs: PosePairs, link: str) -> dict[str,
         "mount": found.mount,
         "link": link if in_hand else BASE_FRAME,
         "stream": "color",
-        "T_link_camera": pose_record(solution.X if in_hand else solution.Z),
-        "T_base_target" if in_hand else "T_effector_target": pose_record(
+        "T_link_camera": se3.pose_record(solution.X if in_hand else solution.Z),
+        "T_base_target" if in_hand else "T_effector_target": se3.pose_record(
             solution.Z if in_hand else solution.X
         ),
         "residual_m": solution.residual_m.to_record(),
@@ -305,7 +306,7 @@ def fixed_record(found: FixedCamera) -> dict[str, Any]:
         "mount": "fixed",
         "link": BASE_FRAME,
         "stream": "depth",
-        "T_link_camera": pose_record(found.alignment.T_base_source),
+        "T_link_camera": se3.pose_record(found.alignment.T_base_source),
         **found.alignment.to_record(),
         "sources": list(found.episodes),
     }
@@ -314,12 +315,6 @@ def fixed_record(found: FixedCamera) -> dict[str, Any]:
         record["correction_m"] = float(np.linalg.norm(change[:3, 3]))
         record["correction_rad"] = float(se3.rotation_angle_rad(change[:3, :3]))
     return record
-
-
-def pose_record(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
-    """Position [m] and quaternion, as they are stored."""
-    q, p = se3.split(T)
-    return {"p_m": p.tolist(), "q_wxyz": q.tolist()}
 
 
 def _nothing(run: RunFolder, reasons: Mapping[str, str]) -> str:

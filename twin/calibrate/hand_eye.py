@@ -1,7 +1,10 @@
-"""AX = ZB from noisy pose pairs: refined, robust, with intervals, or refused with a reason.
+"""Hand-eye calibration: AX = ZB from noisy pose pairs, with intervals, or refused with a reason.
 
-See ``closed_form`` for what A, B, X and Z are. The misfit of a pair is E = (Z B)^-1 A X: what is
-left between the two ways to the same frame. It does not change with the choice of base frame.
+With a camera in the hand, A is ``T_base_hand``, B is ``T_target_camera``, X is ``T_hand_camera``
+and Z is ``T_base_target``. With a fixed camera and the target in the hand, B is
+``T_camera_target``, X is ``T_hand_target`` and Z is ``T_base_camera``. Closed forms give the
+start; a robust least squares refines it. The misfit of a pair is E = (Z B)^-1 A X: what is left
+between the two ways to the same frame. It does not change with the choice of base frame.
 """
 
 from dataclasses import dataclass
@@ -13,12 +16,6 @@ from bridge.geometry import se3
 from twin.calibrate.config import Mount
 from twin.calibrate.pairs import PosePairs
 from twin.errors import TwinError
-
-# Closed-form solutions of AX = XB and AX = ZB; where ``robot_world`` starts refining from.
-# Both describe one set of pose pairs. With a camera in the hand, A is ``T_base_hand``, B is
-# ``T_target_camera``, X is ``T_hand_camera`` and Z is ``T_base_target``. With a fixed camera and
-# the target in the hand, B is ``T_camera_target``, X is ``T_hand_target`` and Z is
-# ``T_base_camera``.
 
 MAX_MOTIONS = 2000
 """Motions between pairs of poses that are used; more change nothing but the time."""
@@ -58,7 +55,7 @@ def solve_hand_eye(
     clear &= np.linalg.norm(beta, axis=1) < HALF_TURN_RAD
     if clear.sum() < 2:
         clear[:] = True
-    R = nearest_rotation(alpha[clear].T @ beta[clear])
+    R = se3.nearest_rotation(alpha[clear].T @ beta[clear])
     left = P[:, :3, :3] - np.eye(3)
     right = Q[:, :3, 3] @ R.T - P[:, :3, 3]
     t, *_ = np.linalg.lstsq(left.reshape(-1, 3), right.reshape(-1), rcond=None)
@@ -86,16 +83,9 @@ def solve_robot_world(
     return _transform(R_x, t[:3]), _transform(R_z, t[3:])
 
 
-def nearest_rotation(M: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation R that maximises trace(R^T M)."""
-    U, _, Vt = np.linalg.svd(M)
-    sign = np.array([1.0, 1.0, np.linalg.det(U @ Vt)])
-    return np.asarray((U * sign) @ Vt)
-
-
 def _rotation_from_columns(values: Float[np.ndarray, "9"]) -> Float[np.ndarray, "3 3"]:
     M = values.reshape(3, 3).T
-    return nearest_rotation(M * np.sign(np.linalg.det(M)))
+    return se3.nearest_rotation(M * np.sign(np.linalg.det(M)))
 
 
 def _transform(R: Float[np.ndarray, "3 3"], t_m: Float[np.ndarray, "3"]) -> np.ndarray:
@@ -171,7 +161,7 @@ def solve(
 
     Args:
         Ts_a: Poses from the robot.
-        Ts_b: Poses from the camera; see ``closed_form``.
+        Ts_b: Poses from the camera; see the module.
         seed: Of the resampling.
 
     Raises:

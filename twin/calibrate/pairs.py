@@ -164,8 +164,7 @@ def _stops(
 
 def _mean(Ts: Float[np.ndarray, "num_samples 4 4"]) -> Float[np.ndarray, "4 4"]:
     """Mean of nearby poses: positions, and the chordal mean of rotations."""
-    U, _, Vt = np.linalg.svd(Ts[:, :3, :3].sum(axis=0))
     T = np.eye(4)
-    T[:3, :3] = (U * np.array([1.0, 1.0, np.linalg.det(U @ Vt)])) @ Vt
+    T[:3, :3] = se3.nearest_rotation(Ts[:, :3, :3].sum(axis=0))
     T[:3, 3] = Ts[:, :3, 3].mean(axis=0)
     return T

@@ -78,6 +78,7 @@ def answer(question: Question) -> Verdict:
     """
     from twin.replay.dynamics import num_steps  # noqa: PLC0415
     from twin.replay.monte_carlo import replay_samples, with_probability  # noqa: PLC0415
+    from twin.replay.path import MAX_DURATION_S  # noqa: PLC0415
     from twin.replay.rebuilt_scene import (  # noqa: PLC0415
         calibrated,
         for_task,
@@ -93,7 +94,9 @@ def answer(question: Question) -> Verdict:
         question.task, question.urdf, question.Ts_base_object, covariances=question.covariances
     )
     config = for_task(calibrated(question.config, read_calibration(run)), question.task)
-    steps = num_steps(plan.tau[-1].t_ns if plan.tau else 0, config)
+    # Of a plan with impossible times the replay says what is wrong.
+    end_ns = min(max(plan.tau[-1].t_ns if plan.tau else 0, 0), round(MAX_DURATION_S * 1e9))
+    steps = max(1, num_steps(end_ns, config))
     if steps > question.max_steps:
         raise UndecidedError(
             f"its replay takes {steps} simulated steps, and a verdict at most "

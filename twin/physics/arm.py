@@ -1,4 +1,4 @@
-"""The robot in PyBullet: its motors, its fingers, where its links are."""
+"""The robot in PyBullet: its description as PyBullet should load it, motors, fingers and links."""
 
 import tempfile
 import xml.etree.ElementTree as ET
@@ -159,7 +159,7 @@ class Arm:
         self._joints: dict[str, int] = {}
         self.links: dict[str, int] = {}
         self._efforts: dict[str, float] = {}
-        self._axes: dict[str, tuple[float, ...]] = {}
+        self.opening_axes: dict[str, tuple[float, ...]] = {}
         parents: dict[str, int] = {}
         client = self._client
         for index in range(pybullet.getNumJoints(self.id, physicsClientId=client)):
@@ -167,7 +167,7 @@ class Arm:
             self._joints[item[1].decode()] = index
             self.links[item[12].decode()] = index
             self._efforts[item[1].decode()] = item[10]
-            self._axes[item[12].decode()] = tuple(item[13])
+            self.opening_axes[item[12].decode()] = tuple(item[13])
             parents[item[12].decode()] = item[16]
         missing = [name for name in (*ARM_JOINTS, *FINGER_JOINTS) if name not in self._joints] + [
             name for name in (TCP_FRAME, *FINGER_LINKS) if name not in self.links
@@ -329,10 +329,6 @@ class Arm:
         """Pose of a link's frame."""
         p, (x, y, z, w) = self.link_poses([self.links[link]])[0]
         return se3.transform_from(np.array([w, x, y, z]), np.array(p))
-
-    def opening_axis(self, link: str) -> tuple[float, ...]:
-        """Direction in which a finger opens, in its own frame."""
-        return self._axes[link]
 
     def push(
         self, link: str | None, force_N: tuple[float, ...], point_m: tuple[float, ...]

@@ -1,4 +1,4 @@
-"""Soft bodies as lattices of tetrahedra: what they are made of, and whether they hold."""
+"""Soft bodies as lattices of tetrahedra: geometry, coarser lattices, material, and health."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from bridge.errors import UsageError
+from bridge.geometry import se3
 from bridge.task.meshes.catalogue import ToyMesh, toy_mesh
 from bridge.task.meshes.lattice import Lattice, fill, make_lattice, volumes_m3
 from bridge.task.task_file import ObjectModel
@@ -22,22 +23,15 @@ def rigid_fit(
     nodes_m: Float[np.ndarray, "num_nodes 3"],
     mass_fraction: Float[np.ndarray, " num_nodes"],
 ) -> Float[np.ndarray, "4 4"]:
-    """Rigid motion that brings the nodes at rest nearest to where they are: Kabsch (1976).
+    """Rigid motion that brings the nodes at rest nearest to where they are.
 
     Squared distances are weighted by mass. Nodes that are no numbers give a pose that is none.
     """
-    T = np.eye(4)
     if not np.isfinite(nodes_m).all():
+        T = np.eye(4)
         T[:3] = np.nan
         return T
-    weight = mass_fraction / mass_fraction.sum()
-    middle_rest, middle = weight @ rest_m, weight @ nodes_m
-    cross = ((nodes_m - middle) * weight[:, None]).T @ (rest_m - middle_rest)
-    left, _, right = np.linalg.svd(cross)
-    flip = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))])
-    T[:3, :3] = left @ flip @ right
-    T[:3, 3] = middle - T[:3, :3] @ middle_rest
-    return T
+    return se3.align_rigid(rest_m, nodes_m, mass_fraction)
 
 
 def surface_triangles(
@@ -334,16 +328,9 @@ class SoftModel:
         """Triangles of the surface, counter-clockwise seen from outside."""
         return surface_triangles(self.tets) if self.triangles is None else self.triangles
 
-    def edges(self) -> Int[np.ndarray, "num_edges 2"]:
-        """Edges of all tetrahedra, once each, the lower number first."""
-        return self._rest_edges[0]
-
-    def edge_lengths_m(self) -> Float[np.ndarray, " num_edges"]:
-        """Lengths of ``edges`` at rest."""
-        return self._rest_edges[1]
-
     @cached_property
-    def _rest_edges(self) -> tuple[Int[np.ndarray, "num_edges 2"], Float[np.ndarray, " num_edges"]]:
+    def rest_edges(self) -> tuple[Int[np.ndarray, "num_edges 2"], Float[np.ndarray, " num_edges"]]:
+        """Edges of all tetrahedra, once each, the lower number first; and their lengths [m]."""
         # Asked for with every state of a replay: sorting them anew was a third of its time.
         pairs = np.concatenate([self.tets[:, list(pair)] for pair in _EDGES])
         edges = np.asarray(np.unique(np.sort(pairs, axis=1), axis=0))
@@ -391,10 +378,11 @@ def health_of(model: SoftModel, nodes_m: Float[np.ndarray, "num_nodes 3"]) -> So
     """Compare a body's nodes with its rest state."""
     if not np.isfinite(nodes_m).all():
         return SoftHealth(num_inverted=0, max_stretch=np.inf, is_finite=False)
-    now = _lengths_m(nodes_m, model.edges())
+    edges, rest_m = model.rest_edges
+    now_m = _lengths_m(nodes_m, edges)
     return SoftHealth(
         num_inverted=_num_inverted(np.asarray(nodes_m, dtype=np.float64), model.tets),
-        max_stretch=float((now / model.edge_lengths_m()).max()),
+        max_stretch=float((now_m / rest_m).max()),
         is_finite=True,
     )
 

@@ -1,4 +1,4 @@
-"""How a soft body is handed to the native solver: masses, damping, where contact is looked for."""
+"""How soft bodies, and the convex pieces they touch, are handed to the native solver."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from jaxtyping import Float, Int32
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
-from bridge.geometry.box import box_corners
+from bridge.geometry.mesh import box_corners
 from twin.physics._soft import SoftSolver as SoftSolver
 from twin.physics.arm import Hulls
 from twin.physics.soft import SoftModel

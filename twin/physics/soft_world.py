@@ -62,7 +62,7 @@ class Reaction:
             force, moment = tuple(row[:3]), tuple(row[3:])
             finger = self._arm.links[link] in self._arm.finger_links
             if finger:
-                opening += _dot(force, _rotated(q, self._arm.opening_axis(link)))
+                opening += _dot(force, _rotated(q, self._arm.opening_axes[link]))
             # The fingers' own forces meet in what carries them; their drive feels the rest.
             wrench = wrenches.setdefault(None if finger else link, [0.0] * 6)
             for k, value in enumerate((*force, *_sum(moment, _cross(p, force)))):

@@ -12,14 +12,13 @@ from math import cos
 from types import TracebackType
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.robots.default import BASE_FRAME, TCP_FRAME
-from twin.physics.arm import Arm, Hulls, Joints, PhysicsError, Press
+from twin.physics.arm import Arm, Hulls, PhysicsError, Press
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import give_client_back, pybullet, take_client
-from twin.physics.soft import SoftHealth, SoftModel
 from twin.physics.soft_world import SoftWorld
 
 # Friction that holds where it held: PyBullet's friction anchors, with fresh contact normals.
@@ -114,12 +113,12 @@ class World:
         self.free_ids: dict[str, int] = {}
         self._anchors = FrictionAnchors(self._client)
         try:
-            self._arm = Arm(self._client, urdf, mesh_hulls_m, config)
+            self.robot = Arm(self._client, urdf, mesh_hulls_m, config)
         except PhysicsError:
             self.close()
             raise
-        self._press = Press(self._arm)
-        self._soft = SoftWorld(self._client, self._arm, urdf, mesh_hulls_m, config)
+        self._press = Press(self.robot)
+        self.soft = SoftWorld(self._client, self.robot, urdf, mesh_hulls_m, config)
 
     def add_static(self, boxes: Sequence[Box], T_base_owner: Float[np.ndarray, "4 4"]) -> list[int]:
         """Add solid boxes that never move, one body each; returns the body ids."""
@@ -129,7 +128,7 @@ class World:
             T_owner_box[:3, 3] = centre
             body = self._box(extents, 0.0, T_base_owner @ T_owner_box)
             self._set_friction(body, self.config.surface_friction)
-            self._soft.add_static(extents, T_base_owner @ T_owner_box)
+            self.soft.add_static(extents, T_base_owner @ T_owner_box)
             ids.append(body)
         return ids
 
@@ -140,13 +139,13 @@ class World:
         body = self.add_static([(centre, extents)], np.eye(4))[0]
         # The robot stands on the table: its base touches it by construction.
         self._ignore(body, -1)
-        if BASE_FRAME in self._arm.links:
-            self._ignore(body, self._arm.links[BASE_FRAME])
+        if BASE_FRAME in self.robot.links:
+            self._ignore(body, self.robot.links[BASE_FRAME])
         return body
 
     def _ignore(self, body: int, link: int) -> None:
         pybullet.setCollisionFilterPair(
-            self._arm.id, body, link, -1, 0, physicsClientId=self._client
+            self.robot.id, body, link, -1, 0, physicsClientId=self._client
         )
 
     def add_free(
@@ -160,20 +159,8 @@ class World:
         body = self._box(size_m, mass_kg, T_base_object)
         self._set_friction(body, self.config.object_friction)
         self._anchors.add(body)
-        self._soft.add_free(body, size_m, mass_kg, T_base_object)
+        self.soft.add_free(body, size_m, mass_kg, T_base_object)
         self.free_ids[object_id] = body
-
-    def add_soft(
-        self, object_id: str, model: SoftModel, T_base_object: Float[np.ndarray, "4 4"]
-    ) -> None:
-        """Add a body that deforms, at rest and undeformed.
-
-        Args:
-            object_id: Its name in all other calls.
-            model: Shape and material.
-            T_base_object: Where its object frame is.
-        """
-        self._soft.add(object_id, model, T_base_object)
 
     def _box(
         self, size_m: Float[np.ndarray, "3"], mass_kg: float, T: Float[np.ndarray, "4 4"]
@@ -204,45 +191,25 @@ class World:
 
     def reset_robot(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
         """Put the robot into a posture at rest, without simulating."""
-        self._arm.reset(joints_rad, width_m)
-        self._soft.place_links()
-
-    def command(self, joints_rad: Joints, velocity_rad_s: Joints, width_m: float) -> None:
-        """Set the position targets that the motors follow from the next step on."""
-        self._arm.command(joints_rad, velocity_rad_s, width_m)
+        self.robot.reset(joints_rad, width_m)
+        self.soft.place_links()
 
     def step(self) -> None:
         """Advance rigid and soft bodies by one fixed step."""
-        self._soft.push_rigid()
+        self.soft.push_rigid()
         anew = self._anchors.refresh()
-        if not self._soft.names:  # soft bodies slow the fingers down themselves
+        if not self.soft.names:  # soft bodies slow the fingers down themselves
             self._press.update(anew=anew)
         pybullet.stepSimulation(physicsClientId=self._client)
-        self._soft.step()
-
-    def joints_rad(self) -> Float[np.ndarray, " num_joints"]:
-        """Where the arm is."""
-        return self._arm.joints_rad()
-
-    def width_m(self) -> float:
-        """Distance between the finger pads."""
-        return self._arm.width_m()
-
-    def posture(self) -> tuple[Float[np.ndarray, " num_joints"], float]:
-        """Where the arm is, and the distance between the finger pads."""
-        return self._arm.posture()
-
-    def T_base_link(self, link: str) -> Float[np.ndarray, "4 4"]:
-        """Pose of a link's frame."""
-        return self._arm.T_base_link(link)
+        self.soft.step()
 
     def object_pose(self, object_id: str) -> tuple[float, ...]:
         """Position [m] and quaternion wxyz of an object that moves, seven numbers.
 
         The pose of a soft body is the rigid motion nearest to its nodes, weighted by mass.
         """
-        if object_id in self._soft.names:
-            return self._soft.pose(object_id)
+        if object_id in self.soft.names:
+            return self.soft.pose(object_id)
         p, (x, y, z, w) = pybullet.getBasePositionAndOrientation(
             self._free(object_id), physicsClientId=self._client
         )
@@ -250,42 +217,27 @@ class World:
 
     def T_base_object(self, object_id: str) -> Float[np.ndarray, "4 4"]:
         """Pose of an object that moves, as ``object_pose``."""
-        if object_id in self._soft.names:
-            return self._soft.T_base_object(object_id).copy()
+        if object_id in self.soft.names:
+            return self.soft.T_base_object(object_id).copy()
         pose = np.array(self.object_pose(object_id))
         return se3.transform_from(pose[3:], pose[:3])
 
     def finger_touches(self, object_id: str) -> bool:
         """Whether a finger is in contact with an object that moves."""
-        if object_id in self._soft.names:
-            return self._soft.finger_touches(object_id)
+        if object_id in self.soft.names:
+            return self.soft.finger_touches(object_id)
         body = self._free(object_id)
         return any(
             point[8] <= 0.0
-            for link in self._arm.finger_links
+            for link in self.robot.finger_links
             for point in pybullet.getContactPoints(
-                self._arm.id, body, linkIndexA=link, physicsClientId=self._client
+                self.robot.id, body, linkIndexA=link, physicsClientId=self._client
             )
         )
 
-    def soft_nodes_m(self, object_id: str) -> Float32[np.ndarray, "num_nodes 3"]:
-        """Where the nodes of a soft body are, base frame."""
-        return self._soft.nodes_m(object_id).astype(np.float32)
-
-    def soft_extents_m(self, object_id: str) -> Float[np.ndarray, "3"]:
-        """Outer extents of a soft body's surface along the axes of its pose.
-
-        Relative to those of its surface at rest, times ``SoftModel.size_m``.
-        """
-        return self._soft.extents_m(object_id)
-
-    def soft_health(self, object_id: str) -> SoftHealth:
-        """Whether a soft body burst or turned inside out."""
-        return self._soft.health(object_id)
-
     def _free(self, object_id: str) -> int:
         if object_id not in self.free_ids:
-            known = ", ".join([*self.free_ids, *self._soft.names]) or "none"
+            known = ", ".join([*self.free_ids, *self.soft.names]) or "none"
             message = f"no object {object_id!r} moves in this world. There are: {known}."
             raise PhysicsError(message)
         return self.free_ids[object_id]
@@ -294,15 +246,6 @@ class World:
     def client(self) -> int:
         """PyBullet's number of this world."""
         return self._client
-
-    @property
-    def robot_id(self) -> int:
-        """PyBullet's number of the robot."""
-        return self._arm.id
-
-    def link_id(self, link: str) -> int:
-        """PyBullet's number of a link of the robot."""
-        return self._arm.links[link]
 
     def close(self) -> None:
         """Give the client back; a second call does nothing."""
@@ -355,7 +298,7 @@ class Attachment:
                 pybullet.removeConstraint(self._constraint, physicsClientId=self._world.client)
                 self._constraint = None
             return
-        width_m = self._world.width_m()
+        width_m = self._world.robot.width_m()
         if command_m > width_m - PRESS_M:
             return
         for object_id in self._world.free_ids:
@@ -364,13 +307,13 @@ class Attachment:
                 return
 
     def _tie(self, object_id: str) -> int:
-        T_tcp_base = se3.invert(self._world.T_base_link(TCP_FRAME))
+        T_tcp_base = se3.invert(self._world.robot.T_base_link(TCP_FRAME))
         q, p = se3.split(T_tcp_base @ self._world.T_base_object(object_id))
         w, x, y, z = q.tolist()
         return int(
             pybullet.createConstraint(
-                self._world.robot_id,
-                self._world.link_id(TCP_FRAME),
+                self._world.robot.id,
+                self._world.robot.links[TCP_FRAME],
                 self._world.free_ids[object_id],
                 -1,
                 pybullet.JOINT_FIXED,

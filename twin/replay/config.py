@@ -1,4 +1,4 @@
-"""Settings of a replay; imports nothing heavy."""
+"""Settings of replays, of what their samples vary and of comparisons; imports nothing heavy."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -28,13 +28,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bridge.geometry import se3
+from bridge.geometry.signals import LAGS_S, lag_of_least_cost
 from bridge.task.record import check_record
 from twin.replay.config import DivergenceConfig
 from twin.replay.trace import Touch, Trace
 
 LAG_STEP_NS = 66_666_668
 """Between the instants at which tools are compared: four steps of the physics."""
-LAGS_S = np.arange(-0.2, 0.601, 0.01)
 
 
 def lag_s(first: Trace, second: Trace) -> float:
@@ -46,10 +46,7 @@ def lag_s(first: Trace, second: Trace) -> float:
         float(np.linalg.norm(_positions(second, times + round(lag * 1e9)) - here, axis=1).mean())
         for lag in LAGS_S
     ]
-    best = min(costs)
-    # A tool that hardly moves fits any lag: of equal ones the smallest.
-    near = [lag for lag, cost in zip(LAGS_S, costs, strict=True) if cost <= best + 1e-5]
-    return round(float(min(near, key=abs)), 3)
+    return lag_of_least_cost(np.array(costs))
 
 
 def _positions(

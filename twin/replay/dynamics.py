@@ -1,4 +1,8 @@
-"""Let physics answer: drive the robot along a path and watch the objects."""
+"""Dynamic replay: put the objects into a physics world, drive the robot and sample the states.
+
+Objects that were localised into each other are moved apart first, or refused: physics answers an
+overlap with a kick, and what follows says nothing about the plan.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -9,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from bridge.geometry import se3
-from bridge.geometry.box import box_corners
+from bridge.geometry.mesh import box_corners
 from bridge.task.task_file import ObjectModel
 from twin.physics.soft import BURST_STRETCH, SoftHealth, SoftModel
 from twin.physics.world import Attachment, World
@@ -58,7 +62,7 @@ def spawn(world: World, scene: ReplayScene, soft: Mapping[str, SoftModel]) -> No
         model = scene.task.objects[name]
         T_free = lifted(T, outline_m(model, soft.get(name)), scene.table_height_m)
         if name in soft:
-            world.add_soft(name, soft[name], T_free)
+            world.soft.add(name, soft[name], T_free)
         else:
             world.add_free(name, np.array(model.size_m), model.mass_kg, T_free)
 
@@ -145,13 +149,13 @@ def simulate(
     with World(hulls.robot.urdf, _mesh_hulls(hulls), config.physics) as world:
         spawn(world, scene, soft)
         world.reset_robot(postures[0], widths[0])
-        world.command(targets[0], [0.0] * len(targets[0]), widths[0])
+        world.robot.command(targets[0], [0.0] * len(targets[0]), widths[0])
         for _ in range(round(config.settle_before_s * rate)):
             world.step()
         samples.take(world, 0)
         tie = Attachment(world) if config.grasp == "attach" else None
         for step in range(total):
-            world.command(targets[step + 1], velocities[step], widths[step])
+            world.robot.command(targets[step + 1], velocities[step], widths[step])
             world.step()
             if tie is not None:
                 tie.update(widths[step])
@@ -190,14 +194,14 @@ class _Samples:
     def take(self, world: World, t_ns: int) -> bool:
         """Keep the state; False, and nothing kept, when a soft body has burst."""
         for name in self._soft:
-            found = burst_of(world.soft_health(name))
+            found = burst_of(world.soft.health(name))
             if found is not None:
                 self._burst = Burst(object_id=name, t_ns=t_ns, found=found)
                 if self._stamps:
                     return False
                 raise NotEvaluatedError(f"{name} before anything moved: {found}")
         self._stamps.append(t_ns)
-        joints, width = world.posture()
+        joints, width = world.robot.posture()
         self._joints.append(joints)
         self._widths.append(width)
         for name in self._objects:
@@ -206,8 +210,8 @@ class _Samples:
             self._poses[name].append(world.object_pose(name))
         for name in self._soft:
             self._fits[name].append(world.T_base_object(name))
-            self._nodes[name].append(world.soft_nodes_m(name).copy())
-            self._extents[name].append(world.soft_extents_m(name))
+            self._nodes[name].append(world.soft.nodes_m(name).astype(np.float32))
+            self._extents[name].append(world.soft.extents_m(name))
         return True
 
     def states(self, world: World) -> States:
@@ -240,7 +244,7 @@ class _Samples:
         if self._burst is not None:
             found[self._burst.object_id] = self._burst.found
         for name in self._soft:
-            health = world.soft_health(name)
+            health = world.soft.health(name)
             if not health.sound and name not in found:
                 found[name] = f"at the end: {health.describe()}"
         return found
@@ -251,9 +255,6 @@ def burst_of(health: SoftHealth) -> str | None:
     burst = not health.is_finite or not health.max_stretch < BURST_STRETCH
     return health.describe() if burst else None
 
-
-# Objects that were localised into each other: small overlaps are resolved, large ones refused.
-# Physics answers an overlap with a kick, and what follows says nothing about the plan.
 
 GAP_M = 0.0002
 """What was moved apart stays this far apart."""

@@ -1,4 +1,4 @@
-"""From recorded joints and finger distances to the path that an executed replay follows."""
+"""The path of an executed replay: recorded joints and gripper widths, checked and cut."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,4 +1,7 @@
-"""One replay of one trajectory: what decides it, what its file is called, its row in the table."""
+"""One replay of one trajectory: what decides it, doing it, comparing it, and its row in the table.
+
+An executed replay is laid over the planned one and the recording before it is written.
+"""
 
 import re
 from collections.abc import Mapping

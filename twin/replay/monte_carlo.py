@@ -1,4 +1,9 @@
-"""Success as a probability: replays of varied starts and settings, and what they add up to."""
+"""Success probability by Monte Carlo: replays of varied starts and settings.
+
+Poses, frictions, forces, masses, stiffnesses and delays are varied. The same seed and the same
+start draw the same variations, whatever plan is replayed, on whichever worker and in whatever
+order (common random numbers: Law, Simulation Modeling and Analysis, ch. 11).
+"""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
@@ -17,11 +22,6 @@ from twin.physics.config import PhysicsConfig
 from twin.replay.config import ReplayConfig, VariationConfig
 from twin.replay.scene import ReplayScene
 from twin.scene.shape.known import yaw_period_rad
-
-# What is not known exactly, drawn: poses, frictions, forces, masses, stiffnesses and delays.
-# The same seed and the same start draw the same variations, whatever plan is replayed, on
-# whichever worker and in whatever order (common random numbers: Law, Simulation Modeling and
-# Analysis, ch. 11).
 
 UPRIGHT = 0.98
 """Cosine of the tilt up to which an object stands."""
@@ -56,7 +56,9 @@ class Variation:
         spreads = config.variation.physics_spreads()
         soft = {key: model.soft for key, model in self.objects.items() if model.soft is not None}
         return {
-            "T_base_object": {name: _pose(T) for name, T in sorted(self.Ts_base_object.items())},
+            "T_base_object": {
+                name: se3.pose_record(T) for name, T in sorted(self.Ts_base_object.items())
+            },
             "physics": {name: getattr(self.physics, name) for name in spreads},
             "grip_delay_s": self.grip_delay_s,
             "mass_kg": {
@@ -164,11 +166,6 @@ def _moved(
     moved[:3, :3] = se3.rotation_from_vector(turn) @ T[:3, :3]
     moved[:3, 3] += step[:3]
     return moved
-
-
-def _pose(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
-    q, p = se3.split(T)
-    return {"p_m": p.tolist(), "q_wxyz": q.tolist()}
 
 
 SCHEMA_VERSION = 1

@@ -124,14 +124,19 @@ def calibrated(config: ReplayConfig, calibration: Calibration | None) -> ReplayC
     """
     if calibration is None:
         return config
-    physics = physics_for(config.physics, calibration)
-    taken = {
-        name
-        for name, value in physics_of(calibration.record).items()
-        if getattr(physics, name) == value
+    wanted, nominal = config.physics, PhysicsConfig()
+    known = physics_of(calibration.record)
+    free = {
+        name: type(getattr(nominal, name))(value)
+        for name, value in known.items()
+        if getattr(wanted, name) == getattr(nominal, name)
     }
+    physics = replace(wanted, **free)
+    taken = {name for name, value in known.items() if getattr(physics, name) == value}
     spreads = tuple(
-        (name, spread) for name, spread in spreads_of(calibration).items() if name in taken
+        (name, spread)
+        for name, spread in sorted(_identified(calibration.record, "sigma_log").items())
+        if name in taken and spread >= 0
     )
     masses = _mass_spread(calibration)
     if masses is not None:
@@ -149,47 +154,22 @@ def for_task(config: ReplayConfig, task: Task) -> ReplayConfig:
     return replace(config, physics=replace(config.physics, grip_force_N=task.grip_force_N))
 
 
-def physics_for(wanted: PhysicsConfig, calibration: Calibration | None) -> PhysicsConfig:
-    """Calibrated physics, but for the fields that the user set to something of their own."""
-    if calibration is None:
-        return wanted
-    nominal = PhysicsConfig()
-    free = {
-        name: type(getattr(nominal, name))(value)
-        for name, value in physics_of(calibration.record).items()
-        if getattr(wanted, name) == getattr(nominal, name)
-    }
-    return replace(wanted, **free)
-
-
 def physics_of(calibration: Mapping[str, Any]) -> dict[str, float]:
     """Fields of ``PhysicsConfig`` that a calibration record says were identified."""
     known = {item.name for item in fields(PhysicsConfig)}
-    values = {
-        name: item.get("value") if isinstance(item, Mapping) else item
-        for name, item in _mapping(_mapping(calibration, "physics"), "identified").items()
-        if name in known
-    }
-    return {
-        name: float(value)
-        for name, value in values.items()
-        if isinstance(value, int | float) and np.isfinite(value)
-    }
+    found = _identified(calibration, "value")
+    return {name: value for name, value in found.items() if name in known}
 
 
-def spreads_of(calibration: Calibration) -> dict[str, float]:
-    """Standard deviation of the logarithm per identified field of ``PhysicsConfig``, by name."""
-    identified = _mapping(_mapping(calibration.record, "physics"), "identified")
-    found = {
-        name: item.get("sigma_log")
-        for name, item in sorted(identified.items())
-        if isinstance(item, Mapping)
-    }
-    return {
-        name: float(value)
-        for name, value in found.items()
-        if isinstance(value, int | float) and np.isfinite(value) and value >= 0
-    }
+def _identified(record: Mapping[str, Any], key: str) -> dict[str, float]:
+    """A number of each identified quantity, where it has one; a plain number is a value."""
+    found = {}
+    for name, item in _mapping(_mapping(record, "physics"), "identified").items():
+        plain = item if key == "value" else None
+        value = item.get(key) if isinstance(item, Mapping) else plain
+        if isinstance(value, int | float) and np.isfinite(value):
+            found[name] = float(value)
+    return found
 
 
 def _mass_spread(calibration: Calibration) -> float | None:

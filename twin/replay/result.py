@@ -1,10 +1,11 @@
-"""What a replay says: states over time and the verdict."""
+"""What a replay says: states over time and the verdict, and when something holds in them."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from bridge.geometry.signals import runs_of_true
 from bridge.task.predicate import Contact, Rollout
 from bridge.task.verdict import Verdict
 from twin.replay.monte_carlo import Sample
@@ -46,15 +47,8 @@ class ReplayResult:
         )
 
 
-def stretches(flags: Bool[np.ndarray, " num_steps"]) -> list[tuple[int, int]]:
-    """First step of each run of True, and the one after its last."""
-    edges = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
-    first, end = np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist()
-    return list(zip(first, end, strict=True))
-
-
 def stretches_ns(
     stamps_ns: Int[np.ndarray, " num_steps"], flags: Bool[np.ndarray, " num_steps"]
 ) -> list[tuple[int, int]]:
     """First and last stamp of each run of True."""
-    return [(int(stamps_ns[first]), int(stamps_ns[end - 1])) for first, end in stretches(flags)]
+    return [(int(stamps_ns[first]), int(stamps_ns[end - 1])) for first, end in runs_of_true(flags)]

@@ -1,4 +1,4 @@
-"""What a replay happens in: the task, where its objects were, and the robot."""
+"""What a replay happens in: the task, the robot, and where the objects were localised before it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -147,7 +147,7 @@ def _state_of(phase: Phase, task: Task, records: list[dict[str, object]]) -> Sta
         if name not in task.objects:
             continue
         if record["found"] and isinstance(pose, dict):
-            poses[name] = se3.transform_from(np.array(pose["q_wxyz"]), np.array(pose["p_m"]))
+            poses[name] = se3.pose_from_record(pose)
             reasons.pop(name, None)
             seen_ns = max(seen_ns or 0, int(str(record["stamp_ns"])))
             soft = record.get("soft_shape")

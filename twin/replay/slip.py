@@ -1,6 +1,6 @@
 """Whether a plan's grasps hold: how far a carried object moves in the hand.
 
-What moves in the hand is held by a hair: a little less friction or force, and it is dropped. On
+What moves in the hand is barely held: a little less friction or force, and it is dropped. On
 soft toys this margin tells right yes from wrong yes about as well as swing and lever do, and better
 than forces and contacts (docs/decisions/0018-replay-and-gate.md).
 """
@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bridge.geometry import se3
+from bridge.geometry.signals import runs_of_true
 from bridge.task.plan import Plan
 from bridge.task.verdict import Factor
 from twin.replay.failure import Failure, factor_from
 from twin.replay.path import JointPath
-from twin.replay.result import ReplayResult, stretches
+from twin.replay.result import ReplayResult
 
 LEAVES_M = 0.002
 """The hand carries once its tool is this far from where it was told to close."""
@@ -70,7 +71,7 @@ def _closed(
     told: Bool[np.ndarray, " num_waypoints"] = np.array([w.g == 1 for w in plan.tau])
     index = np.searchsorted(path.width_times_ns, stamps, side="right") - 1
     closed = (index >= 0) & told[np.clip(index, 0, len(told) - 1)]
-    return stretches(closed)
+    return runs_of_true(closed)
 
 
 def _grasped(plan: Plan, t_ns: int) -> str | None:

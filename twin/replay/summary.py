@@ -93,7 +93,7 @@ def executions_of(rows: Rows, labels: Mapping[str, str]) -> list[dict[str, Any]]
 
 
 def cross_table(executions: Rows) -> dict[str, dict[str, dict[str, int]]]:
-    """Planned, executed and seen, by what they said, against the recorded label."""
+    """Planned, executed and seen, by their verdict, against the recorded label."""
     return {
         name: {
             word: {

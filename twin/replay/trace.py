@@ -1,4 +1,4 @@
-"""The trace of one execution: planned in the twin, executed in the twin, or recorded.
+"""Traces of an execution, to be compared: planned in the twin, executed in the twin, recorded.
 
 Times count from the start of the execution, so that the three can be laid over each other.
 """
@@ -19,7 +19,7 @@ from bridge.robots.default import GRIPPER
 from bridge.task.plan import Plan
 from bridge.task.predicate import Rollout
 from bridge.task.record import parse_record
-from twin.replay.clearance import ClearanceMonitor
+from twin.replay.clearance.monitor import ClearanceMonitor
 from twin.replay.config import ReplayConfig
 from twin.replay.execution import closed_mask
 from twin.replay.path import JointPath

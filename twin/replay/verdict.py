@@ -21,7 +21,7 @@ from bridge.task.predicate import (
 from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
 from twin.physics.engine import ENGINE_VERSION
-from twin.replay.clearance import ClearanceMonitor
+from twin.replay.clearance.monitor import ClearanceMonitor
 from twin.replay.clearance.surroundings import posture_clearance
 from twin.replay.config import ReplayConfig
 from twin.replay.dynamics import Burst, States, free_start, simulate, soft_models

@@ -1,4 +1,4 @@
-"""The same work on a Ray cluster, which is never spoken to without a token.
+"""What replays a run: this process, several, or a Ray cluster, which needs a token.
 
 Ray 2.60 without a token runs anybody's code, and its control service listens on every interface
 even where a loopback address was asked for (measured), so a cluster without one is refused.

@@ -1,4 +1,4 @@
-"""Signed distances between the robot's own links (coal, convex against convex)."""
+"""The robot's convex hulls, shared by pinocchio, coal and PyBullet, and their signed distances."""
 
 from dataclasses import dataclass
 from functools import lru_cache

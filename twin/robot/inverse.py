@@ -2,7 +2,7 @@
 
 Levenberg-Marquardt on the SE(3) error with a warm start, because the next waypoint of a
 trajectory is near; random restarts, from a fixed seed, only where there is no warm start. Works
-for any arm; ``twin.robot.inverse`` knows all answers at once for arms of one kind.
+for any arm; for UR-type arms the closed form gives all eight branches at once.
 """
 
 import math
@@ -297,26 +297,13 @@ class UrInverse:
     upper_rad: Float[np.ndarray, "6"]
 
     @staticmethod
+    @lru_cache(maxsize=4)
     def for_robot(robot: RobotModel) -> "UrInverse | None":
         """Return the inverse of a robot's arm, None when its geometry is not that of a UR."""
-        return _for_robot(robot)
-
-    def all_branches(
-        self, Ts_base_tcp: Float[np.ndarray, "num_poses 4 4"]
-    ) -> tuple[Float[np.ndarray, "num_poses 8 6"], Bool[np.ndarray, "num_poses 8"]]:
-        """Solve many poses.
-
-        Args:
-            Ts_base_tcp: Rigid poses of the tool centre point.
-
-        Returns:
-            Joints [rad], one turn of each joint, within the limits; and which of them are
-            solutions. Out of reach, outside the limits, not a number, or with a joint that may be
-            anything (the wrist point on the first axis, the fifth joint straight): not valid, and
-            all joints are 0.
-        """
-        joints, valid, _ = self.solve(Ts_base_tcp)
-        return joints, valid
+        geometry = ur_geometry(robot)
+        if geometry is None:
+            return None
+        return UrInverse(geometry=geometry, lower_rad=robot.lower_rad, upper_rad=robot.upper_rad)
 
     def solve(
         self, Ts_base_tcp: Float[np.ndarray, "num_poses 4 4"]
@@ -325,9 +312,17 @@ class UrInverse:
         Bool[np.ndarray, "num_poses 8"],
         Bool[np.ndarray, " num_poses"],
     ]:
-        """``all_branches``, and at which poses some branch has a straight wrist.
+        """Solve many poses, on all branches.
 
-        There the pose is within reach on that branch too, by joints that nobody can number.
+        Args:
+            Ts_base_tcp: Rigid poses of the tool centre point.
+
+        Returns:
+            Joints [rad], one turn of each joint, within the limits; which of them are solutions;
+            and at which poses some branch has a straight wrist: within reach there too, by joints
+            that nobody can number. Out of reach, outside the limits, not a number, or with a joint
+            that may be anything (the wrist point on the first axis, the fifth joint straight): not
+            a solution, and all joints are 0.
         """
         finite = np.isfinite(Ts_base_tcp).all(axis=(1, 2))
         theta, valid, singular = _angles(
@@ -342,14 +337,6 @@ class UrInverse:
         )
         valid &= inside.all(axis=2) & finite[:, None]
         return np.where(valid[..., None], joints, 0.0), valid, singular & finite
-
-
-@lru_cache(maxsize=4)
-def _for_robot(robot: RobotModel) -> UrInverse | None:
-    geometry = ur_geometry(robot)
-    if geometry is None:
-        return None
-    return UrInverse(geometry=geometry, lower_rad=robot.lower_rad, upper_rad=robot.upper_rad)
 
 
 def _angles(

@@ -1,4 +1,4 @@
-"""The robot as pinocchio sees it: joint limits, forward kinematics of the arm and its gripper.
+"""The robot as pinocchio sees it: its URDF, joint limits, forward kinematics of arm and gripper.
 
 One arm of revolute joints and, where the description has them, two prismatic fingers that open by
 half of the gripper width each. A model keeps scratch memory: use it from one thread at a time.

@@ -1,4 +1,4 @@
-"""Where the robot's joints were at an instant of an episode, and whether it stood still."""
+"""Recorded postures: joints at an instant, whether the robot stood still, whether time ran back."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -16,6 +16,7 @@ import open3d
 import pinocchio as pin
 from jaxtyping import Float, Float32, Int, Int64
 
+from bridge.geometry.mesh import sample_triangles
 from twin.robot.collision import collision_geometry
 from twin.robot.model import RobotDescriptionError, RobotModel
 from twin.robot.posture import Posture
@@ -162,11 +163,7 @@ def sample_surface(
     )
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    rng = np.random.default_rng(seed)
-    chosen = rng.choice(len(area), size=count, p=area / area.sum())
-    u, v = rng.uniform(size=(2, count, 1))
-    over = u + v > 1
-    u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
+    chosen, u, v = sample_triangles(area, count, np.random.default_rng(seed))
     return np.asarray(a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen])
 
 

@@ -132,18 +132,9 @@ def node_rotations(
     arms_rest = rest_m[neighbours] - rest_m[:, None]
     arms = nodes_m[neighbours] - nodes_m[:, None]
     cross = np.einsum("nka,nkb->nab", arms, arms_rest)
-    body = _rotation_part(cross.sum(axis=0)[None])[0]
+    body = se3.nearest_rotation(cross.sum(axis=0)[None])[0]
     size = np.einsum("nka,nka->n", arms_rest, arms_rest)
-    return _rotation_part(cross + BODY_SHARE * size[:, None, None] * body)
-
-
-def _rotation_part(
-    matrices: Float[np.ndarray, "num_nodes 3 3"],
-) -> Float[np.ndarray, "num_nodes 3 3"]:
-    left, _, right = np.linalg.svd(matrices)
-    sign = np.where(np.linalg.det(left @ right) < 0, -1.0, 1.0)
-    left[:, :, 2] *= sign[:, None]
-    return np.asarray(left @ right)
+    return se3.nearest_rotation(cross + BODY_SHARE * size[:, None, None] * body)
 
 
 def _product(

@@ -32,7 +32,7 @@ from bridge.exchange.output import message_named, new_folder, safe_names, write_
 from bridge.task.plan import Plan
 from bridge.terminal import Advance
 
-# --- An episode on a grid of equal steps: what was measured, what was commanded, which image.
+# An episode on a grid of equal steps: what was measured, what was commanded, which image.
 #
 # Row k is at ``t_0 + k / fps``. State: joints and gripper, interpolated at that time. Image: the
 # one nearest in time. Action: the plan's command for the next row, or the next row's state.
@@ -220,8 +220,6 @@ def _plan_columns(
         columns.append(np.array(widths, dtype=np.float64)[held])
     return np.stack(columns, axis=1)
 
-
-# --- The README of an exported dataset: what its numbers mean.
 
 _HEAD = """---
 task_categories:

@@ -33,8 +33,6 @@ from bridge.exchange.lerobot.video import read_frames
 from bridge.media.color import JPEG_MAGIC, JPEG_QUALITY, encode_jpeg
 from bridge.terminal import Advance
 
-# --- Read a LeRobotDataset v3.0: its list of episodes, and their rows in the order of the files.
-
 BATCH_ROWS = 1024
 _RESTORE = "Restore it from the original dataset."
 

@@ -13,8 +13,6 @@ from typing import Any, Literal
 
 from bridge.errors import BridgeError, MissingDependencyError, PathNotFoundError, refuse_outside
 
-# --- How a run becomes a LeRobot dataset. Imports nothing heavy.
-
 
 @dataclass(frozen=True, kw_only=True)
 class LeRobotConfig:

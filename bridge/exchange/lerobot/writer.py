@@ -15,8 +15,6 @@ from bridge.exchange.lerobot import layout
 from bridge.exchange.lerobot.layout import parquet
 from bridge.exchange.lerobot.video import VideoWriter
 
-# --- Statistics of features, in one pass and with bounded memory: min, max, mean, std, count.
-
 PIXEL_STRIDE = 4
 """Image statistics look at every fourth pixel of both axes."""
 

@@ -6,8 +6,6 @@ from pathlib import Path
 from bridge.episode.topics import refuse_bad_name
 from bridge.errors import UsageError, refuse_outside
 
-# --- What can be wrong with a source.
-
 
 class FolderError(UsageError):
     """An RGB-D folder breaks its contract."""

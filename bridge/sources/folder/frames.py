@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt16
 
 from bridge.errors import PathNotFoundError
+from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.media.color import UnreadableImageError
@@ -75,7 +76,7 @@ class FolderIndex:
         return text
 
 
-def nearest_rotation(
+def checked_rotation(
     path: Path, R: Float[np.ndarray, "3 3"], where: str
 ) -> Float[np.ndarray, "3 3"]:
     """Return the rotation nearest to a matrix written with few digits.
@@ -83,14 +84,14 @@ def nearest_rotation(
     Raises:
         FolderError: When the matrix is not close to any rotation.
     """
-    u, singular, v = np.linalg.svd(R)
+    singular = np.linalg.svd(R, compute_uv=False)
     if np.any(np.abs(singular - 1) > ROTATION_TOLERANCE) or np.linalg.det(R) < 0:
         raise FolderError(
             path=path,
             found=f"the rotation of {where} is none (singular values {np.round(singular, 3)})",
             hint="Poses are camera-to-world, row by row.",
         )
-    return np.asarray(u @ v)
+    return se3.nearest_rotation(R)
 
 
 def read_stored_depth(path: Path) -> UInt16[np.ndarray, "height width"]:

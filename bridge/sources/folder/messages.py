@@ -29,7 +29,7 @@ from bridge.sources.folder.scene_json import INDEX_NAME, read_scene
 from bridge.sources.folder.sevenscenes import find_frames, read_sevenscenes
 from bridge.sources.folder.tum import find_lists, read_tum
 
-# --- Which layout an RGB-D folder has, and its frames.
+# Which layout an RGB-D folder has, and its frames.
 #
 # Three layouts are told apart by their files: our own index ``scene.json``, the lists of the TUM
 # RGB-D benchmark (``rgb.txt`` and ``depth.txt``, or ``associations.txt``), and the numbered files

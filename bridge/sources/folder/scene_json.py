@@ -20,7 +20,7 @@ from bridge.sources.folder.config import FolderConfig, FolderError
 from bridge.sources.folder.frames import (
     FolderFrame,
     FolderIndex,
-    nearest_rotation,
+    checked_rotation,
     refuse_scale_without_use,
     require_image,
 )
@@ -122,7 +122,7 @@ def _color(path: Path, record: dict[str, Any]) -> tuple[Camera, Float[np.ndarray
     T_color_depth[:3, 3] = _value(path, estimate, "t_color_from_depth_m")
     R_color_depth = estimate.get("R_color_from_depth", "identity assumed")
     if not isinstance(R_color_depth, str):
-        T_color_depth[:3, :3] = nearest_rotation(
+        T_color_depth[:3, :3] = checked_rotation(
             path, np.array(R_color_depth, dtype=float), "R_color_from_depth"
         )
     return camera, se3.invert(T_color_depth)
@@ -156,5 +156,5 @@ def _frame(path: Path, entry: Any, where: str) -> FolderFrame | None:
         raise FolderError(path=path, found=f"T_world_cam of {where} is not 4x4", hint=_KEYS_HINT)
     if not np.isfinite(T).all():
         return None
-    T[:3, :3] = nearest_rotation(path, T[:3, :3], where)
+    T[:3, :3] = checked_rotation(path, T[:3, :3], where)
     return FolderFrame(color_path=files["color"], depth_path=files["depth"], T_world_depth=T)

@@ -19,7 +19,7 @@ from bridge.sources.folder.frames import (
     FolderFrame,
     FolderIndex,
     camera_of,
-    nearest_rotation,
+    checked_rotation,
     read_stored_depth,
     require_image,
 )
@@ -121,7 +121,7 @@ def _read_pose(path: Path) -> Float[np.ndarray, "4 4"] | None:
     T = _matrix(path, (4, 4))
     if not np.isfinite(T).all():
         return None
-    T[:3, :3] = nearest_rotation(path, T[:3, :3], "the pose")
+    T[:3, :3] = checked_rotation(path, T[:3, :3], "the pose")
     T[3] = (0.0, 0.0, 0.0, 1.0)
     return T
 

@@ -31,8 +31,6 @@ from bridge.sources.folder.frames import (
     require_image,
 )
 
-# --- The text files of the TUM layout: lists of stamped files, pairs of them, stamped poses.
-
 PAIRING_TOLERANCE_NS = 20_000_000
 """Colour and depth of one frame lie at most this far apart (the benchmark's own choice)."""
 MAX_STAMP_S = 2**31

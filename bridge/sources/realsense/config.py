@@ -7,8 +7,6 @@ from typing import Literal
 from bridge.episode.topics import refuse_bad_name
 from bridge.errors import BridgeError, UsageError, refuse_outside
 
-# --- What can be wrong with a RealSense camera.
-
 
 class CameraNotFoundError(UsageError):
     """No camera with the serial number is attached."""

@@ -18,8 +18,6 @@ from bridge.sources.device_samples import HostClock
 from bridge.sources.realsense.config import CameraStreamError, RealSenseConfig
 from bridge.sources.realsense.messages import Calibration, ColorFrame, DepthFrame, Frame
 
-# --- The one place that imports pyrealsense2.
-
 try:
     import pyrealsense2 as rs
 except ImportError as import_error:  # pragma: no cover  # needs an environment without it
@@ -30,7 +28,7 @@ except ImportError as import_error:  # pragma: no cover  # needs an environment 
 __all__ = ["rs"]
 
 
-# --- Takes lens distortion out of colour images, as the episode's cameras have none.
+# Takes lens distortion out of colour images, as the episode's cameras have none.
 #
 # D415 and D435 send undistorted colour (all coefficients 0). D405 and D455 do not.
 
@@ -112,8 +110,6 @@ def _distorted_pixels(intrinsics: Any) -> Float[np.ndarray, "height width 2"]:
     rows = [[project(intrinsics, [float(a), float(b), 1.0]) for a in x] for b in y]
     return np.asarray(rows, dtype=np.float64)
 
-
-# --- When was a frame taken, in this host's time?
 
 US_PER_MS, NS_PER_US = 1000, 1000
 COUNTER_WRAPS_NS = 2**32 * 1_000

@@ -25,8 +25,6 @@ from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
 from bridge.sources.realsense.config import MountsError, RealSenseConfig
 
-# --- Where the cameras hang: the user's calibration, read from a small JSON file.
-
 ROUNDED = 0.01
 """Quaternions written by hand have few digits; a length this far from one is still a rotation."""
 Mount = tuple[str, Float[np.ndarray, "4 4"]]
@@ -72,9 +70,6 @@ def _mount(path: Path, name: str, entry: object) -> Mount:
     if not (np.isfinite(p_m).all() and abs(np.linalg.norm(q_wxyz) - 1.0) < ROUNDED):
         raise MountsError(path=path, found=f"{name}: q_wxyz is not a unit quaternion")
     return parent, se3.transform_from(q_wxyz, p_m)
-
-
-# --- What the device layer hands on: calibration and frames, without the camera library's types.
 
 
 @dataclass(frozen=True, kw_only=True)

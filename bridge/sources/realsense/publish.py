@@ -4,6 +4,14 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+from bridge.episode.topics import (
+    COLOR_IMAGE,
+    COLOR_INFO,
+    DEPTH_IMAGE,
+    DEPTH_INFO,
+    TF_STATIC,
+    camera_topic,
+)
 from bridge.errors import GstError
 from bridge.sources.device_samples import Announcer, NumberedPublisher
 from bridge.sources.realsense.config import (
@@ -148,60 +156,76 @@ class CameraWorker:
         }
 
 
-def publish_cameras(
-    session: WireSession,
-    config: RealSenseConfig,
-    *,
-    stop: threading.Event,
-    output: Output,
-    list_devices: ListDevices,
-) -> dict[str, dict[str, int]]:
-    """Publish every camera asked for until stopped.
+class RealSenseSource:
+    """Cameras as a ``bridge.sources.source.Source``."""
 
-    Args:
-        session: An open session.
-        config: Which cameras, and how.
-        stop: Set by the caller, or here when a camera failed.
-        output: Told what happens to the cameras.
-        list_devices: Called whenever a camera is looked for.
+    def __init__(self, config: RealSenseConfig, list_devices: ListDevices) -> None:
+        """Look for every camera asked for.
 
-    Returns:
-        Frames sent and lost by camera.
+        Args:
+            config: Which cameras, and how.
+            list_devices: Called whenever a camera is looked for.
 
-    Raises:
-        CameraNotFoundError: When one of them is not attached at the start.
-        CameraStreamError: When one of them cannot be opened at the start.
-    """
-    wanted = choose_cameras(config, list_devices)
-    mounts = {} if config.mounts is None else read_mounts(config.mounts, list(wanted))
-    announcer = Announcer(session)
-    workers = [
-        CameraWorker(
-            camera,
-            serial,
-            config=config,
-            session=session,
-            announcer=announcer,
-            mount=mounts.get(camera),
-            list_devices=list_devices,
-            output=output,
-        )
-        for camera, serial in wanted.items()
-    ]
-    threads = [
-        threading.Thread(target=worker.run, args=(stop,), name=f"camera {worker.camera}")
-        for worker in workers
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    announcer.close()
-    failures = [worker.failure for worker in workers] + [announcer.failure]
-    for failure in failures:
-        if failure is not None:
-            raise failure
-    return {worker.camera: worker.counts() for worker in workers}
+        Raises:
+            CameraNotFoundError: When one of them is not attached.
+        """
+        self._config, self._list_devices = config, list_devices
+        self._wanted = choose_cameras(config, list_devices)
+
+    @property
+    def name(self) -> str:
+        """The cameras by name."""
+        return f"RealSense {', '.join(self._wanted)}"
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Images and intrinsics of each camera, and where they are."""
+        endings = (COLOR_IMAGE, COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO)
+        cell = self._config.cell
+        images = (camera_topic(cell, name, each) for name in self._wanted for each in endings)
+        return (*images, TF_STATIC)
+
+    def run(
+        self, session: WireSession, stop: threading.Event, output: Output
+    ) -> dict[str, dict[str, int]]:
+        """Publish every camera until stopped, by the caller or because one failed.
+
+        Returns:
+            Frames sent and lost by camera.
+
+        Raises:
+            CameraStreamError: When one of them cannot be opened at the start.
+        """
+        config = self._config
+        mounts = {} if config.mounts is None else read_mounts(config.mounts, list(self._wanted))
+        announcer = Announcer(session)
+        workers = [
+            CameraWorker(
+                camera,
+                serial,
+                config=config,
+                session=session,
+                announcer=announcer,
+                mount=mounts.get(camera),
+                list_devices=self._list_devices,
+                output=output,
+            )
+            for camera, serial in self._wanted.items()
+        ]
+        threads = [
+            threading.Thread(target=worker.run, args=(stop,), name=f"camera {worker.camera}")
+            for worker in workers
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        announcer.close()
+        failures = [worker.failure for worker in workers] + [announcer.failure]
+        for failure in failures:
+            if failure is not None:
+                raise failure
+        return {worker.camera: worker.counts() for worker in workers}
 
 
 def choose_cameras(config: RealSenseConfig, list_devices: ListDevices) -> dict[str, str]:

@@ -17,9 +17,9 @@ from bridge.sources.standin.render import Layer, Renderer, measure_color, measur
 from bridge.sources.standin.streams import Streams
 from bridge.sources.standin.surfaces import (
     clutter_surfaces,
+    lab_surfaces,
     object_surfaces,
     robot_surfaces,
-    room_surfaces,
 )
 from bridge.sources.standin.world import World
 from bridge.task.predicate import Rollout
@@ -129,8 +129,8 @@ class StandinCell:
     @cached_property
     def _renderer(self) -> Renderer:
         """Made with the first picture; a cell that takes none saves a second."""
-        room = [*room_surfaces(self._seed), *clutter_surfaces(self.file.clutter)]
-        return Renderer([*robot_surfaces(), *object_surfaces(self.task), *room])
+        lab = [*lab_surfaces(self._seed), *clutter_surfaces(self.file.clutter)]
+        return Renderer([*robot_surfaces(), *object_surfaces(self.task), *lab])
 
     def reset(self, Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]) -> None:
         """Bring the arm home with an open gripper and put the objects down."""

@@ -219,8 +219,6 @@ def _mount_pose(table: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
     return T
 
 
-# --- What the cell keeps to itself: drawn from a seed, published under ``/standin/truth/`` only.
-
 HIDDEN_STREAM = 101
 """Keeps the draw of the hidden parameters apart from every other draw of the same seed."""
 

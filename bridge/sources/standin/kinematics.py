@@ -171,9 +171,6 @@ def slerp_poses(
     return se3.transform_from(q, p_start + fractions[:, None] * (p_end - p_start))
 
 
-# --- From tool poses to a timed joint trajectory: straight lines at 20 Hz within the joints'
-# speed.
-
 WAYPOINT_S = 0.05
 
 TimeLaw = Callable[[Float[np.ndarray, " num_times"]], Float[np.ndarray, " num_times"]]

@@ -25,7 +25,7 @@ from bridge.sources.standin.planner import (
     perceive,
     plan_pick_and_place,
 )
-from bridge.sources.standin.probes import PROBES, NoRoomForProbeError, plan_probe
+from bridge.sources.standin.probes import PROBES, NoSpaceForProbeError, plan_probe
 from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
 from bridge.sources.standin.settings import (
     CONDITIONS,
@@ -39,8 +39,6 @@ from bridge.task.predicate import all_hold, evaluate_success, objects_done
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from bridge.terminal import Output
-
-# --- The operator's eye: an outcome from what really happened, by the task's hard predicates.
 
 OPERATOR = "stand-in operator"
 LIFTED_M = 0.05
@@ -121,8 +119,6 @@ def _above(
     return bool(over.any())
 
 
-# --- Executing a plan on the cell, with the events that say what was going on.
-
 SETTLE_S = 0.8
 """The arm waits after a plan, so that the final state is seen at rest."""
 
@@ -185,7 +181,7 @@ def _pieces(plan: Plan) -> list[tuple[int, int]]:
 RESET_STREAM = 404
 PROBE_STREAM = 505
 PROBE_TRIES = 100
-"""The object is put elsewhere until there is room for the probe."""
+"""The object is put elsewhere until there is space for the probe."""
 LOOK_S = 0.9
 """The arm waits at home before a plan, so that the start is seen at rest."""
 BETWEEN_S = 8.0
@@ -374,14 +370,14 @@ class Operator:
     def _probe_start(
         self, number: int, kind: str
     ) -> tuple[dict[str, Float[np.ndarray, "4 4"]], Plan]:
-        """Put the objects where there is room for the probe, and plan it as it is perceived."""
+        """Put the objects where there is space for the probe, and plan it as it is perceived."""
         cell, config = self._cell, self._config
         noise = cell.file.noise_for(cell.task.name)
         for attempt in range(PROBE_TRIES):
             rng = np.random.default_rng([PROBE_STREAM, config.seed, number, attempt])
             poses = cell.task.draw_start(rng)
             seed = config.seed * SEEDS_PER_SESSION + number
-            with contextlib.suppress(NoRoomForProbeError):
+            with contextlib.suppress(NoSpaceForProbeError):
                 return poses, plan_probe(
                     kind,
                     cell.task,
@@ -393,7 +389,7 @@ class Operator:
                     start_id=f"{cell.task.name}/probe/{config.seed}/{number}",
                     turn=1 if (number - 1) // len(PROBES) % 2 else -1,
                 )
-        raise NoRoomForProbeError(kind)
+        raise NoSpaceForProbeError(kind)
 
     def _decide(self, info: EpisodeInfo, start_seed: int) -> Decision:
         """Plan, and with replanning ask the gate until it accepts or the rounds are used up."""

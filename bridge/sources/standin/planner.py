@@ -29,9 +29,6 @@ from bridge.sources.standin.kinematics import (
 from bridge.task.plan import Plan, Stage
 from bridge.task.task_file import ObjectModel, Task
 
-# --- The stages that the scripted planner's plans state: those of the task, with what they
-# predict.
-
 
 @dataclass(frozen=True, kw_only=True)
 class StageIds:
@@ -93,7 +90,7 @@ def planned_stages(
                 release=table.get("release"),
                 allowed_contacts=tuple((a, b) for a, b in table.get("allowed_contacts", [])),
                 terminal=tuple(dict(item) for item in task.success) if last else (),
-                predicted_objects={object_id: pose_record(predicted)},
+                predicted_objects={object_id: se3.pose_record(predicted)},
                 t_start_ns=start_ns,
                 t_end_ns=end_ns,
             )
@@ -131,12 +128,6 @@ def _predicted(
     else:
         T[:3, 3] += place["carry" if table.get("carry") else "lift"] - place["close"]
     return T
-
-
-def pose_record(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
-    """A pose as plans write it."""
-    q, p = se3.split(T)
-    return {"p_m": [float(v) for v in p], "q_wxyz": [float(v) for v in q]}
 
 
 PLANNER_NAME = "standin_scripted"
@@ -273,7 +264,7 @@ def plan_pick_and_place(
         task=task.name,
         instruction=task.instruction,
         grounding_source=GROUNDING,
-        entities={key: pose_record(T) for key, T in seen.items()},
+        entities={key: se3.pose_record(T) for key, T in seen.items()},
         keypoints_m=tuple(_point(seen[key][:3, 3]) for key in (*task.manipulated, container)),
         joint_names=ARM_JOINTS,
         stages=planned_stages(task, legs_of, track.bounds, seen),

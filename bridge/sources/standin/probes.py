@@ -64,12 +64,12 @@ KEEP_OFF_M = 0.06
 """Beyond the outer circles of the object and of anything that stands on the table."""
 
 
-class NoRoomForProbeError(BridgeError):
+class NoSpaceForProbeError(BridgeError):
     """From where the object lies, the probe would leave table or reach, or hit something."""
 
     def __init__(self, kind: str) -> None:
         """Say which one."""
-        super().__init__(f"no room for the probe {kind!r} from here: put the object elsewhere.")
+        super().__init__(f"no space for the probe {kind!r} from here: put the object elsewhere.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +120,7 @@ def plan_probe(
 
     Raises:
         UsageError: The object is soft: the probes are made for rigid boxes.
-        NoRoomForProbeError: The object lies where the probe cannot be carried out.
+        NoSpaceForProbeError: The object lies where the probe cannot be carried out.
     """
     object_id = task.manipulated[0]
     if task.objects[object_id].soft is not None:
@@ -138,7 +138,7 @@ def plan_probe(
             continue
         tracks.append(track)
     if not tracks:
-        raise NoRoomForProbeError(kind)
+        raise NoSpaceForProbeError(kind)
     best = min(tracks, key=lambda track: track.tau[-1].t_ns)
     start_ns, end_ns = best.bounds[kind]
     allowed = (("gripper", object_id), (object_id, "table"))

@@ -65,20 +65,20 @@ class Renderer:
 
     The scene is built anew for each picture (bodies move): with six thousand triangles this costs
     less than casting the rays once per body and merging. A camera that stands still may keep the
-    room as a backdrop; then only the rays that meet a moving body are shaded.
+    laboratory as a backdrop; then only the rays that meet a moving body are shaded.
     """
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
         """Keep the surfaces; only poses change afterwards."""
         self._surfaces = list(surfaces)
         self._colors = np.array([item.color for item in surfaces], dtype=np.float32)
-        self._room = [k for k, item in enumerate(surfaces) if item.body == ""]
+        self._unmoving = [k for k, item in enumerate(surfaces) if item.body == ""]
         self._moving = [k for k, item in enumerate(surfaces) if item.body != ""]
         self._painted = [k for k, item in enumerate(surfaces) if item.paint is not None]
 
     def backdrop(self, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]) -> Layer:
-        """See the room without the bodies in it, for ``render`` from the same place."""
-        posed = self._pose(T_base_camera, {}, self._room, {})
+        """See the laboratory without the bodies in it, for ``render`` from the same place."""
+        posed = self._pose(T_base_camera, {}, self._unmoving, {})
         seen = self._look(posed, _rays(camera, T_base_camera))
         return replace(seen, colors=self._smooth_edges(posed, seen, camera, T_base_camera))
 
@@ -91,7 +91,7 @@ class Renderer:
         skins_m: Mapping[str, Float[np.ndarray, "num_vertices 3"]] | None = None,
     ) -> Picture:
         """Take a picture of the bodies where they are, the soft ones by their skins."""
-        which = self._moving if backdrop is not None else [*self._room, *self._moving]
+        which = self._moving if backdrop is not None else [*self._unmoving, *self._moving]
         posed = self._pose(T_base_camera, Ts_base_body, which, skins_m or {})
         seen = self._look(posed, _rays(camera, T_base_camera))
         if backdrop is not None:
@@ -186,7 +186,7 @@ class Renderer:
     def _albedo(
         self, surface_ids: Int[np.ndarray, " num_rays"], points: Float[np.ndarray, "num_rays 3"]
     ) -> Float[np.ndarray, "num_rays 3"]:
-        """Plain colours, and textures where a surface of the (unmoving) room has one."""
+        """Plain colours, and textures where a surface of the unmoving laboratory has one."""
         colors = self._colors[surface_ids]
         for index, item in enumerate(self._surfaces):
             if item.texture is None:
@@ -286,8 +286,6 @@ def _shade(normals: Float[np.ndarray, "num_rays 3"]) -> Float[np.ndarray, " num_
         light = light + strength * np.maximum(normals @ towards, 0.0)
     return np.asarray(light, dtype=np.float32)
 
-
-# --- From what an ideal camera sees to what a cheap one delivers.
 
 GAP_AT_EDGE_FRACTION = 0.6
 """Share of pixels without depth beside a jump in depth, where a stereo pair finds no match."""

@@ -1,19 +1,25 @@
 """One session of the stand-in cell, from the files to the last episode."""
 
 import contextlib
+import threading
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from bridge.clock import AnchoredClock
+from bridge.episode import topics
 from bridge.errors import BridgeError
 from bridge.sources.standin.cell import CellConfig, StandinCell, StoppedError
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.operator import Operator
 from bridge.sources.standin.settings import SessionConfig
-from bridge.sources.standin.streams import Session, Streams
+from bridge.sources.standin.streams import TRUTH_PARAMETERS, Session, Streams
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
+
+if TYPE_CHECKING:
+    from bridge.wire.session import WireSession
 
 
 def run_session(
@@ -67,6 +73,53 @@ def run_session(
     return _summary(operator, config, stopped=stopped)
 
 
+@dataclass(frozen=True)
+class StandinSource:
+    """The stand-in cell as a ``bridge.sources.source.Source``."""
+
+    config: SessionConfig
+
+    @property
+    def name(self) -> str:
+        """The cell's."""
+        return f"stand-in cell {self.config.cell}"
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Those of a real cell, and the truth that only tests and perception metrics read."""
+        task = load_task(self.config.task)
+        cell, cameras = self.config.cell, load_cell(self.config.cell_file or task.cell).cameras
+        endings = (topics.COLOR_IMAGE, topics.COLOR_INFO, topics.DEPTH_IMAGE, topics.DEPTH_INFO)
+        of_cell = (
+            topics.JOINT_STATES,
+            topics.GRIPPER_STATE,
+            topics.TCP_POSE,
+            topics.PLAN,
+            topics.PLAN_TRAJECTORY,
+            topics.PLAN_PATH,
+            topics.EVENT,
+        )
+        soft = [key for key, model in task.objects.items() if model.soft is not None]
+        return (
+            *(topics.cell_topic(cell, ending) for ending in of_cell),
+            *(
+                topics.camera_topic(cell, camera, ending)
+                for camera in cameras
+                for ending in endings
+            ),
+            *(topics.object_topic(topics.TRUTH, key, "pose") for key in task.objects),
+            *(topics.object_topic(topics.TRUTH, key, "nodes") for key in soft),
+            TRUTH_PARAMETERS,
+            topics.TF,
+            topics.TF_STATIC,
+            topics.ROBOT_DESCRIPTION,
+        )
+
+    def run(self, session: "WireSession", stop: threading.Event, output: Output) -> dict[str, Any]:
+        """Record as the configuration says, or until stopped; see ``run_session``."""
+        return run_session(session, self.config, output, should_stop=stop.is_set)
+
+
 def _summary(operator: Operator, config: SessionConfig, *, stopped: bool) -> dict[str, Any]:
     counts: dict[str, Counter[str]] = {}
     objects: dict[str, dict[str, int]] = {}
@@ -84,6 +137,7 @@ def _summary(operator: Operator, config: SessionConfig, *, stopped: bool) -> dic
         "probes": operator.num_probes,
         "outcomes": {condition: dict(counter) for condition, counter in counts.items()},
         "objects": objects,
+        "unknown": {i.id: o.detail for i, o in operator.results if o.result == "unknown"},
         "stopped": stopped,
     }
 
@@ -97,6 +151,7 @@ def describe(summary: dict[str, Any]) -> str:
         sums = summary["objects"].get(condition)
         told = f"; {sums['k']} of {sums['n']} objects" if sums else ""
         lines.append(f"  {condition}: {total} trials, {listed}{told}")
+    lines += [f"  {name} unknown: {why}" for name, why in summary.get("unknown", {}).items()]
     if summary.get("probes"):
         lines.append(f"  {summary['probes']} probes")
     if summary["stopped"]:

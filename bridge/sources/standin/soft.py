@@ -75,15 +75,8 @@ class SoftBody:
         return np.asarray(se3.apply(T_base_object, self.rest_nodes_m) - self.rest_nodes_m)
 
     def pose_of(self, nodes_m: Float[np.ndarray, "8 3"]) -> Float[np.ndarray, "4 4"]:
-        """Rigid pose that comes nearest to where the nodes are: Kabsch (1976)."""
-        rest_middle, middle = self.rest_nodes_m.mean(axis=0), nodes_m.mean(axis=0)
-        cross = (nodes_m - middle).T @ (self.rest_nodes_m - rest_middle)
-        left, _, right = np.linalg.svd(cross)
-        flip = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))])
-        T = np.eye(4)
-        T[:3, :3] = left @ flip @ right
-        T[:3, 3] = middle - T[:3, :3] @ rest_middle
-        return T
+        """Rigid pose that comes nearest to where the nodes are."""
+        return se3.align_rigid(self.rest_nodes_m, nodes_m)
 
     def extents_m(
         self, nodes_m: Float[np.ndarray, "8 3"], T_base_object: Float[np.ndarray, "4 4"]

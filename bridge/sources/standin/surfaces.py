@@ -18,7 +18,7 @@ from bridge.task.meshes.catalogue import ToyMesh, object_mesh, toy_mesh
 from bridge.task.meshes.toys import Paint
 from bridge.task.task_file import ObjectModel, Task
 
-# --- Surface colours of the laboratory, made from a seed: wood, patches, floor, walls.
+# Surface colours of the laboratory, made from a seed: wood, patches, floor, walls.
 #
 # A texture is a picture laid over a rectangle of a plane; features are several millimetres wide
 # so that a camera half a metre away sees them without aliasing.
@@ -105,7 +105,7 @@ def _add_patches(
                 block[mask[: block.shape[0], : block.shape[1]]] = PATCH_COLORS[second]
 
 
-def room_texture(
+def lab_texture(
     size_m: tuple[float, float], base: tuple[float, float, float], seed: int
 ) -> Texture:
     """Floor or wall: large soft blotches and tile lines, low contrast."""
@@ -131,7 +131,7 @@ ROOM_HEIGHT_M = 2.2
 
 @dataclass(frozen=True, kw_only=True)
 class Surface:
-    """One coloured body; vertices are in the frame ``body``, which moves (``""``: the room)."""
+    """One coloured body; vertices are in the frame ``body``, which moves (``""``: the lab)."""
 
     body: str
     vertices_m: Float[np.ndarray, "num_vertices 3"]
@@ -279,7 +279,7 @@ def smooth_normals(
 
 
 def clutter_surfaces(clutter: Sequence[Clutter]) -> list[Surface]:
-    """What stands about on the table, as part of the room."""
+    """What stands about on the table, as part of the laboratory."""
     surfaces = []
     for item in clutter:
         if item.shape == "box":
@@ -293,7 +293,7 @@ def clutter_surfaces(clutter: Sequence[Clutter]) -> list[Surface]:
 
 
 def _placed(surface: Surface, T_base_body: Float[np.ndarray, "4 4"]) -> Surface:
-    """Bring a surface of the room from its own frame to where it stands."""
+    """Bring a surface of the laboratory from its own frame to where it stands."""
     vertices = se3.apply(T_base_body, surface.vertices_m.astype(np.float64))
     normals = surface.corner_normals @ T_base_body[:3, :3].T
     return replace(
@@ -303,17 +303,17 @@ def _placed(surface: Surface, T_base_body: Float[np.ndarray, "4 4"]) -> Surface:
     )
 
 
-def room_surfaces(seed: int) -> list[Surface]:
+def lab_surfaces(seed: int) -> list[Surface]:
     """Table top with its texture, floor and four walls."""
     x, y, z = TABLE_SIZE_M
     texture = table_texture((x, y), TABLE_CENTRE_M, seed)
     top = box_surface(
         "", np.array([*TABLE_CENTRE_M, -z / 2]), np.array(TABLE_SIZE_M), (0.7, 0.56, 0.4)
     )
-    return [_textured(top, texture, (0, 1), (0.0, 0.0)), *_room_shell(seed)]
+    return [_textured(top, texture, (0, 1), (0.0, 0.0)), *_walls(seed)]
 
 
-def _room_shell(seed: int) -> list[Surface]:
+def _walls(seed: int) -> list[Surface]:
     (x0, y0), (x1, y1) = ROOM_MIN_M, ROOM_MAX_M
     z0, height = FLOOR_Z_M, ROOM_HEIGHT_M
     mid = (z0 + height) / 2
@@ -328,7 +328,7 @@ def _room_shell(seed: int) -> list[Surface]:
     surfaces = []
     for index, ((centre, size, axes), color) in enumerate(zip(walls, colors, strict=True)):
         extents = np.array(size)
-        texture = room_texture((size[axes[0]], size[axes[1]]), color, seed + index)
+        texture = lab_texture((size[axes[0]], size[axes[1]]), color, seed + index)
         corner = centre - extents / 2
         surface = box_surface("", centre, extents, color)
         surfaces.append(_textured(surface, texture, axes, (corner[axes[0]], corner[axes[1]])))

@@ -26,8 +26,6 @@ from bridge.sources.standin.soft import SoftBody, soft_body, soft_model_xml
 from bridge.task.meshes.toys import BoxPart, basket_parts
 from bridge.task.task_file import BASKET, ObjectModel, Task
 
-# --- The robot's links and joints, read once from the URDF for physics and for the cameras.
-
 
 @dataclass(frozen=True, kw_only=True)
 class LinkShape:
@@ -144,8 +142,6 @@ def _multiply(a: Float[np.ndarray, "4"], b: Float[np.ndarray, "4"]) -> Float[np.
     w = a[0] * b[0] - a[1:] @ b[1:]
     return np.concatenate([[w], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])])
 
-
-# --- The MuJoCo model of the laboratory: robot, gripper, table, task objects.
 
 STEP_S = 0.002
 SOFT_STEP_S = 0.004

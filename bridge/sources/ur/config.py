@@ -9,7 +9,7 @@ from typing import Literal
 from bridge.episode.topics import refuse_bad_name
 from bridge.errors import BridgeError, UsageError, refuse_outside
 
-# --- The opening of a gripper, read from the controller's inputs, outputs or registers.
+# The opening of a gripper, read from the controller's inputs, outputs or registers.
 #
 # RTDE does not know grippers: it knows the signals they are wired to, and registers that the
 # robot program writes. ``docs/recording.md`` says which signal suits which gripper.
@@ -75,9 +75,6 @@ def parse_signal(text: str) -> Signal:
         raise UsageError(f"--gripper {text} is no signal of a UR controller. Use none or {listed}.")
     bit = number if kind.startswith("digital") else None
     return Signal(variable=variable.format(number), bit=bit)
-
-
-# --- What can be wrong between us and a UR controller.
 
 
 class ControllerError(BridgeError):

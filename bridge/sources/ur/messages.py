@@ -18,7 +18,7 @@ from bridge.episode.schema import StampedMessage
 from bridge.episode.topics import EVENT, cell_topic
 from bridge.robots.default import ARM_JOINTS, BASE_FRAME
 
-# --- Messages of one layout, serialised once: only stamp and numbers change from sample to sample.
+# Messages of one layout, serialised once: only stamp and numbers change from sample to sample.
 #
 # At 500 samples a second and six topics a general serialiser would cost a quarter of a core.
 
@@ -70,8 +70,6 @@ class MessageTemplate:
             start += count
         return bytes(data)
 
-
-# --- What the controller's mode numbers mean, as the vendor's RTDE guide lists them.
 
 _ROBOT = {
     -1: "NO_CONTROLLER",

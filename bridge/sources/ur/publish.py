@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -10,6 +11,7 @@ from bridge.episode import schema
 from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.schema import StampedMessage
 from bridge.episode.topics import (
+    EVENT,
     GRIPPER_STATE,
     JOINT_STATES,
     JOINT_TARGETS,
@@ -30,8 +32,6 @@ from bridge.sources.ur.rtde import RtdeClient, Sample, Wish
 from bridge.terminal import Output
 from bridge.wire.qos import Qos
 from bridge.wire.session import WireSession
-
-# --- Turns the samples of a UR arm into messages and publishes them, numbered by the robot's time.
 
 SLOW_HZ = 125.0
 """The gripper and the transform of the tool change slowly enough for this rate."""
@@ -185,49 +185,57 @@ def _vector(value: object) -> tuple[float, ...]:
 RETRY_S = 1.0
 
 
-def publish_arm(
-    session: WireSession,
-    host: str,
-    config: UrConfig,
-    *,
-    stop: threading.Event,
-    output: Output,
-) -> dict[str, Any]:
-    """Publish the arm until stopped.
+@dataclass(frozen=True)
+class UrSource:
+    """An arm as a ``bridge.sources.source.Source``."""
 
-    Args:
-        session: An open session.
-        host: Name or address of the controller.
-        config: What is read, and how it is named.
-        stop: Asked between samples.
-        output: Told what happens to the connection.
+    host: str
+    """Name or address of the controller."""
+    config: UrConfig
+    """What is read, and how it is named."""
 
-    Returns:
-        Samples sent, samples that did not reach us, and connections made.
+    @property
+    def name(self) -> str:
+        """The controller's address."""
+        return f"UR arm at {self.host}"
 
-    Raises:
-        ControllerError: When the first connection fails; later ones are tried again.
-    """
-    urdf = read_urdf(config)
-    client: RtdeClient | None = _connect(session, host, config, output)
-    announcer = Announcer(session)
-    if urdf is not None:
-        announcer.fact("urdf", _description(urdf, session.now_ns()))
-    arm = ArmPublisher(session, config, announcer)
-    connections = 1
-    try:
-        while client is not None:
-            arm.begin(client.rate_hz)
-            _read(client, arm, stop=stop, output=output)
-            client = _connect_again(session, host, config, stop=stop)
-            if client is not None:
-                connections += 1
-                output.say(f"{host}: the controller is back")
-    finally:
-        announcer.close()
-    if announcer.failure is not None:
-        raise announcer.failure
-    return {**arm.counts(), "connections": connections}
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Without those of signals that the controller does not know."""
+        named = (JOINT_STATES, JOINT_TARGETS, TCP_POSE, TCP_WRENCH, GRIPPER_STATE, SPEED_SCALING)
+        of_cell = (cell_topic(self.config.cell, ending) for ending in (*named, EVENT))
+        return (*of_cell, TF, ROBOT_DESCRIPTION)
+
+    def run(self, session: WireSession, stop: threading.Event, output: Output) -> dict[str, Any]:
+        """Publish until stopped.
+
+        Returns:
+            Samples sent, samples that did not reach us, and connections made.
+
+        Raises:
+            ControllerError: When the first connection fails; later ones are tried again.
+        """
+        host, config = self.host, self.config
+        urdf = read_urdf(config)
+        client: RtdeClient | None = _connect(session, host, config, output)
+        announcer = Announcer(session)
+        if urdf is not None:
+            announcer.fact("urdf", _description(urdf, session.now_ns()))
+        arm = ArmPublisher(session, config, announcer)
+        connections = 1
+        try:
+            while client is not None:
+                arm.begin(client.rate_hz)
+                _read(client, arm, stop=stop, output=output)
+                client = _connect_again(session, host, config, stop=stop)
+                if client is not None:
+                    connections += 1
+                    output.say(f"{host}: the controller is back")
+        finally:
+            announcer.close()
+        if announcer.failure is not None:
+            raise announcer.failure
+        return {**arm.counts(), "connections": connections}
 
 
 def describe_counts(counts: dict[str, Any]) -> str:

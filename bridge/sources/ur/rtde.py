@@ -11,7 +11,7 @@ from enum import IntEnum
 
 from bridge.sources.ur.config import ControllerError, NotRtdeError, Value
 
-# --- Packages of the Real-Time Data Exchange, as the vendor's public guide describes them.
+# Packages of the Real-Time Data Exchange, as the vendor's public guide describes them.
 #
 # All numbers are big endian. A package is its size (uint16, header included), its kind (uint8)
 # and a payload. Version 2 of the protocol puts the number of the recipe before the data.
@@ -140,8 +140,6 @@ def text_of(payload: bytes) -> str:
     source = rest[1 : 1 + rest[0]].decode(errors="replace") if rest else ""
     return f"{source}: {message}" if source else message
 
-
-# --- A TCP connection that carries RTDE packages, with a limit on every wait.
 
 CONNECT_S = 3.0
 AGREE_S = 5.0

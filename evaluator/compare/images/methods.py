@@ -14,6 +14,7 @@ from jaxtyping import Bool
 
 from bridge.errors import BridgeError, GstError, PathNotFoundError
 from bridge.media.color import JPEG_MAGIC, MAX_PIXELS, decode_color, open_image
+from bridge.media.image_quality import ImageShapeError, as_float
 from evaluator.compare.images.scores import (
     NUM_WORST,
     Variant,
@@ -31,7 +32,7 @@ from evaluator.compare.images.tables import (
 )
 from evaluator.errors import EvaluatorError
 from evaluator.measurements import RENDERS
-from evaluator.metrics.image import ImageShapeError, as_float, refuse_swapped
+from evaluator.metrics.image import refuse_swapped
 from evaluator.metrics.image_scores import ImageScore
 from evaluator.metrics.lpips import PerceptualNet
 from evaluator.result import Exclusion

@@ -29,15 +29,9 @@ from bridge.episode.topics import (
 )
 from bridge.errors import GstError, MissingDependencyError
 from bridge.media.color import JPEG_MAGIC, decode_color
+from bridge.media.image_quality import ALIGNMENTS, Alignment, as_float
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.image import (
-    ALIGNMENTS,
-    Alignment,
-    DepthScore,
-    as_float,
-    refuse_swapped,
-    score_depth,
-)
+from evaluator.metrics.image import DepthScore, refuse_swapped, score_depth
 from evaluator.metrics.image_protocol import MASK_MODES, MaskMode, NetName
 from evaluator.metrics.image_scores import METRICS, ImageScore, score_image
 from evaluator.metrics.lpips import PerceptualNet

@@ -152,7 +152,7 @@ class StampedValue:
     """One cell of a table of image numbers."""
 
     value: float | str | None
-    """A word where there is no number; None is undefined."""
+    """A word where there is not a number; None is undefined."""
     stamp: Stamp
 
 
@@ -265,8 +265,8 @@ def per_image_table(table_id: str, title: str, scores: Sequence[ViewScore]) -> T
 
 
 def _definitions(metrics: Iterable[ImageMetric]) -> str:
-    said = ". ".join(metric.definition for metric in metrics)
-    return f"{said}. LPIPS where a backbone is given. Full stamps: the table of protocols."
+    definitions = ". ".join(metric.definition for metric in metrics)
+    return f"{definitions}. LPIPS where a backbone is given. Full stamps: the table of protocols."
 
 
 def rounded(value: float | str | None) -> Cell:

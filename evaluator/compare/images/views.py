@@ -262,14 +262,14 @@ def _measure(
 ) -> tuple[list[Measurement], list[StampedMeasurement]]:
     """All numbers about some views; the raw ones first."""
     settings: list[Mapping[str, Any]] = [file.derived.settings for file in files]
-    said = _said(settings)
+    described = _described(settings)
     stored = "rendered images stored as JPEG" if any(s.jpeg for s in scores) else "stored lossless"
     protocol = Protocol(
         resolution=resolution_words([score.size for score in scores]),
         split=agreed_setting(settings, "holdout") or UNSTATED,
         stored=stored,
         nets=nets,
-        note=said,
+        note=described,
     )
     variants: dict[Variant, None] = {}
     for score in scores:
@@ -287,7 +287,7 @@ def _measure(
         )
     ]
     measurements = [number.measurement for number in stamped]
-    after = "; ".join(part for part in (stored, "mean of per-image values", said) if part)
+    after = "; ".join(part for part in (stored, "mean of per-image values", described) if part)
     measurements += _measure_depth(part, episodes, scores, after)
     if not nets:
         measurements.append(
@@ -329,7 +329,7 @@ def agreed_setting(settings: Sequence[Mapping[str, Any]], name: str) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def _said(settings: Sequence[Mapping[str, Any]]) -> str:
+def _described(settings: Sequence[Mapping[str, Any]]) -> str:
     """What the views say about how their scenes were made, where they agree."""
     parts = []
     for name, text in (

@@ -45,7 +45,7 @@ def confusion(tables: Sequence[Table], word: str) -> Drawing | NotDrawn:
 
     return Drawing(
         id="confusion",
-        title="What the twin said, and what happened",
+        title="Prediction of the twin against the outcome",
         caption="Trials with a known outcome. Diagonal from the upper left: the twin was right. "
         "Executed-in-twin is diagnosis only. Refused plans are not executed with replanning, so "
         "an obeyed verdict cannot show its false refusals.",
@@ -94,7 +94,7 @@ def _matrix(axes: "Axes", row: Sequence[Cell], word: str) -> None:
     axes.set_yticks([0.5, 1.5], ["success", "failure"], rotation=90, va="center")
     axes.tick_params(length=0, pad=2, labelsize=7)
     axes.set_xlabel(word, labelpad=1, fontsize=7.5)
-    axes.set_ylabel("twin said", labelpad=2, fontsize=7.5)
+    axes.set_ylabel("twin predicted", labelpad=2, fontsize=7.5)
     axes.set_title(str(row[0]).replace(" (", "\n("), fontsize=7.5, pad=4, color=LIGHT["ink"])
 
 
@@ -114,10 +114,12 @@ def reliability(bins: Sequence[ReliabilityPoint]) -> Drawing | NotDrawn:
         for b in bins:
             if b.rate_low is not None and b.rate_high is not None:
                 axes.plot(
-                    [100 * b.mean_said] * 2, [100 * b.rate_low, 100 * b.rate_high],
+                    [100 * b.mean_probability] * 2, [100 * b.rate_low, 100 * b.rate_high],
                     color=LIGHT["sim"], linewidth=1.4, alpha=0.6,
                 )  # fmt: skip
-            axes.plot([100 * b.mean_said], [100 * b.rate], "o", color=LIGHT["sim"], markersize=5)
+            axes.plot(
+                [100 * b.mean_probability], [100 * b.rate], "o", color=LIGHT["sim"], markersize=5
+            )
         counts = framed(figure, (0.5, 0.42, side, 0.5))
         counts.bar(
             [50 * (b.low + b.high) for b in bins], [b.n for b in bins], width=9.2,
@@ -136,7 +138,10 @@ def reliability(bins: Sequence[ReliabilityPoint]) -> Drawing | NotDrawn:
         "dashed line a probability is kept; below it the twin promises too much.",
         alt="Bins of the stated probability: "
         + listed(
-            [f"mean {100 * b.mean_said:.0f} %, {b.succeeded} of {b.n} succeeded" for b in bins],
+            [
+                f"mean {100 * b.mean_probability:.0f} %, {b.succeeded} of {b.n} succeeded"
+                for b in bins
+            ],
             at_most=10,
         ),
         table=Table(
@@ -150,7 +155,7 @@ def reliability(bins: Sequence[ReliabilityPoint]) -> Drawing | NotDrawn:
                 (
                     round(100 * b.low),
                     round(100 * b.high),
-                    round(100 * b.mean_said, 1),
+                    round(100 * b.mean_probability, 1),
                     b.succeeded,
                     b.n,
                     round(100 * b.rate, 1),
@@ -169,7 +174,7 @@ def costs(tables: Sequence[Table]) -> Drawing | NotDrawn:
     """Draw what a trial costs with and without the gate, by the price of a refused good plan."""
     table = next((table for table in tables if table.id == "gate_costs"), None)
     if table is None or not table.rows:
-        return NotDrawn(id="costs", reason="the gate was nowhere asked without being obeyed")
+        return NotDrawn(id="costs", reason="no executed trial has an advisory verdict")
     rows = [tuple(float(str(value)) for value in row[:3]) for row in table.rows]
 
     def draw(figure: "Figure") -> None:

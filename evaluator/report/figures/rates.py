@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from evaluator.compare.rows import RateCell
+from evaluator.compare.rows import RateGroup
 from evaluator.compare.success import WITH
 from evaluator.report.figures.drawing import (
     COLUMN_IN,
@@ -20,7 +20,7 @@ from evaluator.report.figures.drawing import (
     words,
 )
 from evaluator.result import Cell, Measurement, Table
-from evaluator.statistics.agreement import counted_cells
+from evaluator.statistics.agreement import counted_groups
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -203,16 +203,16 @@ def _gain(axes: "Axes", gain: Measurement, y: float, side: str, marker: str, rea
 
 MAX_GROUPS = len(MARKERS)
 MAX_ROWS = 40
-"""Cells drawn one below the other; a longer figure would not fit a page."""
+"""Groups drawn one below the other; a longer figure would not fit a page."""
 
 
-def scatter(cells: Sequence[RateCell], word: str) -> Drawing | NotDrawn:
+def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
     """Draw sim against recorded rates with both intervals and the identity line."""
-    drawn = [cell for cell in cells if all(rate.value is not None for rate in cell.pair)]
+    drawn = [group for group in groups if all(rate.value is not None for rate in group.pair)]
     if not drawn:
-        return NotDrawn(id="scatter", reason="no cell has both rates")
-    groups = list(dict.fromkeys((cell.task, cell.policy) for cell in drawn))
-    legend_rows = _legend_rows(groups)
+        return NotDrawn(id="scatter", reason="no group has both rates")
+    series = list(dict.fromkeys((group.task, group.policy) for group in drawn))
+    legend_rows = _legend_rows(series)
     below = 0.55 + 0.17 * (legend_rows + 1)
     side = COLUMN_IN - 0.62
 
@@ -227,17 +227,17 @@ def scatter(cells: Sequence[RateCell], word: str) -> Drawing | NotDrawn:
             color=LIGHT["soft"], fontsize=7,
         )  # fmt: skip
         taken: dict[tuple[float, float], int] = {}
-        for cell in drawn:
-            _point(axes, cell, groups.index((cell.task, cell.policy)), taken)
-        _legend(axes, groups, any(cell.condition == WITH for cell in drawn))
+        for group in drawn:
+            _point(axes, group, series.index((group.task, group.policy)), taken)
+        _legend(axes, series, any(group.condition == WITH for group in drawn))
 
     return Drawing(
         id="scatter",
         title=f"Success in the twin against {word} success",
-        caption="One mark per cell (task, condition, policy), over the trials where both sides are "
-        "known; bars are 95 % intervals of both rates. Below the dashed line the twin is "
+        caption="One mark per group (task, condition, policy), over the trials where both sides "
+        "are known; bars are 95 % intervals of both rates. Below the dashed line the twin is "
         "optimistic. Marks that coincide are set apart.",
-        alt=f"Scatter of {counted_cells(len(drawn))}: "
+        alt=f"Scatter of {counted_groups(len(drawn))}: "
         + listed([f"{c.label}: twin {_text(c.pair[0])}, {word} {_text(c.pair[1])}" for c in drawn]),
         table=_table("scatter", drawn, word, common=True),
         height_in=below + side + 0.12,
@@ -245,18 +245,20 @@ def scatter(cells: Sequence[RateCell], word: str) -> Drawing | NotDrawn:
     )
 
 
-def _legend_rows(groups: Sequence[tuple[str, str]]) -> int:
-    return min(len(groups), MAX_GROUPS) + (len(groups) > MAX_GROUPS)
+def _legend_rows(series: Sequence[tuple[str, str]]) -> int:
+    return min(len(series), MAX_GROUPS) + (len(series) > MAX_GROUPS)
 
 
-def _point(axes: "Axes", cell: RateCell, group: int, taken: dict[tuple[float, float], int]) -> None:
-    sim, recorded = cell.pair
-    place = (100 * (sim.value or 0.0), 100 * (recorded.value or 0.0))
-    nudge = 2.6 * taken.get(place, 0)
-    taken[place] = taken.get(place, 0) + 1
+def _point(
+    axes: "Axes", group: RateGroup, place: int, taken: dict[tuple[float, float], int]
+) -> None:
+    sim, recorded = group.pair
+    at = (100 * (sim.value or 0.0), 100 * (recorded.value or 0.0))
+    nudge = 2.6 * taken.get(at, 0)
+    taken[at] = taken.get(at, 0) + 1
     # Towards the middle, so that marks in a corner stay inside.
-    x = place[0] - nudge if place[0] >= 50 else place[0] + nudge
-    y = place[1] + nudge if place[1] <= 50 else place[1] - nudge
+    x = at[0] - nudge if at[0] >= 50 else at[0] + nudge
+    y = at[1] + nudge if at[1] <= 50 else at[1] - nudge
     style = {"color": LIGHT["ink"], "linewidth": 0.8, "alpha": 0.55, "zorder": 2}
     if sim.interval is not None:
         axes.plot([100 * sim.interval.low, 100 * sim.interval.high], [y, y], **style)  # type: ignore[arg-type]
@@ -264,18 +266,18 @@ def _point(axes: "Axes", cell: RateCell, group: int, taken: dict[tuple[float, fl
         ends = [100 * recorded.interval.low, 100 * recorded.interval.high]
         axes.plot([x, x], ends, **style)  # type: ignore[arg-type]
     axes.plot(
-        [x], [y], linestyle="", marker=MARKERS[group % MAX_GROUPS], markersize=6,
-        markerfacecolor=LIGHT["sim"] if cell.condition == WITH else LIGHT["paper"],
+        [x], [y], linestyle="", marker=MARKERS[place % MAX_GROUPS], markersize=6,
+        markerfacecolor=LIGHT["sim"] if group.condition == WITH else LIGHT["paper"],
         markeredgecolor=LIGHT["sim"], markeredgewidth=1.4, zorder=3,
     )  # fmt: skip
 
 
-def _legend(axes: "Axes", groups: Sequence[tuple[str, str]], conditions: bool) -> None:
-    """List the groups below the axes; long names have the whole width."""
+def _legend(axes: "Axes", series: Sequence[tuple[str, str]], conditions: bool) -> None:
+    """List the series below the axes; long names have the whole width."""
     step = 0.17 / (COLUMN_IN - 0.62)
     y = -0.46 / (COLUMN_IN - 0.62)
     where: dict[str, Any] = {"transform": axes.transAxes, "clip_on": False}
-    for index, (task, policy) in enumerate(groups[:MAX_GROUPS]):
+    for index, (task, policy) in enumerate(series[:MAX_GROUPS]):
         axes.plot(
             [0.02], [y + 0.01], linestyle="", marker=MARKERS[index], markersize=5,
             markerfacecolor=LIGHT["paper"], markeredgecolor=LIGHT["sim"], markeredgewidth=1.2,
@@ -284,20 +286,20 @@ def _legend(axes: "Axes", groups: Sequence[tuple[str, str]], conditions: bool) -
         axes.text(0.06, y, words(task, policy), va="center", **where)
         y -= step
     notes = ["hollow: without replanning, solid: with"] if conditions else []
-    if len(groups) > MAX_GROUPS:
-        notes.insert(0, f"{len(groups)} groups share {MAX_GROUPS} marks; the table names them")
+    if len(series) > MAX_GROUPS:
+        notes.insert(0, f"{len(series)} series share {MAX_GROUPS} marks; the table names them")
     for note in notes:
         axes.text(0.0, y, note, va="center", color=LIGHT["soft"], **where)
         y -= step
 
 
-def success(cells: Sequence[RateCell], word: str) -> Drawing | NotDrawn:
-    """Draw both rates of every cell, one cell below the other, with their intervals."""
+def success(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
+    """Draw both rates of every group, one group below the other, with their intervals."""
     known = [
-        cell for cell in cells if cell.sim.value is not None or cell.recorded.value is not None
+        group for group in groups if group.sim.value is not None or group.recorded.value is not None
     ]
     if not known:
-        return NotDrawn(id="success", reason="no cell has a rate")
+        return NotDrawn(id="success", reason="no group has a rate")
     shown = known[:MAX_ROWS]
     row = 0.56
 
@@ -308,11 +310,11 @@ def success(cells: Sequence[RateCell], word: str) -> Drawing | NotDrawn:
         percent_axis(axes, "x", "success rate")
         axes.set_ylim(len(shown), 0)
         axes.set_yticks([])
-        for index, cell in enumerate(shown):
-            label = words(cell.task, cell.condition, cell.policy)
+        for index, group in enumerate(shown):
+            label = words(group.task, group.condition, group.policy)
             axes.text(-3, index + 0.22, label, va="center", fontsize=8, bbox=ON_PAPER)
-            _rate(axes, cell.sim, index + 0.5, "sim", "o")
-            _rate(axes, cell.recorded, index + 0.76, "rec", "s")
+            _rate(axes, group.sim, index + 0.5, "sim", "o")
+            _rate(axes, group.recorded, index + 0.76, "rec", "s")
         for x, name, marker, text in ((0, "sim", "o", "twin"), (24, "rec", "s", word)):
             axes.plot(
                 [x], [-0.3], marker=marker, color=LIGHT[name], markersize=5, clip_on=False,
@@ -321,13 +323,13 @@ def success(cells: Sequence[RateCell], word: str) -> Drawing | NotDrawn:
             axes.text(x + 3, -0.3, text, va="center")
 
     more = len(known) - len(shown)
-    rest = f" The first {MAX_ROWS} of {len(known)} cells; the table has all." if more else ""
+    rest = f" The first {MAX_ROWS} of {len(known)} groups; the table has all." if more else ""
     return Drawing(
         id="success",
         title=f"Success rates in the twin and {word}",
         caption="Circle: planned-in-twin; square: as labelled. Bars are 95 % intervals; the counts "
         f"stand at the right.{rest}",
-        alt=f"Rates of {counted_cells(len(known))}: "
+        alt=f"Rates of {counted_groups(len(known))}: "
         + listed([f"{c.label}: twin {_text(c.sim)}, {word} {_text(c.recorded)}" for c in known]),
         table=_table("success", known, word, common=False),
         height_in=0.7 + row * len(shown),
@@ -355,12 +357,12 @@ def _text(rate: Measurement) -> str:
     return f"{rate.k}/{rate.n}"
 
 
-def _table(table_id: str, cells: Sequence[RateCell], word: str, *, common: bool) -> Table:
+def _table(table_id: str, groups: Sequence[RateGroup], word: str, *, common: bool) -> Table:
     rows: list[tuple[Cell, ...]] = []
-    for cell in cells:
-        sides = cell.pair if common else (cell.sim, cell.recorded)
+    for group in groups:
+        sides = group.pair if common else (group.sim, group.recorded)
         numbers = [value for side in sides for value in _numbers(side)]
-        rows.append((cell.task, cell.condition.replace("_", " "), cell.policy, *numbers))
+        rows.append((group.task, group.condition.replace("_", " "), group.policy, *numbers))
     sides_named = [
         f"{side}{what}" for side in ("twin", word) for what in (" (%)", " low", " high", " k", " n")
     ]

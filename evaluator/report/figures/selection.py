@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from evaluator.compare.band_measurements import BandCurve
 from evaluator.compare.motion import MotionSummary
 from evaluator.compare.plot_data import CurveBand, ReliabilityPoint, curve_bands, reliability_points
-from evaluator.compare.rows import Comparison, RateCell
+from evaluator.compare.rows import Comparison, RateGroup
 from evaluator.memory import Packed
 from evaluator.report.figures.distributions import (
     Panel,
@@ -29,7 +29,7 @@ class Drawable:
 
     word: str
     """What the recorded side is called."""
-    cells: tuple[RateCell, ...]
+    groups: tuple[RateGroup, ...]
     """Without the episodes they rest on, as the gains."""
     gains: tuple[Measurement, ...]
     tables: tuple[Table, ...]
@@ -45,7 +45,7 @@ def drawable(comparison: Comparison) -> Drawable:
     panels = (state_panels(comparison.states), view_panels(comparison.views))
     return Drawable(
         word=comparison.recorded_word,
-        cells=tuple(_cell_alone(cell) for cell in comparison.cells),
+        groups=tuple(_group_alone(group) for group in comparison.groups),
         gains=tuple(_alone(measurement) for measurement in gained),
         tables=tuple(table for table in comparison.tables if table.id in TABLES),
         bins=tuple(reliability_points(comparison.rows)),
@@ -67,8 +67,8 @@ def drawings(comparison: Comparison) -> tuple[list[Drawing], list[NotDrawn]]:
 def drawings_of(data: Drawable) -> tuple[list[Drawing], list[NotDrawn]]:
     """Return the figures that have data, in the order of the report, and the others."""
     everything: tuple[Drawing | NotDrawn, ...] = (
-        success(data.cells, data.word),
-        scatter(data.cells, data.word),
+        success(data.groups, data.word),
+        scatter(data.groups, data.word),
         gains(data.gains, data.word),
         confusion(data.tables, data.word),
         costs(data.tables),
@@ -82,12 +82,12 @@ def drawings_of(data: Drawable) -> tuple[list[Drawing], list[NotDrawn]]:
     return drawn, [item for item in everything if isinstance(item, NotDrawn)]
 
 
-def _cell_alone(cell: RateCell) -> RateCell:
-    recorded, sim = cell.recorded_common, cell.sim_common
+def _group_alone(group: RateGroup) -> RateGroup:
+    recorded, sim = group.recorded_common, group.sim_common
     return replace(
-        cell,
-        recorded=_alone(cell.recorded),
-        sim=_alone(cell.sim),
+        group,
+        recorded=_alone(group.recorded),
+        sim=_alone(group.sim),
         episodes=(),
         recorded_common=None if recorded is None else _alone(recorded),
         sim_common=None if sim is None else _alone(sim),

@@ -1,4 +1,4 @@
-"""Coverage by counting every outcome out: no random numbers, so no noise in the worst case."""
+"""Coverage by counting every outcome out: no random numbers, so no noise in the least coverage."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Coverage by drawing: closed forms over cells, and the real rate with the twin's help."""
+"""Coverage by drawing: closed forms over groups, and the real rate with the twin's help."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -11,54 +11,54 @@ from scipy.stats import rankdata
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
-from evaluator.statistics.bootstrap import METHODS, CellSample, refuse_no_width, remeasure_counts
+from evaluator.statistics.bootstrap import METHODS, GroupSample, refuse_no_width, remeasure_counts
 from evaluator.statistics.coverage.exact import Coverage
 from evaluator.statistics.gate import Confusion
 from evaluator.statistics.weighted import STATISTICS, Values, values_of
 
-# --- Coverage by drawing cells: every statistic of agreement, by every method, from the same
+# --- Coverage by drawing groups: every statistic of agreement, by every method, from the same
 # draws.
 
-# --- What cells are drawn from when the coverage of agreement is simulated.
+# --- What groups are drawn from when the coverage of agreement is simulated.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Population:
-    """Cells whose recorded and simulated success rates go together more or less.
+    """Groups whose recorded and simulated success rates go together more or less.
 
-    Both rates of a cell are 0.05 + 0.9 x the normal distribution function of two normal variables
+    Both rates of a group are 0.05 + 0.9 x the normal distribution function of two normal variables
     with correlation ``correlation``; a share of each belongs to the cluster. Counts are binomial.
     """
 
     correlation: float
     cluster_share: float = 0.0
-    cells_per_cluster: int = 1
+    groups_per_cluster: int = 1
     trials: int = 10
 
     @property
     def name(self) -> str:
-        """What the map says about a worst case."""
-        return f"r = {self.correlation:g}, {self.trials} trials per cell"
+        """What the map says of the truth that is covered least."""
+        return f"r = {self.correlation:g}, {self.trials} trials per group"
 
     def draw(
         self, num_clusters: int, rng: np.random.Generator
-    ) -> tuple[Float64[np.ndarray, " cells"], Float64[np.ndarray, " cells"]]:
+    ) -> tuple[Float64[np.ndarray, " groups"], Float64[np.ndarray, " groups"]]:
         """Draw measured rates, recorded and simulated, cluster by cluster."""
         recorded, sim = self.measure(self.true_rates(num_clusters, rng), rng)
         return recorded / self.trials, sim / self.trials
 
     def measure(
-        self, true_rates: Float64[np.ndarray, "sides cells"], rng: np.random.Generator
-    ) -> Int64[np.ndarray, "sides cells"]:
-        """Count successes of cells with these true rates."""
+        self, true_rates: Float64[np.ndarray, "sides groups"], rng: np.random.Generator
+    ) -> Int64[np.ndarray, "sides groups"]:
+        """Count successes of groups with these true rates."""
         return np.asarray(rng.binomial(self.trials, true_rates), dtype=np.int64)
 
     def true_rates(
         self, num_clusters: int, rng: np.random.Generator
-    ) -> Float64[np.ndarray, "sides cells"]:
+    ) -> Float64[np.ndarray, "sides groups"]:
         """Draw true rates, recorded and simulated, cluster by cluster."""
         own, shared = (1 - self.cluster_share) ** 0.5, self.cluster_share**0.5
-        size = (num_clusters, self.cells_per_cluster)
+        size = (num_clusters, self.groups_per_cluster)
         alone = self._pairs(size, rng)
         together = self._pairs((num_clusters, 1), rng)
         rates = 0.05 + 0.9 * ndtr(own * alone + shared * together)
@@ -74,17 +74,17 @@ POPULATIONS = tuple(
     Population(correlation=r, trials=trials) for r in (0.0, 0.5, 0.9) for trials in (10, 50)
 )
 CLUSTERED = tuple(
-    Population(correlation=r, trials=trials, cluster_share=0.5, cells_per_cluster=3)
+    Population(correlation=r, trials=trials, cluster_share=0.5, groups_per_cluster=3)
     for r in (0.0, 0.5, 0.9)
     for trials in (10, 50)
 )
 
 
 TRUTH_DRAWS = 200_000
-PAIR_CELLS, PAIR_SETS = 400, 60
-"""Cells of one set, and sets, for the truth of what is counted over pairs of cells."""
+PAIR_GROUPS, PAIR_SETS = 400, 60
+"""Groups of one set, and sets, for the truth of what is counted over pairs of groups."""
 MAX_SETS, SET_NUMBERS = 2_000, 5_000_000
-"""Sets whose mean MMRV is the truth, and sets x cells x cells at most."""
+"""Sets whose mean MMRV is the truth, and sets x groups x groups at most."""
 MAX_EXACT, NUM_RESAMPLES, NUM_DRAWS = 2_000, 499, 400
 """Fewer resamples than are made for a report: the drawing repeats them thousands of times."""
 SEED = 20_261_121
@@ -94,27 +94,27 @@ ENOUGH = 0.2
 
 @cache
 def truth(statistic: str, population: Population, num_units: int) -> float:
-    """Return the statistic of a very large sample of measured cells.
+    """Return the statistic of a very large sample of measured groups.
 
-    The mean maximum rank violation grows with the number of cells, whatever the twin is like; its
-    truth is the mean over many samples of as many cells.
+    The mean maximum rank violation grows with the number of groups, whatever the twin is like; its
+    truth is the mean over many samples of as many groups.
 
     Args:
         statistic: A name in ``weighted.STATISTICS``.
-        population: Of cells.
-        num_units: Cells, or clusters of cells, in one sample; asked for by MMRV only.
+        population: Of groups.
+        num_units: Groups, or clusters of groups, in one sample; asked for by MMRV only.
     """
     rng = np.random.default_rng(SEED)
     if statistic == "bias":
         return 0.0  # both sides have the same distribution
     if statistic.startswith("mmrv"):
-        cells = num_units * population.cells_per_cluster
-        sets = min(MAX_SETS, SET_NUMBERS // cells**2)
+        groups = num_units * population.groups_per_cluster
+        sets = min(MAX_SETS, SET_NUMBERS // groups**2)
         return _mean_over_sets(statistic, population, num_units, sets, rng)
     if statistic in ("kendall", "order"):
-        units = PAIR_CELLS // population.cells_per_cluster
+        units = PAIR_GROUPS // population.groups_per_cluster
         return _mean_over_sets(statistic, population, units, PAIR_SETS, rng)
-    x, y = population.draw(TRUTH_DRAWS // population.cells_per_cluster, rng)
+    x, y = population.draw(TRUTH_DRAWS // population.groups_per_cluster, rng)
     if statistic == "spearman":
         return float(np.corrcoef(rankdata(x), rankdata(y))[0, 1])
     (value,), _ = values_of(statistic, np.ones((1, len(x))), x, y)
@@ -138,19 +138,19 @@ def of_agreement(
     Samples in which a method gives no interval do not count for it.
 
     Args:
-        num_units: Cells, or clusters of cells.
-        populations: What the cells are drawn from; all of them clustered, or none.
+        num_units: Groups, or clusters of groups.
+        populations: What the groups are drawn from; all of them clustered, or none.
         draws: Samples of each population.
         rng: Source of the samples and resamples.
     """
     tally = _Tally(populations)
     for place, population in enumerate(populations):
-        per_cluster = population.cells_per_cluster
+        per_cluster = population.groups_per_cluster
         clusters = [i // per_cluster for i in range(num_units * per_cluster)]
         truths = {name: truth(name, population, num_units) for name in STATISTICS}
         for _ in range(draws):
             x, y = population.draw(num_units, rng)
-            sample = CellSample(
+            sample = GroupSample(
                 recorded=x.tolist(),
                 sim=y.tolist(),
                 rng=rng,
@@ -169,29 +169,29 @@ def of_agreement(
 
 
 def of_remeasurements(
-    num_cells: int, populations: Sequence[Population], *, draws: int, rng: np.random.Generator
+    num_groups: int, populations: Sequence[Population], *, draws: int, rng: np.random.Generator
 ) -> dict[str, Coverage]:
     """How often a band holds the statistic of a second measurement, as ``remeasurement:mae``.
 
     Pearson's is called ``remeasurement``.
 
     Args:
-        num_cells: Cells.
-        populations: What the cells are drawn from.
+        num_groups: Groups.
+        populations: What the groups are drawn from.
         draws: Samples of each population.
         rng: Source of the samples.
     """
     tally = _Tally(populations)
     for place, population in enumerate(populations):
         for _ in range(draws):
-            rates = population.true_rates(num_cells, rng)
+            rates = population.true_rates(num_groups, rng)
             first, second = population.measure(rates, rng), population.measure(rates, rng)
             counts = [[(int(k), population.trials) for k in side] for side in first]
             band = remeasure_counts(counts[0], counts[1], rng=rng, num_draws=NUM_DRAWS)
             for statistic, value in _second(second / population.trials):
                 key = f"remeasurement:{statistic}".removesuffix(":pearson")
                 tally.add(key, place, lambda b=band, s=statistic: b.band(s), value)  # type: ignore[misc]
-    return tally.coverage(num_cells)
+    return tally.coverage(num_groups)
 
 
 def _second(rates: np.ndarray) -> Iterator[tuple[str, float]]:
@@ -244,11 +244,11 @@ LOOKED_AT_AGAIN = 3
 """Truths with the lowest coverage that are drawn a second time."""
 LONGER = 5
 
-Cells = tuple[Sequence[float], Sequence[float]]
+Groups = tuple[Sequence[float], Sequence[float]]
 
 
-def of_cells(
-    interval: Callable[[Cells, int, np.random.Generator], Interval],
+def of_groups(
+    interval: Callable[[Groups, int, np.random.Generator], Interval],
     statistic: str,
     num_units: int,
     populations: Sequence[Population],
@@ -256,13 +256,13 @@ def of_cells(
     draws: int,
     rng: np.random.Generator,
 ) -> Coverage:
-    """Coverage over populations of cells; samples without an interval do not count.
+    """Coverage over populations of groups; samples without an interval do not count.
 
     Args:
-        interval: Makes one from measured rates and the number of cells in a cluster.
+        interval: Makes one from measured rates and the number of groups in a cluster.
         statistic: A name in ``weighted.STATISTICS``: what the truth is.
-        num_units: Cells, or clusters of cells.
-        populations: What the cells are drawn from.
+        num_units: Groups, or clusters of groups.
+        populations: What the groups are drawn from.
         draws: Samples of each population.
         rng: Source of the samples.
     """
@@ -271,7 +271,7 @@ def of_cells(
         population = populations[place]
         x, y = population.draw(num_units, rng)
         try:
-            found = interval((x.tolist(), y.tolist()), population.cells_per_cluster, rng)
+            found = interval((x.tolist(), y.tolist()), population.groups_per_cluster, rng)
         except UndefinedStatisticError:
             return None
         return found.low <= truth(statistic, population, num_units) <= found.high

@@ -19,14 +19,14 @@ INSTEAD = {
     "jeffreys": "wilson or clopper-pearson",
     "newcombe-10": "clopper-pearson-difference",
     "tango": "McNemar's exact test, which needs no interval",
-    "fisher-z": "the coefficient with its n, or more cells",
-    "bootstrap-points": "fisher-z for r, student-t for means, or more cells",
+    "fisher-z": "the coefficient with its n, or more groups",
+    "bootstrap-points": "fisher-z for r, student-t for means, or more groups",
     "bootstrap-clusters": "more policies: no interval holds with so few",
-    "bootstrap-expanded-points": "the value with its n, or more cells",
+    "bootstrap-expanded-points": "the value with its n, or more groups",
     "bootstrap-expanded-clusters": "the value with its n, or more policies",
-    "jackknife-points": "the value with its n, or more cells",
+    "jackknife-points": "the value with its n, or more groups",
     "jackknife-clusters": "the value with its n, or more policies",
-    "student-t": "the value with its n, or more cells",
+    "student-t": "the value with its n, or more groups",
     "post-stratified-beta": "wilson on the robot trials alone",
     "ppi++": "post-stratified-beta",
     "remeasurement": "the coefficient with its n",
@@ -92,7 +92,7 @@ def vouch(
 
     Args:
         interval: What a method gave.
-        n: What the method's coverage depends on: trials, pairs, cells, policies; of a difference
+        n: What the method's coverage depends on: trials, pairs, groups, policies; of a difference
             the trials of both groups.
         key: Name in the map, where one method serves several statistics; its own without.
         instead: What to use where it is refused; what the method's own entry says without.
@@ -120,7 +120,7 @@ def vouch(
     return replace(interval, worst_coverage=round(known.worst, 4)), ""
 
 
-# --- Which method gives the interval of a statistic over so many cells: the map decides.
+# --- Which method gives the interval of a statistic over so many groups: the map decides.
 
 LEVEL = 0.95
 CLOSED_FORMS: dict[tuple[str, str], tuple[str, str]] = {
@@ -150,7 +150,7 @@ def choose_method(statistic: str, kind: str, num_units: int) -> Choice:
     Args:
         statistic: A name in ``weighted.STATISTICS``.
         kind: points or clusters.
-        num_units: Cells, or clusters of cells.
+        num_units: Groups, or clusters of groups.
     """
     options = _options(statistic, kind)
 
@@ -169,13 +169,13 @@ def _options(statistic: str, kind: str) -> list[tuple[str, str]]:
 
 
 def _instead(options: list[tuple[str, str]], kind: str, num_units: int) -> str:
-    """Name the smallest number of cells from which on one of the methods holds."""
+    """Name the smallest number of groups from which on one of the methods holds."""
     found = [
         (enough, key.partition(":")[0])
         for _, key in options
         if (enough := holds_from(key)) is not None and enough > num_units
     ]
-    unit = "cells" if kind == "points" else "policies"
+    unit = "groups" if kind == "points" else "policies"
     if not found:
         return "the value with its n"
     enough, name = min(found)

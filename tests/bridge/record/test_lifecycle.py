@@ -141,7 +141,7 @@ def test_a_discarded_take_leaves_nothing(recorder: Recorder, run: RunFolder) -> 
 def test_commands_out_of_place_are_refused(recorder: Recorder, run: RunFolder) -> None:
     with pytest.raises(LifecycleError, match="nothing is being recorded"):
         recorder.stop()
-    with pytest.raises(LifecycleError, match="no episode to label"):
+    with pytest.raises(LifecycleError, match="no episode has been recorded"):
         recorder.label(text="x")
     recorder.start(INFO)
     with pytest.raises(LifecycleError, match="'t1' is being recorded"):

@@ -137,14 +137,14 @@ def test_a_preview_is_made_only_while_somebody_looks(
     publisher = client.publisher("/lab/cam/eye/color/image", schema.COMPRESSED_IMAGE)
     publisher.put(message.to_cdr(), source_ns=1)
     wait_for(lambda: "/lab/cam/eye/color/image" in live.status()["seen"])
-    assert live.core.intake.watched == frozenset()
+    assert live.core.input_queue.watched == frozenset()
     looking = client.subscribe("rec/main/preview/eye", got.append)
-    wait_for(lambda: live.core.intake.watched)
+    wait_for(lambda: live.core.input_queue.watched)
     publisher.put(message.to_cdr(), source_ns=1)
     wait_for(lambda: got)
     assert decode_color(CompressedColor.from_cdr(got[0].data).data).shape == (240, 320, 3)
     looking.close()
-    wait_for(lambda: not live.core.intake.watched)
+    wait_for(lambda: not live.core.input_queue.watched)
 
 
 def test_what_a_departed_source_said_is_not_repeated(

@@ -1,6 +1,8 @@
 """Recorder, control keys and the folder source joined by real sessions, in one process."""
 
+import contextlib
 import json
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +22,8 @@ from bridge.record.recorder import Recorder
 from bridge.record.status import describe_status
 from bridge.sources.folder.config import FolderConfig
 from bridge.sources.folder.messages import read_index
-from bridge.sources.folder.publish import publish_folder_frames
+from bridge.sources.folder.publish import FolderSource
+from bridge.terminal import Advance, Output
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import RemoteError
 from bridge.wire.session import WireSession, open_session
@@ -123,14 +126,20 @@ def test_a_folder_is_recorded_as_a_camera(joined: Joined, tmp_path: Path) -> Non
     client = RecorderClient(joined.client, timeout_s=10.0)
     client.start("scan", {"kind": "scan"})
     progress: list[int] = []
-    sent = publish_folder_frames(
-        joined.client,
-        read_index(tmp_path),
-        FolderConfig(cell="lab", camera="eye", rate_hz=100.0),
-        fast=False,
-        should_stop=lambda: len(progress) >= 4,
-        advance=lambda done, note: progress.append(done),
-    )
+    stop = threading.Event()
+
+    class Watched(Output):
+        @contextlib.contextmanager
+        def progress(self, label: str, total: int) -> Iterator[Advance]:
+            def advance(done: int, note: str) -> None:
+                progress.append(done)
+                if done == 4:
+                    stop.set()
+
+            yield advance
+
+    config = FolderConfig(cell="lab", camera="eye", rate_hz=100.0)
+    sent = FolderSource(read_index(tmp_path), config).run(joined.client, stop, Watched())
     answer = client.stop()
     assert (sent["frames"], sent["of"], progress) == (4, 5, [1, 2, 3, 4])
     assert answer["messages"] == sent["messages"] == 4 * 3 + 3

@@ -30,26 +30,26 @@ MakeSample = Callable[..., WireSample]
 
 
 class Queues:
-    """An intake whose images wait until they are let through."""
+    """An input_queue whose images wait until they are let through."""
 
     def __init__(self, **limits: object) -> None:
         """Open the queues."""
         self.images: deque[Item] = deque()
         self.kinds: dict[str, str] = {}
-        self.intake = InputQueue(QueueConfig(**limits), self.images.append, self.kinds)  # type: ignore[arg-type]
+        self.input_queue = InputQueue(QueueConfig(**limits), self.images.append, self.kinds)  # type: ignore[arg-type]
 
     def encode(self, count: int | None = None) -> None:
         for _ in range(len(self.images) if count is None else count):
-            self.intake.put_image(self.images.popleft(), 0)
+            self.input_queue.put_image(self.images.popleft(), 0)
 
     def drain(self) -> list[Entry]:
         self.encode()
         merge = Merge()
-        merge.feed(*self.intake.take())
+        merge.feed(*self.input_queue.take())
         entries = list(merge.ready())
         for entry in entries:
             if isinstance(entry, Item):
-                self.intake.release(entry)
+                self.input_queue.release(entry)
         return entries
 
 
@@ -88,7 +88,7 @@ def test_every_message_is_kept_or_counted(
         sample = image(sequence, size, received_ns=number * 10**8)
         if not is_image:
             sample = replace(sample, topic="/small", type_name=schema.JOINT_STATE)
-        queues.intake.put(sample)
+        queues.input_queue.put(sample)
         is_last = not any(other == is_image for _, other, _ in messages[number + 1 :])
         sent[is_image] += 1 + (0 if is_last else missing)
         if number == encoded:
@@ -101,7 +101,7 @@ def test_every_message_is_kept_or_counted(
     total = ledger.total()
     assert total.received + total.queue_drops + total.shed == len(messages)
     assert total.received + total.lost == sum(sent.values())
-    assert queues.intake.queued_bytes == 0
+    assert queues.input_queue.queued_bytes == 0
     by_second = list(ledger.close_seconds())
     for name in ("received", "queue_drops", "shed", "gaps"):
         assert sum(record[name] for record in by_second) == getattr(total, name)
@@ -110,9 +110,9 @@ def test_every_message_is_kept_or_counted(
 def test_images_never_evict_joints(make_sample: MakeSample) -> None:
     queues = Queues(camera_queue_mb=1, small_queue_mb=1)
     for number in range(20):
-        queues.intake.put(image(number, 200_000))
+        queues.input_queue.put(image(number, 200_000))
     for _ in range(100):
-        queues.intake.put(make_sample())
+        queues.input_queue.put(make_sample())
     entries = queues.drain()
     joints = [e for e in entries if isinstance(e, Item) and "joint" in e.sample.topic]
     dropped = [e for e in entries if isinstance(e, Dropped)]
@@ -123,7 +123,7 @@ def test_images_never_evict_joints(make_sample: MakeSample) -> None:
 def test_small_messages_have_a_bound_of_their_own(make_sample: MakeSample) -> None:
     queues = Queues(small_queue_mb=1)
     for _ in range(3000):
-        queues.intake.put(make_sample(data=bytes(500)))
+        queues.input_queue.put(make_sample(data=bytes(500)))
     kept = [entry for entry in queues.drain() if isinstance(entry, Item)]
     assert len(kept) == 1_000_000 // (500 + 512)
 
@@ -133,16 +133,16 @@ def test_commands_keep_their_place_and_wait_for_the_images_before_them(
 ) -> None:
     queues, merge = Queues(), Merge()
     stop = command()
-    queues.intake.put(image(0, 10))
+    queues.input_queue.put(image(0, 10))
     before = make_sample()
-    queues.intake.put(before)
-    queues.intake.put_command(stop)
-    queues.intake.put(image(1, 10))
+    queues.input_queue.put(before)
+    queues.input_queue.put_command(stop)
+    queues.input_queue.put(image(1, 10))
     after = make_sample()
-    queues.intake.put(after)
+    queues.input_queue.put(after)
 
     def ready() -> list[object]:
-        merge.feed(*queues.intake.take())
+        merge.feed(*queues.input_queue.take())
         return [e.sample if isinstance(e, Item) else e for e in merge.ready()]
 
     assert ready() == [before]  # small messages wait for no image
@@ -155,15 +155,15 @@ def test_commands_keep_their_place_and_wait_for_the_images_before_them(
 
 def test_an_image_from_behind_a_command_does_not_overtake_it() -> None:
     queues, merge = Queues(), Merge()
-    queues.intake.put(image(0, 10, topic="/slow/cam/a/color/image"))
-    queues.intake.put_command(command())
-    queues.intake.put(image(1, 10))
+    queues.input_queue.put(image(0, 10, topic="/slow/cam/a/color/image"))
+    queues.input_queue.put_command(command())
+    queues.input_queue.put(image(1, 10))
     slow = queues.images.popleft()
     queues.encode()
-    merge.feed(*queues.intake.take())
+    merge.feed(*queues.input_queue.take())
     assert list(merge.ready()) == []
-    queues.intake.put_image(slow, 0)
-    merge.feed(*queues.intake.take())
+    queues.input_queue.put_image(slow, 0)
+    merge.feed(*queues.input_queue.take())
     kinds = [type(entry) for entry in merge.ready()]
     assert kinds == [Item, Command, Item]
 
@@ -171,12 +171,12 @@ def test_an_image_from_behind_a_command_does_not_overtake_it() -> None:
 def test_what_is_given_up_ends_at_the_next_barrier() -> None:
     queues, merge = Queues(), Merge()
     stop = command()
-    queues.intake.put(image(0, 10))
-    queues.intake.put(image(1, 10, topic="/a", type_name="x"))
-    queues.intake.put_command(stop)
-    queues.intake.put(image(2, 10, topic="/b", type_name="x"))
+    queues.input_queue.put(image(0, 10))
+    queues.input_queue.put(image(1, 10, topic="/a", type_name="x"))
+    queues.input_queue.put_command(stop)
+    queues.input_queue.put(image(2, 10, topic="/b", type_name="x"))
     queues.encode()
-    merge.feed(*queues.intake.take())
+    merge.feed(*queues.input_queue.take())
     given_up = [entry.ticket for entry in merge.rest()]
     assert sorted(given_up) == [0, 1]
     assert [entry.ticket for entry in merge.ready()] == [stop.ticket, 3]
@@ -184,25 +184,25 @@ def test_what_is_given_up_ends_at_the_next_barrier() -> None:
 
 def test_a_quiet_intake_queues_only_what_is_latched(make_sample: MakeSample) -> None:
     queues = Queues()
-    queues.intake.be_quiet(0)
-    queues.intake.put(make_sample())
-    queues.intake.put(make_sample(topic="/tf_static"))
-    queues.intake.put(image(0, 10))
+    queues.input_queue.be_quiet(0)
+    queues.input_queue.put(make_sample())
+    queues.input_queue.put(make_sample(topic="/tf_static"))
+    queues.input_queue.put(image(0, 10))
     assert [e.sample.topic for e in queues.drain() if isinstance(e, Item)] == ["/tf_static"]
-    assert queues.intake.seen()["/cell/joint_states"] == 1
-    queues.intake.put_command(command())
-    queues.intake.be_quiet(0)  # too late: a command is on its way
-    queues.intake.put(make_sample())
+    assert queues.input_queue.seen()["/cell/joint_states"] == 1
+    queues.input_queue.put_command(command())
+    queues.input_queue.be_quiet(0)  # too late: a command is on its way
+    queues.input_queue.put(make_sample())
     assert [type(entry) for entry in queues.drain()] == [Command, Item]
 
 
 def test_too_large_and_too_many_are_dropped_and_said(make_sample: MakeSample) -> None:
     queues = Queues(max_message_mb=0.1, max_rate_hz=5)
-    queues.intake.put(make_sample(data=bytes(100_001), topic="/huge"))
+    queues.input_queue.put(make_sample(data=bytes(100_001), topic="/huge"))
     now_ns = make_sample().received_ns // 10**9 * 10**9
     for _ in range(8):
-        queues.intake.put(make_sample(received_ns=now_ns))
-    queues.intake.put(make_sample(received_ns=now_ns + 10**9))
+        queues.input_queue.put(make_sample(received_ns=now_ns))
+    queues.input_queue.put(make_sample(received_ns=now_ns + 10**9))
     ledger = Ledger()
     kept = 0
     for entry in queues.drain():
@@ -232,7 +232,7 @@ def test_shed_images_are_counted_as_such() -> None:
     queues = Queues(camera_queue_mb=1)
     queues.kinds["/color"] = "color"
     for number in range(16):
-        queues.intake.put(image(number, 50_000, topic="/color"))
+        queues.input_queue.put(image(number, 50_000, topic="/color"))
     ledger, kept = Ledger(), 0
     for entry in queues.drain():
         if isinstance(entry, Item):
@@ -251,7 +251,7 @@ def test_threads_that_put_at_once_lose_nothing(make_sample: MakeSample) -> None:
 
     def put(gid: bytes) -> None:
         for number, sample in enumerate(samples):
-            queues.intake.put(replace(sample, source_gid=gid, sequence=number))
+            queues.input_queue.put(replace(sample, source_gid=gid, sequence=number))
 
     threads = [threading.Thread(target=put, args=(bytes([n]) * 16,)) for n in range(4)]
     for thread in threads:

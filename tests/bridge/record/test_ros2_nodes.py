@@ -169,7 +169,7 @@ def test_what_was_said_before_we_came_is_recorded_once(cell: Cell, flag: str) ->
 def test_what_a_transient_local_publisher_said_last_begins_the_next_episode(cell: Cell) -> None:
     cell.listen()
     robot = cell.robot("33", "3", "latched")
-    cell.wait_for(lambda: "/chatter" in cell.recorder.intake.latched, "the token")
+    cell.wait_for(lambda: "/chatter" in cell.recorder.input_queue.latched, "the token")
     robot.speak()
     cell.wait_for(lambda: len(cell.got) == 3, "the messages")
     cell.recorder.start(EpisodeInfo(id="t1", kind="trial"))

@@ -4,6 +4,7 @@ import io
 import json
 import os
 import shutil
+import threading
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +21,7 @@ from bridge.errors import PathNotFoundError, UsageError
 from bridge.sources.folder.config import FolderConfig, FolderError
 from bridge.sources.folder.messages import folder_messages, frame_times_ns, read_index
 from bridge.sources.folder.tum import StampedFile, associate
+from bridge.terminal import Output
 
 BESIDE = Path(__file__).parents[4] / "shared" / "data"
 DATA = Path(os.environ.get("GST_SHARED_DATA", BESIDE))
@@ -297,22 +299,18 @@ def test_a_published_tum_folder_keeps_the_distances_between_its_times(
         def put(self, data: bytes, *, source_ns: int) -> None:
             self._sent.append(source_ns)
 
-    from bridge.sources.folder.publish import publish_folder_frames
+    from bridge.sources.folder.publish import FolderSource
 
     session = Session()
     slept_s = [0.0]
     now_s = time.monotonic()
     monkeypatch.setattr(time, "monotonic", lambda: now_s + slept_s[0])
     monkeypatch.setattr(time, "sleep", lambda seconds: slept_s.append(slept_s.pop() + seconds))
-    unchecked = getattr(publish_folder_frames, "__wrapped__", publish_folder_frames)
-    sent = unchecked(  # our session only looks like one
-        session,
-        read_index(tum, TUM),
-        TUM,
-        fast=False,
-        should_stop=lambda: False,
-        advance=lambda done, note: None,
-    )
+    source = FolderSource(read_index(tum, TUM), TUM)
+    unchecked = getattr(FolderSource.run, "__wrapped__", FolderSource.run)
+    # Our session only looks like one.
+    sent = unchecked(source, session, threading.Event(), Output(quiet=True))
+    assert set(sent["topics"]) <= set(source.topics)
     assert slept_s[0] == pytest.approx((STAMPS_NS[2] - STAMPS_NS[0]) * 1e-9)
     assert sent["frames"] == 3
     color = session.sent["/kitchen/cam/kinect/color/image"]

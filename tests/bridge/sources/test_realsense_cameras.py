@@ -32,7 +32,7 @@ from bridge.sources.realsense.config import (  # noqa: E402
 )
 from bridge.sources.realsense.device import CameraDevice  # noqa: E402
 from bridge.sources.realsense.messages import ColorFrame, DepthFrame  # noqa: E402
-from bridge.sources.realsense.publish import choose_cameras, publish_cameras  # noqa: E402
+from bridge.sources.realsense.publish import RealSenseSource, choose_cameras  # noqa: E402
 from bridge.terminal import Output  # noqa: E402
 
 QUIET = Output(quiet=True)
@@ -177,7 +177,7 @@ def test_the_command_says_that_no_camera_is_there(capsys: pytest.CaptureFixture[
 
 
 class Running:
-    """``publish_cameras`` on a thread of its own."""
+    """``RealSenseSource`` on a thread of its own."""
 
     def __init__(
         self,
@@ -208,9 +208,9 @@ class Running:
         output: Output,
     ) -> None:
         try:
-            self.result = publish_cameras(
-                joined.client, config, stop=self.stop, output=output, list_devices=list_devices
-            )
+            source = RealSenseSource(config, list_devices)
+            self.result = source.run(joined.client, self.stop, output)
+            assert {topic for topic in self.heard if "/cam/" in topic} <= set(source.topics)
         except Exception as error:  # noqa: BLE001  # told to the test
             self.error = error
 

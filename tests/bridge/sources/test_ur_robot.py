@@ -18,7 +18,7 @@ from bridge.episode.check import check_episode
 from bridge.episode.reader import Episode
 from bridge.episode.topics import DROPS
 from bridge.sources.ur.config import UrConfig
-from bridge.sources.ur.publish import publish_arm
+from bridge.sources.ur.publish import UrSource
 from bridge.terminal import Output
 from bridge.wire.session import WireSample
 
@@ -27,7 +27,7 @@ ANSWER_S = 20.0
 
 
 class Running:
-    """``publish_arm`` on a thread of its own, and how far what it publishes has come."""
+    """``UrSource`` on a thread of its own, and how far what it publishes has come."""
 
     def __init__(self, joined: Joined, config: UrConfig, output: Output = QUIET) -> None:
         """Start."""
@@ -53,9 +53,8 @@ class Running:
 
     def _run(self, joined: Joined, config: UrConfig, output: Output) -> None:
         try:
-            self.result = publish_arm(
-                joined.client, "127.0.0.1", config, stop=self.stop, output=output
-            )
+            source = UrSource("127.0.0.1", config)
+            self.result = source.run(joined.client, self.stop, output)
         except Exception as error:  # noqa: BLE001  # told to the test
             self.error = error
 

@@ -9,15 +9,15 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters, SensorModel
 from bridge.sources.standin.render import Picture, Renderer, measure_color, measure_depth
-from bridge.sources.standin.surfaces import Surface, box_surface, room_surfaces
+from bridge.sources.standin.surfaces import Surface, box_surface, lab_surfaces
 
 CAMERA = Camera(width=40, height=30, fx=35.0, fy=35.0, cx=20.0, cy=15.0)
 UP = np.array([0.0, 0.0, 1.0])
 
 
 @pytest.fixture(scope="module")
-def room() -> list[Surface]:
-    return room_surfaces(9_000_000)
+def lab() -> list[Surface]:
+    return lab_surfaces(9_000_000)
 
 
 @pytest.fixture
@@ -31,30 +31,30 @@ def plane_depth(T_base_camera: np.ndarray) -> np.ndarray:
     return -T_base_camera[2, 3] / rays[..., 2]
 
 
-def test_depth_of_the_table_agrees_with_the_plane(room: list[Surface]) -> None:
+def test_depth_of_the_table_agrees_with_the_plane(lab: list[Surface]) -> None:
     T = se3.look_at(np.array([0.1, -0.2, 0.6]), np.array([0.35, 0.0, 0.0]), UP)
-    picture = Renderer(room).render(CAMERA, T, {})
+    picture = Renderer(lab).render(CAMERA, T, {})
     np.testing.assert_allclose(picture.depth_m, plane_depth(T), atol=1e-5)
 
 
-def test_a_box_on_the_table_is_nearer_by_its_height(room: list[Surface]) -> None:
+def test_a_box_on_the_table_is_nearer_by_its_height(lab: list[Surface]) -> None:
     box = box_surface("cube", np.array([0.0, 0.0, 0.0]), np.array([0.1, 0.1, 0.1]), (1.0, 0.0, 0.0))
     T = se3.look_at(np.array([0.3, 0.0, 0.8]), np.array([0.3001, 0.0, 0.0]), UP)
     T_base_cube = np.eye(4)
     T_base_cube[:3, 3] = [0.3, 0.0, 0.05]
-    picture = Renderer([*room, box]).render(CAMERA, T, {"cube": T_base_cube})
+    picture = Renderer([*lab, box]).render(CAMERA, T, {"cube": T_base_cube})
     assert picture.depth_m[15, 20] == pytest.approx(0.7, abs=1e-3)
     red, green, blue = picture.image[15, 20]
     assert red > 0.5
     assert green == blue == 0.0
 
 
-def test_a_backdrop_changes_no_depth(room: list[Surface]) -> None:
+def test_a_backdrop_changes_no_depth(lab: list[Surface]) -> None:
     box = box_surface("cube", np.zeros(3), np.array([0.1, 0.1, 0.1]), (1.0, 0.0, 0.0))
     T = se3.look_at(np.array([0.8, -0.5, 0.5]), np.array([0.35, 0.0, 0.0]), UP)
     T_base_cube = np.eye(4)
     T_base_cube[:3, 3] = [0.35, 0.0, 0.05]
-    renderer = Renderer([*room, box])
+    renderer = Renderer([*lab, box])
     whole = renderer.render(CAMERA, T, {"cube": T_base_cube})
     kept = renderer.render(CAMERA, T, {"cube": T_base_cube}, renderer.backdrop(CAMERA, T))
     np.testing.assert_array_equal(whole.depth_m, kept.depth_m)

@@ -15,7 +15,7 @@ from bridge.robots.default import MAX_WIDTH_M
 from bridge.sources.standin import operator
 from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.operator import execute_plan
-from bridge.sources.standin.probes import PROBES, NoRoomForProbeError, plan_probe
+from bridge.sources.standin.probes import PROBES, NoSpaceForProbeError, plan_probe
 from bridge.sources.standin.session import run_session
 from bridge.sources.standin.settings import SessionConfig
 from bridge.task.plan import Plan
@@ -109,7 +109,7 @@ def test_no_room_is_said_instead_of_pushed_off_the_table(
     make_session: Callable[..., Any], make_cell: Callable[..., StandinCell]
 ) -> None:
     cell = make_cell(make_session())
-    with pytest.raises(NoRoomForProbeError, match="put the object elsewhere"):
+    with pytest.raises(NoSpaceForProbeError, match="put the object elsewhere"):
         planned("slide", cell, cube(x=0.6, y=0.25))
 
 

@@ -26,7 +26,7 @@ from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.kinematics import UnreachablePoseError
 from bridge.sources.standin.operator import Operator
 from bridge.sources.standin.scan import ScanConfig, scan_joints
-from bridge.sources.standin.session import run_session
+from bridge.sources.standin.session import describe, run_session
 from bridge.sources.standin.settings import SessionConfig
 from bridge.sources.standin.streams import TRUTH_PARAMETERS
 from bridge.task.plan import Plan
@@ -188,6 +188,7 @@ def test_without_a_verdict_nothing_is_executed_and_the_trial_is_void(
     assert summary["outcomes"] == {"with_replanning": {"unknown": 1}}
     assert not [event for event in session.events() if event["type"] == "execution_started"]
     assert "nobody answered" in session.events()[0]["text"]
+    assert "trial_0001 unknown: nothing executed, no verdict (nobody" in describe(summary)
 
 
 def test_an_undecided_verdict_is_no_permission(make_session: Callable[..., Any]) -> None:
@@ -343,7 +344,7 @@ def truth_rollout(sent: list[Any]) -> Rollout:
     )
 
 
-def test_importing_the_room_and_the_settings_loads_no_physics() -> None:
+def test_importing_the_package_and_the_settings_loads_no_physics() -> None:
     code = (
         "import sys, bridge.sources, bridge.sources.standin.settings;"
         "print([m for m in ('mujoco', 'open3d', 'pinocchio', 'zenoh') if m in sys.modules])"

@@ -27,7 +27,7 @@ from bridge.sources.standin.planner import (
 from bridge.sources.standin.render import Renderer
 from bridge.sources.standin.soft import SoftBody
 from bridge.sources.standin.streams import Streams
-from bridge.sources.standin.surfaces import clutter_surfaces, object_surfaces, room_surfaces
+from bridge.sources.standin.surfaces import clutter_surfaces, lab_surfaces, object_surfaces
 from bridge.sources.standin.world import World
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task, load_task
@@ -268,8 +268,8 @@ def test_a_camera_sees_the_toys_where_and_how_they_are(sloth: Task, toys_cell: C
     p = Ts["sloth"][:3, 3]
     eye = p + np.array([0.0, -0.001, 0.4])
     T = se3.look_at(eye, p, np.array([0.0, 0.0, 1.0]))
-    room = [*room_surfaces(SEED), *clutter_surfaces(toys_cell.clutter)]
-    renderer = Renderer([*object_surfaces(sloth), *room])
+    lab = [*lab_surfaces(SEED), *clutter_surfaces(toys_cell.clutter)]
+    renderer = Renderer([*object_surfaces(sloth), *lab])
     skins = world.skins_m()
     seen = renderer.render(camera, T, world.Ts_base_object(), None, skins)
     assert 0.33 < seen.depth_m[30, 40] < 0.39, "on the sloth's back"

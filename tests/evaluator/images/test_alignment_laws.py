@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evaluator.metrics.image import aligned
+from bridge.media.image_quality import aligned
 
 
 def images(seed: int) -> tuple[np.ndarray, np.ndarray]:

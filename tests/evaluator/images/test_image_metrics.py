@@ -5,16 +5,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.image import (
+from bridge.media.image_quality import (
+    MS_SSIM_MIN_PX,
+    PADDINGS,
     ImageShapeError,
-    SwappedColourError,
-    gmsd,
+    ms_ssim,
     psnr_db,
-    refuse_swapped,
+    ssim,
+    ssim_maps,
 )
+from evaluator.errors import UndefinedStatisticError
+from evaluator.metrics.image import SwappedColourError, gmsd, refuse_swapped
 from evaluator.metrics.image_scores import METRICS, PLAIN_METRICS, score_image
-from evaluator.metrics.ssim import MS_SSIM_MIN_PX, PADDINGS, ms_ssim, ssim, ssim_maps
 
 
 def picture(seed: int = 0, size: tuple[int, int] = (40, 56)) -> np.ndarray:
@@ -158,7 +160,7 @@ def test_psnr_of_masked_pixels_is_that_of_these_pixels() -> None:
 def test_every_metric_names_its_source_and_implementation() -> None:
     for metric in METRICS.values():
         assert metric.definition
-        assert metric.implementation.startswith("evaluator.metrics.")
+        assert metric.implementation.startswith(("evaluator.metrics.", "bridge.media."))
         assert metric.named("raw") == metric.id
     assert METRICS["psnr_db"].named("gain") == "psnr_gain_db"
     assert METRICS["ssim_zero"].named("objects_black") == "ssim_zero_objects_black"

@@ -10,7 +10,7 @@ from evaluator.metrics.image_protocol import Stamp, common_text
 
 STAMP = Stamp(
     metric="SSIM",
-    implementation="evaluator.metrics.ssim 1",
+    implementation="bridge.media.image_quality 1",
     window="gaussian 11 x 11 sigma 1.5",
     padding="zeros",
     resolution="640 x 480",

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evaluator.metrics.ssim import (
+from bridge.media.image_quality import (
     BORDER,
     C1,
     C2,

@@ -150,6 +150,7 @@ sys.exit(robot_gst.run(["evaluate", sys.argv[1]]))
 def test_an_interrupt_reaches_both_and_neither_leaves_a_trace(tmp_path: Path) -> None:
     for name in ("episodes", "derived"):
         (tmp_path / name).mkdir()
+    (tmp_path / "episodes" / "one.mcap").touch()
     with subprocess.Popen(
         [sys.executable, "-c", INTERRUPTED, str(tmp_path)],
         stdout=subprocess.PIPE,
@@ -163,7 +164,8 @@ def test_an_interrupt_reaches_both_and_neither_leaves_a_trace(tmp_path: Path) ->
         assert process.stdout.readline() == "comparing\n"
         os.killpg(process.pid, signal.SIGINT)
         out, said = process.communicate(timeout=20)
-    assert (process.returncode, out, said) == (130, "", "")
+    told = f"robot-gst: interrupted; continue with: robot-gst evaluate {tmp_path}\n"
+    assert (process.returncode, out, said) == (130, "", told)
     assert ended_within(pid, 10.0)
 
 
@@ -182,6 +184,7 @@ def test_an_evaluation_that_fails_leaves_no_process(
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     for name in ("episodes", "derived"):
         (tmp_path / name).mkdir()
+    (tmp_path / "episodes" / "one.mcap").touch()
     blocked = tmp_path / "blocked"
     blocked.write_text("a file, not a folder")
     assert robot_gst.run(["evaluate", str(tmp_path), "--out", str(blocked)]) == 1

@@ -91,7 +91,7 @@ def test_figures_have_words_for_those_who_cannot_see_them(rendered: list[Rendere
 
 
 def test_the_papers_cells_stand_in_the_data_of_the_scatter() -> None:
-    drawing = scatter(compare_csv(PAPER).cells, "real")
+    drawing = scatter(compare_csv(PAPER).groups, "real")
     assert isinstance(drawing, Drawing)
     columns = drawing.table.columns
     sim, recorded = columns.index("twin (%)"), columns.index("real (%)")

@@ -14,7 +14,7 @@ import pytest
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT, ROBOT_NAME
-from bridge.task.plan import Plan
+from bridge.task.plan import Plan, Waypoint
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.gate.gate import UndecidedError
@@ -102,6 +102,18 @@ def test_as_many_samples_are_run_as_fit_into_the_steps_on_any_machine(
     hours = itertools.count(step=3600.0)
     monkeypatch.setattr(time, "monotonic", lambda: next(hours))
     assert answer(question).to_json() == idle.to_json()
+
+
+@pytest.mark.parametrize("t_ns", [10**400, -(10**12)])
+def test_impossible_times_are_left_for_the_replay_to_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, t_ns: int
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    question = question_of(run, max_steps=1_000_000)
+    odd = Waypoint(t_ns=t_ns, p_m=(0.4, 0.0, 0.3), q_wxyz=(1.0, 0.0, 0.0, 0.0), g=0)
+    asked = accepting(monkeypatch)
+    answer(replace(question, plan=replace(question.plan, tau=(odd,))))
+    assert len(asked) == 1
 
 
 def test_a_plan_that_alone_needs_too_many_steps_gets_no_verdict(

@@ -30,9 +30,9 @@ def gripping(world: World, mass_kg: float) -> None:
     """Hold a cube between the fingers, weightless."""
     pybullet.setGravity(0, 0, 0, physicsClientId=world.client)
     world.reset_robot(HOME, 0.041)
-    world.add_free("cube", SIZE, mass_kg, world.T_base_link("tcp"))
+    world.add_free("cube", SIZE, mass_kg, world.robot.T_base_link("tcp"))
     for _ in range(60):
-        world.command(HOME, STILL, 0.0)
+        world.robot.command(HOME, STILL, 0.0)
         world.step()
 
 
@@ -44,7 +44,7 @@ def turning(world: World, angle_rad: float, speed_rad_s: float = 2.0) -> Iterato
     yield joints
     for _ in range(steps):
         joints[5] += angle_rad / steps
-        world.command(joints, velocity, 0.0)
+        world.robot.command(joints, velocity, 0.0)
         world.step()
         yield joints
 
@@ -52,20 +52,20 @@ def turning(world: World, angle_rad: float, speed_rad_s: float = 2.0) -> Iterato
 def weigh_down(world: World, joints: np.ndarray, steps: int) -> float:
     """Switch gravity on; how far the cube has moved in the tool's frame [m]."""
     pybullet.setGravity(0, 0, -G, physicsClientId=world.client)
-    start = se3.invert(world.T_base_link("tcp")) @ world.T_base_object("cube")
+    start = se3.invert(world.robot.T_base_link("tcp")) @ world.T_base_object("cube")
     for _ in range(steps):
-        world.command(joints, STILL, 0.0)
+        world.robot.command(joints, STILL, 0.0)
         world.step()
-    end = se3.invert(world.T_base_link("tcp")) @ world.T_base_object("cube")
+    end = se3.invert(world.robot.T_base_link("tcp")) @ world.T_base_object("cube")
     return float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
 
 
 def normal_error_rad(world: World) -> float:
     """Angle between the fingers' closing direction and contact normals, weighted by force."""
-    finger = world.T_base_link("gripper_left_finger")[:3, :3]
+    finger = world.robot.T_base_link("gripper_left_finger")[:3, :3]
     axis = finger @ np.array([0.0, 1.0, 0.0])
     points = pybullet.getContactPoints(
-        world.robot_id, world.free_ids["cube"], physicsClientId=world.client
+        world.robot.id, world.free_ids["cube"], physicsClientId=world.client
     )
     angles = [np.arccos(min(1.0, abs(axis @ np.array(point[7])))) for point in points]
     return float(np.average(angles, weights=[point[9] for point in points]))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from bridge.geometry.box import box_corners
+from bridge.geometry.mesh import box_corners
 from bridge.robots.default import ROBOT
 from twin.physics import engine
 from twin.physics.arm import Arm, write_description
@@ -38,11 +38,11 @@ def dropped(urdf: str, steps: int = 120) -> tuple[np.ndarray, str]:
         world.add_free("high", SIZE, 0.05, at(0.51, 0.01, 0.12))
         world.reset_robot(HOME, 0.08)
         for _ in range(steps):
-            world.command(HOME, np.zeros(6), 0.08)
+            world.robot.command(HOME, np.zeros(6), 0.08)
             world.step()
             digest.update(world.T_base_object("low").tobytes())
             digest.update(world.T_base_object("high").tobytes())
-            digest.update(world.joints_rad().tobytes())
+            digest.update(world.robot.joints_rad().tobytes())
         return world.T_base_object("low"), digest.hexdigest()
 
 
@@ -108,10 +108,10 @@ def test_orders_given_once_do_what_repeated_ones_do(
 def test_a_posture_is_the_joints_and_the_width(urdf: str) -> None:
     with World(urdf, {}, PhysicsConfig()) as world:
         world.reset_robot(HOME, 0.05)
-        joints, width = world.posture()
-        np.testing.assert_array_equal(joints, world.joints_rad())
+        joints, width = world.robot.posture()
+        np.testing.assert_array_equal(joints, world.robot.joints_rad())
         np.testing.assert_allclose(joints, HOME, atol=1e-12)
-        assert width == world.width_m() == pytest.approx(0.05)
+        assert width == world.robot.width_m() == pytest.approx(0.05)
 
 
 def test_a_free_fall_follows_newton(urdf: str) -> None:
@@ -127,16 +127,16 @@ def test_a_free_fall_follows_newton(urdf: str) -> None:
 def test_fingers_stop_at_the_cube_and_stay_symmetric(urdf: str) -> None:
     with World(urdf, {}, PhysicsConfig()) as world:
         world.reset_robot(HOME, 0.041)
-        T_tcp = world.T_base_link("tcp")
+        T_tcp = world.robot.T_base_link("tcp")
         world.add_free("cube", SIZE, 0.05, T_tcp)
         for _ in range(240):
-            world.command(HOME, np.zeros(6), 0.0)
+            world.robot.command(HOME, np.zeros(6), 0.0)
             world.step()
         left, right = (
-            np.linalg.norm(world.T_base_link(f"gripper_{side}_finger")[:3, 3] - T_tcp[:3, 3])
+            np.linalg.norm(world.robot.T_base_link(f"gripper_{side}_finger")[:3, 3] - T_tcp[:3, 3])
             for side in ("left", "right")
         )
-        assert world.width_m() == pytest.approx(0.04, abs=2e-3)
+        assert world.robot.width_m() == pytest.approx(0.04, abs=2e-3)
         assert abs(left - right) < 1e-3
         assert world.finger_touches("cube")
         drift = world.T_base_object("cube")[:3, 3] - T_tcp[:3, 3]
@@ -146,10 +146,10 @@ def test_fingers_stop_at_the_cube_and_stay_symmetric(urdf: str) -> None:
 def test_open_fingers_hold_nothing(urdf: str) -> None:
     with World(urdf, {}, PhysicsConfig()) as world:
         world.reset_robot(HOME, 0.08)
-        T_tcp = world.T_base_link("tcp")
+        T_tcp = world.robot.T_base_link("tcp")
         world.add_free("cube", SIZE, 0.05, T_tcp)
         for _ in range(60):
-            world.command(HOME, np.zeros(6), 0.08)
+            world.robot.command(HOME, np.zeros(6), 0.08)
             world.step()
         assert not world.finger_touches("cube")
         assert world.T_base_object("cube")[2, 3] < T_tcp[2, 3] - 0.2

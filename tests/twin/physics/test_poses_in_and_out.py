@@ -67,17 +67,17 @@ def test_an_attached_cube_stays_turned_in_the_hand_as_it_was(
     """Position and rotation in the tool's frame, while the hand turns; faces stay parallel."""
     with World(urdf, {}, PhysicsConfig()) as world:
         world.reset_robot(HOME, 0.045)
-        T = world.T_base_link("tcp").copy()
+        T = world.robot.T_base_link("tcp").copy()
         T[:3, :3] = T[:3, :3] @ np.eye(3)[:, axes]
         world.add_free("cube", SIZE, 0.05, T)
         tie = Attachment(world)
         relative = []
         for step in range(240):
             target = HOME + np.array([0.3, 0.1, 0, 0, 0, 0.4]) * min(step / 200, 1.0)
-            world.command(target, np.zeros(6), 0.02)
+            world.robot.command(target, np.zeros(6), 0.02)
             world.step()
             tie.update(0.02)
-            hand = world.T_base_link("tcp")
+            hand = world.robot.T_base_link("tcp")
             relative.append(se3.invert(hand) @ world.T_base_object("cube"))
     turned = se3.rotation_angle_rad(relative[60][:3, :3].T @ relative[-1][:3, :3])
     assert turned < 0.03
@@ -93,17 +93,17 @@ def test_fingers_told_the_width_they_have_keep_what_is_attached_and_let_go_when_
     slippery = replace(PhysicsConfig(), finger_friction=0.0, object_friction=0.0)
     with World(urdf, {}, slippery) as world:
         world.reset_robot(HOME, 0.045)
-        T = world.T_base_link("tcp").copy()
+        T = world.robot.T_base_link("tcp").copy()
         world.add_free("cube", SIZE, 0.05, T)
         tie = Attachment(world)
 
         def fallen(width_m: float, steps: int = 60) -> float:
             for _ in range(steps):
-                world.command(HOME, np.zeros(6), width_m)
+                world.robot.command(HOME, np.zeros(6), width_m)
                 world.step()
                 tie.update(width_m)
             return float(T[2, 3] - world.T_base_object("cube")[2, 3])
 
         assert fallen(0.02) < 5e-3
-        assert fallen(world.width_m()) < 5e-3
-        assert fallen(world.width_m() + 0.004, 120) > 0.1
+        assert fallen(world.robot.width_m()) < 5e-3
+        assert fallen(world.robot.width_m() + 0.004, 120) > 0.1

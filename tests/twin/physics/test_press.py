@@ -27,13 +27,13 @@ def urdf() -> str:
 def fingers(world: World) -> np.ndarray:
     """Speed [m/s] and force [N] of each finger."""
     names = {
-        pybullet.getJointInfo(world.robot_id, index, physicsClientId=world.client)[1].decode(): (
+        pybullet.getJointInfo(world.robot.id, index, physicsClientId=world.client)[1].decode(): (
             index
         )
-        for index in range(pybullet.getNumJoints(world.robot_id, physicsClientId=world.client))
+        for index in range(pybullet.getNumJoints(world.robot.id, physicsClientId=world.client))
     }
     states = pybullet.getJointStates(
-        world.robot_id, [names[name] for name in FINGER_JOINTS], physicsClientId=world.client
+        world.robot.id, [names[name] for name in FINGER_JOINTS], physicsClientId=world.client
     )
     return np.array([[state[1], state[3]] for state in states])
 
@@ -42,7 +42,7 @@ def run(world: World, steps: int, width_m: float) -> np.ndarray:
     """Step, and return the speeds and forces on the way."""
     rows = []
     for _ in range(steps):
-        world.command(HOME, STILL, width_m)
+        world.robot.command(HOME, STILL, width_m)
         world.step()
         rows.append(fingers(world))
     return np.array(rows)
@@ -52,7 +52,7 @@ def holding(world: World) -> np.ndarray:
     """Close on a cube that floats between the fingers."""
     pybullet.setGravity(0, 0, 0, physicsClientId=world.client)
     world.reset_robot(HOME, OPEN_M)
-    world.add_free("cube", SIZE, 0.05, world.T_base_link("tcp"))
+    world.add_free("cube", SIZE, 0.05, world.robot.T_base_link("tcp"))
     run(world, 10, OPEN_M)
     return run(world, 120, CLOSED_M)
 
@@ -71,7 +71,7 @@ def test_the_whole_force_is_there_after_a_few_iterations(
 def test_fingers_that_hold_something_stand_still(urdf: str) -> None:
     with World(urdf, {}, STRONG) as world:
         assert np.abs(holding(world)[-20:, :, 0]).max() < 1e-3
-        assert world.width_m() == pytest.approx(0.04, abs=3e-4)
+        assert world.robot.width_m() == pytest.approx(0.04, abs=3e-4)
 
 
 def test_fingers_keep_their_speed_until_they_meet_something(urdf: str) -> None:
@@ -86,7 +86,7 @@ def test_fingers_keep_their_speed_until_they_meet_something(urdf: str) -> None:
 def test_fingers_whose_cube_is_gone_are_slow_again_after_a_few_steps(urdf: str) -> None:
     with World(urdf, {}, STRONG) as world:
         holding(world)
-        width_m = world.width_m()
+        width_m = world.robot.width_m()
         pybullet.resetBasePositionAndOrientation(
             world.free_ids["cube"], [2.0, 0.0, 1.0], [0, 0, 0, 1], physicsClientId=world.client
         )
@@ -95,7 +95,7 @@ def test_fingers_whose_cube_is_gone_are_slow_again_after_a_few_steps(urdf: str) 
         assert (speeds.max(axis=1) > free_m_s).sum() <= arm.EVERY_STEPS
         usual_m = 2 * STRONG.finger_speed_m_s * 12 / STRONG.rate_hz
         farthest_m = 2 * arm.EVERY_STEPS * arm.PRESS_M_S / STRONG.rate_hz
-        assert world.width_m() > width_m - usual_m - farthest_m - 1e-3
+        assert world.robot.width_m() > width_m - usual_m - farthest_m - 1e-3
 
 
 def test_fingers_that_open_are_as_fast_as_ever(urdf: str) -> None:
@@ -103,4 +103,4 @@ def test_fingers_that_open_are_as_fast_as_ever(urdf: str) -> None:
         holding(world)
         speeds = np.abs(run(world, 30, OPEN_M)[:, :, 0])
         assert speeds.max() < 1.05 * STRONG.finger_speed_m_s
-        assert world.width_m() > 0.05
+        assert world.robot.width_m() > 0.05

@@ -47,7 +47,7 @@ def test_without_a_start_no_branch_moves_less_than_the_chosen_one(robot: RobotMo
     Ts = robot.Ts_base_tcp(wanted)
     inverse = UrInverse.for_robot(robot)
     assert inverse is not None
-    raw, valid = inverse.all_branches(Ts)
+    raw, valid, _ = inverse.solve(Ts)
     motions = [motion(raw[:, k]) for k in range(8) if valid[:, k].all()]
     assert min(motions) < 0.2 * motion(wanted), "otherwise there is nothing to choose"
     followed = follow_poses(robot, Ts, start_rad=None, config=IkConfig())
@@ -58,7 +58,7 @@ def test_of_branches_that_move_alike_the_one_nearest_home_is_chosen(robot: Robot
     T = robot.Ts_base_tcp(np.array([[0.4, -1.2, 1.4, -1.4, -1.3, 0.5]]))
     inverse = UrInverse.for_robot(robot)
     assert inverse is not None
-    raw, valid = inverse.all_branches(T)
+    raw, valid, _ = inverse.solve(T)
     assert valid.all()
     away = raw[0] - HOME_RAD
     away -= 2 * np.pi * np.rint(away / (2 * np.pi))

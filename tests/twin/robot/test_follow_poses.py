@@ -44,7 +44,7 @@ def test_whatever_the_start_nothing_jumps(robot: RobotModel, branch: int) -> Non
     Ts = robot.Ts_base_tcp(arc(HOME, HOME + np.array([0.8, 0.3, -0.3, 0.2, 0.3, -0.5])))
     inverse = UrInverse.for_robot(robot)
     assert inverse is not None
-    start = inverse.all_branches(Ts[:1])[0][0, branch]
+    start = inverse.solve(Ts[:1])[0][0, branch]
     followed = follow_poses(robot, Ts, start_rad=start, config=IkConfig())
     assert followed.reached.all()
     assert np.abs(followed.joints_rad[0] - start).max() < 1e-9

@@ -50,8 +50,8 @@ def test_limits_a_whole_turn_apart_lose_no_answer_wherever_they_are(lower: list[
     low = np.array(lower)
     turn = UrInverse(geometry=wide.geometry, lower_rad=low, upper_rad=low + 2 * math.pi)
     Ts = robot.Ts_base_tcp(np.array([POSTURE, -POSTURE + 0.3]))
-    joints, valid = turn.all_branches(Ts)
-    assert np.array_equal(valid, wide.all_branches(Ts)[1])
+    joints, valid, _ = turn.solve(Ts)
+    assert np.array_equal(valid, wide.solve(Ts)[1])
     assert np.all(joints[valid] >= low - 1e-6)
     assert np.all(joints[valid] <= low + 2 * math.pi + 1e-6)
 
@@ -64,5 +64,5 @@ def test_one_joint_that_moves_is_enough_to_be_moving(joint: int) -> None:
     position[moving, joint] += 0.2 * (stamps[moving] - 1_000_000_000) * 1e-9
     arm = JointTrack(names=ARM_JOINTS, stamps_ns=stamps, position=position)
     track = PostureTrack(urdf="", arm=arm, widths=None)
-    assert track.is_still(500_000_000)
-    assert not track.is_still(1_500_000_000)
+    assert track.is_stationary(500_000_000)
+    assert not track.is_stationary(1_500_000_000)

@@ -49,7 +49,7 @@ def test_every_reachable_pose_is_solved_and_every_answer_reaches_it(
     rng = np.random.default_rng(11)
     postures = rng.uniform(-np.pi, np.pi, (1000, 6))
     Ts = robot.Ts_base_tcp(postures)
-    joints, valid = inverse.all_branches(Ts)
+    joints, valid, _ = inverse.solve(Ts)
     assert valid.any(axis=1).all()
     assert np.isfinite(joints).all()
     for index in range(0, 1000, 10):
@@ -64,7 +64,7 @@ def test_the_posture_that_made_a_pose_is_among_its_answers(
 ) -> None:
     rng = np.random.default_rng(12)
     postures = rng.uniform(-3.1, 3.1, (300, 6))
-    joints, valid = inverse.all_branches(robot.Ts_base_tcp(postures))
+    joints, valid, _ = inverse.solve(robot.Ts_base_tcp(postures))
     apart = joints - postures[:, None]
     apart = np.abs(apart - 2 * np.pi * np.rint(apart / (2 * np.pi))).max(axis=2)
     nearest = np.where(valid, apart, np.inf).min(axis=1)
@@ -74,7 +74,7 @@ def test_the_posture_that_made_a_pose_is_among_its_answers(
 def test_the_branches_of_a_pose_are_eight_different_postures(
     robot: RobotModel, inverse: UrInverse
 ) -> None:
-    joints, valid = inverse.all_branches(robot.T_base_tcp(HOME)[None])
+    joints, valid, _ = inverse.solve(robot.T_base_tcp(HOME)[None])
     assert valid.all()
     for first in range(8):
         for second in range(first):
@@ -87,7 +87,7 @@ def test_other_sizes_and_other_tools_are_solved_too(size: str) -> None:
     inverse = UrInverse.for_robot(robot)
     assert inverse is not None
     Ts = robot.Ts_base_tcp(np.random.default_rng(13).uniform(-3.0, 3.0, (40, 6)))
-    joints, valid = inverse.all_branches(Ts)
+    joints, valid, _ = inverse.solve(Ts)
     assert valid.any(axis=1).all()
     for index, branch in np.argwhere(valid):
         offset, turned = errors(robot, joints[index, branch], Ts[index])
@@ -133,7 +133,7 @@ def test_an_arm_with_a_tilted_axis_is_refused() -> None:
 def test_a_pose_out_of_reach_has_no_answer(robot: RobotModel, inverse: UrInverse) -> None:
     T = robot.T_base_tcp(HOME)
     T[:3, 3] = (2.0, 0.0, 0.3)
-    joints, valid = inverse.all_branches(T[None])
+    joints, valid, _ = inverse.solve(T[None])
     assert not valid.any()
     assert np.all(joints == 0.0)
 
@@ -141,7 +141,7 @@ def test_a_pose_out_of_reach_has_no_answer(robot: RobotModel, inverse: UrInverse
 def test_a_pose_that_is_not_a_number_has_no_answer(robot: RobotModel, inverse: UrInverse) -> None:
     Ts = np.stack([robot.T_base_tcp(HOME)] * 2)
     Ts[0, 1, 3] = np.nan
-    joints, valid = inverse.all_branches(Ts)
+    joints, valid, _ = inverse.solve(Ts)
     assert not valid[0].any()
     assert valid[1].all()
     assert np.isfinite(joints).all()
@@ -155,7 +155,7 @@ def test_a_straight_wrist_is_not_valid_and_nearly_straight_is(
         posture = HOME.copy()
         posture[4] = bend
         T = robot.T_base_tcp(posture)
-        joints, valid = inverse.all_branches(T[None])
+        joints, valid, _ = inverse.solve(T[None])
         own_side = [b for b in range(8) if abs(np.sin(joints[0, b, 4])) < 1e-3 or not valid[0, b]]
         assert any(valid[0, b] for b in own_side) is determined
         for branch in np.flatnonzero(valid[0]):
@@ -168,7 +168,7 @@ def test_a_stretched_arm_is_reached_from_both_elbows_at_once(
     posture = HOME.copy()
     posture[2] = 0.0
     T = robot.T_base_tcp(posture)
-    joints, valid = inverse.all_branches(T[None])
+    joints, valid, _ = inverse.solve(T[None])
     assert valid.any()
     for branch in np.flatnonzero(valid[0]):
         assert max(errors(robot, joints[0, branch], T)) < 1e-9
@@ -182,7 +182,7 @@ def test_a_wrist_inside_the_shoulder_cylinder_has_no_answer(
     T_0_6 = T_0_tcp @ np.linalg.inv(g.T_6_tcp)
     for radius, reachable in ((0.9 * g.d4_m, False), (0.0, False), (1.1 * g.d4_m, True)):
         T_0_6[:3, 3] = (radius, 0.0, 0.5)
-        _, valid = inverse.all_branches((g.T_base_0 @ T_0_6 @ g.T_6_tcp)[None])
+        _, valid, _ = inverse.solve((g.T_base_0 @ T_0_6 @ g.T_6_tcp)[None])
         assert valid.any() == reachable
 
 
@@ -199,13 +199,13 @@ def test_joints_are_within_limits_and_whole_turns_are_used_to_stay_there(robot: 
     inverse = UrInverse.for_robot(narrow)
     assert inverse is not None
     Ts = robot.Ts_base_tcp(np.random.default_rng(14).uniform(-3.0, 3.0, (100, 6)))
-    joints, valid = inverse.all_branches(Ts)
+    joints, valid, _ = inverse.solve(Ts)
     assert valid.any(axis=1).all()
     assert np.all(joints[valid] >= narrow.lower_rad - 1e-6)
     assert np.all(joints[valid] <= narrow.upper_rad + 1e-6)
 
 
 def test_no_poses_give_no_joints(inverse: UrInverse) -> None:
-    joints, valid = inverse.all_branches(np.zeros((0, 4, 4)))
+    joints, valid, _ = inverse.solve(np.zeros((0, 4, 4)))
     assert joints.shape == (0, 8, 6)
     assert valid.shape == (0, 8)

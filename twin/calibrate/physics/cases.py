@@ -15,6 +15,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
+from bridge.geometry.signals import runs_of_true
 from bridge.robots.default import ARM_JOINTS, MAX_WIDTH_M
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task, load_task
@@ -315,7 +316,7 @@ def _localised(path: Path, plan_id: str) -> tuple[dict[str, Found], dict[str, Fo
         pose = record.get("T_base_object")
         if not record["found"] or not isinstance(pose, dict):
             continue
-        T = se3.transform_from(np.array(pose["q_wxyz"]), np.array(pose["p_m"]))
+        T = se3.pose_from_record(pose)
         found = Found(T_base_object=T, covariance=_covariance(record))
         if record.get("phase") == "start":
             before[str(record["object"])] = found
@@ -370,9 +371,8 @@ def _stretches(
     if not busy.any():
         raise UnusableCaseError("the tool never came near to an object.")
     busy |= is_holding(times_s, commands, widths)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], busy.astype(int), [0]])))
     merged: list[list[float]] = []
-    for first, last in edges.reshape(-1, 2):
+    for first, last in runs_of_true(busy):
         begin_s = max(float(times_s[first]) - BEFORE_S, 0.0)
         end_s = min(float(times_s[last - 1]) + AFTER_S, float(times_s[-1]))
         if merged and begin_s <= merged[-1][1]:

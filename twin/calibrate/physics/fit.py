@@ -132,7 +132,7 @@ class Best:
 
 
 def search(
-    worth: Objective,
+    objective: Objective,
     bounds: Float[np.ndarray, "num_parameters 2"],
     *,
     evaluations: int,
@@ -143,7 +143,7 @@ def search(
     """Maximise from the nominal point.
 
     Args:
-        worth: The log-posterior.
+        objective: The log-posterior.
         bounds: Limits of each parameter.
         evaluations: At most so many points; a generation that was begun is finished.
         seed: Of the points that are drawn.
@@ -151,7 +151,7 @@ def search(
         advance: Told how many points were tried.
     """
     start = np.zeros(len(bounds))
-    best = Best(x=start, log_posterior=worth(start[None])[0], num_evaluations=1)
+    best = Best(x=start, log_posterior=objective(start[None])[0], num_evaluations=1)
     if len(bounds) < 2:  # the package asks for at least two dimensions
         bounds = np.concatenate([bounds, [[-1.0, 1.0]]])
     size = len(start)
@@ -159,7 +159,7 @@ def search(
     count = 1
     while count < evaluations and has_time():
         points = np.stack([optimiser.ask() for _ in range(optimiser.population_size)])
-        values = worth(points[:, :size])
+        values = objective(points[:, :size])
         optimiser.tell([(x, -value) for x, value in zip(points, values, strict=True)])
         count += len(points)
         top = int(np.argmax(values))
@@ -183,7 +183,7 @@ CLOUD_PER_POSTERIOR = 1.5
 
 @runtime_checkable
 class Predictor(Protocol):
-    """What simulates cases: ``evaluate.Evaluator``, or a formula in a test."""
+    """What simulates cases: ``simulate.Evaluator``, or a formula in a test."""
 
     @property
     def cases(self) -> Sequence[Case]:
@@ -267,7 +267,7 @@ def fit(
     def score_at(x: Float[np.ndarray, " num_parameters"]) -> Score:
         return score(observed, features_of(training, predictor.predict(x[None], split.training)[0]))
 
-    def worth(points: Float[np.ndarray, "num_points num_parameters"]) -> list[float]:
+    def objective(points: Float[np.ndarray, "num_points num_parameters"]) -> list[float]:
         rows = predictor.predict(points, split.training)
         return [
             score(observed, features_of(training, row)).log_likelihood - 0.5 * float(x @ x)
@@ -275,7 +275,7 @@ def fit(
         ]
 
     found = search(
-        worth,
+        objective,
         bounds,
         evaluations=config.evaluations,
         seed=config.seed + 1,
@@ -343,7 +343,7 @@ def _estimates(
     """Decide what is identified, then fit that again with everything else left nominal."""
     covariance = spread(emulator, best)
     intervals = [_interval(emulator, best, index, covariance) for index in range(len(best))]
-    known = [_is_identified(interval) for interval in intervals]
+    known = [item.closed and item.sigma <= IDENTIFIED for item in intervals]
     fixed = {index: 0.0 for index, yes in enumerate(known) if not yes}
     final, _ = maximise(emulator, best, fixed)
     return tuple(
@@ -363,10 +363,6 @@ def _interval(
     if sigma <= IDENTIFIED:
         return profile(emulator, best, index, covariance)
     return ProfileInterval(low=at - 1.96 * sigma, high=at + 1.96 * sigma, sigma=sigma, closed=False)
-
-
-def _is_identified(interval: ProfileInterval) -> bool:
-    return interval.closed and interval.sigma <= IDENTIFIED
 
 
 def _estimate(

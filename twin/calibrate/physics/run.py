@@ -1,4 +1,4 @@
-"""``robot-gst calibrate RUN --physics``: everything in order, from the run to the scene."""
+"""``robot-gst calibrate RUN --physics``: fit contact and delay, write the record and its table."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import minimize_scalar
 from scipy.stats import t as student
 
 from bridge.episode import provenance, streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
+from bridge.geometry.signals import lag_of_least_cost
 from bridge.process_pool import default_size
 from bridge.robots.default import ARM_JOINTS
 from bridge.terminal import Output
@@ -34,7 +34,7 @@ from twin.physics.config import PhysicsConfig
 from twin.physics.engine import ENGINE_VERSION
 from twin.scene.store.calibration import write_physics
 
-LONGEST_S = 0.5
+DELAYS_S = np.arange(101) * 0.005
 FIRST_S = 3.0
 """Later, controllers that wait for the gripper run behind the plan for other reasons."""
 MOVES_RAD = 0.05
@@ -83,11 +83,10 @@ def best_shift_s(
     if len(seen_s) < 2 or float(np.ptp(seen_rad, axis=0).max()) < MOVES_RAD:
         return None
 
-    def cost(delay_s: float) -> float:
-        columns = [np.interp(seen_s - delay_s, told_s, column) for column in told_rad.T]
-        return float(np.mean((np.stack(columns, axis=1) - seen_rad) ** 2))
-
-    return float(minimize_scalar(cost, bounds=(0.0, LONGEST_S), method="bounded").x)
+    asked = seen_s[None, :] - DELAYS_S[:, None]
+    told = np.stack([np.interp(asked, told_s, column) for column in told_rad.T], axis=2)
+    costs = np.mean((told - seen_rad) ** 2, axis=(1, 2))
+    return lag_of_least_cost(costs, DELAYS_S, between=True)
 
 
 def mean_delay(delays_s: list[float]) -> Delay | None:

@@ -52,7 +52,7 @@ def predict(
         num_samples: Noisy starts of a judged trial.
     """
     physics = apply_values(values, config)
-    nominal = _live(case, values, physics, np.zeros((len(case.objects), 3)))
+    nominal = _simulated(case, values, physics, np.zeros((len(case.objects), 3)))
     success = float("nan")
     if case.success is not None and num_samples > 0:
         seed = int(case.sha256[:15] or "0", 16)
@@ -62,12 +62,12 @@ def predict(
             noise = np.stack(
                 [rng.multivariate_normal(np.zeros(3), C) for C in case.start_covariance]
             )
-            results.append(_live(case, values, physics, noise).success)
+            results.append(_simulated(case, values, physics, noise).success)
         success = float(np.mean(results))
     return Prediction(settled=nominal.settled, held_widths_m=nominal.held_widths_m, success=success)
 
 
-def _live(
+def _simulated(
     case: Case,
     values: Mapping[str, float],
     physics: PhysicsConfig,
@@ -94,10 +94,10 @@ def _live(
             first, last = int(begin_s * rate), min(int(np.ceil(end_s * rate)), steps)
             world.reset_robot(targets[first], float(widths[first]))
             for step in range(first, last):
-                world.command(targets[step + 1], velocities[step], float(widths[step]))
+                world.robot.command(targets[step + 1], velocities[step], float(widths[step]))
                 world.step()
                 if step in holds:
-                    held[step] = world.width_m()
+                    held[step] = world.robot.width_m()
         success = _settle(world, case, statics, targets[-1], float(widths[-1]))
         settled = np.stack([planar(world.T_base_object(key)) for key in case.objects])
     return Prediction(
@@ -140,7 +140,7 @@ def _settle(
     at_rest = np.zeros(len(joints_rad))
     before: Float[np.ndarray, "num_objects 7"] | None = None
     for step in range(round(SETTLE_S * rate)):
-        world.command(joints_rad, at_rest, width_m)
+        world.robot.command(joints_rad, at_rest, width_m)
         world.step()
         if case.success is None and step % round(REST_S * rate) == 0:
             now = np.array([world.object_pose(key) for key in case.objects])

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
-from bridge.geometry.box import box_corners
+from bridge.geometry.mesh import box_corners
 from bridge.robots.default import GRIPPER_LINKS
 from bridge.task.task_file import ObjectModel
 from twin.replay._clearance import Bounds

@@ -42,10 +42,6 @@ class BoundingSphereTree:
     cover_m: float
     """No point of the surface is farther from one of the finest."""
 
-    def finest_m(self) -> Float[np.ndarray, "num_finest 3"]:
-        """The points without others below them."""
-        return np.asarray(self.points_m[self.children[:, 0] == self.children[:, 1]])
-
 
 class BoundingSpheres:
     """Pieces that are asked for together."""

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from bridge.geometry import se3
-from bridge.geometry.box import box_corners
+from bridge.geometry.mesh import box_corners
 from twin.replay.clearance.bodies import TABLE, Solid, half_space_solid, solid_of
 from twin.robot.collision import RobotHulls
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid

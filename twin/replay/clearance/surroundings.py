@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.geometry.box import box_corners
+from bridge.geometry.mesh import box_corners
 from bridge.robots.default import GRIPPER_LINKS, MAX_WIDTH_M
 from twin.replay.clearance.bodies import (
     SCENE,

@@ -163,12 +163,7 @@ def without_drift(
     new = np.stack(
         [_frame_points(T @ v.T_base_color) for T, v in zip(corrections, views, strict=True)]
     ).reshape(-1, 3)
-    middle_old, middle_new = old.mean(axis=0), new.mean(axis=0)
-    u, _, vt = np.linalg.svd((old - middle_old).T @ (new - middle_new))
-    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    T_old_new = np.eye(4)
-    T_old_new[:3, :3] = u @ turn @ vt
-    T_old_new[:3, 3] = middle_old - T_old_new[:3, :3] @ middle_new
+    T_old_new = se3.align_rigid(new, old)
     return [T_old_new @ T for T in corrections]
 
 

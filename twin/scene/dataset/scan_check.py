@@ -327,7 +327,7 @@ class CameraCheck:
 
     @property
     def name(self) -> str:
-        """The camera, as a sentence begins with it."""
+        """The camera, as messages begin with it."""
         return f"camera {self.choice.camera_id} of episode {self.choice.episode.info.id}"
 
 
@@ -338,14 +338,14 @@ class ScanReport:
     poses: Mapping[str, PoseReport]
     """By camera; one that stands still is compared with those that move, where there are any."""
     found: tuple[str, ...]
-    """Sentences about what is wrong."""
+    """What is wrong, one remark each."""
     moving_fraction: float = 0.0
     """Share of the measured surface that other frames look through."""
     ego_mask_shares: Mapping[str, float] = field(default_factory=dict)
     """By camera without joints: share of its image that moves with it."""
 
     def remarks(self) -> list[str]:
-        """All sentences, that about motion included."""
+        """All remarks, that about motion included."""
         found = list(self.found)
         for name, share in self.ego_mask_shares.items():
             found.append(

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from bridge.geometry.mesh import sample_triangles
 from twin.errors import TwinError
 from twin.scene.least_squares import tukey_weights
 
@@ -38,12 +39,9 @@ def sample_surface(
     if not len(faces) or not area.sum() > 0.0 or not np.isfinite(area).all():
         message = f"the shape's {len(faces)} triangles have no area; generate it again."
         raise MetricFitError(message)
-    rng = np.random.default_rng(seed)
-    chosen = rng.choice(len(faces), size=num_samples, p=area / area.sum())
-    u, v = rng.uniform(size=(2, num_samples))
-    u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
+    chosen, u, v = sample_triangles(area, num_samples, np.random.default_rng(seed))
     a, b, c = np.moveaxis(corners[chosen], 1, 0)
-    points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    points = a + u * (b - a) + v * (c - a)
     return points, normals[chosen] / area[chosen][:, None]
 
 

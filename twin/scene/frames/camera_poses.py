@@ -203,6 +203,15 @@ def find_poses(
     Frames that are held out get a pose from the odometry too, but nothing is learnt from them:
     neither the path of the camera nor its loop closures.
 
+    Args:
+        episode: Recorded.
+        camera_id: Has colour and depth.
+        stamps_ns: Source times of its frames, ascending.
+        held_out_ns: Those of them that nothing is learnt from.
+        config: Where poses come from, and the depth that is trusted.
+        output: Told what was found.
+        calibration: Where cameras are mounted, if known.
+
     Raises:
         FrameNotFoundError: When ``/tf`` is asked for and does not know the camera.
         UnusableCameraError: When no image was taken while ``/tf`` or the joints said where the

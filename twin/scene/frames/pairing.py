@@ -96,7 +96,7 @@ class UnusableCameraError(TwinError):
 
 
 def name_of(episode: Episode, camera_id: str) -> str:
-    """The camera, as a sentence begins with it."""
+    """The camera, as messages begin with it."""
     return f"camera {camera_id} of episode {episode.info.id}"
 
 

@@ -223,7 +223,7 @@ class Chosen:
 
     choices: list[FrameChoice]
     left_out: tuple[str, ...]
-    """A sentence about each camera that is not used."""
+    """Why, for each camera that is not used."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -317,9 +317,9 @@ def choose_frames(
     if lost and not choices:
         raise lost[0]
     kept, others = _in_one_frame(choices)
-    left_out = (*(f"left out: {reason}" for reason in lost), *others)
-    for sentence in left_out:
-        output.say(sentence)
+    left_out = (*(f"left out: {error}" for error in lost), *others)
+    for reason in left_out:
+        output.say(reason)
     if not any(choice.train_ns for choice in kept):
         message = "the cameras of this run have no frames to learn from. Record a longer scan."
         raise NoFramesError(message)

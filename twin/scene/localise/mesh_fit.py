@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
+from bridge.geometry.mesh import sample_triangles
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.scene.least_squares import normal_equations, tukey_weights
@@ -56,10 +57,8 @@ def mesh_surface(
     a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
     double_area = np.linalg.norm(cross, axis=1)
-    edges = np.cumsum(double_area) / double_area.sum()
-    chosen = np.searchsorted(edges, (np.arange(num_samples) + 0.5) / num_samples)
-    u, v = np.random.default_rng(0).random((2, num_samples, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    rng = np.random.default_rng(0)
+    chosen, u, v = sample_triangles(double_area, num_samples, rng, in_order=True)
     p = a[chosen] * (1 - u - v) + b[chosen] * u + c[chosen] * v
     return MeshSurface(p_m=p, normals=cross[chosen] / double_area[chosen, None])
 

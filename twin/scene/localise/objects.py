@@ -25,7 +25,7 @@ from twin.scene.localise.points import (
     Cluster,
     ColourConfig,
     PointConfig,
-    fuse_stills,
+    fuse_stationary,
     likeness,
     moved,
     object_points,
@@ -233,7 +233,7 @@ def localise_objects(
         seen. Never a guess.
     """
     config = LocaliseConfig() if config is None else config
-    views = fuse_stills(frames, config.max_frames, config.max_views, task, config.points)
+    views = fuse_stationary(frames, config.max_frames, config.max_views, task, config.points)
     views, tables = correct_for_table(views, task, config.table, config.points, config.colour)
     objects = {
         object_id: _localise_one(views, model, config, tables, (surfaces or {}).get(object_id))

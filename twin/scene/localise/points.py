@@ -14,13 +14,11 @@ from scipy import ndimage
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from bridge.media.color import linear_from_srgb
 from bridge.task.task_file import ObjectModel, Task
 from twin.scene.frames.camera_poses import same_pose
 
-_SRGB = np.arange(256) / 255.0
-_LINEAR = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4).astype(
-    np.float32
-)
+_LINEAR = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,10 +31,10 @@ class ColourConfig:
     """Darker pixels, in linear light of 0 to 1, have no dependable hue."""
 
 
-def linear_from_srgb(
+def linear_image(
     image_u8: UInt8[np.ndarray, "height width 3"],
 ) -> Float[np.ndarray, "height width 3"]:
-    """Undo the sRGB curve (IEC 61966-2-1): linear light of 0 to 1."""
+    """Linear light of 0 to 1."""
     return np.asarray(_LINEAR[image_u8])
 
 
@@ -63,8 +61,8 @@ def likeness(
     return np.where(dark | other_hue | (along <= 0), 0.0, along / strength)
 
 
-STATIONARY_DISTANCE_M = 5e-4
-STATIONARY_ANGLE_RAD = 1e-3
+SAME_POSE_M = 5e-4
+SAME_POSE_RAD = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +104,7 @@ class CameraView:
     """Linear light of each point; 0 where the colour camera does not see it."""
 
 
-def fuse_stills(
+def fuse_stationary(
     frames: Sequence[RgbdFrame], max_frames: int, max_views: int, task: Task, config: PointConfig
 ) -> list[CameraView]:
     """Average the last frames of each camera that were taken from one pose.
@@ -135,8 +133,8 @@ def _same_pose(a: RgbdFrame, b: RgbdFrame) -> bool:
     return same_pose(
         a.T_base_depth,
         b.T_base_depth,
-        distance_m=STATIONARY_DISTANCE_M,
-        angle_rad=STATIONARY_ANGLE_RAD,
+        distance_m=SAME_POSE_M,
+        angle_rad=SAME_POSE_RAD,
     )
 
 
@@ -147,7 +145,7 @@ def _view(frames: Sequence[RgbdFrame], task: Task, config: PointConfig) -> Camer
     count = measured.sum(axis=0)
     depth = np.where(measured, depths, 0.0).sum(axis=0) / np.maximum(count, 1)
     depth[2 * count < len(frames)] = 0.0
-    image = np.mean([linear_from_srgb(frame.image_u8) for frame in frames], axis=0)
+    image = np.mean([linear_image(frame.image_u8) for frame in frames], axis=0)
     p_base = se3.apply(newest.T_base_depth, newest.depth_camera.unproject(depth)[depth > 0])
     p_base = p_base[_in_search_area(p_base, task, config)]
     return CameraView(

@@ -49,16 +49,13 @@ class LocalisedObject:
 
     def to_record(self) -> dict[str, Any]:
         """Return the gst localisation v1 record, checked against its schema."""
-        pose = None
-        if self.T_base_object is not None:
-            q, p = se3.split(self.T_base_object)
-            pose = {"p_m": p.tolist(), "q_wxyz": q.tolist()}
+        T = self.T_base_object
         record = {
             "schema_version": SCHEMA_VERSION,
             "stamp_ns": self.stamp_ns,
             "object": self.object_id,
             "found": self.found,
-            "T_base_object": pose,
+            "T_base_object": None if T is None else se3.pose_record(T),
             "covariance": None if self.covariance is None else self.covariance.ravel().tolist(),
             "symmetry": self.symmetry,
             "confidence": self.confidence,

@@ -15,13 +15,13 @@ from scipy.spatial import cKDTree
 from bridge.geometry import se3
 from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.scene.gaussians import GaussianCloud
-from twin.scene.localise.points import ColourConfig, likeness, linear_from_srgb
+from twin.scene.localise.points import ColourConfig, likeness, linear_image
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.localise.shape_fit import ShapeFitConfig, refine_on_points
+from twin.scene.shape.from_training import Poses
 from twin.scene.shape.known import surface_distances
 from twin.scene.shape.reconstruct import ObjectShape
 
-Poses = Mapping[str, Float[np.ndarray, "4 4"]]
 Shapes = Mapping[str, ObjectShape]
 
 HALO_M = 0.015
@@ -100,7 +100,7 @@ def alike(
 ) -> Bool[np.ndarray, " num_splats"]:
     """Tell which Gaussians have an object's colour, see ``twin.scene.localise.points.likeness``."""
     color_u8 = np.clip(np.rint(cloud.colors * 255), 0, 255).astype(np.uint8)
-    linear = linear_from_srgb(color_u8[None])[0]
+    linear = linear_image(color_u8[None])[0]
     return np.asarray(likeness(linear, model.color_srgb, ColourConfig()) >= min_likeness)
 
 

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from bridge.episode import provenance
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder, check_episode_id
-from bridge.errors import GstError
+from bridge.errors import GstError, InvalidRecordError
 from bridge.geometry import se3
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import ObjectModel, Task, load_task
@@ -41,14 +41,13 @@ from twin.scene.localise.episode import localise_episode
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.assignment import (
     HALO_M,
-    Poses,
     SplitConfig,
     assign_splats,
     hidden_table,
     object_poses,
 )
 from twin.scene.shape.files import MESH, TASK_SHAPE, remove_shape, write_shape
-from twin.scene.shape.from_training import shapes_of, write_static
+from twin.scene.shape.from_training import Poses, shapes_of, write_static
 from twin.scene.shape.mesh import mesh_ply
 from twin.scene.shape.reconstruct import ObjectShape
 from twin.scene.store.folder import UnreadableSceneError
@@ -257,14 +256,9 @@ def _object_record(
         "fixed": model.fixed,
         "frame": "all files of this folder are in the object frame",
         "num_splats": len(item.cloud),
-        "T_base_object": _pose_record(item.T_base_object),
+        "T_base_object": se3.pose_record(item.T_base_object),
         "localisation": localised.to_record(),
     }
-
-
-def _pose_record(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
-    q, p = se3.split(T)
-    return {"p_m": p.tolist(), "q_wxyz": q.tolist()}
 
 
 Complete = Callable[[Sequence[TrainingView], Mapping[str, ObjectModel], Poses, Shapes], Completed]
@@ -420,12 +414,9 @@ def read_pose(pose: Any, path: Path) -> Float[np.ndarray, "4 4"]:
         UnreadableSceneError: When they are no pose; names the file.
     """
     try:
-        q, p = np.array(pose["q_wxyz"], dtype=np.float64), np.array(pose["p_m"], dtype=np.float64)
-    except (ValueError, KeyError, TypeError) as error:
-        raise UnreadableSceneError(path=path, found=f"no pose ({error!r})") from error
-    if q.shape != (4,) or p.shape != (3,) or not np.isfinite([*q, *p]).all() or not q.any():
-        raise UnreadableSceneError(path=path, found=f"a pose that is none: {pose}")
-    return se3.transform_from(q, p)
+        return se3.pose_from_record(pose)
+    except InvalidRecordError as error:
+        raise UnreadableSceneError(path=path, found=f"a pose that is none: {pose}") from error
 
 
 def compose_parts(

@@ -24,14 +24,16 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.topics import camera_topic
 from bridge.episode.writer import EpisodeWriter
+from bridge.errors import UndefinedStatisticError
 from bridge.media.color import encode_png
+from bridge.media.image_quality import aligned, as_float, psnr_db, ssim
 from bridge.terminal import Advance
 from twin.scene.dataset.masks import EgoMask, ReferenceView, find_moving
 from twin.scene.fit.camera_correction import align_view
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.frames.selection import FrameChoice, load
 from twin.scene.gaussians import GaussianCloud
-from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View, load_native, psnr_db
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
 from twin.scene.robot.extraction import DrivenRobot
 
 VIEWS_NOTE = (
@@ -84,9 +86,8 @@ def rate_view(
     stationary: bool,
 ) -> ViewNumbers:
     """Compare one rendered view with its recorded frame."""
-    rendered = view.image_u8().astype(np.float32) / 255.0
-    wanted = frame.image_u8.astype(np.float32) / 255.0
-    squared = np.square((rendered - wanted).astype(np.float64))
+    rendered_u8 = view.image_u8()
+    rendered, wanted = as_float(rendered_u8), as_float(frame.image_u8)
     both = (recorded.full.depth_m > 0) & (view.depth_m > 0)
     difference = np.abs(recorded.full.depth_m - view.depth_m)[both]
     return ViewNumbers(
@@ -94,37 +95,27 @@ def rate_view(
         camera_id=frame.camera_id,
         stamp_ns=frame.stamp_ns,
         stationary_camera=stationary,
-        psnr_db=finite_psnr_db(float(squared.mean())),
-        static_psnr_db=finite_psnr_db(float(squared[static_mask].mean()))
-        if static_mask.any()
-        else None,
+        psnr_db=finite_psnr_db(wanted, rendered),
+        static_psnr_db=finite_psnr_db(wanted, rendered, static_mask) if static_mask.any() else None,
         static_fraction=float(static_mask.mean()),
-        gain_psnr_db=finite_psnr_db(float(np.square(brightened(rendered, wanted) - wanted).mean())),
-        ssim=_similarity(rendered, wanted),
+        gain_psnr_db=finite_psnr_db(wanted, aligned(frame.image_u8, rendered_u8, "gain")),
+        ssim=ssim(wanted, rendered, padding="zero"),
         depth_mean_abs_m=float(difference.mean()) if both.any() else None,
         depth_median_abs_m=float(np.median(difference)) if both.any() else None,
         coverage_fraction=float(view.alpha.mean()),
     )
 
 
-def finite_psnr_db(mse: float) -> float:
+def finite_psnr_db(
+    wanted: Float[np.ndarray, "height width 3"],
+    rendered: Float[np.ndarray, "height width 3"],
+    mask: Bool[np.ndarray, "height width"] | None = None,
+) -> float:
     """Peak signal-to-noise ratio, at most 100 dB: JSON has no word for identical images."""
-    return min(psnr_db(mse), MOST_DB)
-
-
-def brightened(
-    rendered: Float[np.ndarray, "height width 3"], wanted: Float[np.ndarray, "height width 3"]
-) -> Float[np.ndarray, "height width 3"]:
-    """Multiply each channel by the factor that brings it nearest to the recorded one."""
-    a, b = rendered.astype(np.float64), wanted.astype(np.float64)
-    power = np.maximum(np.square(a).sum(axis=(0, 1)), 1e-12)
-    return np.asarray(np.clip(a * ((a * b).sum(axis=(0, 1)) / power), 0.0, 1.0))
-
-
-def _similarity(rendered: np.ndarray, wanted: np.ndarray) -> float:
-    planes = [np.ascontiguousarray(np.moveaxis(image, -1, 0)) for image in (rendered, wanted)]
-    value, _ = load_native().Similarity(0, "auto").mean(*planes)
-    return float(value)
+    try:
+        return min(psnr_db(wanted, rendered, mask=mask), MOST_DB)
+    except UndefinedStatisticError:
+        return MOST_DB
 
 
 def summarise_views(numbers: Sequence[ViewNumbers], files: Sequence[str]) -> dict[str, Any]:

@@ -283,11 +283,6 @@ def write_robot(
     """Write ``robot/<link>.ply`` and return what ``scene.json`` says about the robot."""
     record: dict[str, Any] = {"remark": found.remark, "links": write_links(run, links)}
     if found.alignment is not None:
-        record["T_base_root"] = _pose(found.frames.T_base_root)
+        record["T_base_root"] = se3.pose_record(found.frames.T_base_root)
         record["alignment"] = found.alignment.to_record()
     return {"robot": record}
-
-
-def _pose(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
-    q, p = se3.split(T)
-    return {"p_m": p.tolist(), "q_wxyz": q.tolist()}

@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Int64
 
 from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder, check_episode_id
-from bridge.geometry import se3
 from twin.robot.model import RobotModel, load_robot
-from twin.robot.posture import Posture
-from twin.robot.surface import PosedSurface, fixed_links, link_poses
+from twin.robot.surface import PosedSurface, fixed_links
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud, read_ply, write_ply
 
 FOLDER = "robot"
@@ -24,42 +22,6 @@ BOUND_M = 0.015
 """A Gaussian nearer than this to a link belongs to it (design page on perception, section 5)."""
 ASIDE_M = 0.006
 """Beside a link that never moves, a surface point must lie over it and not next to it."""
-
-
-def bind(
-    cloud: GaussianCloud,
-    joints_rad: Float[np.ndarray, " num_joints"],
-    urdf: str,
-    *,
-    width_m: float = 0.0,
-) -> dict[str, GaussianCloud]:
-    """Give each Gaussian within 15 mm of the posed robot to its nearest link.
-
-    Args:
-        cloud: Gaussians in the robot's base frame.
-        joints_rad: Where the arm was, in the order of ``bridge.robots.default.ARM_JOINTS``.
-        urdf: The robot's description.
-        width_m: Opening of the gripper.
-
-    Returns:
-        Per link its Gaussians in the link's frame; links without any are left out.
-
-    Raises:
-        RobotDescriptionError: The description has no usable shapes.
-    """
-    robot, posture = load_robot(urdf), Posture(joints_rad=joints_rad, width_m=width_m)
-    surface = PosedSurface(robot, posture)
-    owner = splat_links(surface, cloud.means_m.astype(np.float64))
-    poses = link_poses(robot, posture)
-    links = sorted({surface.links[index] for index in owner[owner >= 0]})
-    numbers = np.array(surface.links)
-    return {
-        link: moved_cloud(
-            cloud.take(np.flatnonzero((owner >= 0) & (numbers[owner] == link))),
-            se3.invert(poses[link]),
-        )
-        for link in links
-    }
 
 
 def posed(
@@ -72,7 +34,7 @@ def posed(
     """Put the Gaussians of all links where forward kinematics puts the links.
 
     Args:
-        links: Per link its Gaussians in the link's frame, as ``bind`` or ``read_links`` give them.
+        links: Per link its Gaussians in the link's frame, as ``read_links`` gives them.
         joints_rad: Where the arm is to be.
         urdf: The robot's description.
         width_m: Opening of the gripper.
@@ -91,29 +53,20 @@ def posed(
     return concatenate(placed) if placed else _empty()
 
 
-def splat_links(
-    surface: PosedSurface, p_base: Float[np.ndarray, "num_points 3"]
-) -> Int64[np.ndarray, " num_points"]:
-    """Index in ``surface.links`` of the nearest shape within 15 mm, or -1."""
-    found, near = _nearest(surface, p_base)
-    owner = np.full(len(p_base), -1, dtype=np.int64)
-    close = found.distance_m < BOUND_M
-    owner[near[close]] = found.link_ids[close]
-    return owner
-
-
 def surface_links(
     robot: RobotModel,
     surface: PosedSurface,
     p_base: Float[np.ndarray, "num_points 3"],
     normals: Float[np.ndarray, "num_points 3"],
 ) -> Int64[np.ndarray, " num_points"]:
-    """Like ``splat_links``, but the table around a link that never moves is not taken for the link.
+    """Index in ``surface.links`` of the nearest shape within 15 mm, or -1.
 
-    Everything beside a moving link will be seen by itself in another posture. Beside the base it
-    never will, so there a point must lie along its own normal from the link.
+    The table around a link that never moves is not taken for the link. Everything beside a moving
+    link will be seen by itself in another posture. Beside the base it never will, so there a point
+    must lie along its own normal from the link.
     """
-    found, near = _nearest(surface, p_base)
+    near = surface.near_box(p_base, BOUND_M)
+    found = surface.nearest(p_base[near])
     close = found.distance_m < BOUND_M
     gap = p_base[near] - found.p_m
     along = np.einsum("ij,ij->i", gap, normals[near])
@@ -124,11 +77,6 @@ def surface_links(
     owner = np.full(len(p_base), -1, dtype=np.int64)
     owner[near[close]] = found.link_ids[close]
     return owner
-
-
-def _nearest(surface: PosedSurface, p_base: Float64[np.ndarray, "num_points 3"]) -> tuple[Any, Any]:
-    near = surface.near_box(p_base, BOUND_M)
-    return surface.nearest(p_base[near]), near
 
 
 def write_links(run: RunFolder, links: Mapping[str, GaussianCloud]) -> dict[str, Any]:

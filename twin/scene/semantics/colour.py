@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
+from bridge.media.color import linear_from_srgb
+
 _XYZ_FROM_RGB = np.array(
     [
         [0.4124564, 0.3575761, 0.1804375],
@@ -46,8 +48,7 @@ def lab_from_srgb(
     Range: L 0..100; a difference of 2 is just visible.
     """
     srgb = np.clip(np.asarray(color, dtype=np.float64), 0.0, 1.0)
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    ratio = linear @ _XYZ_FROM_RGB.T / _WHITE
+    ratio = linear_from_srgb(srgb) @ _XYZ_FROM_RGB.T / _WHITE
     knee = 6.0 / 29.0
     f = np.where(ratio > knee**3, np.cbrt(ratio), ratio / (3 * knee**2) + 4.0 / 29.0)
     x, y, z = np.moveaxis(f, -1, 0)

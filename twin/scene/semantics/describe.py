@@ -222,6 +222,19 @@ def describe(
 
     Without a plane, or where it lies above the thing, heights count from its lowest Gaussian. An
     object of a task is called by its ``key`` and its colour, whatever the label.
+
+    Args:
+        cloud: The whole scene.
+        number: Id of the instance.
+        mask: Its Gaussians.
+        label: What it is called.
+        support: Frames with a matching mask.
+        seen: Frames that show it.
+        score: Confidence, 0..1.
+        source: Who found it.
+        plane: What it stands on.
+        key: Id of the object in the task; empty: none.
+        surface_m: Points of its reconstructed surface, where there is one.
     """
     ids = np.flatnonzero(mask)
     p = cloud.means_m[ids].astype(np.float64)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
 from bridge.episode import provenance
-from bridge.errors import PathNotFoundError
+from bridge.errors import InvalidRecordError, PathNotFoundError
 from bridge.geometry import se3
 from bridge.whole_file import write_whole
 from twin.errors import UnreadableFileError
@@ -78,7 +78,6 @@ def _part_codes(scene: SemanticScene) -> UInt8[np.ndarray, " num_splats"]:
 
 
 def _about(item: Instance, rows: Mapping[str, int]) -> dict[str, Any]:
-    q, p = se3.split(item.T_base_instance)
     return {
         "id": item.id,
         "label": item.label,
@@ -89,7 +88,7 @@ def _about(item: Instance, rows: Mapping[str, int]) -> dict[str, Any]:
         "score": round(item.score, 4),
         "source": item.source,
         "color_srgb": list(item.color_srgb),
-        "T_base_instance": {"p_m": p.tolist(), "q_wxyz": q.tolist()},
+        "T_base_instance": se3.pose_record(item.T_base_instance),
         "size_m": list(item.size_m),
         "parts": list(item.parts),
         "keypoints_m": {name: point.tolist() for name, point in item.keypoints_m.items()},
@@ -137,7 +136,7 @@ def read_semantics(folder: Path, rows: Mapping[str, int]) -> SemanticScene:
         instances = tuple(_instance(item, labels, codes) for item in table["instances"])
     except UnreadableArraysError as error:
         raise UnreadableSemanticsError(path=path, found=f"unreadable ({error.found})") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, InvalidRecordError) as error:
         raise UnreadableSemanticsError(path=path, found=f"unreadable ({error})") from error
     return SemanticScene(
         instances=instances,
@@ -156,7 +155,6 @@ def _instance(
     mask = labels == number
     red, green, blue = (int(channel) for channel in about["color_srgb"])
     long, short, height = (float(extent) for extent in about["size_m"])
-    pose = about["T_base_instance"]
     return Instance(
         id=number,
         label=str(about["label"]),
@@ -166,7 +164,7 @@ def _instance(
         score=float(about["score"]),
         source=str(about["source"]),
         color_srgb=(red, green, blue),
-        T_base_instance=se3.transform_from(_vector(pose["q_wxyz"], 4), _vector(pose["p_m"], 3)),
+        T_base_instance=se3.pose_from_record(about["T_base_instance"]),
         size_m=(long, short, height),
         parts={
             str(name): mask & (codes == code) for code, name in enumerate(about["parts"], start=1)

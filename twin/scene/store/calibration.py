@@ -18,6 +18,7 @@ from bridge.episode.cdr.messages import FrameTransform
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
+from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
 from bridge.robots.default import BASE_FRAME
 from bridge.whole_file import write_whole
@@ -93,21 +94,16 @@ def read_calibration(run: RunFolder) -> Calibration | None:
             found = f"schema version {version!r}, this program knows {CALIBRATION_VERSION}"
             raise UnreadableCalibrationError(path=path, found=found)
         cameras = {key: _mount(value) for key, value in record["cameras"].items()}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, InvalidRecordError) as error:
         raise UnreadableCalibrationError(path=path, found=f"no calibration ({error!r})") from error
     return Calibration(record=record, cameras=cameras)
 
 
 def _mount(record: Mapping[str, Any]) -> MountedCamera:
-    pose = record["T_link_camera"]
-    q, p = np.array(pose["q_wxyz"], dtype=np.float64), np.array(pose["p_m"], dtype=np.float64)
-    if q.shape != (4,) or p.shape != (3,) or not np.isfinite([*q, *p]).all() or not q.any():
-        message = f"a pose that is none: {pose}"
-        raise ValueError(message)
     return MountedCamera(
         link=str(record["link"]),
         stream=str(record["stream"]),
-        T_link_camera=se3.transform_from(q, p),
+        T_link_camera=se3.pose_from_record(record["T_link_camera"]),
         depth_scale=float(record.get("depth_scale", 1.0)),
     )
 

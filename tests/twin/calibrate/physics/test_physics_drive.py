@@ -1,4 +1,4 @@
-"""Probes lived through in the replays' own physics: laws of friction, and parameters recovered."""
+"""Probes simulated in the replays' own physics: laws of friction, and parameters recovered."""
 
 import os
 import signal

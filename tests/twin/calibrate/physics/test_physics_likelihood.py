@@ -142,35 +142,31 @@ def scattered(
     ]
 
 
-def worth(
-    cases: list[Case], pose: np.ndarray, beliefs: DiscrepancyPosterior | None = None
-) -> Score:
+def worth(cases: list[Case], pose: np.ndarray, prior: DiscrepancyPosterior | None = None) -> Score:
     said = Prediction(settled=pose[None], held_widths_m=np.zeros(0), success=np.nan)
-    return score(
-        observations_of(cases, 0), features_of(cases, [said] * len(cases)), beliefs=beliefs
-    )
+    return score(observations_of(cases, 0), features_of(cases, [said] * len(cases)), prior=prior)
 
 
 def test_what_some_episodes_teach_of_errors_is_taken_to_the_next_by_the_rule_of_bayes() -> None:
     cases = [*scattered(6, 0.001, 1), *scattered(5, 0.004, 2, kind="slide")]
     first = worth(cases[:8], GOOD)
-    second = worth(cases[8:], GOOD, first.beliefs)
+    second = worth(cases[8:], GOOD, first.posterior)
     together = worth(cases, GOOD)
     assert first.log_likelihood + second.log_likelihood == pytest.approx(together.log_likelihood)
-    np.testing.assert_allclose(second.beliefs.share, together.beliefs.share)
+    np.testing.assert_allclose(second.posterior.share, together.posterior.share)
     for kind in ("push", "slide"):
-        np.testing.assert_allclose(second.beliefs.pose[kind], together.beliefs.pose[kind])
+        np.testing.assert_allclose(second.posterior.pose[kind], together.posterior.pose[kind])
 
 
 def test_an_error_that_all_localisations_share_does_not_hide_a_better_point() -> None:
     # 0.3 mm of scatter, of which 2.5 mm are stated: 1.5 mm are five standard deviations.
     cases, off = scattered(14, 0.0003, 3), GOOD + np.array([0.0015, 0.0, 0.0])
     right, wrong = worth(cases, GOOD), worth(cases, off)
-    assert right.beliefs.most_likely()["noise_share"] == NOISE_SHARE[-1]
+    assert right.posterior.most_likely()["noise_share"] == NOISE_SHARE[-1]
     assert right.log_likelihood - wrong.log_likelihood > 20.0
     new = scattered(6, 0.0003, 4)
-    gain = worth(new, GOOD, right.beliefs).log_likelihood
-    assert gain - worth(new, off, wrong.beliefs).log_likelihood > 6.0
+    gain = worth(new, GOOD, right.posterior).log_likelihood
+    assert gain - worth(new, off, wrong.posterior).log_likelihood > 6.0
 
 
 def test_poses_that_scatter_as_stated_count_as_stated() -> None:
@@ -179,7 +175,7 @@ def test_poses_that_scatter_as_stated_count_as_stated() -> None:
         for case in scattered(10, 0.00025, 5)
     ]
     poorly = scattered(10, 0.0025, 6)
-    assert worth(well + poorly, GOOD).beliefs.most_likely()["noise_share"] in NOISE_SHARE[:2]
+    assert worth(well + poorly, GOOD).posterior.most_likely()["noise_share"] in NOISE_SHARE[:2]
 
 
 def test_how_fingers_jam_on_an_object_is_counted_once() -> None:
@@ -203,7 +199,7 @@ def test_how_fingers_jam_on_an_object_is_counted_once() -> None:
 
 def test_each_kind_of_episode_has_a_discrepancy_of_its_own() -> None:
     cases = [*scattered(12, 0.0003, 6), *scattered(12, 0.008, 7, kind="slide")]
-    found = worth(cases, GOOD).beliefs.most_likely()["pose_m"]
+    found = worth(cases, GOOD).posterior.most_likely()["pose_m"]
     assert isinstance(found, dict)
     assert found["push"] <= 0.001
     assert found["slide"] >= 0.004

@@ -12,9 +12,8 @@ from scripted_plans import joints_over
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.task.plan import Stage
-from twin.replay.clearance import ClearanceMonitor
 from twin.replay.clearance.bodies import planes_of
-from twin.replay.clearance.monitor import State, allowed_pairs, object_travel_m
+from twin.replay.clearance.monitor import ClearanceMonitor, State, allowed_pairs, object_travel_m
 from twin.replay.config import ReplayConfig
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot

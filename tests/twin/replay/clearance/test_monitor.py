@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 from scripted_plans import joints_over
 
-from twin.replay.clearance import ClearanceMonitor, active_stage
+from twin.replay.clearance.monitor import ClearanceMonitor, active_stage
 from twin.replay.config import ReplayConfig
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import hulls_of

@@ -10,11 +10,10 @@ from scripted_plans import joints_over
 
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from twin.replay.clearance import SCENE, ClearanceMonitor
-from twin.replay.clearance.bodies import distances_to_boxes_m, planes_of
+from twin.replay.clearance.bodies import SCENE, distances_to_boxes_m, planes_of
 from twin.replay.clearance.bounding_spheres import bounding_spheres_of
 from twin.replay.clearance.distance_grid import GridLookup, candidate_clearance
-from twin.replay.clearance.monitor import Reach, State
+from twin.replay.clearance.monitor import ClearanceMonitor, Reach, State
 from twin.replay.clearance.static_obstacles import stationary_links, unmodelled_obstacles
 from twin.replay.config import ReplayConfig
 from twin.replay.rebuilt_scene import Correction
@@ -169,7 +168,8 @@ def test_no_point_of_a_hull_is_farther_from_its_tree_than_is_subtracted(
         corners = hull.points_m[ConvexHull(hull.points_m).simplices]
         weights = rng.dirichlet(np.ones(3), size=len(corners))
         points = np.einsum("nk,nkj->nj", weights, corners)
-        assert cKDTree(tree.finest_m()).query(points)[0].max() <= tree.cover_m + 1e-9
+        finest = tree.points_m[tree.children[:, 0] == tree.children[:, 1]]
+        assert cKDTree(finest).query(points)[0].max() <= tree.cover_m + 1e-9
 
 
 def test_everything_below_a_point_of_a_tree_is_within_its_radius() -> None:

@@ -23,13 +23,13 @@ def held(tied: bool) -> tuple[float, float]:
     """How far a cube without friction falls from between the fingers, closed and then open."""
     with World(with_absolute_meshes(ROBOT.urdf_text()), {}, SLIPPERY) as world:
         world.reset_robot(HOME, 0.045)
-        T = world.T_base_link("tcp")
+        T = world.robot.T_base_link("tcp")
         world.add_free("cube", SIZE, 0.05, T)
         tie = Attachment(world)
         drops = []
         for width in (0.02, 0.08):
             for _ in range(120):
-                world.command(HOME, np.zeros(6), width)
+                world.robot.command(HOME, np.zeros(6), width)
                 world.step()
                 if tied:
                     tie.update(width)
@@ -47,16 +47,16 @@ def test_an_attached_cube_does_not_slip_and_is_let_go_when_the_fingers_open() ->
 def test_an_attached_cube_keeps_its_place_in_the_hand() -> None:
     with World(with_absolute_meshes(ROBOT.urdf_text()), {}, SLIPPERY) as world:
         world.reset_robot(HOME, 0.045)
-        world.add_free("cube", SIZE, 0.05, world.T_base_link("tcp"))
+        world.add_free("cube", SIZE, 0.05, world.robot.T_base_link("tcp"))
         tie = Attachment(world)
         for step in range(240):
             target = HOME + np.array([0.3, 0, 0, 0, 0, 0.4]) * min(step / 200, 1.0)
-            world.command(target, np.zeros(6), 0.02)
+            world.robot.command(target, np.zeros(6), 0.02)
             world.step()
             tie.update(0.02)
             if step == 60:
-                before = se3.invert(world.T_base_link("tcp")) @ world.T_base_object("cube")
-        after = se3.invert(world.T_base_link("tcp")) @ world.T_base_object("cube")
+                before = se3.invert(world.robot.T_base_link("tcp")) @ world.T_base_object("cube")
+        after = se3.invert(world.robot.T_base_link("tcp")) @ world.T_base_object("cube")
     assert np.linalg.norm(after[:3, 3] - before[:3, 3]) < 2e-3
 
 

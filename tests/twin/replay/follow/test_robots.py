@@ -90,8 +90,8 @@ def test_a_mimicking_finger_moves_with_the_one_it_mimics() -> None:
     ("mimic", "found"),
     [
         ('<mimic joint="thumb"/>', "thumb"),
-        ('<mimic joint="gripper_left_finger_joint" multiplier="twice"/>', "no number"),
-        ('<mimic joint="gripper_left_finger_joint" multiplier="nan"/>', "no number"),
+        ('<mimic joint="gripper_left_finger_joint" multiplier="twice"/>', "not a number"),
+        ('<mimic joint="gripper_left_finger_joint" multiplier="nan"/>', "not a number"),
     ],
 )
 def test_a_joint_that_mimics_nothing_is_refused_by_name(mimic: str, found: str) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from twin.gate.gate import no_verdict
 from twin.physics.soft import SoftHealth
+from twin.physics.soft_world import SoftWorld
 from twin.physics.world import World
 from twin.replay.clearance.monitor import allowed_pairs
 from twin.replay.config import ReplayConfig
@@ -134,7 +135,7 @@ def test_a_replay_ends_where_a_toy_bursts_and_is_rejected(
     scene = script.toy_scene()
     calls = iter(range(10_000))
     monkeypatch.setattr(
-        World, "soft_health", lambda self, name: replace(SOUND, is_finite=next(calls) < 20)
+        SoftWorld, "health", lambda self, name: replace(SOUND, is_finite=next(calls) < 20)
     )
     result = replay_plan(script.toy_plan(scene), scene, CONFIG)
     terminal = result.verdict.terminal
@@ -152,7 +153,7 @@ def test_a_toy_whose_nodes_fly_apart_ends_the_replay_and_never_passes(
 
     def blown_up(self: World) -> None:
         if next(steps) == 100:
-            solver = self._soft._begun()
+            solver = self.soft._begun()
             apart = np.random.default_rng(0).normal(0.0, 1e4, solver.velocities(0).shape)
             solver.set_velocities(0, apart)
         step(self)

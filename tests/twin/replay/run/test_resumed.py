@@ -263,5 +263,5 @@ def test_nobody_at_an_address_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -
         RayRunner(there, 1).__enter__()
     assert asked == [], "Ray would try for minutes"
     for wrong in ("auto", "head.lab", "ray://head.lab", "head.lab:port", "head.lab:0"):
-        with pytest.raises(UsageError, match="is no address: give HOST:PORT"):
+        with pytest.raises(UsageError, match="is not an address: give HOST:PORT"):
             RayRunner(wrong, 1).__enter__()

@@ -256,7 +256,10 @@ def test_distances_that_cannot_be_read_leave_everything_not_evaluated(
 
 
 def test_a_run_without_plans_says_so(tmp_path: Path) -> None:
-    summary = replay_run(RunFolder.create(tmp_path / "empty"), ReplayRunConfig(), QUIET)
+    run = RunFolder.create(tmp_path / "run")
+    with EpisodeWriter(run.episodes_dir / "scan.mcap") as writer:
+        writer.describe(EpisodeInfo(id="scan", kind="scan"))
+    summary = replay_run(run, ReplayRunConfig(), QUIET)
     assert describe_run(summary) == "No trial with a plan to replay."
     json.dumps(summary)
 

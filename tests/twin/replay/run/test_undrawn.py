@@ -14,6 +14,7 @@ from twin.replay.workers import replay_run
 
 def test_pictures_without_a_scene_are_refused_before_anything_is_replayed(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path / "run")
+    (run.episodes_dir / "never_read.mcap").touch()
     with pytest.raises(PathNotFoundError, match=r"--render draws it.*robot-gst rebuild RUN"):
         replay_run(run, ReplayRunConfig(render=True), Output(quiet=True))
 

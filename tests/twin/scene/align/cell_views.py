@@ -10,7 +10,7 @@ from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.sources.standin.cell_file import load_cell, nominal_hidden
 from bridge.sources.standin.render import Renderer, measure_depth
-from bridge.sources.standin.surfaces import object_surfaces, robot_surfaces, room_surfaces
+from bridge.sources.standin.surfaces import lab_surfaces, object_surfaces, robot_surfaces
 from bridge.task.task_file import load_task
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import Posture
@@ -44,7 +44,7 @@ def robot() -> RobotModel:
 @cache
 def renderer() -> Renderer:
     task = load_task("cube_into_box")
-    return Renderer([*robot_surfaces(), *object_surfaces(task), *room_surfaces(0)])
+    return Renderer([*robot_surfaces(), *object_surfaces(task), *lab_surfaces(0)])
 
 
 def side_camera_pose() -> np.ndarray:

@@ -12,7 +12,7 @@ from twin.scene.localise.points import (
     ColourConfig,
     clusters,
     likeness,
-    linear_from_srgb,
+    linear_image,
     voxel_mean,
 )
 from twin.scene.shape.known import pose_of, rectangle_yaw_rad, surface_distances
@@ -62,7 +62,7 @@ def test_points_on_a_line_have_a_yaw_of_zero() -> None:
 @settings(max_examples=50, deadline=None)
 @given(shade=st.floats(0.15, 1.0))
 def test_likeness_does_not_depend_on_shading(shade: float) -> None:
-    albedo = linear_from_srgb(np.array([[[200, 45, 40]]], dtype=np.uint8))
+    albedo = linear_image(np.array([[[200, 45, 40]]], dtype=np.uint8))
     like = likeness(albedo * shade, (200, 45, 40), ColourConfig())
     np.testing.assert_allclose(like, 1.0, atol=1e-5)
 
@@ -71,13 +71,13 @@ def test_likeness_does_not_depend_on_shading(shade: float) -> None:
     "other", [(120, 120, 124), (60, 110, 180), (150, 140, 128), (0, 0, 0), (40, 160, 60)]
 )
 def test_other_colours_are_not_alike(other: tuple[int, int, int]) -> None:
-    pixel = linear_from_srgb(np.array([[other]], dtype=np.uint8))
+    pixel = linear_image(np.array([[other]], dtype=np.uint8))
     assert likeness(pixel, (200, 45, 40), ColourConfig()).item() < 0.3
 
 
 def test_a_pixel_that_is_half_grey_is_half_alike() -> None:
     """Equal luminance of object and grey: the likeness is the covered share."""
-    red = linear_from_srgb(np.array([[[200, 45, 40]]], dtype=np.uint8))
+    red = linear_image(np.array([[[200, 45, 40]]], dtype=np.uint8))
     mixed = 0.5 * red + 0.5 * red.mean()
     np.testing.assert_allclose(likeness(mixed, (200, 45, 40), ColourConfig()), 0.5, atol=1e-5)
 

@@ -16,7 +16,7 @@ from twin.scene.localise.mesh_fit import (
     seen_through,
 )
 from twin.scene.localise.objects import LocaliseConfig
-from twin.scene.localise.points import fuse_stills
+from twin.scene.localise.points import fuse_stationary
 
 
 def test_samples_lie_on_the_mesh_evenly_and_face_outwards() -> None:
@@ -44,7 +44,7 @@ def test_samples_lie_on_the_mesh_evenly_and_face_outwards() -> None:
 def test_a_mesh_where_nothing_is_is_seen_through(stage: Callable[..., Any]) -> None:
     task = only(DUCKS, "duck_1")
     frames, config = shoot(table_with(stage, (DUCK, AT))), LocaliseConfig()
-    views = fuse_stills(frames, 3, 8, task, config.points)
+    views = fuse_stationary(frames, 3, 8, task, config.points)
     surface = known_surface(DUCK, 1000)
     assert seen_through(AT, surface, views, 0.012) < 0.1
     elsewhere = AT.copy()
@@ -57,7 +57,7 @@ def test_a_mesh_of_which_no_camera_measures_anything_is_not_believed(
 ) -> None:
     task = only(DUCKS, "duck_1")
     frames, config = shoot(table_with(stage, (DUCK, AT))), LocaliseConfig()
-    views = fuse_stills(frames, 3, 8, task, config.points)
+    views = fuse_stationary(frames, 3, 8, task, config.points)
     surface, below = known_surface(DUCK, 1000), AT.copy()
     below[2, 3] -= 0.2  # hidden by the table, so nothing sees through it either
     assert agreeing(AT, surface, views, 0.012) > 0.8

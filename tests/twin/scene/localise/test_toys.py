@@ -14,7 +14,7 @@ from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.record import check_record
 from bridge.task.task_file import Task
 from twin.scene.localise import soft
-from twin.scene.localise.objects import localise, localise_objects
+from twin.scene.localise.objects import localise_objects
 from twin.scene.shape.known import pose_of
 
 
@@ -149,4 +149,4 @@ def test_depth_without_a_measurement_finds_nothing(stage: Callable[..., Any]) ->
         replace(frame, depth_m=np.zeros_like(frame.depth_m))
         for frame in shoot(table_with(stage, (DUCK, AT)))
     ]
-    assert not localise(frames, only(DUCKS, "duck_1")).objects["duck_1"].found
+    assert not localise_objects(frames, only(DUCKS, "duck_1"))["duck_1"].found

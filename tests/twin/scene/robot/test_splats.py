@@ -18,11 +18,11 @@ from bridge.geometry.camera import Camera
 from bridge.robots.default import ARM_JOINTS, ROBOT
 from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture, posture_track
-from twin.robot.surface import PosedSurface, sample_surface
+from twin.robot.surface import PosedSurface, link_poses, sample_surface
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
-from twin.scene.gaussians import GaussianCloud, as_float32, concatenate
+from twin.scene.gaussians import GaussianCloud, as_float32, moved_cloud
 from twin.scene.robot.extraction import RobotFrames, robot_mask
-from twin.scene.robot.splats import bind, posed, read_links, write_links
+from twin.scene.robot.splats import posed, read_links, write_links
 from twin.scene.settings import InitialiseConfig
 
 URDF = ROBOT.urdf_text()
@@ -54,6 +54,19 @@ def skin() -> GaussianCloud:
     return cloud_at(sample_surface(load_robot(URDF), posture, 3000, seed=1))
 
 
+def bind(cloud: GaussianCloud) -> dict[str, GaussianCloud]:
+    """Give each Gaussian to its nearest link at home, in the link's frame."""
+    robot, posture = load_robot(URDF), Posture(joints_rad=HOME, width_m=WIDTH_M)
+    surface = PosedSurface(robot, posture)
+    nearest = surface.nearest(cloud.means_m.astype(np.float64)).link_ids
+    links = np.array(surface.links)[nearest]
+    return {
+        link: moved_cloud(cloud.take(links == link), se3.invert(pose))
+        for link, pose in link_poses(robot, posture).items()
+        if (links == link).any()
+    }
+
+
 def in_order(cloud: GaussianCloud) -> np.ndarray:
     return np.lexsort(cloud.opacities_logit[None])
 
@@ -63,7 +76,7 @@ def rotations(cloud: GaussianCloud) -> np.ndarray:
 
 
 def test_posing_at_the_joints_of_binding_changes_nothing(skin: GaussianCloud) -> None:
-    links = bind(skin, HOME, URDF, width_m=WIDTH_M)
+    links = bind(skin)
     again = posed(links, HOME, URDF, width_m=WIDTH_M)
     a, b = skin.take(in_order(skin)), again.take(in_order(again))
     assert len(a) == len(b)
@@ -75,7 +88,7 @@ def test_posing_at_the_joints_of_binding_changes_nothing(skin: GaussianCloud) ->
 
 def test_a_link_moves_exactly_as_forward_kinematics_says(skin: GaussianCloud) -> None:
     robot = load_robot(URDF)
-    links = bind(skin, HOME, URDF, width_m=WIDTH_M)
+    links = bind(skin)
     for link in ("forearm_link", "wrist_3_link", "gripper_left_finger"):
         before = posed({link: links[link]}, HOME, URDF, width_m=WIDTH_M)
         after = posed({link: links[link]}, AWAY, URDF, width_m=0.08)
@@ -86,12 +99,7 @@ def test_a_link_moves_exactly_as_forward_kinematics_says(skin: GaussianCloud) ->
         np.testing.assert_array_equal(after.scales_log, before.scales_log)
 
 
-def test_only_what_lies_near_the_robot_is_bound(skin: GaussianCloud) -> None:
-    away = cloud_at(np.array([[0.6, 0.5, 0.0], [0.42, 0.0, 2.0]]))
-    links = bind(concatenate([skin, away]), HOME, URDF, width_m=WIDTH_M)
-    assert sum(len(cloud) for cloud in links.values()) == len(skin)
-    assert {"base_link", "shoulder_link", "upper_arm_link", "forearm_link"} <= set(links)
-    assert bind(away, HOME, URDF) == {}
+def test_without_links_nothing_is_posed() -> None:
     assert len(posed({}, HOME, URDF)) == 0
 
 
@@ -102,7 +110,7 @@ def test_an_unknown_link_lists_those_that_exist(skin: GaussianCloud) -> None:
 
 def test_links_survive_the_disk_and_stale_ones_go(skin: GaussianCloud, tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path / "run")
-    links = bind(skin, HOME, URDF, width_m=WIDTH_M)
+    links = bind(skin)
     write_links(run, {"old_link": skin})
     record = {"robot": {"links": write_links(run, links)}}
     assert not (run.scene_dir / "robot" / "old_link.ply").exists()

@@ -75,7 +75,7 @@ def test_the_static_scene_is_read_back_and_described(static: StaticSdf, tmp_path
     assert about["truncation_m"] == pytest.approx(3 * about["voxel_m"])
 
 
-def test_an_observed_distance_that_is_no_number_is_refused(
+def test_an_observed_distance_that_is_not_finite_is_refused(
     static: StaticSdf, tmp_path: Path
 ) -> None:
     """No check of clearance fails on it: whoever read it would take the place for free."""
@@ -83,7 +83,7 @@ def test_an_observed_distance_that_is_no_number_is_refused(
     values[1, 1, 1] = np.nan
     damaged = replace(static, observed=replace(static.observed, values_m=values))
     damaged.save(tmp_path / "sdf.npz")
-    with pytest.raises(UnreadableArraysError, match="a distance is no number"):
+    with pytest.raises(UnreadableArraysError, match="a distance is not finite"):
         StaticSdf.load(tmp_path / "sdf.npz")
 
 

@@ -92,7 +92,7 @@ def test_an_object_in_the_air_moves_in_all_six_directions(script: SimpleNamespac
     np.testing.assert_allclose(np.std(steps, axis=0), np.sqrt(np.diag(CORRELATED)), rtol=0.16)
 
 
-def test_given_standing_is_the_conditional_distribution() -> None:
+def test_given_upright_is_the_conditional_distribution() -> None:
     rng = np.random.default_rng(3)
     root = rng.normal(size=(6, 6)) * 1e-2
     covariance = root @ root.T

@@ -1,4 +1,8 @@
-"""SSIM with its three customs at the border of an image, and MS-SSIM, in float64."""
+"""How much an image is like another one: PSNR, SSIM and MS-SSIM of RGB images, in float64.
+
+SSIM has three customs at the border of an image; all three are here. Every number is computed on
+8-bit images scaled to 0..1, so that rebuild and evaluation give the same one of the same files.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -7,11 +11,110 @@ from functools import cache
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, UInt8
 from numpy.lib.stride_tricks import as_strided
 
-from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.image import check_same_shape
+from bridge.errors import BridgeError, UndefinedStatisticError
+
+Alignment = Literal["raw", "gain", "affine"]
+"""How a replayed image was brightened before it was scored."""
+ALIGNMENTS: dict[Alignment, str] = {
+    "raw": "no colour alignment",
+    "gain": (
+        "after one gain per image and channel (least squares on the recorded image, "
+        "then clipped to 0..1)"
+    ),
+    "affine": (
+        "after one gain and offset per image and channel (least squares on the recorded image, "
+        "then clipped to 0..1)"
+    ),
+}
+"""In words, for definitions. Alignment looks at the recorded image, so numbers are named by it."""
+
+
+class ImageShapeError(BridgeError):
+    """Two images that cannot be laid over each other."""
+
+    def __init__(self, *, found: str) -> None:
+        """Remember what did not fit."""
+        super().__init__(f"{found}. Compare images of the same camera and size.")
+
+
+def as_float(
+    image: UInt8[np.ndarray, "height width 3"] | Float[np.ndarray, "height width 3"],
+) -> Float[np.ndarray, "height width 3"]:
+    """Scale an 8-bit image to 0..1, or take one that is; no gamma is undone."""
+    if image.dtype == np.uint8:
+        return np.asarray(np.divide(image, 255.0, dtype=np.float64))
+    return np.asarray(image, dtype=np.float64)
+
+
+def psnr_db(
+    recorded: Float[np.ndarray, "height width channels"],
+    replayed: Float[np.ndarray, "replayed_height replayed_width channels"],
+    *,
+    mask: Bool[np.ndarray, "height width"] | None = None,
+) -> float:
+    """Return the peak signal-to-noise ratio [dB]; with a mask, of its pixels only.
+
+    The replayed axes carry their own names, so that a wrong size gets our message.
+
+    Range: 0 dB and up for images in 0..1, higher is better. Undefined when: the images are equal.
+
+    Raises:
+        ImageShapeError: When the sizes differ.
+        UndefinedStatisticError: When the error is exactly zero, or the mask is empty.
+    """
+    check_same_shape(recorded, replayed)
+    squared = (recorded - replayed) ** 2
+    if mask is not None:
+        squared = squared[mask]
+    if squared.size == 0:
+        raise UndefinedStatisticError(statistic="PSNR", reason="the mask holds no pixel")
+    error = float(squared.mean())
+    if error == 0:
+        raise UndefinedStatisticError(statistic="PSNR", reason="the images are identical")
+    return -10.0 * math.log10(error)
+
+
+def aligned(
+    recorded_u8: UInt8[np.ndarray, "height width 3"] | Float[np.ndarray, "height width 3"],
+    replayed_u8: (
+        UInt8[np.ndarray, "replayed_height replayed_width 3"]
+        | Float[np.ndarray, "replayed_height replayed_width 3"]
+    ),
+    alignment: Alignment,
+) -> Float[np.ndarray, "height width 3"]:
+    """Brighten the replayed image, channel by channel, as near to the recorded one as it gets.
+
+    Raises:
+        ImageShapeError: When the sizes differ.
+    """
+    check_same_shape(recorded_u8, replayed_u8)
+    replayed = as_float(replayed_u8)
+    if alignment == "raw":
+        return replayed
+    recorded = as_float(recorded_u8)
+    channels = []
+    for a, b in zip(np.moveaxis(replayed, -1, 0), np.moveaxis(recorded, -1, 0), strict=True):
+        shift_a, shift_b = (a.mean(), b.mean()) if alignment == "affine" else (0.0, 0.0)
+        power = float(np.square(a - shift_a).sum())
+        gain = float(((a - shift_a) * (b - shift_b)).sum()) / power if power > 0 else 1.0
+        channels.append(gain * (a - shift_a) + shift_b)
+    return np.asarray(np.clip(np.stack(channels, axis=-1), 0.0, 1.0))
+
+
+def check_same_shape(recorded: np.ndarray, replayed: np.ndarray) -> None:
+    """Refuse images of different size.
+
+    Raises:
+        ImageShapeError: With both sizes.
+    """
+    if recorded.shape != replayed.shape:
+        raise ImageShapeError(
+            found=f"the recorded image is {recorded.shape}, the replayed one {replayed.shape}"
+        )
+
 
 # --- The sliding window of SSIM as products with small matrices of weights, in float64.
 #

@@ -8,7 +8,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
-from bridge.errors import PathNotFoundError
+from bridge.errors import PathNotFoundError, UsageError
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
 from twin.cli import replay
@@ -38,10 +38,6 @@ def test_the_command_refuses_a_run_that_is_not_there(tmp_path: Path) -> None:
         replay(tmp_path / "nowhere", output=Output(quiet=True))
 
 
-def test_the_command_ends_well_when_there_is_nothing_to_do(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert (
-        replay(RunFolder.create(tmp_path / "run").path, output=Output(quiet=True, json=True)) == 0
-    )
-    assert '"rows": []' in capsys.readouterr().out
+def test_the_command_refuses_a_run_without_episodes(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no episodes in"):
+        replay(RunFolder.create(tmp_path / "run").path, output=Output(quiet=True, json=True))

@@ -11,7 +11,8 @@ from bridge.episode.run_folder import RunFolder
 from bridge.task.task_file import load_task
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
-from twin.replay.rebuilt_scene import TASK_SHAPE, physics_for, read_rebuilt_scene, shape_hashes
+from twin.replay.config import ReplayConfig
+from twin.replay.rebuilt_scene import TASK_SHAPE, calibrated, read_rebuilt_scene, shape_hashes
 from twin.scene.shape.lattice import Lattice
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import StaticSdf
@@ -25,7 +26,7 @@ def lattice_of_task(stretch: float = 1.0) -> Lattice:
     """The task's own lattice as a scene would hold it."""
     body = SoftModel.from_task(TASK.objects["sloth"])
     nodes = body.nodes_m * np.array([stretch, 1.0, 1.0], dtype=np.float32)
-    edges = body.edges().astype(np.int32)
+    edges = body.rest_edges[0].astype(np.int32)
     lengths = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
     return Lattice(
         nodes_m=nodes.astype(np.float32),
@@ -114,7 +115,7 @@ def test_distances_that_cannot_be_read_are_no_free_way(run: RunFolder) -> None:
     with pytest.raises(UnreadableArraysError, match=r"sdf\.npz: .*robot-gst rebuild RUN --force"):
         read_rebuilt_scene(run, TASK)
     write_distances(run, np.nan)
-    with pytest.raises(UnreadableArraysError, match=r"sdf\.npz: a distance is no number"):
+    with pytest.raises(UnreadableArraysError, match=r"sdf\.npz: a distance is not finite"):
         read_rebuilt_scene(run, TASK)
     write_distances(run, -0.1)
     assert read_rebuilt_scene(run, TASK).static_sdf is not None
@@ -134,13 +135,14 @@ def calibration(**identified: object) -> Calibration:
 
 def test_calibrated_physics_is_used_where_the_user_said_nothing() -> None:
     found = calibration(object_friction=0.42, grip_force_N={"value": 9.0}, gravity_m_s2=None)
-    physics = physics_for(PhysicsConfig(), found)
+    physics = calibrated(ReplayConfig(), found).physics
     assert (physics.object_friction, physics.grip_force_N) == (0.42, 9.0)
     assert physics.gravity_m_s2 == PhysicsConfig().gravity_m_s2
-    mine = physics_for(replace(PhysicsConfig(), object_friction=0.7), found)
-    assert (mine.object_friction, mine.grip_force_N) == (0.7, 9.0)
+    mine = ReplayConfig(physics=PhysicsConfig(object_friction=0.7))
+    physics = calibrated(mine, found).physics
+    assert (physics.object_friction, physics.grip_force_N) == (0.7, 9.0)
 
 
 def test_without_a_calibration_nothing_is_moved() -> None:
-    assert physics_for(PhysicsConfig(), None) == PhysicsConfig()
-    assert physics_for(PhysicsConfig(), calibration(unheard_of=3.0)) == PhysicsConfig()
+    assert calibrated(ReplayConfig(), None) == ReplayConfig()
+    assert calibrated(ReplayConfig(), calibration(unheard_of=3.0)).physics == PhysicsConfig()

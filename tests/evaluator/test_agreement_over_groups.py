@@ -1,4 +1,4 @@
-"""Rank agreement, error, calibration, resampling and decisions over cells."""
+"""Rank agreement, error, calibration, resampling and decisions over groups."""
 
 import itertools
 import math

@@ -1,0 +1,43 @@
+"""Signals over time: where a flag holds, and by how much one signal comes later than another."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+LAGS_S = np.arange(-20, 61) / 100
+"""Delays that are tried between two motions: -0.2 s to 0.6 s in steps of 10 ms."""
+EQUAL_M = 1e-5
+"""Delays whose mean distances differ by less fit equally well."""
+
+
+def runs_of_true(flags: Bool[np.ndarray, " num_steps"]) -> list[tuple[int, int]]:
+    """First step of each run of True, and the one after its last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
+
+
+def lag_of_least_cost(
+    costs: Float[np.ndarray, " num_lags"],
+    lags_s: Float[np.ndarray, " num_lags"] = LAGS_S,
+    *,
+    equal: float = EQUAL_M,
+    between: bool = False,
+) -> float:
+    """Choose the lag at which two signals differ least [s].
+
+    Of lags that fit equally well the smallest is taken: a motion that hardly moves has none.
+
+    Args:
+        costs: How much the signals differ at each lag.
+        lags_s: The lags, evenly spaced.
+        equal: Costs above the least one by at most this count as equal to it.
+        between: Look between the lags too, where a parabola through three costs is lowest.
+    """
+    if not between:
+        near = lags_s[costs <= costs.min() + equal]
+        return float(near[np.argmin(np.abs(near))])
+    best = int(costs.argmin())
+    if not 0 < best < len(costs) - 1:
+        return float(lags_s[best])
+    before, here, after = costs[best - 1 : best + 2]
+    share = 0.5 * (before - after) / (before - 2 * here + after)
+    return float(lags_s[best] + share * (lags_s[best + 1] - lags_s[best]))

@@ -1,0 +1,68 @@
+"""What a source of live data is: a folder, cameras, an arm, the stand-in cell; and how one is run.
+
+Another device becomes a source by fulfilling ``Source``: ``run_source`` connects it, stops it and
+counts what it sent.
+"""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+from bridge.terminal import Output, stop_signals
+from bridge.wire.config import WireConfig
+
+if TYPE_CHECKING:
+    from bridge.wire.session import WireSession
+
+
+@runtime_checkable
+class Source(Protocol):
+    """Publishes what one device, folder or simulation has to say."""
+
+    @property
+    def name(self) -> str:
+        """What people call it."""
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The topics it publishes, or some of them where the device lacks a signal."""
+
+    def run(self, session: "WireSession", stop: threading.Event, output: Output) -> dict[str, Any]:
+        """Publish until ``stop`` is set or there is nothing left, and count what was sent."""
+
+
+def run_source(
+    source: Source, wire: WireConfig, output: Output, *, duration_s: float | None = None
+) -> dict[str, Any]:
+    """Run a source until it ends, SIGINT or SIGTERM arrives, or the time is over.
+
+    Args:
+        source: What to run.
+        wire: Where the recorder listens.
+        output: How to talk.
+        duration_s: Stop after this long [s]; None: never.
+
+    Returns:
+        What the source counted.
+    """
+    from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
+
+    output.detail(f"{source.name} publishes {', '.join(source.topics)}")
+    with _stopping(duration_s) as stop, open_session(wire) as session:
+        return source.run(session, stop, output)
+
+
+@contextmanager
+def _stopping(duration_s: float | None) -> Iterator[threading.Event]:
+    """An event that is set by a signal, or when the time is over."""
+    with stop_signals() as stop:
+        timer = None if duration_s is None else threading.Timer(duration_s, stop.set)
+        if timer is not None:
+            timer.daemon = True
+            timer.start()
+        try:
+            yield stop
+        finally:
+            if timer is not None:
+                timer.cancel()

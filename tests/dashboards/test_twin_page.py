@@ -1,0 +1,73 @@
+"""What the page of held-out views holds, without a browser."""
+
+from dataclasses import replace
+from types import ModuleType
+
+import pytest
+
+from bridge.episode.run_folder import RunFolder
+from dashboards.comparison import Judgement, judge
+from dashboards.errors import NotHereError
+from dashboards.twin_page import VIEWS_TITLE, build_twin, view_image
+from evaluator.result import Table
+
+COLUMNS = ("camera", "stamp_ns", "PSNR (dB)", "SSIM")
+
+
+def rated(run: RunFolder, psnr_db: list[float | None]) -> Judgement:
+    """Let the results rate the first views, in the order in which they were recorded."""
+    judgement = judge(run)
+    assert judgement.results is not None
+    (path,) = run.derived("*.views.*")
+    views = sorted(build_twin(run, judgement).views, key=lambda view: view.stamp_ns)
+    rows = tuple((v.camera_id, v.stamp_ns, db, 0.8) for v, db in zip(views, psnr_db, strict=False))
+    (first, *_) = judgement.results.tables
+    table = replace(first, title=VIEWS_TITLE + path.stem, columns=COLUMNS, rows=rows)
+    assert isinstance(table, Table)
+    return replace(judgement, results=replace(judgement.results, tables=(table,)))
+
+
+def test_rated_views_come_worst_first_and_unrated_ones_last(shared_run: RunFolder) -> None:
+    page = build_twin(shared_run, rated(shared_run, [25.0, 18.0]))
+    assert [view.psnr_db for view in page.views] == [18.0, 25.0, None]
+    assert [view.ssim for view in page.views] == [0.8, 0.8, None]
+    assert page.rated
+    assert page.stand_in is True
+
+
+def test_views_without_scores_are_shown_in_recorded_order(shared_run: RunFolder) -> None:
+    judgement = judge(shared_run)
+    assert judgement.results is not None
+    bare = replace(judgement, results=replace(judgement.results, tables=()))
+    page = build_twin(shared_run, bare)
+    assert not page.rated
+    stamps_ns = [view.stamp_ns for view in page.views]
+    assert stamps_ns == sorted(stamps_ns)
+    assert {view.camera_id for view in page.views} == {"side"}
+
+
+def test_a_run_without_views_names_the_next_command(own_run: RunFolder) -> None:
+    for path in own_run.derived("*.views.*"):
+        path.unlink()
+    page = build_twin(own_run, judge(own_run))
+    assert page.views == ()
+    assert page.next_command == f"robot-gst rebuild {own_run.path}"
+
+
+def test_both_sides_of_a_view_are_images_and_a_third_side_is_refused(
+    shared_run: RunFolder,
+) -> None:
+    view = build_twin(shared_run, judge(shared_run)).views[0]
+    path = shared_run.derived_dir / view.file
+    for side in ("recorded", "rendered"):
+        data, kind = view_image(shared_run, path, side, view.camera_id, view.stamp_ns)
+        assert data.startswith(b"\xff\xd8")
+        assert kind == "image/jpeg"
+    with pytest.raises(NotHereError, match="neither recorded nor rendered"):
+        view_image(shared_run, path, "top", view.camera_id, view.stamp_ns)
+
+
+def test_a_view_whose_recording_is_gone_says_so(own_run: RunFolder, synthetic: ModuleType) -> None:
+    other = synthetic.write_views(own_run, source="elsewhere")
+    with pytest.raises(NotHereError, match="was made from is not in this run"):
+        view_image(own_run, other, "recorded", "wrist", 0)
