@@ -146,7 +146,6 @@ def check_same_shape(recorded: np.ndarray, replayed: np.ndarray) -> None:
         )
 
 
-# --- How a rendered depth image differs from the recorded one.
 
 DEPTH_PROTOCOL = (
     "rendered against recorded depth along the optical axis, over pixels where both exist"
@@ -190,7 +189,6 @@ def score_depth(
     )
 
 
-# --- GMSD: how unevenly the edges of two images differ; needs no learned weights.
 
 LUMA = (0.299, 0.587, 0.114)
 """Shares of red, green and blue in luma (ITU-R BT.601)."""

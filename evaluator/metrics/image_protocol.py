@@ -8,7 +8,6 @@ from typing import Literal
 
 from bridge.errors import UsageError
 
-# --- What one image metric is called and means.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,7 +144,6 @@ def _written(name: str, value: str) -> str:
     return value if name in _PLAIN else f"{name} {value}"
 
 
-# --- What ``evaluate`` is told about images: methods to compare, masks, and backbones of LPIPS.
 
 NetName = Literal["vgg", "alex"]
 

@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import as_strided
 from evaluator.errors import UndefinedStatisticError
 from evaluator.metrics.image import check_same_shape
 
-# --- The sliding window of SSIM as products with small matrices of weights, in float64.
+# The sliding window of SSIM as products with small matrices of weights, in float64.
 #
 # A band of rows times a matrix that holds the window once for each row, one place further on, is
 # the window slid down; blocks of columns times its transpose slide it across. Half of these

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from evaluator.compare.plot_data import CurveBand, Shares
+from evaluator.measurements import BAND_WIDTH
 from evaluator.report.figures.drawing import (
     LEGEND_LINE_IN,
     LIGHT,
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
-from evaluator.compare.band_measurements import BAND_WIDTH, BandCurve
+from evaluator.compare.band_measurements import BandCurve
 from evaluator.compare.images.scores import ViewQuality
 from evaluator.compare.plot_data import shares_of
 from evaluator.compare.states import StateSummary
@@ -231,7 +232,6 @@ def _at(group: Shares, share: float) -> float:
     return next((value for value, part in pairs if part >= share - 1e-12), group.values[-1])
 
 
-# --- Predicted against localised and replayed final states, as distributions of errors.
 
 PAIRS = (
     ("plan", "recorded", "plan to localised"),
@@ -286,7 +286,6 @@ def _groups(
     return tuple(found)
 
 
-# --- Image metrics of all views as distributions, and the worst views as pictures.
 
 METRICS = (
     ("psnr_db", "PSNR (dB), higher is better"),
@@ -352,7 +351,6 @@ def worst_pairs(views: Sequence[ViewQuality]) -> list[ViewPair]:
     return [pair for _, pair in sorted(found, key=lambda item: item[0])]
 
 
-# --- Simulated runs against the band of recorded ones, over normalised time.
 
 BAND_COLOURS = ("sim", "third", "fourth", "ink", "soft")
 """The recorded colour is the band's."""
