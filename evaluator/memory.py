@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 
-
 @contextmanager
 def without_collecting() -> Iterator[None]:
     """Let only reference counts free memory, as long as the block lasts.

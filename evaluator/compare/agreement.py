@@ -40,7 +40,6 @@ from evaluator.statistics.bootstrap import (
 )
 from evaluator.statistics.coverage.stored import Choice, choose_method, vouch
 
-
 SEED = 0
 """Resampling is seeded: the same groups give the same interval."""
 MIN_CLUSTERS = 4

@@ -44,7 +44,6 @@ from evaluator.statistics.power import (
     trials_needed,
 )
 
-
 START_LIMIT_M = 0.03
 """Paired trials whose objects started further apart than this are not the same start."""
 

@@ -35,7 +35,6 @@ from evaluator.statistics.gate import (
     reliability_bins,
 )
 
-
 PLANNED, GATE = "planned in twin", "verdict before motion, not obeyed"
 PRICES = (0.1, 0.5, 1.0)
 """Of refusing a good plan, in bad executions, at which each clause is priced."""

@@ -149,7 +149,6 @@ def _tool_m(recorded: Episode, seen_ns: int) -> Float[np.ndarray, "3"] | None:
     return None
 
 
-
 NAMES = {True: "success", False: "failure", None: "open"}
 OPEN = "the localised poses leave it open"
 Pair = tuple[TrialRow, PerceivedOutcome]

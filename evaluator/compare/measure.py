@@ -11,7 +11,6 @@ from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.statistics.coverage.stored import Size, vouch
 from evaluator.statistics.intervals import RATE_INTERVALS
 
-
 Item = TypeVar("Item")
 DEGREES = math.degrees(1.0)
 
@@ -55,8 +54,6 @@ def average(items: Sequence[Item], read: Callable[[Item], float | None]) -> floa
 
 def _rounded(value: float | None, factor: float) -> float | None:
     return None if value is None or not math.isfinite(value) else round(factor * value, 2)
-
-
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -272,8 +272,6 @@ def _or_none(compute: Callable[[], float]) -> float | None:
         return None
 
 
-
-
 Groups = Mapping[str, Sequence[MotionSummary]]
 """By what the motions are held against: planned, executed, or twin."""
 OVER_TIME = range(0, 101, 10)

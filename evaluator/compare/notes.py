@@ -124,7 +124,6 @@ def _power(by_id: dict[str, Measurement]) -> list[Note]:
     return found
 
 
-
 ABOUT = "replays"
 CHANGES_NO_VERDICT = ("mode", "samples", "seed")
 """Settings that one evaluation may well find in several values."""

@@ -43,7 +43,6 @@ from evaluator.statistics.sequential import (
     stop_or_continue,
 )
 
-
 NOWHERE = (
     "not computed: no object was localised before the execution in most of these trials; record "
     "or make localisations at the start"

@@ -24,7 +24,6 @@ from evaluator.compare.success import trials_in
 from evaluator.result import Exclusion
 
 
-
 def row_from_record(record: TrialRecord) -> TrialRow:
     """Turn one line of a trials CSV into a trial row."""
     return TrialRow(

@@ -157,8 +157,6 @@ def _differences(
     return float(np.linalg.norm(middle_first - middle_second)), rotation, extents, None
 
 
-
-
 Group = tuple[str, str, str, str]
 """Who predicts, what it is held against, task, condition."""
 

@@ -103,7 +103,6 @@ class Ledger:
         return changes, gone
 
 
-
 Key = tuple[str, str, str]
 
 
@@ -238,7 +237,6 @@ def _gain(task: str, policy: str, changes: Sequence[int]) -> GainSummary | None:
         return summary(low=-1.0, high=1.0, advice=advice, changed=error.reason)
     advice = pairs_advice(changes, interval)
     return summary(low=interval.low, high=interval.high, advice=advice)
-
 
 
 BOTH = (WITHOUT, WITH)

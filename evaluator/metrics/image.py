@@ -146,7 +146,6 @@ def check_same_shape(recorded: np.ndarray, replayed: np.ndarray) -> None:
         )
 
 
-
 DEPTH_PROTOCOL = (
     "rendered against recorded depth along the optical axis, over pixels where both exist"
 )
@@ -187,7 +186,6 @@ def score_depth(
         rmse_m=float(np.sqrt(np.square(error).mean())),
         num_pixels=int(both.sum()),
     )
-
 
 
 LUMA = (0.299, 0.587, 0.114)

@@ -9,7 +9,6 @@ from typing import Literal
 from bridge.errors import UsageError
 
 
-
 @dataclass(frozen=True, kw_only=True)
 class ImageMetric:
     """One named number about a pair of images."""
@@ -142,7 +141,6 @@ def common_text(stamps: Sequence[Stamp]) -> str:
 
 def _written(name: str, value: str) -> str:
     return value if name in _PLAIN else f"{name} {value}"
-
 
 
 NetName = Literal["vgg", "alex"]

@@ -123,8 +123,6 @@ def without_rigid_motion(
     return np.asarray(np.linalg.norm(p_recorded_m - (p_replayed_m @ R.T + shift), axis=1))
 
 
-
-
 @dataclass(frozen=True, kw_only=True)
 class JointErrors:
     """Joint angles of two motions at the same instants."""
@@ -277,7 +275,6 @@ def angles_rad(
     near = np.linalg.norm(q_first_wxyz - q_second_wxyz, axis=1)
     far = np.linalg.norm(q_first_wxyz + q_second_wxyz, axis=1)
     return np.asarray(4.0 * np.arctan2(np.minimum(near, far), np.maximum(near, far)))
-
 
 
 MOVING_THRESHOLD_M = 0.01

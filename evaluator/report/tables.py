@@ -59,7 +59,6 @@ def as_text(table: Table, *, width: int | None = None) -> str:
     return f"{text.rstrip()}\n{table.note}\n" if table.note else f"{text.rstrip()}\n"
 
 
-
 _COMMANDS = {
     "\\": r"\textbackslash{}",
     "&": r"\&",

@@ -24,7 +24,6 @@ from bridge.task.verdict import Verdict
 from evaluator.errors import EvaluatorError
 from evaluator.run_reader.inventory import RunFile
 
-
 # What each clause of a verdict said: the three factors, and every success predicate by its
 # kind.
 #
@@ -278,8 +277,6 @@ def _note_event(log: _Log, event: Mapping[str, Any]) -> None:
             known = {key: outcome[key] for key in names & outcome.keys()}
             stages = [s for s in outcome.get("stages") or () if isinstance(s, dict)]
             log.label = build(Outcome, {**known, "stages": stages})
-
-
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,6 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
 from evaluator.statistics.intervals import LEVEL, normal_quantile
 
-
 MIN_GROUPS = 3
 """Two points always lie on a line."""
 
@@ -245,7 +244,6 @@ def mean_rate(rates: Sequence[Number]) -> float:
     return float(floats(rates).mean())
 
 
-
 MIN_GROUPS_INTERVAL = 4
 """Fisher's standard error is 1/sqrt(n - 3)."""
 
@@ -321,8 +319,6 @@ def fisher_interval(r: float, num_groups: int, *, level: float = LEVEL) -> Inter
 
 def _sign(value: Number) -> int:
     return (value > 0) - (value < 0)
-
-
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,6 @@ from evaluator.statistics.intervals import (
     wilson,
 )
 
-
 BISECTIONS = 60
 """Halvings of an interval of length 2; what is left is below the spacing of floats near 1."""
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from evaluator.errors import UndefinedStatisticError
 
-
 NUM_BINS = 10
 
 

@@ -36,7 +36,6 @@ from evaluator.metrics.image_scores import METRICS, ImageScore, score_image
 from evaluator.metrics.lpips import PerceptualNet
 
 
-
 @dataclass(frozen=True, kw_only=True)
 class Variant:
     """One way to score a pair."""
@@ -127,7 +126,6 @@ def values_by_id(scores: Mapping[Variant, ImageScore]) -> dict[str, float]:
         for variant, score in scores.items()
         for metric, value in score.values.items()
     }
-
 
 
 NUM_WORST = 4

@@ -52,7 +52,6 @@ from evaluator.result import Exclusion, Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
 
 
-
 @dataclass(frozen=True, kw_only=True)
 class ViewSummary:
     """One view that was scored, or the reason why it could not be."""

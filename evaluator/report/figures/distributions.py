@@ -232,7 +232,6 @@ def _at(group: Shares, share: float) -> float:
     return next((value for value, part in pairs if part >= share - 1e-12), group.values[-1])
 
 
-
 PAIRS = (
     ("plan", "recorded", "plan to localised"),
     ("planned", "recorded", "planned replay to localised"),
@@ -284,7 +283,6 @@ def _groups(
         if shares is not None:
             found.append(shares)
     return tuple(found)
-
 
 
 METRICS = (
@@ -349,7 +347,6 @@ def worst_pairs(views: Sequence[ViewQuality]) -> list[ViewPair]:
         )
         found.append((score if score is not None else float("inf"), pair))
     return [pair for _, pair in sorted(found, key=lambda item: item[0])]
-
 
 
 BAND_COLOURS = ("sim", "third", "fourth", "ink", "soft")

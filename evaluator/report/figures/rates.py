@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-
 MAX_LINES = 60
 Row = tuple[Cell, ...]
 
@@ -97,8 +96,6 @@ def _bar(axes: "Axes", row: Row, y: float, most: int) -> None:
     if row[5]:
         text += f" ({row[5]} unknown)"
     axes.text(1.04 * most, middle, text, va="center", fontsize=7.5, clip_on=False)
-
-
 
 
 def gains(measurements: Sequence[Measurement], word: str) -> Drawing | NotDrawn:

@@ -142,7 +142,6 @@ def _chances(n: int) -> Float64[np.ndarray, "rates counts"]:
     return np.asarray(np.exp(ways + xlogy(k, rates) + xlog1py(n - k, -rates)))
 
 
-
 Sample = Float64[np.ndarray, "draws lengths"]
 
 

@@ -20,7 +20,6 @@ from evaluator.statistics.weighted import STATISTICS, Values, values_of
 # draws.
 
 
-
 @dataclass(frozen=True, kw_only=True)
 class Population:
     """Groups whose recorded and simulated success rates go together more or less.

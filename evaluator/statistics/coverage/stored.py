@@ -120,7 +120,6 @@ def vouch(
     return replace(interval, worst_coverage=round(known.worst, 4)), ""
 
 
-
 LEVEL = 0.95
 CLOSED_FORMS: dict[tuple[str, str], tuple[str, str]] = {
     ("pearson", "points"): ("fisher-z", "fisher-z"),
