@@ -3,19 +3,16 @@
 An evaluation as DataFrames: ``evaluator.read_trials(RUN)``, ``read_groups``, ``read_measurements``.
 """
 
-from typing import TYPE_CHECKING, Any
+from importlib import import_module
+from typing import Any
 
-if TYPE_CHECKING:
-    from evaluator.frames import read_groups, read_measurements, read_trials
-
-__all__ = ["read_groups", "read_measurements", "read_trials"]
+_FRAMES = ("read_groups", "read_measurements", "read_trials")
 
 
 def __getattr__(name: str) -> Any:
     """Load pandas only when somebody reads a DataFrame."""
-    if name not in __all__:
+    if name not in _FRAMES:
         message = f"module 'evaluator' has no attribute {name!r}"
         raise AttributeError(message)
-    from evaluator import frames  # noqa: PLC0415  # loads pandas
-
-    return getattr(frames, name)
+    # by name: the package itself stands below all its modules
+    return getattr(import_module("evaluator.frames"), name)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 
-# --- The folder a cache lies in: files of summaries, each written whole under a name of its own.
+# The folder a cache lies in: files of summaries, each written whole under a name of its own.
 #
 # So any number of evaluations may write at once, one may be killed at any instant, and the folder
 # may be deleted at any time. Nothing that is wrong with it raises; whoever asks is told once.

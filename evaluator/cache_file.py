@@ -28,7 +28,7 @@ from evaluator.arrow_columns import (
 )
 from evaluator.memory import Packed, without_collecting
 
-# --- Nested records as JSON text, read back with the types their hints name.
+# Nested records as JSON text, read back with the types their hints name.
 #
 # Tuples stay tuples and dataclasses stay dataclasses. Nothing but JSON is read: no names, no code.
 

@@ -11,8 +11,6 @@ import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-# --- Spare the garbage collector a look at millions of objects of which none is garbage.
-
 
 @contextmanager
 def without_collecting() -> Iterator[None]:

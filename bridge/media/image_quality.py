@@ -116,6 +116,8 @@ def check_same_shape(recorded: np.ndarray, replayed: np.ndarray) -> None:
         )
 
 
+# The sliding window of SSIM as products with small matrices of weights, in float64.
+#
 # A band of rows times a matrix that holds the window once for each row, one place further on, is
 # the window slid down; blocks of columns times its transpose slide it across. Half of these
 # products are with zeros, and BLAS is still much faster than sums of shifted rows. Bands are so

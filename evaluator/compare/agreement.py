@@ -40,8 +40,6 @@ from evaluator.statistics.bootstrap import (
 )
 from evaluator.statistics.coverage.stored import Choice, choose_method, vouch
 
-# --- Over groups: which interval each statistic of agreement has, or why it has none.
-
 SEED = 0
 """Resampling is seeded: the same groups give the same interval."""
 MIN_CLUSTERS = 4

@@ -36,8 +36,6 @@ from evaluator.metrics.trajectory import band_distance, moving_part, repeatabili
 from evaluator.result import Cell, Exclusion, Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
 
-# --- Recorded against simulated runs as tables.
-
 OVER_TIME = range(0, 101, 10)
 """Places on the curves that the table shows, in percent of the motion."""
 

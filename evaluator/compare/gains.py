@@ -44,8 +44,6 @@ from evaluator.statistics.power import (
     trials_needed,
 )
 
-# --- Do paired starts improve with replanning? The same start without and with it.
-
 START_LIMIT_M = 0.03
 """Paired trials whose objects started further apart than this are not the same start."""
 

@@ -35,8 +35,6 @@ from evaluator.statistics.gate import (
     reliability_bins,
 )
 
-# --- The gate's scorecard clause by clause: how often each refused, and how often it was right to.
-
 PLANNED, GATE = "planned in twin", "verdict before motion, not obeyed"
 PRICES = (0.1, 0.5, 1.0)
 """Of refusing a good plan, in bad executions, at which each clause is priced."""

@@ -149,8 +149,6 @@ def _tool_m(recorded: Episode, seen_ns: int) -> Float[np.ndarray, "3"] | None:
     return None
 
 
-# --- Does the label agree with the predicate on localised poses? Headline numbers keep the label.
-
 NAMES = {True: "success", False: "failure", None: "open"}
 OPEN = "the localised poses leave it open"
 Pair = tuple[TrialRow, PerceivedOutcome]

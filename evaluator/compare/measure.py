@@ -11,8 +11,6 @@ from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.statistics.coverage.stored import Size, vouch
 from evaluator.statistics.intervals import RATE_INTERVALS
 
-# --- Numbers as tables show them: millimetres, degrees and milliseconds with two decimals.
-
 Item = TypeVar("Item")
 DEGREES = math.degrees(1.0)
 
@@ -56,9 +54,6 @@ def average(items: Sequence[Item], read: Callable[[Item], float | None]) -> floa
 
 def _rounded(value: float | None, factor: float) -> float | None:
     return None if value is None or not math.isfinite(value) else round(factor * value, 2)
-
-
-# --- What one part of a comparison found.
 
 
 @dataclass(frozen=True, kw_only=True)

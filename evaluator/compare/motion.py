@@ -272,10 +272,6 @@ def _or_none(compute: Callable[[], float]) -> float | None:
         return None
 
 
-# --- How far recorded and replayed motions of the arm lie apart, summed up over trials.
-
-# --- Motion errors as tables: per task, over time, and where they are largest.
-
 Groups = Mapping[str, Sequence[MotionSummary]]
 """By what the motions are held against: planned, executed, or twin."""
 OVER_TIME = range(0, 101, 10)

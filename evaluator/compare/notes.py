@@ -124,8 +124,6 @@ def _power(by_id: dict[str, Measurement]) -> list[Note]:
     return found
 
 
-# --- Whether the replays that count were made alike: in one scene, with the same settings.
-
 ABOUT = "replays"
 CHANGES_NO_VERDICT = ("mode", "samples", "seed")
 """Settings that one evaluation may well find in several values."""

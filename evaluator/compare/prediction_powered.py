@@ -43,8 +43,6 @@ from evaluator.statistics.sequential import (
     stop_or_continue,
 )
 
-# --- Where objects lay at the starts with a robot trial, and at those only the twin has.
-
 NOWHERE = (
     "not computed: no object was localised before the execution in most of these trials; record "
     "or make localisations at the start"

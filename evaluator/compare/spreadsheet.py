@@ -23,8 +23,6 @@ from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.success import trials_in
 from evaluator.result import Exclusion
 
-# --- Trials that were kept in a spreadsheet and brought into the run (``import trials``).
-
 
 def row_from_record(record: TrialRecord) -> TrialRow:
     """Turn one line of a trials CSV into a trial row."""

@@ -157,10 +157,6 @@ def _differences(
     return float(np.linalg.norm(middle_first - middle_second)), rotation, extents, None
 
 
-# --- How far objects end from where they were predicted to, per task, with and without replanning.
-
-# --- Final object states as tables: medians per task, and every stage.
-
 Group = tuple[str, str, str, str]
 """Who predicts, what it is held against, task, condition."""
 

@@ -247,7 +247,7 @@ def of_group(quantity: Quantity, key: Key, **words: object) -> Defined:
     return quantity.of(task=key[0], condition=key[1], policy=key[2], **words)
 
 
-# --- Sim estimated again with fresh seeds: what the twin says beyond the replay that chose a plan.
+# Sim estimated again with fresh seeds: what the twin says beyond the replay that chose a plan.
 #
 # With replanning the accepted plan was selected by the twin, so its one nominal replay is
 # optimistic by that selection (the winner's curse). ``robot-gst replay RUN --samples K`` replays

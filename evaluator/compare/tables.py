@@ -111,7 +111,6 @@ def gains_table(gains: Sequence[Measurement], word: str) -> tuple[Table, ...]:
         )
         for named, gain, relative in found
     ]
-    points = [gain for _, gain, _ in found]
     table = Table(
         id="gains",
         title="Gain with replanning",
@@ -120,8 +119,8 @@ def gains_table(gains: Sequence[Measurement], word: str) -> tuple[Table, ...]:
             *("relative gain", "why undefined"),
         ),
         rows=tuple(rows),
-        note=f"Two different numbers. {_brackets(points)} Groups count as unpaired; an interval "
-        "that reaches below 0 does not show a gain.",
+        note=f"Two different numbers. {_brackets([gain for _, gain, _ in found])} Groups count as "
+        "unpaired; an interval that reaches below 0 does not show a gain.",
     )
     return (table,)
 
@@ -239,10 +238,10 @@ def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
             "trials",
         ),
         rows=tuple(lines),
-        note="Trials with a known outcome in which a plan was executed. A verdict before motion that "
-        "predicted failure refused the plan; it was executed anyway, because the answer was only "
-        "recorded. With replanning refused plans are not executed, so the gate's misses there show "
-        "and its false refusals cannot.",
+        note="Trials with a known outcome in which a plan was executed. A verdict before motion "
+        "that predicted failure refused the plan; it was executed anyway, because the answer was "
+        "only recorded. With replanning refused plans are not executed, so the gate's misses there "
+        "show and its false refusals cannot.",
     )
 
 

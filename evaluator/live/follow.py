@@ -35,7 +35,7 @@ from evaluator.live.session import (
 )
 from evaluator.statistics.sequential import Advice
 
-# --- One line for each trial, the state in a few lines, and the same as records for other
+# One line for each trial, the state in a few lines, and the same as records for other
 # programs.
 
 SCHEMA_VERSION = 1

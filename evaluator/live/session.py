@@ -103,8 +103,6 @@ class Ledger:
         return changes, gone
 
 
-# --- What the trials so far have settled: each group's success rate, and the gain with replanning.
-
 Key = tuple[str, str, str]
 
 
@@ -172,13 +170,13 @@ def summarise_session(trials: Sequence[LiveTrial], goal: float | None) -> Sessio
         goal: Success rate that is asked about.
     """
     known = [trial for trial in trials if trial.recorded is not None]
-    groups: dict[Key, list[bool]] = {}
+    outcomes_of: dict[Key, list[bool]] = {}
     for trial in known:
-        groups.setdefault(trial.key, []).append(bool(trial.recorded))
+        outcomes_of.setdefault(trial.key, []).append(bool(trial.recorded))
     groups = dict.fromkeys((trial.task, trial.policy) for trial in known)
     gains = (_gain(task, policy, changes_of(known, task, policy)) for task, policy in groups)
     return SessionSummary(
-        rates=tuple(_rate(key, outcomes, goal) for key, outcomes in sorted(groups.items())),
+        rates=tuple(_rate(key, outcomes, goal) for key, outcomes in sorted(outcomes_of.items())),
         gains=tuple(gain for gain in gains if gain is not None),
         unknown=len(trials) - len(known),
     )
@@ -240,8 +238,6 @@ def _gain(task: str, policy: str, changes: Sequence[int]) -> GainSummary | None:
     advice = pairs_advice(changes, interval)
     return summary(low=interval.low, high=interval.high, advice=advice)
 
-
-# --- Which start and condition to run next, so that conditions stay balanced and pairs complete.
 
 BOTH = (WITHOUT, WITH)
 

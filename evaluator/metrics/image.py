@@ -48,8 +48,6 @@ def refuse_swapped(
         raise SwappedColourError(as_it_is_db=decibel[0], swapped_db=decibel[1])
 
 
-# --- How a rendered depth image differs from the recorded one.
-
 DEPTH_PROTOCOL = (
     "rendered against recorded depth along the optical axis, over pixels where both exist"
 )
@@ -91,8 +89,6 @@ def score_depth(
         num_pixels=int(both.sum()),
     )
 
-
-# --- GMSD: how unevenly the edges of two images differ; needs no learned weights.
 
 LUMA = (0.299, 0.587, 0.114)
 """Shares of red, green and blue in luma (ITU-R BT.601)."""

@@ -8,8 +8,6 @@ from typing import Literal
 
 from bridge.errors import UsageError
 
-# --- What one image metric is called and means.
-
 
 @dataclass(frozen=True, kw_only=True)
 class ImageMetric:
@@ -144,8 +142,6 @@ def common_text(stamps: Sequence[Stamp]) -> str:
 def _written(name: str, value: str) -> str:
     return value if name in _PLAIN else f"{name} {value}"
 
-
-# --- What ``evaluate`` is told about images: methods to compare, masks, and backbones of LPIPS.
 
 NetName = Literal["vgg", "alex"]
 

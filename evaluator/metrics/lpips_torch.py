@@ -20,7 +20,7 @@ from bridge.errors import MissingDependencyError, UsageError
 from evaluator.metrics.image_protocol import NetName
 from evaluator.metrics.lpips import INPUTS, MIN_SIDE_PX, NET_WORDS, Distances, InputName, metric_id
 
-# --- Weights of LPIPS: the backbone from a file of the user, the linear heads from a wheel.
+# Weights of LPIPS: the backbone from a file of the user, the linear heads from a wheel.
 #
 # Nothing is downloaded, and neither the ``lpips`` package nor torchvision is imported: only files
 # are read. Every shape is checked, since a wrong network would give a number that looks right.

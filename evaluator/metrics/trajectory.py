@@ -13,7 +13,7 @@ from bridge.geometry.signals import LAGS_S, lag_of_least_cost
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.errors import UndefinedStatisticError
 
-# --- What is left of a trajectory error without a constant delay, or without a constant rigid
+# What is left of a trajectory error without a constant delay, or without a constant rigid
 # motion.
 #
 # A delay is the controller's, a rigid motion the calibration's; what remains of an error when
@@ -115,9 +115,6 @@ def without_rigid_motion(
     """
     R, shift = align_rigid(p_replayed_m, p_recorded_m)
     return np.asarray(np.linalg.norm(p_recorded_m - (p_replayed_m @ R.T + shift), axis=1))
-
-
-# --- Errors of a motion that no constant offset explains: of its joints, and of its single steps.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,8 +270,6 @@ def angles_rad(
     far = np.linalg.norm(q_first_wxyz + q_second_wxyz, axis=1)
     return np.asarray(4.0 * np.arctan2(np.minimum(near, far), np.maximum(near, far)))
 
-
-# --- How far two sets of runs of one motion lie apart over normalised time, and how each strays.
 
 MOVING_THRESHOLD_M = 0.01
 """A run waits while it is closer than this to where it started, or will stay."""

@@ -59,8 +59,6 @@ def as_text(table: Table, *, width: int | None = None) -> str:
     return f"{text.rstrip()}\n{table.note}\n" if table.note else f"{text.rstrip()}\n"
 
 
-# --- Tables for a paper: LaTeX with booktabs, its special characters escaped.
-
 _COMMANDS = {
     "\\": r"\textbackslash{}",
     "&": r"\&",

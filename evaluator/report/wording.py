@@ -2,6 +2,7 @@
 
 import math
 
+from evaluator.compare.tables import METHOD_NAMES
 from evaluator.report.views import Shown
 from evaluator.result import Measurement, Results
 
@@ -122,7 +123,9 @@ def method_text(measurement: Measurement) -> str:
         return ""
     known = interval.worst_coverage
     worst = "" if known is None else f"; guaranteed coverage at this n: {100 * known:.1f} %"
-    return f"{100 * interval.level:.0f} % {interval.method}{worst}"
+    return (
+        f"{100 * interval.level:.0f} % {METHOD_NAMES.get(interval.method, interval.method)}{worst}"
+    )
 
 
 def measurement_text(measurement: Measurement) -> str:

@@ -24,9 +24,7 @@ from bridge.task.verdict import Verdict
 from evaluator.errors import EvaluatorError
 from evaluator.run_reader.inventory import RunFile
 
-# --- What a verdict said, as far as an evaluation goes by it.
-
-# --- What each clause of a verdict said: the three factors, and every success predicate by its
+# What each clause of a verdict said: the three factors, and every success predicate by its
 # kind.
 #
 # A clause of several objects says no as soon as one object fails it.
@@ -279,9 +277,6 @@ def _note_event(log: _Log, event: Mapping[str, Any]) -> None:
             known = {key: outcome[key] for key in names & outcome.keys()}
             stages = [s for s in outcome.get("stages") or () if isinstance(s, dict)]
             log.label = build(Outcome, {**known, "stages": stages})
-
-
-# --- The derived episodes of a run, found by what they say of themselves and not by file name.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,8 +16,6 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
 from evaluator.statistics.intervals import LEVEL, normal_quantile
 
-# --- Recorded and simulated success rates side by side, checked before anything is computed.
-
 MIN_GROUPS = 3
 """Two points always lie on a line."""
 
@@ -246,8 +244,6 @@ def mean_rate(rates: Sequence[Number]) -> float:
     return float(floats(rates).mean())
 
 
-# --- Do the twin's success rates move with the recorded ones? Pearson, Spearman, Kendall.
-
 MIN_GROUPS_INTERVAL = 4
 """Fisher's standard error is 1/sqrt(n - 3)."""
 
@@ -323,9 +319,6 @@ def fisher_interval(r: float, num_groups: int, *, level: float = LEVEL) -> Inter
 
 def _sign(value: Number) -> int:
     return (value > 0) - (value < 0)
-
-
-# --- Would the twin have chosen what is best on the robot? A high r does not say so.
 
 
 @dataclass(frozen=True, kw_only=True)

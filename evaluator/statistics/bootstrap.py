@@ -20,7 +20,7 @@ from evaluator.statistics.agreement import Number, counted_groups, exact, floats
 from evaluator.statistics.intervals import LEVEL
 from evaluator.statistics.weighted import EPSILON, STATISTICS, Values, values_of
 
-# --- On which scale a statistic of agreement errs by as much upwards as downwards, and where it
+# On which scale a statistic of agreement errs by as much upwards as downwards, and where it
 # ends.
 #
 # Fisher's z for correlations, the logarithm for errors; the others are taken as they are.
@@ -370,7 +370,7 @@ def refuse_no_width(interval: Interval) -> Interval:
     return interval
 
 
-# --- Where each statistic of agreement would fall if the same groups were measured again.
+# Where each statistic of agreement would fall if the same groups were measured again.
 #
 # A band of measurement noise, not an interval of a true value: the noise itself pulls a
 # correlation towards 0 and errors away from it.

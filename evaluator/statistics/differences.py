@@ -21,8 +21,6 @@ from evaluator.statistics.intervals import (
     wilson,
 )
 
-# --- Two answers on the same starts: only the pairs that differ carry information.
-
 BISECTIONS = 60
 """Halvings of an interval of length 2; what is left is below the spacing of floats near 1."""
 

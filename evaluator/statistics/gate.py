@@ -12,8 +12,6 @@ import numpy as np
 
 from evaluator.errors import UndefinedStatisticError
 
-# --- Is a stated success probability kept? Brier score, calibration error, reliability bins.
-
 NUM_BINS = 10
 
 

@@ -109,7 +109,7 @@ def normal_quantile(probability: float) -> float:
     return float(ndtri(probability))
 
 
-# --- Intervals of lengths that are mostly small and now and then large, as the miss of a dropped
+# Intervals of lengths that are mostly small and now and then large, as the miss of a dropped
 # cube.
 #
 # Student's interval of their mean needs many of them; the median has an interval that holds for

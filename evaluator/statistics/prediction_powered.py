@@ -19,7 +19,7 @@ from evaluator.statistics.differences import boschloo
 from evaluator.statistics.gate import Confusion
 from evaluator.statistics.intervals import LEVEL, check_count, normal_quantile, wilson
 
-# --- Do the starts that were tried on the robot lie where the twin's other starts lie?
+# Do the starts that were tried on the robot lie where the twin's other starts lie?
 #
 # What the twin says of the other starts may stand for them only if the tried ones are like them.
 # Two looks at where objects lay: are both draws from one distribution, and is any other start

@@ -197,7 +197,7 @@ def fewest(decided: Callable[[int], bool], at_least: int) -> int | None:
     return max(high, at_least)
 
 
-# --- Looking after every pair: has the rate changed between two conditions on the same starts?
+# Looking after every pair: has the rate changed between two conditions on the same starts?
 #
 # Like ``sequential``, for three outcomes of a pair: improved, worsened, the same.
 

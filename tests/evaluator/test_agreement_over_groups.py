@@ -170,7 +170,7 @@ def test_ties_are_sets_and_the_worst_of_them_counts() -> None:
     decision = choose(recorded={"a": 0.5, "b": 0.75}, sim={"a": 1, "b": 1})
     assert decision.sim_best == {"a", "b"}
     assert decision.possibly_right
-    assert not decision.surely_right
+    assert not decision.confident
     assert (float(decision.regret), decision.regret_if_lucky) == (0.25, 0)
     with pytest.raises(UndefinedStatisticError, match="1 candidate; a choice needs two"):
         choose(recorded={"a": 1}, sim={"a": 1})

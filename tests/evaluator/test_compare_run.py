@@ -65,10 +65,10 @@ def test_success_rates_are_counted_per_cell_and_side(six_trials: Any) -> None:
     assert (sim.k, sim.n) == (2, 3)
 
 
-def test_r_of_two_cells_is_undefined_with_its_reason(six_trials: Any) -> None:
+def test_r_of_two_groups_is_undefined_with_its_reason(six_trials: Any) -> None:
     r = compare_run(six_trials.run).results().get("agreement.pearson_r")
     assert r.value is None
-    assert r.reason_if_undefined == "2 cells; it needs at least 3"
+    assert r.reason_if_undefined == "2 groups; it needs at least 3"
 
 
 def test_starts_are_paired_across_conditions(six_trials: Any) -> None:

@@ -41,7 +41,7 @@ def test_the_papers_rates_give_its_averages_and_both_gains() -> None:
     assert results.get("gain.relative.recorded.average").value == pytest.approx(0.44578, abs=1e-5)
 
 
-def test_the_papers_r_without_with_and_over_all_cells() -> None:
+def test_the_papers_r_without_with_and_over_all_groups() -> None:
     results = compare_csv(RATES).results()
     # By hand: (80, 40, 46) with (80, 60, 60), and (90, 80, 70) with (100, 100, 80).
     without = results.get("agreement.pearson_r.without_replanning")
@@ -51,7 +51,7 @@ def test_the_papers_r_without_with_and_over_all_cells() -> None:
     assert results.get("agreement.pearson_r").value == pytest.approx(0.92914, abs=1e-5)
     for r in (without, with_it):
         assert r.interval is None
-        assert "3 cells; Fisher's interval needs 4" in str(r.reason_without_interval)
+        assert "3 groups; Fisher's interval needs 4" in str(r.reason_without_interval)
     assert results.get("agreement.bias_pp").value == pytest.approx(12.333, abs=5e-4)
 
 
@@ -240,7 +240,7 @@ def test_a_printed_figure_that_the_rows_do_not_give_does_not_pass(
     rows = "a,c,sim,trial,10,50,,\na,c,real,trial,10,40,,\n"
     check = check_published(write_table(f"{HEAD}{rows},,,,,,pearson_r,0.95\n"))
     assert [finding.verdict for finding in check.failed] == ["undefined"]
-    assert "printed 0.95, but the rows do not give it: 1 cell" in check.failed[0].note
+    assert "printed 0.95, but the rows do not give it: 1 group" in check.failed[0].note
 
 
 def test_the_count_behind_a_rate_of_a_billion_trials_is_not_searched_for(

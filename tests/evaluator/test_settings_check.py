@@ -108,4 +108,4 @@ def test_the_report_says_so_beside_the_rates_it_is_about(two: Any, tmp_path: Pat
         report.index(text) for text in ('id="success"', f"1 in scene {OLD}", 'id="agreement"')
     )
     assert rates < note < cells
-    assert "1 cells" not in report
+    assert "1 groups" not in report

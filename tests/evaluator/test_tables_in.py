@@ -186,7 +186,7 @@ def test_rates_without_n_have_no_interval(write_table: Callable[[str], Path]) ->
     rate = results.get("rate.recorded.a.-.-")
     assert rate.interval is None
     assert rate.reason_without_interval == "no n"
-    assert results.get("agreement.pearson_r").reason_if_undefined == "1 cell; it needs at least 3"
+    assert results.get("agreement.pearson_r").reason_if_undefined == "1 group; it needs at least 3"
 
 
 def test_a_table_that_is_neither_is_refused(

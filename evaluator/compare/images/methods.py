@@ -37,7 +37,7 @@ from evaluator.metrics.image_scores import ImageScore
 from evaluator.metrics.lpips import PerceptualNet
 from evaluator.result import Exclusion
 
-# --- Folders of images, read strictly: what cannot be compared is refused with what to do about
+# Folders of images, read strictly: what cannot be compared is refused with what to do about
 # it.
 #
 # A view is named by its path inside the folder without the ending: ``wrist/0001``. What a decoder

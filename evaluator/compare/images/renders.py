@@ -48,8 +48,6 @@ from evaluator.metrics.lpips import PerceptualNet
 from evaluator.result import Table
 from evaluator.run_reader.episodes import DerivedFile
 
-# --- Tables of several methods on the same views, the first laid out as the paper's Table I.
-
 HEADLINE = ("psnr_db", "ssim_zero", "lpips_vgg_01")
 """Metrics of the first table, by the conventions of 3D Gaussian splatting papers."""
 _NOTE = (

@@ -36,8 +36,6 @@ from evaluator.metrics.image_protocol import MASK_MODES, MaskMode, NetName
 from evaluator.metrics.image_scores import METRICS, ImageScore, score_image
 from evaluator.metrics.lpips import PerceptualNet
 
-# --- The ways one pair of images is scored: as it is, brightened, re-posed, and under each mask.
-
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
@@ -131,8 +129,6 @@ def values_by_id(scores: Mapping[Variant, ImageScore]) -> dict[str, float]:
     }
 
 
-# --- One rendered view with all its scores, as figures and dashboards take it.
-
 NUM_WORST = 4
 """Views of a method whose pictures are kept: those with the lowest raw PSNR."""
 PICTURE_WIDTH_PX = 320
@@ -188,7 +184,7 @@ def open_nets(backbones: Mapping[NetName, Path]) -> tuple[PerceptualNet, ...]:
     return tuple(LpipsNet.open(net, path) for net, path in backbones.items())
 
 
-# --- Work on many images with a few threads; NumPy and the image decoders let go of the
+# Work on many images with a few threads; NumPy and the image decoders let go of the
 # interpreter.
 #
 # Episodes are read and compared by processes: ``workers``.

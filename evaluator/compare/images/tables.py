@@ -15,8 +15,6 @@ from evaluator.metrics.image_scores import METRICS, PLAIN_METRICS, ImageScore
 from evaluator.metrics.lpips import LPIPS_METRICS, LPIPS_NOT_COMPUTED, PerceptualNet, net_of
 from evaluator.result import Cell, Measurement, Table
 
-# --- Turn the scores of many images into measurements, each with its protocol stamp.
-
 Quantities = Mapping[tuple[str, bool], Quantity]
 """By the metric, and whether the images were compared as they are stored."""
 NOT_A_SAMPLE = (

@@ -6,6 +6,7 @@ episode are found, and their scores become measurements, each with its protocol.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,8 +50,6 @@ from evaluator.metrics.image_scores import ImageScore
 from evaluator.metrics.lpips import LPIPS_NOT_COMPUTED, PerceptualNet
 from evaluator.result import Exclusion, Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
-
-# --- Scores of rendered views as the cache keeps them: plain records without images.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -310,7 +309,7 @@ def _measure_depth(
     return [
         measured(
             quantity.of(part=part, after=after),
-            lambda name=name: float(np.mean([getattr(d, name) for d in depths])),
+            partial(_mean_depth_m, depths, name),
             n=len(depths),
             counted="image",
             reason_without_interval="the per-image list is in the table",
@@ -344,3 +343,7 @@ def _described(settings: Sequence[Mapping[str, Any]]) -> str:
         if agreed := agreed_setting(settings, name):
             parts.append(text.format(agreed))
     return "; ".join(parts)
+
+
+def _mean_depth_m(depths: Sequence[DepthScore], name: str) -> float:
+    return float(np.mean([getattr(depth, name) for depth in depths]))

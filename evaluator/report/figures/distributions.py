@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from evaluator.compare.plot_data import CurveBand, Shares
+from evaluator.measurements import BAND_WIDTH
 from evaluator.report.figures.drawing import (
     LEGEND_LINE_IN,
     LIGHT,
@@ -31,7 +32,6 @@ from evaluator.compare.band_measurements import BandCurve
 from evaluator.compare.images.scores import ViewQuality
 from evaluator.compare.plot_data import shares_of
 from evaluator.compare.states import StateSummary
-from evaluator.measurements import BAND_WIDTH
 from evaluator.report.pairs import ViewPair
 
 if TYPE_CHECKING:
@@ -232,8 +232,6 @@ def _at(group: Shares, share: float) -> float:
     return next((value for value, part in pairs if part >= share - 1e-12), group.values[-1])
 
 
-# --- Predicted against localised and replayed final states, as distributions of errors.
-
 PAIRS = (
     ("plan", "recorded", "plan to localised"),
     ("planned", "recorded", "planned replay to localised"),
@@ -286,8 +284,6 @@ def _groups(
             found.append(shares)
     return tuple(found)
 
-
-# --- Image metrics of all views as distributions, and the worst views as pictures.
 
 METRICS = (
     ("psnr_db", "PSNR (dB), higher is better"),
@@ -352,8 +348,6 @@ def worst_pairs(views: Sequence[ViewQuality]) -> list[ViewPair]:
         found.append((score if score is not None else float("inf"), pair))
     return [pair for _, pair in sorted(found, key=lambda item: item[0])]
 
-
-# --- Simulated runs against the band of recorded ones, over normalised time.
 
 BAND_COLOURS = ("sim", "third", "fourth", "ink", "soft")
 """The recorded colour is the band's."""

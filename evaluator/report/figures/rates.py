@@ -25,19 +25,7 @@ from evaluator.statistics.agreement import counted_groups
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-
-# --- Where trials are lost: the funnel of stages, one block per task and condition.
 
 MAX_LINES = 60
 Row = tuple[Cell, ...]
@@ -108,9 +96,6 @@ def _bar(axes: "Axes", row: Row, y: float, most: int) -> None:
     if row[5]:
         text += f" ({row[5]} unknown)"
     axes.text(1.04 * most, middle, text, va="center", fontsize=7.5, clip_on=False)
-
-
-# --- What replanning gained, per task and side, in percentage points.
 
 
 def gains(measurements: Sequence[Measurement], word: str) -> Drawing | NotDrawn:

@@ -21,7 +21,7 @@ from matplotlib.font_manager import get_font
 
 from evaluator.report.figures.drawing import LIGHT, Drawing, Rendered
 
-# --- One cut of the font for the PDF files of all figures.
+# One cut of the font for the PDF files of all figures.
 #
 # matplotlib cuts out of the font what each file needs, and fontTools takes longer for that than
 # everything else in a figure. Here one cut with the usual characters is made and put into every

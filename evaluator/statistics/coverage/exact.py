@@ -90,7 +90,7 @@ def _summary(n: int, covered: Float64[np.ndarray, " rates"], names: Sequence[str
     )
 
 
-# --- Coverage of Newcombe's interval for groups of different size, counted out when it is asked
+# Coverage of Newcombe's interval for groups of different size, counted out when it is asked
 # for.
 #
 # The stored map holds groups of equal size. The smaller group's entry is no bound for others:
@@ -141,8 +141,6 @@ def _chances(n: int) -> Float64[np.ndarray, "rates counts"]:
     ways = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
     return np.asarray(np.exp(ways + xlogy(k, rates) + xlog1py(n - k, -rates)))
 
-
-# --- Coverage of intervals of lengths: counted out for the median, drawn for the mean.
 
 Sample = Float64[np.ndarray, "draws lengths"]
 

@@ -16,10 +16,8 @@ from evaluator.statistics.coverage.exact import Coverage
 from evaluator.statistics.gate import Confusion
 from evaluator.statistics.weighted import STATISTICS, Values, values_of
 
-# --- Coverage by drawing groups: every statistic of agreement, by every method, from the same
+# Coverage by drawing groups: every statistic of agreement, by every method, from the same
 # draws.
-
-# --- What groups are drawn from when the coverage of agreement is simulated.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -120,8 +120,6 @@ def vouch(
     return replace(interval, worst_coverage=round(known.worst, 4)), ""
 
 
-# --- Which method gives the interval of a statistic over so many groups: the map decides.
-
 LEVEL = 0.95
 CLOSED_FORMS: dict[tuple[str, str], tuple[str, str]] = {
     ("pearson", "points"): ("fisher-z", "fisher-z"),

@@ -130,7 +130,7 @@ def test_evaluate_writes_everything_and_says_where(evaluated: Evaluated) -> None
     run, code, shown = evaluated
     assert code == 0
     assert "5/6 = 83.3 %" in shown
-    assert "undefined: 2 cells; it needs at least 3" in shown
+    assert "undefined: 2 groups; it needs at least 3" in shown
     assert "Stand-in:" in shown
     assert load_results(run.path).get("agreement.sim_planned.rate").k == 5
     for name in ("report.html", "trials.csv", "figures/success.svg", "figures/success.pdf"):
