@@ -139,7 +139,7 @@ def motions(run: RunFolder) -> Spent:
 
 def intervals() -> Spent:
     """Every statistic's bootstrap interval over 8 policies: 6,435 resamples, drawn once."""
-    from evaluator.statistics.bootstrap import CellSample
+    from evaluator.statistics.bootstrap import GroupSample
     from evaluator.statistics.weighted import STATISTICS
 
     rng = np.random.default_rng(2)
@@ -147,7 +147,7 @@ def intervals() -> Spent:
     clusters = [index // 3 for index in range(24)]
 
     def all_of_them() -> None:
-        sample = CellSample(recorded=recorded, sim=sim, rng=rng, clusters=clusters)
+        sample = GroupSample(recorded=recorded, sim=sim, rng=rng, clusters=clusters)
         for statistic in STATISTICS:
             sample.interval(statistic, "bootstrap")
 
