@@ -1,4 +1,4 @@
-"""Commands of the room ``evaluator``; imports stay late so that --help is quick."""
+"""Commands of ``evaluator``; imports stay late so that --help is quick."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal

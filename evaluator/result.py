@@ -7,14 +7,28 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from bridge.errors import InvalidRecordError, PathNotFoundError
 from bridge.task.record import check_record, parse_record
-from bridge.units import Unit
 from bridge.whole_file import write_whole
 from evaluator.errors import EvaluatorError
+
+
+class Unit(StrEnum):
+    """SI units and the few dimensionless ones that measurements carry."""
+
+    METRE = "m"
+    RADIAN = "rad"
+    SECOND = "s"
+    NANOSECOND = "ns"
+    DECIBEL = "dB"
+    FRACTION = "1"
+    COUNT = "count"
+    PERCENTAGE_POINT = "pp"
+
 
 SCHEMA_VERSION = 2
 

@@ -1,5 +1,6 @@
 """Commands that record, and that control a recorder from anywhere."""
 
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -134,7 +135,9 @@ def ctl(
         )
     with open_session(WireConfig(connect=connect, config=zenoh_config)) as session:
         answer = RecorderClient(session, recorder).ask(action, requests[action])
-    describe = {"status": describe_status, "list": _describe_list}.get(action, describe_answer)
+    describers: dict[str, Callable[[dict[str, Any]], str]]
+    describers = {"status": describe_status, "list": _describe_list}
+    describe = describers.get(action, describe_answer)
     output.result(answer, describe(answer))
     return 0
 

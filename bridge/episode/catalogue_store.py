@@ -57,7 +57,7 @@ class Entry:
     """Of all parts."""
     parts: int = 1
     lost: int | None = None
-    """Messages the recorder declared lost; None when nobody counted."""
+    """Messages the recorder logged as dropped; None when nobody counted."""
     recovered: bool = False
     """Its writer was killed, so its tail is missing."""
     error: str = ""
@@ -172,7 +172,7 @@ class CatalogueQuery:
     until: str | None = None
     """Begun before this time."""
     lost: bool | None = None
-    """Only with declared losses, or recovered after a crash; --no-lost only those without."""
+    """Only with dropped messages, or recovered after a crash; --no-lost only those without."""
     error: bool | None = None
     """Only those that cannot be read; --no-error only the others."""
     sort: Order = "name"

@@ -1,7 +1,7 @@
 """Verify an episode: every CRC, index and stream, and list the messages that were dropped.
 
 Broken is what contradicts itself: damage, indexes and counts that disagree with the data, messages
-that are not what they promise, parts that are missing. Lost is another matter: a ledger that lists
+that are not what they promise, parts that are missing. Lost is another matter: a drop log with
 losses, or a recording that was cut off and recovered, leaves a whole file (``exit_code`` 3). Files
 of other programs are held to the format only; our contract is asked of ours.
 """
@@ -71,7 +71,7 @@ class CheckReport:
     """What a person may want to know; never makes it broken."""
     declared_losses: int = 0
     undeclared_losses: int = 0
-    """Numbers missing on topics of a recording whose ledger does not list them."""
+    """Numbers missing on topics of a recording whose drop log does not list them."""
     recovered: dict[str, Any] | None = None
     """What recovery said: the recorder died, and the end of the recording is unknown."""
 
@@ -87,12 +87,12 @@ class CheckReport:
     def summary(self) -> str:
         """A word or two."""
         if self.exit_code == 3 and self.undeclared_losses:
-            return "losses not declared"
-        return {0: "clean", 1: "broken", 3: "losses declared"}[self.exit_code]
+            return "drops not logged"
+        return {0: "clean", 1: "broken", 3: "drops logged"}[self.exit_code]
 
     def lines(self) -> list[str]:
         """What to print: one line, and one for each fault and note."""
-        lost = f"{self.declared_losses} declared lost"
+        lost = f"{self.declared_losses} dropped (logged)"
         if self.undeclared_losses:
             lost += f", {self.undeclared_losses} more missing"
         parts = f" in {len(self.parts)} parts" if len(self.parts) > 1 else ""
@@ -263,21 +263,21 @@ def _judge_topics(
     for topic, topic_watch in sorted(watch.topics.items()):
         result = report.topics[topic] = topic_watch.finish()
         report.messages += result.messages
-        result.declared_losses = decoder.ledger.get(topic, 0)
+        result.declared_losses = decoder.drop_log.get(topic, 0)
         if result.undecodable:
             _say(report, faults if ours else None, result.first_fault)
         if result.time_steps_back:
             text = f"{topic}: its log time steps back {result.time_steps_back} times"
             _say(report, faults if ours and is_recording else None, text)
-        if decoder.has_ledger and topic not in shared:
+        if decoder.has_drop_log and topic not in shared:
             missing = max(0, result.sequence_gaps - result.declared_losses)
             report.undeclared_losses += missing
             if missing:
                 report.notes.append(
                     f"{topic}: {result.sequence_gaps} numbers are missing, "
-                    f"the ledger declares {result.declared_losses}"
+                    f"the drop log lists {result.declared_losses}"
                 )
-    report.declared_losses = sum(decoder.ledger.values())
+    report.declared_losses = sum(decoder.drop_log.values())
     for text in decoder.size_faults():
         _say(report, faults if ours else None, text)
 
@@ -296,7 +296,7 @@ def _is_imported(episode: Episode | None) -> bool:
 
 
 def _shared_topics(episode: Episode | None) -> list[str]:
-    """Topics of several publishers: a file does not say whose number is whose, the ledger knew."""
+    """Topics of several publishers: the file does not say whose number is whose."""
     record = episode.metadata_records.get("drops", {}) if episode else {}
     topics = record.get("several_publishers")
     return topics if isinstance(topics, list) else []

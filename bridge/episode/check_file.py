@@ -33,7 +33,7 @@ from bridge.episode.mcap.walk import (
     BrokenRecordError,
     ByteStream,
     MessageHead,
-    Place,
+    RecordSpan,
     attachment_of,
     message_head,
     parse,
@@ -69,7 +69,7 @@ class Seen:
             self.start_ns = head.log_time_ns
         self.end_ns = max(self.end_ns, head.log_time_ns)
 
-    def define(self, place: Place, record: records.McapRecord | None) -> Iterator[str]:
+    def define(self, place: RecordSpan, record: records.McapRecord | None) -> Iterator[str]:
         """Take a schema, channel or metadata record; yields what is wrong with it."""
         if isinstance(record, records.Metadata):
             self.metadata.append(metadata_entry(place, record))
@@ -274,7 +274,7 @@ class FileCheck:
         if not ended:
             self._fault("the end of its data is not marked")
 
-    def _take(self, place: Place, body: bytes) -> Iterator[ScannedMessage]:
+    def _take(self, place: RecordSpan, body: bytes) -> Iterator[ScannedMessage]:
         if place.opcode == MESSAGE:
             front = RECORD_HEAD.pack(place.opcode, place.length) + body[: MESSAGE_HEAD.size]
             head = message_head(front, 0, place.offset)
@@ -294,11 +294,11 @@ class FileCheck:
         self.seen.count(head)
         yield ScannedMessage(channel, self.seen.schemas.get(channel.schema_id), head, data)
 
-    def _define(self, place: Place, record: records.McapRecord | None) -> None:
+    def _define(self, place: RecordSpan, record: records.McapRecord | None) -> None:
         for text in self.seen.define(place, record):
             self._fault(text)
 
-    def _walk_chunk(self, place: Place, body: bytes) -> Iterator[ScannedMessage]:
+    def _walk_chunk(self, place: RecordSpan, body: bytes) -> Iterator[ScannedMessage]:
         self._end_chunk()
         whose = f"the chunk at byte {place.offset}"
         self.seen.num_chunks += 1
@@ -316,7 +316,9 @@ class FileCheck:
                 payload = at + MESSAGE_HEAD.size
                 yield from self._message(head, data[payload : start + length])
             else:
-                self._define(Place(opcode, at, length), parse(opcode, data[start : start + length]))
+                self._define(
+                    RecordSpan(opcode, at, length), parse(opcode, data[start : start + length])
+                )
         found = (first_ns, last_ns) if self._entries else (0, 0)
         if found != (chunk.start_ns, chunk.end_ns):
             said = (chunk.start_ns, chunk.end_ns)
@@ -329,7 +331,7 @@ class FileCheck:
         entries.append(head.log_time_ns)
         entries.append(head.at)
 
-    def _check_index(self, place: Place, body: bytes) -> None:
+    def _check_index(self, place: RecordSpan, body: bytes) -> None:
         channel_id, said = _index_entries(body)
         if self._chunk is None:
             self._fault(f"the message index at byte {place.offset} follows no chunk")
@@ -356,7 +358,7 @@ class FileCheck:
         self._entries = {}
         self._indexed = set()
 
-    def _add_attachment(self, stream: ByteStream, place: Place) -> None:
+    def _add_attachment(self, stream: ByteStream, place: RecordSpan) -> None:
         try:
             found, data_size = attachment_of(stream, place, keep=False)
             self.seen.attachments.append(attachment_entry(place, found, data_size))
@@ -372,7 +374,7 @@ class FileCheck:
             left -= len(piece)
             self._crc = zlib.crc32(piece, self._crc)
 
-    def _check_data_end(self, stream: ByteStream, place: Place) -> None:
+    def _check_data_end(self, stream: ByteStream, place: RecordSpan) -> None:
         record = parse(place.opcode, read_body(stream, place))
         if isinstance(record, records.DataEnd) and record.data_section_crc not in (0, self._crc):
             self._fault("its data has another CRC than it declares")

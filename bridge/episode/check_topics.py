@@ -32,7 +32,7 @@ from bridge.task.verdict import Verdict
 
 
 class Decoder:
-    """Reads messages and forgets them, but for the ledger and the sizes of depth images.
+    """Reads messages and forgets them, but for the drop log and the sizes of depth images.
 
     A topic of the contract must hold what ``docs/episode_format.md`` says. Any other topic of a
     known type need only be valid: a camera of another maker may send raw colour or a distorted
@@ -40,10 +40,10 @@ class Decoder:
     """
 
     def __init__(self) -> None:
-        """Start without a ledger."""
-        self.ledger: dict[str, int] = {}
+        """Start without a drop log."""
+        self.drop_log: dict[str, int] = {}
         """Losses declared by topic."""
-        self.has_ledger = False
+        self.has_drop_log = False
         self.missing: set[str] = set()
         """Sentences on packages without which something was not decoded."""
         self._depth_sizes: dict[str, tuple[int, int]] = {}
@@ -90,9 +90,9 @@ class Decoder:
             codec.validate(type_name, data)
 
     def _add_losses(self, record: dict[str, Any]) -> None:
-        self.has_ledger = True
+        self.has_drop_log = True
         lost = record["gaps"] + record["queue_drops"] + record.get("shed", 0)
-        self.ledger[record["topic"]] = self.ledger.get(record["topic"], 0) + lost
+        self.drop_log[record["topic"]] = self.drop_log.get(record["topic"], 0) + lost
 
     def size_faults(self) -> list[str]:
         """Sentences on depth images that are not of the size their camera info says."""
@@ -220,7 +220,7 @@ class TopicCheck:
     sequences_backward: int = 0
     """Numbers repeated, late, or of a publisher that began anew."""
     declared_losses: int = 0
-    """Gaps, queue drops and shed messages the ledger lists."""
+    """Gaps, queue drops and shed messages the drop log lists."""
     time_steps_back: int = 0
     """Messages whose log time is before that of the one before."""
     latency_median_s: float = 0.0

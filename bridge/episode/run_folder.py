@@ -118,7 +118,7 @@ class RunFolder:
 
     @property
     def scene_dir(self) -> Path:
-        """The rebuilt place."""
+        """The rebuilt scene."""
         return self.path / "scene"
 
     @property

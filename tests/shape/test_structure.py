@@ -50,7 +50,7 @@ def imported(path: Path, *, lazily: bool = True) -> set[str]:
             case ast.ImportFrom(module=str(module)):
                 found |= {f"{module}.{alias.name}" for alias in node.names} | {module}
             case ast.Constant(value=str(text)) if lazily:
-                found.add(text.partition(":")[0])
+                found.add(text.partition(":")[0] if "." in text else "")
     direct = {name for name in found if name in known}
     packages = {name for name in direct if any(other.startswith(f"{name}.") for other in direct)}
     return direct - packages
@@ -75,11 +75,18 @@ def test_functions_fit_a_screen() -> None:
     assert lengths[int(0.95 * len(lengths))] <= 60
 
 
+def _is_offered(name: str) -> bool:
+    package = modules().get(name.rpartition(".")[0])
+    return package is not None and package.name == "__init__.py" and name in imported(package)
+
+
 def test_a_small_module_that_one_neighbour_imports_is_part_of_it() -> None:
     importers = defaultdict(set)
     for name, path in modules().items():
         for other in imported(path):
             importers[other].add(name)
+        # what a package offers by its own name is public
+        importers[name] |= {"everybody"} if _is_offered(name) else set()
     tested = set()
     for path in (ROOT / "tests").rglob("*.py"):
         tested |= imported(path)

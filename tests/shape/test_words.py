@@ -156,8 +156,8 @@ WORDS = {
     "room": Word(
         use="package, module",
         files="rooms?",
-        names="rooms?",
-        text=r"(?<!head)\brooms?\b(?! planes?)",
+        names="rooms",
+        text=r"\brooms\b|\b(of|in) the room\b",
     ),
 }
 

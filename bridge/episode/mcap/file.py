@@ -24,7 +24,7 @@ from bridge.episode.mcap.walk import (
     BrokenRecordError,
     ByteStream,
     ChunkHead,
-    Place,
+    RecordSpan,
     attachment_of,
     message_head,
     parse,
@@ -50,7 +50,7 @@ def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
     return builder.finish()
 
 
-def chunk_entry(place: Place, chunk: ChunkHead) -> records.ChunkIndex:
+def chunk_entry(place: RecordSpan, chunk: ChunkHead) -> records.ChunkIndex:
     """Make the index entry of a chunk; its message indexes are yet to be added."""
     return records.ChunkIndex(
         chunk_length=place.end - place.offset,
@@ -65,7 +65,7 @@ def chunk_entry(place: Place, chunk: ChunkHead) -> records.ChunkIndex:
     )
 
 
-def metadata_entry(place: Place, record: records.Metadata) -> records.MetadataIndex:
+def metadata_entry(place: RecordSpan, record: records.Metadata) -> records.MetadataIndex:
     """Make the index entry of a metadata record."""
     return records.MetadataIndex(
         offset=place.offset, length=place.end - place.offset, name=record.name
@@ -73,7 +73,7 @@ def metadata_entry(place: Place, record: records.Metadata) -> records.MetadataIn
 
 
 def attachment_entry(
-    place: Place, record: records.Attachment, data_size: int
+    place: RecordSpan, record: records.Attachment, data_size: int
 ) -> records.AttachmentIndex:
     """Make the index entry of an attachment."""
     return records.AttachmentIndex(
@@ -95,7 +95,7 @@ class _Builder:
         self._end_ns = 0
         self._chunk: records.ChunkIndex | None = None
 
-    def add(self, stream: ByteStream, place: Place) -> None:
+    def add(self, stream: ByteStream, place: RecordSpan) -> None:
         """Take one record of the data section."""
         if place.opcode == mcap_format.MESSAGE:
             stream.seek(place.offset)
@@ -115,7 +115,7 @@ class _Builder:
         if place.opcode not in (mcap_format.CHUNK, mcap_format.MESSAGE_INDEX):
             self._chunk = None
 
-    def _note(self, place: Place, record: records.McapRecord | None) -> None:
+    def _note(self, place: RecordSpan, record: records.McapRecord | None) -> None:
         if isinstance(record, records.Metadata):
             self.summary.metadata_indexes.append(metadata_entry(place, record))
         elif isinstance(record, records.MessageIndex) and self._chunk is not None:
@@ -139,7 +139,7 @@ class _Builder:
         self._start_ns = min(earliest, log_time_ns)
         self._end_ns = max(self._end_ns, log_time_ns)
 
-    def _add_chunk(self, stream: ByteStream, place: Place) -> None:
+    def _add_chunk(self, stream: ByteStream, place: RecordSpan) -> None:
         chunk = parse_chunk(read_body(stream, place))
         data = unpack_chunk(chunk, whose=f"the chunk at byte {place.offset}")
         for opcode, at, length in records_in(data):
@@ -152,7 +152,7 @@ class _Builder:
         self._chunk = chunk_entry(place, chunk)
         self.summary.chunk_indexes.append(self._chunk)
 
-    def _add_attachment(self, stream: ByteStream, place: Place) -> None:
+    def _add_attachment(self, stream: ByteStream, place: RecordSpan) -> None:
         found, data_size = attachment_of(stream, place, keep=False)
         self.summary.attachment_indexes.append(attachment_entry(place, found, data_size))
 
@@ -186,7 +186,7 @@ class LooseMessages:
 
 
 def damaged(path: Path, error: BaseException) -> EpisodeError:
-    """Make one sentence of what reading a file's bytes raised."""
+    """Make one message of what reading a file's bytes raised."""
     return EpisodeError(
         path=path,
         found=f"damaged ({type(error).__name__}: {str(error)[:120]})",
@@ -223,7 +223,7 @@ class McapFile:
             if isinstance(record, records.Metadata):
                 yield record
 
-    def _indexed(self, stream: ByteStream, offset: int, opcode: int) -> Place:
+    def _indexed(self, stream: ByteStream, offset: int, opcode: int) -> RecordSpan:
         """Return the place of the record an index points at."""
         place = next(walk(stream, offset, self.data_end), None)
         if place is None or place.opcode != opcode:
@@ -277,7 +277,7 @@ class McapFile:
             yield at, self.data_end
 
 
-def _note(stream: ByteStream, place: Place, found: LooseMessages) -> None:
+def _note(stream: ByteStream, place: RecordSpan, found: LooseMessages) -> None:
     stream.seek(place.offset)
     head = message_head(stream.read(MESSAGE_HEAD.size), 0, place.offset)
     found.log_times_ns.append(head.log_time_ns)

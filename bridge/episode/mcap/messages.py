@@ -29,7 +29,7 @@ from bridge.episode.mcap.walk import (
     BrokenRecordError,
     ByteStream,
     MessageHead,
-    Place,
+    RecordSpan,
     message_head,
     parse_chunk,
     read_body,
@@ -420,7 +420,7 @@ class _Loose:
             stream.seek(offset)
             head = message_head(stream.read(MESSAGE_HEAD.size), 0, offset)
             payload_at = offset + MESSAGE_HEAD.size - RECORD_HEAD.size
-            yield head, read_body(stream, Place(MESSAGE, payload_at, head.length))
+            yield head, read_body(stream, RecordSpan(MESSAGE, payload_at, head.length))
 
 
 _Source = _Chunk | _Loose

@@ -61,7 +61,7 @@ class BrokenRecordError(ValueError):
     """A record is not what it claims to be. The reader makes a sentence with the file's name."""
 
 
-class Place(NamedTuple):
+class RecordSpan(NamedTuple):
     """Where a record lies."""
 
     opcode: int
@@ -76,7 +76,7 @@ class Place(NamedTuple):
         return self.offset + RECORD_HEAD.size + self.length
 
 
-def walk(stream: ByteStream, start: int, end: int) -> Iterator[Place]:
+def walk(stream: ByteStream, start: int, end: int) -> Iterator[RecordSpan]:
     """Yield the places of all records between two offsets; the stream may be used in between.
 
     Raises:
@@ -90,7 +90,7 @@ def walk(stream: ByteStream, start: int, end: int) -> Iterator[Place]:
         at = place.end
 
 
-def walk_section(section: bytes, start: int) -> Iterator[Place]:
+def walk_section(section: bytes, start: int) -> Iterator[RecordSpan]:
     """Yield the places of all records of a section of a file that is in memory.
 
     Args:
@@ -108,7 +108,7 @@ def walk_section(section: bytes, start: int) -> Iterator[Place]:
         at = place.end
 
 
-def _place(head: bytes, at: int, end: int) -> Place:
+def _place(head: bytes, at: int, end: int) -> RecordSpan:
     if len(head) < RECORD_HEAD.size:
         message = f"the record at byte {at} is cut off"
         raise BrokenRecordError(message)
@@ -119,10 +119,10 @@ def _place(head: bytes, at: int, end: int) -> Place:
     if length > end - at - RECORD_HEAD.size:
         message = f"the record at byte {at} claims {length} bytes, {end - at} are left"
         raise BrokenRecordError(message)
-    return Place(opcode, at, length)
+    return RecordSpan(opcode, at, length)
 
 
-def read_body(stream: ByteStream, place: Place) -> bytes:
+def read_body(stream: ByteStream, place: RecordSpan) -> bytes:
     """Return a record's bytes without opcode and length."""
     stream.seek(place.offset + RECORD_HEAD.size)
     body = stream.read(place.length)
@@ -205,7 +205,7 @@ class FoundAttachment(NamedTuple):
     data_size: int
 
 
-def attachment_of(stream: ByteStream, place: Place, *, keep: bool = True) -> FoundAttachment:
+def attachment_of(stream: ByteStream, place: RecordSpan, *, keep: bool = True) -> FoundAttachment:
     """Read an attachment record and check its CRC; without ``keep`` its data is left empty.
 
     Raises:
@@ -241,7 +241,7 @@ def attachment_of(stream: ByteStream, place: Place, *, keep: bool = True) -> Fou
 
 
 def _attachment_crc(
-    stream: ByteStream, place: Place, count: int, data_start: int, *, keep: bool
+    stream: ByteStream, place: RecordSpan, count: int, data_start: int, *, keep: bool
 ) -> tuple[int, list[bytes]]:
     stream.seek(place.offset + RECORD_HEAD.size)
     crc = zlib.crc32(stream.read(data_start))

@@ -11,7 +11,7 @@ from mcap.writer import CompressionType, Writer
 from bridge.episode.check import check_episode
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.format import MAGIC, RECORD_HEAD
-from bridge.episode.mcap.walk import Place, walk
+from bridge.episode.mcap.walk import RecordSpan, walk
 
 FOOTER_CRC_BYTES = 4 + len(MAGIC)
 
@@ -31,11 +31,11 @@ def whole_file() -> bytes:
     return stream.getvalue()
 
 
-def places(data: bytes) -> list[Place]:
+def places(data: bytes) -> list[RecordSpan]:
     return list(walk(io.BytesIO(data), len(MAGIC), len(data) - len(MAGIC)))
 
 
-def find(data: bytes, opcode: int, *, in_summary: bool) -> Place:
+def find(data: bytes, opcode: int, *, in_summary: bool) -> RecordSpan:
     end = next(place for place in places(data) if place.opcode == mcap_format.DATA_END)
     return next(
         place

@@ -121,7 +121,7 @@ def test_losses_the_ledger_does_not_list_are_named(tmp_path: Path) -> None:
     report = check(tmp_path, fill)
     assert (report.exit_code, report.summary) == (3, "losses not declared")
     assert (report.declared_losses, report.undeclared_losses) == (1, 2)
-    assert report.notes == [f"{JOINTS}: 3 numbers are missing, the ledger declares 1"]
+    assert report.notes == [f"{JOINTS}: 3 numbers are missing, the drop log lists 1"]
 
 
 @pytest.mark.parametrize("is_recovered", [False, True])
@@ -149,7 +149,7 @@ def test_what_a_pause_left_out_is_no_loss_and_nothing_else_is_excused(
 
     report = check(tmp_path, fill)
     assert report.undeclared_losses == 1
-    assert report.notes == [f"{JOINTS}: 1 numbers are missing, the ledger declares 0"]
+    assert report.notes == [f"{JOINTS}: 1 numbers are missing, the drop log lists 0"]
 
 
 def test_without_a_ledger_numbers_prove_nothing(tmp_path: Path) -> None:

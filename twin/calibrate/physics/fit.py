@@ -200,7 +200,7 @@ class Predictor(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitConfig:
+class PhysicsFitConfig:
     """How hard to look."""
 
     evaluations: int = 50
@@ -246,7 +246,7 @@ class Fit:
 def fit(
     predictor: Predictor,
     parameters: Sequence[PhysicsParameter],
-    config: FitConfig,
+    config: PhysicsFitConfig,
     advance: Callable[[int, str], None] = lambda done, note: None,
 ) -> Fit:
     """Find parameters from the training cases and judge them on the held-out ones.
@@ -309,7 +309,7 @@ def _emulate(
     split: Split,
     centre: Float[np.ndarray, " num_parameters"],
     bounds: Float[np.ndarray, "num_parameters 2"],
-    config: FitConfig,
+    config: PhysicsFitConfig,
     advance: Callable[[int, str], None],
 ) -> tuple[Emulator, int]:
     """Two clouds: the first says how wide the second has to be."""

@@ -19,7 +19,7 @@ from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.physics.cases import Case, read_cases
 from twin.calibrate.physics.emulator import cloud_size
-from twin.calibrate.physics.fit import Estimate, Fit, FitConfig, fit
+from twin.calibrate.physics.fit import Estimate, Fit, PhysicsFitConfig, fit
 from twin.calibrate.physics.incline import pybullet_friction
 from twin.calibrate.physics.parameters import (
     BIAS,
@@ -258,7 +258,9 @@ def calibrate_physics(
     physics = PhysicsConfig()
     parameters = rigid_parameters(physics)
     total = config.evaluations + 2 * cloud_size(len(parameters))
-    settings = FitConfig(evaluations=config.evaluations, budget_s=config.budget_s, seed=config.seed)
+    settings = PhysicsFitConfig(
+        evaluations=config.evaluations, budget_s=config.budget_s, seed=config.seed
+    )
     output.say(
         f"{len(cases)} episodes: "
         + ", ".join(

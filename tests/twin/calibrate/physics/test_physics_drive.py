@@ -17,7 +17,7 @@ from bridge.task.plan import Plan
 from bridge.task.task_file import load_task
 from twin.calibrate.physics import simulate
 from twin.calibrate.physics.cases import Case, Prediction, planar
-from twin.calibrate.physics.fit import FitConfig, fit
+from twin.calibrate.physics.fit import PhysicsFitConfig, fit
 from twin.calibrate.physics.parameters import (
     FINGER_FRICTION,
     SURFACE_FRICTION,
@@ -165,7 +165,7 @@ def test_friction_of_simulated_slides_is_recovered_within_its_interval_in_proces
         noise = rng.standard_normal((1, 3)) * [0.001, 0.001, 0.01]
         cases.append(Case(**{**vars(case), "settled": seen.settled + noise}))
     with Evaluator(cases, some, CONFIG, num_samples=0, workers=2) as evaluator:
-        found = fit(evaluator, some, FitConfig(evaluations=8))
+        found = fit(evaluator, some, PhysicsFitConfig(evaluations=8))
         (pooled,) = evaluator.predict(np.zeros((1, 1)), [0])
     (item,) = found.estimates
     assert item.identified

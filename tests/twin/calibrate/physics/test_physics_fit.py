@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from twin.calibrate.physics.cases import Case
-from twin.calibrate.physics.fit import Fit, FitConfig, fit, split_cases
+from twin.calibrate.physics.fit import Fit, PhysicsFitConfig, fit, split_cases
 from twin.calibrate.physics.parameters import (
     FINGER_FRICTION,
     MASS_SCALE,
@@ -27,7 +27,7 @@ ALL = tuple(
     if item.name in (SURFACE_FRICTION, FINGER_FRICTION, MASS_SCALE, "bias_x_m")
 )
 PROBES = ("push", "slide", "squeeze") * 4
-QUICK = FitConfig(evaluations=40)
+QUICK = PhysicsFitConfig(evaluations=40)
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # the first fit, made for all, is checked
 
@@ -133,7 +133,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
         found = fit(
             synthetic.observe(("push", "slide") * 4, some, x, seed=100 + seed),
             some,
-            FitConfig(evaluations=20, seed=seed),
+            PhysicsFitConfig(evaluations=20, seed=seed),
         )
         for item, u in zip(found.estimates, x, strict=True):
             inside += item.low <= item.parameter.value(u) <= item.high
