@@ -106,21 +106,24 @@ def _vertices(path: Path) -> bytes:
 
 def compare_episodes(before: Path, after: Path, into: Differences) -> None:
     """Topic and payload of every message, episode by episode, whatever settings hash it carries."""
-    theirs = {_without_hash(path): path for path in sorted((after / "derived").glob("*.mcap"))}
-    for path in sorted((before / "derived").glob("*.mcap")):
-        key = _without_hash(path)
-        other = theirs.pop(key, None)
+    ours = {path.name: path for path in sorted((before / "derived").glob("*.mcap"))}
+    theirs = {path.name: path for path in sorted((after / "derived").glob("*.mcap"))}
+    by_hash = {_without_hash(name): path for name, path in theirs.items() if name not in ours}
+    for name, path in ours.items():
+        # where settings are hashed otherwise, the rest of the name says which replay it is
+        other = theirs.pop(name, None) or by_hash.pop(_without_hash(name), None)
         if other is None:
-            into.add(f"derived/{key}: missing afterwards")
+            into.add(f"derived/{name}: missing afterwards")
             continue
+        theirs.pop(other.name, None)
         into.count("derived episodes")
-        _compare_messages(key, path, other, into)
-    for key in theirs:
-        into.add(f"derived/{key}: only afterwards")
+        _compare_messages(_without_hash(name), path, other, into)
+    for name in theirs:
+        into.add(f"derived/{name}: only afterwards")
 
 
-def _without_hash(path: Path) -> str:
-    return re.sub(r"\.[0-9a-f]{8,12}(?=\.mcap$)", "", path.name)
+def _without_hash(name: str) -> str:
+    return re.sub(r"\.[0-9a-f]{8,12}(?=\.mcap$)", "", name)
 
 
 def _messages(path: Path) -> dict[str, list[bytes]]:
