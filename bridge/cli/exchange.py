@@ -286,16 +286,25 @@ def import_kinova(folder: Path, run: Path, /, *, output: Output = OUTPUT) -> int
         output: How to talk.
     """
     from bridge.episode.run_folder import RunFolder
-    from bridge.exchange.kinova import find_runs, import_runs
+    from bridge.exchange.kinova import KinovaFormatError, find_runs, import_runs
 
-    real, simulated = find_runs(folder)
-    files = []
-    with output.progress("import", len(real) + len(simulated)) as advance:
-        for path, _ in import_runs(folder, RunFolder.create(run)):
+    total = sum(map(len, find_runs(folder)))
+    files, real, skipped = [], 0, list[KinovaFormatError]()
+    with output.progress("import", total) as advance:
+        for path, imported in import_runs(folder, RunFolder.create(run), skipped):
             files.append(str(path))
-            advance(len(files), path.name)
-    data = {"real": len(real), "simulated": len(simulated), "files": files}
-    output.result(data, f"{len(real)} real and {len(simulated)} simulated runs in {run}")
+            real += imported.engine is None
+            advance(len(files) + len(skipped), path.name)
+    simulated = len(files) - real
+    data = {
+        "real": real,
+        "simulated": simulated,
+        "files": files,
+        "skipped": [str(fault) for fault in skipped],
+    }
+    lines = [f"{real} real and {simulated} simulated runs in {run}"]
+    lines += [f"skipped: {fault}" for fault in skipped]
+    output.result(data, "\n".join(lines))
     return 0
 
 

@@ -5,9 +5,12 @@ simulator runs (``sim/Experiment*/*.csv``) become unpaired derived episodes.
 
 Three facts that the folder's notes leave open were settled by numbers (see
 ``tests/bridge/exchange``): the nine ``Rot`` values are column by column (then R = Rx(roll)
-Ry(pitch) Rz(yaw) holds to 6e-6, row by row it is off by 0.04); PyBullet files hold quaternions as
-xyzw and MuJoCo files as wxyz (the other way round the end effector would turn 24 degrees
-differently from the real one, or start upside down).
+Ry(pitch) Rz(yaw) holds to 6e-6, row by row it is off by 0.04); PyBullet and V-REP files hold
+quaternions as xyzw and MuJoCo files as wxyz (the other way round the end effector would turn 24
+degrees differently from the real one, or start upside down).
+
+A file that cannot be used (damaged, of an unknown simulator, of a simulation that exploded) is
+listed and skipped; the others are imported.
 """
 
 import json
@@ -41,8 +44,20 @@ _REAL_COLUMNS = 53
 _SIM_COLUMNS = 14
 _BODY_STARTS = {BASE_TOPIC: 2, TCP_TOPIC: 19, CUBE_TOPIC: 36}
 _REAL_NAME = re.compile(r"^(?P<task>[A-Za-z]+)(?P<number>\d+)_6D\.tsv$")
-_SIM_NAME = re.compile(r"^(?P<task>[A-Za-z]+)_(?P<engine>PyBullet|Mujoco)_(?P<number>\d+)\.csv$")
-_QUATERNION_ORDERS = {"PyBullet": "xyzw", "Mujoco": "wxyz"}
+_QUATERNION_ORDERS = {
+    "PyBullet": "xyzw",
+    "Mujoco": "wxyz",
+    "VRepBullet278": "xyzw",
+    "VRepBullet283": "xyzw",
+    "VRepNewton": "xyzw",
+    "VRepODE": "xyzw",
+    "VRepVortex": "xyzw",
+}
+_SIM_NAME = re.compile(
+    rf"^(?P<task>[A-Za-z]+)_(?P<engine>{'|'.join(_QUATERNION_ORDERS)})_(?P<number>\d+)\.csv$"
+)
+FARTHEST_M = 10.0
+"""Nothing on the table goes so far; the simulations that explode end at 1e13 m and more."""
 CITATION = "Collins, Howard, Leitner: Quantifying the reality gap, ICRA 2019"
 
 
@@ -63,7 +78,7 @@ class KinovaRun:
     task: str
     number: int
     engine: str | None
-    """None for the real robot, else pybullet or mujoco."""
+    """None for the real robot, else the simulator's name in lower case."""
     stamps_s: Float[np.ndarray, " num_samples"]
     Ts_world_body: dict[str, Float[np.ndarray, "num_samples 4 4"]]
     """By topic."""
@@ -104,11 +119,22 @@ def read_real_run(path: Path) -> KinovaRun:
 
 
 def read_sim_run(path: Path, duration_s: float) -> KinovaRun:
-    """Read a simulator file; it has no times, so they are spread evenly over ``duration_s``."""
+    """Read a simulator file; it has no times, so they are spread evenly over ``duration_s``.
+
+    Raises:
+        KinovaFormatError: When columns are missing or are not numbers, the simulator is not known,
+            or a body is farther away than ``FARTHEST_M``.
+    """
     name = _SIM_NAME.match(path.name)
     if name is None:
-        raise KinovaFormatError(path=path, found="the name is not like Single_PyBullet_0.csv")
+        known = ", ".join(_QUATERNION_ORDERS)
+        found = f"the name is not like Single_PyBullet_0.csv with one of {known}"
+        raise KinovaFormatError(path=path, found=found)
     rows = _rows(path, None, _SIM_COLUMNS)
+    farthest_m = np.abs(rows[:, [0, 1, 2, 7, 8, 9]]).max()
+    if not farthest_m <= FARTHEST_M:
+        found = f"a position of {farthest_m:.3g} m: the simulation exploded"
+        raise KinovaFormatError(path=path, found=found)
     order = [_QUATERNION_ORDERS[name["engine"]].index(axis) for axis in "wxyz"]
     transforms = {
         topic: se3.transform_from(
@@ -161,20 +187,42 @@ def find_runs(folder: Path) -> tuple[list[Path], list[Path]]:
     return real, simulated
 
 
-def import_runs(folder: Path, run: RunFolder) -> Iterator[tuple[Path, KinovaRun]]:
-    """Write every run as an episode; yields the file and the run as each is done."""
+def import_runs(
+    folder: Path, run: RunFolder, skipped: list[KinovaFormatError] | None = None
+) -> Iterator[tuple[Path, KinovaRun]]:
+    """Write every run that can be used as an episode; yields file and run as each is done.
+
+    Args:
+        folder: The data set, with ``real/Experiment*`` and ``sim/Experiment*``.
+        run: Where the episodes go.
+        skipped: Takes what was wrong with each file that is left out.
+
+    Raises:
+        KinovaFormatError: The first fault, where no file at all can be used.
+    """
     real_paths, sim_paths = find_runs(folder)
+    faults = [] if skipped is None else skipped
     durations: dict[tuple[str, str], list[float]] = {}
     for path in real_paths:
-        real = read_real_run(path)
+        try:
+            real = read_real_run(path)
+        except KinovaFormatError as fault:
+            faults.append(fault)
+            continue
         durations.setdefault((path.parent.name, real.task), []).append(float(real.stamps_s[-1]))
         yield _write_real(real, run), real
+    if not durations:
+        raise faults[0]
     for path in sim_paths:
-        task = path.name.split("_")[0].lower()
-        of_task = durations.get((path.parent.name, task))
-        if not of_task:
-            raise KinovaFormatError(path=path, found="no real run of its task gives its duration")
-        simulated = read_sim_run(path, float(np.mean(of_task)))
+        of_task = durations.get((path.parent.name, path.name.split("_")[0].lower()))
+        try:
+            if not of_task:
+                found = "no real run of its task gives its duration"
+                raise KinovaFormatError(path=path, found=found)
+            simulated = read_sim_run(path, float(np.mean(of_task)))
+        except KinovaFormatError as fault:
+            faults.append(fault)
+            continue
         yield _write_sim(simulated, run, num_real=len(of_task)), simulated
 
 

@@ -106,7 +106,7 @@ def test_losses_the_ledger_lists_are_declared(tmp_path: Path) -> None:
         writer.write_json(DROPS, record, type_name=schema.DROPS, log_time_ns=2000)
 
     report = check(tmp_path, fill)
-    assert (report.exit_code, report.summary) == (3, "losses declared")
+    assert (report.exit_code, report.summary) == (3, "drops logged")
     assert (report.declared_losses, report.undeclared_losses) == (5, 0)
     assert report.topics[JOINTS].sequence_gaps == 5
     assert report.topics[JOINTS].declared_losses == 5
@@ -119,7 +119,7 @@ def test_losses_the_ledger_does_not_list_are_named(tmp_path: Path) -> None:
         writer.write_json(DROPS, record, type_name=schema.DROPS, log_time_ns=2000)
 
     report = check(tmp_path, fill)
-    assert (report.exit_code, report.summary) == (3, "losses not declared")
+    assert (report.exit_code, report.summary) == (3, "drops not logged")
     assert (report.declared_losses, report.undeclared_losses) == (1, 2)
     assert report.notes == [f"{JOINTS}: 3 numbers are missing, the drop log lists 1"]
 
@@ -260,7 +260,7 @@ def test_the_command_prints_everything_as_json(
     data = json.loads(said.out)
     assert data["unfinished"] == [str(part)]
     (episode,) = data["episodes"]
-    assert episode["state"] == "losses declared"
+    assert episode["state"] == "drops logged"
     assert episode["topics"][JOINTS]["sequence_gaps"] == 1
     assert episode["topics"][JOINTS]["messages"] == 2
     assert episode["parts"] == [str(tmp_path / "e1.mcap")]

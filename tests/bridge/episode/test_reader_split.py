@@ -147,7 +147,7 @@ def test_the_end_of_a_recovered_recording_is_lost_but_no_part_is_missing(tmp_pat
     assert len(episode.parts) == 2
     assert episode.missing_parts == ()
     report = check_episode(path)
-    assert (report.exit_code, report.summary) == (3, "losses declared")
+    assert (report.exit_code, report.summary) == (3, "drops logged")
     assert report.recovered == {"reason": "killed", "bytes_lost": 7}
     assert "7 bytes were lost" in report.notes[0]
 

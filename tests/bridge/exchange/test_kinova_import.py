@@ -107,6 +107,28 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
         find_runs(tmp_path)
 
 
+def test_a_file_that_cannot_be_used_is_listed_and_the_others_are_imported(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "data")
+    sim = folder / "sim" / "Experiment1"
+    (sim / "Single_VRepODE_0.csv").write_text("1e15 0 1 0 0 0 1 0 0 0 0 0 0 1\n" * 5)
+    (sim / "Single_Gazebo_0.csv").write_text("0 0 1 0 0 0 1 0 0 0 0 0 0 1\n" * 5)
+    (sim / "CubeExp_PyBullet_0.csv").write_text("0 0 1 0 0 0 1 0 0 0 0 0 0 1\n" * 5)
+    (folder / "real" / "Experiment1" / "Single0002_6D.tsv").write_text("")
+    skipped: list[KinovaFormatError] = []
+    files = list(import_runs(folder, RunFolder.create(tmp_path / "run"), skipped))
+    assert len(files) == 3
+    assert [fault.path.name for fault in skipped] == [
+        "Single0002_6D.tsv",
+        "CubeExp_PyBullet_0.csv",
+        "Single_Gazebo_0.csv",
+        "Single_VRepODE_0.csv",
+    ]
+    assert "1e+15 m: the simulation exploded" in str(skipped[-1])
+    (folder / "real" / "Experiment1" / "Single0001_6D.tsv").write_text("")
+    with pytest.raises(KinovaFormatError, match="0 rows of data"):
+        list(import_runs(folder, RunFolder.create(tmp_path / "none")))
+
+
 @needs_data
 @pytest.mark.slow
 def test_recorded_values_equal_the_rows_of_the_file(tmp_path: Path) -> None:
@@ -157,19 +179,27 @@ def spread_deg(Ts_world_sim: np.ndarray, Ts_world_real: np.ndarray) -> float:
 
 
 @needs_data
-@pytest.mark.parametrize("engine", ["PyBullet", "Mujoco"])
+@pytest.mark.parametrize(
+    "engine",
+    ["PyBullet", "Mujoco", "VRepBullet278", "VRepBullet283", "VRepNewton", "VRepVortex"],
+)
 def test_the_quaternion_order_is_the_one_that_agrees_with_the_real_robot(engine: str) -> None:
     real = read_real_run(FOLDER / "real" / "Experiment1" / "Single0001_6D.tsv")
     path = FOLDER / "sim" / "Experiment1" / f"Single_{engine}_0.csv"
     simulated = read_sim_run(path, 7.5).Ts_world_body
     assert spread_deg(simulated[TCP_TOPIC], real.Ts_world_body[TCP_TOPIC]) < 5.0
-    if engine == "PyBullet":  # the other order is far off
+    if engine != "Mujoco":  # the other order is far off
         rows = np.array(
-            [[float(cell) for cell in line.split()] for line in path.read_text().splitlines()]
+            [
+                [float(cell) for cell in line.replace(",", " ").split()]
+                for line in path.read_text().splitlines()
+            ]
         )
         other = se3.transform_from(rows[:, 3:7], rows[:, :3])
         assert spread_deg(other, real.Ts_world_body[TCP_TOPIC]) > 15.0
     else:  # by the turn alone both orders agree; the tool's axis and the lying cube decide
         z_real, z_sim = (T[TCP_TOPIC][0, :3, :3] for T in (real.Ts_world_body, simulated))
         assert np.einsum("ij,ij->j", z_real, z_sim).min() > 0.99
-    np.testing.assert_allclose(simulated[CUBE_TOPIC][0, :3, :3], np.eye(3), atol=1e-6)
+    # V-REP writes its first row after a step, in which the cube settles by a few microradians
+    atol = 1e-5 if engine.startswith("VRep") else 1e-6
+    np.testing.assert_allclose(simulated[CUBE_TOPIC][0, :3, :3], np.eye(3), atol=atol)
