@@ -69,7 +69,7 @@ def trial_of(entry: Entry) -> LiveTrial | None:
     )
 
 
-class Ledger:
+class SessionTrials:
     """All trials by episode. Takes the same update any number of times, in any order."""
 
     def __init__(self) -> None:

@@ -18,7 +18,7 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
 from evaluator.statistics.agreement import Number, counted_groups, exact, floats
 from evaluator.statistics.intervals import LEVEL
-from evaluator.statistics.weighted import EPSILON, STATISTICS, Values, values_of
+from evaluator.statistics.weighted import EPSILON, Values, values_of
 
 # On which scale a statistic of agreement errs by as much upwards as downwards, and where it
 # ends.
@@ -265,48 +265,6 @@ def expanded_tail(tail: float, num_units: int) -> float:
     """Return the tail at which a percentile is as far out as Student's t would have it."""
     quantile = float(stdtrit(num_units - 1, tail))
     return float(ndtr(quantile * math.sqrt(num_units / (num_units - 1))))
-
-
-def bootstrap_interval(
-    statistic: str,
-    *,
-    recorded: Sequence[Number],
-    sim: Sequence[Number],
-    rng: np.random.Generator,
-    clusters: Sequence[Hashable] | None = None,
-    level: float = LEVEL,
-    max_exact: int = MAX_EXACT,
-    num_resamples: int = NUM_RESAMPLES,
-) -> Interval:
-    """Return the percentile interval of a statistic over resampled groups or clusters of groups.
-
-    Args:
-        statistic: A name in ``weighted.STATISTICS``: pearson, mae, mmrv-recorded ...
-        recorded: Recorded rate of each group.
-        sim: The twin's.
-        rng: Draws the resamples where they are too many to visit.
-        clusters: What each group belongs to, for example its policy; groups on their own without.
-        level: Confidence level.
-        max_exact: All resamples are visited up to this many.
-        num_resamples: Random resamples beyond that.
-
-    Raises:
-        UndefinedStatisticError: Below 4 units, or when the statistic is undefined in more than
-            5 % of the resamples.
-        ValueError: For an unknown statistic.
-    """
-    if statistic not in STATISTICS:
-        message = f"{statistic!r} has no bootstrap; there are: {', '.join(STATISTICS)}"
-        raise ValueError(message)
-    sample = GroupSample(
-        recorded=recorded,
-        sim=sim,
-        rng=rng,
-        clusters=clusters,
-        max_exact=max_exact,
-        num_resamples=num_resamples,
-    )
-    return sample.interval(statistic, "bootstrap", level=level)
 
 
 def student_interval(values: Sequence[Number], *, level: float = LEVEL) -> Interval:

@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import optimize
 
@@ -77,6 +77,7 @@ def test_the_bettors_capital_is_no_more_than_a_martingale_under_the_truth() -> N
     assert total <= 1
 
 
+@settings(max_examples=40)
 @given(st.lists(st.sampled_from((-1, 0, 1)), min_size=1, max_size=12))
 def test_a_sequence_is_all_that_every_look_leaves_and_mirrors_when_conditions_swap(
     changes: list[int],
