@@ -1,4 +1,8 @@
-"""Follow one session: hear of trials, say what they settle, publish it, end on a signal."""
+"""Follow one session: hear of trials, say what they settle, publish it, end on a signal.
+
+Said is one line for each trial and the state in a few lines; published the same as records for
+other programs.
+"""
 
 import json
 import queue
@@ -34,9 +38,6 @@ from evaluator.live.session import (
     trial_of,
 )
 from evaluator.statistics.sequential import Advice
-
-# One line for each trial, the state in a few lines, and the same as records for other
-# programs.
 
 SCHEMA_VERSION = 1
 

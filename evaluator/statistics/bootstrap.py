@@ -1,7 +1,12 @@
 """Uncertainty of agreement over groups: resampled groups, resampled policies, one left out.
 
 Points: other tasks of the same kind. Clusters: other policies, whose groups come together. What the
-same groups would give when measured again is another question: ``remeasure``.
+same groups would give when measured again is another question: a ``Remeasured`` band of measurement
+noise, not an interval of a true value, for the noise itself pulls a correlation towards 0 and
+errors away from it.
+
+Each statistic errs by as much upwards as downwards on its own scale (``SCALES``): Fisher's z for
+correlations, the logarithm for errors; the others are taken as they are.
 """
 
 import math
@@ -19,11 +24,6 @@ from evaluator.result import Interval
 from evaluator.statistics.agreement import Number, counted_groups, exact, floats
 from evaluator.statistics.intervals import LEVEL
 from evaluator.statistics.weighted import EPSILON, Values, values_of
-
-# On which scale a statistic of agreement errs by as much upwards as downwards, and where it
-# ends.
-#
-# Fisher's z for correlations, the logarithm for errors; the others are taken as they are.
 
 NEAR = 1e-9
 """A value this close to its limit is at it; Fisher's z is endless there."""
@@ -327,11 +327,6 @@ def refuse_no_width(interval: Interval) -> Interval:
         )
     return interval
 
-
-# Where each statistic of agreement would fall if the same groups were measured again.
-#
-# A band of measurement noise, not an interval of a true value: the noise itself pulls a
-# correlation towards 0 and errors away from it.
 
 NUM_DRAWS = 4_000
 MIN_GROUPS = 3

@@ -28,7 +28,7 @@ def test_the_overview_shows_the_numbers_of_results_json(
     assert answer.status_code == 200
     text = words(answer.text)
     assert f"{agreement.k} of {agreement.n}" in text
-    assert "2 cells; it needs at least 3" in text
+    assert "2 groups; it needs at least 3" in text
     assert "95 % Wilson" in text
     assert "Stand-in cell" in text
 
