@@ -1,4 +1,4 @@
-"""Read what one episode says: a recorded one of plan, verdict and outcome, a derived one of a replay.
+"""Read what an episode says: a recorded one of plan, verdict, outcome, a derived one of a replay.
 
 Only its metadata and its few messages about plans, events, verdicts and places are read; how the
 arm moved is left to ``motion``.
