@@ -107,14 +107,14 @@ def summarise_motions(
     if PLANNED in tracks and EXECUTED in tracks:
         pairs.append((EXECUTED, tracks[EXECUTED], PLANNED, tracks[PLANNED]))
     info = recorded.info
-    of = {"episode": info.id, "task": info.task, "condition": info.condition, "plan_id": plan_id}
     found = []
     for side, tracks_of, against, others in pairs:
         try:
             summary = compare_tracks(tracks_of, others)
         except UndefinedStatisticError:
             continue
-        found.append(replace(summary, side=side, against=against, **of))
+        named = replace(summary, side=side, against=against, plan_id=plan_id)
+        found.append(replace(named, episode=info.id, task=info.task, condition=info.condition))
     return tuple(found)
 
 
