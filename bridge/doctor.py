@@ -6,23 +6,51 @@ from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
-EXTRAS: dict[str, tuple[str, ...]] = {
-    "base": ("numpy", "mcap", "cyclopts", "rich", "zstandard", "jaxtyping", "jsonschema"),
-    "record": ("eclipse-zenoh", "simplejpeg", "rosbags", "pillow"),
-    "twin": ("torch", "open3d", "pybullet", "python-fcl", "pin", "scipy", "example-robot-data"),
-    "report": ("pandas", "pyarrow", "plotly", "matplotlib"),
-    "dashboard": ("starlette", "uvicorn", "jinja2", "rerun-sdk"),
-    "standin": ("mujoco", "open3d", "pin", "example-robot-data"),
-    "video": ("av",),
-    "realsense": ("pyrealsense2",),
-    "ur": ("example-robot-data",),
-    "foundation": ("transformers", "safetensors"),
-    "lpips": ("torch", "safetensors", "torchmetrics"),
-    "gpu": ("gsplat",),
-    "cluster": ("ray",),
+
+@dataclass(frozen=True)
+class Extra:
+    """Packages that come together, and what for."""
+
+    purpose: str
+    packages: tuple[str, ...]
+    is_optional: bool = False
+    """Nothing is wrong without it: the demo and all it shows run on one machine's CPU."""
+
+
+EXTRAS = {
+    "base": Extra(
+        "read, write, check and list episodes",
+        ("numpy", "mcap", "cyclopts", "rich", "zstandard", "jaxtyping", "jsonschema", "lz4"),
+    ),
+    "record": Extra(
+        "record from zenoh; ROS 2 messages; colour images",
+        ("eclipse-zenoh", "simplejpeg", "rosbags", "pillow", "ruamel.yaml"),
+    ),
+    "replay": Extra(
+        "rebuild, render, replay, gate, calibrate",
+        ("open3d", "pybullet", "pin", "scipy", "example-robot-data", "cmaes"),
+    ),
+    "report": Extra(
+        "evaluate: tables, figures, report", ("pandas", "pyarrow", "scipy", "matplotlib", "pillow")
+    ),
+    "dashboard": Extra("review pages, Rerun view", ("starlette", "uvicorn", "jinja2", "rerun-sdk")),
+    "standin": Extra(
+        "the stand-in cell of the demo", ("mujoco", "open3d", "pin", "example-robot-data", "scipy")
+    ),
+    "video": Extra("video streams, LeRobot videos", ("av",), is_optional=True),
+    "realsense": Extra("RealSense cameras", ("pyrealsense2",), is_optional=True),
+    "ur": Extra("the UR arm's model", ("example-robot-data",), is_optional=True),
+    "twin": Extra("what needs torch in the twin", ("python-fcl", "torch"), is_optional=True),
+    "foundation": Extra(
+        "SAM 3, DINOv3, CLIP from folders of weights",
+        ("transformers", "safetensors"),
+        is_optional=True,
+    ),
+    "lpips": Extra("LPIPS", ("torch", "safetensors", "torchmetrics"), is_optional=True),
+    "gpu": Extra("drawing on CUDA", ("gsplat",), is_optional=True),
+    "cluster": Extra("replays on Ray", ("ray",), is_optional=True),
 }
-OPTIONAL = ("foundation", "lpips", "gpu", "cluster")
-"""Nothing is wrong without these: all works on one machine's CPU and without weights of others."""
+"""As ``pyproject.toml`` has them."""
 NATIVE = (
     ("splat rasteriser", "twin.scene._splat", "no scene can be rebuilt"),
     ("depth codec", "bridge.media._depth", "slow fallback, for playing back only"),
@@ -39,11 +67,13 @@ class InstallCheck:
     found: str
     ok: bool
     advice: str = ""
+    purpose: str = ""
+    """What the package's extra is for."""
 
 
 def examine() -> list[InstallCheck]:
     """Look at packages, the native extensions, system libraries and programs; import nothing."""
-    findings = [_package(name, extra) for extra, names in EXTRAS.items() for name in names]
+    findings = [_package(name, extra) for extra in EXTRAS for name in EXTRAS[extra].packages]
     findings.extend(_native(*each) for each in NATIVE)
     findings.append(_program("chromium", "needed only to test the dashboard: apt install chromium"))
     findings.extend(_system_libraries())
@@ -51,14 +81,21 @@ def examine() -> list[InstallCheck]:
 
 
 def _package(name: str, extra: str) -> InstallCheck:
+    what, purpose = f"{name} [{extra}]", EXTRAS[extra].purpose
     try:
         found = metadata.version(name)
     except metadata.PackageNotFoundError:
-        advice = f"pip install 'robot-gst[{extra}]'" if extra != "base" else "pip install robot-gst"
-        is_optional = extra in OPTIONAL
-        found = "missing (optional)" if is_optional else "missing"
-        return InstallCheck(what=f"{name} [{extra}]", found=found, ok=is_optional, advice=advice)
-    return InstallCheck(what=f"{name} [{extra}]", found=found, ok=True)
+        is_optional = EXTRAS[extra].is_optional
+        return InstallCheck(
+            what=what,
+            found="missing (optional)" if is_optional else "missing",
+            ok=is_optional,
+            advice=f"pip install 'robot-gst[{extra}]'"
+            if extra != "base"
+            else "pip install robot-gst",
+            purpose=purpose,
+        )
+    return InstallCheck(what=what, found=found, ok=True, purpose=purpose)
 
 
 def _native(what: str, module: str, without: str) -> InstallCheck:

@@ -3,6 +3,9 @@
 A summary is a frozen dataclass that follows from the bytes of a few files and from nothing else.
 It is kept under a key that names those bytes by their content hash, together with a digest of the
 code that makes summaries, so that neither a changed file nor changed code is answered from here.
+Files of summaries are each written whole under a name of its own, so any number of evaluations may
+write at once, one may be killed at any instant, and the folder may be deleted at any time. Nothing
+that is wrong with it raises; whoever asks is told once.
 ``docs/decisions/0008-caches-and-processes.md`` says why.
 """
 
@@ -24,11 +27,6 @@ from bridge.episode.provenance import software
 if TYPE_CHECKING:
     from types import ModuleType
 
-
-# The folder a cache lies in: files of summaries, each written whole under a name of its own.
-#
-# So any number of evaluations may write at once, one may be killed at any instant, and the folder
-# may be deleted at any time. Nothing that is wrong with it raises; whoever asks is told once.
 
 Say = Callable[[str], None]
 

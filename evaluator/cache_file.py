@@ -1,8 +1,8 @@
 """One Parquet file of summaries: frozen dataclasses in columns, read back as they were.
 
 Text, numbers and answers are columns of their own, tuples and arrays of them are lists, and what is
-nested is JSON text. Importing this module loads pyarrow; ``cache`` does so only when a cache is
-asked for.
+nested is JSON text (nothing else is read: no names, no code). Importing this module loads pyarrow;
+``cache`` does so only when a cache is asked for.
 """
 
 import json
@@ -27,10 +27,6 @@ from evaluator.arrow_columns import (
     values_of,
 )
 from evaluator.memory import Packed, without_collecting
-
-# Nested records as JSON text, read back with the types their hints name.
-#
-# Tuples stay tuples and dataclasses stay dataclasses. Nothing but JSON is read: no names, no code.
 
 Reader = Callable[[Any], Any]
 _AS_IT_IS = (str, int, float, bool, NoneType, Any, object)

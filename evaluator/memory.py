@@ -1,15 +1,15 @@
-"""A curve as packed doubles: kept, compared and handed on without a Python object per number."""
+"""Millions of records in little memory and time: curves as packed doubles, no search for cycles."""
 
+import gc
 from array import array
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     Packed = array[float]
 else:  # before Python 3.12 the class takes no parameters
     Packed = array
-import gc
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 
 @contextmanager

@@ -1,20 +1,19 @@
-"""Compute how far simulation and reality agree, from a table of trials.
+"""Compute how far simulation and reality agree, from the trials of a run or of a table.
 
-Run: python examples/agreement.py runs/demo/results/trials.csv
+Run: python examples/agreement.py runs/demo, or any CSV file of trials (docs/exchange.md)
 """
 
 import sys
 from pathlib import Path
 
-import pandas as pd
-
+import evaluator
 from evaluator.statistics import agreement
 from evaluator.statistics.intervals import wilson
 
 
 def main(path: Path) -> None:
     """Print agreement trial by trial, and the rates of each group."""
-    trials = pd.read_csv(path).dropna(subset=["recorded", "sim_planned"])
+    trials = evaluator.read_trials(path).dropna(subset=["recorded", "sim_planned"])
     agree = trials["recorded"] == trials["sim_planned"]
     interval = wilson(int(agree.sum()), len(agree))
     print(
@@ -22,9 +21,7 @@ def main(path: Path) -> None:
         f"[{interval.low:.3f}, {interval.high:.3f}] ({interval.method})"
     )
 
-    succeeded = trials[["recorded", "sim_planned"]] == "success"
-    groups = [trials["task"], trials["condition"]]
-    rates = succeeded.groupby(groups).mean()
+    rates = trials.groupby(["task", "condition"])[["recorded", "sim_planned"]].mean()
     print(rates.to_string())
     recorded, sim = rates["recorded"].tolist(), rates["sim_planned"].tolist()
     print(f"bias (sim - recorded): {100 * agreement.bias(recorded=recorded, sim=sim):+.1f} pp")

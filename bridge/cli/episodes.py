@@ -138,8 +138,12 @@ def doctor(*, output: Output = OUTPUT) -> int:
     from bridge.doctor import examine
 
     findings = examine()
-    lines = []
+    lines: list[str] = []
+    purpose = ""
     for item in findings:
+        if item.purpose != purpose:
+            lines.append(item.purpose or "built here, and found on this machine")
+            purpose = item.purpose
         line = f"{'ok  ' if item.ok else 'MISS'} {item.what:<28} {item.found:<12}"
         apart = "\n     " if len(line) + len(item.advice) >= 80 else " "
         lines.append(f"{line.rstrip()}{apart}{item.advice}".rstrip())

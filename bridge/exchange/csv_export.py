@@ -1,4 +1,9 @@
-"""Episodes as tidy CSV files, one per family of topics, and one line per episode."""
+"""Episodes as tidy CSV files, one per family of topics, and one line per episode.
+
+RFC 4180: comma, CRLF, quotes doubled. Times are whole nanoseconds and, beside them, seconds with
+nine decimals. Numbers are the shortest decimals that read back as the same 64-bit number. An empty
+field is unknown.
+"""
 
 import csv
 import json
@@ -20,12 +25,6 @@ from bridge.geometry import se3
 from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
 from bridge.terminal import Advance
-
-# The CSV files of ``export csv``: which columns each has, what they mean, and their rows.
-#
-# RFC 4180: comma, CRLF, quotes doubled. Times are whole nanoseconds and, beside them, seconds
-# with nine decimals. Numbers are the shortest decimals that read back as the same 64-bit number.
-# An empty field is unknown.
 
 Value = str | int | float | bool | None
 Rows = Iterator[tuple[int, list[Value]]]

@@ -1,4 +1,10 @@
-"""Writes the messages of an RGB-D folder straight into a scan episode, without the wire."""
+"""Folders of RGB-D images: read into a scan episode without the wire, and written in TUM's layout.
+
+Written colour is as it was recorded (JPEG bytes) or PNG; depth is 16-bit PNG with 5000 per metre,
+so that whole millimetres survive exactly up to 13.107 m. Stamps keep nine decimals. Poses are
+``T_base_color`` at the time of every colour and every depth image. The layout has no place for
+intrinsics: ``camera.json`` beside the lists holds them, and ``import rgbd`` reads it back.
+"""
 
 import json
 from collections.abc import Iterable
@@ -29,14 +35,6 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import JPEG_MAGIC
 from bridge.terminal import Advance
-
-# An episode's cameras as folders of the TUM RGB-D layout.
-#
-# Colour is written as it was recorded (JPEG bytes) or as PNG; depth as 16-bit PNG with 5000 per
-# metre, so that whole millimetres survive exactly up to 13.107 m. Stamps keep nine decimals.
-# Poses are ``T_base_color`` at the time of every colour and every depth image. The layout has no
-# place for intrinsics: ``camera.json`` beside the lists holds them, and ``import rgbd`` reads it
-# back.
 
 STORED_PER_MM = 5
 MAX_MM = 65535 // STORED_PER_MM

@@ -116,15 +116,13 @@ def check_same_shape(recorded: np.ndarray, replayed: np.ndarray) -> None:
         )
 
 
-# The sliding window of SSIM as products with small matrices of weights, in float64.
-#
-# A band of rows times a matrix that holds the window once for each row, one place further on, is
-# the window slid down; blocks of columns times its transpose slide it across. Half of these
-# products are with zeros, and BLAS is still much faster than sums of shifted rows. Bands are so
-# small that they stay in the cache and that BLAS starts no threads of its own.
-#
-# Windowed are u = a + b, v = a - b and their squares, for SSIM needs no more: 2 mu_a mu_b is half
-# of mu_u^2 - mu_v^2, mu_a^2 + mu_b^2 half of mu_u^2 + mu_v^2, and so on for the variances.
+# The sliding window as products with small matrices of weights, in float64: a band of rows times a
+# matrix that holds the window once for each row, one place further on, is the window slid down;
+# blocks of columns times its transpose slide it across. Half of these products are with zeros, and
+# BLAS is still much faster than sums of shifted rows. Bands are so small that they stay in the
+# cache and that BLAS starts no threads of its own. Windowed are u = a + b, v = a - b and their
+# squares, for SSIM needs no more: 2 mu_a mu_b is half of mu_u^2 - mu_v^2, mu_a^2 + mu_b^2 half of
+# mu_u^2 + mu_v^2, and so on for the variances.
 
 WINDOW = 11
 SIGMA = 1.5

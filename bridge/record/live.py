@@ -137,11 +137,10 @@ def small_picture(sample: WireSample) -> CompressedColor | None:
     return CompressedColor(stamp_ns=stamp_ns, frame_id=frame_id, format="jpeg", data=data)
 
 
-# Notices publishers that left, so that nothing they said is repeated in later episodes.
-#
-# A source of ours declares ``<prefix>/alive``; with it go the latched messages under
-# ``/<prefix>/``. A ROS 2 publisher has a token; with the last one of a topic go that topic's
-# latched messages. What a source without either has said is remembered until the recorder ends.
+# Publishers that left are noticed, so that nothing they said is repeated in later episodes. A
+# source of ours declares ``<prefix>/alive``; with it go the latched messages under ``/<prefix>/``.
+# A ROS 2 publisher has a token; with the last one of a topic go that topic's latched messages. What
+# a source without either has said is remembered until the recorder ends.
 
 ALIVE = "/alive"
 

@@ -96,10 +96,9 @@ def _children(sample: WireSample) -> frozenset[str]:
         return frozenset()
 
 
-# What is left out first when images come faster than they can be written.
-#
-# The order is fixed: previews, then the quality of colour, then every other colour image, then
-# every other depth image. Joints, plans and all other small messages are never shed.
+# What is left out first when images come faster than they can be written: previews, then the
+# quality of colour, then every other colour image, then every other depth image. Joints, plans and
+# all other small messages are never shed.
 
 
 class LoadShedding(IntEnum):
@@ -460,11 +459,8 @@ class InputQueue:
             self._is_quiet = self._commands == after
 
 
-# Puts small messages, encoded images and commands back in order for the writer.
-#
-# Small messages never wait for images. A barrier command (start, stop ...) waits until every
-# image received before it has come out of its encoder, and holds back everything received after
-# it.
+# Small messages never wait for images. A barrier command (start, stop ...) waits until every image
+# received before it has come out of its encoder, and holds back everything received after it.
 
 
 class Merge:

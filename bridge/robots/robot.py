@@ -186,6 +186,6 @@ def _data_root() -> Path:
     root = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix" / "share" / PACKAGE
     if not root.is_dir():
         raise MissingDependencyError(
-            package=PACKAGE, extra="twin", purpose="the default robot (UR5)"
+            package=PACKAGE, extra="replay", purpose="the default robot (UR5)"
         )
     return root

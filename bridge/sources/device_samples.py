@@ -1,4 +1,9 @@
-"""Says what must not be lost on a thread of its own, so that samples never wait for it."""
+"""Samples of a device: their time on this host's clock, their numbers, what is announced with them.
+
+A sample cannot arrive before it was taken, so the smallest (arrival - device stamp) of a while is
+the offset between the clocks plus the shortest way the samples took. Queues and stalls only make
+arrivals later, and later ones do not count.
+"""
 
 import contextlib
 import queue
@@ -12,12 +17,6 @@ from bridge.episode.schema import StampedMessage
 from bridge.errors import GstError
 from bridge.wire.qos import Qos
 from bridge.wire.session import WirePublisher, WireSession
-
-# When did a device with a clock of its own take a sample, in this host's time?
-#
-# A sample cannot arrive before it was taken, so the smallest (arrival - device stamp) of a while
-# is the offset between the clocks plus the shortest way the samples took. Queues and stalls only
-# make arrivals later, and later ones do not count.
 
 BUCKET_NS = 2 * NS_PER_S
 NUM_BUCKETS = 5

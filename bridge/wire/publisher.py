@@ -1,4 +1,9 @@
-"""Sending one topic, through shared memory where that is on."""
+"""Sending one topic, through shared memory where that is on, with an attachment to each message.
+
+The attachment's bytes are those of rmw_zenoh, so that native and ROS 2 publishers look alike: int64
+sequence, int64 source time [ns], length 16 and a 16-byte publisher id, little endian, 33 bytes.
+ROS 2 Jazzy's first releases put each field's name before it (77 bytes); both are read.
+"""
 
 import contextlib
 import shutil
@@ -10,12 +15,6 @@ from typing import Any
 
 from bridge.wire.errors import WireConfigError, WireError, cause_of
 from bridge.wire.zenoh_config import zenoh, zenoh_shm
-
-# The attachment each message carries: sequence number, source time and publisher identity.
-#
-# The bytes are those of rmw_zenoh, so that native and ROS 2 publishers look alike: int64
-# sequence, int64 source time [ns], length 16 and a 16-byte publisher id, little endian, 33 bytes.
-# ROS 2 Jazzy's first releases put each field's name before it (77 bytes); both are read.
 
 GID_BYTES = 16
 _PLAIN = struct.Struct("<qqB16s")

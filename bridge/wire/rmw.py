@@ -1,9 +1,13 @@
-"""What rmw_zenoh tells about a ROS 2 graph: one liveliness token for each endpoint.
+"""What rmw_zenoh tells about a ROS 2 graph; texts and hashes of its message types without ROS 2.
 
-The token's key is, in rmw_zenoh's own words (docs/design.md of ros2/rmw_zenoh),
+Each endpoint has a liveliness token. Its key is, in rmw_zenoh's own words (docs/design.md of
+ros2/rmw_zenoh),
 ``@ros2_lv/<domain>/<session>/<node id>/<entity id>/<kind>/<enclave>/<namespace>/<node>`` and, for
 all but nodes, ``/<topic>/<type>/<type hash>/<qos>``; slashes inside a name are written as ``%``.
 Later releases may append parts; they are ignored.
+
+Definitions of types come with rosbags. A type may differ between ROS 2 releases; its RIHS01 hash
+says which definition a publisher was built with. Releases are searched newest first.
 """
 
 from dataclasses import dataclass
@@ -15,11 +19,6 @@ from typing import Any, NamedTuple
 from bridge.episode.schema import Schema
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.wire import keys
-
-# Texts and hashes of ROS 2 message types, without ROS 2: the definitions come with rosbags.
-#
-# A type may differ between ROS 2 releases; its RIHS01 hash says which definition a publisher was
-# built with. Releases are searched newest first.
 
 NAME_PARTS = 3
 

@@ -36,8 +36,10 @@ from evaluator.statistics.gate import (
 )
 
 PLANNED, GATE = "planned in twin", "verdict before motion, not obeyed"
-PRICES = (0.1, 0.5, 1.0)
-"""Of refusing a good plan, in bad executions, at which each clause is priced."""
+REFUSAL_PRICES = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)
+"""Of refusing a good plan, in bad executions, at which the gate is priced."""
+CLAUSE_PRICES = (0.1, 0.5, 1.0)
+"""Those at which each clause alone is priced."""
 
 
 def clause_scorecard(
@@ -64,7 +66,7 @@ def clause_scorecard(
             lines.append((side, clause, *_line(counts)))
             if name == "verdict":
                 costs.append((clause, *_costs(counts)))
-    return measurements, (*_table(lines), *_clause_cost_table(costs))
+    return measurements, (*_clause_table(lines), *_clause_cost_table(costs))
 
 
 def _of_replay(row: TrialRow) -> Clauses:
@@ -145,11 +147,11 @@ def _price(counts: Confusion) -> float | None:
 
 
 def _costs(counts: Confusion) -> tuple[Cell, ...]:
-    points = cost_curve(counts, PRICES)
+    points = cost_curve(counts, CLAUSE_PRICES)
     return (*(round(point.with_gate, 4) for point in points), round(points[0].without_gate, 4))
 
 
-def _table(lines: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
+def _clause_table(lines: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
     if not lines:
         return ()
     return (
@@ -175,7 +177,7 @@ def _table(lines: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
 def _clause_cost_table(costs: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
     if not costs:
         return ()
-    prices = tuple(f"obeying it, price {price:g}" for price in PRICES)
+    prices = tuple(f"obeying it, price {price:g}" for price in CLAUSE_PRICES)
     return (
         Table(
             id="gate_clause_costs",
@@ -186,11 +188,6 @@ def _clause_cost_table(costs: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
             "asked and not obeyed; price: of refusing a good plan.",
         ),
     )
-
-
-CLAUSES = ("ik", "clearance", "terminal")
-REFUSAL_PRICES = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)
-"""What refusing a good plan costs, in bad executions."""
 
 
 def agreement(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Measurement]:
@@ -296,7 +293,7 @@ def gate_scorecard(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[T
 def _clauses(rows: Sequence[TrialRow]) -> list[Measurement]:
     """How often the trials failed that the twin called a failure for this reason."""
     measurements = []
-    for clause in CLAUSES:
+    for clause in FACTORS:
         blamed = [
             row
             for row in rows

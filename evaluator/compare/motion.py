@@ -106,6 +106,7 @@ def summarise_motions(
     pairs = [(RECORDED, own, side, tracks[side]) for side in (PLANNED, EXECUTED) if side in tracks]
     if PLANNED in tracks and EXECUTED in tracks:
         pairs.append((EXECUTED, tracks[EXECUTED], PLANNED, tracks[PLANNED]))
+    info = recorded.info
     found = []
     for side, tracks_of, against, others in pairs:
         try:
@@ -113,26 +114,8 @@ def summarise_motions(
         except UndefinedStatisticError:
             continue
         named = replace(summary, side=side, against=against, plan_id=plan_id)
-        found.append(_of(recorded, named))
+        found.append(replace(named, episode=info.id, task=info.task, condition=info.condition))
     return tuple(found)
-
-
-def summarise_motion(
-    recorded: Episode, replay: Episode, *, against: str, plan_id: str
-) -> MotionSummary:
-    """Compare a recorded execution with one replay.
-
-    Raises:
-        EpisodeError: When a file turns out to be damaged.
-        UndefinedStatisticError: When they have no tool poses in common.
-    """
-    summary = compare_tracks(read_tracks(recorded, plan_id), read_tracks(replay, plan_id))
-    return _of(recorded, replace(summary, against=against, plan_id=plan_id))
-
-
-def _of(recorded: Episode, summary: MotionSummary) -> MotionSummary:
-    info = recorded.info
-    return replace(summary, episode=info.id, task=info.task, condition=info.condition)
 
 
 def compare_tracks(mine: Tracks, other: Tracks) -> MotionSummary:

@@ -247,13 +247,11 @@ def of_group(quantity: Quantity, key: Key, **words: object) -> Defined:
     return quantity.of(task=key[0], condition=key[1], policy=key[2], **words)
 
 
-# Sim estimated again with fresh seeds: what the twin says beyond the replay that chose a plan.
-#
-# With replanning the accepted plan was selected by the twin, so its one nominal replay is
-# optimistic by that selection (the winner's curse). ``robot-gst replay RUN --samples K`` replays
-# each plan K more times with everything varied that is not known exactly. The gate used none of
-# those draws: those of a replay are named after its recording, those of a gate after the start it
-# was asked about.
+# Sim estimated again with fresh seeds. With replanning the accepted plan was selected by the twin,
+# so its one nominal replay is optimistic by that selection (the winner's curse).
+# ``robot-gst replay RUN --samples K`` replays each plan K more times with everything varied that is
+# not known exactly. The gate used none of those draws: those of a replay are named after its
+# recording, those of a gate after the start it was asked about.
 
 NO_INTERVAL = "means of shares are no counts, and no interval of them was checked for its coverage"
 

@@ -1,4 +1,8 @@
-"""Follow one session: hear of trials, say what they settle, publish it, end on a signal."""
+"""Follow one session: hear of trials, say what they settle, publish it, end on a signal.
+
+Said is one line for each trial and the state in a few lines; published the same as records for
+other programs.
+"""
 
 import json
 import queue
@@ -24,19 +28,16 @@ from evaluator.live.config import LiveConfig
 from evaluator.live.session import (
     Change,
     GainSummary,
-    Ledger,
     LiveTrial,
     NextStart,
     RateSummary,
     SessionSummary,
+    SessionTrials,
     next_start,
     summarise_session,
     trial_of,
 )
 from evaluator.statistics.sequential import Advice
-
-# One line for each trial, the state in a few lines, and the same as records for other
-# programs.
 
 SCHEMA_VERSION = 1
 
@@ -247,7 +248,7 @@ class Follower:
         """Begin knowing nothing."""
         self._run, self._publish, self._now_ns = run, publish, now_ns
         self._goal, self._output = goal, output
-        self._ledger = Ledger()
+        self._known = SessionTrials()
         self._heard: queue.Queue[WireSample] = queue.Queue(MAX_WAITING)
         self._next_listing_s = 0.0
         self._shown_once: set[str] = set()
@@ -288,7 +289,7 @@ class Follower:
         if not _same_folder(update.run, self._run.path):
             self._once(f"the recorder writes to {update.run}, not to {self._run.path}; left out")
             return
-        change = None if update.trial is None else self._ledger.take(update.trial)
+        change = None if update.trial is None else self._known.take(update.trial)
         if change is not None and change.changes_numbers:
             self._tell([change])
 
@@ -301,7 +302,7 @@ class Follower:
             self._next_listing_s = began_s + LISTING_PERIOD_S
             return
         trials = [trial for entry in entries if (trial := trial_of(entry)) is not None]
-        changes, gone = self._ledger.take_listing(trials)
+        changes, gone = self._known.take_listing(trials)
         took_s = time.monotonic() - began_s
         self._next_listing_s = began_s + max(LISTING_PERIOD_S, LISTING_SHARE * took_s)
         if quiet:
@@ -326,7 +327,7 @@ class Follower:
         self._show(text, None, summary, proposal)
 
     def _now(self) -> tuple[SessionSummary, NextStart | None]:
-        trials = self._ledger.trials
+        trials = self._known.trials
         summary = summarise_session(trials, self._goal)
         return summary, next_start(trials, summary)
 

@@ -1,4 +1,7 @@
-"""The trials of a session as they are known now: each episode once, the last word counts."""
+"""The trials of a session as they are known now, what they settle, and which start to run next.
+
+Each episode counts once, by the last word on it.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -69,7 +72,7 @@ def trial_of(entry: Entry) -> LiveTrial | None:
     )
 
 
-class Ledger:
+class SessionTrials:
     """All trials by episode. Takes the same update any number of times, in any order."""
 
     def __init__(self) -> None:

@@ -1,4 +1,7 @@
-"""The stamp on every image number: all that must be equal before two of them may be compared."""
+"""How images are compared: the metrics, the options, and the stamp on every image number.
+
+All of a stamp must be equal before two numbers may be compared.
+"""
 
 import hashlib
 from collections.abc import Sequence

@@ -1,4 +1,9 @@
-"""The network of LPIPS, version 0.1, in plain torch; loaded only when a backbone was given."""
+"""The network of LPIPS, version 0.1, in plain torch; loaded only when a backbone was given.
+
+Its backbone's weights come from a file of the user, those of the linear heads from a wheel. Nothing
+is downloaded, and neither the ``lpips`` package nor torchvision is imported: only files are read.
+Every shape is checked, since a wrong network would give a number that looks right.
+"""
 
 import pickle
 import warnings
@@ -19,11 +24,6 @@ from bridge.episode.provenance import hash_file
 from bridge.errors import MissingDependencyError, UsageError
 from evaluator.metrics.image_protocol import NetName
 from evaluator.metrics.lpips import INPUTS, MIN_SIDE_PX, NET_WORDS, Distances, InputName, metric_id
-
-# Weights of LPIPS: the backbone from a file of the user, the linear heads from a wheel.
-#
-# Nothing is downloaded, and neither the ``lpips`` package nor torchvision is imported: only files
-# are read. Every shape is checked, since a wrong network would give a number that looks right.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,8 @@
-"""How far two poses of one body lie apart over a common clock."""
+"""How far two poses of one body lie apart over a common clock.
+
+Also without a constant delay, which is the controller's, or without a constant rigid motion, which
+is the calibration's: what remains of an error when either is taken out belongs to neither.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,12 +16,6 @@ from bridge.geometry import se3
 from bridge.geometry.signals import LAGS_S, lag_of_least_cost
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.errors import UndefinedStatisticError
-
-# What is left of a trajectory error without a constant delay, or without a constant rigid
-# motion.
-#
-# A delay is the controller's, a rigid motion the calibration's; what remains of an error when
-# either is taken out belongs to neither.
 
 MAX_INSTANTS = 200
 """Delays are compared at no more instants than this."""

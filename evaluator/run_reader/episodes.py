@@ -1,4 +1,4 @@
-"""Read what one recorded episode says: which plan was sent, what the gate had said, how it ended.
+"""Read what an episode says: a recorded one of plan, verdict, outcome, a derived one of a replay.
 
 Only its metadata and its few messages about plans, events, verdicts and places are read; how the
 arm moved is left to ``motion``.
@@ -24,14 +24,12 @@ from bridge.task.verdict import Verdict
 from evaluator.errors import EvaluatorError
 from evaluator.run_reader.inventory import RunFile
 
-# What each clause of a verdict said: the three factors, and every success predicate by its
-# kind.
-#
-# A clause of several objects says no as soon as one object fails it.
-
 FACTORS = ("ik", "clearance", "terminal")
 Clauses = tuple[tuple[str, bool], ...]
-"""Name and answer; undecided clauses are left out. Predicates are ``terminal.inside`` and so on."""
+"""Name and answer: the three factors, and each success predicate by its kind (``terminal.inside``).
+
+One of several objects says no as soon as one object fails it; undecided clauses are left out.
+"""
 
 
 def clauses_of(verdict: Verdict | None) -> Clauses:

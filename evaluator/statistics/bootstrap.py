@@ -1,7 +1,12 @@
 """Uncertainty of agreement over groups: resampled groups, resampled policies, one left out.
 
 Points: other tasks of the same kind. Clusters: other policies, whose groups come together. What the
-same groups would give when measured again is another question: ``remeasure``.
+same groups would give when measured again is another question: a ``Remeasured`` band of measurement
+noise, not an interval of a true value, for the noise itself pulls a correlation towards 0 and
+errors away from it.
+
+Each statistic errs by as much upwards as downwards on its own scale (``SCALES``): Fisher's z for
+correlations, the logarithm for errors; the others are taken as they are.
 """
 
 import math
@@ -18,12 +23,7 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
 from evaluator.statistics.agreement import Number, counted_groups, exact, floats
 from evaluator.statistics.intervals import LEVEL
-from evaluator.statistics.weighted import EPSILON, STATISTICS, Values, values_of
-
-# On which scale a statistic of agreement errs by as much upwards as downwards, and where it
-# ends.
-#
-# Fisher's z for correlations, the logarithm for errors; the others are taken as they are.
+from evaluator.statistics.weighted import EPSILON, Values, values_of
 
 NEAR = 1e-9
 """A value this close to its limit is at it; Fisher's z is endless there."""
@@ -267,48 +267,6 @@ def expanded_tail(tail: float, num_units: int) -> float:
     return float(ndtr(quantile * math.sqrt(num_units / (num_units - 1))))
 
 
-def bootstrap_interval(
-    statistic: str,
-    *,
-    recorded: Sequence[Number],
-    sim: Sequence[Number],
-    rng: np.random.Generator,
-    clusters: Sequence[Hashable] | None = None,
-    level: float = LEVEL,
-    max_exact: int = MAX_EXACT,
-    num_resamples: int = NUM_RESAMPLES,
-) -> Interval:
-    """Return the percentile interval of a statistic over resampled groups or clusters of groups.
-
-    Args:
-        statistic: A name in ``weighted.STATISTICS``: pearson, mae, mmrv-recorded ...
-        recorded: Recorded rate of each group.
-        sim: The twin's.
-        rng: Draws the resamples where they are too many to visit.
-        clusters: What each group belongs to, for example its policy; groups on their own without.
-        level: Confidence level.
-        max_exact: All resamples are visited up to this many.
-        num_resamples: Random resamples beyond that.
-
-    Raises:
-        UndefinedStatisticError: Below 4 units, or when the statistic is undefined in more than
-            5 % of the resamples.
-        ValueError: For an unknown statistic.
-    """
-    if statistic not in STATISTICS:
-        message = f"{statistic!r} has no bootstrap; there are: {', '.join(STATISTICS)}"
-        raise ValueError(message)
-    sample = GroupSample(
-        recorded=recorded,
-        sim=sim,
-        rng=rng,
-        clusters=clusters,
-        max_exact=max_exact,
-        num_resamples=num_resamples,
-    )
-    return sample.interval(statistic, "bootstrap", level=level)
-
-
 def student_interval(values: Sequence[Number], *, level: float = LEVEL) -> Interval:
     """Return Student's t interval of a mean over independent groups, or over cluster means.
 
@@ -369,11 +327,6 @@ def refuse_no_width(interval: Interval) -> Interval:
         )
     return interval
 
-
-# Where each statistic of agreement would fall if the same groups were measured again.
-#
-# A band of measurement noise, not an interval of a true value: the noise itself pulls a
-# correlation towards 0 and errors away from it.
 
 NUM_DRAWS = 4_000
 MIN_GROUPS = 3

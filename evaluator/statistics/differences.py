@@ -1,4 +1,4 @@
-"""Two groups of trials that share no starts: Newcombe's interval, Boschloo's exact test."""
+"""Has a rate changed? Same starts: McNemar, sign test, Tango; other starts: Newcombe, Boschloo."""
 
 import math
 from collections.abc import Iterable

@@ -1,4 +1,9 @@
-"""Intervals for success rates. Never Wald: it collapses at 0/n and n/n."""
+"""Intervals for success rates and for medians of lengths.
+
+Rates never have Wald's: it collapses at 0/n and n/n. Lengths that are mostly small and now and then
+large, as the miss of a dropped cube, would need many values for Student's interval of their mean;
+the median has one that holds for any distribution, from six values on.
+"""
 
 import math
 from collections.abc import Callable, Hashable, Sequence
@@ -108,12 +113,6 @@ def normal_quantile(probability: float) -> float:
     """Return the standard normal's quantile, 1.96 at 0.975."""
     return float(ndtri(probability))
 
-
-# Intervals of lengths that are mostly small and now and then large, as the miss of a dropped
-# cube.
-#
-# Student's interval of their mean needs many of them; the median has an interval that holds for
-# any distribution, from six values on.
 
 ORDER_STATISTICS = "order-statistics"
 

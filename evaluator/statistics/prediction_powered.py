@@ -1,6 +1,8 @@
 """The real success rate from few robot trials and many in the twin.
 
-Needs robot trials whose starts are a random part of the twin's: an easier part would mislead.
+Needs robot trials whose starts are a random part of the twin's: an easier part would mislead. Two
+looks at where objects lay tell: are both draws from one distribution, and is any other start
+further out than the tried ones reach?
 """
 
 import math
@@ -18,12 +20,6 @@ from evaluator.result import Interval
 from evaluator.statistics.differences import boschloo
 from evaluator.statistics.gate import Confusion
 from evaluator.statistics.intervals import LEVEL, check_count, normal_quantile, wilson
-
-# Do the starts that were tried on the robot lie where the twin's other starts lie?
-#
-# What the twin says of the other starts may stand for them only if the tried ones are like them.
-# Two looks at where objects lay: are both draws from one distribution, and is any other start
-# further out than the tried ones reach?
 
 MIN_STARTS = 2
 """On each side; a single start has no neighbour of its own kind."""

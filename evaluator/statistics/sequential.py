@@ -1,7 +1,8 @@
 """Looking after every trial without paying for it: stop, or continue?
 
 A test for a fixed n that is looked at again and again will be significant sooner or later. A
-confidence sequence holds at every n at once.
+confidence sequence holds at every n at once: here of a success rate, and of the difference between
+two conditions on the same starts (three outcomes of a pair: improved, worsened, the same).
 """
 
 import math
@@ -9,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from scipy.special import betaln, gammaln, xlog1py, xlogy
 
 from evaluator.errors import UndefinedStatisticError
@@ -19,6 +20,12 @@ from evaluator.statistics.intervals import LEVEL, ImpossibleCountError, check_co
 PRIOR = 0.5
 """Krichevsky and Trofimov's bettor: a mixture of bets with Beta(1/2, 1/2) weights."""
 MAX_TRIALS = 100_000
+BISECTIONS, PAIR_BISECTIONS = 60, 50
+SURE = "sequence of pairs"
+
+Counts = Int64[np.ndarray, " looks"]
+Ends = Float64[np.ndarray, " looks"]
+Poor = Bool[np.ndarray, " looks"]
 
 
 def capital_log(k: int, n: int, rate: float) -> float:
@@ -62,7 +69,7 @@ def betting_interval(k: int, n: int, *, level: float = LEVEL) -> Interval:
 def _end(k: int, n: int, ruin: float, outside: float) -> float:
     """Where the capital reaches 1/alpha between the observed rate and 0 or 1."""
     inside = k / n
-    for _ in range(60):
+    for _ in range(BISECTIONS):
         middle = (inside + outside) / 2
         if capital_log(k, n, middle) < ruin:
             inside = middle
@@ -111,8 +118,14 @@ def sequence_of(outcomes: Sequence[bool], *, level: float = LEVEL) -> Confidence
     if not outcomes:
         return sequence
     k, n = np.cumsum(np.array(outcomes, dtype=bool)), np.arange(1, len(outcomes) + 1)
-    lows = np.where(k == 0, 0.0, _ends(k, n, level, np.zeros(len(n))))
-    highs = np.where(k == n, 1.0, _ends(k, n, level, np.ones(len(n))))
+    ruin = -np.log1p(-level)
+    mixture = betaln(k + PRIOR, n - k + PRIOR) - betaln(PRIOR, PRIOR)
+
+    def is_poor(rate: Ends) -> Poor:
+        return np.asarray(mixture - xlogy(k, rate) - xlog1py(n - k, -rate) < ruin)
+
+    lows = np.where(k == 0, 0.0, _ends(k / n, 0.0, is_poor, BISECTIONS))
+    highs = np.where(k == n, 1.0, _ends(k / n, 1.0, is_poor, BISECTIONS))
     low, high = np.maximum.accumulate(lows), np.minimum.accumulate(highs)
     crossed = np.flatnonzero(low > high)
     if len(crossed):
@@ -122,21 +135,14 @@ def sequence_of(outcomes: Sequence[bool], *, level: float = LEVEL) -> Confidence
     return sequence
 
 
-def _ends(
-    k: Int64[np.ndarray, " trials"],
-    n: Int64[np.ndarray, " trials"],
-    level: float,
-    outside: Float64[np.ndarray, " trials"],
-) -> Float64[np.ndarray, " trials"]:
-    """Bisect all ends together."""
-    ruin = -np.log1p(-level)
-    mixture = betaln(k + PRIOR, n - k + PRIOR) - betaln(PRIOR, PRIOR)
-    inside = k / n
-    for _ in range(60):
-        middle = (inside + outside) / 2
-        poor = mixture - xlogy(k, middle) - xlog1py(n - k, -middle) < ruin
-        inside, outside = np.where(poor, middle, inside), np.where(poor, outside, middle)
-    return np.asarray(inside)
+def _ends(seen: Ends, outside: float, is_poor: Callable[[Ends], Poor], bisections: int) -> Ends:
+    """Bisect all looks together: where, from what was seen, the capital reaches 1/alpha."""
+    far = np.full(len(seen), outside)
+    for _ in range(bisections):
+        middle = (seen + far) / 2
+        poor = is_poor(middle)
+        seen, far = np.where(poor, middle, seen), np.where(poor, far, middle)
+    return seen
 
 
 def _changed(after: int) -> UndefinedStatisticError:
@@ -197,17 +203,6 @@ def fewest(decided: Callable[[int], bool], at_least: int) -> int | None:
     return max(high, at_least)
 
 
-# Looking after every pair: has the rate changed between two conditions on the same starts?
-#
-# Like ``sequential``, for three outcomes of a pair: improved, worsened, the same.
-
-BISECTIONS = 50
-SURE = "sequence of pairs"
-
-Counts = Int64[np.ndarray, " looks"]
-Ends = Float64[np.ndarray, " looks"]
-
-
 def pairs_capital_log(improved: int, worsened: int, n: int, difference: float) -> float:
     """Return the log of what a bettor against this difference owns after n pairs.
 
@@ -219,18 +214,13 @@ def pairs_capital_log(improved: int, worsened: int, n: int, difference: float) -
     Raises:
         ImpossibleCountError: When more pairs changed than there are.
     """
-    counts = _checked(improved, worsened, n)
-    return float(_capital_log(*counts, np.array([difference]))[0])
-
-
-def _checked(improved: int, worsened: int, n: int) -> tuple[Counts, Counts, Counts]:
     if min(improved, worsened) < 0 or improved + worsened > n:
         raise ImpossibleCountError(k=improved + worsened, n=n)
     better, worse, same = (np.array([k]) for k in (improved, worsened, n - improved - worsened))
-    return better, worse, same
+    return float(_pairs_capital_log(better, worse, same, np.array([difference]))[0])
 
 
-def _capital_log(better: Counts, worse: Counts, same: Counts, d: Ends) -> Ends:
+def _pairs_capital_log(better: Counts, worse: Counts, same: Counts, d: Ends) -> Ends:
     n = better + worse + same
     counts = (better, worse, same)
     mixture = sum(gammaln(k + PRIOR) - gammaln(PRIOR) for k in counts)
@@ -248,35 +238,6 @@ def _best_chances(better: Counts, worse: Counts, same: Counts, d: Ends) -> tuple
     return p, np.maximum(0.0, p - d), np.maximum(0.0, 1 - 2 * p + d)
 
 
-def _pairs_ends(better: Counts, worse: Counts, same: Counts, ruin: float, outside: float) -> Ends:
-    """Bisect all looks together: where the capital reaches 1/alpha, or ``outside``."""
-    close = (better - worse) / (better + worse + same)
-    far = np.full(len(close), outside)
-    reached = _capital_log(better, worse, same, far) < ruin
-    for _ in range(BISECTIONS):
-        middle = (close + far) / 2
-        poor = _capital_log(better, worse, same, middle) < ruin
-        close, far = np.where(poor, middle, close), np.where(poor, far, middle)
-    return np.where(reached, outside, close)
-
-
-def pairs_betting_interval(
-    improved: int, worsened: int, n: int, *, level: float = LEVEL
-) -> Interval:
-    """Return the differences P(improved) - P(worsened) that a bettor has not yet refuted.
-
-    Raises:
-        UndefinedStatisticError: Without pairs.
-        ImpossibleCountError: When more pairs changed than there are.
-    """
-    if n == 0:
-        raise UndefinedStatisticError(statistic=SURE, reason="there are no pairs")
-    counts = _checked(improved, worsened, n)
-    ruin = -math.log1p(-level)
-    low, high = (float(_pairs_ends(*counts, ruin, outside)[0]) for outside in (-1.0, 1.0))
-    return Interval(low=low, high=high, level=level, method="betting-pairs")
-
-
 def pairs_sequence(changes: Sequence[int], *, level: float = LEVEL) -> Interval:
     """Return what is left after every pair in order: +1 improved, -1 worsened, 0 the same.
 
@@ -290,8 +251,16 @@ def pairs_sequence(changes: Sequence[int], *, level: float = LEVEL) -> Interval:
     seen, ruin = np.array(changes, dtype=np.int64), -math.log1p(-level)
     better, worse = np.cumsum(seen > 0), np.cumsum(seen < 0)
     same = np.arange(1, len(seen) + 1) - better - worse
-    low = np.maximum.accumulate(_pairs_ends(better, worse, same, ruin, -1.0))
-    high = np.minimum.accumulate(_pairs_ends(better, worse, same, ruin, 1.0))
+
+    def is_poor(difference: Ends) -> Poor:
+        return np.asarray(_pairs_capital_log(better, worse, same, difference) < ruin)
+
+    def ends(outside: float) -> Ends:
+        mean = (better - worse) / (better + worse + same)
+        found = _ends(mean, outside, is_poor, PAIR_BISECTIONS)
+        return np.where(is_poor(np.full(len(seen), outside)), outside, found)
+
+    low, high = np.maximum.accumulate(ends(-1.0)), np.minimum.accumulate(ends(1.0))
     crossed = np.flatnonzero(low > high)
     if len(crossed):
         raise UndefinedStatisticError(

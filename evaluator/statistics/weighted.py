@@ -2,7 +2,7 @@
 
 A resample counts each group several times: ``recorded`` and ``sim`` hold one value per group and
 ``counts`` tells the sets apart. A new measurement has other rates in each set: then both sides are
-sets x groups and every count is one. The plain forms are in ``agreement`` and ``correlation``.
+sets x groups and every count is one. The plain forms are in ``agreement``.
 """
 
 from collections.abc import Callable

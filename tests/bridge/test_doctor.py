@@ -1,10 +1,32 @@
 """What ``robot-gst doctor`` finds."""
 
 import importlib.util
+import re
+import tomllib
+from pathlib import Path
 
 import pytest
 
 from bridge import doctor
+
+PYPROJECT = Path(__file__).parents[2] / "pyproject.toml"
+
+
+def test_packages_and_what_is_optional_are_those_of_the_project_file() -> None:
+    project = tomllib.loads(PYPROJECT.read_text())["project"]
+    extras = project["optional-dependencies"]
+    (demo,) = extras["demo"]
+    needed = {"base", *demo.removeprefix("robot-gst[").removesuffix("]").split(",")}
+    wanted = {"base": project["dependencies"]} | {
+        name: packages
+        for name, packages in extras.items()
+        if name not in ("demo", "all", "bench", "dev")
+    }
+    assert {name for name, extra in doctor.EXTRAS.items() if not extra.is_optional} == needed
+    assert {name: set(extra.packages) for name, extra in doctor.EXTRAS.items()} == {
+        name: {re.split(r"[^\w.-]", package)[0] for package in packages} - {"robot-gst"}
+        for name, packages in wanted.items()
+    }
 
 
 def test_each_native_extension_is_built_or_what_goes_without_it_is_said(
@@ -30,7 +52,8 @@ def test_extras_that_nothing_depends_on_are_named_but_not_held_against_a_machine
 
     monkeypatch.setattr(doctor.metadata, "version", nothing_installed)
     found = {item.what: item for item in doctor.examine()}
-    for what in ("transformers [foundation]", "safetensors [foundation]", "gsplat [gpu]"):
+    for what in ("transformers [foundation]", "av [video]", "torch [twin]", "gsplat [gpu]"):
         assert (found[what].ok, found[what].found) == (True, "missing (optional)")
         assert "pip install" in found[what].advice
-    assert not found["torch [twin]"].ok
+    assert not found["open3d [replay]"].ok
+    assert found["open3d [replay]"].purpose == "rebuild, render, replay, gate, calibrate"

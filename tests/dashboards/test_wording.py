@@ -56,9 +56,9 @@ def test_a_rate_in_large_is_its_count_and_below_stands_its_interval() -> None:
 
 
 def test_undefined_says_why_and_absent_says_missing() -> None:
-    undefined = measurement(value=None, reason_if_undefined="2 cells; it needs at least 3")
+    undefined = measurement(value=None, reason_if_undefined="2 groups; it needs at least 3")
     assert wording.measured(undefined) == "undefined"
-    assert wording.evidence(undefined) == "2 cells; it needs at least 3"
+    assert wording.evidence(undefined) == "2 groups; it needs at least 3"
     assert wording.measured(None) == "missing"
 
 

@@ -13,7 +13,7 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics import agreement
 from evaluator.statistics.agreement import choose, over_tasks, without_each
 from evaluator.statistics.bootstrap import (
-    bootstrap_interval,
+    GroupSample,
     remeasure_counts,
     remeasure_paired,
     resamples,
@@ -107,7 +107,8 @@ def test_an_exact_bootstrap_is_the_bootstrap_of_all_ordered_draws(statistic: str
             values.append(plain([recorded[i] for i in draw], [sim[i] for i in draw]))
         except UndefinedStatisticError:
             continue
-    interval = bootstrap_interval(statistic, recorded=recorded, sim=sim, rng=rng())
+    sample = GroupSample(recorded=recorded, sim=sim, rng=rng())
+    interval = sample.interval(statistic, "bootstrap")
     low, high = np.quantile(values, [0.025, 0.975], method="inverted_cdf")
     assert interval.low == pytest.approx(low, abs=1e-9)
     assert interval.high == pytest.approx(high, abs=1e-9)
@@ -118,7 +119,8 @@ def test_clusters_are_resampled_together() -> None:
     recorded = [0.1, 0.2, 0.5, 0.6, 0.8, 0.9, 0.3, 0.4]
     sim = [0.2, 0.1, 0.6, 0.5, 0.9, 0.8, 0.4, 0.3]
     clusters = list("aabbccdd")
-    interval = bootstrap_interval("bias", recorded=recorded, sim=sim, rng=rng(), clusters=clusters)
+    sample = GroupSample(recorded=recorded, sim=sim, rng=rng(), clusters=clusters)
+    interval = sample.interval("bias", "bootstrap")
     # Within every cluster the gaps cancel, so no resample of clusters has a bias.
     assert interval.low == pytest.approx(0, abs=1e-12)
     assert interval.high == pytest.approx(0, abs=1e-12)
@@ -126,12 +128,12 @@ def test_clusters_are_resampled_together() -> None:
 
 
 def test_too_few_units_and_too_many_constant_resamples_are_refused() -> None:
+    few = GroupSample(recorded=[0, 1, 1], sim=[0, 1, 0], rng=rng())
     with pytest.raises(UndefinedStatisticError, match="3 units; it needs at least 4"):
-        bootstrap_interval("bias", recorded=[0, 1, 1], sim=[0, 1, 0], rng=rng())
+        few.interval("bias", "bootstrap")
+    constant = GroupSample(recorded=[0, 1, 1, 1], sim=[0.1, 0.5, 0.2, 0.3], rng=rng())
     with pytest.raises(UndefinedStatisticError, match="undefined in 32 % of the resamples"):
-        bootstrap_interval("pearson", recorded=[0, 1, 1, 1], sim=[0.1, 0.5, 0.2, 0.3], rng=rng())
-    with pytest.raises(ValueError, match="'regret' has no bootstrap"):
-        bootstrap_interval("regret", recorded=[0, 1], sim=[0, 1], rng=rng())
+        constant.interval("pearson", "bootstrap")
 
 
 def test_student_gives_no_interval_of_no_width() -> None:

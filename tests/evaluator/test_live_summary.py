@@ -7,8 +7,8 @@ import pytest
 from bridge.episode.catalogue import Entry
 from evaluator.live.follow import change_line, state_lines
 from evaluator.live.session import (
-    Ledger,
     LiveTrial,
+    SessionTrials,
     changes_of,
     next_start,
     summarise_session,
@@ -37,11 +37,11 @@ def trial(
     )
 
 
-def fill(*trials: LiveTrial) -> Ledger:
-    ledger = Ledger()
+def fill(*trials: LiveTrial) -> SessionTrials:
+    session = SessionTrials()
     for each in trials:
-        ledger.take(each)
-    return ledger
+        session.take(each)
+    return session
 
 
 def test_only_trials_that_can_be_read_count() -> None:
@@ -57,32 +57,32 @@ def test_only_trials_that_can_be_read_count() -> None:
 
 
 def test_the_same_news_twice_is_no_news_and_a_corrected_label_replaces() -> None:
-    ledger = fill(trial(1, True))
-    assert ledger.take(trial(1, True)) is None
-    change = ledger.take(trial(1, False))
+    session = fill(trial(1, True))
+    assert session.take(trial(1, True)) is None
+    change = session.take(trial(1, False))
     assert change is not None
     assert change.before is not None
     assert (change.before.recorded, change.trial.recorded) == (True, False)
-    assert [t.recorded for t in ledger.trials] == [False]
+    assert [t.recorded for t in session.trials] == [False]
 
 
 def test_a_late_label_takes_its_place_in_the_order_of_trials() -> None:
-    ledger = fill(trial(2, True), trial(1, None), trial(3, False))
-    assert summarise_session(ledger.trials, None).unknown == 1
-    ledger.take(trial(1, True))
-    assert [t.recorded for t in ledger.trials] == [True, True, False]
-    standing = summarise_session(ledger.trials, None)
+    session = fill(trial(2, True), trial(1, None), trial(3, False))
+    assert summarise_session(session.trials, None).unknown == 1
+    session.take(trial(1, True))
+    assert [t.recorded for t in session.trials] == [True, True, False]
+    standing = summarise_session(session.trials, None)
     assert (standing.rates[0].k, standing.rates[0].n) == (2, 3)
 
 
 def test_what_left_the_folder_counts_no_more_and_what_it_has_not_listed_yet_stays() -> None:
-    ledger = fill(trial(9, True))
-    changes, gone = ledger.take_listing([trial(1, True)])
+    session = fill(trial(9, True))
+    changes, gone = session.take_listing([trial(1, True)])
     assert ([c.trial.episode for c in changes], gone) == (["trial_0001"], [])
-    assert len(ledger.trials) == 2  # the message was quicker than the folder
-    _, gone = ledger.take_listing([trial(1, True), trial(9, True)])
+    assert len(session.trials) == 2  # the message was quicker than the folder
+    _, gone = session.take_listing([trial(1, True), trial(9, True)])
     assert gone == []
-    _, gone = ledger.take_listing([trial(9, True)])
+    _, gone = session.take_listing([trial(9, True)])
     assert [t.episode for t in gone] == ["trial_0001"]
 
 
@@ -180,13 +180,13 @@ def test_the_task_with_fewer_trials_comes_first_and_settled_ones_not_at_all() ->
 def test_a_line_says_what_happened_what_follows_and_what_is_next(
     before: bool | None, words: str
 ) -> None:
-    ledger = fill(*[trial(i, True, start=f"s{i}") for i in range(1, 4)])
+    session = fill(*[trial(i, True, start=f"s{i}") for i in range(1, 4)])
     if before is not None:
-        ledger.take(trial(4, before, start="s4"))
-    change = ledger.take(trial(4, True, start="s4"))
+        session.take(trial(4, before, start="s4"))
+    change = session.take(trial(4, True, start="s4"))
     assert change is not None
-    standing = summarise_session(ledger.trials, 0.9)
-    line = change_line(change, standing, next_start(ledger.trials, standing), 0.9)
+    standing = summarise_session(session.trials, 0.9)
+    line = change_line(change, standing, next_start(session.trials, standing), 0.9)
     assert line.startswith("trial_0004: success")
     assert words in line
     assert "cube, with replanning, scripted 4/4 [" in line

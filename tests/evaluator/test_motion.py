@@ -20,7 +20,6 @@ from evaluator.compare.motion import (
     MotionSummary,
     compare_tracks,
     motion_results,
-    summarise_motion,
     summarise_motions,
 )
 from evaluator.errors import UndefinedStatisticError
@@ -262,10 +261,8 @@ def test_files_give_what_their_tracks_give_and_the_replays_are_compared_too(tmp_
     assert found[1].joint_max_rad == pytest.approx(0.01)
     assert found[1].position_max_m == pytest.approx(0.0, abs=1e-9)
     assert found[2].position_mean_m == pytest.approx(found[0].position_mean_m, abs=1e-9)
-    alone = summarise_motion(
-        episodes["recorded"], episodes["planned"], against="planned", plan_id="p1"
-    )
-    assert alone == found[0]
+    alone = {"planned": episodes["planned"]}
+    assert summarise_motions(episodes["recorded"], alone, plan_id="p1") == found[:1]
 
 
 def test_samples_outside_the_execution_do_not_count(tmp_path: Path) -> None:
@@ -277,10 +274,9 @@ def test_samples_outside_the_execution_do_not_count(tmp_path: Path) -> None:
         started_ns=START_NS + 50 * STEP_NS,
         ended_ns=START_NS + 100 * STEP_NS,
     )
-    found = summarise_motion(
+    (found,) = summarise_motions(
         write(tmp_path / "a.mcap", waiting),
-        write(tmp_path / "b.mcap", tracks()),
-        against="planned",
+        {"planned": write(tmp_path / "b.mcap", tracks())},
         plan_id="p1",
     )
     assert found.num_samples == 51

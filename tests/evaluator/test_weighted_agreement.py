@@ -13,7 +13,6 @@ from evaluator.statistics.bootstrap import (
     METHODS,
     SCALES,
     GroupSample,
-    bootstrap_interval,
     expanded_tail,
     remeasure_counts,
     remeasure_paired,
@@ -82,9 +81,8 @@ def test_an_exact_bootstrap_is_the_bootstrap_of_all_ordered_draws(statistic: str
     )
     values = [value for value in found if value is not None]
     # Sets with fewer than three different groups are undefined for the plain forms in other places.
-    interval = bootstrap_interval(
-        statistic, recorded=recorded, sim=sim, rng=np.random.default_rng(0)
-    )
+    sample = GroupSample(recorded=recorded, sim=sim, rng=np.random.default_rng(0))
+    interval = sample.interval(statistic, "bootstrap")
     low, high = np.quantile(values, [0.025, 0.975], method="inverted_cdf")
     assert interval.low == pytest.approx(low, abs=1e-9)
     assert interval.high == pytest.approx(high, abs=1e-9)

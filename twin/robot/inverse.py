@@ -267,15 +267,12 @@ def _link(theta: float, a_m: float, d_m: float, alpha: float) -> Float[np.ndarra
     )
 
 
-# Closed-form inverse kinematics of UR-type arms: all eight branches of many poses at once.
-# The second, third and fourth axes are parallel, so the direction n they share and the wrist
-# point (where the last two axes meet) give the joints one after another (Hawkins 2013, "Analytic
-# inverse kinematics for the Universal Robots UR-5/UR-10 arms"):
-#
-#     n . wrist = d4                      two shoulders     n seen from the tool
-# two wrists, and with them the fifth axis     what is left is a planar arm        two elbows
-#
-# Angles come from two-argument arctangents of quantities that stay exact near the singularities.
+# The closed form for UR-type arms. The second, third and fourth axes are parallel, so the direction
+# n they share and the wrist point (where the last two axes meet) give the joints one after another
+# (Hawkins 2013, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms"):
+# n . wrist = d4 has two shoulders; n seen from the tool gives two wrists, and with them the fifth
+# axis; what is left is a planar arm with two elbows. Angles come from two-argument arctangents of
+# quantities that stay exact near the singularities.
 
 NUM_BRANCHES = 8
 """Branch number: 4 * shoulder + 2 * wrist + elbow, each 0 or 1."""

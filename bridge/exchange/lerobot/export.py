@@ -1,4 +1,8 @@
-"""A run's trials as one LeRobotDataset v3.0."""
+"""A run's trials as one LeRobotDataset v3.0, each on a grid of equal steps.
+
+Row k is at ``t_0 + k / fps``. State: joints and gripper, interpolated at that time. Image: the one
+nearest in time. Action: the plan's command for the next row, or the next row's state.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -31,11 +35,6 @@ from bridge.exchange.lerobot.writer import DatasetShape, DatasetWriter
 from bridge.exchange.output import message_named, new_folder, safe_names, write_note
 from bridge.task.plan import Plan
 from bridge.terminal import Advance
-
-# An episode on a grid of equal steps: what was measured, what was commanded, which image.
-#
-# Row k is at ``t_0 + k / fps``. State: joints and gripper, interpolated at that time. Image: the
-# one nearest in time. Action: the plan's command for the next row, or the next row's state.
 
 ActionKind = Literal["plan", "next_state"]
 DEFAULT_FPS = 30

@@ -1,4 +1,9 @@
-"""An RGB-D folder as the messages of a live camera."""
+"""An RGB-D folder as the messages of a live camera.
+
+Three layouts are told apart by their files: our own index ``scene.json``, the lists of the TUM
+RGB-D benchmark (``rgb.txt`` and ``depth.txt``, or ``associations.txt``), and the numbered files of
+7-Scenes (``frame-000000.color.png``). ``docs/rgbd_folder.md`` describes each.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,12 +33,6 @@ from bridge.sources.folder.frames import FolderFrame, FolderIndex, read_stored_d
 from bridge.sources.folder.scene_json import INDEX_NAME, read_scene
 from bridge.sources.folder.sevenscenes import find_frames, read_sevenscenes
 from bridge.sources.folder.tum import find_lists, read_tum
-
-# Which layout an RGB-D folder has, and its frames.
-#
-# Three layouts are told apart by their files: our own index ``scene.json``, the lists of the TUM
-# RGB-D benchmark (``rgb.txt`` and ``depth.txt``, or ``associations.txt``), and the numbered files
-# of 7-Scenes (``frame-000000.color.png``). ``docs/rgbd_folder.md`` describes each.
 
 DEFAULTS = FolderConfig()
 

@@ -28,9 +28,8 @@ except ImportError as import_error:  # pragma: no cover  # needs an environment 
 __all__ = ["rs"]
 
 
-# Takes lens distortion out of colour images, as the episode's cameras have none.
-#
-# D415 and D435 send undistorted colour (all coefficients 0). D405 and D455 do not.
+# D415 and D435 send undistorted colour (all coefficients 0), D405 and D455 do not; an episode's
+# cameras have no distortion.
 
 ONE = 256
 """Weights are eight-bit fixed point and sum to this: 255 times it still fits into 16 bits."""

@@ -1,4 +1,9 @@
-"""What the cameras can see: triangles, smooth normals and colours of every body."""
+"""What the cameras can see: triangles, smooth normals and colours of every body.
+
+The laboratory's wood, patches, floor and walls are made from a seed. A texture is a picture laid
+over a rectangle of a plane; features are several millimetres wide so that a camera half a metre
+away sees them without aliasing.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,11 +22,6 @@ from bridge.sources.standin.world import TABLE_CENTRE_M, TABLE_SIZE_M, LinkShape
 from bridge.task.meshes.catalogue import ToyMesh, object_mesh, toy_mesh
 from bridge.task.meshes.toys import Paint
 from bridge.task.task_file import ObjectModel, Task
-
-# Surface colours of the laboratory, made from a seed: wood, patches, floor, walls.
-#
-# A texture is a picture laid over a rectangle of a plane; features are several millimetres wide
-# so that a camera half a metre away sees them without aliasing.
 
 TABLE_RESOLUTION_M = 0.001
 ROOM_RESOLUTION_M = 0.01

@@ -1,4 +1,8 @@
-"""What is read from a UR arm, and how it is named. Imports nothing heavy."""
+"""What is read from a UR arm, and how it is named. Imports nothing heavy.
+
+RTDE does not know grippers: it knows the inputs, outputs and registers they are wired to, and
+registers that the robot program writes. ``docs/recording.md`` says which suits which gripper.
+"""
 
 import re
 from collections.abc import Mapping
@@ -8,11 +12,6 @@ from typing import Literal
 
 from bridge.episode.topics import refuse_bad_name
 from bridge.errors import BridgeError, UsageError, refuse_outside
-
-# The opening of a gripper, read from the controller's inputs, outputs or registers.
-#
-# RTDE does not know grippers: it knows the signals they are wired to, and registers that the
-# robot program writes. ``docs/recording.md`` says which signal suits which gripper.
 
 Value = bool | int | float | tuple[float, ...] | tuple[int, ...]
 _SIGNAL = re.compile(r"([a-z_]+):(\d{1,2})")

@@ -18,9 +18,9 @@ from bridge.episode.schema import StampedMessage
 from bridge.episode.topics import EVENT, cell_topic
 from bridge.robots.default import ARM_JOINTS, BASE_FRAME
 
-# Messages of one layout, serialised once: only stamp and numbers change from sample to sample.
-#
-# At 500 samples a second and six topics a general serialiser would cost a quarter of a core.
+# Messages of one layout are serialised once; then only stamp and numbers change from sample to
+# sample. At 500 samples a second and six topics a general serialiser would cost a quarter of a
+# core.
 
 _STAMP = {"sec": 0x13579BDF, "nanosec": 0x2468ACE0}
 _STAMP_BYTES = struct.pack("<iI", *_STAMP.values())

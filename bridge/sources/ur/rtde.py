@@ -1,4 +1,8 @@
-"""Reads a UR controller over RTDE: every package, in order, with the controller's own time."""
+"""Reads a UR controller over RTDE: every package, in order, with the controller's own time.
+
+All numbers are big endian. A package is its size (uint16, header included), its kind (uint8) and a
+payload. Version 2 of the protocol puts the number of the recipe before the data.
+"""
 
 import contextlib
 import socket
@@ -10,11 +14,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from bridge.sources.ur.config import ControllerError, NotRtdeError, Value
-
-# Packages of the Real-Time Data Exchange, as the vendor's public guide describes them.
-#
-# All numbers are big endian. A package is its size (uint16, header included), its kind (uint8)
-# and a payload. Version 2 of the protocol puts the number of the recipe before the data.
 
 PROTOCOL_VERSION = 2
 HEADER = struct.Struct(">HB")

@@ -2,6 +2,10 @@
 
 A mean over other images is another number. So the table is made over the views that every method
 has, and each view that is left out is named with its reason.
+
+Folders of images are read strictly: what cannot be compared is refused with what to do about it. A
+view is named by its path inside the folder without the ending: ``wrist/0001``. What a decoder would
+quietly change (16 bits to 8, transparency, grey to colour) is looked for in the file itself.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -36,13 +40,6 @@ from evaluator.metrics.image import refuse_swapped
 from evaluator.metrics.image_scores import ImageScore
 from evaluator.metrics.lpips import PerceptualNet
 from evaluator.result import Exclusion
-
-# Folders of images, read strictly: what cannot be compared is refused with what to do about
-# it.
-#
-# A view is named by its path inside the folder without the ending: ``wrist/0001``. What a decoder
-# would quietly change (16 bits to 8, transparency, grey to colour) is looked for in the file
-# itself.
 
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 READ = (".png", ".jpg", ".jpeg", ".npy")

@@ -2,7 +2,8 @@
 
 Topics end in ``/cam/<id>/`` and ``rendered/image``, ``recorded/image`` (or, in the source episode,
 ``color/image``), ``pose_aligned/image``, ``mask/<name>/image`` or ``mask/<name>`` (white inside),
-``rendered/depth``, ``recorded/depth`` and ``recorded/depth_in_color``.
+``rendered/depth``, ``recorded/depth`` and ``recorded/depth_in_color``. Images are worked on by a
+few threads, as NumPy and the image decoders let go of the interpreter.
 """
 
 import os
@@ -183,11 +184,6 @@ def open_nets(backbones: Mapping[NetName, Path]) -> tuple[PerceptualNet, ...]:
         raise MissingDependencyError(package="torch", extra="lpips", purpose="LPIPS") from error
     return tuple(LpipsNet.open(net, path) for net, path in backbones.items())
 
-
-# Work on many images with a few threads; NumPy and the image decoders let go of the
-# interpreter.
-#
-# Episodes are read and compared by processes: ``workers``.
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -1,6 +1,6 @@
 """Score rendered views against the held-out recorded images they stand for.
 
-``view_images`` pairs and scores the images of one episode; here the newest views of each recorded
+``scores`` pairs and scores the images of one episode; here the newest views of each recorded
 episode are found, and their scores become measurements, each with its protocol.
 """
 

@@ -21,12 +21,10 @@ from matplotlib.font_manager import get_font
 
 from evaluator.report.figures.drawing import LIGHT, Drawing, Rendered
 
-# One cut of the font for the PDF files of all figures.
-#
-# matplotlib cuts out of the font what each file needs, and fontTools takes longer for that than
+# matplotlib cuts out of the font what each PDF file needs, and fontTools takes longer for that than
 # everything else in a figure. Here one cut with the usual characters is made and put into every
-# file: ten kilobytes more in each. This reaches into matplotlib 3.11; where its insides are
-# others, each file has its own cut as before, and only takes longer.
+# file: ten kilobytes more in each. This reaches into matplotlib 3.11; where its insides are others,
+# each file has its own cut as before, and only takes longer.
 
 embedding: Any = _backend_pdf_ps
 

@@ -59,11 +59,6 @@ TABLES = ("confusion", "gate_costs", "funnel")
 """Those that a figure shows; the one of all trials is as long as the run."""
 
 
-def drawings(comparison: Comparison) -> tuple[list[Drawing], list[NotDrawn]]:
-    """Return the figures that have data, in the order of the report, and the others."""
-    return drawings_of(drawable(comparison))
-
-
 def drawings_of(data: Drawable) -> tuple[list[Drawing], list[NotDrawn]]:
     """Return the figures that have data, in the order of the report, and the others."""
     everything: tuple[Drawing | NotDrawn, ...] = (

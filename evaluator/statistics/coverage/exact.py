@@ -1,4 +1,9 @@
-"""Coverage by counting every outcome out: no random numbers, so no noise in the least coverage."""
+"""Coverage by counting every outcome out: no random numbers, so no noise in the least coverage.
+
+The stored map holds groups of equal size. The smaller group's entry is no bound for others (with 10
+and 16 trials Newcombe's interval covers as little as 88.3 %, with 10 and 10 at least 90.9 %), so
+groups of different size are counted out when they are asked for.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -89,12 +94,6 @@ def _summary(n: int, covered: Float64[np.ndarray, " rates"], names: Sequence[str
         n=n, worst=float(covered[worst]), worst_at=names[worst], mean=float(covered.mean())
     )
 
-
-# Coverage of Newcombe's interval for groups of different size, counted out when it is asked
-# for.
-#
-# The stored map holds groups of equal size. The smaller group's entry is no bound for others:
-# with 10 and 16 trials it covers as little as 88.3 %, with 10 and 10 at least 90.9 %.
 
 MOST = 200
 """A larger group is taken as one of this size: its own rate is as good as known then."""

@@ -19,7 +19,7 @@ from evaluator.compare import Comparison, compare_csv
 from evaluator.report.figures import beside as module
 from evaluator.report.figures.beside import MIN_FILES, Beside, beside
 from evaluator.report.figures.drawing import Rendered
-from evaluator.report.figures.selection import drawable, drawings
+from evaluator.report.figures.selection import drawable, drawings_of
 from evaluator.report.write import write_report
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -83,7 +83,7 @@ def test_a_killed_process_takes_nothing_of_the_report_with_it(
 
 def test_half_an_answer_is_none(comparison: Comparison, second: Beside) -> None:
     second.close()
-    drawn = drawings(comparison)[0]
+    drawn = drawings_of(drawable(comparison))[0]
     loaded = process_pool._packed(None)
     data = loaded + process_pool._packed({item.id: (b"svg", b"pdf", "inline") for item in drawn})
 
@@ -106,7 +106,7 @@ def test_a_process_that_hangs_is_not_waited_for(
 ) -> None:
     monkeypatch.setattr(module, "MAX_WAIT_S", 0.1)
     second.process.send_signal(signal.SIGSTOP)
-    assert second.take(drawings(comparison)[0]) is None
+    assert second.take(drawings_of(drawable(comparison))[0]) is None
     assert second.process.returncode == -signal.SIGKILL
 
 

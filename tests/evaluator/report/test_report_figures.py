@@ -11,7 +11,7 @@ from evaluator.compare import Comparison, compare_csv
 from evaluator.report.figures.drawing import DARK, LIGHT, Drawing, NotDrawn, Rendered
 from evaluator.report.figures.rates import scatter, success
 from evaluator.report.figures.render import render
-from evaluator.report.figures.selection import drawings
+from evaluator.report.figures.selection import drawable, drawings_of
 from evaluator.report.sections import SECTIONS
 from evaluator.report.write import write_report
 
@@ -21,7 +21,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 @pytest.fixture(scope="module")
 def rendered(everything: Comparison) -> list[Rendered]:
-    drawn, not_drawn = drawings(everything)
+    drawn, not_drawn = drawings_of(drawable(everything))
     assert [item.id for item in not_drawn] == []
     with lean_checks.unchecked():
         return [render(drawing) for drawing in drawn]
@@ -36,7 +36,7 @@ def test_a_run_with_everything_has_every_figure_and_each_has_its_place(
 
 
 def test_what_has_no_data_is_named_with_its_reason() -> None:
-    drawn, not_drawn = drawings(compare_csv(PAPER))
+    drawn, not_drawn = drawings_of(drawable(compare_csv(PAPER)))
     assert {item.id for item in drawn} == {"scatter", "success", "gains"}
     assert {item.id for item in not_drawn} == {
         *("confusion", "costs", "reliability", "funnel", "motions", "bands", "states", "views")

@@ -76,7 +76,7 @@ class Aligner:
             import open3d  # noqa: PLC0415  # heavy, and only scans without poses need it
         except ImportError as error:
             raise MissingDependencyError(
-                package="open3d", extra="twin", purpose="following a camera without poses"
+                package="open3d", extra="replay", purpose="following a camera without poses"
             ) from error
         self.config = config
         self.open3d: Any = open3d
