@@ -50,6 +50,9 @@ class FileSession:
         if verb == "stop":
             self._stop(request["outcome"], discard=bool(request["discard"]))
             return b"{}"
+        if verb == "list":
+            done = [{"id": path.stem} for path in sorted(self._folder.glob("*.mcap"))]
+            return json.dumps({"of": len(done), "episodes": done}).encode()
         raise NoReplyError(key=key, timeout_s=timeout_s)
 
     def _stop(self, outcome: dict[str, Any] | None, *, discard: bool) -> None:
