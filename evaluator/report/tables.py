@@ -4,6 +4,7 @@ import csv
 import io
 import re
 import shutil
+import textwrap
 from functools import lru_cache
 
 from rich.box import SIMPLE_HEAD
@@ -44,19 +45,94 @@ def _bar(cells: list[str]) -> str:
 
 
 def as_text(table: Table, *, width: int | None = None) -> str:
-    """Draw the table for a terminal, without the columns that are empty throughout."""
-    drawn = RichTable(box=SIMPLE_HEAD, title=table.title, title_justify="left", padding=(0, 1))
+    """Draw the table for a terminal, without the columns that are empty throughout.
+
+    Lines break between words only. Columns that hold one value throughout are named once where the
+    table is too wide, and rows become lists of their cells where it still is.
+    """
+    width = width or shutil.get_terminal_size(fallback=(80, 24)).columns
     shown = view(table)
     used = used_columns(shown)
-    for index in used:
-        drawn.add_column(Text(shown.columns[index]), overflow="fold")
-    for row in shown.rows:
-        drawn.add_row(*(Text(cell_text(row[index])) for index in used))
+    heads = [shown.columns[index] for index in used]
+    rows = [[_kept_together(cell_text(row[index])) for index in used] for row in shown.rows]
+    title = table.title
+    if len(rows) > 1 and _whole_width(heads, rows) > width:
+        same = [k for k in range(len(heads)) if len({row[k] for row in rows}) == 1]
+        kept = [k for k in range(len(heads)) if k not in same]
+        if same and kept:
+            title += f" ({'; '.join(f'{heads[k]}: {rows[0][k]}' for k in same)})"
+            heads, rows = [heads[k] for k in kept], [[row[k] for k in kept] for row in rows]
+    widths = _widths(heads, rows, width)
+    body = _listed(heads, rows, width) if widths is None else _drawn(heads, rows, widths)
+    parts = [*_filled(title, width), *body]
+    text = "\n".join(parts + (_filled(table.note, width) if table.note else [])) + "\n"
+    return text.replace(_NO_BREAK, " ")
+
+
+_NO_BREAK = "\ue000"
+"""Stands for a space while lines are broken: rich breaks at every kind of space."""
+_TOGETHER = re.compile(r"\[[^\]]*\]|[\d/]+ = [\d.]+ %|[+-]?[\d.]+ (%|pp|mm|°)")
+"""An interval, a share, a number with its unit: each stays on one line."""
+
+
+def _kept_together(text: str) -> str:
+    return _TOGETHER.sub(lambda found: found[0].replace(" ", _NO_BREAK), text)
+
+
+_EDGE, _GAP = 1, 3
+"""Characters before the first column, and between two."""
+
+
+def _whole_width(heads: list[str], rows: list[list[str]]) -> int:
+    columns = zip(heads, *rows, strict=True)
+    return _EDGE + sum(_GAP + max(map(len, column)) for column in columns)
+
+
+def _widths(heads: list[str], rows: list[list[str]], width: int) -> list[int] | None:
+    """Give each column its longest word and a share of what is left; None: not even that fits."""
+    columns = list(zip(heads, *rows, strict=True))
+    least = [
+        max(len(word) for text in column for word in text.split() or [""]) for column in columns
+    ]
+    whole = [max(map(len, column)) for column in columns]
+    spare = width - _EDGE - _GAP * len(columns) - sum(least)
+    if spare < 0:
+        return None
+    wanted = sum(whole) - sum(least)
+    share = min(1.0, spare / wanted) if wanted else 0.0
+    return [low + int(share * (high - low)) for low, high in zip(least, whole, strict=True)]
+
+
+def _drawn(heads: list[str], rows: list[list[str]], widths: list[int]) -> list[str]:
+    drawn = RichTable(box=SIMPLE_HEAD, padding=(0, 1))
+    for head, column in zip(heads, widths, strict=True):
+        drawn.add_column(Text(head), overflow="fold", width=column)
+    for row in rows:
+        drawn.add_row(*map(Text, row))
     stream = io.StringIO()
-    width = width or shutil.get_terminal_size(fallback=(140, 24)).columns
+    width = _EDGE + _GAP * len(widths) + sum(widths)
     Console(file=stream, width=width, no_color=True, highlight=False).print(drawn)
-    text = "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
-    return f"{text.rstrip()}\n{table.note}\n" if table.note else f"{text.rstrip()}\n"
+    return [line.rstrip() for line in stream.getvalue().rstrip().splitlines()]
+
+
+def _listed(heads: list[str], rows: list[list[str]], width: int) -> list[str]:
+    """Write each row as its cells with their heads, one below the other."""
+    lines: list[str] = []
+    for row in rows:
+        cells = [f"{head}: {text}" for head, text in zip(heads, row, strict=True) if text]
+        lines += ["", *(line for cell in cells for line in _filled(cell, width, "  "))]
+    return lines
+
+
+def _filled(text: str, width: int, indent: str = "") -> list[str]:
+    return textwrap.wrap(
+        text,
+        width,
+        initial_indent=indent,
+        subsequent_indent=2 * indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 _COMMANDS = {

@@ -214,3 +214,31 @@ def test_a_markdown_row_stays_one_line() -> None:
         "| --- |",
         r"| first second \| third |",
     ]
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 120, 200])
+def test_a_table_fits_the_terminal_and_no_word_is_broken(width: int) -> None:
+    conditions = ("without replanning", "with replanning")
+    table = Table(
+        id="any",
+        title="A table",
+        columns=("task", "condition", "policy", "unit", "rate", "why"),
+        rows=tuple(
+            (
+                "five_ducks_into_basket",
+                condition,
+                "scripted",
+                "trial",
+                "3/10 = 30.0 % [10.8, 60.3]",
+                f"undefined: {reason}",
+            )
+            for condition, reason in zip(conditions, ("too few trials", ""), strict=True)
+        ),
+        note="A note that is longer than a narrow terminal is wide, and says so.",
+    )
+    text = as_text(table, width=width)
+    assert max(map(len, text.splitlines())) <= width
+    words = text.split()
+    for cell in (table.title, table.note, *table.columns, *(c for row in table.rows for c in row)):
+        for word in cell.split():
+            assert any(word in shown for shown in words), word
