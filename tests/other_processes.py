@@ -1,7 +1,13 @@
 """What becomes of processes that need not be our children."""
 
+import os
+import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
+
+from own_process import ROOT
 
 
 def is_running(pid: int) -> bool:
@@ -18,3 +24,30 @@ def ended_within(pid: int, seconds: float) -> bool:
     while is_running(pid) and time.monotonic() < limit:
         time.sleep(0.02)
     return not is_running(pid)
+
+
+def check_an_interrupted_evaluation(code: str, run: Path, at_work: str) -> None:
+    """Law: Ctrl-C ends an evaluation with the way to continue, and all that it started.
+
+    Args:
+        code: Evaluates the run it is given; prints the id of the process it starts, then
+            ``at_work`` when it may be interrupted.
+        run: A run folder.
+        at_work: See ``code``.
+    """
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(run)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        pid = int(process.stdout.readline())
+        assert process.stdout.readline() == f"{at_work}\n"
+        os.killpg(process.pid, signal.SIGINT)
+        out, said = process.communicate(timeout=20)
+    again = f"robot-gst: interrupted; continue with: robot-gst evaluate {run}\n"
+    assert (process.returncode, out, said) == (130, "", again)
+    assert ended_within(pid, 10.0)

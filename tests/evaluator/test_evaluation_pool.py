@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -14,7 +13,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from other_processes import ended_within
+from other_processes import check_an_interrupted_evaluation
 
 from bridge import process_pool
 from bridge.process_pool import ProcessPool
@@ -186,22 +185,7 @@ sys.exit(robot_gst.run(["evaluate", sys.argv[1]]))
 
 @pytest.mark.slow
 def test_an_interrupt_ends_all_processes(six_trials: Any) -> None:
-    with subprocess.Popen(
-        [sys.executable, "-c", INTERRUPTED, str(six_trials.run.path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-        start_new_session=True,
-    ) as process:
-        assert process.stdout is not None
-        pid = int(process.stdout.readline())
-        assert process.stdout.readline() == "reading\n"
-        os.killpg(process.pid, signal.SIGINT)
-        out, said = process.communicate(timeout=20)
-    again = f"robot-gst: interrupted; continue with: robot-gst evaluate {six_trials.run.path}\n"
-    assert (process.returncode, out, said) == (130, "", again)
-    assert ended_within(pid, 10.0)
+    check_an_interrupted_evaluation(INTERRUPTED, six_trials.run.path, "reading")
 
 
 def test_few_files_start_nothing(six_trials: Any, nobody: list[bool]) -> None:

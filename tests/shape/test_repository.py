@@ -4,11 +4,11 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-ROOMS = ("bridge", "twin", "evaluator", "dashboards")
+PACKAGES = ("bridge", "twin", "evaluator", "dashboards")
 
 
 def sources() -> list[Path]:
-    return [path for room in ROOMS for path in (ROOT / room).rglob("*.py")]
+    return [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
 
 
 def test_there_is_no_drawer_for_everything() -> None:

@@ -2,14 +2,14 @@
 
 import ast
 import re
-import subprocess
 from collections import defaultdict
 from functools import cache
 from pathlib import Path
 
 import pytest
+from own_process import ROOT
+from tracked_files import tracked
 
-ROOT = Path(__file__).parents[2]
 PACKAGES = ("bridge", "twin", "evaluator", "dashboards", "robot_gst")
 SMALL = 150
 """Below so many lines a module that one neighbour imports is part of that neighbour."""
@@ -150,8 +150,4 @@ def test_decisions_are_few() -> None:
 def test_nothing_large_is_tracked() -> None:
     if not (ROOT / ".git").exists():
         return
-    listed = subprocess.run(
-        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    files = [ROOT / name for name in listed.stdout.splitlines() if (ROOT / name).is_file()]
-    assert [path for path in files if path.stat().st_size > 1_000_000] == []
+    assert [name for name in tracked() if (ROOT / name).stat().st_size > 1_000_000] == []

@@ -6,15 +6,15 @@ in text (docstrings, help, messages, documents, pages). Readers of old files are
 
 import ast
 import re
-import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import pytest
+from own_process import ROOT
+from tracked_files import tracked
 
-ROOT = Path(__file__).parents[2]
 PACKAGES = ("bridge", "twin", "evaluator", "dashboards")
 
 
@@ -160,17 +160,6 @@ WORDS = {
         text=r"\brooms\b|\b(of|in) the room\b",
     ),
 }
-
-
-@cache
-def tracked() -> tuple[str, ...]:
-    """Names of all files that git knows; without git, all there are."""
-    if not (ROOT / ".git").exists():
-        return tuple(str(path.relative_to(ROOT)) for path in ROOT.rglob("*") if path.is_file())
-    listed = subprocess.run(
-        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    return tuple(name for name in listed.stdout.splitlines() if (ROOT / name).is_file())
 
 
 def files_of(word: Word) -> list[str]:

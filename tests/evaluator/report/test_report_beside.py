@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from other_processes import ended_within, is_running
+from other_processes import check_an_interrupted_evaluation, ended_within, is_running
 
 import robot_gst
 from bridge import process_pool
@@ -159,22 +159,7 @@ def make_run(path: Path) -> None:
 
 def test_an_interrupt_reaches_both_and_neither_leaves_a_trace(tmp_path: Path) -> None:
     make_run(tmp_path)
-    with subprocess.Popen(
-        [sys.executable, "-c", INTERRUPTED, str(tmp_path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-        start_new_session=True,
-    ) as process:
-        assert process.stdout is not None
-        pid = int(process.stdout.readline())
-        assert process.stdout.readline() == "comparing\n"
-        os.killpg(process.pid, signal.SIGINT)
-        out, said = process.communicate(timeout=20)
-    again = f"robot-gst: interrupted; continue with: robot-gst evaluate {tmp_path}\n"
-    assert (process.returncode, out, said) == (130, "", again)
-    assert ended_within(pid, 10.0)
+    check_an_interrupted_evaluation(INTERRUPTED, tmp_path, "comparing")
 
 
 def test_an_evaluation_that_fails_leaves_no_process(
