@@ -50,7 +50,7 @@ TARGET_POSE = "/target/pose"
 """Of a calibration target in the frame of the camera."""
 RENDERED_IMAGE = "/rendered/image"
 
-COLOR_TOPIC = re.compile(r"/cam/([^/]+)/color/image$")
+COLOR_TOPIC = re.compile(f"{CAMERAS}([^/]+){COLOR_IMAGE}$")
 RECORDED_TOPIC = re.compile(r"/cam/([^/]+)/(?:color|recorded)(?:/image)?$")
 RENDERED_TOPIC = re.compile(r"/cam/([^/]+)/(?:color/)?(?:rendered|replayed)(?:/image)?$")
 POSE_ALIGNED_TOPIC = re.compile(r"/cam/([^/]+)/pose_aligned(?:/image)?$")
@@ -59,10 +59,10 @@ RECORDED_DEPTH_TOPIC = re.compile(r"/cam/([^/]+)/recorded/depth(?:_in_color)?$")
 RENDERED_DEPTH_TOPIC = re.compile(r"/cam/([^/]+)/rendered/depth$")
 
 _TYPES: tuple[tuple[str, str], ...] = (
-    (r"/cam/[^/]+/color/image$", schema.COMPRESSED_IMAGE),
-    (r"/cam/[^/]+/color/preview$", schema.COMPRESSED_VIDEO),
-    (r"/cam/[^/]+/depth/image$", schema.IMAGE),
-    (r"/cam/[^/]+/(color|depth)/info$", schema.CAMERA_INFO),
+    (COLOR_TOPIC.pattern, schema.COMPRESSED_IMAGE),
+    (f"{CAMERAS}[^/]+/color/preview$", schema.COMPRESSED_VIDEO),
+    (f"{CAMERAS}[^/]+{DEPTH_IMAGE}$", schema.IMAGE),
+    (f"{CAMERAS}[^/]+({COLOR_INFO}|{DEPTH_INFO})$", schema.CAMERA_INFO),
     (f"{JOINT_STATES}$", schema.JOINT_STATE),
     (f"{GRIPPER_STATE}$", schema.JOINT_STATE),
     (f"^({TF}|{TF_STATIC})$", schema.TF_MESSAGE),
@@ -75,8 +75,8 @@ _TYPES: tuple[tuple[str, str], ...] = (
     (f"{VERDICT_SAMPLE}$", schema.SAMPLE),
     (f"{CONTACT}$", schema.CONTACT),
     (f"{DIVERGENCE}$", schema.DIVERGENCE),
-    (r"/object/[^/]+/pose$", schema.POSE_STAMPED),
-    (r"/object/[^/]+/nodes$", schema.POINT_CLOUD),
+    (f"{OBJECTS}[^/]+/pose$", schema.POSE_STAMPED),
+    (f"{OBJECTS}[^/]+/nodes$", schema.POINT_CLOUD),
     (f"{LOCALISATION}$", schema.LOCALISATION),
     (f"^{DROPS}$", schema.DROPS),
 )
