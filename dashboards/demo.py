@@ -213,9 +213,11 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> None:
     rebuild = ["rebuild", path, *fit]
     label = f"3/6 rebuilding the scene ({config.iterations} images)"
     found = look(run, config)
-    for episode, why in (found.unusable | found.void).items():
+    useless = found.unusable | found.void
+    for episode, why in useless.items():
         _set_aside(run, episode, why, output)
-    found = look(run, config)
+    if useless:
+        found = look(run, config)
     if found.has_scan and not found.missing:
         output.say(f"1/6 to 4/6: {path} holds the scan and all trials; they are kept and used")
         if not _scene(run):
