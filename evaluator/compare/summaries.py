@@ -19,6 +19,7 @@ from bridge.episode.reader import Episode
 from bridge.process_pool import SERIAL, ProcessPool, Serial, cores
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
+from evaluator.compare.baselines import RuleSummary, apply_rule
 from evaluator.compare.known_task import known_task
 from evaluator.compare.labels import PerceivedOutcome, perceive_outcome
 from evaluator.compare.motion import MotionSummary, summarise_motions
@@ -40,6 +41,7 @@ class Summaries:
     motions: tuple[MotionSummary, ...] = ()
     states: tuple[StateSummary, ...] = ()
     perceived: tuple[PerceivedOutcome, ...] = ()
+    rules: tuple[RuleSummary, ...] = ()
     left_out: tuple[Exclusion, ...] = ()
     """Trials of which something could not be read."""
 
@@ -137,6 +139,7 @@ def sum_up(
         motions=_in_order(found[MotionSummary], trials),
         states=_in_order(found[StateSummary], trials),
         perceived=_in_order(found[PerceivedOutcome], trials),
+        rules=_in_order(found[RuleSummary], trials),
         left_out=tuple(left_out),
     )
 
@@ -176,6 +179,11 @@ def _perceived(files: _Files) -> tuple[PerceivedOutcome, ...]:
     return () if found is None else (found,)
 
 
+def _rules(files: _Files) -> tuple[RuleSummary, ...]:
+    found = apply_rule(files.recorded, files.localised, plan_id=files.plan_id)
+    return () if found is None else (found,)
+
+
 def _replays_key(trial: Trial) -> str:
     hashes = [trial.replays[name].sha256 if name in trial.replays else "-" for name in TRAJECTORIES]
     return " ".join([trial.file.sha256, *hashes, str(trial.row.plan_id)])
@@ -199,4 +207,5 @@ PARTS = (
     _Part(kind=MotionSummary, scope="motion", make=_motions, key=_replays_key),
     _Part(kind=StateSummary, scope="final states", make=_states, key=_states_key),
     _Part(kind=PerceivedOutcome, scope="label", make=_perceived, key=_localised_key),
+    _Part(kind=RuleSummary, scope="baselines", make=_rules, key=_localised_key),
 )
