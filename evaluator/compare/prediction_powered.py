@@ -262,7 +262,7 @@ def sequences(rows: Sequence[TrialRow], pairs: Sequence[StartPair]) -> list[Meas
     """Say what holds however often somebody looked: each group's rate, and the paired gain.
 
     Args:
-        rows: Trials of all groups; a group that stands for counted trials has no order and is left
+        rows: Trials of all groups; a group in which one row stands for several trials is left
             out.
         pairs: The same starts without and with replanning; none leaves the gain out.
     """

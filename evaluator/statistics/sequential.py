@@ -39,8 +39,8 @@ def capital_log(k: int, n: int, rate: float) -> float:
     Args:
         k: Successes.
         n: Trials; without any the bettor still owns 1, so the log is 0.
-        rate: The rate that is bet against, 0 to 1; infinite where an outcome it excludes has
-            happened.
+        rate: The rate that is bet against, 0 to 1; one that excludes what has happened gives
+            infinity.
 
     Raises:
         ImpossibleCountError: When k is not in 0..n.
