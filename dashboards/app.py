@@ -31,7 +31,12 @@ HERE = Path(__file__).parent
 
 
 def create_app(library: Library, admission: Admission | None = None) -> Starlette:
-    """Build the application over some run folders."""
+    """Build the application over some run folders.
+
+    Args:
+        library: The runs that are shown.
+        admission: Which host and token are answered; None answers only on the loopback address.
+    """
     pages = Pages(library)
     routes = [
         Route("/", pages.overview),
@@ -183,7 +188,12 @@ class Pages:
         return _image(data, media_type)
 
     def failed(self, request: Request, error: Exception) -> Response:
-        """Show one of our errors as a page."""
+        """Show one of our errors as a page.
+
+        Args:
+            request: What was asked for.
+            error: What went wrong; something that is not there gives 404, anything else 500.
+        """
         missing = isinstance(error, NotHereError)
         title = "Not found" if missing else "This cannot be read"
         return self._page(
@@ -191,7 +201,12 @@ class Pages:
         )
 
     def http_failed(self, request: Request, error: Exception) -> Response:
-        """Show a wrong address as a page."""
+        """Show a wrong address as a page.
+
+        Args:
+            request: What was asked for.
+            error: Carries the HTTP status; one without gives 500.
+        """
         status = error.status_code if isinstance(error, HTTPException) else 500
         title = "Not found" if status == 404 else f"Request refused ({status})"
         message = "No page of this dashboard has that address."

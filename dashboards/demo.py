@@ -101,6 +101,10 @@ class Recorded:
 def look(run: RunFolder, config: DemoConfig) -> Recorded:
     """Say what of the demo is recorded, and what of it is of no use.
 
+    Args:
+        run: The run folder of the demo, perhaps filled in part by an earlier start.
+        config: Which task, seed and number of trials the demo is to have.
+
     Raises:
         UsageError: When the folder holds episodes of anything else, or is being recorded into.
     """
@@ -177,6 +181,11 @@ def _set_aside(run: RunFolder, path: Path, why: str, output: Output) -> None:
 
 def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
     """Record, rebuild, replay, evaluate, and say what to look at next.
+
+    Args:
+        path: The run folder; made, or continued.
+        config: What the demo does.
+        output: Told of each step and of the result.
 
     Raises:
         DashboardError: When a step failed, or nothing could be measured.

@@ -38,7 +38,13 @@ Samples = tuple[np.ndarray, np.ndarray]
 def episode_stages(
     recording: Recording, clock: PageClock, failure_t_s: float | None
 ) -> StageChart | None:
-    """Draw planned stages, recorded stages, and marks for failure, replanning and gripper."""
+    """Draw planned stages, recorded stages, and marks for failure, replanning and gripper.
+
+    Args:
+        recording: The recorded episode.
+        clock: Converts its stamps to the page's time.
+        failure_t_s: Page time of the first failure in the twin [s]; None marks none.
+    """
     marks = [
         (clock.seconds(event["stamp_ns"]), "replan", "replan")
         for event in recording.events
@@ -94,7 +100,15 @@ def main_plots(
     row: TrialRow | None,
     clock: PageClock,
 ) -> tuple[TimePlot, ...]:
-    """Tool error, tool position, gripper, clearance and objects; only those that have data."""
+    """Tool error, tool position, gripper, clearance and objects; only those that have data.
+
+    Args:
+        recording: The recorded episode.
+        replays: All replays that could be read.
+        sent_plan: Only its replays are drawn; None where no plan was sent.
+        row: The trial beside its replays, for the tool's error; None where it was not compared.
+        clock: Converts stamps to the page's time.
+    """
     shown = _shown_replays(replays, sent_plan)
     plots = [
         _error_plot(row, clock),
@@ -200,7 +214,13 @@ def _height(replay: Recording, name: str) -> Samples | None:
 
 
 def plots_of_joints(recording: Recording, clock: PageClock) -> tuple[TimePlot, ...]:
-    """Draw one small plot per joint: planned and recorded."""
+    """Draw one small plot per joint: planned and recorded.
+
+    Args:
+        recording: The recorded episode; joints are named by it, or by its first plan that names
+            them.
+        clock: Converts its stamps to the page's time.
+    """
     track = recording.joints
     planned = (plan.joint_names for _, plan in recording.plans if plan.joint_names)
     names = next(planned, ()) if track is None else track.names
@@ -362,6 +382,12 @@ def build_page(
     run: RunFolder, episode_id: str, row: TrialRow | None, t_s: float | None
 ) -> EpisodePage:
     """Gather the page of one episode.
+
+    Args:
+        run: The run folder.
+        episode_id: Id of the recorded episode, as it stands in the address.
+        row: The trial beside its replays; None where it was not compared.
+        t_s: Page time of the cursor [s]; None puts it at the first failure, else at the end.
 
     Raises:
         NotHereError: When the run has no such episode.

@@ -134,7 +134,13 @@ class StageChart:
 
 
 def nice_ticks(low: float, high: float, wanted: int = 5) -> list[float]:
-    """Return round numbers (1, 2, 5 times a power of ten) within a range."""
+    """Return round numbers (1, 2, 5 times a power of ten) within a range.
+
+    Args:
+        low: Lower end of the range.
+        high: Upper end; a range that is empty or not finite has no ticks.
+        wanted: About how many ticks; fewer where the round step is larger.
+    """
     if not (math.isfinite(low) and math.isfinite(high)) or high <= low:
         return []
     rough = (high - low) / max(wanted, 1)
@@ -154,7 +160,16 @@ def _labels(values: Sequence[float]) -> list[str]:
 
 
 def axis(low: float, high: float, px_low: float, px_high: float, wanted: int = 5) -> Axis:
-    """Build an axis with round ticks; a single value gets a margin."""
+    """Build an axis with round ticks; a single value gets a margin.
+
+    Args:
+        low: Least value to show.
+        high: Greatest value to show.
+        px_low: Where the least value is drawn [px].
+        px_high: Where the greatest value is drawn [px]; below ``px_low`` for an axis that points
+            up.
+        wanted: About how many ticks.
+    """
     if high - low < 1e-12:
         margin = max(abs(low) * 0.1, 1e-3)
         low, high = low - margin, high + margin
@@ -213,6 +228,18 @@ def time_plot(
     """Lay out signals over a span of time; None when there is nothing to draw.
 
     The value axis covers ``least_span`` at least, so that noise is not blown up to a motion.
+
+    Args:
+        title: What is drawn.
+        unit: Unit of the values, as the page prints it.
+        signals: One for each line; gaps where values are not finite.
+        span_s: First and last page time of the horizontal axis [s].
+        level: Value of a horizontal line, for example a safety distance; None draws none.
+        level_label: What stands at that line.
+        least_span: Least range of the value axis, in ``unit``.
+        note: A sentence below the plot; empty leaves it out.
+        width: Of the whole plot [px].
+        height: Of the whole plot [px].
     """
     finite = [signal.values[np.isfinite(signal.values)] for signal in signals]
     finite = [values for values in finite if len(values)]
@@ -254,7 +281,15 @@ def stage_chart(
     span_s: tuple[float, float],
     width: int = 1130,
 ) -> StageChart | None:
-    """Lay out stages in named lanes; None when no lane holds any."""
+    """Lay out stages in named lanes; None when no lane holds any.
+
+    Args:
+        lanes: Name and stages of each lane, from top to bottom; a lane without stages is left out.
+        marks: Page time [s], text and style of each vertical mark; those outside the span are left
+            out.
+        span_s: First and last page time of the chart [s].
+        width: Of the whole chart [px].
+    """
     filled = [(name, spans) for name, spans in lanes if spans]
     if not filled:
         return None

@@ -82,6 +82,11 @@ def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
     """Return the image nearest to an instant and its media type.
 
     A compressed image is given byte for byte as recorded; a raw one becomes JPEG.
+
+    Args:
+        path: The episode file.
+        camera_id: Id of the camera, without the parts of its topic.
+        stamp_ns: Source time of the wanted instant [ns].
     """
     tracks = camera_tracks(path)
     if camera_id not in tracks:
@@ -101,7 +106,12 @@ def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
 
 
 def media_type(data: bytes, path: Path) -> str:
-    """Name the image format by its first bytes; anything but JPEG and PNG is refused."""
+    """Name the image format by its first bytes; anything but JPEG and PNG is refused.
+
+    Args:
+        data: The image file.
+        path: The episode it comes from, for the message.
+    """
     for magic, name in MEDIA_TYPES:
         if data.startswith(magic):
             return name

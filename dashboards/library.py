@@ -39,7 +39,12 @@ class Library:
 
 
 def episode_path(run: RunFolder, episode_id: str) -> Path:
-    """Return the file of a recorded episode; nothing outside the run folder is ever reached."""
+    """Return the file of a recorded episode; nothing outside the run folder is ever reached.
+
+    Args:
+        run: The run folder.
+        episode_id: As it stands in an address, so it may be anything.
+    """
     what = f"episode {episode_id!r}"
     for path in run.episodes():
         if path.stem == episode_id:
@@ -49,13 +54,24 @@ def episode_path(run: RunFolder, episode_id: str) -> Path:
 
 
 def derived_paths(run: RunFolder, episode_id: str, kind: str) -> list[Path]:
-    """Return the derived episodes of one kind (replay, localised, views) of one episode."""
+    """Return the derived episodes of one kind (replay, localised, views) of one episode.
+
+    Args:
+        run: The run folder.
+        episode_id: Id of the recorded episode.
+        kind: replay, localised or views.
+    """
     found = run.derived(f"{escape(episode_id)}.{kind}.*")
     return [path for path in found if _is_inside(run, path)]
 
 
 def derived_path(run: RunFolder, name: str) -> Path:
-    """Return one derived episode by file name, among those that exist in the run."""
+    """Return one derived episode by file name, among those that exist in the run.
+
+    Args:
+        run: The run folder.
+        name: File name as it stands in an address, so it may be anything.
+    """
     for path in run.derived():
         if path.name == name:
             return _inside(run, path, f"derived episode {name!r}")

@@ -218,7 +218,12 @@ def gain_rows(measurements: Sequence[Measurement]) -> tuple[GainRow, ...]:
 
 
 def methods(measurements: Sequence[Measurement], start: str) -> str:
-    """Name the interval methods of the measurements whose id starts so."""
+    """Name the interval methods of the measurements whose id starts so.
+
+    Args:
+        measurements: Everything that was measured.
+        start: What the id begins with, for example ``gain.``.
+    """
     named = [
         wording.method(m.interval)
         for m in measurements
@@ -230,7 +235,12 @@ def methods(measurements: Sequence[Measurement], start: str) -> str:
 def other_measurements(
     measurements: Sequence[Measurement], shown: Sequence[Card]
 ) -> tuple[Measurement, ...]:
-    """Whatever is in the results and not already on the page."""
+    """Whatever is in the results and not already on the page.
+
+    Args:
+        measurements: Everything that was measured.
+        shown: Headline numbers of the page; what they stand for is left out.
+    """
     ids = {name for card in shown for name in card.ids}
     return tuple(
         m
@@ -262,7 +272,13 @@ class Selection:
         return {name: changes.get(name, getattr(self, name)) for name in names}
 
     def takes_group(self, task: str, condition: str, policy: str) -> bool:
-        """Say whether a group is selected."""
+        """Say whether a group is selected.
+
+        Args:
+            task: Task of the group, as recorded; all three are compared as slugs.
+            condition: Its condition.
+            policy: Its policy.
+        """
         return (
             self.task in ("", slug(task))
             and self.condition in ("", slug(condition))
@@ -340,7 +356,13 @@ def ordered(rows: Sequence[TrialRow]) -> list[TrialRow]:
 def neighbours(
     judgement: Judgement, selection: Selection, episode_id: str
 ) -> tuple[str | None, str | None]:
-    """Return the trials before and after one in the filtered list."""
+    """Return the trials before and after one in the filtered list.
+
+    Args:
+        judgement: Numbers and trials of the run.
+        selection: Which trials the list holds.
+        episode_id: The trial in question; outside the list it has no neighbours.
+    """
     ids = [row.episode for row in ordered(judgement.rows) if selection.takes(row)]
     if episode_id not in ids:
         return None, None
@@ -349,7 +371,13 @@ def neighbours(
 
 
 def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -> Overview:
-    """Gather the overview of one run."""
+    """Gather the overview of one run.
+
+    Args:
+        run: The run folder.
+        judgement: Its numbers and trials.
+        selection: Which trials are listed; the numbers are of all.
+    """
     rows = ordered(judgement.rows)
     others, broken = _files(run, {row.episode for row in rows})
     cards = headline_cards(judgement)

@@ -30,7 +30,12 @@ class Problems:
     texts: list[str] = field(default_factory=list)
 
     def attempt(self, read: Callable[[], Part], otherwise: Part) -> Part:
-        """Return what ``read`` gives; on one of our errors, note it and return the fallback."""
+        """Return what ``read`` gives; on one of our errors, note it and return the fallback.
+
+        Args:
+            read: Reads one part of a file.
+            otherwise: What stands for the part when that fails.
+        """
         try:
             return read()
         except GstError as error:
@@ -188,7 +193,12 @@ class PageClock:
         return (np.asarray(stamps_ns) - self.zero_ns) * 1e-9
 
     def of_plan_time(self, plan_id: str, t_ns: int | None) -> float | None:
-        """Return the page time of an instant of a plan; None if it never ran."""
+        """Return the page time of an instant of a plan; None if it never ran.
+
+        Args:
+            plan_id: A plan of the recording.
+            t_ns: Time since that plan's start [ns]; None stays None.
+        """
         if t_ns is None or plan_id not in self.starts_ns:
             return None
         return self.seconds(self.starts_ns[plan_id] + t_ns)
@@ -199,6 +209,10 @@ class PageClock:
         """Return a replay's page times; its clock starts with the plan or is the recording's.
 
         None when the replayed plan was never executed: it has no time on this axis.
+
+        Args:
+            replay: The replay, for where its clock starts and which plan it replays.
+            stamps_ns: Instants on the replay's own clock [ns].
         """
         first = replay.first_stamp_ns()
         if first is None:

@@ -65,7 +65,12 @@ def read_splats(path: Path) -> Float[np.ndarray, "num_splats 14"]:
 
 
 def log_splats(file: RerunFile, scene_dir: Path) -> bool:
-    """Log the rebuilt scene under ``scene/background``; return whether there is one."""
+    """Log the rebuilt scene under ``scene/background``; return whether there is one.
+
+    Args:
+        file: The Rerun file being written; it notes why there is no scene.
+        scene_dir: Folder of the rebuilt scene.
+    """
     path = scene_dir / BACKGROUND
     if not path.is_file():
         file.note("no scene: rebuild it first (robot-gst rebuild RUN)")
@@ -105,6 +110,12 @@ def log_object(
     """Log an object's poses from its first one on and, where the task knows its shape, its boxes.
 
     Its id in the task is the last part of ``entity``.
+
+    Args:
+        file: The Rerun file being written.
+        entity: Path of the object in it.
+        track: ``T_base_object`` over the cell's source time.
+        task: Knows the object's shape and colour; None draws axes of 5 cm.
     """
     model = None if task is None else task.objects.get(entity.rpartition("/")[2])
     file.poses(entity, track)
@@ -138,6 +149,13 @@ def log_robot(
     """Log the robot under ``<prefix>/robot``; when it cannot be drawn, note why and return False.
 
     Each finger joint is at half the gripper width.
+
+    Args:
+        file: The Rerun file being written.
+        urdf: Robot description as text; None where the episode holds none.
+        prefix: Entities start with this.
+        joints: Joint positions [rad] over the cell's source time; None leaves the robot still.
+        widths: Gripper widths [m] over time, in the first column; None leaves the fingers still.
     """
     if urdf is None:
         file.note("the robot is not drawn: the episode holds no robot description")
@@ -255,6 +273,12 @@ def log_cameras(file: RerunFile, episode: Episode, prefix: str, start_ns: int) -
 
     A camera has the pose of its first frame from ``start_ns`` on. What is missing (intrinsics,
     transforms, images that are no JPEG or PNG) is noted and the rest is shown.
+
+    Args:
+        file: The Rerun file being written; it notes what is missing.
+        episode: The recorded episode.
+        prefix: Entities start with this.
+        start_ns: Source time from which a camera has a pose [ns].
     """
     try:
         tree = streams.transform_tree(episode)

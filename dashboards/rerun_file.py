@@ -64,7 +64,13 @@ class RerunFile:
         stamps_ns: Int[np.ndarray, " num_rows"],
         columns: Iterable[Any],
     ) -> None:
-        """Send component columns, one row per stamp of source time [ns]."""
+        """Send component columns, one row per stamp of source time [ns].
+
+        Args:
+            entity: Path of the entity.
+            stamps_ns: Source time of each row.
+            columns: Component columns of as many rows, as Rerun's ``columns`` methods make them.
+        """
         times = np.asarray(stamps_ns, dtype=np.int64).astype("datetime64[ns]")
         index = rr.TimeColumn(TIMELINE, timestamp=times)
         self.stream.send_columns(entity, [index], columns, strict=True)
@@ -84,13 +90,27 @@ class RerunFile:
         color: tuple[int, int, int],
         width: float,
     ) -> None:
-        """Send one number over time, with its name in the legend."""
+        """Send one number over time, with its name in the legend.
+
+        Args:
+            entity: Path of the series.
+            stamps_ns: Source time of each value.
+            values: The number at each stamp.
+            name: What the legend says.
+            color: Of the line: red, green, blue, each 0 to 255.
+            width: Of the line, in points.
+        """
         self.always(entity, rr.SeriesLines(names=[name], colors=[color], widths=[width]))
         values = np.asarray(values, dtype=np.float64)
         self.rows(entity, stamps_ns, rr.Scalars.columns(scalars=values))
 
     def poses(self, entity: str, track: PoseTrajectory) -> None:
-        """Send ``T_base_entity`` over time."""
+        """Send ``T_base_entity`` over time.
+
+        Args:
+            entity: Path of the entity.
+            track: ``T_base_entity`` over source time.
+        """
         columns = rr.Transform3D.columns(
             translation=track.p_m, quaternion=np.roll(track.q_wxyz, -1, axis=1)
         )

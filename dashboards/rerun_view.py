@@ -71,7 +71,13 @@ class Side:
 
 
 def log_side(file: RerunFile, side: Side, task: Task | None) -> None:
-    """Log everything of one recording that is a number over time, a pose or a line of text."""
+    """Log everything of one recording that is a number over time, a pose or a line of text.
+
+    Args:
+        file: The Rerun file being written; it notes what could not be read.
+        side: The recording or a replay, and where it goes.
+        task: Knows the shapes of objects; None draws axes instead.
+    """
     _log_series(file, side)
     _log_tool(file, side)
     for name, track in side.recording.objects.items():

@@ -48,7 +48,12 @@ def default_out(episode: Path) -> Path:
 
 
 def has_display(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> bool:
-    """Say whether a window can be opened: always on macOS and Windows, with X or Wayland else."""
+    """Say whether a window can be opened: always on macOS and Windows, with X or Wayland else.
+
+    Args:
+        environment: Environment variables; ``DISPLAY`` and ``WAYLAND_DISPLAY`` are read.
+        platform: As ``sys.platform`` names it.
+    """
     if platform in ("darwin", "win32"):
         return True
     return bool(environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY"))

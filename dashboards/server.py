@@ -79,7 +79,13 @@ def listen(config: DashboardConfig) -> socket.socket:
 
 
 def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
-    """Show run folders until SIGINT or SIGTERM; prints the address first."""
+    """Show run folders until SIGINT or SIGTERM; prints the address first.
+
+    Args:
+        runs: Run folders; those of the same name get a number.
+        config: Where to listen.
+        output: Gets the address, and the command for another computer.
+    """
     library = Library.open(runs)
     listener = listen(config)
     token = None if is_loopback(config.host) else secrets.token_urlsafe(24)

@@ -50,7 +50,12 @@ class TwinPage:
 
 
 def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
-    """Gather the held-out views of a run, worst first where the results rate them."""
+    """Gather the held-out views of a run, worst first where the results rate them.
+
+    Args:
+        run: The run folder.
+        judgement: Its numbers; without them the views are sorted by time.
+    """
     views: list[HeldOutView] = []
     problems = []
     paths = run.derived("*.views.*")
@@ -132,7 +137,15 @@ def _badness(view: HeldOutView) -> tuple[bool, float, int]:
 def view_image(
     run: RunFolder, path: Path, side: str, camera_id: str, stamp_ns: int
 ) -> tuple[bytes, str]:
-    """Return the recorded or the rendered image of one held-out view."""
+    """Return the recorded or the rendered image of one held-out view.
+
+    Args:
+        run: The run folder.
+        path: The views episode.
+        side: ``recorded`` or ``rendered``.
+        camera_id: Id of the camera.
+        stamp_ns: Source time of the view [ns].
+    """
     if side == "rendered":
         return read_frame(path, RENDERED + camera_id, stamp_ns)
     if side != "recorded":

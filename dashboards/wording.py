@@ -44,7 +44,12 @@ FORMS = {
 
 
 def number(value: float, unit: str) -> str:
-    """Print a value in its unit: fractions as percent, lengths in millimetres."""
+    """Print a value in its unit: fractions as percent, lengths in millimetres.
+
+    Args:
+        value: The value in ``unit``.
+        unit: Unit of the measurement: one of ``FORMS``, or another, which is printed as it is.
+    """
     figure, shown = _figure(value, unit)
     return f"{figure}{NARROW}{shown}" if shown else figure
 
@@ -87,7 +92,12 @@ def headline(measurement: Measurement) -> str:
 
 
 def bounds(interval: Interval | None, unit: str) -> str:
-    """Print the two ends of an interval."""
+    """Print the two ends of an interval.
+
+    Args:
+        interval: The interval; None prints nothing.
+        unit: Unit of the measurement.
+    """
     if interval is None:
         return ""
     (low, shown), (high, _) = _figure(interval.low, unit), _figure(interval.high, unit)

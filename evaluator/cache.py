@@ -106,7 +106,12 @@ class CacheFolder:
         return found, reasons, is_whole
 
     def write(self, kind: type[Any], rows: Mapping[str, tuple[Any, ...]]) -> Path | None:
-        """Write summaries into a new file; None where the disk refuses."""
+        """Write summaries into a new file; None where the disk refuses.
+
+        Args:
+            kind: The dataclass of the summaries; its name begins the file's name.
+            rows: Summaries by the key they are kept under.
+        """
         if self._parquet is None or not self._can_write:
             return None
         path = self._path / f"{kind.__name__}.{secrets.token_hex(8)}.parquet"
@@ -230,7 +235,13 @@ class SummaryCache:
     def kept_or_made(
         self, kind: type[Summary], key: str, make: Callable[[], tuple[Summary, ...]]
     ) -> tuple[Summary, ...]:
-        """Return what is kept under a key, or make and keep it; what ``make`` raises passes."""
+        """Return what is kept under a key, or make and keep it; what ``make`` raises passes.
+
+        Args:
+            kind: The dataclass of the summaries.
+            key: Names what they are made from, so that a changed file has another key.
+            make: Makes them where nothing is kept.
+        """
         found = self.find(kind, key)
         if found is None:
             found = make()
@@ -238,7 +249,12 @@ class SummaryCache:
         return found
 
     def find(self, kind: type[Summary], key: str) -> tuple[Summary, ...] | None:
-        """Return what is kept under a key, None where nothing is."""
+        """Return what is kept under a key, None where nothing is.
+
+        Args:
+            kind: The dataclass of the summaries.
+            key: What they were kept under; it counts as used from now on.
+        """
         kept = self._of(kind)
         found = kept.found.rows.get(key)
         if found is not None:
@@ -246,7 +262,13 @@ class SummaryCache:
         return found
 
     def keep(self, kind: type[Summary], key: str, made: tuple[Summary, ...]) -> None:
-        """Keep summaries under a key; now and then everything new is written."""
+        """Keep summaries under a key; now and then everything new is written.
+
+        Args:
+            kind: The dataclass of the summaries.
+            key: Names what they were made from, so that a changed file has another key.
+            made: The summaries; none is an answer too.
+        """
         if self._folder is None or not self._folder.is_of_use:
             return
         kept = self._of(kind)

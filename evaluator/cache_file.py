@@ -125,6 +125,12 @@ class _Column(NamedTuple):
 def write_summaries(path: Path, kind: type[Any], rows: Rows, version: str) -> int:
     """Write all rows, whole or not at all, and return how many keys could not be packed.
 
+    Args:
+        path: Where the file goes; its folder is made.
+        kind: The dataclass of the summaries.
+        rows: Summaries by key.
+        version: Of the code that made them; another one does not read them.
+
     Raises:
         OSError: When the disk refuses.
     """
@@ -142,6 +148,11 @@ def write_summaries(path: Path, kind: type[Any], rows: Rows, version: str) -> in
 
 def read_summaries(path: Path, kind: type[Summary], version: str) -> dict[str, tuple[Summary, ...]]:
     """Read all rows of a file.
+
+    Args:
+        path: A file of ``write_summaries``.
+        kind: The dataclass that it must hold.
+        version: Of the code that must have made it.
 
     Raises:
         UnusableFileError: When it is damaged, foreign, or made by other code.

@@ -232,7 +232,12 @@ def _lines(value: Any, indent: int, deep: int) -> str:
 
 
 def write_results(results: Results, path: Path) -> Path:
-    """Write ``results.json``; a half-written file never carries the final name."""
+    """Write ``results.json``; a half-written file never carries the final name.
+
+    Args:
+        results: Everything the evaluation has to say.
+        path: Where the file goes; its folder is made.
+    """
     text = _written(results.to_record())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

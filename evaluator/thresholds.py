@@ -74,7 +74,12 @@ def _parse(part: str) -> Threshold:
 
 
 def missed(thresholds: list[Threshold], results: Results) -> list[Missed]:
-    """Return what was not reached; an undefined number reaches nothing."""
+    """Return what was not reached; an undefined number reaches nothing.
+
+    Args:
+        thresholds: The least value of each number that counts as passed.
+        results: What the evaluation found.
+    """
     by_id = {measurement.id: measurement for measurement in results.measurements}
     found = []
     for threshold in thresholds:

@@ -84,7 +84,13 @@ class BandCurve:
 
 
 def distance_measurements(task: str, real: Side, simulated: Side) -> list[Measurement]:
-    """Measure how far two bands lie apart, whole and moving part."""
+    """Measure how far two bands lie apart, whole and moving part.
+
+    Args:
+        task: Task of the runs, a part of the ids.
+        real: Recorded runs.
+        simulated: Runs of one engine.
+    """
     measurements = []
     what = f"end effector, {len(real.runs)} recorded against {len(simulated.runs)} "
     what += f"{simulated.name} runs, unpaired"
@@ -138,7 +144,13 @@ def _shape(real: Side, simulated: Side, parts: dict[str, str]) -> list[Measureme
 
 
 def inside_band(task: str, real: Side, simulated: Side) -> list[Measurement]:
-    """Measure how much of the time a simulated mean curve lies within the recorded band."""
+    """Measure how much of the time a simulated mean curve lies within the recorded band.
+
+    Args:
+        task: Task of the runs, a part of the ids.
+        real: Recorded runs; their spread gives the band its width.
+        simulated: Runs of one engine.
+    """
 
     def share() -> float:
         tracks = real.tracks(moving_part)
@@ -159,7 +171,12 @@ def inside_band(task: str, real: Side, simulated: Side) -> list[Measurement]:
 
 
 def spread_measurements(task: str, side: Side) -> list[Measurement]:
-    """Measure how far the runs of one side stray from their own mean."""
+    """Measure how far the runs of one side stray from their own mean.
+
+    Args:
+        task: Task of the runs, a part of the ids.
+        side: Recorded runs, or those of one engine.
+    """
     spread: Repeatability | None = None
     refusal: UndefinedStatisticError | None = None
     try:

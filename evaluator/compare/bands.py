@@ -41,7 +41,13 @@ OVER_TIME = range(0, 101, 10)
 
 
 def band_row(task: str, engine: str, by_id: Mapping[str, Measurement]) -> tuple[Cell, ...]:
-    """One engine's row."""
+    """One engine's row.
+
+    Args:
+        task: Task of the runs.
+        engine: The simulated side.
+        by_id: Measurements of that task, by their ids.
+    """
 
     def of(quantity: Quantity, side: str = "") -> Measurement:
         words = {"task": task, "engine": engine, "side": side, "what": "", "count": 0}
@@ -68,7 +74,13 @@ def band_row(task: str, engine: str, by_id: Mapping[str, Measurement]) -> tuple[
 
 
 def band_table(table_id: str, task: str, rows: Sequence[tuple[Cell, ...]]) -> Table:
-    """One task's table."""
+    """One task's table.
+
+    Args:
+        table_id: Id of the table, its file name too.
+        task: Task of the runs; may be empty.
+        rows: One for each engine, as ``band_row`` lays it out.
+    """
     return Table(
         id=table_id,
         title=f"Recorded against simulated runs: {task}" if task else "Imported runs",
@@ -140,7 +152,12 @@ class BandReport(Part):
 
 
 def compare_bands(recorded: Sequence[Episode], files: Sequence[DerivedFile]) -> BandReport:
-    """Compare the end-effector bands of imported runs, per task and simulation engine."""
+    """Compare the end-effector bands of imported runs, per task and simulation engine.
+
+    Args:
+        recorded: Recorded episodes; only imported ones are looked at.
+        files: Derived episodes; only imported replays without a plan are looked at.
+    """
     imported = [(e, engine_of(e.info)) for e in recorded if e.info.kind == "imported"]
     imported += [
         (file.episode, file.derived.engine or "unnamed engine")

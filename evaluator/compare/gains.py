@@ -96,7 +96,12 @@ def pair_starts(rows: Sequence[TrialRow]) -> tuple[list[StartPair], list[Exclusi
 
 
 def start_distance_m(first: TrialRow, second: TrialRow) -> float | None:
-    """Return the largest distance between objects localised in both trials [m]."""
+    """Return the largest distance between objects localised in both trials [m].
+
+    Args:
+        first: A trial of the pair.
+        second: The other one; without an object localised in both the answer is None.
+    """
     shared = first.start_positions_m.keys() & second.start_positions_m.keys()
     if not shared:
         return None
@@ -256,7 +261,12 @@ def changes(groups: Sequence[RateGroup]) -> list[Change]:
 
 
 def replanning_gains(groups: Sequence[RateGroup], *, method: str = "wilson") -> list[Measurement]:
-    """Measure the gain with replanning per task and side: percentage points and relative."""
+    """Measure the gain with replanning per task and side: percentage points and relative.
+
+    Args:
+        groups: Groups of both conditions; a gain needs one of each.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+    """
     pairs = changes(groups)
     measurements = [m for change in pairs for m in _gain(change, method)]
     measurements.extend(_average_gains(pairs))

@@ -191,7 +191,12 @@ def _clause_cost_table(costs: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
 
 
 def agreement(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Measurement]:
-    """Measure k/n agreement, phi, kappa and predictive values, of the replay and of the verdict."""
+    """Measure k/n agreement, phi, kappa and predictive values, of the replay and of the verdict.
+
+    Args:
+        rows: Trials; those without an answer or an outcome do not count.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+    """
     measurements = []
     for name, answer_of, words in (
         ("sim_planned", lambda row: row.sim_planned, "planned-in-twin (dynamic, of the sent plan)"),
@@ -221,7 +226,12 @@ def heeded_verdict(row: TrialRow) -> bool | None:
 
 
 def confusion_of(rows: Sequence[TrialRow], answer_of: Answer) -> Confusion:
-    """Count what was said against what was labelled, over trials where both are known."""
+    """Count what was said against what was labelled, over trials where both are known.
+
+    Args:
+        rows: Trials, each as often as its ``count`` says.
+        answer_of: Reads what the twin said of a trial; None where it said nothing.
+    """
     return Confusion.weigh(
         (answer, row.recorded, row.count)
         for row in rows

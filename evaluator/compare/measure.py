@@ -31,7 +31,12 @@ def milliseconds(value_s: float | None) -> float | None:
 
 
 def ends(interval: Interval | None, factor: float = 1.0) -> tuple[float | None, float | None]:
-    """Return both ends of an interval, in another unit by ``factor``; unknown without one."""
+    """Return both ends of an interval, in another unit by ``factor``; unknown without one.
+
+    Args:
+        interval: What was estimated; None where there is no interval.
+        factor: Multiplies both ends, for example 1000 from m to mm.
+    """
     return (None, None) if interval is None else (factor * interval.low, factor * interval.high)
 
 
@@ -47,7 +52,12 @@ def rate_row(rate: Measurement) -> tuple[Cell, ...]:
 
 
 def average(items: Sequence[Item], read: Callable[[Item], float | None]) -> float | None:
-    """Return the mean of what is known; None when nothing is."""
+    """Return the mean of what is known; None when nothing is.
+
+    Args:
+        items: What is averaged over.
+        read: Gives the number of an item; None leaves the item out.
+    """
     values = [value for item in items if (value := read(item)) is not None]
     return sum(values) / len(values) if values else None
 
@@ -92,7 +102,12 @@ def refuse_alike(kind: str, named: Iterable[tuple[str, str]]) -> None:
 def interval_or_reason(
     interval_of: Callable[[Sequence[float]], Interval], values: Sequence[float]
 ) -> tuple[Interval | None, str | None]:
-    """Return the interval of some values, or None and the reason why they have none."""
+    """Return the interval of some values, or None and the reason why they have none.
+
+    Args:
+        interval_of: Estimates the interval; refuses by ``UndefinedStatisticError``.
+        values: What it is estimated from.
+    """
     try:
         return interval_of(values), None
     except UndefinedStatisticError as error:
@@ -116,6 +131,18 @@ def measured(
     What is not finite is undefined and says so: one broken pose must not end an evaluation.
     An interval that covers too little at ``interval_n`` (``n`` without it) is left out, with why
     and what to use ``instead``.
+
+    Args:
+        defined: Id, unit and definition.
+        compute: Gives the value, or the value with its interval; refuses by
+            ``UndefinedStatisticError``.
+        n: How many were counted; None where nothing is counted.
+        counted: What was counted, in the singular: trial, pair, run.
+        reason_without_interval: Said where there is no interval.
+        episodes: Ids of the episodes that the number rests on.
+        interval_n: What the coverage of the interval depends on, where it is not ``n``.
+        coverage_key: Name in the coverage map, where one method serves several statistics.
+        instead: What to use where the interval is refused; what its method says without.
     """
     value: float | None = None
     interval: Interval | None = None
@@ -154,7 +181,17 @@ def proportion(
     episodes: Iterable[str] = (),
     method: str = "wilson",
 ) -> Measurement:
-    """Measure k/n with its interval, Wilson's unless another was asked for; undefined for n = 0."""
+    """Measure k/n with its interval, Wilson's unless another was asked for; undefined for n = 0.
+
+    Args:
+        defined: Id, unit and definition.
+        k: Successes.
+        n: How many were counted.
+        counted: What was counted, in the singular: trial, pair.
+        reason_if_undefined: Said where n is 0.
+        episodes: Ids of the episodes that the number rests on.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+    """
     interval, refusal = vouched_rate(k, n, method) if n else (None, "")
     return Measurement(
         **vars(defined),
@@ -170,5 +207,11 @@ def proportion(
 
 
 def vouched_rate(k: int, n: int, method: str) -> tuple[Interval | None, str]:
-    """Return the interval of k/n by a named method, or None and why it is not printed."""
+    """Return the interval of k/n by a named method, or None and why it is not printed.
+
+    Args:
+        k: Successes.
+        n: Trials, 1 or more.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+    """
     return vouch(RATE_INTERVALS[method](k, n), n)

@@ -121,6 +121,10 @@ def summarise_motions(
 def compare_tracks(mine: Tracks, other: Tracks) -> MotionSummary:
     """Compare two motions on one clock, or over normalised time where there is none.
 
+    Args:
+        mine: The motion that is cut to its execution and gives the instants of comparison.
+        other: The motion held against it; shifted to the same start where its clock is another one.
+
     Raises:
         UndefinedStatisticError: When they have no tool poses in common.
     """

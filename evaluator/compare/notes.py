@@ -20,7 +20,12 @@ Note = tuple[str, str]
 
 
 def notes(groups: Sequence[RateGroup], measurements: Sequence[Measurement]) -> list[Note]:
-    """Collect what follows from the groups and the numbers alone."""
+    """Collect what follows from the groups and the numbers alone.
+
+    Args:
+        groups: Success rates per task, condition and policy.
+        measurements: Everything that was measured over them.
+    """
     by_id = {measurement.id: measurement for measurement in measurements}
     return [
         *_units(groups),
@@ -40,7 +45,12 @@ def notes_table(found: Iterable[Note]) -> tuple[Table, ...]:
 
 
 def with_notes(tables: Iterable[Table], found: Iterable[Note]) -> tuple[Table, ...]:
-    """Put notes before those that are among some tables already."""
+    """Put notes before those that are among some tables already.
+
+    Args:
+        tables: Tables of the evaluation, perhaps with one of notes.
+        found: Notes to add; without any the tables stay as they are.
+    """
     kept, found = list(tables), list(found)
     if not found:
         return tuple(kept)

@@ -73,6 +73,10 @@ class StartPositions:
 def start_positions(tried: Sequence[TrialRow], others: Sequence[TrialRow]) -> StartPositions:
     """Gather where objects lay; those localised in most starts count.
 
+    Args:
+        tried: Trials that the robot and the twin made.
+        others: Trials that only the twin made.
+
     Raises:
         UndefinedStatisticError: When no object was localised in most of them.
     """
@@ -255,7 +259,13 @@ def _assisted_rate(
 
 
 def sequences(rows: Sequence[TrialRow], pairs: Sequence[StartPair]) -> list[Measurement]:
-    """Say what holds however often somebody looked: each group's rate, and the paired gain."""
+    """Say what holds however often somebody looked: each group's rate, and the paired gain.
+
+    Args:
+        rows: Trials of all groups; a group in which one row stands for several trials is left
+            out.
+        pairs: The same starts without and with replanning; none leaves the gain out.
+    """
     measurements = []
     for key, members in group_rows(rows).items():
         known = _in_order([row for row in members if row.recorded is not None])
@@ -295,7 +305,12 @@ def _sequence(key: Key, known: Sequence[TrialRow]) -> Measurement:
 
 
 def stopping_table(rows: Sequence[TrialRow], goal: float | None) -> tuple[Table, ...]:
-    """Say for each group whether its recorded rate is settled against a goal; none without one."""
+    """Say for each group whether its recorded rate is settled against a goal; none without one.
+
+    Args:
+        rows: Trials of all groups; those without an outcome do not count.
+        goal: The success rate that is asked about, 0 to 1; None makes no table.
+    """
     if goal is None:
         return ()
     lines: list[tuple[Cell, ...]] = []

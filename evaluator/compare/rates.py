@@ -21,6 +21,10 @@ from evaluator.result import Exclusion, Measurement
 def compare_rates(path: Path, *, method: str = "wilson") -> Comparison:
     """Compare printed rates: r over groups, gains, intervals where n is known.
 
+    Args:
+        path: The rates CSV.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+
     Raises:
         TableError: Naming the row that contradicts itself.
     """
@@ -31,6 +35,11 @@ def compare_records(
     records: Sequence[RateRecord], path: Path, *, method: str = "wilson"
 ) -> Comparison:
     """Compare rates that were read already; ``path`` is where they come from.
+
+    Args:
+        records: One for each row that was read.
+        path: The file they come from, for the name of the run and the hash.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
 
     Raises:
         AlikeNamesError: When ids cannot tell two tasks or conditions apart.

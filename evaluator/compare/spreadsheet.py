@@ -50,6 +50,10 @@ def imported_rows(
 ) -> tuple[list[TrialRow], list[Exclusion]]:
     """Read the run's imported trials; one that was recorded too is left out and named.
 
+    Args:
+        run: The run folder; without imported trials there are no rows.
+        recorded_ids: Ids of the recorded episodes, which count before imported ones.
+
     Raises:
         TableError: When somebody has changed the file so that a row contradicts itself.
     """
@@ -78,6 +82,11 @@ def compare_csv(path: Path, *, method: str = "wilson", goal: float | None = None
 
     Read are a trials CSV, a rates CSV, a published table (rates with printed figures),
     ``eval_results.csv`` of PolaRiS, ``eval_info.json`` of LeRobot, and a folder of SIMPLER videos.
+
+    Args:
+        path: The table, result file or folder.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+        goal: The success rate that is asked about, 0 to 1; None asks nothing.
 
     Raises:
         TableError: Naming the row that contradicts itself.
@@ -123,6 +132,13 @@ def compare_trials(
 
     A large one is streamed: its rows are counted by their answers, in constant memory; what needs
     single trials (pairs of starts, success probabilities, the list of trials) is left out by name.
+
+    Args:
+        path: The trials CSV.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+        goal: The success rate that is asked about, 0 to 1; None asks nothing, and so does a
+            streamed table.
+        stream_above: Size of the file from which it is streamed [bytes].
     """
     if path.stat().st_size > stream_above:
         return _compare_streamed(path, method)

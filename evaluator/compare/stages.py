@@ -158,7 +158,12 @@ def _tables(
 
 
 def failures_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:
-    """Count what failed first: in the twin by clause and cause, recorded by stage."""
+    """Count what failed first: in the twin by clause and cause, recorded by stage.
+
+    Args:
+        rows: Trials; only failures count.
+        word: What the recorded side is called: stand-in, real or recorded.
+    """
     twin = failure_taxonomy(
         (row.first_failing or "unknown", row.failing_cause or "", row.count)
         for row in rows

@@ -180,7 +180,12 @@ def _defined(key: Group, name: str, kind: str, **words: object) -> Defined:
 
 
 def final_table(keys: Sequence[Group], by_id: dict[str, Measurement]) -> Table:
-    """Medians of each group."""
+    """Medians of each group.
+
+    Args:
+        keys: Groups in the order of the rows: who predicts, against what, task, condition.
+        by_id: Measurements of these groups, by their ids.
+    """
     rows = []
     for key in keys:
         position = by_id[_defined(key, "position", "median").id]

@@ -63,7 +63,15 @@ def answered(
     reason_if_undefined: str,
     method: str = "wilson",
 ) -> Measurement:
-    """Measure the share of yes among the trials whose answer is known."""
+    """Measure the share of yes among the trials whose answer is known.
+
+    Args:
+        defined: Id, unit and definition of the share.
+        rows: Trials, each as often as its ``count`` says.
+        answer: Reads yes, no, or None for unknown from a trial.
+        reason_if_undefined: Said where no answer is known.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+    """
     known = [row for row in rows if answer(row) is not None]
     return proportion(
         defined,
@@ -77,7 +85,12 @@ def answered(
 
 
 def side_rates(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Measurement]:
-    """Measure every side of every group, counted in trials; object counts beside them."""
+    """Measure every side of every group, counted in trials; object counts beside them.
+
+    Args:
+        rows: Trials of all groups.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+    """
     measurements = []
     for key, members in group_rows(rows).items():
         for side, answer in SIDES.items():
@@ -137,7 +150,13 @@ def never_sent(rows: Sequence[TrialRow]) -> list[Measurement]:
 def rate_groups(
     rows: Sequence[TrialRow], rates: Sequence[Measurement], *, method: str = "wilson"
 ) -> tuple[RateGroup, ...]:
-    """Lay the recorded and the headline sim rate of each group side by side."""
+    """Lay the recorded and the headline sim rate of each group side by side.
+
+    Args:
+        rows: Trials of all groups.
+        rates: What ``side_rates`` measured of the same trials.
+        method: Interval of the rates over trials where both sides are known.
+    """
     by_id = {measurement.id: measurement for measurement in rates}
     groups = []
     for key, members in group_rows(rows).items():
@@ -188,7 +207,12 @@ def _trial_table(both: Sequence[TrialRow]) -> tuple[int, int, int, int]:
 
 
 def averages(groups: Sequence[RateGroup], *, method: str = "wilson") -> list[Measurement]:
-    """Average over groups of a condition: macro (groups alike) and pooled (trials alike)."""
+    """Average over groups of a condition: macro (groups alike) and pooled (trials alike).
+
+    Args:
+        groups: Groups of any condition; a condition with fewer than two has no average.
+        method: Interval of the pooled rate: wilson, clopper-pearson or jeffreys.
+    """
     measurements = []
     for condition in dict.fromkeys(group.condition for group in groups):
         members = [group for group in groups if group.condition == condition]
@@ -243,7 +267,13 @@ def _macro(rates: Sequence[Measurement]) -> float:
 
 
 def of_group(quantity: Quantity, key: Key, **words: object) -> Defined:
-    """Name a measurement of one task, condition and policy."""
+    """Name a measurement of one task, condition and policy.
+
+    Args:
+        quantity: What is measured.
+        key: Task, condition and policy.
+        **words: Further variable parts of its id or definition.
+    """
     return quantity.of(task=key[0], condition=key[1], policy=key[2], **words)
 
 

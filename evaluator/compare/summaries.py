@@ -110,7 +110,14 @@ def sum_up(
     output: Output,
     pool: ProcessPool | Serial = SERIAL,
 ) -> Summaries:
-    """Summarise motions, final states and localised success of every trial with a plan sent."""
+    """Summarise motions, final states and localised success of every trial with a plan sent.
+
+    Args:
+        trials: Trials laid beside their replays; without a plan sent one is passed over.
+        cache: What was made before, under the hashes of the files.
+        output: Told how far the comparison is.
+        pool: Compares several trials at once; one after the other without.
+    """
     found: dict[type[Any], list[Any]] = {part.kind: [] for part in PARTS}
     unknown: list[tuple[Trial, _Job]] = []
     for trial in trials:

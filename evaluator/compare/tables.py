@@ -48,7 +48,13 @@ def _brackets(shown: Sequence[Measurement]) -> str:
 
 
 def success_table(groups: Sequence[RateGroup], word: str, sim_note: str = SIM_NOTE) -> Table:
-    """Success without and with replanning, in the twin and recorded."""
+    """Success without and with replanning, in the twin and recorded.
+
+    Args:
+        groups: Success rates per task, condition and policy.
+        word: What the recorded side is called: stand-in, real or recorded.
+        sim_note: What the twin's rate is, the first sentence of the note.
+    """
     shown = [side for group in groups for side in (group.sim, group.recorded)]
     rows = tuple(
         (
@@ -84,7 +90,12 @@ def _gap(group: RateGroup) -> float | None:
 
 
 def gains_table(gains: Sequence[Measurement], word: str) -> tuple[Table, ...]:
-    """The replanning gain: percentage points and relative gain are two columns; none without."""
+    """The replanning gain: percentage points and relative gain are two columns; none without.
+
+    Args:
+        gains: What ``replanning_gains`` measured.
+        word: What the recorded side is called: stand-in, real or recorded.
+    """
     if not gains:
         return ()
     by_id = {gain.id: gain for gain in gains}
@@ -128,7 +139,13 @@ def gains_table(gains: Sequence[Measurement], word: str) -> tuple[Table, ...]:
 def layout_table(
     groups: Sequence[RateGroup], measurements: Sequence[Measurement], word: str
 ) -> tuple[Table, ...]:
-    """Lay rates out as papers print them: a row per task, sim and recorded without and with."""
+    """Lay rates out as papers print them: a row per task, sim and recorded without and with.
+
+    Args:
+        groups: Success rates per task, condition and policy; one condition alone makes no table.
+        measurements: Holds the averages, for the last rows.
+        word: What the recorded side is called: stand-in, real or recorded.
+    """
     conditions = [name for name in (WITHOUT, WITH) if any(c.condition == name for c in groups)]
     if len(conditions) < 2:
         return ()
@@ -167,7 +184,12 @@ def layout_table(
 
 
 def trials_table(rows: Sequence[TrialRow], word: str) -> Table:
-    """One line per trial."""
+    """One line per trial.
+
+    Args:
+        rows: Trials, in the order of the lines.
+        word: What the recorded side is called: stand-in, real or recorded.
+    """
     return Table(
         id="trials",
         title="Trials",
@@ -206,7 +228,12 @@ def trials_table(rows: Sequence[TrialRow], word: str) -> Table:
 
 
 def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
-    """What the twin said against what happened, counted over trials."""
+    """What the twin said against what happened, counted over trials.
+
+    Args:
+        rows: Trials, each as often as its ``count`` says.
+        word: What the recorded side is called: stand-in, real or recorded.
+    """
     lines = []
     for name, answer_of in (
         ("sim planned", lambda row: row.sim_planned),

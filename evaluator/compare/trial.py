@@ -58,7 +58,13 @@ class Trial:
 
 
 def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
-    """Find what was made from a recorded trial, build its row, and say what it lacks."""
+    """Find what was made from a recorded trial, build its row, and say what it lacks.
+
+    Args:
+        file: The recorded episode, with its hash as it is now.
+        facts: What the episode says of itself.
+        index: The derived episodes of the run, by what they were made from.
+    """
     source, sha256 = facts.info.id, file.sha256
     lacking = _unlabelled(facts.outcome)
     found = dict.fromkeys(TRAJECTORIES, Replay())

@@ -48,7 +48,13 @@ def outcome_word(trial: LiveTrial) -> str:
 
 
 def label(task: str, condition: str, policy: str) -> str:
-    """Return a group in a reader's words."""
+    """Return a group in a reader's words.
+
+    Args:
+        task: Task of the group; its underscores become spaces, as in the others.
+        condition: Without or with replanning; empty leaves it out.
+        policy: Policy of the group; empty leaves it out.
+    """
     return ", ".join(part.replace("_", " ") for part in (task, condition, policy) if part)
 
 
@@ -64,7 +70,13 @@ def what_happened(change: Change) -> str:
 
 
 def advice_words(advice: Advice | None, changed: str, stop: str) -> str:
-    """Stop, or continue: about n more."""
+    """Stop, or continue: about n more.
+
+    Args:
+        advice: What the interval settles; None without a goal.
+        changed: Why no interval is left; empty where there is one.
+        stop: What is settled, said when the advice is to stop.
+    """
     if changed:
         return f"stop: {changed}"
     if advice is None:
@@ -77,7 +89,12 @@ def advice_words(advice: Advice | None, changed: str, stop: str) -> str:
 
 
 def rate_words(rate: RateSummary, goal: float | None) -> str:
-    """One group's rate, its interval at any time, and what follows."""
+    """One group's rate, its interval at any time, and what follows.
+
+    Args:
+        rate: Counts of one group, its interval and the advice.
+        goal: The success rate that is asked about, 0 to 1; None where none is.
+    """
     percent = 0.0 if goal is None else 100 * goal
     answer = rate.advice.answer if rate.advice else ""
     words = advice_words(rate.advice, rate.changed, f"{answer} {percent:g} %")
@@ -111,7 +128,14 @@ def next_words(proposal: NextStart | None) -> str:
 def change_line(
     change: Change, summary: SessionSummary, proposal: NextStart | None, goal: float | None
 ) -> str:
-    """Return the line of one trial."""
+    """Return the line of one trial.
+
+    Args:
+        change: The trial that is new, or corrected, and what was known of it before.
+        summary: What is known with that trial.
+        proposal: Which start to run next; None when every question is settled.
+        goal: The success rate that is asked about, 0 to 1; None where none is.
+    """
     trial = change.trial
     rate, gain = summary.rate(trial.key), summary.gain(trial.task, trial.policy)
     parts = [what_happened(change)]
@@ -123,7 +147,13 @@ def change_line(
 def state_lines(
     summary: SessionSummary, proposal: NextStart | None, goal: float | None
 ) -> list[str]:
-    """Everything that is known, one line for each group and gain."""
+    """Everything that is known, one line for each group and gain.
+
+    Args:
+        summary: What is known of the session.
+        proposal: Which start to run next; None when every question is settled.
+        goal: The success rate that is asked about, 0 to 1; None where none is.
+    """
     if not summary.rates:
         return [f"no trial with a known outcome yet ({summary.unknown} without)"]
     lines = [rate_words(rate, goal) for rate in summary.rates]

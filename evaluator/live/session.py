@@ -161,7 +161,12 @@ class SessionSummary:
         return next((r for r in self.rates if (r.task, r.condition, r.policy) == key), None)
 
     def gain(self, task: str, policy: str) -> GainSummary | None:
-        """Return the gain of one task and policy."""
+        """Return the gain of one task and policy.
+
+        Args:
+            task: Task of the pairs.
+            policy: Policy of the pairs; without a complete pair of both the answer is None.
+        """
         return next((g for g in self.gains if (g.task, g.policy) == (task, policy)), None)
 
 
@@ -208,6 +213,11 @@ def changes_of(known: Sequence[LiveTrial], task: str, policy: str) -> list[int]:
 
     In the order in which the pairs became complete. A start tried twice in one condition is no
     pair: which of the two would count?
+
+    Args:
+        known: Trials with an outcome, of any task and policy.
+        task: Task whose pairs are wanted.
+        policy: Policy whose pairs are wanted.
     """
     starts: dict[str, list[LiveTrial]] = {}
     for trial in known:

@@ -34,6 +34,10 @@ def refuse_swapped(
 
     Grey images cannot tell, and are let through.
 
+    Args:
+        recorded: Recorded image, red first, 0 to 1.
+        replayed: The image held against it, in the same order and range.
+
     Raises:
         ImageShapeError: When the sizes differ.
         SwappedColourError: With both numbers.
@@ -69,6 +73,10 @@ def score_depth(
     rendered_m: Float[np.ndarray, "rendered_height rendered_width"],
 ) -> DepthScore:
     """Compare two depth images [m]; 0 is "no measurement".
+
+    Args:
+        recorded_m: Depth that the camera measured [m].
+        rendered_m: Depth of the twin from the same place [m].
 
     Raises:
         ImageShapeError: When the sizes differ.
@@ -112,6 +120,11 @@ def gmsd(
     over the pixels whose four originals all lie inside.
 
     Range: 0 and up, 0 is identical edges, lower is better.
+
+    Args:
+        recorded: Recorded image in RGB, 0 to 1.
+        replayed: The image held against it, of the same size.
+        mask: Pixels that count; None counts all.
 
     Raises:
         ImageShapeError: When the sizes differ.

@@ -27,7 +27,12 @@ MIN_SIDE_PX = 32
 
 
 def metric_id(net: NetName, given: InputName) -> str:
-    """Return the id of LPIPS with one backbone and one input range."""
+    """Return the id of LPIPS with one backbone and one input range.
+
+    Args:
+        net: The backbone, ``vgg`` or ``alex``.
+        given: The range in which it is fed with images: ``01`` or ``pm1``, see ``INPUTS``.
+    """
     return f"lpips_{net}_{given}"
 
 
@@ -73,9 +78,19 @@ class PerceptualNet(Protocol):
         recorded: Float[np.ndarray, "height width 3"],
         replayed: Float[np.ndarray, "height width 3"],
     ) -> Distances:
-        """Return a distance, or the reason against one, by metric id."""
+        """Return a distance, or the reason against one, by metric id.
+
+        Args:
+            recorded: Recorded image in RGB, 0 to 1.
+            replayed: The image held against it, of the same size.
+        """
 
 
 def net_of(metric: ImageMetric, nets: Sequence[PerceptualNet]) -> PerceptualNet | None:
-    """Return the network that an LPIPS is computed with, where it was given."""
+    """Return the network that an LPIPS is computed with, where it was given.
+
+    Args:
+        metric: Any image metric; for one that is no LPIPS the answer is None.
+        nets: The networks that were loaded.
+    """
     return next((net for net in nets if metric.id.startswith(f"lpips_{net.name}_")), None)

@@ -93,5 +93,10 @@ def soft_box(
 def extents_difference_m(
     first_m: Float[np.ndarray, "3"], second_m: Float[np.ndarray, "3"]
 ) -> float:
-    """Return the largest difference of an extent [m]. Range: 0 m and up, 0 is perfect."""
+    """Return the largest difference of an extent [m]. Range: 0 m and up, 0 is perfect.
+
+    Args:
+        first_m: Extents of the object in one state [m].
+        second_m: Its extents in the other, along the same axes [m].
+    """
     return float(np.abs(first_m - second_m).max())

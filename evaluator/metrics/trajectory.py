@@ -108,6 +108,10 @@ def without_rigid_motion(
 ) -> Float[np.ndarray, " num_poses"]:
     """Distance [m] of the same instants after the replay was laid over the recording.
 
+    Args:
+        p_recorded_m: Recorded positions [m].
+        p_replayed_m: Replayed positions at the same instants [m].
+
     Raises:
         UndefinedStatisticError: When the replayed positions lie on a line, or are not finite.
     """
@@ -135,6 +139,11 @@ def joint_errors(recorded: JointTrack, replayed: JointTrack) -> JointErrors:
 
     Angles that differ by a whole turn put the arm into the same place and count as equal.
     Range: 0 rad to pi, 0 is perfect. Undefined when: no joint or no instant is shared.
+
+    Args:
+        recorded: Recorded joint positions [rad] over time.
+        replayed: Those of the replay, on the same clock; joints that only one side names are left
+            out.
 
     Raises:
         UndefinedStatisticError: When the two share no joint, or no instant.
@@ -214,6 +223,10 @@ def pose_errors(recorded: PoseTrajectory, replayed: PoseTrajectory) -> PoseError
     Absolute pose error without alignment, its length and its angle: Sturm et al. (2012).
     Range: 0 m and up, 0 is perfect. Undefined when: the two share no instant.
 
+    Args:
+        recorded: Recorded poses over time.
+        replayed: Those of the replay, in the same frame and on the same clock.
+
     Raises:
         UndefinedStatisticError: When the stamps do not overlap.
     """
@@ -233,6 +246,11 @@ def position_errors(
     replayed: PoseTrajectory,
 ) -> Float[np.ndarray, " num_common"]:
     """Return the distances [m] of ``pose_errors``, to the bit, where no angle is asked for.
+
+    Args:
+        stamps_ns: When the recorded positions were taken [ns].
+        p_recorded_m: Recorded positions [m].
+        replayed: Poses of the replay, in the same frame and on the same clock.
 
     Raises:
         UndefinedStatisticError: When the stamps do not overlap.
@@ -263,6 +281,10 @@ def angles_rad(
 
     Range: 0 rad to pi. The arc tangent of the chords is exact at zero and for opposite signs, where
     the arc cosine of a product is noisy.
+
+    Args:
+        q_first_wxyz: Rotations of one side, at each instant.
+        q_second_wxyz: Those of the other side, at the same instants.
     """
     near = np.linalg.norm(q_first_wxyz - q_second_wxyz, axis=1)
     far = np.linalg.norm(q_first_wxyz + q_second_wxyz, axis=1)
@@ -277,6 +299,11 @@ def moving_part(run: PoseTrajectory, *, threshold_m: float = MOVING_THRESHOLD_M)
     """Cut the waiting at both ends: from leaving the start to staying at the end.
 
     A run that never leaves its start is returned whole.
+
+    Args:
+        run: Poses of one run.
+        threshold_m: Distance from the start, or the end, up to which the body counts as waiting
+            [m].
     """
     away_from_start = np.linalg.norm(run.p_m - run.p_m[0], axis=1) > threshold_m
     away_from_end = np.linalg.norm(run.p_m - run.p_m[-1], axis=1) > threshold_m
@@ -319,6 +346,11 @@ def band_distance(
 
     Range: 0 and up, 0 is perfect.
 
+    Args:
+        recorded: Recorded runs; their clocks need not agree.
+        replayed: Runs of the other side, in the same frame; as many as there are.
+        num_samples: Instants of normalised time at which runs are compared.
+
     Raises:
         UndefinedStatisticError: When one side has no run.
     """
@@ -359,6 +391,11 @@ def path_distance_m(
 
     Range: 0 m and up, 0 is perfect. Undefined when: one side has no run, or a run does not move.
 
+    Args:
+        recorded: Recorded runs; how long they take plays no part.
+        replayed: Runs of the other side, in the same frame.
+        num_samples: Equal shares of the way at which runs are compared.
+
     Raises:
         UndefinedStatisticError: When it is undefined.
     """
@@ -398,6 +435,10 @@ def repeatability(
 
     The sum of squares is divided by (runs - 1), since the mean is estimated from the same runs.
 
+    Args:
+        runs: Runs of the same motion.
+        num_samples: Instants of normalised time at which runs are compared.
+
     Raises:
         UndefinedStatisticError: Below 2 runs.
     """
@@ -419,7 +460,12 @@ def repeatability(
 def mean_curve_m(
     runs: Sequence[PoseTrajectory], num_samples: int = NORMALISED_SAMPLES
 ) -> Float[np.ndarray, "num_samples 3"]:
-    """Mean position of several runs at uniform instants of normalised time."""
+    """Mean position of several runs at uniform instants of normalised time.
+
+    Args:
+        runs: Runs of the same motion; one at least.
+        num_samples: Instants of normalised time, both ends included.
+    """
     return np.asarray(_curves(runs, num_samples)[0].mean(axis=0))
 
 

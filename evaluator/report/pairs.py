@@ -27,7 +27,12 @@ class ViewPair:
 
 
 def pairs_html(pairs: Sequence[ViewPair], number: int) -> str:
-    """Write the worst views, worst first; nothing without pictures."""
+    """Write the worst views, worst first; nothing without pictures.
+
+    Args:
+        pairs: Views, worst first; as many as fit are shown.
+        number: Number of the figure in the page.
+    """
     shown, spent = [], 0
     for pair in pairs[:MAX_PAIRS]:
         pictures = (_png(pair.recorded_u8), _png(pair.rendered_u8))

@@ -53,14 +53,24 @@ MEASUREMENT_TYPES = {
 
 
 def write_trials(path: Path, trials: Sequence[TrialRecord]) -> Path:
-    """Write one row per trial, the columns of ``trials.csv``; outcomes are true, false or null."""
+    """Write one row per trial, the columns of ``trials.csv``; outcomes are true, false or null.
+
+    Args:
+        path: Where the file goes.
+        trials: One for each row.
+    """
     names = [field.name for field in fields(TrialRecord)]
     columns = {name: [getattr(trial, name) for trial in trials] for name in names}
     return _write(path, columns, TRIAL_TYPES)
 
 
 def write_measurements(path: Path, measurements: Sequence[Measurement]) -> Path:
-    """Write one row per measured number, its interval in columns."""
+    """Write one row per measured number, its interval in columns.
+
+    Args:
+        path: Where the file goes.
+        measurements: One for each row; an undefined one has an empty value and its reason.
+    """
     columns: dict[str, list[Any]] = {
         name: [getattr(item, name, None) for item in measurements] for name in MEASUREMENT_TYPES
     }
@@ -74,7 +84,12 @@ def write_measurements(path: Path, measurements: Sequence[Measurement]) -> Path:
 
 
 def write_table(path: Path, table: Table) -> Path:
-    """Write one row per row of a table, each column with the type of what it holds."""
+    """Write one row per row of a table, each column with the type of what it holds.
+
+    Args:
+        path: Where the file goes.
+        table: Any table of the evaluation, unrounded.
+    """
     columns = {name: [row[i] for row in table.rows] for i, name in enumerate(table.columns)}
     types = {name: _type_of(values) for name, values in columns.items()}
     return _write(path, columns, types)

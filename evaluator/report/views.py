@@ -69,7 +69,12 @@ def used_columns(table: View) -> list[int]:
 
 
 def is_number(table: View, index: int) -> bool:
-    """Say whether a column holds numbers, or mostly numbers with their intervals."""
+    """Say whether a column holds numbers, or mostly numbers with their intervals.
+
+    Args:
+        table: A table as it is printed.
+        index: Place of the column, from 0.
+    """
     cells = [row[index] for row in table.rows if row[index] is not None]
     if any(isinstance(cell, Figures) for cell in cells):
         return 2 * sum(isinstance(cell, Figures) for cell in cells) > len(cells)
@@ -83,7 +88,14 @@ def _known(value: Any) -> bool:
 
 
 def percent(value: float | None, low: Any = None, high: Any = None, digits: int = 1) -> Shown:
-    """Write a share and its interval in percent; nothing where it is unknown."""
+    """Write a share and its interval in percent; nothing where it is unknown.
+
+    Args:
+        value: The share, 0 to 1; None where it is unknown.
+        low: Lower end of its interval, 0 to 1; None leaves the interval out.
+        high: Upper end.
+        digits: Digits after the point.
+    """
     if not _known(value):
         return None
     ends = ""

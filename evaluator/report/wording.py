@@ -61,7 +61,12 @@ HUGE = 1e7
 
 
 def number(value: float, unit: str) -> str:
-    """Write a value in the unit a reader thinks in."""
+    """Write a value in the unit a reader thinks in.
+
+    Args:
+        value: What was measured, in ``unit``.
+        unit: Unit of the measurement: one of ``SHOWN_UNITS``, or another, which is left out.
+    """
     _, name, _ = SHOWN_UNITS.get(unit, PLAIN)
     return f"{_figure(value, unit)}{name}"
 

@@ -59,7 +59,14 @@ class RunContents:
 def read_contents(
     run: RunFolder, cache: SummaryCache, output: Output, pool: ProcessPool | Serial = SERIAL
 ) -> RunContents:
-    """Read what is new or has changed in a run; a broken file is left out and named."""
+    """Read what is new or has changed in a run; a broken file is left out and named.
+
+    Args:
+        run: The run folder.
+        cache: What was read before; a file that has not changed is taken from there.
+        output: Told how far the reading is.
+        pool: Reads several files at once; one after the other without.
+    """
     inventory = take_inventory(run, cache, output)
     labels = _labels(run)
     recorded, left_out = _read(
@@ -186,6 +193,12 @@ def _read(
 
 
 def broken(name: str, error: Exception, *, scope: str = "everything") -> Exclusion:
-    """Leave a file out of something, with what reading it raised."""
+    """Leave a file out of something, with what reading it raised.
+
+    Args:
+        name: Name of the file.
+        error: What reading it raised.
+        scope: What it is left out of.
+    """
     words = str(error) if isinstance(error, GstError) else f"{type(error).__name__}: {error}"
     return Exclusion(episode=name, scope=scope, reason=words)

@@ -155,6 +155,10 @@ class _Log:
 def read_recorded(run: RunFolder, episode: Episode) -> RecordedFacts:
     """Sum up a recorded episode; of one that is no trial, only who and what.
 
+    Args:
+        run: The run folder, for labels beside the episode.
+        episode: The recorded episode, open.
+
     Raises:
         EpisodeError: When its metadata was written by another program and cannot be read.
     """
@@ -211,7 +215,13 @@ def localised_positions(localisations: Iterable[bytes]) -> list[LocalisedPositio
 def positions_at_start(
     places: Iterable[LocalisedPosition], started_ns: int | None
 ) -> dict[str, Position]:
-    """Return the last place of each object that is not younger than the start."""
+    """Return the last place of each object that is not younger than the start.
+
+    Args:
+        places: Localised objects in the order of time; a later one of an object replaces an earlier
+            one.
+        started_ns: When the execution started; None takes the last place of each.
+    """
     return {
         place.object_id: place.p_m
         for place in places
@@ -402,6 +412,12 @@ class DerivedIndex:
         """Find the dynamic replay of a recorded episode's plan, planned or executed.
 
         The newest file wins where several settings were tried.
+
+        Args:
+            source: Id of the recorded episode.
+            source_sha256: Its hash as it is now; a replay of another version does not count.
+            plan_id: Plan that was sent.
+            trajectory: ``planned`` or ``executed``.
         """
         made = self._replays.get((source, plan_id, trajectory), [])
         if not made:
@@ -427,7 +443,12 @@ class DerivedIndex:
         return Replay(file=file, verdict=decided, reason=undecided)
 
     def localised(self, *, source: str, source_sha256: str) -> DerivedFile | None:
-        """Find the newest localisation of a recorded episode."""
+        """Find the newest localisation of a recorded episode.
+
+        Args:
+            source: Id of the recorded episode.
+            source_sha256: Its hash as it is now; a localisation of another version does not count.
+        """
         current = _current(self._localised.get(source, []), source_sha256)
         return _newest(current) if current else None
 

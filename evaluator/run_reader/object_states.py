@@ -61,7 +61,12 @@ class Sent:
 
 
 def read_sent(recorded: Episode, plan_id: str) -> Sent | None:
-    """Find a plan in the recording; None when it is not there."""
+    """Find a plan in the recording; None when it is not there.
+
+    Args:
+        recorded: The recorded episode.
+        plan_id: Plan that was sent.
+    """
     names = (schema.PLAN, schema.EVENT, schema.LOCALISATION)
     topics = [topic for name in names for topic in recorded.topics_of_type(name)]
     plan: Plan | None = None
@@ -93,7 +98,12 @@ def predicted_states(plan: Plan) -> dict[Key, ObjectState]:
 
 
 def recorded_states(sent: Sent, localised: Episode | None) -> dict[str, ObjectState]:
-    """The poses localised after the execution, from the twin's localisation or the cell's own."""
+    """The poses localised after the execution, from the twin's localisation or the cell's own.
+
+    Args:
+        sent: The plan, when it ended, and what the cell localised itself.
+        localised: The twin's localisation of the episode; None takes the cell's own.
+    """
     records = sent.localisations if localised is None else streams.localisations(localised)
     states = {}
     for record in records:
@@ -118,7 +128,13 @@ def _is_after(record: Mapping[str, Any], sent: Sent) -> bool:
 
 
 def replayed_states(replay: Episode, sent: Sent, task: Task | None) -> dict[Key, ObjectState]:
-    """The poses at the end of each stage; after an object's last stage, when all has settled."""
+    """The poses at the end of each stage; after an object's last stage, when all has settled.
+
+    Args:
+        replay: A replay of the plan.
+        sent: The plan; its stages name the objects whose poses are wanted.
+        task: Knows which objects are soft; None takes all of them as rigid.
+    """
     wanted, last = sent.steps(), sent.last_stages()
     topics = {
         name: topic for name, topic in streams.object_pose_topics(replay).items() if name in last

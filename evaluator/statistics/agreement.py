@@ -33,6 +33,12 @@ def exact(
 ) -> tuple[list[Fraction], list[Fraction]]:
     """Return both sides as exact fractions.
 
+    Args:
+        statistic: What is to be computed, as the refusal names it.
+        recorded: Recorded rate of each group; a fraction stays exact.
+        sim: The twin's, of the same groups in the same order.
+        at_least: Fewest groups with which the statistic is defined.
+
     Raises:
         UndefinedStatisticError: Below ``at_least`` groups.
         ValueError: When the sides differ in length.
@@ -53,6 +59,11 @@ def varying(
     statistic: str, recorded: Sequence[Number], sim: Sequence[Number]
 ) -> tuple[list[Fraction], list[Fraction]]:
     """Return both sides, at least 3 groups of which not all are the same on either side.
+
+    Args:
+        statistic: What is to be computed, as the refusal names it.
+        recorded: Recorded rate of each group.
+        sim: The twin's, of the same groups in the same order.
 
     Raises:
         UndefinedStatisticError: With the reason.
@@ -93,6 +104,10 @@ CONVENTIONS = ("recorded", "sim")
 def bias(*, recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     """Return mean(sim - recorded): above 0 the twin is optimistic. r does not see this.
 
+    Args:
+        recorded: Recorded rate of each group, 0 to 1.
+        sim: The twin's, of the same groups in the same order.
+
     Raises:
         UndefinedStatisticError: Without groups.
     """
@@ -102,6 +117,10 @@ def bias(*, recorded: Sequence[Number], sim: Sequence[Number]) -> float:
 
 def mean_absolute_error(*, recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     """Return mean |sim - recorded|; 0 is perfect.
+
+    Args:
+        recorded: Recorded rate of each group, 0 to 1.
+        sim: The twin's, of the same groups in the same order.
 
     Raises:
         UndefinedStatisticError: Without groups.
@@ -113,6 +132,10 @@ def mean_absolute_error(*, recorded: Sequence[Number], sim: Sequence[Number]) ->
 def root_mean_square_error(*, recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     """Return sqrt(mean (sim - recorded)^2); 0 is perfect, and never below the mean |gap|.
 
+    Args:
+        recorded: Recorded rate of each group, 0 to 1.
+        sim: The twin's, of the same groups in the same order.
+
     Raises:
         UndefinedStatisticError: Without groups.
     """
@@ -122,6 +145,10 @@ def root_mean_square_error(*, recorded: Sequence[Number], sim: Sequence[Number])
 
 def largest_gap(*, recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     """Return max |sim - recorded| over groups.
+
+    Args:
+        recorded: Recorded rate of each group, 0 to 1.
+        sim: The twin's, of the same groups in the same order.
 
     Raises:
         UndefinedStatisticError: Without groups.
@@ -142,6 +169,10 @@ def calibration_line(*, recorded: Sequence[Number], sim: Sequence[Number]) -> Ca
 
     Both sides are counts with noise, so the slope is pulled towards 0 (attenuation); it predicts,
     it does not say what the physics would do.
+
+    Args:
+        recorded: Recorded rate of each group, 0 to 1: what the line predicts.
+        sim: The twin's, of the same groups in the same order: what it predicts from.
 
     Raises:
         UndefinedStatisticError: Below 3 groups, or when the sim side is constant.
@@ -167,6 +198,11 @@ def mmrv(*, recorded: Sequence[Number], sim: Sequence[Number], gap: str = "recor
     swapping the arguments. A tie on one side only is a violation. Exact on counts.
 
     Range: 0 to 1, 0 is perfect.
+
+    Args:
+        recorded: Recorded rate of each group, 0 to 1.
+        sim: The twin's, of the same groups in the same order.
+        gap: ``recorded`` or ``sim``: in whose rates a wrong order is weighed.
 
     Raises:
         UndefinedStatisticError: Below 2 groups.
@@ -205,6 +241,10 @@ class OrderAccuracy:
 
 def order_accuracy(*, recorded: Sequence[Number], sim: Sequence[Number]) -> OrderAccuracy:
     """Count the pairs of groups that the twin orders as the recorded rates do.
+
+    Args:
+        recorded: Recorded rate of each group; pairs that tie here are not counted.
+        sim: The twin's, of the same groups in the same order; a tie only here is half right.
 
     Raises:
         UndefinedStatisticError: Below 2 groups, or when no two recorded rates differ.
@@ -253,6 +293,10 @@ def pearson(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
 
     Range: -1 to 1. Undefined when: fewer than 3 groups, or one side is constant.
 
+    Args:
+        recorded: Recorded rate of each group.
+        sim: The twin's, of the same groups in the same order.
+
     Raises:
         UndefinedStatisticError: With the reason.
     """
@@ -270,6 +314,10 @@ def spearman(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
 
     Range: -1 to 1. Undefined when: fewer than 3 groups, or one side is constant.
 
+    Args:
+        recorded: Recorded rate of each group; only their order counts.
+        sim: The twin's, of the same groups in the same order.
+
     Raises:
         UndefinedStatisticError: With the reason.
     """
@@ -284,6 +332,10 @@ def kendall(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
 
     Range: -1 to 1. Undefined when: fewer than 3 groups, or one side is constant.
 
+    Args:
+        recorded: Recorded rate of each group; only their order counts.
+        sim: The twin's, of the same groups in the same order.
+
     Raises:
         UndefinedStatisticError: With the reason.
     """
@@ -297,6 +349,11 @@ def kendall(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
 
 def fisher_interval(r: float, num_groups: int, *, level: float = LEVEL) -> Interval:
     """Return Fisher's z interval of Pearson's r. The groups must be independent of each other.
+
+    Args:
+        r: Pearson's r over the groups.
+        num_groups: Groups that r was computed over.
+        level: Confidence level, 0 to 1.
 
     Raises:
         UndefinedStatisticError: Below 4 groups, or when r is exactly 1 or -1.

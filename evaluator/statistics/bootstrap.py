@@ -48,6 +48,12 @@ class Scale:
     def around(self, statistic: str, value: float, error: float) -> tuple[float, float]:
         """Go ``error`` to both sides of a value, on this scale by the delta method.
 
+        Args:
+            statistic: What the value is, as the refusal names it.
+            value: Where the interval has its middle, in units of the statistic.
+            error: How far to go to each side where the scale is straight, in units of the
+                statistic.
+
         Raises:
             UndefinedStatisticError: At a limit of the scale, or when the error is 0.
         """
@@ -61,6 +67,10 @@ class Scale:
 
     def refuse_limit(self, statistic: str, value: float) -> None:
         """Refuse a value at which the scale has no end.
+
+        Args:
+            statistic: What the value is, as the refusal names it.
+            value: The statistic that was found.
 
         Raises:
             UndefinedStatisticError: Naming it.
@@ -148,6 +158,12 @@ def resamples(
 
     The K^K ordered draws of K units are C(2K - 1, K) different resamples, each as likely as its
     multinomial coefficient says (Hall 1992, appendix I).
+
+    Args:
+        num_units: Groups, or clusters of them, that are drawn with replacement.
+        rng: Draws the resamples where they are too many to visit.
+        max_exact: All resamples are visited up to this many different ones.
+        num_resamples: Random resamples beyond that.
     """
     if math.comb(2 * num_units - 1, num_units) <= max_exact:
         counts = _all_counts(num_units)
@@ -229,6 +245,11 @@ class GroupSample:
         jackknife: Student's t with the standard error of leaving one unit out (Tukey 1958), on
         Fisher's z or the logarithm where ``scales`` says so.
 
+        Args:
+            statistic: Its name in ``weighted.STATISTICS``.
+            method: One of ``METHODS``.
+            level: Confidence level, 0 to 1.
+
         Raises:
             UndefinedStatisticError: Below 4 units, when the statistic is undefined in more than
                 5 % of the resamples, at the end of its range, or when nothing varies.
@@ -262,13 +283,22 @@ class GroupSample:
 
 
 def expanded_tail(tail: float, num_units: int) -> float:
-    """Return the tail at which a percentile is as far out as Student's t would have it."""
+    """Return the tail at which a percentile is as far out as Student's t would have it.
+
+    Args:
+        tail: Probability that the interval leaves on each side.
+        num_units: Units that are resampled, 2 or more.
+    """
     quantile = float(stdtrit(num_units - 1, tail))
     return float(ndtr(quantile * math.sqrt(num_units / (num_units - 1))))
 
 
 def student_interval(values: Sequence[Number], *, level: float = LEVEL) -> Interval:
     """Return Student's t interval of a mean over independent groups, or over cluster means.
+
+    Args:
+        values: One number for each independent unit.
+        level: Confidence level, 0 to 1.
 
     Raises:
         UndefinedStatisticError: Below 3 values, or when they are all the same: no interval of
@@ -297,6 +327,13 @@ def weighted_ends(
     statistic: str,
 ) -> tuple[float, float]:
     """Return the weighted quantiles of the defined values that leave ``tail`` on each side.
+
+    Args:
+        values: The statistic in each resample; anything where it is undefined.
+        defined: Where the statistic exists.
+        weights: Probability of each resample; together 1.
+        tail: Probability that is left on each side.
+        statistic: What the values are, as the refusal names it.
 
     Raises:
         UndefinedStatisticError: When more than 5 % are undefined.
@@ -352,6 +389,10 @@ class Remeasured:
         Two measurements differ by sqrt(2) times the spread of one, around the value that was
         found; on Fisher's scale for correlations and shares, on the logarithm for errors.
 
+        Args:
+            statistic: Its name in ``weighted.STATISTICS``.
+            level: Share of repeated measurements that are to fall inside, 0 to 1.
+
         Raises:
             UndefinedStatisticError: Below 3 groups, when the statistic is undefined or at the end
                 of its range, or when no redrawn rate changes it.
@@ -390,6 +431,11 @@ def remeasure_paired(
 
     From a multinomial with the observed shares, 1/4 added to each count.
 
+    Args:
+        tables: For each group the trials in which both succeed, only sim, only recorded, neither.
+        rng: Draws the tables.
+        num_draws: How often each group is measured anew.
+
     Raises:
         UndefinedStatisticError: When a group has no trial.
     """
@@ -417,7 +463,14 @@ def remeasure_counts(
     rng: np.random.Generator,
     num_draws: int = NUM_DRAWS,
 ) -> Remeasured:
-    """Draw counts (k, n) anew, of sides whose trials are not paired; 1/2 added to each count."""
+    """Draw counts (k, n) anew, of sides whose trials are not paired; 1/2 added to each count.
+
+    Args:
+        recorded: Successes and trials of each group as recorded; 1 trial or more.
+        sim: The twin's, of the same groups in the same order.
+        rng: Draws the counts.
+        num_draws: How often each group is measured anew.
+    """
     found, drawn = [], []
     for side in (recorded, sim):
         found.append(np.array([k / n for k, n in side]))

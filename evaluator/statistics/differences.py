@@ -60,7 +60,12 @@ def mcnemar(pairs: Iterable[tuple[bool, bool]]) -> McNemar:
 
 
 def sign_test(improved: int, worsened: int) -> tuple[float, float]:
-    """Return the two-sided exact p and mid-p of Binomial(improved + worsened, 1/2)."""
+    """Return the two-sided exact p and mid-p of Binomial(improved + worsened, 1/2).
+
+    Args:
+        improved: Pairs that failed before and succeeded after.
+        worsened: Pairs that succeeded before and failed after.
+    """
     discordant, smaller = improved + worsened, min(improved, worsened)
     # Whole numbers as long as possible: exact for any count.
     below, here = 0, 1
@@ -144,6 +149,13 @@ def newcombe_difference(
     """Return the interval of second - first for independent groups (Newcombe 1998, method 10).
 
     The result is a fraction: 0.2 is a gain of 20 percentage points.
+
+    Args:
+        k_first: Successes of the first group.
+        n_first: Trials of the first group.
+        k_second: Successes of the second group.
+        n_second: Trials of the second group.
+        level: Confidence level, 0 to 1.
     """
     first = wilson(k_first, n_first, level=level)
     second = wilson(k_second, n_second, level=level)
@@ -163,6 +175,13 @@ def guaranteed_difference(
 
     The difference of two Clopper-Pearson intervals, each at (1 + level) / 2: by Bonferroni both
     hold together with at least ``level``. Wide; for where Newcombe's is refused.
+
+    Args:
+        k_first: Successes of the first group.
+        n_first: Trials of the first group.
+        k_second: Successes of the second group.
+        n_second: Trials of the second group.
+        level: Confidence level that is kept for every pair of true rates, 0 to 1.
     """
     each = (1 + level) / 2
     first = clopper_pearson(k_first, n_first, level=each)
@@ -183,6 +202,12 @@ def boschloo(k_first: int, n_first: int, k_second: int, n_second: int) -> float:
     SciPy has it. Given the total s of successes, the probability of the region is fixed, so the
     p-value is a polynomial in the rate with s = 0..N as terms; it is searched on a grid and
     polished.
+
+    Args:
+        k_first: Successes of the first group.
+        n_first: Trials of the first group.
+        k_second: Successes of the second group.
+        n_second: Trials of the second group.
 
     Raises:
         UndefinedStatisticError: Without trials, or for groups whose tables cannot be counted out.

@@ -32,6 +32,10 @@ def brier(predicted: Sequence[float], happened: Sequence[bool]) -> float:
 
     Range: 0 to 1, 0 is perfect; always saying 1/2 gives 1/4.
 
+    Args:
+        predicted: Predicted probability of success of each trial, 0 to 1.
+        happened: Whether that trial succeeded.
+
     Raises:
         UndefinedStatisticError: Without trials.
         ValueError: For probabilities outside 0..1.
@@ -62,6 +66,11 @@ def expected_calibration_error(
 
     Range: 0 to 1, 0 is perfect.
 
+    Args:
+        predicted: Predicted probability of success of each trial, 0 to 1.
+        happened: Whether that trial succeeded.
+        num_bins: Bins of equal width over 0..1.
+
     Raises:
         UndefinedStatisticError: Without trials.
         ValueError: For probabilities outside 0..1.
@@ -74,6 +83,11 @@ def reliability_bins(
     predicted: Sequence[float], happened: Sequence[bool], *, num_bins: int = NUM_BINS
 ) -> list[ReliabilityBin]:
     """Return the bins that hold trials, in order.
+
+    Args:
+        predicted: Predicted probability of success of each trial, 0 to 1.
+        happened: Whether that trial succeeded.
+        num_bins: Bins of equal width over 0..1; the last one holds 1 too.
 
     Raises:
         UndefinedStatisticError: Without trials.
@@ -228,6 +242,10 @@ def cost_curve(confusion: Confusion, refusal_prices: Iterable[float]) -> list[Co
     """Compare obeying the gate with executing everything, over prices of a false refusal.
 
     Only trials in which the answer was not obeyed can show false refusals; give only those.
+
+    Args:
+        confusion: What the gate said against what happened, over trials that were executed anyway.
+        refusal_prices: What refusing a good plan costs, in units of one bad execution.
 
     Raises:
         UndefinedStatisticError: Without trials.

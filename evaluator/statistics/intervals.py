@@ -30,6 +30,11 @@ class ImpossibleCountError(EvaluatorError):
 def wilson(k: int, n: int, *, level: float = LEVEL) -> Interval:
     """Return the score interval of a proportion k/n (Wilson 1927), the default for rates.
 
+    Args:
+        k: Successes.
+        n: Trials.
+        level: Confidence level, 0 to 1.
+
     Raises:
         UndefinedStatisticError: Without trials.
         ImpossibleCountError: When k is not in 0..n.
@@ -47,6 +52,11 @@ def wilson(k: int, n: int, *, level: float = LEVEL) -> Interval:
 def clopper_pearson(k: int, n: int, *, level: float = LEVEL) -> Interval:
     """Return the interval that covers at least ``level`` for every true rate (1934).
 
+    Args:
+        k: Successes.
+        n: Trials.
+        level: Confidence level, 0 to 1.
+
     Raises:
         UndefinedStatisticError: Without trials.
         ImpossibleCountError: When k is not in 0..n.
@@ -63,6 +73,11 @@ def jeffreys(k: int, n: int, *, level: float = LEVEL) -> Interval:
 
     With the ends 0 at k = 0 and 1 at k = n (Brown, Cai and DasGupta 2001, section 4.1): without
     that change it never covers rates near 0 and 1.
+
+    Args:
+        k: Successes.
+        n: Trials.
+        level: Probability of the posterior that lies between the ends, 0 to 1.
 
     Raises:
         UndefinedStatisticError: Without trials.
@@ -86,6 +101,10 @@ RATE_INTERVALS: dict[str, Callable[..., Interval]] = {
 def relative_gain(before: float, after: float) -> float:
     """Return (after - before) / before; 1.0 means doubled. Not a gain in percentage points.
 
+    Args:
+        before: Rate that the gain is relative to; not 0.
+        after: Rate in the same unit.
+
     Raises:
         UndefinedStatisticError: When there is nothing to be relative to.
     """
@@ -98,6 +117,10 @@ def relative_gain(before: float, after: float) -> float:
 
 def check_count(k: int, n: int) -> None:
     """Refuse what cannot be counted.
+
+    Args:
+        k: Successes.
+        n: Trials.
 
     Raises:
         UndefinedStatisticError: Without trials.
@@ -123,6 +146,10 @@ def median_interval(values: Sequence[float], *, level: float = LEVEL) -> Interva
     The l-th smallest and the l-th largest hold it with probability 1 - 2 P(B < l), where B is
     binomial(n, 1/2); the largest l that keeps the level (Thompson 1936).
 
+    Args:
+        values: Independent values in any order.
+        level: Confidence level, 0 to 1.
+
     Raises:
         UndefinedStatisticError: Below 6 values at 95 %: even the smallest and the largest may miss.
     """
@@ -143,7 +170,12 @@ def median_interval(values: Sequence[float], *, level: float = LEVEL) -> Interva
 
 
 def median_rank(n: int, level: float = LEVEL) -> int:
-    """Return l, counted from 1; 0 where no two values keep the level."""
+    """Return l, counted from 1; 0 where no two values keep the level.
+
+    Args:
+        n: How many values there are.
+        level: Confidence level, 0 to 1.
+    """
     if not n:
         return 0
     below = bdtr(np.arange(n // 2 + 1), n, 0.5)  # P(B <= l - 1) for l = 1, 2 ..
@@ -151,7 +183,12 @@ def median_rank(n: int, level: float = LEVEL) -> int:
 
 
 def cluster_means(values: Sequence[float], clusters: Sequence[Hashable]) -> list[float]:
-    """Return the mean of each cluster, in the order in which clusters first appear."""
+    """Return the mean of each cluster, in the order in which clusters first appear.
+
+    Args:
+        values: What is averaged.
+        clusters: What each value belongs to, for example its episode.
+    """
     of_cluster: dict[Hashable, list[float]] = {}
     for value, cluster in zip(values, clusters, strict=True):
         of_cluster.setdefault(cluster, []).append(value)

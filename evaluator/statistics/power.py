@@ -23,6 +23,13 @@ def power_unpaired(
     Normal approximation with the pooled variance under no difference and the separate variances
     under the difference (Fleiss, Levin and Paik 2003, section 4.3, no continuity correction).
 
+    Args:
+        p_first: True rate of the first arm, 0 to 1.
+        p_second: True rate of the second arm.
+        n_per_arm: Trials in each arm.
+        alpha: Chance of a false alarm that the test allows.
+        sides: 2 for a difference in either direction, 1 where only one direction counts.
+
     Raises:
         UndefinedStatisticError: Without trials, or for equal rates.
     """
@@ -51,6 +58,13 @@ def trials_needed(
     The smallest n with the wanted power by the formula of ``power_unpaired`` (one tail counted,
     as its closed form has it): 82 per arm for 60 % against 80 %.
 
+    Args:
+        p_first: True rate of the first arm, 0 to 1.
+        p_second: True rate of the second arm.
+        power: Chance with which the difference is to be found.
+        alpha: Chance of a false alarm that the test allows.
+        sides: 2 for a difference in either direction, 1 where only one direction counts.
+
     Raises:
         UndefinedStatisticError: For equal rates: no number of trials is enough.
     """
@@ -65,6 +79,12 @@ def detectable_rate(
     p_first: float, n_per_arm: int, *, power: float = POWER, alpha: float = ALPHA
 ) -> float:
     """Return the smallest better rate that n trials per arm would show with this power.
+
+    Args:
+        p_first: True rate of the first arm, 0 to 1.
+        n_per_arm: Trials in each arm.
+        power: Chance with which the difference is to be found.
+        alpha: Chance of a false alarm that the two-sided test allows.
 
     Raises:
         UndefinedStatisticError: When even a rate of 1 would not show.
@@ -93,6 +113,12 @@ def power_paired(
     """Return the chance that McNemar's exact test on n pairs is significant.
 
     By counting out: sum over the number of pairs that differ, and over how many of them improved.
+
+    Args:
+        p_improved: Chance of a pair to fail before and succeed after.
+        p_worsened: Chance of a pair to succeed before and fail after.
+        num_pairs: Pairs, those without a change included; 1 to 400.
+        alpha: Chance of a false alarm that the test allows.
 
     Raises:
         UndefinedStatisticError: Beyond 400 pairs, or without pairs that can differ.

@@ -72,6 +72,10 @@ def starts_covered(
     Further means: beyond the largest distance of a tried start from its nearest tried neighbour.
     Were both drawn alike, about n / (n + 1) of the others would be covered by n tried ones.
 
+    Args:
+        tried: Coordinates of all objects [m], one row for each start with a robot trial.
+        others: The same of the starts that only the twin has.
+
     Returns:
         Covered starts, and all others that were looked at.
 
@@ -267,6 +271,12 @@ def applicability(paired_k: int, paired_n: int, alone_k: int, alone_n: int) -> f
     Compares the twin's success rate on the starts that were tried on the robot with its rate on
     the others. A small p forbids the estimates above; a large one does not prove them.
 
+    Args:
+        paired_k: Successes in the twin, on starts that were tried on the robot.
+        paired_n: Such starts.
+        alone_k: Successes in the twin, on further starts.
+        alone_n: Further starts.
+
     Raises:
         UndefinedStatisticError: Without trials in one part.
     """
@@ -282,6 +292,10 @@ def trials_saved(estimate: Estimate, num_pairs: int) -> int:
     """Return how many more robot trials Wilson's interval would need to be as narrow.
 
     At the estimated rate; 0 when it is as narrow already, never below.
+
+    Args:
+        estimate: The rate found with the twin's help, with its interval.
+        num_pairs: Robot trials that it rests on.
 
     Raises:
         UndefinedStatisticError: When it would be more than 10,000.

@@ -36,6 +36,12 @@ def capital_log(k: int, n: int, rate: float) -> float:
     is a martingale, so it ever exceeds 1/alpha with probability at most alpha (Ville 1939;
     Robbins 1970; Waudby-Smith and Ramdas 2024, section 4).
 
+    Args:
+        k: Successes.
+        n: Trials; without any the bettor still owns 1, so the log is 0.
+        rate: The rate that is bet against, 0 to 1; one that excludes what has happened gives
+            infinity.
+
     Raises:
         ImpossibleCountError: When k is not in 0..n.
     """
@@ -54,6 +60,11 @@ def capital_log(k: int, n: int, rate: float) -> float:
 
 def betting_interval(k: int, n: int, *, level: float = LEVEL) -> Interval:
     """Return the rates a bettor has not yet refuted; valid however often one looked before.
+
+    Args:
+        k: Successes until now.
+        n: Trials until now.
+        level: Confidence level that is kept over all looks together, 0 to 1.
 
     Raises:
         UndefinedStatisticError: Without trials.
@@ -111,6 +122,10 @@ class ConfidenceSequence:
 def sequence_of(outcomes: Sequence[bool], *, level: float = LEVEL) -> ConfidenceSequence:
     """Return the sequence after all these trials; ``add`` one by one, but for all at once.
 
+    Args:
+        outcomes: Whether each trial succeeded, in the order in which they were run.
+        level: Confidence level that is kept over all looks together, 0 to 1.
+
     Raises:
         UndefinedStatisticError: When after some trial no constant rate was left.
     """
@@ -167,6 +182,10 @@ class Advice:
 def stop_or_continue(sequence: ConfidenceSequence, goal: float) -> Advice:
     """Say whether the rate is above or below a goal, or how many more trials it may take.
 
+    Args:
+        sequence: What is known after the trials until now.
+        goal: The success rate that is asked about, 0 to 1.
+
     Raises:
         UndefinedStatisticError: Without trials.
     """
@@ -190,7 +209,12 @@ def _trials_to_decide(rate: float, goal: float, at_least: int, level: float) -> 
 
 
 def fewest(decided: Callable[[int], bool], at_least: int) -> int | None:
-    """Return from how many on something is decided, ``at_least`` or more; None beyond the most."""
+    """Return from how many on something is decided, ``at_least`` or more; None beyond the most.
+
+    Args:
+        decided: Says whether so many decide it; true for all larger numbers once it is true.
+        at_least: Where the answer starts.
+    """
     high = max(1, at_least)
     while not decided(high):
         high *= 2
@@ -210,6 +234,12 @@ def pairs_capital_log(improved: int, worsened: int, n: int, difference: float) -
     the capital against a difference d = P(improved) - P(worsened) is the least of those against
     any pair of chances with that difference, so it ever exceeds 1/alpha with probability at most
     alpha (Ville 1939). The chances that fit best under d solve a quadratic.
+
+    Args:
+        improved: Pairs that failed before and succeeded after.
+        worsened: Pairs that succeeded before and failed after.
+        n: All pairs, those without a change included.
+        difference: P(improved) - P(worsened) that is bet against, -1 to 1.
 
     Raises:
         ImpossibleCountError: When more pairs changed than there are.
@@ -243,6 +273,10 @@ def pairs_sequence(changes: Sequence[int], *, level: float = LEVEL) -> Interval:
 
     Ends only move inwards: what was refuted once stays refuted.
 
+    Args:
+        changes: One number for each pair, in the order in which the pairs became complete.
+        level: Confidence level that is kept over all looks together, 0 to 1.
+
     Raises:
         UndefinedStatisticError: Without pairs, or when after some pair no difference was left.
     """
@@ -271,7 +305,12 @@ def pairs_sequence(changes: Sequence[int], *, level: float = LEVEL) -> Interval:
 
 
 def pairs_advice(changes: Sequence[int], interval: Interval) -> Advice:
-    """Say whether the difference is above or below 0, or how many more pairs that may take."""
+    """Say whether the difference is above or below 0, or how many more pairs that may take.
+
+    Args:
+        changes: One number for each pair: +1 improved, -1 worsened, 0 the same; one pair at least.
+        interval: What ``pairs_sequence`` left of the difference after these pairs.
+    """
     if interval.low > 0:
         return Advice(stop=True, answer="above", more_trials=None)
     if interval.high < 0:

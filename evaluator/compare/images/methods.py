@@ -85,6 +85,10 @@ class ImageSet:
 def folder_set(name: str, folder: Path) -> ImageSet:
     """List the images of a folder and its subfolders.
 
+    Args:
+        name: What the method is called in tables and ids.
+        folder: Where its images are; a path below it without its ending names the view.
+
     Raises:
         PathNotFoundError: When there is no such folder.
         EvaluatorError: When it holds no image.
@@ -117,7 +121,12 @@ def folder_set(name: str, folder: Path) -> ImageSet:
 
 
 def list_files(folder: Path, endings: tuple[str, ...] = READ) -> dict[str, list[Path]]:
-    """Return the files with certain endings by view; hidden ones are nobody's images."""
+    """Return the files with certain endings by view; hidden ones are nobody's images.
+
+    Args:
+        folder: Searched with all its subfolders.
+        endings: File endings that count, in lower case with their point.
+    """
     found: dict[str, list[Path]] = {}
     for path in sorted(folder.rglob("*")):
         relative = path.relative_to(folder)

@@ -103,6 +103,12 @@ def score_variants(
 ) -> dict[Variant, ImageScore]:
     """Score one pair in every way but re-posed.
 
+    Args:
+        recorded: Recorded image in RGB: bytes, or 0 to 1.
+        rendered: The image held against it: bytes, or 0 to 1.
+        masks: Pixels that count, by the name of the mask.
+        nets: Networks that compute LPIPS where a variant asks for it; none without.
+
     Raises:
         ImageShapeError: When the sizes differ.
     """

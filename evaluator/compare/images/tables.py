@@ -207,7 +207,13 @@ def cell_of(stamped: StampedMeasurement) -> StampedValue:
 
 
 def stamp_table(table_id: str, title: str, stamped: Sequence[StampedMeasurement]) -> Table:
-    """List every number with its full stamp; the key tells numbers that may be compared."""
+    """List every number with its full stamp; the key tells numbers that may be compared.
+
+    Args:
+        table_id: Id of the table, its file name too.
+        title: What a reader sees above it.
+        stamped: Numbers, each with the protocol it was measured by.
+    """
     return Table(
         id=table_id,
         title=title,
@@ -233,7 +239,13 @@ _ALIGNED = tuple(
 
 
 def per_image_table(table_id: str, title: str, scores: Sequence[ViewScore]) -> Table:
-    """List every view with its raw scores, and PSNR after each alignment."""
+    """List every view with its raw scores, and PSNR after each alignment.
+
+    Args:
+        table_id: Id of the table, its file name too.
+        title: What a reader sees above it.
+        scores: One for each view, in the order of the rows.
+    """
     others = [metric for metric in PLAIN_METRICS if metric.id not in ("psnr_db", "ssim")]
     learned = [m for m in METRICS.values() if any(m.id in s.scores[RAW].values for s in scores)]
     others += [metric for metric in learned if metric not in PLAIN_METRICS]

@@ -191,7 +191,12 @@ def compare_views(
 def newest_views(
     files: Sequence[DerivedFile], sources: Mapping[str, Source]
 ) -> tuple[list[DerivedFile], list[Exclusion]]:
-    """Find the newest views of each recorded episode; stale and older ones are left out by name."""
+    """Find the newest views of each recorded episode; stale and older ones are left out by name.
+
+    Args:
+        files: Derived episodes of any kind.
+        sources: Recorded episodes by id; views of another version of one are stale.
+    """
     views, stale = _current([file for file in files if file.derived.kind == "views"], sources)
     views, older = _newest(views)
     return views, [*older, *stale]
@@ -320,7 +325,12 @@ def _measure_depth(
 
 
 def agreed_setting(settings: Sequence[Mapping[str, Any]], name: str) -> str:
-    """Return what all views say of one setting, or nothing."""
+    """Return what all views say of one setting, or nothing.
+
+    Args:
+        settings: What each derived episode says of how it was made.
+        name: The setting; the answer is empty where one lacks it or says something else.
+    """
     values = [each.get(name) for each in settings]
     if not values or values[0] is None or any(value != values[0] for value in values):
         return ""

@@ -134,7 +134,12 @@ class Subject:
 
 
 def distributions(subject: Subject, panels: Sequence[Panel]) -> Drawing | NotDrawn:
-    """Draw for each panel which share of the values is at most as large."""
+    """Draw for each panel which share of the values is at most as large.
+
+    Args:
+        subject: Words of the figure.
+        panels: Distributions that share one axis each, from top to bottom; empty ones are left out.
+    """
     panels = [panel for panel in panels if panel.groups]
     if not panels:
         return NotDrawn(id=subject.id, reason=subject.reason)

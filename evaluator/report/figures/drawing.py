@@ -82,13 +82,26 @@ class NotDrawn:
 def panel(
     figure: "Figure", *, left: float, bottom: float, right: float = 0.12, top: float = 0.12
 ) -> "Axes":
-    """Add axes that leave these margins [in] to the edges of the figure."""
+    """Add axes that leave these margins [in] to the edges of the figure.
+
+    Args:
+        figure: Gets the axes.
+        left: Margin for the labels of the vertical axis [in].
+        bottom: Margin for the labels of the horizontal axis [in].
+        right: Margin [in].
+        top: Margin [in].
+    """
     width, height = figure.get_size_inches()
     return framed(figure, (left, bottom, float(width) - left - right, float(height) - bottom - top))
 
 
 def framed(figure: "Figure", box_in: tuple[float, float, float, float]) -> "Axes":
-    """Add axes at (left, bottom, width, height) [in] with two quiet spines."""
+    """Add axes at (left, bottom, width, height) [in] with two quiet spines.
+
+    Args:
+        figure: Gets the axes.
+        box_in: Left and bottom edge from the figure's corner, width and height [in].
+    """
     width, height = (float(side) for side in figure.get_size_inches())
     left, bottom, across, up = box_in
     axes = figure.add_axes((left / width, bottom / height, across / width, up / height))
@@ -104,12 +117,23 @@ def framed(figure: "Figure", box_in: tuple[float, float, float, float]) -> "Axes
 
 
 def grid(axes: "Axes", which: str = "both") -> None:
-    """Draw hairlines behind the data."""
+    """Draw hairlines behind the data.
+
+    Args:
+        axes: Gets the lines.
+        which: The axis whose ticks get lines: ``x``, ``y`` or ``both``.
+    """
     axes.grid(visible=True, axis=which, color=LIGHT["line"], linewidth=0.6)  # type: ignore[arg-type]
 
 
 def percent_axis(axes: "Axes", which: str, label: str) -> None:
-    """Run an axis from 0 to 100 %, with room for marks at both ends."""
+    """Run an axis from 0 to 100 %, with room for marks at both ends.
+
+    Args:
+        axes: Axes whose data are in percent.
+        which: ``x`` or ``y``.
+        label: What the axis shows, without its unit.
+    """
     name = f"{label} (%)"
     if which == "x":
         axes.set_xlim(-3, 103)
@@ -130,7 +154,13 @@ def legend_columns(names: Sequence[str]) -> int:
 
 
 def legend(axes: "Axes", *, above_in: float = 0.05, columns: int = 2) -> None:
-    """Put the legend above the axes, where no data can lie under it."""
+    """Put the legend above the axes, where no data can lie under it.
+
+    Args:
+        axes: Axes whose artists have labels.
+        above_in: Distance from the upper edge of the axes [in].
+        columns: Columns of the legend.
+    """
     height = axes.get_position().height * float(axes.figure.get_size_inches()[1])  # type: ignore[union-attr]
     axes.legend(
         loc="lower left",
@@ -161,7 +191,12 @@ def words(*parts: str) -> str:
 
 
 def listed(names: Sequence[str], *, at_most: int = 6) -> str:
-    """Name a few and count the rest."""
+    """Name a few and count the rest.
+
+    Args:
+        names: Texts to name, in order.
+        at_most: How many are named; the rest is only counted.
+    """
     shown = "; ".join(names[:at_most])
     more = len(names) - at_most
     return shown if more <= 0 else f"{shown}; and {more} more"

@@ -28,7 +28,12 @@ STRONGEST = 0.42
 
 
 def confusion(tables: Sequence[Table], word: str) -> Drawing | NotDrawn:
-    """Draw a two by two field of counts for each way the twin was asked."""
+    """Draw a two by two field of counts for each way the twin was asked.
+
+    Args:
+        tables: Tables of the evaluation; the one called ``confusion`` is drawn.
+        word: What the recorded side is called: stand-in, real or recorded.
+    """
     table = next((table for table in tables if table.id == "confusion"), None)
     asked = [row for row in (() if table is None else table.rows) if row[5]][:MAX_MATRICES]
     if not asked:

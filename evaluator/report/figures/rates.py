@@ -99,7 +99,12 @@ def _bar(axes: "Axes", row: Row, y: float, most: int) -> None:
 
 
 def gains(measurements: Sequence[Measurement], word: str) -> Drawing | NotDrawn:
-    """Draw every gain with its interval around the line of no gain."""
+    """Draw every gain with its interval around the line of no gain.
+
+    Args:
+        measurements: Everything measured; gains in percentage points are drawn.
+        word: What the recorded side is called: stand-in, real or recorded.
+    """
     found: dict[str, dict[str, Measurement]] = {}
     for measurement in measurements:
         if measurement.id.startswith("gain.pp.") and measurement.value is not None:
@@ -192,7 +197,12 @@ MAX_ROWS = 40
 
 
 def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
-    """Draw sim against recorded rates with both intervals and the identity line."""
+    """Draw sim against recorded rates with both intervals and the identity line.
+
+    Args:
+        groups: Success rates per task, condition and policy; only those with both rates are drawn.
+        word: What the recorded side is called: stand-in, real or recorded.
+    """
     drawn = [group for group in groups if all(rate.value is not None for rate in group.pair)]
     if not drawn:
         return NotDrawn(id="scatter", reason="no group has both rates")
@@ -279,7 +289,12 @@ def _legend(axes: "Axes", series: Sequence[tuple[str, str]], conditions: bool) -
 
 
 def success(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
-    """Draw both rates of every group, one group below the other, with their intervals."""
+    """Draw both rates of every group, one group below the other, with their intervals.
+
+    Args:
+        groups: Success rates per task, condition and policy; one with neither rate is left out.
+        word: What the recorded side is called: stand-in, real or recorded.
+    """
     known = [
         group for group in groups if group.sim.value is not None or group.recorded.value is not None
     ]

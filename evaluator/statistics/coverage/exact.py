@@ -36,7 +36,12 @@ class Coverage:
 
 
 def of_rate(interval: Callable[[int, int], Interval], n: int) -> Coverage:
-    """Coverage of a binomial interval at n trials, over rates 0.05 .. 0.95."""
+    """Coverage of a binomial interval at n trials, over rates 0.05 .. 0.95.
+
+    Args:
+        interval: Gives the interval of k successes in n trials.
+        n: Trials.
+    """
     from scipy.stats import binom  # noqa: PLC0415  # half a second, and only the map is made of it
 
     ends = np.array([(i.low, i.high) for i in (interval(k, n) for k in range(n + 1))])
@@ -47,7 +52,13 @@ def of_rate(interval: Callable[[int, int], Interval], n: int) -> Coverage:
 
 
 def of_difference(interval: Callable[[int, int, int, int], Interval], n: int) -> Coverage:
-    """Coverage of an interval of second - first with n trials in each of two groups."""
+    """Coverage of an interval of second - first with n trials in each of two groups.
+
+    Args:
+        interval: Gives the interval from successes and trials of the first group, then of the
+            second.
+        n: Trials in each group.
+    """
     from scipy.stats import binom  # noqa: PLC0415  # as above
 
     counts = range(n + 1)
@@ -65,7 +76,12 @@ def of_difference(interval: Callable[[int, int, int, int], Interval], n: int) ->
 
 
 def of_paired_difference(interval: Callable[[int, int, int], Interval], n: int) -> Coverage:
-    """Coverage of an interval of P(improved) - P(worsened) over n pairs."""
+    """Coverage of an interval of P(improved) - P(worsened) over n pairs.
+
+    Args:
+        interval: Gives the interval from pairs improved, pairs worsened, and all pairs.
+        n: Pairs, those without a change included.
+    """
     outcomes = [(b, c) for b in range(n + 1) for c in range(n + 1 - b)]
     made = [interval(b, c, n) for b, c in outcomes]
     low, high = np.array([i.low for i in made]), np.array([i.high for i in made])
@@ -198,7 +214,14 @@ def of_median(n: int) -> Coverage:
 def of_mean(
     interval: Callable[[list[float]], Interval], n: int, *, draws: int, rng: np.random.Generator
 ) -> Coverage:
-    """Coverage of an interval of the mean of n lengths, over the populations above."""
+    """Coverage of an interval of the mean of n lengths, over the populations above.
+
+    Args:
+        interval: Gives the interval of the mean of some lengths.
+        n: Lengths in each sample.
+        draws: Samples from each population.
+        rng: Draws the samples.
+    """
     covered = []
     for population in POPULATIONS:
         made = [interval(row.tolist()) for row in population.draw(rng, (draws, n))]

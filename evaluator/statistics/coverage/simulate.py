@@ -41,20 +41,36 @@ class Population:
     def draw(
         self, num_clusters: int, rng: np.random.Generator
     ) -> tuple[Float64[np.ndarray, " groups"], Float64[np.ndarray, " groups"]]:
-        """Draw measured rates, recorded and simulated, cluster by cluster."""
+        """Draw measured rates, recorded and simulated, cluster by cluster.
+
+        Args:
+            num_clusters: Clusters to draw, each of ``groups_per_cluster`` groups.
+            rng: Draws true rates and outcomes.
+        """
         recorded, sim = self.measure(self.true_rates(num_clusters, rng), rng)
         return recorded / self.trials, sim / self.trials
 
     def measure(
         self, true_rates: Float64[np.ndarray, "sides groups"], rng: np.random.Generator
     ) -> Int64[np.ndarray, "sides groups"]:
-        """Count successes of groups with these true rates."""
+        """Count successes of groups with these true rates.
+
+        Args:
+            true_rates: Chance of success of each group, 0 to 1: recorded in the first row, then the
+                twin's.
+            rng: Draws the outcomes.
+        """
         return np.asarray(rng.binomial(self.trials, true_rates), dtype=np.int64)
 
     def true_rates(
         self, num_clusters: int, rng: np.random.Generator
     ) -> Float64[np.ndarray, "sides groups"]:
-        """Draw true rates, recorded and simulated, cluster by cluster."""
+        """Draw true rates, recorded and simulated, cluster by cluster.
+
+        Args:
+            num_clusters: Clusters to draw, each of ``groups_per_cluster`` groups.
+            rng: Draws the rates.
+        """
         own, shared = (1 - self.cluster_share) ** 0.5, self.cluster_share**0.5
         size = (num_clusters, self.groups_per_cluster)
         alone = self._pairs(size, rng)
@@ -284,7 +300,15 @@ def of_proxy(
     draws: int,
     rng: np.random.Generator,
 ) -> Coverage:
-    """Coverage of the real rate from robot trials and ten times as many starts in the twin."""
+    """Coverage of the real rate from robot trials and ten times as many starts in the twin.
+
+    Args:
+        interval: Gives the interval of the real rate from the paired trials, and from successes and
+            trials of the twin on further starts.
+        num_pairs: Trials that both the robot and the twin made.
+        draws: Samples for each true rate and twin.
+        rng: Draws the samples.
+    """
     truths = [(rate, twin) for rate in REAL_RATES for twin in TWINS]
     alone = ALONE_PER_PAIR * num_pairs
 

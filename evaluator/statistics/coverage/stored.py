@@ -69,6 +69,10 @@ def coverage_of(method: str, n: int) -> Coverage | None:
     """Return the stored coverage of a method at n, the worse of the two stored neighbours.
 
     Above the largest stored n that one counts; below the smallest nothing is known.
+
+    Args:
+        method: Name in the coverage map; None is returned for one that it does not hold.
+        n: What the method's coverage depends on: trials, pairs, groups or policies.
     """
     found = load_map().get(method)
     if found is None or n < found.points[0].n:
