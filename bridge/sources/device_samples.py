@@ -153,7 +153,7 @@ class Announcer:
 
         Args:
             key: Names the fact, not None; a later one with an equal key takes its place.
-            message: What is sent; its stamp stays the same each time.
+            message: What is sent; the source time of a repetition is that of its sending.
         """
         self._queue.put(_Entry(message, key))
 
