@@ -207,8 +207,8 @@ class Surroundings:
         Args:
             links: The robot's pieces in the order of its hulls, which are placed already.
             nodes_m: Nodes of each soft body, base frame.
-            moved_m: Those of the bodies that moved since they were last measured against what
-                stands still.
+            moved_m: Those of bodies that have left where they had come to rest; only they are
+                measured against what stands still.
         """
         found: dict[Pair, float] = {}
         for name, nodes in nodes_m.items():
