@@ -100,7 +100,7 @@ def find_fixed_camera(
     recording does not say, the whole table is searched.
 
     Args:
-        episodes: Whose joints and depth images are used, of one cell.
+        episodes: Whose joints and depth images are used.
         camera_id: The camera, by its name in the topics.
         max_postures: At most so many postures at rest are looked at, those farthest apart.
         seed: Of the alignment's random draws.

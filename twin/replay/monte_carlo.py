@@ -73,7 +73,7 @@ def sample_rng(seed: int, identity: str, index: int) -> np.random.Generator:
 
     Args:
         seed: Of the whole evaluation.
-        identity: Names the replay and where it starts.
+        identity: Of the start; the same one draws the same variations.
         index: Number of the sample.
     """
     digest = hashlib.sha256(f"{seed}/{identity}/{index}".encode()).digest()

@@ -128,7 +128,7 @@ def localised_starts(
         run: Where the derived episode is kept.
         episode: What was recorded.
         task: Whose objects are looked for.
-        scene_hash: Of the rebuilt scene that helps; None: there is none.
+        scene_hash: Of the scene the poses are meant for; None: there is none.
         force: Localise again even where an answer is kept.
     """
     phases = quiet_phases(episode)

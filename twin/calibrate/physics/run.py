@@ -130,7 +130,7 @@ def physics_record(
     Args:
         found: What the fit gave.
         cases: What it was fitted to, in the order its split refers to.
-        config: Nominal physics, against which identified values are stated.
+        config: Nominal physics; identified frictions are shares of its ``object_friction``.
         delay: Between commands and motion; None: it was not measured.
         skipped: Why episodes were not used, by id.
     """
