@@ -87,6 +87,10 @@ def to_strings(record: object) -> dict[str, str]:
 def build(of_type: type[Record], record: Mapping[str, Any]) -> Record:
     """Make one of the records above from parsed values; fields of later versions are left out.
 
+    Args:
+        of_type: The class of the record, such as ``EpisodeInfo``.
+        record: Values by field name, as parsed from JSON; a list may stand for a tuple.
+
     Raises:
         TypeError: When a field is missing, or is a list, text or number and should not be.
     """

@@ -159,7 +159,13 @@ class RecoveryTally:
         return "; ".join(parts)
 
     def report(self, path: Path, output: Path | None, *, finished: bool) -> RecoveryReport:
-        """Say what was done with a file."""
+        """Say what was done with a file.
+
+        Args:
+            path: The file that was read.
+            output: The finished episode; None when there is none.
+            finished: The file was whole before; its reason is then that of an earlier recovery.
+        """
         counts: dict[str, int] = {}
         last: dict[str, int] = {}
         for channel_id, count in self.messages.items():
@@ -237,7 +243,12 @@ class CopyTarget:
                 pass
 
     def finish(self, metadata_name: str, values: dict[str, str]) -> PartFile:
-        """Write the rest and sync; the caller verifies, renames and closes."""
+        """Write the rest and sync; the caller verifies, renames and closes.
+
+        Args:
+            metadata_name: Name of the record that says what recovery did.
+            values: What that record holds.
+        """
         self._flush_loose()
         self.section.add_metadata(metadata_name, values)
         self.section.seal()
@@ -334,7 +345,12 @@ def verbatim(found: Chunk) -> EncodedChunk:
 
 
 def salvaged_head(records: bytes, contents: Contents) -> bytes:
-    """Return the head of an unpacked chunk with the records that were saved from a cut one."""
+    """Return the head of an unpacked chunk with the records that were saved from a cut one.
+
+    Args:
+        records: The whole records from the chunk's front, unpacked.
+        contents: What is in them; its log times become the chunk's.
+    """
     start_ns, end_ns = contents.time_range()
     return mcap.chunk_head(
         start_ns=start_ns,
@@ -347,7 +363,12 @@ def salvaged_head(records: bytes, contents: Contents) -> bytes:
 
 
 def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
-    """Return the records saved from a cut chunk as a whole one."""
+    """Return the records saved from a cut chunk as a whole one.
+
+    Args:
+        records: The whole records from the chunk's front, unpacked; they are written so.
+        contents: What is in them, with their message index.
+    """
     head = salvaged_head(records, contents)
     start_ns, end_ns = contents.time_range()
     return EncodedChunk(
@@ -471,6 +492,10 @@ class InPlaceTarget:
 
     def finish(self, metadata_name: str, values: dict[str, str]) -> PartFile:
         """Cut off what is torn, write the rest and sync.
+
+        Args:
+            metadata_name: Name of the record that says what recovery did.
+            values: What that record holds.
 
         Raises:
             OSError: When there is no room even for that; what was whole still is.

@@ -113,7 +113,13 @@ def camera_ids(episode: Episode) -> list[str]:
 
 
 def find_camera_topic(episode: Episode, camera_id: str, tail: str) -> str | None:
-    """Return a camera's topic by its end (``depth/image``); stand-in truth is never found."""
+    """Return a camera's topic by its end (``depth/image``); stand-in truth is never found.
+
+    Args:
+        episode: Whose topics are searched.
+        camera_id: Name of the camera in its topics.
+        tail: What follows the camera in the topic, without a leading slash.
+    """
     ending = f"{CAMERAS}{camera_id}/{tail}"
     found = (t for t in episode.topics() if t.endswith(ending) and not is_truth(t))
     return next(found, None)
@@ -131,7 +137,13 @@ def _camera_topic(episode: Episode, camera_id: str, tail: str) -> str:
 
 
 def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> CameraInfo:
-    """Return the first intrinsics of ``color`` or ``depth``."""
+    """Return the first intrinsics of ``color`` or ``depth``.
+
+    Args:
+        episode: Where to look.
+        camera_id: Name of the camera in its topics.
+        stream: ``color`` or ``depth``.
+    """
     topic = _camera_topic(episode, camera_id, f"{stream}/info")
     for message in episode.messages([topic]):
         return CameraInfo.from_cdr(message.data)
@@ -141,7 +153,13 @@ def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> Came
 def rgbd_frames(
     episode: Episode, camera_id: str, tree: TransformTree | None = None
 ) -> Iterator[RgbdFrame]:
-    """Yield posed frames in time order; colour without depth nearby is passed over."""
+    """Yield posed frames in time order; colour without depth nearby is passed over.
+
+    Args:
+        episode: Must have colour and depth of the camera.
+        camera_id: Name of the camera in its topics.
+        tree: The episode's frames where they are known; None reads them from it.
+    """
     tree = transform_tree(episode) if tree is None else tree
     color_info = camera_info(episode, camera_id, "color")
     depth_info = camera_info(episode, camera_id, "depth")
@@ -185,6 +203,10 @@ def joint_track(episode: Episode, ending: str = JOINT_STATES) -> JointTrack:
 
     ROS lets several nodes publish on one topic, each its own joints in its own order: those who
     know the most joints are taken, in the order of the first of them.
+
+    Args:
+        episode: Where to look.
+        ending: How the topic ends, such as ``GRIPPER_STATE``.
     """
     topics = [
         topic for topic in episode.topics_of_type(schema.JOINT_STATE) if topic.endswith(ending)
@@ -258,7 +280,12 @@ def localisations(episode: Episode) -> list[dict[str, Any]]:
 
 
 def executed_interval_ns(episode: Episode, plan_id: str) -> tuple[int, int] | None:
-    """Source times between which a plan was executed, or None if it never was."""
+    """Source times between which a plan was executed, or None if it never was.
+
+    Args:
+        episode: Whose events say when plans were executed.
+        plan_id: The plan asked for.
+    """
     start, end = execution_ns(events(episode), plan_id)
     return None if start is None or end is None else (start, end)
 
@@ -266,7 +293,12 @@ def executed_interval_ns(episode: Episode, plan_id: str) -> tuple[int, int] | No
 def execution_ns(
     records: Iterable[Mapping[str, Any]], plan_id: str
 ) -> tuple[int | None, int | None]:
-    """Source times [ns] at which a plan's execution started and ended, as far as events say."""
+    """Source times [ns] at which a plan's execution started and ended, as far as events say.
+
+    Args:
+        records: Events in the order they were recorded.
+        plan_id: The plan asked for.
+    """
     start: int | None = None
     for event in records:
         if event.get("plan_id") != plan_id:
@@ -279,7 +311,12 @@ def execution_ns(
 
 
 def pose_track(episode: Episode, topic: str) -> PoseTrajectory:
-    """Collect the poses of one PoseStamped topic, ordered by source time, duplicates dropped."""
+    """Collect the poses of one PoseStamped topic, ordered by source time, duplicates dropped.
+
+    Args:
+        episode: Where to look.
+        topic: The whole topic, such as ``/lab/tcp/pose``.
+    """
     track = pose_track_of([message.data for message in episode.messages([topic])])
     if track is None:
         raise EpisodeError(

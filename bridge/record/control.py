@@ -37,6 +37,10 @@ class RecorderClient:
     def ask(self, verb: str, request: dict[str, Any] | None = None) -> dict[str, Any]:
         """Send one command and return the recorder's answer.
 
+        Args:
+            verb: One of the recorder's commands, such as ``status``.
+            request: Fields of the command; None for none.
+
         Raises:
             RemoteError: When the recorder refused.
             NoReplyError: When no recorder of that name answered.
@@ -49,13 +53,24 @@ class RecorderClient:
         return answer
 
     def start(self, episode_id: str, info: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Begin an episode."""
+        """Begin an episode.
+
+        Args:
+            episode_id: Id of the new episode, which names its file.
+            info: Fields of ``EpisodeInfo`` other than the id; None for a trial of which no more is
+                known.
+        """
         return self.ask("start", {"id": episode_id, "info": info or {}})
 
     def stop(
         self, outcome: dict[str, Any] | None = None, *, discard: bool = False
     ) -> dict[str, Any]:
-        """Finish it after everything this session has sent so far."""
+        """Finish it after everything this session has sent so far.
+
+        Args:
+            outcome: Fields of ``Outcome``; None leaves it as it was labelled.
+            discard: Throw the episode away.
+        """
         return self.ask("stop", {"outcome": outcome, "discard": discard})
 
     def status(self) -> dict[str, Any]:
@@ -70,7 +85,12 @@ Record = TypeVar("Record")
 
 
 def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
-    """Answer the control keys until the session closes."""
+    """Answer the control keys until the session closes.
+
+    Args:
+        session: Where the keys are announced.
+        recorder: What the commands go to; its configured name is part of the keys.
+    """
 
     def start(request: dict[str, Any]) -> dict[str, Any]:
         _only(request, "start", {"id", "info"})
@@ -165,7 +185,13 @@ def _text(request: dict[str, Any]) -> str:
 
 
 def parse_info(episode_id: Any, info: Any) -> metadata.EpisodeInfo:
-    """Build the episode's description from a request; unknown fields are refused."""
+    """Build the episode's description from a request; unknown fields are refused.
+
+    Args:
+        episode_id: As it arrived; must be a string that can name a file.
+        info: As it arrived; a JSON object with fields of ``EpisodeInfo``, ``kind`` a trial if left
+            out.
+    """
     if not isinstance(episode_id, str):
         raise ControlError(f"start needs an episode id as a string, got {episode_id!r:.80}.")
     check_episode_id(episode_id)

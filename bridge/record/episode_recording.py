@@ -66,7 +66,12 @@ class Channels:
         self._hashes: dict[str, str] = {}
 
     def of(self, sample: WireSample, type_name: str) -> Channel | None:
-        """Return the channel of a message, or None when there are too many."""
+        """Return the channel of a message, or None when there are too many.
+
+        Args:
+            sample: With the topic, the encoding and the hash of the type.
+            type_name: The type after ``resolve_type``; "" where nobody knows it.
+        """
         key = (sample.topic, type_name, sample.message_encoding, sample.type_hash)
         channel = self._channels.get(key)
         if channel is None and len(self._channels) < self._max_topics:
@@ -74,7 +79,13 @@ class Channels:
         return channel
 
     def later(self, topic: str, stamp_ns: int) -> int:
-        """Return a log time for a record of our own."""
+        """Return a log time for a record of our own.
+
+        Args:
+            topic: Where the record will go.
+            stamp_ns: Wanted log time [ns since 1970]; a later one is returned rather than one step
+                back.
+        """
         last_ns = self._last_ns.setdefault(topic, [0])
         last_ns[0] = max(last_ns[0], stamp_ns)
         return last_ns[0]
@@ -412,7 +423,15 @@ class EpisodeRecording:
         outcome: metadata.Outcome | None = None,
         data: dict[str, Any] | None = None,
     ) -> None:
-        """Append a mark or a label to the cell's events; a label is the outcome from now on."""
+        """Append a mark or a label to the cell's events; a label is the outcome from now on.
+
+        Args:
+            kind: One of the types of the event schema, such as ``mark`` or ``label``.
+            stamp_ns: When it happened [ns since 1970].
+            text: Free text; "" for none.
+            outcome: Of a label; None leaves the episode's outcome as it is.
+            data: Fields of this kind of event; None for none.
+        """
         record: dict[str, Any] = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind}
         if text:
             record["text"] = text
@@ -425,7 +444,12 @@ class EpisodeRecording:
         self.outcome = outcome or self.outcome
 
     def note_clock_step(self, step_ns: int, *, stamp_ns: int) -> None:
-        """Write down that the system clock has jumped; log times have not."""
+        """Write down that the system clock has jumped; log times have not.
+
+        Args:
+            step_ns: How far it jumped, forwards positive.
+            stamp_ns: When that was seen, on the clock that does not jump [ns since 1970].
+        """
         self._clock_steps_ns.append(step_ns)
         self.write_event("clock_step", stamp_ns=stamp_ns, data={"step_ns": step_ns})
 
@@ -460,6 +484,12 @@ class EpisodeRecording:
         """Write the accounts, finish the file and give it its final name.
 
         May be called again after an OSError, when there is space.
+
+        Args:
+            end_ns: When recording ended [ns since 1970].
+            reason: Who or what stopped it, for the metadata.
+            outcome: How it ended; None: as it was labelled last.
+            health: Counts of what went wrong in the recorder, by name.
         """
         self._write_ledger(None, end_ns, health)
         if not self._is_summed_up:

@@ -97,7 +97,12 @@ class Previews:
         return name
 
     def show(self, sample: WireSample, kind: str) -> None:
-        """Send a small copy of an image, if somebody looks and it is time for one."""
+        """Send a small copy of an image, if somebody looks and it is time for one.
+
+        Args:
+            sample: An image as it arrived.
+            kind: ``color``, ``depth`` (never shown) or "" for unknown.
+        """
         topic = sample.topic
         if topic not in self._watched or kind == "depth" or self._shed() >= LoadShedding.PREVIEWS:
             return
@@ -280,7 +285,13 @@ class LiveRecorder:
     def stop(
         self, *, result: str | None = None, detail: str | None = None, discard: bool = False
     ) -> dict[str, Any]:
-        """Finish the episode; ``result`` is success, failure or unknown."""
+        """Finish the episode; ``result`` is success, failure or unknown.
+
+        Args:
+            result: ``success``, ``failure`` or ``unknown``; None leaves it as it was labelled.
+            detail: Why, in a few words; None for none.
+            discard: Throw the episode away.
+        """
         return self.core.stop(outcome=_outcome(result, detail), discard=discard)
 
     def mark(self, text: str = "") -> dict[str, Any]:
@@ -290,7 +301,13 @@ class LiveRecorder:
     def label(
         self, result: str, *, detail: str | None = None, episode: str | None = None
     ) -> dict[str, Any]:
-        """Say how the open episode went, or a finished one by its id."""
+        """Say how the open episode went, or a finished one by its id.
+
+        Args:
+            result: ``success``, ``failure`` or ``unknown``.
+            detail: Why, in a few words; None for none.
+            episode: Id of a finished episode; None: the open one, else the last.
+        """
         return self.core.label(outcome=_outcome(result, detail), episode=episode)
 
     def pause(self) -> dict[str, Any]:

@@ -54,7 +54,12 @@ def pressed_key() -> str:
 
 
 def next_info(run: RunFolder, about: EpisodeAbout) -> EpisodeInfo:
-    """Describe the next episode: the first free number after the kind's name."""
+    """Describe the next episode: the first free number after the kind's name.
+
+    Args:
+        run: Whose episodes have taken numbers already.
+        about: What all episodes of this process have in common; its kind names them.
+    """
     taken = {path.name.split(".")[0] for path in run.episodes_dir.iterdir()}
     number = 1
     while f"{about.kind}_{number:04d}" in taken:

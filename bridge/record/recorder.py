@@ -115,7 +115,13 @@ class Recorder:
         discard: bool = False,
         reason: str = "command",
     ) -> Answer:
-        """Finish the episode, or throw it away, after everything received so far."""
+        """Finish the episode, or throw it away, after everything received so far.
+
+        Args:
+            outcome: How it ended; None: as it was labelled last.
+            discard: Throw it away.
+            reason: Who or what stopped it, for the metadata.
+        """
         answer = self._command(
             lambda command: self._life.stop(outcome, command, discard=discard, reason=reason)
         )
@@ -152,7 +158,13 @@ class Recorder:
     def label(
         self, *, text: str = "", outcome: metadata.Outcome | None = None, episode: str | None = None
     ) -> Answer:
-        """Say how the open episode went, or, by its id, a finished one (kept under notes/)."""
+        """Say how the open episode went, or, by its id, a finished one (kept under notes/).
+
+        Args:
+            text: Free text; "" for none.
+            outcome: How it went; None for text alone.
+            episode: Id of an episode; None: the open one, else the last.
+        """
 
         def act(command: Command) -> Answer:
             take = self._life.take
@@ -211,7 +223,12 @@ class Recorder:
         self._tell = tell
 
     def also_tell(self, name: str, ask: Callable[[], object]) -> None:
-        """Add something to every status and episode; ``ask`` must answer at once."""
+        """Add something to every status and episode; ``ask`` must answer at once.
+
+        Args:
+            name: Its key in the status and in the metadata.
+            ask: Returns what to tell, something JSON can hold; called from several threads.
+        """
         self._status.others[name] = ask
         self._life.others[name] = ask
 

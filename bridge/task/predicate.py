@@ -64,7 +64,12 @@ class PredicateResult:
 
 
 def evaluate_success(task: Task, rollout: Rollout) -> list[PredicateResult]:
-    """Evaluate every success predicate of a task on a rollout's final state."""
+    """Evaluate every success predicate of a task on a rollout's final state.
+
+    Args:
+        task: Whose ``success`` lists the predicates.
+        rollout: Poses of the objects over time, with contacts where a predicate asks for them.
+    """
     return [_evaluate(spec, task, rollout) for spec in task.success]
 
 
@@ -92,7 +97,12 @@ def all_hold(findings: list[PredicateResult]) -> bool | None:
 
 
 def already_true_at_start(task: Task, rollout: Rollout) -> bool:
-    """Say whether the geometric part of the goal held before anything moved (a useless trial)."""
+    """Say whether the geometric part of the goal held before anything moved (a useless trial).
+
+    Args:
+        task: Of its predicates only those of kind ``inside`` are looked at.
+        rollout: Of its poses only the first.
+    """
     start = Rollout(
         stamps_ns=rollout.stamps_ns[:1],
         Ts_base_object={key: Ts[:1] for key, Ts in rollout.Ts_base_object.items()},
@@ -225,7 +235,12 @@ def _allowed_contacts(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> 
 def objects_done(
     findings: list[PredicateResult], manipulated: tuple[str, ...]
 ) -> dict[str, bool | None]:
-    """Per manipulated object: whether everything asked of it holds."""
+    """Per manipulated object: whether everything asked of it holds.
+
+    Args:
+        findings: Results of all predicates.
+        manipulated: Ids of the objects asked about.
+    """
     return {
         key: all_hold([finding for finding in findings if finding.object_id == key])
         for key in manipulated

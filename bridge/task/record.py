@@ -294,6 +294,11 @@ def check_record(
 ) -> Mapping[str, Any]:
     """Return the record if it fits ``schemas/<name>.schema.json``.
 
+    Args:
+        record: As parsed from JSON.
+        name: Of the schema, such as ``plan``.
+        package: Where its folder ``schemas`` is.
+
     Raises:
         InvalidRecordError: With the place and the value that does not fit.
     """
@@ -326,12 +331,23 @@ def _finite(text: str) -> float:
 
 
 def parse_record(data: bytes, *, name: str, package: str = "bridge.task") -> dict[str, Any]:
-    """Parse JSON bytes and check them."""
+    """Parse JSON bytes and check them.
+
+    Args:
+        data: UTF-8 text.
+        name: Of the schema, such as ``plan``.
+        package: Where its folder ``schemas`` is.
+    """
     return dict(check_record(load_record(data, name=name), name=name, package=package))
 
 
 def load_record(data: bytes, *, name: str) -> dict[str, Any]:
-    """Parse JSON bytes that hold one object of finite numbers, and check no more than that."""
+    """Parse JSON bytes that hold one object of finite numbers, and check no more than that.
+
+    Args:
+        data: UTF-8 text.
+        name: What the record is, for the error.
+    """
     try:
         record = json.loads(data, parse_constant=_refuse, parse_float=_finite)
     except (ValueError, RecursionError) as error:

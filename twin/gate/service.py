@@ -40,7 +40,14 @@ class GateError(TwinError):
 def make_gate(
     config: GateConfig, perception: Perception, now_ns: Callable[[], int], twin: TwinProcess
 ) -> Gate:
-    """Put the real localisation and replay behind the gate."""
+    """Put the real localisation and replay behind the gate.
+
+    Args:
+        config: Task, limits and deadline.
+        perception: What the cell shows now.
+        now_ns: The clock on which messages arrive; says how long the cell has been silent.
+        twin: The process that localises and replays.
+    """
     return Gate(
         task=load_task(config.task),
         config=config,
@@ -58,6 +65,13 @@ def serve_gate(
 
     A published verdict carries the time of the newest thing seen, on the cell's own clock, so
     that it lies before the execution it allows.
+
+    Args:
+        session: An open ``bridge.wire.session``.
+        gate: Judges one plan.
+        perception: Says what time it is in the cell.
+        config: Cell, and how many plans may wait.
+        output: Told each verdict in a line.
     """
     publisher = session.publisher(cell_topic(config.cell, VERDICT), schema.VERDICT)
     publishing = threading.Lock()
@@ -87,7 +101,15 @@ def watch_cell(
     *,
     joints: bool = False,
 ) -> None:
-    """Hand the cell's images, transforms, description and events to ``take``; joints if asked."""
+    """Hand the cell's images, transforms, description and events to ``take``; joints if asked.
+
+    Args:
+        session: An open ``bridge.wire.session``.
+        cell: Its name, the first part of its topics.
+        take: Called with topic, payload, time of arrival [ns] and type name, from the session's
+            threads.
+        joints: Joint states too.
+    """
 
     def on_sample(sample: Any) -> None:
         take(sample.topic, sample.data, sample.received_ns, sample.type_name)
@@ -104,6 +126,10 @@ def claim_gate(session: Any, cell: str) -> None:
     Whoever asks takes the first answer that comes, and of two gates one may know another task or
     an older scene.
 
+    Args:
+        session: An open ``bridge.wire.session``; the claim lasts as long as it.
+        cell: Name of the cell.
+
     Raises:
         GateError: When there is one already.
     """
@@ -117,7 +143,13 @@ def claim_gate(session: Any, cell: str) -> None:
 
 
 def run_gate(path: Path, config: GateConfig, output: Output) -> int:
-    """Judge plans until SIGINT or SIGTERM; both end with exit code 0."""
+    """Judge plans until SIGINT or SIGTERM; both end with exit code 0.
+
+    Args:
+        path: The run whose scene and calibration are used.
+        config: Cell, task, connection and limits.
+        output: Told when the gate is ready, and each verdict.
+    """
     from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
     from twin.scene.localise.live import LiveView  # noqa: PLC0415
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415

@@ -196,7 +196,12 @@ def divergence_of(episode: Episode) -> dict[str, Any] | None:
 
 
 def row_of_failure(job: ReplayJob, message: str) -> dict[str, Any]:
-    """Return the row of a trajectory that was not evaluated, with the reason."""
+    """Return the row of a trajectory that was not evaluated, with the reason.
+
+    Args:
+        job: The replay that was asked for.
+        message: Why it was not made.
+    """
     why = message.removeprefix(NOT_EVALUATED)
     return {**_row(job), "error": f"{NOT_EVALUATED}{why}", "reason": f"{NOT_EVALUATED}{why}"}
 
@@ -229,7 +234,14 @@ def judged(
     *,
     skipped: bool = False,
 ) -> dict[str, Any]:
-    """Return the row of a trajectory with its verdict, and where it diverges from the others."""
+    """Return the row of a trajectory with its verdict, and where it diverges from the others.
+
+    Args:
+        job: The replay that was asked for.
+        verdict: What came out.
+        divergence: Where planned, executed and recorded part; None: they were not compared.
+        skipped: The verdict was there from an earlier run.
+    """
     return {
         **_row(job),
         "skipped": skipped,
@@ -264,7 +276,12 @@ Findings = dict[tuple[str, str], bool | None]
 
 
 def recorded_findings(recording: Recording, config: ReplayConfig) -> tuple[dict[str, Any], ...]:
-    """What the success predicates, and the one on contacts, say of the recording itself."""
+    """What the success predicates, and the one on contacts, say of the recording itself.
+
+    Args:
+        recording: What was measured during one execution.
+        config: Limits that contacts are inferred with.
+    """
     robot = load_robot(recording.scene.urdf)
     rollout = rollout_of_recording(recording, robot, hulls_of(robot), config)
     task = recording.scene.task

@@ -142,7 +142,13 @@ def jobs_of(item: Preparation) -> list[ReplayJob]:
 
 
 def replayed_task(episode: Episode, plans: list[tuple[int, Plan]]) -> str | None:
-    """Name the task an episode's plans are judged by; None when it is not one to replay."""
+    """Name the task an episode's plans are judged by; None when it is not one to replay.
+
+    Args:
+        episode: Only trials are replayed.
+        plans: The episode's plans with their times [ns]; the first names the task where the episode
+            does not.
+    """
     if episode.info.kind != "trial" or not plans:
         return None
     return episode.info.task or plans[0][1].task

@@ -51,6 +51,13 @@ def terminal_factor(
 
     A soft body that burst, or is turned inside out, makes it false whatever the task asks: the
     middle of a burst body may well lie in the basket.
+
+    Args:
+        result: States, contacts and shapes over time.
+        scene: Its task has the success predicates.
+        config: Only its mode counts.
+        unreachable_ns: From when on waypoints cannot be reached; None: all can.
+        burst: The soft body that burst first; None: none did.
     """
     if config.mode == "kinematic":
         return Factor(value=None, detail="a kinematic replay does not move objects")
@@ -134,7 +141,12 @@ def findings_of(task: Task, rollout: Rollout, side: str, *, tolerance_m: float =
 
 
 def warnings_of(scene: ReplayScene, result: ReplayResult) -> tuple[str, ...]:
-    """What does not change the verdict but should be known."""
+    """What does not change the verdict but should be known.
+
+    Args:
+        scene: Its task has the success predicates.
+        result: What was replayed.
+    """
     warnings = []
     if already_true_at_start(scene.task, result.rollout()):
         warnings.append(HELD_BEFORE)
@@ -164,6 +176,11 @@ SOFT_ENGINE = "xpbd"
 
 def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> ReplayResult:
     """Replay what a plan commands: waypoints, inverse kinematics, motors, objects.
+
+    Args:
+        plan: Waypoints and stages.
+        scene: Where objects are at the start, and what stands still.
+        config: Mode, physics and limits.
 
     Raises:
         UnusablePlanError: When the plan has no usable waypoints.
@@ -272,7 +289,13 @@ def _clearance_m(
 
 
 def follow(path: JointPath, scene: ReplayScene, config: ReplayConfig) -> States:
-    """Follow the joints exactly; no physics, so nothing is known of objects that can move."""
+    """Follow the joints exactly; no physics, so nothing is known of objects that can move.
+
+    Args:
+        path: Joints and gripper widths over time.
+        scene: Its containers stand where they are.
+        config: Gives the rate of the samples.
+    """
     count = int(np.ceil(path.end_ns() * 1e-9 * config.sample_rate_hz)) + 1
     stamps: Int[np.ndarray, " num_steps"] = (
         np.linspace(0, path.end_ns(), count).round().astype(np.int64)
@@ -314,7 +337,12 @@ def _undecided(plan: Plan, trajectory: str, config: ReplayConfig, scene: ReplayS
 
 
 def engine_of(task: Task, config: ReplayConfig) -> str:
-    """Name what moved things: a grasp that is no friction grasp is part of the name."""
+    """Name what moved things: a grasp that is no friction grasp is part of the name.
+
+    Args:
+        task: Whether it has soft objects.
+        config: Mode and kind of grasp.
+    """
     if config.mode == "kinematic":
         return KINEMATIC_ENGINE
     soft = f"+{SOFT_ENGINE}" if task.soft_objects else ""

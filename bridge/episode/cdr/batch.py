@@ -29,7 +29,13 @@ def joint_messages(
     names: Sequence[str],
     position: Float[np.ndarray, "num_messages num_joints"],
 ) -> Iterator[bytes]:
-    """Yield sensor_msgs/JointState messages with positions alone."""
+    """Yield sensor_msgs/JointState messages with positions alone.
+
+    Args:
+        stamps_ns: Source time of each message [ns since 1970].
+        names: Joints, in the order of the columns of ``position``.
+        position: One row for each message [rad; m for a gripper's width].
+    """
     marks = np.arange(1, len(names) + 1) * 1.2345678e-301  # found nowhere else in the bytes
     sample = JointSample(
         stamp_ns=0,
@@ -48,7 +54,13 @@ def pose_messages(
     frame_id: str,
     Ts_frame_body: Float[np.ndarray, "num_messages 4 4"],
 ) -> Iterator[bytes]:
-    """Yield geometry_msgs/PoseStamped messages."""
+    """Yield geometry_msgs/PoseStamped messages.
+
+    Args:
+        stamps_ns: Source time of each message [ns since 1970].
+        frame_id: The frame the poses are expressed in.
+        Ts_frame_body: Pose of the body in that frame, one for each message.
+    """
     sample = PoseSample(stamp_ns=0, frame_id=frame_id, T_frame_body=np.eye(4))
     template = sample.to_cdr()
     q, p = se3.split(Ts_frame_body)

@@ -44,7 +44,12 @@ class RecordFile:
         return data
 
     def read_into(self, offset: int, room: memoryview) -> int:
-        """Fill ``room`` and return how many bytes there were, fewer only at the end."""
+        """Fill ``room`` and return how many bytes there were, fewer only at the end.
+
+        Args:
+            offset: Where to begin [bytes from the start of the file].
+            room: Memory to fill; its length says how many bytes are wanted.
+        """
         done = 0
         while done < len(room):
             count = os.preadv(self.descriptor, [room[done:]], offset + done)
@@ -106,14 +111,29 @@ class Scratch:
         self._unpacked = bytearray()
 
     def read(self, file: RecordFile, offset: int, size: int) -> memoryview:
-        """Read up to ``size`` bytes, fewer only at the end of the file."""
+        """Read up to ``size`` bytes, fewer only at the end of the file.
+
+        The memory returned is used again by the next call.
+
+        Args:
+            file: The file to read from.
+            offset: Where to begin [bytes from the start of the file].
+            size: How many bytes are wanted.
+        """
         if len(self._record) < size:
             self._record = bytearray(size)
         room = memoryview(self._record)[:size]
         return room[: file.read_into(offset, room)]
 
     def unpack(self, frame: memoryview, size: int) -> memoryview | None:
-        """Unpack a zstd frame of exactly ``size`` bytes; None when it is something else."""
+        """Unpack a zstd frame of exactly ``size`` bytes; None when it is something else.
+
+        The memory returned is used again by the next call.
+
+        Args:
+            frame: The packed bytes.
+            size: What they must unpack to [bytes].
+        """
         if len(self._unpacked) < size:
             self._unpacked = bytearray(size)
         room = memoryview(self._unpacked)[:size]
@@ -323,6 +343,11 @@ def walk_records(data: Buffer) -> Contents:
 def unpack_chunk(head: ChunkHead, data: memoryview, scratch: Scratch) -> Buffer:
     """Return a whole chunk's records.
 
+    Args:
+        head: What the chunk's record claims of itself.
+        data: Its data, still packed, and whole.
+        scratch: Memory that is used again for each chunk; the records may lie in it.
+
     Raises:
         DamagedRecordError: When size or CRC are not as claimed.
         MissingDependencyError: When it is packed with lz4 and that is not installed.
@@ -355,7 +380,12 @@ def _unpack_at_once(head: ChunkHead, data: memoryview, scratch: Scratch) -> Buff
 
 
 def unpack_front(head: ChunkHead, data: bytes) -> bytes:
-    """Return as many records of a chunk as its data, perhaps cut, holds; nothing is verified."""
+    """Return as many records of a chunk as its data, perhaps cut, holds; nothing is verified.
+
+    Args:
+        head: What the chunk's record claims of itself; the size claimed bounds what is unpacked.
+        data: Its data, still packed, from the front; the end may be missing.
+    """
     if head.compression == "":
         return data
     limit = min(head.uncompressed_size or MAX_CHUNK_BYTES, MAX_CHUNK_BYTES)

@@ -79,6 +79,11 @@ class RecordSpan(NamedTuple):
 def walk(stream: ByteStream, start: int, end: int) -> Iterator[RecordSpan]:
     """Yield the places of all records between two offsets; the stream may be used in between.
 
+    Args:
+        stream: The file, or a data section in memory.
+        start: Where the first record begins [bytes from the start of the stream].
+        end: Where the last one must end.
+
     Raises:
         BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
     """
@@ -123,7 +128,12 @@ def _place(head: bytes, at: int, end: int) -> RecordSpan:
 
 
 def read_body(stream: ByteStream, place: RecordSpan) -> bytes:
-    """Return a record's bytes without opcode and length."""
+    """Return a record's bytes without opcode and length.
+
+    Args:
+        stream: The file; its position is changed.
+        place: Where the record lies, as ``walk`` gives it.
+    """
     stream.seek(place.offset + RECORD_HEAD.size)
     body = stream.read(place.length)
     if len(body) < place.length:
@@ -184,6 +194,10 @@ _U8, _U16, _U32, _U64 = map(struct.Struct, ("<B", "<H", "<I", "<Q"))
 def parse(opcode: int, body: bytes) -> records.McapRecord | None:
     """Read a record other than messages, chunks and attachments; None for unknown opcodes.
 
+    Args:
+        opcode: Kind of the record.
+        body: Its bytes without opcode and length.
+
     Raises:
         BrokenRecordError: When its fields run past its end.
     """
@@ -207,6 +221,11 @@ class FoundAttachment(NamedTuple):
 
 def attachment_of(stream: ByteStream, place: RecordSpan, *, keep: bool = True) -> FoundAttachment:
     """Read an attachment record and check its CRC; without ``keep`` its data is left empty.
+
+    Args:
+        stream: The file; its position is changed.
+        place: Where the attachment's record lies.
+        keep: Hold the data in memory; without it, it is read in pieces for the CRC and forgotten.
 
     Raises:
         BrokenRecordError: When its fields run past its end, or its CRC is wrong.
@@ -304,6 +323,10 @@ def parse_chunk(body: bytes) -> ChunkHead:
 def unpack_chunk(chunk: ChunkHead, *, whose: str = "a chunk") -> bytes:
     """Decompress a chunk and compare its size and CRC.
 
+    Args:
+        chunk: Still packed.
+        whose: What to call the chunk in an error.
+
     Raises:
         BrokenRecordError: When one of them is wrong, or it is too large to be believed.
     """
@@ -356,7 +379,13 @@ class MessageHead(NamedTuple):
 
 
 def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
-    """Read the front of the message record at ``at``; ``where`` becomes its ``at``."""
+    """Read the front of the message record at ``at``; ``where`` becomes its ``at``.
+
+    Args:
+        data: A chunk's unpacked data, or the front of a message record.
+        at: Where the record begins in ``data``.
+        where: Its place as the caller counts it: in the chunk, or in the file [bytes].
+    """
     _, length, channel_id, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, at)
     if length < MESSAGE_FIELDS:
         message = f"a message record of {length} bytes"

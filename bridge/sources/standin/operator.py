@@ -124,7 +124,12 @@ SETTLE_S = 0.8
 
 
 def execute_plan(cell: StandinCell, plan: Plan) -> None:
-    """Move as ``joints_rad`` says; events mark the plan, its stages and the gripper."""
+    """Move as ``joints_rad`` says; events mark the plan, its stages and the gripper.
+
+    Args:
+        cell: Moves, and publishes as it does.
+        plan: Its first waypoint should be where the arm is.
+    """
     streams = cell.streams
     times = plan.times_ns()
     joints = np.array([waypoint.joints_rad for waypoint in plan.tau], dtype=np.float64)
@@ -257,7 +262,12 @@ class Operator:
         return [(s, c) for s, c in all_ if (f"{task}/{s}", c) not in there]
 
     def start_poses(self, start_seed: int, condition: str) -> dict[str, Float[np.ndarray, "4 4"]]:
-        """The declared start as a person puts it down: a little off, differently each time."""
+        """The declared start as a person puts it down: a little off, differently each time.
+
+        Args:
+            start_seed: Number of the start; the same one declares the same poses.
+            condition: Which trial of that start it is; the deviations differ between conditions.
+        """
         noise = self._cell.file.noise_for(self._cell.task.name)
         poses = self._cell.task.draw_start(np.random.default_rng(start_seed))
         index = CONDITIONS.index(condition) if condition in CONDITIONS else len(CONDITIONS)

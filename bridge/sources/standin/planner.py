@@ -42,6 +42,10 @@ class StageIds:
 def stage_ids(task: Task, object_id: str) -> StageIds:
     """The stages that grasp, carry and release an object; placing may cover the carrying.
 
+    Args:
+        task: Whose stages are searched.
+        object_id: One of its manipulated objects.
+
     Raises:
         UsageError: When none grasps or none releases it.
     """
@@ -159,7 +163,14 @@ NO_ERROR = GraspError(along_m=0.0, across_m=0.0, yaw_rad=0.0, height_m=0.0, rele
 
 
 def draw_error(noise: PlannerNoise, *, start_seed: int, round_: int, index: int = 0) -> GraspError:
-    """Draw how a candidate is wrong; the same start, round and object give the same error."""
+    """Draw how a candidate is wrong; the same start, round and object give the same error.
+
+    Args:
+        noise: Standard deviations.
+        start_seed: Number of the start.
+        round_: Number of the attempt, from 0: one more for each plan that was refused.
+        index: Number of the object among those manipulated, from 0.
+    """
     # The first object's stream has no index: a task with one object draws what it always drew.
     more = [index] if index else []
     rng = np.random.default_rng([PLANNER_STREAM, start_seed, round_, *more])
@@ -176,7 +187,14 @@ def draw_error(noise: PlannerNoise, *, start_seed: int, round_: int, index: int 
 def draw_errors(
     noise: PlannerNoise, count: int, *, start_seed: int, round_: int
 ) -> tuple[GraspError, ...]:
-    """Draw an error for each of several objects."""
+    """Draw an error for each of several objects.
+
+    Args:
+        noise: Standard deviations.
+        count: How many objects are manipulated.
+        start_seed: Number of the start.
+        round_: Number of the attempt, from 0: one more for each plan that was refused.
+    """
     return tuple(
         draw_error(noise, start_seed=start_seed, round_=round_, index=index)
         for index in range(count)
@@ -189,7 +207,13 @@ def perceive(
     *,
     start_seed: int,
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Return the objects' poses as this planner sees them: shifted and turned a little."""
+    """Return the objects' poses as this planner sees them: shifted and turned a little.
+
+    Args:
+        Ts_base_object: True poses by object id; left as they are.
+        noise: Standard deviations.
+        start_seed: Number of the start; the same one is always seen with the same error.
+    """
     rng = np.random.default_rng([PLANNER_STREAM, start_seed, 10_000])
     seen = {}
     for object_id in sorted(Ts_base_object):
@@ -276,6 +300,10 @@ def release_slots(count: int, container: ObjectModel) -> list[Float[np.ndarray, 
     """Where in a container several objects go: two rows along its x axis, in its frame [m].
 
     An odd last one lies between the rows; a single one goes to the middle.
+
+    Args:
+        count: How many objects.
+        container: Its ``inner_m`` is divided; heights are not decided here.
     """
     x, y, _ = container.inner_m
     columns = -(-count // 2)

@@ -116,7 +116,13 @@ class StandinSource:
         )
 
     def run(self, session: "WireSession", stop: threading.Event, output: Output) -> dict[str, Any]:
-        """Record as the configuration says, or until stopped; see ``run_session``."""
+        """Record as the configuration says, or until stopped; see ``run_session``.
+
+        Args:
+            session: Where the cell publishes and the recorder is asked.
+            stop: Looked at every 8 ms of the cell's time; the open episode is then finished.
+            output: For progress and remarks.
+        """
         return run_session(session, self.config, output, should_stop=stop.is_set)
 
 

@@ -60,7 +60,12 @@ class MessageTemplate:
         return at
 
     def fill(self, stamp_ns: int, numbers: Sequence[float]) -> bytes:
-        """Return the message with this stamp and these numbers."""
+        """Return the message with this stamp and these numbers.
+
+        Args:
+            stamp_ns: Of the header [ns since 1970].
+            numbers: As many as the template has places, in the order the message holds them.
+        """
         data = bytearray(self._bytes)
         struct.pack_into("<iI", data, self._stamp_at, *split_ns(stamp_ns))
         start = 0
@@ -139,7 +144,12 @@ def tool_wrench(wrench: Sequence[float]) -> tuple[float, ...]:
 
 
 def joints_template(names: tuple[str, ...], *, velocities: bool) -> MessageTemplate:
-    """sensor_msgs/JointState: positions [rad or m], then velocities [per s] where wanted."""
+    """sensor_msgs/JointState: positions [rad or m], then velocities [per s] where wanted.
+
+    Args:
+        names: Joints, in the order of the numbers.
+        velocities: One velocity for each joint follows the positions.
+    """
     count = len(names)
 
     def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
@@ -194,7 +204,14 @@ def arm_template() -> MessageTemplate:
 def mode_event(
     cell: str, robot_mode: int | None, safety_mode: int | None, stamp_ns: int
 ) -> StampedMessage:
-    """What the controller says of itself, as an event (type note)."""
+    """What the controller says of itself, as an event (type note).
+
+    Args:
+        cell: Name of the cell, without slashes.
+        robot_mode: The controller's number of it; None when it does not say.
+        safety_mode: The controller's number of it; None when it does not say.
+        stamp_ns: Source time of the sample that says so [ns since 1970].
+    """
     robot = None if robot_mode is None else robot_mode_name(robot_mode)
     safety = None if safety_mode is None else safety_mode_name(safety_mode)
     record = {

@@ -42,7 +42,12 @@ class Split:
 
 
 def split_cases(cases: Sequence[Case], seed: int) -> Split:
-    """Hold out a share of each kind of episode; of a kind with one episode nothing."""
+    """Hold out a share of each kind of episode; of a kind with one episode nothing.
+
+    Args:
+        cases: All that can be used.
+        seed: Of the draw of what is held out.
+    """
     rng = np.random.default_rng([SPLIT_STREAM, seed])
     held: list[int] = []
     for kind in sorted({case.kind for case in cases}):
@@ -196,7 +201,12 @@ class Predictor(Protocol):
     def predict(
         self, points: Float[np.ndarray, "num_points num_parameters"], chosen: Sequence[int]
     ) -> list[list[Prediction]]:
-        """Predict the chosen cases at every point."""
+        """Predict the chosen cases at every point.
+
+        Args:
+            points: Parameters, in units of the prior.
+            chosen: Positions in ``cases``.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -79,7 +79,14 @@ def best_shift_s(
     seen_s: Float[np.ndarray, " num_samples"],
     seen_rad: Float[np.ndarray, "num_samples num_joints"],
 ) -> float | None:
-    """Delay with the least squared distance between two tracks; None when nothing moves."""
+    """Delay with the least squared distance between two tracks; None when nothing moves.
+
+    Args:
+        told_s: When the waypoints were to be reached.
+        told_rad: The joints of the waypoints.
+        seen_s: When joints were recorded, from the same zero.
+        seen_rad: The joints that were recorded.
+    """
     if len(seen_s) < 2 or float(np.ptp(seen_rad, axis=0).max()) < MOVES_RAD:
         return None
 
@@ -119,6 +126,13 @@ def physics_record(
 
     ``identified`` has the fields of ``PhysicsConfig`` that replays take over, empty when nothing
     was promoted.
+
+    Args:
+        found: What the fit gave.
+        cases: What it was fitted to, in the order its split refers to.
+        config: Nominal physics; identified frictions are shares of its ``object_friction``.
+        delay: Between commands and motion; None: it was not measured.
+        skipped: Why episodes were not used, by id.
     """
     by_name = {item.parameter.name: item for item in found.estimates}
     record = {
@@ -210,7 +224,12 @@ def _effective(by_name: Mapping[str, Estimate], config: PhysicsConfig) -> dict[s
 
 
 def describe_physics(record: Mapping[str, Any], calibration_id: str) -> str:
-    """Say in a line per parameter what was found."""
+    """Say in a line per parameter what was found.
+
+    Args:
+        record: As ``physics_record`` makes it.
+        calibration_id: Of the calibration that holds now.
+    """
     lines = [f"physics: {record['why']}; calibration {calibration_id}, {record['engine']}"]
     for name, item in record["parameters"].items():
         word = "identified" if item["identified"] else "not identified"
@@ -247,6 +266,11 @@ def calibrate_physics(
     run: RunFolder, config: CalibrateConfig, output: Output
 ) -> tuple[Mapping[str, Any], str]:
     """Find out about physics from a run's probes and trials, and write ``calibration.json``.
+
+    Args:
+        run: Whose probes and trials are read, and in whose scene folder the calibration goes.
+        config: Evaluations, time budget, samples, workers and seed.
+        output: Shows progress.
 
     Returns:
         The physics record that was made now, and the id of the calibration that holds now.

@@ -384,6 +384,10 @@ def decompose(
 def read_objects(run: RunFolder, record: Mapping[str, Any]) -> dict[str, ObjectSplats]:
     """Load the objects that ``scene.json`` lists, each in its own frame.
 
+    Args:
+        run: Whose scene folder is read.
+        record: The content of ``scene.json``.
+
     Raises:
         PathNotFoundError: When a splat file is gone.
         UnreadablePlyError: When one is damaged.
@@ -410,6 +414,10 @@ def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
 def read_pose(pose: Any, path: Path) -> Float[np.ndarray, "4 4"]:
     """Turn ``p_m`` and ``q_wxyz`` of a scene's JSON file into a transform.
 
+    Args:
+        pose: What the file holds.
+        path: The file, for the message.
+
     Raises:
         UnreadableSceneError: When they are no pose; names the file.
     """
@@ -424,7 +432,13 @@ def compose_parts(
     objects: Mapping[str, ObjectSplats],
     Ts_base_object: Mapping[str, np.ndarray] | None = None,
 ) -> GaussianCloud:
-    """Place every object in the background: where it was scanned, or where the mapping says."""
+    """Place every object in the background: where it was scanned, or where the mapping says.
+
+    Args:
+        background: In the base frame.
+        objects: By name, each in its own frame.
+        Ts_base_object: Other places for some of them; None: all stay where they were scanned.
+    """
     places = {} if Ts_base_object is None else Ts_base_object
     placed = [
         moved_cloud(item.cloud, places.get(key, item.T_base_object))
