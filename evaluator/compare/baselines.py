@@ -70,14 +70,14 @@ def apply_rule(
     return RuleSummary(episode=recorded.info.id, value=answer.value, detail=answer.detail)
 
 
-def with_rule(rows: Iterable[TrialRow], said: Sequence[RuleSummary]) -> list[TrialRow]:
+def with_rule(rows: Iterable[TrialRow], summaries: Sequence[RuleSummary]) -> list[TrialRow]:
     """Enter the rule's answers into the trials' rows; an open answer is left out.
 
     Args:
         rows: The recorded trials.
-        said: The rule's answers, by episode.
+        summaries: What the rule answered, one for each trial asked.
     """
-    answers = {rule.episode: rule.value for rule in said if rule.value is not None}
+    answers = {rule.episode: rule.value for rule in summaries if rule.value is not None}
     return [
         replace(row, baselines=(*row.baselines, (GEOMETRIC_RULE, answers[row.episode])))
         if row.episode in answers
@@ -183,10 +183,10 @@ def _measure(
             k,
             n,
             counted="trial",
-            reason_if_undefined=nothing if not counts.n else f"{name} never said {said}",
+            reason_if_undefined=nothing if not counts.n else f"{name} never said {answer}",
             episodes=names_of(rows),
         )
-        for quantity, k, n, said in (
+        for quantity, k, n, answer in (
             (BASELINE_ACCURACY, counts.agreed, counts.n, ""),
             (BASELINE_PPV, counts.true_positive, counts.predicted_success, "yes"),
             (BASELINE_NPV, counts.true_negative, counts.predicted_failure, "no"),
