@@ -8,9 +8,11 @@ import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from mcap.records import Channel, Metadata, Schema
+
 from bridge.episode import provenance
 from bridge.episode.mcap import format as mcap
-from bridge.episode.mcap.damaged import Contents, Cursor, RecordFile, parse_channel, parse_schema_id
+from bridge.episode.mcap.damaged import Contents, RecordFile, read_plain
 from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk
 from bridge.episode.mcap.format import crc32
 from bridge.episode.mcap.part_file import PartFile
@@ -110,9 +112,8 @@ class RecoveryTally:
             self._define([found.raw])
         elif found.opcode == mcap.METADATA:
             self.metadata += 1
-            cursor = Cursor(found.raw, mcap.RECORD_HEAD.size)
-            if cursor.text() == RECORD_NAME:
-                self.earlier = from_strings(cursor.text_map())
+            if isinstance(found.record, Metadata) and found.record.name == RECORD_NAME:
+                self.earlier = from_strings(found.record.metadata)
 
     def _take_cut(self, found: CutChunk) -> None:
         lost = found.unpacked_size - found.contents.size
@@ -136,8 +137,8 @@ class RecoveryTally:
 
     def _define(self, definitions: list[bytes]) -> None:
         for raw in definitions:
-            if raw[0] == mcap.CHANNEL:
-                channel = parse_channel(raw)
+            channel = read_plain(raw)
+            if isinstance(channel, Channel):
                 self.topics.setdefault(channel.id, channel.topic)
 
     def topic_of(self, channel_id: int) -> str:
@@ -262,21 +263,21 @@ class CopyTarget:
             self._book(found.raw)
         offset = self.section.file.offset
         self.section.file.append([found.raw])
-        if found.opcode == mcap.METADATA:
-            name = Cursor(found.raw, mcap.RECORD_HEAD.size).text()
+        if isinstance(found.record, Metadata):
+            name = found.record.name
             self.section.summary.add_metadata(name, offset=offset, length=found.length)
 
     def _book(self, raw: bytes) -> None:
         """Tell the summary of a definition; the first one of an id counts."""
         summary = self.section.summary
-        if raw[0] == mcap.SCHEMA:
-            _define_once(summary.schemas, self._made_schemas, parse_schema_id(raw), raw)
-            return
-        channel = parse_channel(raw)
-        _define_once(summary.channels, self._made_channels, channel.id, raw)
-        if channel.schema_id and channel.schema_id not in summary.schemas:
-            self._make(mcap.schema(channel.schema_id, "unknown", "", b""))
-            self._made_schemas.add(channel.schema_id)
+        match read_plain(raw):
+            case Schema(id=schema_id):
+                _define_once(summary.schemas, self._made_schemas, schema_id, raw)
+            case Channel(id=channel_id, schema_id=schema_id):
+                _define_once(summary.channels, self._made_channels, channel_id, raw)
+                if schema_id and schema_id not in summary.schemas:
+                    self._make(mcap.schema(schema_id, "unknown", "", b""))
+                    self._made_schemas.add(schema_id)
 
     def _make(self, raw: bytes) -> None:
         """Define a schema or channel whose own definition was lost; readers refuse without."""
@@ -433,8 +434,7 @@ class InPlaceTarget:
             case Chunk():
                 self._define(found.contents)
                 self._chunk = found
-            case Plain() if found.opcode == mcap.METADATA:
-                name = Cursor(found.raw, mcap.RECORD_HEAD.size).text()
+            case Plain(record=Metadata(name=name)):
                 summary.add_metadata(name, offset=found.offset, length=found.length)
             case Plain() if found.opcode in (mcap.SCHEMA, mcap.CHANNEL):
                 self._book(found.raw)
@@ -455,13 +455,13 @@ class InPlaceTarget:
 
     def _book(self, raw: bytes) -> None:
         summary = self.section.summary
-        if raw[0] == mcap.SCHEMA:
-            summary.schemas.setdefault(parse_schema_id(raw), raw)
-            return
-        channel = parse_channel(raw)
-        if channel.schema_id and channel.schema_id not in summary.schemas:
-            raise NeedsCopyError
-        summary.channels.setdefault(channel.id, raw)
+        match read_plain(raw):
+            case Schema(id=schema_id):
+                summary.schemas.setdefault(schema_id, raw)
+            case Channel(id=channel_id, schema_id=schema_id):
+                if schema_id and schema_id not in summary.schemas:
+                    raise NeedsCopyError
+                summary.channels.setdefault(channel_id, raw)
 
     def _define(self, contents: Contents) -> None:
         for raw in contents.definitions:

@@ -216,11 +216,6 @@ class EpisodeWriter:
         """Bytes in the file so far; chunks being filled are not among them."""
         return self._file.offset
 
-    @property
-    def has_failed(self) -> bool:
-        """True after a failed sync: no call will succeed any more."""
-        return self._file.failed is not None
-
     def write(
         self,
         topic: str,

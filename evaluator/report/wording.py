@@ -102,13 +102,15 @@ def count_text(measurement: Measurement) -> str:
     """Write what the value rests on: ``5/6 trials`` or ``6 groups``."""
     if measurement.n is None:
         return ""
-    counted = measurement.counted or ""
-    if counted and measurement.n != 1:
-        counted = PLURALS.get(counted, f"{counted}s")
-    named = f" {counted}" if counted else ""
+    named = f" {noun(measurement.counted, measurement.n)}" if measurement.counted else ""
     if measurement.k is not None and measurement.value is not None:
         return f"{measurement.k}/{measurement.n}{named}"
     return f"{measurement.n}{named}"
+
+
+def noun(name: str, count: int) -> str:
+    """Write what was counted, in the plural but for one."""
+    return name if count == 1 else PLURALS.get(name, f"{name}s")
 
 
 def ends_text(measurement: Measurement) -> str:

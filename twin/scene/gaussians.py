@@ -128,34 +128,6 @@ def harmonic_basis(
     return np.asarray(np.stack([-y, z, -x], axis=-1) * directions.dtype.type(SH_FIRST))
 
 
-def effective_colors(
-    cloud: GaussianCloud, camera_centre_m: Float[np.ndarray, "3"]
-) -> Float32[np.ndarray, "num_splats 3"]:
-    """Colour of each Gaussian as seen from a point of the cloud's frame, not clipped.
-
-    Args:
-        cloud: In the frame of the point.
-        camera_centre_m: From where it is looked at.
-    """
-    if cloud.num_harmonics == 0:
-        return cloud.colors
-    basis = harmonic_basis(view_directions(cloud.means_m, camera_centre_m))
-    return as_float32(cloud.colors + np.einsum("nk,nkc->nc", basis, cloud.harmonics))
-
-
-def view_directions(
-    means_m: Float32[np.ndarray, "num_splats 3"], camera_centre_m: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "num_splats 3"]:
-    """Unit vectors from the camera centre to each mean.
-
-    Args:
-        means_m: In the frame of the camera centre.
-        camera_centre_m: From where it is looked at.
-    """
-    ray = means_m.astype(np.float64) - camera_centre_m
-    return np.asarray(ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12))
-
-
 def turned_harmonics(
     harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"],
     R_new_old: Float[np.ndarray, "*splats 3 3"],

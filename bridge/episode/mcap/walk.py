@@ -23,6 +23,7 @@ from bridge.episode.mcap.format import (
     MESSAGE_FIELDS,
     MESSAGE_HEAD,
     RECORD_HEAD,
+    Buffer,
     crc32,
 )
 
@@ -230,17 +231,9 @@ def attachment_of(stream: ByteStream, place: RecordSpan, *, keep: bool = True) -
     Raises:
         BrokenRecordError: When its fields run past its end, or its CRC is wrong.
     """
-    head_bytes = min(place.length, PIECE_BYTES)
     stream.seek(place.offset + RECORD_HEAD.size)
-    front = _Fields(stream.read(head_bytes))
-    try:
-        log_ns, create_ns = front.read8(), front.read8()
-        name, media_type = front.read_prefixed_string(), front.read_prefixed_string()
-        size = front.read8()
-    except (McapError, struct.error, ValueError) as error:
-        message = f"the attachment at byte {place.offset} cannot be read"
-        raise BrokenRecordError(message) from error
-    start = front.count
+    fields = attachment_fields(stream.read(min(place.length, PIECE_BYTES)), place.offset)
+    name, start, size = fields.name, fields.data_at, fields.data_size
     if size > place.length - start - 4:
         message = f"attachment {name!r} claims {size} bytes, {place.length - start - 4} are there"
         raise BrokenRecordError(message)
@@ -250,13 +243,41 @@ def attachment_of(stream: ByteStream, place: RecordSpan, *, keep: bool = True) -
         message = f"attachment {name!r} has another CRC than it declares"
         raise BrokenRecordError(message)
     record = records.Attachment(
-        create_time=create_ns,
-        log_time=log_ns,
+        create_time=fields.create_time_ns,
+        log_time=fields.log_time_ns,
         name=name,
-        media_type=media_type,
+        media_type=fields.media_type,
         data=b"".join(pieces),
     )
     return FoundAttachment(record, size)
+
+
+class AttachmentFields(NamedTuple):
+    """What stands before the data of an attachment."""
+
+    log_time_ns: int
+    create_time_ns: int
+    name: str
+    media_type: str
+    data_size: int
+    data_at: int
+    """From the start of the record's body."""
+
+
+def attachment_fields(front: bytes, offset: int) -> AttachmentFields:
+    """Read the first bytes of the body of the attachment whose record lies at ``offset``.
+
+    Raises:
+        BrokenRecordError: When its fields run past them.
+    """
+    fields = _Fields(front)
+    try:
+        times = fields.read8(), fields.read8()
+        names = fields.read_prefixed_string(), fields.read_prefixed_string()
+        return AttachmentFields(*times, *names, fields.read8(), fields.count)
+    except (McapError, struct.error, ValueError) as error:
+        message = f"the attachment at byte {offset} cannot be read"
+        raise BrokenRecordError(message) from error
 
 
 def _attachment_crc(
@@ -393,7 +414,7 @@ def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
     return MessageHead(log_ns, where, length - MESSAGE_FIELDS, channel_id, sequence, publish_ns)
 
 
-def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
+def records_in(data: Buffer) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, offset and body length of each record in a chunk's unpacked data.
 
     Raises:

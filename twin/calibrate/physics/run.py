@@ -12,7 +12,7 @@ from bridge.episode import provenance, streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
-from bridge.geometry.signals import lag_of_least_cost
+from bridge.geometry.signals import lag_between_steps
 from bridge.process_pool import default_size
 from bridge.robots.default import ARM_JOINTS
 from bridge.terminal import Output
@@ -93,7 +93,7 @@ def best_shift_s(
     asked = seen_s[None, :] - DELAYS_S[:, None]
     told = np.stack([np.interp(asked, told_s, column) for column in told_rad.T], axis=2)
     costs = np.mean((told - seen_rad) ** 2, axis=(1, 2))
-    return lag_of_least_cost(costs, DELAYS_S, between=True)
+    return lag_between_steps(costs, DELAYS_S)
 
 
 def mean_delay(delays_s: list[float]) -> Delay | None:
@@ -155,7 +155,9 @@ def physics_record(
         "skipped": dict(skipped),
         "num_evaluations": found.num_evaluations,
     }
-    # No times in here: the same inputs give the same id.
+    if found.cut_short:
+        record["cut_short"] = found.cut_short
+    # Where no limit struck, no times are in here: the same inputs give the same id.
     return {**record, "id": provenance.hash_settings(record)}
 
 
@@ -231,6 +233,11 @@ def describe_physics(record: Mapping[str, Any], calibration_id: str) -> str:
         calibration_id: Of the calibration that holds now.
     """
     lines = [f"physics: {record['why']}; calibration {calibration_id}, {record['engine']}"]
+    if "cut_short" in record:
+        lines.append(
+            f"  cut short: {record['cut_short']}; on another machine the numbers may be others. "
+            "Give --budget more."
+        )
     for name, item in record["parameters"].items():
         word = "identified" if item["identified"] else "not identified"
         lines.append(

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt16
+from jaxtyping import Float, Float32, Int, UInt16
 
 from bridge.geometry.camera import Camera
 from twin.scene.gaussians import GaussianCloud, as_float32
@@ -197,11 +197,3 @@ def visible_weight(
     camera = viewpoint.camera
     ones = np.ones((1, camera.height, camera.width), dtype=np.float32)
     return as_float32(_transposed(rasteriser, cloud, viewpoint, ones)[:, 0])
-
-
-def mask_iou(
-    a: Bool[np.ndarray, "height width"], b: Bool[np.ndarray, "height width"]
-) -> float | None:
-    """Intersection over union; None when both are empty."""
-    union = int((a | b).sum())
-    return None if union == 0 else float((a & b).sum() / union)
