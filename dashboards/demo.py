@@ -26,7 +26,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
 from bridge.sources.standin.settings import CONDITIONS, INTERRUPTED, SEEDS_PER_SESSION
-from bridge.task.task_file import load_task
+from bridge.task.find import chosen_task_file
 from bridge.terminal import Output, how_to_activate
 from dashboards.config import DemoConfig
 from dashboards.errors import DashboardError
@@ -146,7 +146,7 @@ def _refuse_other(run: RunFolder, config: DemoConfig, episode: Episode) -> None:
     info = episode.info
     if not info.stand_in:
         found = f"{episode.path.name}, which is not from the stand-in cell"
-    elif info.task != config.task:
+    elif info.task != chosen_task_file(config.task).task().name:
         found = f"episodes of --task {info.task}"
     elif info.start_seed is not None and info.start_seed // SEEDS_PER_SESSION != config.seed:
         found = f"episodes of --seed {info.start_seed // SEEDS_PER_SESSION}"
@@ -191,7 +191,7 @@ def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
         DashboardError: When a step failed, or nothing could be measured.
     """
     started = time.monotonic()
-    load_task(config.task)  # refuse an unknown one before anything is made
+    chosen_task_file(config.task).task()  # refuse an unknown one before anything is made
     run = RunFolder.create(path)
     with _ending_on_signals():
         void = _record(run, config, output).void

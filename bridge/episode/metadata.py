@@ -25,6 +25,8 @@ class EpisodeInfo:
     kind: str
     """One of scan, trial, probe, imported."""
     task: str = ""
+    task_sha256: str = ""
+    """Of the task file it was recorded with, which is attached; empty: not known."""
     instruction: str = ""
     condition: str = ""
     """without_replanning or with_replanning."""

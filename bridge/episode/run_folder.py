@@ -84,7 +84,7 @@ def first_part(path: Path) -> Path:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """``episodes/``, ``scene/``, ``derived/``, ``results/`` and ``notes/`` of one cell."""
+    """``episodes/``, ``tasks/``, ``scene/``, ``derived/``, ``results/`` and ``notes/``."""
 
     path: Path
 
@@ -135,6 +135,11 @@ class RunFolder:
     def results_dir(self) -> Path:
         """What the evaluator computed."""
         return self.path / "results"
+
+    @property
+    def tasks_dir(self) -> Path:
+        """Task files of the recorded episodes."""
+        return self.path / "tasks"
 
     @property
     def notes_dir(self) -> Path:

@@ -23,6 +23,7 @@ from bridge.episode.cdr.messages import (
     transforms_from_cdr,
 )
 from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import (
     CAMERAS,
     COLOR_TOPIC,
@@ -37,8 +38,10 @@ from bridge.errors import EpisodeError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.geometry.trajectory import PoseTrajectory
+from bridge.task.find import ATTACHMENT, Attached, find_task_file
 from bridge.task.plan import Plan
 from bridge.task.record import parse_record
+from bridge.task.task_file import TaskFile
 from bridge.task.verdict import Verdict
 
 PAIRING_TOLERANCE_NS = 20_000_000
@@ -363,3 +366,20 @@ def robot_description(episode: Episode) -> str | None:
         return string_from_cdr(message.data)
     attached = episode.attachment("robot.urdf")
     return None if attached is None else attached.decode()
+
+
+def task_file(episode: Episode, name: str = "") -> TaskFile:
+    """Find the task file an episode was recorded with.
+
+    Args:
+        episode: Recorded, or derived from one; its run's ``tasks/`` lies beside its folder.
+        name: Of the task, where the episode itself names none.
+
+    Raises:
+        MissingTaskError: Saying where it looked.
+        EpisodeError: When the attachment is damaged.
+    """
+    info = episode.info
+    attached = Attached(info.task_sha256, episode.attachment(ATTACHMENT), episode.path.name)
+    tasks_dir = RunFolder(episode.path.absolute().parent.parent).tasks_dir
+    return find_task_file(info.task or name, tasks_dir=tasks_dir, attached=attached)

@@ -14,6 +14,7 @@ from bridge.episode.run_folder import check_episode_id
 from bridge.record.errors import ControlError
 from bridge.record.recorder import Recorder
 from bridge.task.record import check_record
+from bridge.task.task_file import MAX_BYTES, TaskFile
 from bridge.wire.errors import WireError
 from bridge.wire.session import Service, WireSession
 
@@ -52,15 +53,19 @@ class RecorderClient:
             raise WireError(f"{key} answered {answer!r:.80}, expected a JSON object.")
         return answer
 
-    def start(self, episode_id: str, info: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Begin an episode.
+    def start(
+        self, episode_id: str, info: dict[str, Any] | None = None, task: TaskFile | None = None
+    ) -> dict[str, Any]:
+        """Begin an episode, with its task file where there is one.
 
         Args:
             episode_id: Id of the new episode, which names its file.
             info: Fields of ``EpisodeInfo`` other than the id; None for a trial of which no more is
                 known.
+            task: What the episode is of; it is attached to it.
         """
-        return self.ask("start", {"id": episode_id, "info": info or {}})
+        sent = {} if task is None else {"task_file": task.data.decode()}
+        return self.ask("start", {"id": episode_id, "info": info or {}, **sent})
 
     def stop(
         self, outcome: dict[str, Any] | None = None, *, discard: bool = False
@@ -93,8 +98,9 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
     """
 
     def start(request: dict[str, Any]) -> dict[str, Any]:
-        _only(request, "start", {"id", "info"})
-        return recorder.start(parse_info(request.get("id"), request.get("info", {})))
+        _only(request, "start", {"id", "info", "task_file"})
+        info = parse_info(request.get("id"), request.get("info", {}))
+        return recorder.start(info, parse_task_file(request.get("task_file")))
 
     def stop(request: dict[str, Any]) -> dict[str, Any]:
         _only(request, "stop", {"outcome", "discard"})
@@ -115,8 +121,9 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
         )
 
     def snapshot(request: dict[str, Any]) -> dict[str, Any]:
-        _only(request, "snapshot", {"id", "info"})
-        return recorder.snapshot(parse_info(request.get("id"), request.get("info", {})))
+        _only(request, "snapshot", {"id", "info", "task_file"})
+        info = parse_info(request.get("id"), request.get("info", {}))
+        return recorder.snapshot(info, parse_task_file(request.get("task_file")))
 
     def pause(request: dict[str, Any]) -> dict[str, Any]:
         _only(request, "pause", set())
@@ -209,6 +216,22 @@ def parse_info(episode_id: Any, info: Any) -> metadata.EpisodeInfo:
     if made.cell:
         check_episode_id(made.cell)  # becomes part of a topic
     return made
+
+
+def parse_task_file(text: Any) -> TaskFile | None:
+    """Check a task file that came with a request; None stays None.
+
+    Raises:
+        ControlError: When it is not text, or too long.
+        TaskFileError: Listing what is wrong with it.
+    """
+    if text is None:
+        return None
+    if not isinstance(text, str) or len(text) > MAX_BYTES:
+        raise ControlError(f"task_file must be the text of a task file, at most {MAX_BYTES} bytes.")
+    file = TaskFile(text.encode(errors="replace"), "the task file of the command")
+    file.task()
+    return file
 
 
 def parse_outcome(outcome: Any) -> metadata.Outcome | None:

@@ -20,6 +20,8 @@ from bridge.record.config import BYTES_PER_MB, DiskConfig, RecorderConfig
 from bridge.record.inspection import MessageState, inspector, resolve_type
 from bridge.record.ledger import Ledger
 from bridge.record.queue import Command, Dropped, Item, second_of
+from bridge.task.find import ATTACHMENT, MEDIA_TYPE
+from bridge.task.task_file import TaskFile
 from bridge.wire.rmw import ros_schema, type_hash_of
 from bridge.wire.session import WireSample
 
@@ -149,8 +151,22 @@ def _from_ros(type_name: str, type_hash: str, folder: Path | None) -> schema.Sch
 class EpisodeFiles:
     """Opens one part after the other; a full one is finished on a thread of its own."""
 
-    def __init__(self, folder: Path, info: EpisodeInfo, config: DiskConfig, now_ns: int) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        info: EpisodeInfo,
+        config: DiskConfig,
+        now_ns: int,
+        task: TaskFile | None = None,
+    ) -> None:
         """Create the first part.
+
+        Args:
+            folder: Where episodes lie.
+            info: What is being recorded.
+            config: When to begin another part.
+            now_ns: The recorder's clock.
+            task: Attached to every part.
 
         Raises:
             UsageError: When the episode exists, or is being written.
@@ -158,6 +174,7 @@ class EpisodeFiles:
         """
         self._folder = folder
         self._info = info
+        self._task = task
         self._split_bytes = config.split_mb * BYTES_PER_MB
         self._split_ns = ns_from_s(config.split_s)
         self._config = WriterConfig(flush_s=config.flush_s, sync_s=config.sync_s)
@@ -184,6 +201,9 @@ class EpisodeFiles:
         writer = EpisodeWriter(path, config=self._config)
         try:
             writer.describe(self._info)
+            if self._task is not None:
+                data = self._task.data
+                writer.attach(ATTACHMENT, data, media_type=MEDIA_TYPE, log_time_ns=now_ns)
         except OSError as error:
             writer.discard()
             raise BridgeError(
@@ -290,6 +310,7 @@ class EpisodeRecording:
         start_ns: int,
         latched: Callable[[], list[WireSample]],
         others: Mapping[str, Callable[[], object]],
+        task: TaskFile | None = None,
     ) -> None:
         """Create the episode file and say in it who and what it is.
 
@@ -300,6 +321,7 @@ class EpisodeRecording:
             start_ns: When it begins [ns].
             latched: What was said before and still holds, repeated at the start of each file.
             others: What else goes into the ``recorder`` record, by name; asked at the end.
+            task: The task file, to be attached.
 
         Raises:
             UsageError: When the episode exists already.
@@ -319,7 +341,7 @@ class EpisodeRecording:
         self._records: deque[dict[str, Any]] = deque()
         self._clock_steps_ns: list[int] = []
         self._is_summed_up = False
-        self._parts = EpisodeFiles(folder, info, config.disk, start_ns)
+        self._parts = EpisodeFiles(folder, info, config.disk, start_ns, task)
         try:
             self._repeat_latched(start_ns)
         except OSError as error:

@@ -25,6 +25,7 @@ from bridge.record.queue import (
     LatchedMessages,
     LatchedTopics,
 )
+from bridge.task.task_file import TaskFile
 
 
 class DiskReserve:
@@ -256,33 +257,39 @@ class Lifecycle:
 
     # Commands
 
-    def start(self, info: metadata.EpisodeInfo, command: Command) -> Answer:
+    def start(
+        self, info: metadata.EpisodeInfo, command: Command, task: TaskFile | None = None
+    ) -> Answer:
         """Begin an episode, with the pre-roll if there is one.
 
         Args:
             info: What the episode is; its id must be new in the run.
             command: When it was asked for, which is when the episode begins but for its pre-roll.
+            task: The task file to attach.
         """
         self._refuse_start(info.id)
         held = self.ring.held(command.received_ns)
-        self.take = self._open(info, held, command)
+        self.take = self._open(info, held, command, task)
         self.is_paused = False
         self._write_held(self.take, held)
         self.ring.empty()
         return {"ok": True, "episode": info.id, **self._preroll(held, command.received_ns)}
 
-    def snapshot(self, info: metadata.EpisodeInfo, command: Command) -> Answer:
+    def snapshot(
+        self, info: metadata.EpisodeInfo, command: Command, task: TaskFile | None = None
+    ) -> Answer:
         """Write the pre-roll as an episode of its own; it is kept as well.
 
         Args:
             info: What the episode is; its id must be new in the run.
             command: When it was asked for, which is when the pre-roll ends.
+            task: The task file to attach.
         """
         if not self.ring.is_on:
             raise LifecycleError("there is no pre-roll. Start the recorder with --preroll-s 10.")
         self._refuse_start(info.id)
         held = self.ring.held(command.received_ns)
-        self.take = self._open(info, held, command)
+        self.take = self._open(info, held, command, task)
         self._write_held(self.take, held)
         return self.stop(None, command, discard=False, reason="snapshot")
 
@@ -311,7 +318,11 @@ class Lifecycle:
             )
 
     def _open(
-        self, info: metadata.EpisodeInfo, held: list[Item | Dropped], command: Command
+        self,
+        info: metadata.EpisodeInfo,
+        held: list[Item | Dropped],
+        command: Command,
+        task: TaskFile | None,
     ) -> EpisodeRecording:
         self._reserve.hold()
         first_ns = [entry.received_ns for entry in held]
@@ -322,6 +333,7 @@ class Lifecycle:
             start_ns=min([*first_ns, command.received_ns]),
             latched=self.latched.all,
             others=self.others,
+            task=task,
         )
         take.ledger.begin(held[0].ticket if held else command.ticket)
         return take

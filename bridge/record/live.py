@@ -33,6 +33,7 @@ from bridge.record.control import parse_info, parse_outcome, serve_control
 from bridge.record.queue import LoadShedding
 from bridge.record.recorder import Recorder
 from bridge.record.ros2 import watch_ros2
+from bridge.task.task_file import TaskFile
 from bridge.wire import rmw
 from bridge.wire.config import DEFAULT_ENDPOINT, WireConfig
 from bridge.wire.errors import WireError
@@ -201,8 +202,16 @@ class LiveRecorder:
         run: RunFolder,
         config: RecorderConfig,
         say: Callable[[str], None],
+        task: TaskFile | None = None,
     ) -> None:
         """Recover what a crash left, then listen.
+
+        Args:
+            session: Where to listen.
+            run: Where episodes go.
+            config: Settings.
+            say: Told what a person should know.
+            task: The task file of episodes that name this task or none.
 
         Raises:
             UsageError: When ``msg_folder`` holds no definitions, or one that is none.
@@ -219,7 +228,7 @@ class LiveRecorder:
             session, config.recorder, config.preview_hz, lambda: core.input_queue.shed
         )
         core = self.core = Recorder(
-            run, now_ns=session.now_ns, config=config, preview=previews.show
+            run, now_ns=session.now_ns, config=config, preview=previews.show, task=task
         )
         core.note_recovered([_recovery_record(report) for report in reports])
         self._previews = previews

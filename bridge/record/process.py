@@ -19,6 +19,7 @@ from bridge.record.control import parse_info
 from bridge.record.live import LiveRecorder
 from bridge.record.recorder import Recorder
 from bridge.record.status import describe_status
+from bridge.task.task_file import TaskFile
 from bridge.terminal import Output
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import is_loopback
@@ -126,6 +127,7 @@ def run_recorder(
     episode: EpisodeInfo | None = None,
     duration_s: float | None = None,
     about: EpisodeAbout | None = None,
+    task: TaskFile | None = None,
 ) -> dict[str, Any] | None:
     """Record until ``stop`` is set, the duration is over, or the disk fails.
 
@@ -138,6 +140,7 @@ def run_recorder(
         episode: Start this one at once instead of waiting for a command.
         duration_s: With ``episode``, stop after this long [s].
         about: What episodes started from the keyboard are.
+        task: The task file of episodes that name this task or none.
 
     Returns:
         The answer to the last stop if this call stopped an episode, else None.
@@ -147,11 +150,13 @@ def run_recorder(
     """
     with open_session(wire) as session:
         run = RunFolder.create(run_path)
-        recorder = LiveRecorder(session, run, config, output.say)
+        recorder = LiveRecorder(session, run, config, output.say, task)
         _say_where(output, wire, config.recorder, run)
         try:
             if episode is not None:
-                recorder.core.start(episode)
+                started = recorder.core.start(episode)
+                if remark := started.get("task_remark"):
+                    output.say(str(remark))
             with single_keys() as has_keys:
                 keys = Keys(recorder.core, run, about or EpisodeAbout()) if has_keys else None
                 _watch(recorder.core, stop, duration_s, output, keys)

@@ -20,10 +20,12 @@ from bridge.episode.run_folder import RunFolder, check_episode_id, part_name
 from bridge.errors import BridgeError, GstError
 from bridge.record.config import RecorderConfig
 from bridge.record.encoders import EncoderThreads, ImageEncoder, Preview
-from bridge.record.errors import DiskError, LifecycleError
+from bridge.record.errors import ControlError, DiskError, LifecycleError
 from bridge.record.lifecycle import Answer, Lifecycle
 from bridge.record.queue import Command, Dropped, InputQueue, Item, Merge
 from bridge.record.status import Status
+from bridge.task.find import MissingTaskError, find_task_file, keep_task_file
+from bridge.task.task_file import TaskFile
 from bridge.wire.session import WireSample
 
 POLL_S = 0.02
@@ -45,6 +47,7 @@ class Recorder:
         now_ns: Callable[[], int],
         config: RecorderConfig | None = None,
         preview: Preview = lambda sample, kind: None,
+        task: TaskFile | None = None,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """Start the writer thread.
@@ -54,12 +57,14 @@ class Recorder:
             now_ns: The clock that also stamps received messages.
             config: Settings.
             preview: Called with images of which somebody wants a preview.
+            task: The task file of episodes that name this task or none.
             wall_ns: The system clock, watched for steps.
         """
         self.config = config or RecorderConfig()
         self.failed = threading.Event()
         self._now_ns = now_ns
         self._run = run
+        self._task = task
         encoder = ImageEncoder(self.config, lambda: self.input_queue.shed)
         self._encoders = EncoderThreads(encoder, self._take_back, preview)
         self.input_queue = InputQueue(self.config.queues, self._encoders.submit, encoder.kinds)
@@ -98,15 +103,50 @@ class Recorder:
     def _take_back(self, item: Item, saved: int) -> None:
         self.input_queue.put_image(item, saved)
 
-    def start(self, info: metadata.EpisodeInfo) -> Answer:
+    def start(self, info: metadata.EpisodeInfo, task: TaskFile | None = None) -> Answer:
         """Begin an episode, with the pre-roll if there is one.
+
+        Args:
+            info: What is being recorded.
+            task: Its task file: attached to the episode, and kept in the run's ``tasks/``; looked
+                up by the name in ``info`` when it is not given.
 
         Raises:
             UsageError: When the id is unsafe, taken, or another episode is being recorded.
             BridgeError: When the folder cannot be written, or has too little space.
         """
         check_episode_id(info.id)
-        return self._command(lambda command: self._life.start(info, command))
+        task = self._task_of(info) if task is None else task
+        info = described_by(info, task)
+        answer = self._command(lambda command: self._life.start(info, command, task))
+        return {**answer, **self._keep(task)}
+
+    def _task_of(self, info: metadata.EpisodeInfo) -> TaskFile | None:
+        """The recorder's own task file, or the one there is of the name; None for other names."""
+        if self._task is not None and info.task in ("", self._task.task().name):
+            return self._task
+        if not info.task:
+            return None
+        try:
+            return find_task_file(info.task, tasks_dir=self._run.tasks_dir)
+        except MissingTaskError:
+            return None
+
+    def _keep(self, task: TaskFile | None) -> Answer:
+        """Copy the task file into the run, for people and for episodes without attachments."""
+        if task is None:
+            return {}
+        name = task.task().name
+        try:
+            path = keep_task_file(self._run.tasks_dir, name, task.data)
+        except OSError as error:  # the episode carries it all the same
+            return {"task_file": None, "task_remark": f"tasks/ cannot be written: {error.strerror}"}
+        answer = {"task_file": str(path)}
+        if path.name != f"{name}.toml":
+            answer["task_remark"] = (
+                f"{name}.toml in {path.parent} is another file; kept as {path.name}"
+            )
+        return answer
 
     def stop(
         self,
@@ -148,12 +188,14 @@ class Recorder:
         """Record again."""
         return self._command(self._life.resume)
 
-    def snapshot(self, info: metadata.EpisodeInfo) -> Answer:
+    def snapshot(self, info: metadata.EpisodeInfo, task: TaskFile | None = None) -> Answer:
         """Write the pre-roll as an episode; needs ``preroll_s``, and no open episode."""
         check_episode_id(info.id)
-        answer = self._command(lambda command: self._life.snapshot(info, command))
+        task = self._task_of(info) if task is None else task
+        info = described_by(info, task)
+        answer = self._command(lambda command: self._life.snapshot(info, command, task))
         self._enter(info.id)
-        return answer
+        return {**answer, **self._keep(task)}
 
     def label(
         self, *, text: str = "", outcome: metadata.Outcome | None = None, episode: str | None = None
@@ -361,3 +403,25 @@ class Recorder:
             if self._merge.images_seen == self.input_queue.images_in or time.monotonic() > end_s:
                 return self._merge.rest()
             time.sleep(BARRIER_POLL_S)
+
+
+def described_by(info: metadata.EpisodeInfo, task: TaskFile | None) -> metadata.EpisodeInfo:
+    """Add to a description which task file the episode is recorded with.
+
+    Raises:
+        TaskFileError: When the file is no task.
+        ControlError: When name or hash belong to another file.
+    """
+    if task is None:
+        if info.task_sha256:
+            raise ControlError(
+                "task_sha256 is written by the recorder. Send the task file instead."
+            )
+        return info
+    about = task.task()
+    if info.task not in ("", about.name):
+        raise ControlError(f"the episode's task is {info.task!r}, and the file's {about.name!r}.")
+    if info.task_sha256 not in ("", task.sha256):
+        raise ControlError(f"task_sha256 {info.task_sha256!r:.80} is not that of the task file.")
+    instruction = info.instruction or about.instruction
+    return replace(info, task=about.name, task_sha256=task.sha256, instruction=instruction)

@@ -130,4 +130,5 @@ def describe_answer(answer: dict[str, Any]) -> str:
             f"{answer['episode']}: {answer['messages']} messages, {answer['lost']} lost, "
             f"{answer['undecodable']} undecodable, {answer['duration_s']:.1f} s"
         )
-    return f"{answer['episode']}: ok"
+    remark = f"; {text}" if (text := answer.get("task_remark")) else ""
+    return f"{answer['episode']}: ok{remark}"

@@ -11,6 +11,7 @@ from bridge.errors import InvalidRecordError
 
 if TYPE_CHECKING:
     from jsonschema import Draft202012Validator
+    from jsonschema.exceptions import ValidationError
 import operator
 import re
 from collections.abc import Callable, Sequence, Sized
@@ -128,6 +129,10 @@ class _Compiler:
     def any_of(self, wanted: Sequence[Any], _: Mapping[str, Any]) -> Check:
         checks = [self.compile(inner) for inner in wanted]
         return lambda value: any(fits(value) for fits in checks)
+
+    def all_of(self, wanted: Sequence[Any], _: Mapping[str, Any]) -> Check:
+        checks = [self.compile(inner) for inner in wanted]
+        return lambda value: all(fits(value) for fits in checks)
 
     def one_of(self, wanted: Sequence[Any], _: Mapping[str, Any]) -> Check:
         """Sure where no value can fit two of the options, because their types differ."""
@@ -254,6 +259,7 @@ _KEYWORDS: dict[str, Keyword] = {
     "properties": _Compiler.properties,
     "additionalProperties": _Compiler.additional,
     "items": _Compiler.items,
+    "allOf": _Compiler.all_of,
     "anyOf": _Compiler.any_of,
     "oneOf": _Compiler.one_of,
     "if": _Compiler.condition,
@@ -318,6 +324,17 @@ def check_record(
         where = "/".join(str(part) for part in error.absolute_path)
         raise InvalidRecordError(name=name, where=where, found=error.message[:300])
     return record
+
+
+def find_problems(
+    record: Mapping[str, Any], *, name: str, package: str = "bridge.task"
+) -> list["ValidationError"]:
+    """List everything in a record that does not fit ``schemas/<name>.schema.json``, by place."""
+    path = f"schemas/{name}.schema.json"
+    if _quick_check(package, path)(record):
+        return []
+    errors = _validator(package, path).iter_errors(record)
+    return sorted(errors, key=lambda error: [str(part) for part in error.absolute_path])
 
 
 def _refuse(text: str) -> float:

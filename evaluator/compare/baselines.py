@@ -16,7 +16,7 @@ from bridge.geometry import se3
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from evaluator.compare.gate import confusion_of, unheeded_verdict
-from evaluator.compare.known_task import known_task
+from evaluator.compare.known_task import recorded_task
 from evaluator.compare.measure import ends, measured, proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import Answer, names_of
@@ -62,7 +62,7 @@ def apply_rule(
     Raises:
         EpisodeError: When a file turns out to be damaged.
     """
-    task = known_task(recorded.info.task) if task is None else task
+    task = recorded_task(recorded) if task is None else task
     plan = _plan(recorded, plan_id)
     if task is None or plan is None:
         return None

@@ -9,7 +9,7 @@ import numpy as np
 
 from bridge.episode.reader import Episode
 from bridge.task.task_file import ObjectModel, Task
-from evaluator.compare.known_task import known_task
+from evaluator.compare.known_task import recorded_task
 from evaluator.compare.measure import (
     Part,
     degrees,
@@ -99,7 +99,7 @@ def summarise_states(
     if sent is None:
         return ()
     info = recorded.info
-    task = known_task(info.task) if task is None else task
+    task = recorded_task(recorded) if task is None else task
     last = sent.last_stages()
     seen = recorded_states(sent, localised)
     missing = ObjectState(reason=NOT_LOCALISED)

@@ -4,7 +4,6 @@ What is kept follows from the trial's files, the plan sent and the task file, al
 content in the key. Only summaries stay in memory, no series.
 """
 
-import functools
 import gc
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -13,14 +12,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from bridge.data_files import dataset_file
-from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
 from bridge.process_pool import SERIAL, ProcessPool, Serial, cores
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
 from evaluator.compare.baselines import RuleSummary, apply_rule
-from evaluator.compare.known_task import known_task
+from evaluator.compare.known_task import task_sha256
 from evaluator.compare.labels import PerceivedOutcome, perceive_outcome
 from evaluator.compare.motion import MotionSummary, summarise_motions
 from evaluator.compare.states import StateSummary, summarise_states
@@ -198,16 +196,12 @@ def _replays_key(trial: Trial) -> str:
 
 def _localised_key(trial: Trial) -> str:
     localised = "-" if trial.localised is None else trial.localised.sha256
-    return f"{trial.file.sha256} {localised} {trial.row.plan_id} {_task_sha256(trial.row.task)}"
+    task = task_sha256(trial.row.task, RunFolder(trial.file.path.parent.parent).tasks_dir)
+    return f"{trial.file.sha256} {localised} {trial.row.plan_id} {task}"
 
 
 def _states_key(trial: Trial) -> str:
     return f"{_replays_key(trial)} {_localised_key(trial)}"
-
-
-@functools.cache
-def _task_sha256(name: str) -> str:
-    return "-" if known_task(name) is None else hash_file(dataset_file("tasks", name))
 
 
 PARTS = (

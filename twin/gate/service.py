@@ -21,7 +21,8 @@ from bridge.episode.topics import (
     cell_topic,
 )
 from bridge.errors import UsageError
-from bridge.task.task_file import load_task
+from bridge.task.find import chosen_task_file
+from bridge.task.task_file import Task
 from bridge.terminal import Output, printable, stop_signals
 from bridge.wire.config import WireConfig
 from twin.errors import TwinError
@@ -38,7 +39,11 @@ class GateError(TwinError):
 
 
 def make_gate(
-    config: GateConfig, perception: Perception, now_ns: Callable[[], int], twin: TwinProcess
+    task: Task,
+    config: GateConfig,
+    perception: Perception,
+    now_ns: Callable[[], int],
+    twin: TwinProcess,
 ) -> Gate:
     """Put the real localisation and replay behind the gate.
 
@@ -49,7 +54,7 @@ def make_gate(
         twin: The process that localises and replays.
     """
     return Gate(
-        task=load_task(config.task),
+        task=task,
         config=config,
         perception=perception,
         localise=twin.localise,
@@ -157,7 +162,8 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     if not CELL_NAME.match(config.cell):
         message = f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'."
         raise UsageError(message)
-    run, task = RunFolder.open(path), load_task(config.task)
+    run = RunFolder.open(path)
+    task = chosen_task_file(config.task, tasks_dir=run.tasks_dir).task()
     perception = LiveView(config.cell, read_calibration(run))
     wire = WireConfig(connect=config.connect, config=config.zenoh_config)
     with (
@@ -167,10 +173,10 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     ):
         claim_gate(session, config.cell)
         watch_cell(session, config.cell, perception.take, joints=perception.needs_joints)
-        gate = make_gate(config, perception, session.now_ns, twin)
+        gate = make_gate(task, config, perception, session.now_ns, twin)
         serve_gate(session, gate, perception, config, output)
         output.say(
-            f"gate ready: {config.task} of cell {config.cell}, service {config.cell}{GATE}, "
+            f"gate ready: {task.name} of cell {config.cell}, service {config.cell}{GATE}, "
             f"{perception.cameras_from()}. Stop with Ctrl-C."
         )
         while not stopped.wait(0.2):

@@ -20,7 +20,7 @@ from bridge.errors import EpisodeError, GstError
 from bridge.task.plan import Plan
 from bridge.task.predicate import evaluate_success
 from bridge.task.record import parse_record
-from bridge.task.task_file import load_task
+from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from twin.physics.engine import ENGINE
 from twin.replay.config import ReplayConfig
@@ -73,7 +73,7 @@ class ReplayJob:
     start_ns: int
     end_ns: int | None
     """Of the recorded execution, None for a plan that was never executed."""
-    task: str
+    task: Task
     start: StartState
     scene_hash: str | None
     config: ReplayConfig
@@ -110,7 +110,7 @@ class ReplayJob:
         """How long it takes, compared with others."""
         if self.config.mode == "kinematic":
             return 0.1 * self.duration_s
-        bodies = 1 + len(load_task(self.task).soft_objects)
+        bodies = 1 + len(self.task.soft_objects)
         return (1 + self.config.samples) * bodies * self.duration_s
 
     def needed_paths(self) -> tuple[Path, ...]:
@@ -144,12 +144,12 @@ class ReplayJob:
         """What the settings hash covers: settings, inputs, engine and code version."""
         return {
             "replay_version": REPLAY_VERSION,
-            "engine": engine_of(load_task(self.task), self.config),
+            "engine": engine_of(self.task, self.config),
             "episode_sha256": self.episode_sha256,
             "plan_index": self.plan_index,
             "start_ns": self.start_ns,
             "scene_hash": self.scene_hash,
-            "task": asdict(load_task(self.task)),
+            "task": asdict(self.task),
             "Ts_base_object": {name: T.tolist() for name, T in self.start.Ts_base_object.items()},
             "config": asdict(self.config),
             "shapes": dict(self.shapes),
@@ -210,7 +210,7 @@ def _row(job: ReplayJob) -> dict[str, Any]:
     return {
         "episode": job.episode_path.stem,
         "plan": job.plan_id,
-        "task": job.task,
+        "task": job.task.name,
         "trajectory": job.trajectory,
         "mode": job.config.mode,
         "executed": job.was_executed,
@@ -301,7 +301,7 @@ def compare(job: ReplayJob, result: ReplayResult, recording: Recording, end_ns: 
     executed = trace_of_result(result, "executed", end_ns)
     recorded = trace_of_recording(recording, robot, job.config.sample_rate_hz)
     traces = [executed, recorded]
-    task = load_task(job.task)
+    task = job.task
     findings = {
         "executed": _findings(findings_of(task, result.rollout(), "replayed")),
         "recorded": {
@@ -404,7 +404,7 @@ def _open(job: ReplayJob) -> _Source:
             hint=f"Record {ROBOT_DESCRIPTION}, or attach the URDF as robot.urdf.",
         )
     plan = streams.plans(episode)[job.plan_index][1]
-    task = load_task(job.task)
+    task = job.task
     rebuilt = (
         RebuiltScene()
         if job.run_path is None

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bridge.episode.streams import JointTrack
+from bridge.task.check import REFERENCES
 from bridge.task.plan import Plan
 from bridge.task.predicate import (
     ALLOWED_CONTACTS,
@@ -85,7 +86,7 @@ def terminal_factor(
         value=False,
         first_t_ns=end_ns,
         cause=findings[index].kind,
-        bodies=tuple(spec[key] for key in ("object", "container") if key in spec),
+        bodies=tuple(spec[key] for key in REFERENCES if key in spec),
         detail=_once(finding.detail for finding in findings if finding.value is False),
     )
 
@@ -103,7 +104,7 @@ def _why_open(findings: list[PredicateResult], scene: ReplayScene) -> str:
     lost = scene.missing()
     told = []
     for spec, finding in zip(scene.task.success, findings, strict=True):
-        if spec.get("object") in lost or spec.get("container") in lost:
+        if any(spec.get(key) in lost for key in REFERENCES):
             told.append(scene.describe_missing())
         elif finding.value is None:
             told.append(finding.detail)

@@ -18,7 +18,7 @@ from bridge.geometry import se3
 from bridge.geometry.signals import runs_of_true
 from bridge.robots.default import ARM_JOINTS, MAX_WIDTH_M
 from bridge.task.plan import Plan
-from bridge.task.task_file import Task, load_task
+from bridge.task.task_file import Task
 from bridge.terminal import Output
 from twin.errors import TwinError
 from twin.robot.model import load_robot
@@ -258,7 +258,7 @@ def read_case(run: RunFolder, episode: Episode) -> Case:
     """
     plan, start_ns, end_ns = _executed(episode)
     check_clock(episode, (JOINT_STATES, GRIPPER_STATE), start_ns, end_ns, plan.id)
-    task = load_task(plan.task or episode.info.task)
+    task = streams.task_file(episode, plan.task).task()
     if task.soft_objects:
         message = f"task {task.name} has soft objects, and only rigid ones are calibrated."
         raise UnusableCaseError(message)
