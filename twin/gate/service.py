@@ -48,7 +48,8 @@ def make_gate(
     """Put the real localisation and replay behind the gate.
 
     Args:
-        config: Task, limits and deadline.
+        task: What plans are judged by.
+        config: Limits and deadline.
         perception: What the cell shows now.
         now_ns: The clock on which messages arrive; says how long the cell has been silent.
         twin: The process that localises and replays.

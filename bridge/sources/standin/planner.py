@@ -377,7 +377,7 @@ def release_slots(count: int, area_m: tuple[float, float]) -> list[Float[np.ndar
 
     Args:
         count: How many objects.
-        container: Its ``inner_m`` is divided; heights are not decided here.
+        area_m: Extents of the area along its x and y axes; heights are not decided here.
     """
     x, y = area_m
     columns = -(-count // 2)
