@@ -48,6 +48,9 @@ class GateConfig:
     max_silence_s: float = 30.0
     """When nothing at all arrived for this long, not counting the time spent on a verdict, the
     cell is not trusted to be as it was last seen."""
+    max_joint_age_s: float = 1.0
+    """Joint states that are older, on the cell's clock or since they arrived, do not say where the
+    robot is."""
     moved_m: float = 0.01
     """An object seen this far from where the verdict has it, before the answer is given, has been
     moved [m]."""
@@ -71,6 +74,7 @@ class GateConfig:
                 "frame_wait_s": (0, day_s),
                 "max_frame_age_s": (0, day_s),
                 "max_silence_s": (0, day_s),
+                "max_joint_age_s": (0, day_s),
                 "moved_m": (0, 10),
                 "moved_rad": (0, 10),
             },

@@ -47,6 +47,8 @@ class Question:
     config: ReplayConfig
     max_steps: int
     """Simulated steps, the samples' among them."""
+    start_rad: Float[np.ndarray, " num_joints"] | None = None
+    """Where the arm stands; None: not asked."""
 
 
 def get_ready(_: None) -> None:
@@ -93,6 +95,7 @@ def answer(question: Question) -> Verdict:
     scene = rebuilt.scene(
         question.task, question.urdf, question.Ts_base_object, covariances=question.covariances
     )
+    scene = replace(scene, start_rad=question.start_rad)
     config = for_task(calibrated(question.config, read_calibration(run)), question.task)
     # Of a plan with impossible times the replay says what is wrong.
     end_ns = min(max(plan.tau[-1].t_ns if plan.tau else 0, 0), round(MAX_DURATION_S * 1e9))
@@ -105,7 +108,7 @@ def answer(question: Question) -> Verdict:
     most_samples = question.max_steps // steps - 1
 
     def judge(there: ReplayScene, settings: ReplayConfig) -> Verdict:
-        return replay_plan(plan, there, settings).verdict
+        return replay_plan(plan, there, settings, refuse_early=True).verdict
 
     verdict = judge(scene, config)
     samples = replay_samples(
@@ -161,8 +164,15 @@ class TwinProcess:
         found: Mapping[str, Any] = self._do("localisation", look, item, ends_s)
         return found
 
-    def replay(self, plan: Plan, found: Mapping[str, Any], urdf: str, ends_s: float) -> Verdict:
-        """Replay a plan from where its objects were found.
+    def replay(
+        self,
+        plan: Plan,
+        found: Mapping[str, Any],
+        urdf: str,
+        start_rad: Float[np.ndarray, " num_joints"],
+        ends_s: float,
+    ) -> Verdict:
+        """Replay a plan from where its objects were found and the arm stands.
 
         Raises:
             UndecidedError: When there is no answer in time, or none at all.
@@ -178,6 +188,7 @@ class TwinProcess:
             urdf=urdf,
             config=self._config,
             max_steps=self._max_steps,
+            start_rad=start_rad,
         )
         verdict: Verdict = self._do("replay", answer, question, ends_s)
         return verdict

@@ -19,12 +19,14 @@ from bridge.episode.cdr.messages import (
     CompressedColor,
     DepthImage,
     FrameTransform,
+    JointSample,
     string_to_cdr,
     transforms_to_cdr,
 )
 from bridge.episode.topics import type_of_topic
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
+from bridge.robots.default import ARM_JOINTS
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
@@ -52,6 +54,17 @@ def sessions() -> Iterator[tuple[WireSession, WireSession]]:
         yield router, cell
 
 
+def still_at(stamp_ns: int, names: tuple[str, ...] = ARM_JOINTS) -> bytes:
+    sample = JointSample(
+        stamp_ns=stamp_ns,
+        names=names,
+        position=np.zeros(len(names)),
+        velocity=np.zeros(0),
+        effort=np.zeros(0),
+    )
+    return sample.to_cdr()
+
+
 def publish_one_frame(cell: WireSession, stamp_ns: int = S) -> None:
     frames = [
         FrameTransform(
@@ -77,6 +90,7 @@ def publish_one_frame(cell: WireSession, stamp_ns: int = S) -> None:
             )
             for k in ("color", "depth")
         ),
+        ("/lab/joint_states", still_at(stamp_ns)),
         ("/lab/cam/side/color/image", color.to_cdr()),
         ("/lab/cam/side/depth/image", depth.to_cdr()),
     ]
@@ -110,7 +124,7 @@ def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(
         item = SimpleNamespace(found=True, reason=None, T_base_object=np.eye(4))
         return dict.fromkeys(task.objects, item)
 
-    def replay(plan: Plan, poses: dict[str, Any], urdf: str, ends_s: float) -> Verdict:
+    def replay(plan: Plan, *_: Any) -> Verdict:
         return replace(accept(plan), terminal=Factor(value=False, cause="inside"))
 
     gate = Gate(
@@ -272,8 +286,10 @@ def test_pictures_that_are_old_on_the_cells_clock_are_no_basis(
         FrameTransform(stamp_ns=60 * S, parent="base_link", child="wrist", T_parent_child=np.eye(4))
     ]
     cell.publisher("/tf", schema.TF_MESSAGE).put(transforms_to_cdr(later), source_ns=60 * S)
+    states = cell.publisher("/lab/joint_states", schema.JOINT_STATE)
+    states.put(still_at(60 * S), source_ns=60 * S)
     ends = time.monotonic() + 5
-    while perception.newest_ns() < 60 * S and time.monotonic() < ends:
+    while _joints_ns(perception) < 60 * S and time.monotonic() < ends:
         time.sleep(0.01)
     expired = ask(cell)
     assert expired.accepted is None
@@ -306,6 +322,29 @@ def test_a_second_gate_in_a_cell_is_refused_until_the_first_is_gone(
     cell.close()
     _until(lambda: not router.query_alive("lab/gate/alive"))
     claim_gate(router, "lab")
+
+
+def _joints_ns(perception: LiveView) -> int:
+    heard = perception.joints()
+    return 0 if heard is None else heard.stamp_ns
+
+
+def test_joint_states_that_are_old_or_of_another_robot_are_no_basis(
+    sessions: tuple[WireSession, WireSession],
+) -> None:
+    router, cell = sessions
+    perception = LiveView("lab")
+    a_gate(router, perception, accept, lambda *_: everything_at())
+    publish_one_frame(cell)
+    assert ask(cell).accepted is True
+    later = [
+        FrameTransform(stamp_ns=3 * S, parent="base_link", child="wrist", T_parent_child=np.eye(4))
+    ]
+    cell.publisher("/tf", schema.TF_MESSAGE).put(transforms_to_cdr(later), source_ns=3 * S)
+    _until(lambda: perception.newest_ns() == 3 * S)
+    silent = ask(cell)
+    assert silent.accepted is None
+    assert "joint states on /lab/joint_states are 2.0 s old" in str(silent.reason)
 
 
 def _until(holds: Callable[[], bool]) -> None:

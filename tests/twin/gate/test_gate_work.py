@@ -33,7 +33,7 @@ def asked(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> tuple[ReplayScene,
     """Where and with which settings a plan for the sloth would be replayed."""
     seen: list[tuple[ReplayScene, ReplayConfig]] = []
 
-    def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> Any:
+    def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig, **_: Any) -> Any:
         seen.append((scene, config))
         raise SeenError
 
@@ -75,7 +75,7 @@ def accepting(monkeypatch: pytest.MonkeyPatch) -> list[ReplayConfig]:
     """Let every replay succeed; the settings of each."""
     asked: list[ReplayConfig] = []
 
-    def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> Any:
+    def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig, **_: Any) -> Any:
         asked.append(config)
         return SimpleNamespace(verdict=ACCEPTED)
 
