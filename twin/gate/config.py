@@ -28,6 +28,9 @@ class GateConfig:
     max_steps: int = 100_000
     """Simulated steps behind one verdict, the varied replays' among them: the deadline that gives
     the same verdict on every machine. A plan that alone needs more gets no verdict."""
+    max_audit_distances: int = 20_000
+    """Distances between bodies that python-fcl measures again before a yes; a plan that needs more
+    gets no verdict."""
     deadline_s: Annotated[float, Parameter(name="--deadline", converter=convert_duration)] = 300.0
     """Last resort against what hangs: without an answer after this long on the wall clock (20s,
     5min or plain seconds) there is no verdict, and its reason names this limit."""
@@ -66,6 +69,7 @@ class GateConfig:
             self,
             {
                 "max_steps": (1, 10**9),
+                "max_audit_distances": (0, 10**9),
                 "deadline_s": (0, day_s),
                 "waiting": (0, 1000),
                 "samples": (0, 100_000),

@@ -49,10 +49,13 @@ class Question:
     """Simulated steps, the samples' among them."""
     start_rad: Float[np.ndarray, " num_joints"] | None = None
     """Where the arm stands; None: not asked."""
+    max_audit_distances: int = 20_000
+    """Distances that are asked again before a yes."""
 
 
 def get_ready(_: None) -> None:
     """Import what takes seconds, so that the first plan does not wait for it."""
+    import twin.replay.clearance.auditor  # noqa: PLC0415
     import twin.replay.rebuilt_scene  # noqa: PLC0415
     import twin.replay.verdict  # noqa: PLC0415
     import twin.scene.localise.mesh_fit  # noqa: F401, PLC0415
@@ -70,7 +73,7 @@ def look(item: Look) -> dict[str, Any]:
 
 
 def answer(question: Question) -> Verdict:
-    """Replay a plan in the rebuilt scene, then as many varied ones as were asked for and fit.
+    """Replay a plan in the rebuilt scene, audit a yes, then replay as many varied ones as fit.
 
     Nothing here looks at a clock: the same question has the same answer on every machine.
     Rounds of one start are tried against the same variations: their identity is the start's name.
@@ -78,6 +81,8 @@ def answer(question: Question) -> Verdict:
     Raises:
         UndecidedError: When the nominal replay alone needs more steps than there may be.
     """
+    from twin.replay.checks import limited_to_task  # noqa: PLC0415
+    from twin.replay.clearance.auditor import audit  # noqa: PLC0415
     from twin.replay.dynamics import num_steps  # noqa: PLC0415
     from twin.replay.monte_carlo import replay_samples, with_probability  # noqa: PLC0415
     from twin.replay.path import MAX_DURATION_S  # noqa: PLC0415
@@ -87,7 +92,7 @@ def answer(question: Question) -> Verdict:
         read_rebuilt_scene,
     )
     from twin.replay.scene import ReplayScene  # noqa: PLC0415
-    from twin.replay.verdict import replay_plan  # noqa: PLC0415
+    from twin.replay.verdict import reason_of, replay_plan  # noqa: PLC0415
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
 
     run, plan = RunFolder.open(question.run_path), question.plan
@@ -110,7 +115,14 @@ def answer(question: Question) -> Verdict:
     def judge(there: ReplayScene, settings: ReplayConfig) -> Verdict:
         return replay_plan(plan, there, settings, refuse_early=True).verdict
 
-    verdict = judge(scene, config)
+    result = replay_plan(plan, scene, config, refuse_early=True)
+    verdict = result.verdict
+    if verdict.accepted is True:
+        kept = limited_to_task(plan, scene.task)
+        most = question.max_audit_distances
+        audited = audit(result, kept, scene, config, max_queries=most)
+        verdict = replace(verdict, checks={**verdict.checks, "audit": audited})
+        verdict = replace(verdict, reason=reason_of(verdict))
     samples = replay_samples(
         judge,
         scene,
@@ -137,6 +149,7 @@ class TwinProcess:
         self._run_path, self._task, self._output = run_path, task, output
         self._config = replace(config.replay, mode="dynamic", samples=config.samples)
         self._max_steps = config.max_steps
+        self._max_audit_distances = config.max_audit_distances
         self._swapping = threading.Lock()
         self._closed = False
         self._worker: Worker | None = None
@@ -189,6 +202,7 @@ class TwinProcess:
             config=self._config,
             max_steps=self._max_steps,
             start_rad=start_rad,
+            max_audit_distances=self._max_audit_distances,
         )
         verdict: Verdict = self._do("replay", answer, question, ends_s)
         return verdict
