@@ -192,7 +192,7 @@ class _Audit:
         )
         ask = where & (gap < NEAR_M) & (gap < states.said_m - tolerance)
         ask &= ~self._may_touch(first.body.name, second.body.name, states.stamps_ns)
-        found = []
+        found: list[tuple[float, str]] = []
         for index in np.flatnonzero(ask).tolist():
             self._left -= 1
             if self._left < 0:
