@@ -54,6 +54,9 @@ class GateConfig:
     max_joint_age_s: float = 1.0
     """Joint states that are older, on the cell's clock or since they arrived, do not say where the
     robot is."""
+    other_scene_m: float = 0.1
+    """A plan whose planner believed an object to be farther than this from where it is seen was
+    made for another scene [m]."""
     moved_m: float = 0.01
     """An object seen this far from where the verdict has it, before the answer is given, has been
     moved [m]."""
@@ -79,6 +82,7 @@ class GateConfig:
                 "max_frame_age_s": (0, day_s),
                 "max_silence_s": (0, day_s),
                 "max_joint_age_s": (0, day_s),
+                "other_scene_m": (0, 1000),
                 "moved_m": (0, 10),
                 "moved_rad": (0, 10),
             },

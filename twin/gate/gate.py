@@ -61,6 +61,36 @@ def who_moved(
     return told
 
 
+def of_another_scene(plan: Plan, found: Mapping[str, Any], task: Task, limit_m: float) -> str:
+    """Name the first object that a plan has elsewhere than it is seen; "" when there is none.
+
+    Objects that look alike may be confused; entities without a position say nothing.
+
+    Args:
+        plan: Its ``entities`` are where its planner believed the objects to be.
+        found: Where they were localised.
+        task: Knows which look alike.
+        limit_m: How far they may be apart.
+    """
+    for name, entity in plan.entities.items():
+        p_m = entity.get("p_m") if isinstance(entity, Mapping) else None
+        if name not in found or not isinstance(p_m, list | tuple) or len(p_m) != 3:
+            continue
+        like = [key for key in found if _looks(task.objects[key]) == _looks(task.objects[name])]
+        places = np.stack([found[key].T_base_object[:3, 3] for key in like])
+        away_m = float(np.linalg.norm(places - np.array(p_m, dtype=np.float64), axis=1).min())
+        if not away_m <= limit_m:
+            return (
+                f"it has {name} {away_m * 1e3:.0f} mm from where it is seen, and at most "
+                f"{limit_m * 1e3:.0f} mm are a planner's error (--other-scene-m)"
+            )
+    return ""
+
+
+def _looks(model: ObjectModel) -> tuple[object, ...]:
+    return model.shape, model.mesh, model.size_m, model.color_srgb
+
+
 def turn_between(
     T_first: Float[np.ndarray, "4 4"], T_second: Float[np.ndarray, "4 4"], model: ObjectModel
 ) -> float:
@@ -264,6 +294,9 @@ class Gate:
     def _judged(self, plan: Plan, urdf: str, start_rad: Joints, ends_s: float) -> Verdict:
         frames = self._wait_for_frames()
         found = self._find_objects(frames, ends_s)
+        elsewhere = of_another_scene(plan, found, self._task, self._config.other_scene_m)
+        if elsewhere:
+            raise UndecidedError(f"plan {plan.id} was made for another scene: {elsewhere}")
         verdict = self._replay(plan, found, urdf, start_rad, ends_s)
         if verdict.accepted is not True:
             return verdict

@@ -15,7 +15,13 @@ from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
-from twin.gate.gate import Gate, PlanTooLargeError, no_verdict, robot_name
+from twin.gate.gate import (
+    Gate,
+    PlanTooLargeError,
+    no_verdict,
+    of_another_scene,
+    robot_name,
+)
 
 
 def arm(**changes: Any) -> Any:
@@ -124,6 +130,52 @@ def test_what_cannot_be_decided_is_null_with_a_reason(
     assert verdict.plan_id == plan.id
     assert reason in str(verdict.reason)
     assert Verdict.from_json(verdict.to_json()) == verdict
+
+
+def believed(**places: Any) -> Plan:
+    return replace(PLAN, entities=places)
+
+
+def test_a_plan_made_for_another_scene_gets_no_verdict() -> None:
+    """The fakes see every object at the origin."""
+    far = believed(cube={"p_m": [0.0, 0.11, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]})
+    verdict = gate_with().judge(far.to_json())
+    assert verdict.accepted is None
+    assert "was made for another scene: it has cube 110 mm from where it is seen" in str(
+        verdict.reason
+    )
+    near = believed(
+        cube={"p_m": [0.0, 0.09, 0.0]}, box={"where": "left"}, marker={"p_m": [9, 9, 9]}
+    )
+    assert gate_with().judge(near.to_json()).accepted is True
+    assert gate_with(other_scene_m=0.2).judge(far.to_json()).accepted is True
+
+
+def test_objects_that_look_alike_may_be_confused() -> None:
+    task = load_task("five_ducks_into_basket")
+    places = {name: np.eye(4) for name in task.objects}
+    for index, T in enumerate(places.values()):
+        T[0, 3] = 0.3 * index
+    seen = {name: SimpleNamespace(T_base_object=T) for name, T in places.items()}
+    swapped = believed(duck_1={"p_m": [0.3, 0.0, 0.0]}, duck_2={"p_m": [0.0, 0.0, 0.0]})
+    assert of_another_scene(swapped, seen, task, 0.1) == ""
+    on_the_basket = believed(duck_1={"p_m": places["basket"][:3, 3].tolist()})
+    assert "it has duck_1 300 mm" in of_another_scene(on_the_basket, seen, task, 0.1)
+
+
+def test_frames_that_were_searched_are_not_searched_again() -> None:
+    """Two planners ask from one start: it is localised once, until something newer is seen."""
+    perception, searched = FakePerception(), []
+
+    def localise(frames: Any, *_: Any) -> Any:
+        searched.append(frames[0].stamp_ns)
+        return found()
+
+    gate = gate_with(perception, localise)
+    for stamp_ns in (1, 1, 2, 2, 1):
+        perception.seen = [SimpleNamespace(stamp_ns=stamp_ns)]
+        assert gate.judge(PLAN.to_json()).accepted is True
+    assert searched == [1, 2, 1]
 
 
 def test_a_cell_not_heard_for_long_is_not_judged_from_memory_however_often_one_asks() -> None:

@@ -1,6 +1,8 @@
 """The gate on a real zenoh network on the loopback address, with a fake replay."""
 
 import json
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 from gate_fakes import accept
 from loopback import free_endpoint
+from own_process import ROOT
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import (
@@ -44,9 +47,14 @@ S = 1_000_000_000
 
 
 @pytest.fixture
-def sessions() -> Iterator[tuple[WireSession, WireSession]]:
+def endpoint() -> str:
+    """Where the router of ``sessions`` listens."""
+    return free_endpoint()
+
+
+@pytest.fixture
+def sessions(endpoint: str) -> Iterator[tuple[WireSession, WireSession]]:
     """A router, and a client of it that plays the cell."""
-    endpoint = free_endpoint()
     with (
         open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as router,
         open_session(WireConfig(connect=(endpoint,))) as cell,
@@ -98,9 +106,9 @@ def publish_one_frame(cell: WireSession, stamp_ns: int = S) -> None:
         cell.publisher(topic, type_of_topic(topic) or "").put(data, source_ns=stamp_ns)
 
 
-def plan_for(robot: str) -> bytes:
+def plan_for(robot: str, plan_id: str = "plan_1") -> bytes:
     return Plan(
-        id="plan_1",
+        id=plan_id,
         planner="test",
         policy="test",
         condition="with_replanning",
@@ -245,6 +253,64 @@ def test_plans_that_may_not_wait_are_told_at_once_on_the_wire(
     go_on.set()
     first.join(10)
     assert [verdict.accepted for verdict in answers] == [True]
+
+
+def test_two_planners_at_once_each_hear_of_their_own_plan(
+    sessions: tuple[WireSession, WireSession],
+) -> None:
+    router, cell = sessions
+    a_gate(router, LiveView("lab"), accept, lambda *_: everything_at())
+    publish_one_frame(cell)
+    heard: dict[str, list[str]] = {"left": [], "right": []}
+
+    def planner(name: str) -> None:
+        for number in range(10):
+            verdict = ask(cell, plan_for("arm", f"{name}_{number}"))
+            assert verdict.accepted is True
+            heard[name].append(verdict.plan_id)
+
+    threads = [threading.Thread(target=planner, args=(name,)) for name in heard]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+    assert heard == {name: [f"{name}_{n}" for n in range(10)] for name in heard}
+
+
+def test_a_planner_that_dies_before_the_answer_leaves_the_gate_to_the_next(
+    sessions: tuple[WireSession, WireSession], endpoint: str
+) -> None:
+    router, cell = sessions
+    inside, go_on = threading.Semaphore(0), threading.Event()
+
+    def replay(plan: Plan, *_: Any) -> Verdict:
+        inside.release()
+        go_on.wait(10)
+        return accept(plan)
+
+    a_gate(router, LiveView("lab"), replay, lambda *_: everything_at())
+    published: list[Any] = []
+    cell.subscribe("lab/verdict", published.append)
+    publish_one_frame(cell)
+    code = (
+        "import sys; from bridge.wire.config import WireConfig; "
+        "from bridge.wire.session import open_session; session = open_session("
+        "WireConfig(connect=(sys.argv[1],))); "
+        "session.query('lab/gate/verdict', sys.stdin.buffer.read(), timeout_s=60.0)"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, endpoint], stdin=subprocess.PIPE, cwd=ROOT
+    ) as planner:
+        assert planner.stdin is not None
+        planner.stdin.write(plan_for("arm", "orphan"))
+        planner.stdin.close()
+        assert inside.acquire(timeout=30)
+        planner.kill()
+        planner.wait(10)
+    go_on.set()
+    assert ask(cell, plan_for("arm", "next")).plan_id == "next"
+    _until(lambda: len(published) == 2)
+    assert [Verdict.from_json(item.data).plan_id for item in published] == ["orphan", "next"]
 
 
 def test_an_object_moved_while_its_plan_is_judged_is_no_yes(
