@@ -42,6 +42,7 @@ from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 
 HELD_BEFORE = "the goal held before anything moved"
+REFUSED_BEFORE = "not simulated: refused before physics"
 MANY = 8
 """Of more findings than this, those that hold are not worth reading one by one."""
 
@@ -257,18 +258,20 @@ def _replay(
         scene = free_start(scene, soft_models(scene), config.start_overlap_m)
     monitor = ClearanceMonitor(scene, plan, hulls, config)
     _pre_grasp(monitor, path, config)
-    states, physics = None, dynamic
+    states, physics, measured = None, dynamic, True
     if dynamic and refuse_early:
-        wrong = failures or monitor.failures or any(checks.values())
+        measured = not (failures or monitor.failures or any(checks.values()))
         states = follow(path, scene, config)
         ahead = ClearanceMonitor(scene, plan, hulls, config)
-        if not wrong:
+        if measured:
             _clearance_m(ahead, states, [])
-        physics = not (wrong or ahead.failures)
+        physics = measured and not ahead.failures
     if physics:
         states = simulate(path, scene, hulls, config)
     elif states is None:
         states = follow(path, scene, config)
+    if not measured:
+        states = first_of(states)
     clearance_m = _clearance_m(monitor, states, list(scene.movable()))
     if physics and commanded.trajectory == "planned":
         checks = {**checks, "limits": checks["limits"] + simulated_limit_failures(path, states)}
@@ -294,12 +297,15 @@ def _replay(
         result, scene, config, unreachable_ns=unreachable_ns, burst=states.burst
     )
     if dynamic and not physics:
-        terminal = Factor(value=None, detail="not simulated: refused before physics")
+        terminal = Factor(value=None, detail=REFUSED_BEFORE)
     verdict = replace(
         result.verdict,
         ik=factor_from(failures),
         clearance=factor_from(
-            monitor.failures, undecided=_clearance_undecided(scene, unreachable_ns, states)
+            monitor.failures,
+            undecided=_clearance_undecided(scene, unreachable_ns, states)
+            if measured
+            else REFUSED_BEFORE,
         ),
         terminal=unless_slipped(terminal, slipped),
         warnings=warnings_of(scene, result),
@@ -342,6 +348,17 @@ def follow(path: JointPath, scene: ReplayScene, config: ReplayConfig) -> States:
         width_m=path.width_at(stamps),
         Ts_base_object=fixed,
         finger_contact={},
+    )
+
+
+def first_of(states: States) -> States:
+    """The first of several states alone."""
+    return replace(
+        states,
+        stamps_ns=states.stamps_ns[:1],
+        joints_rad=states.joints_rad[:1],
+        width_m=states.width_m[:1],
+        Ts_base_object={name: Ts[:1] for name, Ts in states.Ts_base_object.items()},
     )
 
 

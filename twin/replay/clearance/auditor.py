@@ -13,7 +13,7 @@ no inside: a body wholly inside a link's mesh is not found.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import product
 from typing import Any
@@ -29,7 +29,7 @@ from bridge.task.plan import Plan
 from bridge.task.task_file import BASKET
 from bridge.task.verdict import Factor
 from twin.replay.clearance.bodies import SCENE, TABLE, group_of, placed_panels
-from twin.replay.clearance.monitor import MAX_LEAP_M, active_stage, allowed_pairs
+from twin.replay.clearance.monitor import MAX_LEAP_M, Allowed, active_stage, allowed_pairs
 from twin.replay.clearance.static_obstacles import stationary_links
 from twin.replay.config import ReplayConfig
 from twin.replay.result import ReplayResult
@@ -95,6 +95,10 @@ class _States:
     said_m: Float[np.ndarray, " num_states"]
     """What the clearance said; between two states of the replay what it promised."""
     Ts_base_object: dict[str, Float[np.ndarray, "num_states 4 4"]]
+    allowed: list[Allowed] = field(default_factory=list)
+    """What may touch, for each stage that there is."""
+    stage: Int[np.ndarray, " _"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Which of those each state is in."""
 
 
 def audit(
@@ -191,7 +195,9 @@ class _Audit:
             np.maximum(0.0, np.maximum(other_low - high, low - other_high)), axis=1
         )
         ask = where & (gap < NEAR_M) & (gap < states.said_m - tolerance)
-        ask &= ~self._may_touch(first.body.name, second.body.name, states.stamps_ns)
+        if not ask.any():
+            return []
+        ask &= ~self._may_touch(first.body.name, second.body.name, states)
         found: list[tuple[float, str]] = []
         for index in np.flatnonzero(ask).tolist():
             self._left -= 1
@@ -217,20 +223,10 @@ class _Audit:
         found = self._fcl.distance(first.body.shape, second.body.shape, self._request, answer)
         return max(0.0, float(found))
 
-    def _may_touch(
-        self, body: str, other: str, stamps_ns: Int[np.ndarray, " n"]
-    ) -> Bool[np.ndarray, " n"]:
+    def _may_touch(self, body: str, other: str, states: _States) -> Bool[np.ndarray, " n"]:
         """At which states the stage allows the pair."""
-        stages = self._plan.stages
         pairs = {frozenset((group_of(body), other)), frozenset((body, other))}
-        answers: dict[int, bool] = {}
-        allowed = np.zeros(len(stamps_ns), dtype=bool)
-        for index, t_ns in enumerate(stamps_ns.tolist()):
-            key = id(active_stage(stages, t_ns))
-            if key not in answers:
-                answers[key] = bool(pairs & allowed_pairs(stages, t_ns))
-            allowed[index] = answers[key]
-        return allowed
+        return np.array([bool(pairs & allowed) for allowed in states.allowed])[states.stage]
 
     def _moved(self, Ts: Float[np.ndarray, "num_states 4 4"]) -> Bool[np.ndarray, " num_states"]:
         """Whether an object belongs to somebody's motion; a millimetre later than the monitor."""
@@ -277,7 +273,18 @@ class _Audit:
         share = np.concatenate([np.arange(n) / n for n in parts] or [np.zeros(0)])
         first, share = np.append(first, len(parts)), np.append(share, 0.0)
         second = np.minimum(first + 1, len(parts))
-        return _between(sampled, first, second, share, self._config.eps_col_m)
+        states = _between(sampled, first, second, share, self._config.eps_col_m)
+        stages = self._plan.stages
+        number: dict[int, int] = {}
+        allowed: list[Allowed] = []
+        stage = np.zeros(len(states.stamps_ns), dtype=np.int64)
+        for index, t_ns in enumerate(states.stamps_ns.tolist()):
+            active = id(active_stage(stages, t_ns))
+            if active not in number:
+                number[active] = len(allowed)
+                allowed.append(allowed_pairs(stages, t_ns))
+            stage[index] = number[active]
+        return replace(states, allowed=allowed, stage=stage)
 
     def _still(self) -> list[_Placed]:
         fcl, scene = self._fcl, self._scene

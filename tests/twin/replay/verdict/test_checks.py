@@ -19,7 +19,7 @@ from twin.replay.config import ReplayConfig
 from twin.replay.dynamics import States
 from twin.replay.path import JointPath
 from twin.replay.result import ReplayResult
-from twin.replay.verdict import replay_plan
+from twin.replay.verdict import REFUSED_BEFORE, replay_plan
 from twin.robot.model import load_robot
 
 EARLY = {"refuse_early": True}
@@ -261,7 +261,8 @@ def test_early_refusal_and_whole_replay_agree_on_plans_that_physics_need_not_see
         early = replay_plan(plan, scene, ReplayConfig(), refuse_early=True).verdict
         whole = replay_plan(plan, scene, ReplayConfig()).verdict
         assert (early.accepted, whole.accepted) == (False, False)
-        assert early.terminal == Factor(value=None, detail="not simulated: refused before physics")
+        assert early.terminal == Factor(value=None, detail=REFUSED_BEFORE)
+        assert early.clearance.value is not True
 
 
 def test_a_check_of_a_newer_version_that_says_no_stays_a_no(good: ReplayResult) -> None:
