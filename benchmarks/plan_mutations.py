@@ -197,7 +197,7 @@ def giant(plan: Record, rng: Rng, solve: Solver) -> Any:
     w = plan["tau"][int(rng.integers(len(plan["tau"])))]
     if kind == 0:
         w["p_m"][int(rng.integers(3))] = float(rng.choice([1e3, 1e9, 1e300, -1e30]))
-    elif kind == 1:
+    elif kind == 1 and w["joints_rad"] is not None:
         w["joints_rad"][int(rng.integers(6))] = float(rng.choice([7.0, 1e3, 1e300]))
     elif kind == 2:
         plan["tau"][-1]["t_ns"] = 10 ** int(rng.integers(12, 400))
@@ -270,7 +270,8 @@ def joint_jump(plan: Record, rng: Rng, solve: Solver) -> Record:
     k, joint = int(rng.integers(len(tau))), int(rng.integers(6))
     size = float(rng.choice([0.2, 1.0, 2 * math.pi, -2 * math.pi, -0.5]))
     for w in tau[k : k + 1 if rng.random() < 0.5 else None]:
-        w["joints_rad"][joint] += size
+        if w["joints_rad"] is not None:
+            w["joints_rad"][joint] += size
     if rng.random() < 0.5:
         _poses_from_joints(plan, solve)
     return plan

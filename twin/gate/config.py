@@ -55,7 +55,7 @@ class GateConfig:
     """Joint states that are older, on the cell's clock or since they arrived, do not say where the
     robot is."""
     other_scene_m: float = 0.1
-    """A plan whose planner believed an object to be farther than this from where it is seen was
+    """A plan whose planner expected an object to be farther than this from where it is seen was
     made for another scene [m]."""
     moved_m: float = 0.01
     """An object seen this far from where the verdict has it, before the answer is given, has been

@@ -67,7 +67,7 @@ def of_another_scene(plan: Plan, found: Mapping[str, Any], task: Task, limit_m: 
     Objects that look alike may be confused; entities without a position say nothing.
 
     Args:
-        plan: Its ``entities`` are where its planner believed the objects to be.
+        plan: Its ``entities`` are where its planner expected the objects to be.
         found: Where they were localised.
         task: Knows which look alike.
         limit_m: How far they may be apart.
@@ -411,12 +411,12 @@ class Gate:
             UndecidedError: When it is not, or nobody says so.
         """
         arrived_ns = self._contact_ns  # a cell that waits may be silent meanwhile
-        apart_rad = np.abs(self._where_the_arm_is(arrived_ns) - start_rad)
-        joint = int(np.argmax(apart_rad))
-        if not apart_rad[joint] <= self._config.replay.start_rad:
+        off_rad = np.abs(self._where_the_arm_is(arrived_ns) - start_rad)
+        joint = int(np.argmax(off_rad))
+        if not off_rad[joint] <= self._config.replay.start_rad:
             raise UndecidedError(
                 f"the arm moved while the plan was being judged: {ARM_JOINTS[joint]} by "
-                f"{apart_rad[joint]:.3f} rad"
+                f"{off_rad[joint]:.3f} rad"
             )
 
 

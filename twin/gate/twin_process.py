@@ -55,7 +55,7 @@ class Question:
 
 def get_ready(_: None) -> None:
     """Import what takes seconds, so that the first plan does not wait for it."""
-    import twin.replay.clearance.auditor  # noqa: PLC0415
+    import twin.replay.audit  # noqa: PLC0415
     import twin.replay.rebuilt_scene  # noqa: PLC0415
     import twin.replay.verdict  # noqa: PLC0415
     import twin.scene.localise.mesh_fit  # noqa: F401, PLC0415
@@ -81,8 +81,8 @@ def answer(question: Question) -> Verdict:
     Raises:
         UndecidedError: When the nominal replay alone needs more steps than there may be.
     """
+    from twin.replay.audit import audit  # noqa: PLC0415
     from twin.replay.checks import limited_to_task  # noqa: PLC0415
-    from twin.replay.clearance.auditor import audit  # noqa: PLC0415
     from twin.replay.dynamics import num_steps  # noqa: PLC0415
     from twin.replay.monte_carlo import replay_samples, with_probability  # noqa: PLC0415
     from twin.replay.path import MAX_DURATION_S  # noqa: PLC0415

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from bridge.robots.default import ARM_JOINTS, ROBOT
 from bridge.task.plan import Plan, Stage
@@ -42,18 +42,18 @@ def start_failures(
         robot: Whose they are.
         config: Both limits.
     """
-    apart_rad = np.abs(path.joints_rad[0] - measured_rad)
-    joint = int(np.argmax(apart_rad))
+    off_rad = np.abs(path.joints_rad[0] - measured_rad)
+    joint = int(np.argmax(off_rad))
     place_m = robot.T_base_tcp(measured_rad)[:3, 3]
-    apart_m = float(np.linalg.norm(np.array(plan.tau[0].p_m) - place_m))
-    if apart_rad[joint] <= config.start_rad and apart_m <= config.start_m:
+    off_m = float(np.linalg.norm(np.array(plan.tau[0].p_m) - place_m))
+    if off_rad[joint] <= config.start_rad and off_m <= config.start_m:
         return []
     return [
         Failure(
             t_ns=0,
             cause="start_elsewhere",
             bodies=(ARM_JOINTS[joint],),
-            detail=f"the plan starts {apart_m * 1e3:.1f} mm and {apart_rad[joint]:.3f} rad "
+            detail=f"the plan starts {off_m * 1e3:.1f} mm and {off_rad[joint]:.3f} rad "
             f"({ARM_JOINTS[joint]}) from where the robot is; the limits are "
             f"{config.start_m * 1e3:.0f} mm and {config.start_rad:g} rad",
         )
@@ -194,11 +194,17 @@ def _over(
     over = ~(values <= limit * _SLACK)
     if not np.any(over):
         return []
-    index, joint = (int(i) for i in np.argwhere(over)[0])
+    index, joint = _first(over)
     name = ARM_JOINTS[joint]
     detail = f"{name} {verb} {values[index, joint]:.2f} {unit}, the limit is {limit[joint]:.2f}"
     t_ns = max(0, int(times_ns[index]))
     return [Failure(t_ns=t_ns, cause=cause, bodies=(name,), detail=f"{detail} {unit}")]
+
+
+def _first(over: Bool[np.ndarray, "num_times num_joints"]) -> tuple[int, int]:
+    """The first time at which something holds, and the first joint it holds of."""
+    index, joint = np.argwhere(over)[0].tolist()
+    return index, joint
 
 
 def _accelerations(
@@ -222,13 +228,13 @@ def simulated_limit_failures(path: JointPath, states: States) -> list[Failure]:
     failures = []
     limit_rad, limit_N = ROBOT.tracking_error_rad, ROBOT.contact_force_N
     if limit_rad is not None:
-        apart = np.abs(states.joints_rad - path.joints_at(states.stamps_ns))
-        over = ~(apart <= limit_rad)
+        off = np.abs(states.joints_rad - path.joints_at(states.stamps_ns))
+        over = ~(off <= limit_rad)
         if np.any(over):
-            index, joint = (int(i) for i in np.argwhere(over)[0])
+            index, joint = _first(over)
             name = ARM_JOINTS[joint]
             detail = (
-                f"{name} is {apart[index, joint]:.3f} rad from where it is commanded, the limit is "
+                f"{name} is {off[index, joint]:.3f} rad from where it is commanded, the limit is "
                 f"{limit_rad:g} rad"
             )
             t_ns = int(states.stamps_ns[index])

@@ -19,8 +19,8 @@ from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.gate.gate import UndecidedError
 from twin.gate.twin_process import Question, answer
+from twin.replay import audit as auditor
 from twin.replay import verdict as verdict_module
-from twin.replay.clearance import auditor
 from twin.replay.config import ReplayConfig
 from twin.replay.scene import ReplayScene
 from twin.scene.store.calibration import write_physics

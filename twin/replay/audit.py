@@ -67,7 +67,7 @@ class _Body:
 
 @dataclass(frozen=True)
 class _Placed:
-    """A body over all states, or one that stands still (one state)."""
+    """A body over all states, or one that does not move (one state)."""
 
     body: _Body
     R: Float[np.ndarray, "num_states 3 3"]
@@ -92,7 +92,7 @@ class _States:
     stamps_ns: Int[np.ndarray, " num_states"]
     joints_rad: Float[np.ndarray, "num_states num_joints"]
     width_m: Float[np.ndarray, " num_states"]
-    said_m: Float[np.ndarray, " num_states"]
+    claimed_m: Float[np.ndarray, " num_states"]
     """What the clearance said; between two states of the replay what it promised."""
     Ts_base_object: dict[str, Float[np.ndarray, "num_states 4 4"]]
     allowed: list[Allowed] = field(default_factory=list)
@@ -162,15 +162,15 @@ class _Audit:
         ]
         moved = {name: self._moved(Ts) for name, Ts in states.Ts_base_object.items()}
         found: list[tuple[float, str]] = []
-        still = self._still()
+        fixed = self._fixed()
         always = np.ones(len(states.stamps_ns), dtype=bool)
         for first in links:
-            for second in (*still, *objects):
+            for second in (*fixed, *objects):
                 if second.body.name == TABLE and first.body.name in self._stationary:
                     continue  # the robot stands on it with them
                 found += self._ask(first, second, states, always)
         for item in objects:
-            for second in still:
+            for second in fixed:
                 found += self._ask(item, second, states, moved[item.body.name])
         asked = self._most - self._left
         if self._left < 0:
@@ -194,7 +194,7 @@ class _Audit:
         gap = np.linalg.norm(
             np.maximum(0.0, np.maximum(other_low - high, low - other_high)), axis=1
         )
-        ask = where & (gap < NEAR_M) & (gap < states.said_m - tolerance)
+        ask = where & (gap < NEAR_M) & (gap < states.claimed_m - tolerance)
         if not ask.any():
             return []
         ask &= ~self._may_touch(first.body.name, second.body.name, states)
@@ -204,12 +204,12 @@ class _Audit:
             if self._left < 0:
                 return found
             distance = self._distance_m(first, second, index)
-            excess = float(states.said_m[index]) - distance
+            excess = float(states.claimed_m[index]) - distance
             if not excess <= tolerance:
-                said_mm, t_s = states.said_m[index] * 1e3, states.stamps_ns[index] * 1e-9
+                claimed_mm, t_s = states.claimed_m[index] * 1e3, states.stamps_ns[index] * 1e-9
                 detail = (
                     f"{first.body.name} is {distance * 1e3:.1f} mm from {second.body.name} at "
-                    f"{t_s:.2f} s by python-fcl, the clearance said {said_mm:.1f} mm"
+                    f"{t_s:.2f} s by python-fcl, the clearance said {claimed_mm:.1f} mm"
                 )
                 found.append((excess, detail))
         return found
@@ -226,7 +226,8 @@ class _Audit:
     def _may_touch(self, body: str, other: str, states: _States) -> Bool[np.ndarray, " n"]:
         """At which states the stage allows the pair."""
         pairs = {frozenset((group_of(body), other)), frozenset((body, other))}
-        return np.array([bool(pairs & allowed) for allowed in states.allowed])[states.stage]
+        allowed = np.array([bool(pairs & item) for item in states.allowed], dtype=bool)
+        return np.asarray(allowed[states.stage])
 
     def _moved(self, Ts: Float[np.ndarray, "num_states 4 4"]) -> Bool[np.ndarray, " num_states"]:
         """Whether an object belongs to somebody's motion; a millimetre later than the monitor."""
@@ -254,7 +255,7 @@ class _Audit:
             stamps_ns=result.stamps_ns,
             joints_rad=result.joints_rad,
             width_m=result.width_m,
-            said_m=result.clearance_m,
+            claimed_m=result.clearance_m,
             Ts_base_object=known,
         )
         travel = np.zeros(len(result.stamps_ns) - 1)
@@ -286,7 +287,7 @@ class _Audit:
             stage[index] = number[active]
         return replace(states, allowed=allowed, stage=stage)
 
-    def _still(self) -> list[_Placed]:
+    def _fixed(self) -> list[_Placed]:
         fcl, scene = self._fcl, self._scene
         T_table = np.eye(4)
         T_table[2, 3] = scene.table_height_m - _SLAB_M[2] / 2
@@ -339,8 +340,8 @@ def _between(
         stamps_ns=stamps,
         joints_rad=mixed(states.joints_rad),
         width_m=mixed(states.width_m),
-        said_m=np.where(
-            share == 0.0, states.said_m[first], np.minimum(states.said_m[second], eps_m)
+        claimed_m=np.where(
+            share == 0.0, states.claimed_m[first], np.minimum(states.claimed_m[second], eps_m)
         ),
         Ts_base_object=poses,
     )

@@ -12,8 +12,8 @@ from scripted_plans import joints_over
 from bridge.geometry import se3
 from bridge.task.plan import Plan
 from bridge.task.verdict import Factor, Verdict
+from twin.replay.audit import NEAR_M, audit
 from twin.replay.checks import limited_to_task
-from twin.replay.clearance.auditor import NEAR_M, audit
 from twin.replay.clearance.monitor import ClearanceMonitor
 from twin.replay.config import ReplayConfig
 from twin.replay.result import ReplayResult
