@@ -170,7 +170,7 @@ def verdict_text(verdict: Verdict) -> str:
     text += f", {verdict.mode}, {verdict.engine}"
     name = verdict.first_failing
     if name is not None:
-        factor = getattr(verdict, name)
+        factor = verdict.factors()[name]
         why = factor.detail or factor.cause
         text += f"; {name} {factor_word(factor)}" + (f" ({why})" if why else "")
     elif verdict.accepted is None and verdict.reason:

@@ -78,6 +78,12 @@ class Robot:
     velocity_rad_s: tuple[float, ...] | None = None
     """Limit of each joint [rad/s]; None: those of the URDF."""
     acceleration_rad_s2: tuple[float, ...] | None = None
+    tool_speed_m_s: float | None = None
+    """Fastest its tool may be commanded [m/s]; None: not known."""
+    contact_force_N: float | None = None
+    """Force on the arm beyond which it stops by itself; None: not known."""
+    tracking_error_rad: float | None = None
+    """How far a joint may be from where it is commanded before the arm stops by itself."""
     hulls: str = ""
     """Folder of convex hulls, ``<link>.ply``; "": they are made from the collision meshes."""
     folder: Path = Path()
@@ -156,6 +162,10 @@ def _check(robot: Robot) -> None:
             limits = tuple(limits)
             if len(limits) != len(robot.joints) or not all(0 < x < math.inf for x in limits):
                 raise ValueError(f"{what} must hold one positive number per joint")
+    for what in ("tool_speed_m_s", "contact_force_N", "tracking_error_rad"):
+        limit = getattr(robot, what)
+        if limit is not None and not 0 < limit < math.inf:
+            raise ValueError(f"{what} must be a positive number")
 
 
 def resolve_mesh(uri: str) -> Path:

@@ -1,12 +1,16 @@
 """gst verdict v1: the acceptance indicator I(tau) with its three factors and first failure."""
 
 import json
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from bridge.task.record import check_record, parse_record
 
 SCHEMA_VERSION = 1
+CHECKS = ("start", "task", "limits", "audit")
+"""Factors beside the three of I(tau), docs/gate.md: the plan starts where the robot is; it asks for
+no more than its task; the robot may do it; an independent library finds no less distance."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +26,7 @@ class Factor:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """I(tau) = ik x clearance x terminal, with the first failure of each factor."""
+    """I(tau) = ik x clearance x terminal, times further checks, each with its first failure."""
 
     plan_id: str
     trajectory: str
@@ -41,22 +45,28 @@ class Verdict:
     moved, a shape that was stood in for."""
     findings: tuple[dict[str, Any], ...] = ()
     """What each predicate said: side (replayed or recorded), kind, object, value, detail."""
+    checks: Mapping[str, Factor] = field(default_factory=dict)
+    """Further factors, by their names in ``CHECKS``; one that was not asked for is absent."""
+
+    def factors(self) -> dict[str, Factor]:
+        """All factors by name, in the order in which a plan is examined."""
+        three = {"ik": self.ik, "clearance": self.clearance, "terminal": self.terminal}
+        known = {**self.checks, **three}
+        order = ("start", "task", "ik", "clearance", "limits", "terminal", "audit")
+        return {name: known[name] for name in (*order, *known) if name in known}
 
     @property
     def accepted(self) -> bool | None:
         """The product of the factors in three-valued logic; never yes by default."""
-        values = [self.ik.value, self.clearance.value, self.terminal.value]
+        values = [factor.value for factor in self.factors().values()]
         if False in values:
             return False
         return None if None in values else True
 
     @property
     def first_failing(self) -> str | None:
-        """Name of the first factor that is false, in the order ik, clearance, terminal."""
-        for name in ("ik", "clearance", "terminal"):
-            if getattr(self, name).value is False:
-                return name
-        return None
+        """Name of the first factor that is false, in the order of ``factors``."""
+        return next((name for name, item in self.factors().items() if item.value is False), None)
 
     def to_json(self) -> bytes:
         """Serialise, refusing what the schema refuses."""
@@ -74,6 +84,8 @@ class Verdict:
             known[name] = _factor(record[name])
         known["warnings"] = tuple(record.get("warnings") or ())
         known["findings"] = tuple(record.get("findings") or ())
+        checks = record.get("checks") or {}
+        known["checks"] = {name: _factor(item) for name, item in checks.items()}
         known.setdefault("trajectory", "planned")
         known.setdefault("mode", "dynamic")
         return Verdict(**known)

@@ -63,7 +63,7 @@ class VerdictSummary:
     why_undecided: str
     p_success: float | None
     first_failing: str | None
-    """ik, clearance or terminal; None where none is false."""
+    """ik, clearance, terminal or a further check; None where none is false."""
     failing_cause: str | None
     """The cause alone, to be counted: ``collision``, ``unreachable`` ..."""
     failing_detail: str | None
@@ -80,21 +80,21 @@ def summarise_verdict(verdict: Verdict) -> VerdictSummary:
         why_undecided=verdict.reason or _undecided(verdict),
         p_success=None if probability is None else float(probability),
         first_failing=name,
-        failing_cause=None if name is None else getattr(verdict, name).cause,
+        failing_cause=None if name is None else verdict.factors()[name].cause,
         failing_detail=_detail(verdict),
         clauses=clauses_of(verdict),
     )
 
 
 def _undecided(verdict: Verdict) -> str:
-    names = [name for name in FACTORS if getattr(verdict, name).value is None]
+    names = [name for name, factor in verdict.factors().items() if factor.value is None]
     return f"{' and '.join(names)} undecided"
 
 
 def _detail(verdict: Verdict) -> str | None:
     if verdict.first_failing is None:
         return None
-    factor = getattr(verdict, verdict.first_failing)
+    factor = verdict.factors()[verdict.first_failing]
     parts = [factor.cause, " and ".join(factor.bodies), factor.detail]
     if factor.first_t_ns is not None:
         parts.append(f"at {factor.first_t_ns / NS_PER_S:.2f} s")

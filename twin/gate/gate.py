@@ -17,9 +17,9 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from bridge.episode.topics import ROBOT_DESCRIPTION
+from bridge.episode.topics import JOINT_STATES, ROBOT_DESCRIPTION, cell_topic
 from bridge.errors import GstError
-from bridge.robots.default import BASE_FRAME
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME
 from bridge.task.plan import Plan
 from bridge.task.task_file import ObjectModel, Task
 from bridge.task.verdict import Factor, Verdict
@@ -59,6 +59,36 @@ def who_moved(
         if not (near and turn_rad <= max(moved_rad, SIGMAS * sigma_rad)):  # also what is no number
             told.append(f"{name} by {shift_m * 1e3:.0f} mm and {np.degrees(turn_rad):.0f} degrees")
     return told
+
+
+def of_another_scene(plan: Plan, found: Mapping[str, Any], task: Task, limit_m: float) -> str:
+    """Name the first object that a plan has elsewhere than it is seen; "" when there is none.
+
+    Objects that look alike may be confused; entities without a position say nothing.
+
+    Args:
+        plan: Its ``entities`` are where its planner expected the objects to be.
+        found: Where they were localised.
+        task: Knows which look alike.
+        limit_m: How far they may be apart.
+    """
+    for name, entity in plan.entities.items():
+        p_m = entity.get("p_m") if isinstance(entity, Mapping) else None
+        if name not in found or not isinstance(p_m, list | tuple) or len(p_m) != 3:
+            continue
+        like = [key for key in found if _looks(task.objects[key]) == _looks(task.objects[name])]
+        places = np.stack([found[key].T_base_object[:3, 3] for key in like])
+        away_m = float(np.linalg.norm(places - np.array(p_m, dtype=np.float64), axis=1).min())
+        if not away_m <= limit_m:
+            return (
+                f"it has {name} {away_m * 1e3:.0f} mm from where it is seen, and at most "
+                f"{limit_m * 1e3:.0f} mm are a planner's error (--other-scene-m)"
+            )
+    return ""
+
+
+def _looks(model: ObjectModel) -> tuple[object, ...]:
+    return model.shape, model.mesh, model.size_m, model.color_srgb
 
 
 def turn_between(
@@ -114,6 +144,9 @@ class Perception(Protocol):
     def urdf(self) -> str | None:
         """The robot description."""
 
+    def joints(self) -> Any:
+        """The latest joint states, with their names, stamp and arrival; None before any."""
+
     def executing(self) -> str | None:
         """The plan being executed right now."""
 
@@ -134,8 +167,10 @@ class Perception(Protocol):
 
 Localise = Callable[[Any, Task, float], Mapping[str, Any]]
 """Frames, the task and when to be done, on the monotonic clock [s]; objects as localised."""
-Replay = Callable[[Plan, Mapping[str, Any], str, float], Verdict]
-"""A plan, the objects as localised, the URDF and when to be done, on the monotonic clock [s]."""
+Joints = Float[np.ndarray, " num_joints"]
+Replay = Callable[[Plan, Mapping[str, Any], str, Joints, float], Verdict]
+"""A plan, the objects as localised, the URDF, where the arm's joints are [rad] and when to be done,
+on the monotonic clock [s]."""
 
 
 class Gate:
@@ -162,6 +197,8 @@ class Gate:
         self._counting = threading.Lock()
         self._inside = 0
         self._contact_ns = 0
+        self._seen: tuple[object, Mapping[str, Any]] | None = None
+        """The frames that were looked at last, and what was found in them."""
 
     def judge(self, payload: bytes) -> Verdict:
         """Judge one plan; the wall-clock limit counts from here, reading it included.
@@ -171,6 +208,7 @@ class Gate:
             PlanTooLargeError: When it is too large to be looked at; nothing else is an error.
         """
         ends_s = time.monotonic() + self._config.deadline_s
+        arrived_ns = self._now_ns()
         if len(payload) > MAX_PLAN_BYTES:
             raise PlanTooLargeError(num_bytes=len(payload))
         plan = Plan.from_json(payload)
@@ -179,12 +217,12 @@ class Gate:
                 return no_verdict(plan, f"{self._inside} plans are being judged already; ask later")
             self._inside += 1
         try:
-            return self._in_time(plan, ends_s)
+            return self._in_time(plan, arrived_ns, ends_s)
         finally:
             with self._counting:
                 self._inside -= 1
 
-    def _in_time(self, plan: Plan, ends_s: float) -> Verdict:
+    def _in_time(self, plan: Plan, arrived_ns: int, ends_s: float) -> Verdict:
         limit = f"the wall-clock limit of {self._config.deadline_s:g} s (--deadline)"
         if not self._turn.acquire(timeout=max(0.0, ends_s - time.monotonic())):
             return no_verdict(plan, f"an earlier plan was still being judged at {limit}")
@@ -195,7 +233,7 @@ class Gate:
 
         def work() -> None:
             try:
-                answers.put(self._decide(plan, ends_s - ANSWER_S))
+                answers.put(self._decide(plan, arrived_ns, ends_s - ANSWER_S))
             finally:
                 self._turn.release()
 
@@ -212,7 +250,7 @@ class Gate:
         except queue.Empty:
             return no_verdict(plan, f"the replay was not done at {limit}")
 
-    def _decide(self, plan: Plan, ends_s: float) -> Verdict:
+    def _decide(self, plan: Plan, arrived_ns: int, ends_s: float) -> Verdict:
         silent_ns = self._now_ns() - max(self._perception.heard_ns(), self._contact_ns)
         try:
             urdf = self._check(plan)
@@ -220,7 +258,8 @@ class Gate:
                 raise UndecidedError(
                     f"nothing has arrived from the cell for {silent_ns * 1e-9:.0f} s"
                 )
-            verdict = self._judged(plan, urdf, ends_s)
+            start_rad = self._where_the_arm_is(arrived_ns)
+            verdict = self._judged(plan, urdf, start_rad, ends_s)
             # A cell that waits for the verdict may stand still meanwhile: not counted as silence.
             self._contact_ns = self._now_ns() - silent_ns
             return verdict
@@ -230,15 +269,52 @@ class Gate:
             traceback.print_exc()
             return no_verdict(plan, f"internal error: {type(error).__name__}: {error}")
 
-    def _judged(self, plan: Plan, urdf: str, ends_s: float) -> Verdict:
+    def _where_the_arm_is(self, arrived_ns: int) -> Joints:
+        """The arm's joints as the cell said last, in their order [rad].
+
+        Args:
+            arrived_ns: When the plan came, on the receiver's clock.
+
+        Raises:
+            UndecidedError: When they are not known, or not of now.
+        """
+        heard = self._perception.joints()
+        topic = cell_topic(self._config.cell, JOINT_STATES)
+        if heard is None:
+            raise UndecidedError(f"no joint states have arrived on {topic}")
+        missing = [name for name in ARM_JOINTS if name not in heard.names]
+        if missing:
+            raise UndecidedError(
+                f"the joint states on {topic} are of another robot: they name "
+                f"{', '.join(heard.names) or 'nothing'}, and lack {', '.join(missing)}"
+            )
+        behind_ns = self._perception.newest_ns() - heard.stamp_ns
+        silent_ns = arrived_ns - max(heard.received_ns, self._contact_ns)
+        age_s, limit_s = max(behind_ns, silent_ns) * 1e-9, self._config.max_joint_age_s
+        if age_s > limit_s:
+            raise UndecidedError(
+                f"the joint states on {topic} are {age_s:.1f} s old, and only those of the last "
+                f"{limit_s:g} s say where the robot is (--max-joint-age-s)"
+            )
+        order = [heard.names.index(name) for name in ARM_JOINTS]
+        values: Joints = np.asarray(heard.position_rad, dtype=np.float64)
+        if len(values) != len(heard.names) or not np.isfinite(values[order]).all():
+            raise UndecidedError(f"the joint states on {topic} hold no numbers for every joint")
+        return values[order]
+
+    def _judged(self, plan: Plan, urdf: str, start_rad: Joints, ends_s: float) -> Verdict:
         frames = self._wait_for_frames()
         found = self._find_objects(frames, ends_s)
-        verdict = self._replay(plan, found, urdf, ends_s)
+        elsewhere = of_another_scene(plan, found, self._task, self._config.other_scene_m)
+        if elsewhere:
+            raise UndecidedError(f"plan {plan.id} was made for another scene: {elsewhere}")
+        verdict = self._replay(plan, found, urdf, start_rad, ends_s)
         if verdict.accepted is not True:
             return verdict
         verdict = self._likely(verdict)
         if verdict.accepted is True:
             self._look_again(found, frames, ends_s)
+            self._feel_again(start_rad)
         return verdict
 
     def _check(self, plan: Plan) -> str:
@@ -267,7 +343,11 @@ class Gate:
         return urdf
 
     def _find_objects(self, frames: Any, ends_s: float) -> Mapping[str, Any]:
-        found = self._localise(frames, self._task, ends_s)
+        """Localise; the same frames are not searched twice: planners ask again from one start."""
+        looked_at = [(getattr(frame, "camera_id", ""), int(frame.stamp_ns)) for frame in frames]
+        if self._seen is None or self._seen[0] != looked_at:
+            self._seen = looked_at, self._localise(frames, self._task, ends_s)
+        found = self._seen[1]
         missing = {name: item.reason for name, item in found.items() if not item.found}
         if missing:
             raise UndecidedError(f"not every object was found: {with_reasons(missing)}")
@@ -334,6 +414,21 @@ class Gate:
         )
         if moved:
             raise UndecidedError(f"moved while the plan was being judged: {'; '.join(moved)}")
+
+    def _feel_again(self, start_rad: Joints) -> None:
+        """Before a yes: the arm must still be where the plan was judged from.
+
+        Raises:
+            UndecidedError: When it is not, or nobody says so.
+        """
+        arrived_ns = self._contact_ns  # a cell that waits may be silent meanwhile
+        off_rad = np.abs(self._where_the_arm_is(arrived_ns) - start_rad)
+        joint = int(np.argmax(off_rad))
+        if not off_rad[joint] <= self._config.replay.start_rad:
+            raise UndecidedError(
+                f"the arm moved while the plan was being judged: {ARM_JOINTS[joint]} by "
+                f"{off_rad[joint]:.3f} rad"
+            )
 
 
 def _newest(frames: Any) -> int:

@@ -104,25 +104,22 @@ def watch_cell(
     session: Any,
     cell: str,
     take: Callable[[str, bytes, int, str], None],
-    *,
-    joints: bool = False,
 ) -> None:
-    """Hand the cell's images, transforms, description and events to ``take``; joints if asked.
+    """Hand the cell's images, joints, transforms, description and events to ``take``.
 
     Args:
         session: An open ``bridge.wire.session``.
         cell: Its name, the first part of its topics.
         take: Called with topic, payload, time of arrival [ns] and type name, from the session's
             threads.
-        joints: Joint states too.
     """
 
     def on_sample(sample: Any) -> None:
         take(sample.topic, sample.data, sample.received_ns, sample.type_name)
 
     watched = [cell_topic(cell, CAMERAS) + "**", cell_topic(cell, EVENT)]
-    watched += [TF, TF_STATIC, ROBOT_DESCRIPTION]
-    for topic in [*watched, cell_topic(cell, JOINT_STATES)] if joints else watched:
+    watched += [cell_topic(cell, JOINT_STATES), TF, TF_STATIC, ROBOT_DESCRIPTION]
+    for topic in watched:
         session.subscribe(topic[1:], on_sample)
 
 
@@ -173,7 +170,7 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
         TwinProcess(run.path, task, config, output) as twin,
     ):
         claim_gate(session, config.cell)
-        watch_cell(session, config.cell, perception.take, joints=perception.needs_joints)
+        watch_cell(session, config.cell, perception.take)
         gate = make_gate(task, config, perception, session.now_ns, twin)
         serve_gate(session, gate, perception, config, output)
         output.say(

@@ -47,10 +47,15 @@ class Question:
     config: ReplayConfig
     max_steps: int
     """Simulated steps, the samples' among them."""
+    start_rad: Float[np.ndarray, " num_joints"] | None = None
+    """Where the arm stands; None: not asked."""
+    max_audit_distances: int = 20_000
+    """Distances that are asked again before a yes."""
 
 
 def get_ready(_: None) -> None:
     """Import what takes seconds, so that the first plan does not wait for it."""
+    import twin.replay.audit  # noqa: PLC0415
     import twin.replay.rebuilt_scene  # noqa: PLC0415
     import twin.replay.verdict  # noqa: PLC0415
     import twin.scene.localise.mesh_fit  # noqa: F401, PLC0415
@@ -68,7 +73,7 @@ def look(item: Look) -> dict[str, Any]:
 
 
 def answer(question: Question) -> Verdict:
-    """Replay a plan in the rebuilt scene, then as many varied ones as were asked for and fit.
+    """Replay a plan in the rebuilt scene, audit a yes, then replay as many varied ones as fit.
 
     Nothing here looks at a clock: the same question has the same answer on every machine.
     Rounds of one start are tried against the same variations: their identity is the start's name.
@@ -76,6 +81,8 @@ def answer(question: Question) -> Verdict:
     Raises:
         UndecidedError: When the nominal replay alone needs more steps than there may be.
     """
+    from twin.replay.audit import audit  # noqa: PLC0415
+    from twin.replay.checks import limited_to_task  # noqa: PLC0415
     from twin.replay.dynamics import num_steps  # noqa: PLC0415
     from twin.replay.monte_carlo import replay_samples, with_probability  # noqa: PLC0415
     from twin.replay.path import MAX_DURATION_S  # noqa: PLC0415
@@ -85,7 +92,7 @@ def answer(question: Question) -> Verdict:
         read_rebuilt_scene,
     )
     from twin.replay.scene import ReplayScene  # noqa: PLC0415
-    from twin.replay.verdict import replay_plan  # noqa: PLC0415
+    from twin.replay.verdict import reason_of, replay_plan  # noqa: PLC0415
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
 
     run, plan = RunFolder.open(question.run_path), question.plan
@@ -93,6 +100,7 @@ def answer(question: Question) -> Verdict:
     scene = rebuilt.scene(
         question.task, question.urdf, question.Ts_base_object, covariances=question.covariances
     )
+    scene = replace(scene, start_rad=question.start_rad)
     config = for_task(calibrated(question.config, read_calibration(run)), question.task)
     # Of a plan with impossible times the replay says what is wrong.
     end_ns = min(max(plan.tau[-1].t_ns if plan.tau else 0, 0), round(MAX_DURATION_S * 1e9))
@@ -105,9 +113,16 @@ def answer(question: Question) -> Verdict:
     most_samples = question.max_steps // steps - 1
 
     def judge(there: ReplayScene, settings: ReplayConfig) -> Verdict:
-        return replay_plan(plan, there, settings).verdict
+        return replay_plan(plan, there, settings, refuse_early=True).verdict
 
-    verdict = judge(scene, config)
+    result = replay_plan(plan, scene, config, refuse_early=True)
+    verdict = result.verdict
+    if verdict.accepted is True:
+        kept = limited_to_task(plan, scene.task)
+        most = question.max_audit_distances
+        audited = audit(result, kept, scene, config, max_queries=most)
+        verdict = replace(verdict, checks={**verdict.checks, "audit": audited})
+        verdict = replace(verdict, reason=reason_of(verdict))
     samples = replay_samples(
         judge,
         scene,
@@ -134,6 +149,7 @@ class TwinProcess:
         self._run_path, self._task, self._output = run_path, task, output
         self._config = replace(config.replay, mode="dynamic", samples=config.samples)
         self._max_steps = config.max_steps
+        self._max_audit_distances = config.max_audit_distances
         self._swapping = threading.Lock()
         self._closed = False
         self._worker: Worker | None = None
@@ -166,13 +182,21 @@ class TwinProcess:
         found: Mapping[str, Any] = self._do("localisation", look, item, ends_s)
         return found
 
-    def replay(self, plan: Plan, found: Mapping[str, Any], urdf: str, ends_s: float) -> Verdict:
-        """Replay a plan from where its objects were found.
+    def replay(
+        self,
+        plan: Plan,
+        found: Mapping[str, Any],
+        urdf: str,
+        start_rad: Float[np.ndarray, " num_joints"],
+        ends_s: float,
+    ) -> Verdict:
+        """Replay a plan from where its objects were found and the arm stands.
 
         Args:
             plan: What is to be judged.
             found: The task's objects as localised, by name.
             urdf: Description of the robot.
+            start_rad: Joints as the robot reports them.
             ends_s: When to be done, on the monotonic clock.
 
         Raises:
@@ -189,6 +213,8 @@ class TwinProcess:
             urdf=urdf,
             config=self._config,
             max_steps=self._max_steps,
+            start_rad=start_rad,
+            max_audit_distances=self._max_audit_distances,
         )
         verdict: Verdict = self._do("replay", answer, question, ends_s)
         return verdict

@@ -258,6 +258,15 @@ class World:
             )
         )
 
+    def arm_force_N(self) -> float:
+        """Size of the force that rigid bodies exert on the arm in all; a grasp's cancel out."""
+        total = np.zeros(3)
+        for point in pybullet.getContactPoints(self.robot.id, physicsClientId=self._client):
+            if point[1] != point[2]:  # not the arm against itself
+                total += point[9] * np.array(point[7])
+                total += point[10] * np.array(point[11]) + point[12] * np.array(point[13])
+        return float(np.linalg.norm(total))
+
     def _free(self, object_id: str) -> int:
         if object_id not in self.free_ids:
             known = ", ".join([*self.free_ids, *self.soft.names]) or "none"

@@ -85,6 +85,8 @@ Mode = Literal["kinematic", "dynamic"]
 Grasp = Literal["friction", "attach"]
 
 RANGES: Mapping[str, tuple[float, float]] = {
+    "start_rad": (0, 10),
+    "start_m": (0, 10),
     "start_overlap_m": (0, 1),
     "eps_col_m": (0, 1),
     "max_contact_depth_m": (0, 1),
@@ -134,6 +136,10 @@ class ReplayConfig:
     grasp: Annotated[Grasp, Parameter(name="--grasp")] = "friction"
     """What holds objects: friction between the fingers, or attach, which ties rigid objects to the
     tool at the first touch. The engine's name says attach wherever such a verdict is shown."""
+    start_rad: float = 0.05
+    """A plan starts no farther than this from where each joint of the robot is [rad]."""
+    start_m: float = 0.01
+    """Nor its tool farther than this [m]."""
     start_overlap_m: float = 0.006
     """Rigid objects that were localised into each other by up to this are moved apart; deeper ones
     are not evaluated [m]."""

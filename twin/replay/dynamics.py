@@ -123,6 +123,8 @@ class States:
     """Soft objects that are no bodies any more at the end, and what was found."""
     burst: Burst | None = None
     """The first that burst; the replay ended there."""
+    arm_force_N: Float[np.ndarray, " _"] = field(default_factory=lambda: np.zeros(0))
+    """What rigid bodies press the arm with, where physics was asked."""
 
 
 def num_steps(end_ns: int, config: ReplayConfig) -> int:
@@ -205,6 +207,7 @@ class _Samples:
         self._stamps: list[int] = []
         self._joints: list[Float[np.ndarray, " num_joints"]] = []
         self._widths: list[float] = []
+        self._forces: list[float] = []
         self._rigid = [name for name in self._objects if name not in soft]
         self._poses: dict[str, list[tuple[float, ...]]] = {name: [] for name in self._rigid}
         self._fits: dict[str, list[Float[np.ndarray, "4 4"]]] = {name: [] for name in soft}
@@ -226,6 +229,7 @@ class _Samples:
         joints, width = world.robot.posture()
         self._joints.append(joints)
         self._widths.append(width)
+        self._forces.append(world.arm_force_N())
         for name in self._objects:
             self._touch[name].append(world.finger_touches(name))
         for name in self._rigid:
@@ -251,6 +255,7 @@ class _Samples:
             extents_m={name: np.array(rows, dtype=float) for name, rows in self._extents.items()},
             broken=self._broken(world),
             burst=self._burst,
+            arm_force_N=np.array(self._forces),
         )
 
     def _Ts_base_object(self, name: str) -> Float[np.ndarray, "num_steps 4 4"]:

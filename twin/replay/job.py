@@ -9,6 +9,9 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.metadata import Derived
@@ -17,6 +20,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import EpisodeError, GstError
+from bridge.robots.default import ARM_JOINTS
 from bridge.task.plan import Plan
 from bridge.task.predicate import evaluate_success
 from bridge.task.record import parse_record
@@ -53,8 +57,11 @@ from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 from twin.robot.posture import check_clock
 
-REPLAY_VERSION = 18
+REPLAY_VERSION = 19
 """Raise it when the same inputs give another replay, so that old files are redone."""
+
+START_KNOWN_NS = 1_000_000_000
+"""Joint states this near to a plan's start say where the arm was."""
 
 MAY_STAY_OPEN = ("settled", "shape")
 """Predicates that a recording without an answer to them may succeed without."""
@@ -418,6 +425,8 @@ def _open(job: ReplayJob) -> _Source:
         covariances=job.start.covariances,
     )
     executed = job.trajectory == "executed" and job.end_ns is not None
+    if job.trajectory == "planned":
+        scene = replace(scene, start_rad=recorded_start(episode, job.start_ns))
     events = streams.events(episode) if executed else []
     plan_as_executed = replace(plan, stages=stages_as_executed(plan, events, job.start_ns))
     return _Source(
@@ -429,6 +438,20 @@ def _open(job: ReplayJob) -> _Source:
         scene=scene,
         correction=rebuilt.correction,
     )
+
+
+def recorded_start(episode: Episode, stamp_ns: int) -> Float[np.ndarray, " num_joints"] | None:
+    """Where the arm was recorded to be when a plan began [rad]; None where nobody recorded it."""
+    try:
+        track = streams.joint_track(episode, JOINT_STATES)
+    except GstError:
+        return None
+    near = np.abs(track.stamps_ns - stamp_ns) <= START_KNOWN_NS
+    if not near.any() or not set(ARM_JOINTS) <= set(track.names):
+        return None
+    order = [track.names.index(name) for name in ARM_JOINTS]
+    found: Float[np.ndarray, " num_joints"] = track.at(np.array([stamp_ns]))[0, order]
+    return found if np.isfinite(found).all() else None
 
 
 def _run(source: _Source, scene: ReplayScene, job: ReplayJob) -> ReplayResult:

@@ -243,7 +243,12 @@ class JointPath:
 
 
 def path_of_plan(
-    plan: Plan, robot: RobotModel, config: ReplayConfig, *, clearance: Clearance | None = None
+    plan: Plan,
+    robot: RobotModel,
+    config: ReplayConfig,
+    *,
+    clearance: Clearance | None = None,
+    start_rad: Float[np.ndarray, " num_joints"] | None = None,
 ) -> tuple[JointPath, list[Failure], int | None]:
     """Solve a plan's waypoints.
 
@@ -255,6 +260,7 @@ def path_of_plan(
         robot: What is to follow it.
         config: Spacing and tolerances.
         clearance: Says which postures touch something, where the plan leaves the choice.
+        start_rad: Where the robot stands: a plan that begins without joints goes on from there.
 
     Returns:
         The path up to the last pose that could be reached, what failed, and the time of the first
@@ -268,7 +274,7 @@ def path_of_plan(
     for is_open, group in groupby(_targets(plan, config), key=lambda target: target.given is None):
         run = list(group)
         if is_open:
-            _follow(knots, run, robot, config, clearance)
+            _follow(knots, run, robot, config, clearance, start_rad)
         else:
             _take_given(knots, run, robot, config)
         if knots.unreachable_ns is not None:
@@ -322,12 +328,13 @@ def _follow(
     robot: RobotModel,
     config: ReplayConfig,
     clearance: Clearance | None,
+    start_rad: Float[np.ndarray, " num_joints"] | None,
 ) -> None:
     """Solve poses whose joints the plan leaves open."""
     followed = follow_poses(
         robot,
         np.stack([target.T for target in run]),
-        start_rad=knots.joints[-1] if knots.joints else None,
+        start_rad=knots.joints[-1] if knots.joints else start_rad,
         config=config.ik,
         clearance=clearance,
     )

@@ -45,6 +45,8 @@ class ReplayScene:
     others."""
     shape_sources: Mapping[str, str] = field(default_factory=dict)
     """Per object: where its shape comes from."""
+    start_rad: Float[np.ndarray, " num_joints"] | None = None
+    """Where the arm stands before the plan, as its encoders say; None: not known, not asked."""
 
     def missing(self) -> list[str]:
         """Objects of the task that have no pose."""

@@ -1,7 +1,7 @@
 """Replay one trajectory, planned or executed, and judge it: I(tau) = ik x clearance x terminal."""
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,13 @@ from bridge.task.predicate import (
 from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
 from twin.physics.engine import ENGINE_VERSION
+from twin.replay.checks import (
+    limited_to_task,
+    path_limit_failures,
+    simulated_limit_failures,
+    start_failures,
+    task_failures,
+)
 from twin.replay.clearance.monitor import ClearanceMonitor
 from twin.replay.clearance.surroundings import posture_clearance
 from twin.replay.config import ReplayConfig
@@ -36,6 +43,7 @@ from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 
 HELD_BEFORE = "the goal held before anything moved"
+REFUSED_BEFORE = "not simulated: refused before physics"
 MANY = 8
 """Of more findings than this, those that hold are not worth reading one by one."""
 
@@ -158,12 +166,11 @@ def reason_of(verdict: Verdict) -> str | None:
     """The first factor that fails, or what is open, or the first warning."""
     name = verdict.first_failing
     if name is not None:
-        factor: Factor = getattr(verdict, name)
-        return f"{name}: {factor.cause}: {factor.detail}"
+        failing = verdict.factors()[name]
+        return f"{name}: {failing.cause}: {failing.detail}"
     if verdict.accepted is None:
         names: dict[str | None, list[str]] = {}
-        for name in ("ik", "clearance", "terminal"):
-            factor = getattr(verdict, name)
+        for name, factor in verdict.factors().items():
             if factor.value is None:
                 names.setdefault(factor.detail, []).append(name)
         undecided = [f"{' and '.join(open_for)}: {why}" for why, open_for in names.items()]
@@ -175,22 +182,37 @@ KINEMATIC_ENGINE = "pinocchio"
 SOFT_ENGINE = "xpbd"
 
 
-def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> ReplayResult:
+def replay_plan(
+    plan: Plan, scene: ReplayScene, config: ReplayConfig, *, refuse_early: bool = False
+) -> ReplayResult:
     """Replay what a plan commands: waypoints, inverse kinematics, motors, objects.
 
     Args:
-        plan: Waypoints and stages.
-        scene: Where objects are at the start, and what stands still.
-        config: Mode, physics and limits.
+        plan: What is commanded; its start is checked where the scene knows where the arm is.
+        scene: Where it happens.
+        config: How it is replayed.
+        refuse_early: Simulate nothing once a check that needs no physics says no. The commanded
+            path itself must then keep clear, too.
 
     Raises:
         UnusablePlanError: When the plan has no usable waypoints.
     """
     robot = load_robot(scene.urdf)
     free = posture_clearance(scene, hulls_of(robot), config)
-    path, failures, unreachable_ns = path_of_plan(plan, robot, config, clearance=free)
-    path = path.with_late_gripper(config.grip_delay_s)
-    return _replay(path, failures, unreachable_ns, plan, scene, config, trajectory="planned")
+    path, failures, unreachable_ns = path_of_plan(
+        plan, robot, config, clearance=free, start_rad=scene.start_rad
+    )
+    checks = {"task": task_failures(plan, scene.task), "limits": path_limit_failures(path, robot)}
+    if scene.start_rad is not None:
+        checks["start"] = start_failures(plan, path, scene.start_rad, robot, config)
+    commanded = Commanded(
+        path=path.with_late_gripper(config.grip_delay_s),
+        failures=failures,
+        unreachable_ns=unreachable_ns,
+        trajectory="planned",
+        checks=checks,
+    )
+    return _replay(commanded, plan, scene, config, refuse_early=refuse_early)
 
 
 def replay_joints(
@@ -214,31 +236,60 @@ def replay_joints(
         UnusablePlanError: When a track is empty or names other joints.
     """
     path = path_of_execution(track, widths, plan, config)
-    return _replay(path, [], None, plan, scene, config, trajectory="executed")
+    return _replay(Commanded(path=path, trajectory="executed"), plan, scene, config)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Commanded:
+    """What the arm is to do, and what was found wrong with that already."""
+
+    path: JointPath
+    trajectory: str
+    failures: list[Failure] = field(default_factory=list)
+    """Of inverse kinematics."""
+    unreachable_ns: int | None = None
+    checks: dict[str, list[Failure]] = field(default_factory=dict)
+    """Of the checks beside I(tau)."""
 
 
 def _replay(
-    path: JointPath,
-    failures: list[Failure],
-    unreachable_ns: int | None,
+    commanded: Commanded,
     plan: Plan,
     scene: ReplayScene,
     config: ReplayConfig,
     *,
-    trajectory: str,
+    refuse_early: bool = False,
 ) -> ReplayResult:
+    path, checks = commanded.path, commanded.checks
+    unreachable_ns = commanded.unreachable_ns
     robot = load_robot(scene.urdf)
     hulls = hulls_of(robot)
-    failures = failures + check_path(path, robot, hulls, config)
+    failures = commanded.failures + check_path(path, robot, hulls, config)
+    plan = limited_to_task(plan, scene.task)
     dynamic = config.mode == "dynamic"
     if dynamic:
         scene = free_start(scene, soft_models(scene), config.start_overlap_m)
-    states = simulate(path, scene, hulls, config) if dynamic else follow(path, scene, config)
     monitor = ClearanceMonitor(scene, plan, hulls, config)
     _pre_grasp(monitor, path, config)
+    states, physics, measured = None, dynamic, True
+    if dynamic and refuse_early:
+        measured = not (failures or monitor.failures or any(checks.values()))
+        states = follow(path, scene, config)
+        ahead = ClearanceMonitor(scene, plan, hulls, config)
+        if measured:
+            _clearance_m(ahead, states, [])
+        physics = measured and not ahead.failures
+    if physics:
+        states = simulate(path, scene, hulls, config)
+    elif states is None:
+        states = follow(path, scene, config)
+    if not measured:
+        states = first_of(states)
     clearance_m = _clearance_m(monitor, states, list(scene.movable()))
+    if physics and commanded.trajectory == "planned":
+        checks = {**checks, "limits": checks["limits"] + simulated_limit_failures(path, states)}
     result = ReplayResult(
-        verdict=_undecided(plan, trajectory, config, scene),
+        verdict=_undecided(plan, commanded.trajectory, config, scene),
         stamps_ns=states.stamps_ns,
         joints_rad=states.joints_rad,
         width_m=states.width_m,
@@ -253,20 +304,26 @@ def _replay(
     )
     # What was executed is judged by where things end: it is known whether they were dropped.
     slipped: list[Failure] = []
-    if dynamic and trajectory == "planned" and config.max_slip_m is not None:
+    if physics and commanded.trajectory == "planned" and config.max_slip_m is not None:
         slipped = slips(grasped_objects(plan, path, result), config.max_slip_m)
     terminal = terminal_factor(
         result, scene, config, unreachable_ns=unreachable_ns, burst=states.burst
     )
+    if dynamic and not physics:
+        terminal = Factor(value=None, detail=REFUSED_BEFORE)
     verdict = replace(
         result.verdict,
         ik=factor_from(failures),
         clearance=factor_from(
-            monitor.failures, undecided=_clearance_undecided(scene, unreachable_ns, states)
+            monitor.failures,
+            undecided=_clearance_undecided(scene, unreachable_ns, states)
+            if measured
+            else REFUSED_BEFORE,
         ),
         terminal=unless_slipped(terminal, slipped),
         warnings=warnings_of(scene, result),
-        findings=tuple(findings_of(scene.task, result.rollout(), "replayed")) if dynamic else (),
+        findings=tuple(findings_of(scene.task, result.rollout(), "replayed")) if physics else (),
+        checks={name: factor_from(found) for name, found in checks.items()},
     )
     return replace(result, verdict=replace(verdict, reason=reason_of(verdict)))
 
@@ -310,6 +367,17 @@ def follow(path: JointPath, scene: ReplayScene, config: ReplayConfig) -> States:
         width_m=path.width_at(stamps),
         Ts_base_object=fixed,
         finger_contact={},
+    )
+
+
+def first_of(states: States) -> States:
+    """The first of several states alone."""
+    return replace(
+        states,
+        stamps_ns=states.stamps_ns[:1],
+        joints_rad=states.joints_rad[:1],
+        width_m=states.width_m[:1],
+        Ts_base_object={name: Ts[:1] for name, Ts in states.Ts_base_object.items()},
     )
 
 

@@ -485,6 +485,7 @@ class Operator:
     def _ask_gate(self, plan: Plan) -> tuple[Verdict | None, str]:
         """Return the verdict, None when there is none, and why it is not a yes."""
         key = cell_topic(self._config.gate_cell or self._config.cell, GATE)[1:]
+        self._cell.streams.joints_again()  # a planner may have thought for seconds
         limit_s, asked_s = self._config.gate_timeout_s, time.monotonic()
         try:
             answer = self._session.query(key, plan.to_json(), timeout_s=limit_s)
@@ -545,6 +546,6 @@ def _reason(verdict: Verdict) -> str:
     name = verdict.first_failing
     if name is None:
         return verdict.reason or "the verdict is undecided"
-    factor = getattr(verdict, name)
+    factor = verdict.factors()[name]
     parts = [name, factor.cause or "", factor.detail or ""]
     return " ".join(part for part in parts if part)

@@ -99,6 +99,7 @@ class Streams:
         self._session = session
         self._cell = cell
         self._publishers: dict[str, Publisher] = {}
+        self._latest_joints: tuple[bytes, int] | None = None
 
     def _put(self, topic: str, data: bytes, stamp_ns: int, type_name: str | None = None) -> None:
         publisher = self._publishers.get(topic)
@@ -200,7 +201,13 @@ class Streams:
             velocity=velocity,
             effort=effort,
         )
-        self._put(cell_topic(self._cell, JOINT_STATES), sample.to_cdr(), stamp_ns)
+        self._latest_joints = sample.to_cdr(), stamp_ns
+        self._put(cell_topic(self._cell, JOINT_STATES), *self._latest_joints)
+
+    def joints_again(self) -> None:
+        """Publish the latest joint states once more: time stands still, and so does the arm."""
+        if self._latest_joints is not None:
+            self._put(cell_topic(self._cell, JOINT_STATES), *self._latest_joints)
 
     def gripper(self, width_m: float, stamp_ns: int) -> None:
         """Publish the distance between the pads."""

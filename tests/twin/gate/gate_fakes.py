@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from bridge.robots.default import ARM_JOINTS
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
@@ -29,16 +30,23 @@ PLAN = Plan(
 )
 
 
+HOME = SimpleNamespace(names=ARM_JOINTS, position_rad=np.zeros(6), stamp_ns=42, received_ns=1)
+
+
 @dataclass
 class FakePerception:
     description: str | None = URDF
     running: str | None = None
     heard: int = 1
+    arm: Any = field(default_factory=lambda: HOME)
     seen: list[Any] = field(default_factory=lambda: [SimpleNamespace(stamp_ns=1)])
     reasons: list[str] = field(default_factory=lambda: ["side: silent for 9.0 s"])
 
     def urdf(self) -> str | None:
         return self.description
+
+    def joints(self) -> Any:
+        return self.arm
 
     def executing(self) -> str | None:
         return self.running

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gate_fakes import PLAN, URDF, FakePerception, accept, found, gate_with, raising
+from gate_fakes import HOME, PLAN, URDF, FakePerception, accept, found, gate_with, raising
 
 from bridge.errors import InvalidRecordError
 from bridge.task.plan import Plan
@@ -15,14 +15,26 @@ from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
-from twin.gate.gate import Gate, PlanTooLargeError, no_verdict, robot_name
+from twin.gate.gate import (
+    Gate,
+    PlanTooLargeError,
+    no_verdict,
+    of_another_scene,
+    robot_name,
+)
+
+
+def arm(**changes: Any) -> Any:
+    return SimpleNamespace(**{**vars(HOME), **changes})
 
 
 def test_the_verdict_is_the_replays_from_the_localised_poses() -> None:
     seen: dict[str, Any] = {}
 
-    def replay(plan: Plan, poses: dict[str, Any], urdf: str, ends_s: float) -> Verdict:
-        seen.update(plan=plan, poses=poses, urdf=urdf)
+    def replay(
+        plan: Plan, poses: dict[str, Any], urdf: str, start_rad: np.ndarray, ends_s: float
+    ) -> Verdict:
+        seen.update(plan=plan, poses=poses, urdf=urdf, start_rad=start_rad)
         return replace(accept(plan, poses, urdf), terminal=Factor(value=False, cause="inside"))
 
     verdict = gate_with(replay=replay).judge(PLAN.to_json())
@@ -31,6 +43,7 @@ def test_the_verdict_is_the_replays_from_the_localised_poses() -> None:
     assert seen["plan"] == PLAN
     assert sorted(seen["poses"]) == ["box", "cube"]
     assert seen["urdf"] == URDF
+    assert seen["start_rad"].tolist() == [0.0] * 6
 
 
 def test_a_task_with_soft_objects_is_replayed_like_any_other() -> None:
@@ -63,6 +76,40 @@ def test_an_accepted_plan_is_accepted() -> None:
             "no usable frames within 0 s: side: silent for 9.0 s",
         ),
         ({"perception": FakePerception(description=None)}, PLAN, "no robot description"),
+        (
+            {"perception": FakePerception(arm=None)},
+            PLAN,
+            "no joint states have arrived on /standin/joint_states",
+        ),
+        (
+            {"perception": FakePerception(arm=arm(names=("panda_joint1", "panda_joint2")))},
+            PLAN,
+            "of another robot: they name panda_joint1, panda_joint2, and lack shoulder_pan_joint",
+        ),
+        (
+            {"perception": FakePerception(arm=arm(stamp_ns=42 - 1_100_000_000))},
+            PLAN,
+            "are 1.1 s old, and only those of the last 1 s say where",
+        ),
+        (
+            {"perception": FakePerception(heard=2_000_000_000), "now_ns": lambda: 2_000_000_000},
+            PLAN,
+            "are 2.0 s old, and only those of the last 1 s say where",
+        ),
+        (
+            {
+                "perception": FakePerception(
+                    arm=arm(position_rad=np.array([0.0, np.inf, 0, 0, 0, 0]))
+                )
+            },
+            PLAN,
+            "hold no numbers for every joint",
+        ),
+        (
+            {"perception": FakePerception(arm=arm(position_rad=np.zeros(0)))},
+            PLAN,
+            "hold no numbers for every joint",
+        ),
         ({"perception": FakePerception(running="plan_0")}, PLAN, "plan_0 is being executed"),
         (
             {"localise": lambda *_: found(cube="0 points")},
@@ -85,6 +132,52 @@ def test_what_cannot_be_decided_is_null_with_a_reason(
     assert Verdict.from_json(verdict.to_json()) == verdict
 
 
+def believed(**places: Any) -> Plan:
+    return replace(PLAN, entities=places)
+
+
+def test_a_plan_made_for_another_scene_gets_no_verdict() -> None:
+    """The fakes see every object at the origin."""
+    far = believed(cube={"p_m": [0.0, 0.11, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]})
+    verdict = gate_with().judge(far.to_json())
+    assert verdict.accepted is None
+    assert "was made for another scene: it has cube 110 mm from where it is seen" in str(
+        verdict.reason
+    )
+    near = believed(
+        cube={"p_m": [0.0, 0.09, 0.0]}, box={"where": "left"}, marker={"p_m": [9, 9, 9]}
+    )
+    assert gate_with().judge(near.to_json()).accepted is True
+    assert gate_with(other_scene_m=0.2).judge(far.to_json()).accepted is True
+
+
+def test_objects_that_look_alike_may_be_confused() -> None:
+    task = load_task("five_ducks_into_basket")
+    places = {name: np.eye(4) for name in task.objects}
+    for index, T in enumerate(places.values()):
+        T[0, 3] = 0.3 * index
+    seen = {name: SimpleNamespace(T_base_object=T) for name, T in places.items()}
+    swapped = believed(duck_1={"p_m": [0.3, 0.0, 0.0]}, duck_2={"p_m": [0.0, 0.0, 0.0]})
+    assert of_another_scene(swapped, seen, task, 0.1) == ""
+    on_the_basket = believed(duck_1={"p_m": places["basket"][:3, 3].tolist()})
+    assert "it has duck_1 300 mm" in of_another_scene(on_the_basket, seen, task, 0.1)
+
+
+def test_frames_that_were_searched_are_not_searched_again() -> None:
+    """Two planners ask from one start: it is localised once, until something newer is seen."""
+    perception, searched = FakePerception(), []
+
+    def localise(frames: Any, *_: Any) -> Any:
+        searched.append(frames[0].stamp_ns)
+        return found()
+
+    gate = gate_with(perception, localise)
+    for stamp_ns in (1, 1, 2, 2, 1):
+        perception.seen = [SimpleNamespace(stamp_ns=stamp_ns)]
+        assert gate.judge(PLAN.to_json()).accepted is True
+    assert searched == [1, 2, 1]
+
+
 def test_a_cell_not_heard_for_long_is_not_judged_from_memory_however_often_one_asks() -> None:
     gate = gate_with(now_ns=lambda: 100_000_000_000)
     for _ in range(3):
@@ -95,8 +188,10 @@ def test_a_cell_not_heard_for_long_is_not_judged_from_memory_however_often_one_a
 
 def test_a_cell_that_stands_still_while_it_waits_for_a_verdict_is_not_silent() -> None:
     """Each verdict takes 60 s, the cell asks again 1 s later: 1 s of silence, then 2."""
-    clock = iter([1_000_000_000, 61_000_000_000, 62_000_000_000, 122_000_000_000, 200_000_000_000])
-    gate = gate_with(FakePerception(heard=0), now_ns=lambda: next(clock))
+    seconds = iter([1, 1, 61, 62, 62, 122, 200, 200])
+    gate = gate_with(
+        FakePerception(heard=0), now_ns=lambda: next(seconds) * 10**9, max_joint_age_s=10.0
+    )
     assert gate.judge(PLAN.to_json()).accepted is True
     assert gate.judge(PLAN.to_json()).accepted is True
     assert "for 80 s" in str(gate.judge(PLAN.to_json()).reason)

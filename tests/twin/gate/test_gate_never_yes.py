@@ -11,7 +11,7 @@ from typing import Any
 import gate_fakes
 import numpy as np
 import pytest
-from gate_fakes import TASK, accept
+from gate_fakes import HOME, TASK, accept
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import OptionError, UsageError
@@ -37,9 +37,13 @@ class ChangingPerception:
 
     looks: list[list[Any]] = field(default_factory=lambda: [[frame(1)]])
     running: list[str | None] = field(default_factory=lambda: [None])
+    postures: list[Any] = field(default_factory=lambda: [HOME])
 
     def urdf(self) -> str:
         return '<robot name="arm"/>'
+
+    def joints(self) -> Any:
+        return self.postures.pop(0) if len(self.postures) > 1 else self.postures[0]
 
     def executing(self) -> str | None:
         return self.running.pop(0) if len(self.running) > 1 else self.running[0]
@@ -98,6 +102,10 @@ def judged(
 LOOKS = [[frame(1)], [frame(2)]]
 
 
+def at(joints_rad: list[float]) -> Any:
+    return SimpleNamespace(**{**vars(HOME), "position_rad": np.array(joints_rad)})
+
+
 def test_a_yes_needs_the_cell_to_be_as_it_was_judged() -> None:
     assert judged(ChangingPerception(looks=list(LOOKS))).accepted is True
 
@@ -119,6 +127,16 @@ def test_a_yes_needs_the_cell_to_be_as_it_was_judged() -> None:
             ChangingPerception(running=[None, "plan_0"]),
             None,
             "plan_0 was started while the plan was",
+        ),
+        (
+            ChangingPerception(postures=[HOME, at([0.0, 0.0, 0.06, 0.0, 0.0, 0.0])]),
+            None,
+            "the arm moved while the plan was being judged: elbow_joint by 0.060 rad",
+        ),
+        (
+            ChangingPerception(postures=[HOME, at([np.nan] * 6)]),
+            None,
+            "/standin/joint_states hold no numbers for every joint",
         ),
         (
             ChangingPerception(looks=[[frame(1)], []]),

@@ -1,6 +1,8 @@
 """The gate on a real zenoh network on the loopback address, with a fake replay."""
 
 import json
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 from gate_fakes import accept
 from loopback import free_endpoint
+from own_process import ROOT
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import (
@@ -19,12 +22,14 @@ from bridge.episode.cdr.messages import (
     CompressedColor,
     DepthImage,
     FrameTransform,
+    JointSample,
     string_to_cdr,
     transforms_to_cdr,
 )
 from bridge.episode.topics import type_of_topic
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
+from bridge.robots.default import ARM_JOINTS
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
@@ -42,14 +47,30 @@ S = 1_000_000_000
 
 
 @pytest.fixture
-def sessions() -> Iterator[tuple[WireSession, WireSession]]:
+def endpoint() -> str:
+    """Where the router of ``sessions`` listens."""
+    return free_endpoint()
+
+
+@pytest.fixture
+def sessions(endpoint: str) -> Iterator[tuple[WireSession, WireSession]]:
     """A router, and a client of it that plays the cell."""
-    endpoint = free_endpoint()
     with (
         open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as router,
         open_session(WireConfig(connect=(endpoint,))) as cell,
     ):
         yield router, cell
+
+
+def still_at(stamp_ns: int, names: tuple[str, ...] = ARM_JOINTS) -> bytes:
+    sample = JointSample(
+        stamp_ns=stamp_ns,
+        names=names,
+        position=np.zeros(len(names)),
+        velocity=np.zeros(0),
+        effort=np.zeros(0),
+    )
+    return sample.to_cdr()
 
 
 def publish_one_frame(cell: WireSession, stamp_ns: int = S) -> None:
@@ -77,6 +98,7 @@ def publish_one_frame(cell: WireSession, stamp_ns: int = S) -> None:
             )
             for k in ("color", "depth")
         ),
+        ("/lab/joint_states", still_at(stamp_ns)),
         ("/lab/cam/side/color/image", color.to_cdr()),
         ("/lab/cam/side/depth/image", depth.to_cdr()),
     ]
@@ -84,9 +106,9 @@ def publish_one_frame(cell: WireSession, stamp_ns: int = S) -> None:
         cell.publisher(topic, type_of_topic(topic) or "").put(data, source_ns=stamp_ns)
 
 
-def plan_for(robot: str) -> bytes:
+def plan_for(robot: str, plan_id: str = "plan_1") -> bytes:
     return Plan(
-        id="plan_1",
+        id=plan_id,
         planner="test",
         policy="test",
         condition="with_replanning",
@@ -110,7 +132,7 @@ def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(
         item = SimpleNamespace(found=True, reason=None, T_base_object=np.eye(4))
         return dict.fromkeys(task.objects, item)
 
-    def replay(plan: Plan, poses: dict[str, Any], urdf: str, ends_s: float) -> Verdict:
+    def replay(plan: Plan, *_: Any) -> Verdict:
         return replace(accept(plan), terminal=Factor(value=False, cause="inside"))
 
     gate = Gate(
@@ -233,6 +255,64 @@ def test_plans_that_may_not_wait_are_told_at_once_on_the_wire(
     assert [verdict.accepted for verdict in answers] == [True]
 
 
+def test_two_planners_at_once_each_hear_of_their_own_plan(
+    sessions: tuple[WireSession, WireSession],
+) -> None:
+    router, cell = sessions
+    a_gate(router, LiveView("lab"), accept, lambda *_: everything_at())
+    publish_one_frame(cell)
+    heard: dict[str, list[str]] = {"left": [], "right": []}
+
+    def planner(name: str) -> None:
+        for number in range(10):
+            verdict = ask(cell, plan_for("arm", f"{name}_{number}"))
+            assert verdict.accepted is True
+            heard[name].append(verdict.plan_id)
+
+    threads = [threading.Thread(target=planner, args=(name,)) for name in heard]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+    assert heard == {name: [f"{name}_{n}" for n in range(10)] for name in heard}
+
+
+def test_a_planner_that_dies_before_the_answer_leaves_the_gate_to_the_next(
+    sessions: tuple[WireSession, WireSession], endpoint: str
+) -> None:
+    router, cell = sessions
+    inside, go_on = threading.Semaphore(0), threading.Event()
+
+    def replay(plan: Plan, *_: Any) -> Verdict:
+        inside.release()
+        go_on.wait(10)
+        return accept(plan)
+
+    a_gate(router, LiveView("lab"), replay, lambda *_: everything_at())
+    published: list[Any] = []
+    cell.subscribe("lab/verdict", published.append)
+    publish_one_frame(cell)
+    code = (
+        "import sys; from bridge.wire.config import WireConfig; "
+        "from bridge.wire.session import open_session; session = open_session("
+        "WireConfig(connect=(sys.argv[1],))); "
+        "session.query('lab/gate/verdict', sys.stdin.buffer.read(), timeout_s=60.0)"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, endpoint], stdin=subprocess.PIPE, cwd=ROOT
+    ) as planner:
+        assert planner.stdin is not None
+        planner.stdin.write(plan_for("arm", "orphan"))
+        planner.stdin.close()
+        assert inside.acquire(timeout=30)
+        planner.kill()
+        planner.wait(10)
+    go_on.set()
+    assert ask(cell, plan_for("arm", "next")).plan_id == "next"
+    _until(lambda: len(published) == 2)
+    assert [Verdict.from_json(item.data).plan_id for item in published] == ["orphan", "next"]
+
+
 def test_an_object_moved_while_its_plan_is_judged_is_no_yes(
     sessions: tuple[WireSession, WireSession],
 ) -> None:
@@ -272,8 +352,10 @@ def test_pictures_that_are_old_on_the_cells_clock_are_no_basis(
         FrameTransform(stamp_ns=60 * S, parent="base_link", child="wrist", T_parent_child=np.eye(4))
     ]
     cell.publisher("/tf", schema.TF_MESSAGE).put(transforms_to_cdr(later), source_ns=60 * S)
+    states = cell.publisher("/lab/joint_states", schema.JOINT_STATE)
+    states.put(still_at(60 * S), source_ns=60 * S)
     ends = time.monotonic() + 5
-    while perception.newest_ns() < 60 * S and time.monotonic() < ends:
+    while _joints_ns(perception) < 60 * S and time.monotonic() < ends:
         time.sleep(0.01)
     expired = ask(cell)
     assert expired.accepted is None
@@ -306,6 +388,29 @@ def test_a_second_gate_in_a_cell_is_refused_until_the_first_is_gone(
     cell.close()
     _until(lambda: not router.query_alive("lab/gate/alive"))
     claim_gate(router, "lab")
+
+
+def _joints_ns(perception: LiveView) -> int:
+    heard = perception.joints()
+    return 0 if heard is None else heard.stamp_ns
+
+
+def test_joint_states_that_are_old_or_of_another_robot_are_no_basis(
+    sessions: tuple[WireSession, WireSession],
+) -> None:
+    router, cell = sessions
+    perception = LiveView("lab")
+    a_gate(router, perception, accept, lambda *_: everything_at())
+    publish_one_frame(cell)
+    assert ask(cell).accepted is True
+    later = [
+        FrameTransform(stamp_ns=3 * S, parent="base_link", child="wrist", T_parent_child=np.eye(4))
+    ]
+    cell.publisher("/tf", schema.TF_MESSAGE).put(transforms_to_cdr(later), source_ns=3 * S)
+    _until(lambda: perception.newest_ns() == 3 * S)
+    silent = ask(cell)
+    assert silent.accepted is None
+    assert "joint states on /lab/joint_states are 2.0 s old" in str(silent.reason)
 
 
 def _until(holds: Callable[[], bool]) -> None:

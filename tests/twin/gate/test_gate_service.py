@@ -68,13 +68,14 @@ def test_a_malformed_plan_is_not_published() -> None:
     assert session.published == []
 
 
-def test_only_cameras_events_and_transforms_are_subscribed() -> None:
+def test_only_cameras_events_joints_and_transforms_are_subscribed() -> None:
     session, taken = FakeSession(), []
     watch_cell(session, "standin", lambda *item: taken.append(item))
     assert sorted(session.subscriptions) == [
         "robot_description",
         "standin/cam/**",
         "standin/event",
+        "standin/joint_states",
         "tf",
         "tf_static",
     ]

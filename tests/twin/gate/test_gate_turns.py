@@ -28,9 +28,9 @@ def test_reading_a_plan_counts_towards_its_limit(monkeypatch: pytest.MonkeyPatch
 def test_a_replay_past_the_wall_clock_limit_is_null_and_the_next_plan_waits_for_its_turn() -> None:
     go_on = threading.Event()
 
-    def slow(plan: Plan, poses: dict[str, Any], urdf: str, ends_s: float) -> Verdict:
+    def slow(plan: Plan, *_: Any) -> Verdict:
         go_on.wait()
-        return accept(plan, poses, urdf)
+        return accept(plan)
 
     gate = gate_with(replay=slow, deadline_s=0.05)
     late = gate.judge(PLAN.to_json())  # comes while the replay still waits, or never
@@ -45,10 +45,10 @@ def test_a_replay_past_the_wall_clock_limit_is_null_and_the_next_plan_waits_for_
 def test_more_plans_than_may_wait_are_turned_away_at_once() -> None:
     inside, go_on = threading.Semaphore(0), threading.Event()
 
-    def slow(plan: Plan, poses: dict[str, Any], urdf: str, ends_s: float) -> Verdict:
+    def slow(plan: Plan, *_: Any) -> Verdict:
         inside.release()
         go_on.wait(5)
-        return accept(plan, poses, urdf)
+        return accept(plan)
 
     gate = gate_with(replay=slow, waiting=1)
     answers: list[Verdict] = []
@@ -74,7 +74,7 @@ def test_no_two_replays_ever_run_side_by_side() -> None:
     """Robot models are shared and keep scratch memory; late replays go on and hold the turn."""
     counting, running, most, done = threading.Lock(), 0, 0, 0
 
-    def slow(plan: Plan, poses: dict[str, Any], urdf: str, ends_s: float) -> Verdict:
+    def slow(plan: Plan, *_: Any) -> Verdict:
         nonlocal running, most, done
         with counting:
             running += 1
@@ -83,7 +83,7 @@ def test_no_two_replays_ever_run_side_by_side() -> None:
         with counting:
             running -= 1
             done += 1
-        return accept(plan, poses, urdf)
+        return accept(plan)
 
     gate = gate_with(replay=slow, deadline_s=0.04, waiting=8)
     threads = [threading.Thread(target=gate.judge, args=(PLAN.to_json(),)) for _ in range(8)]

@@ -19,6 +19,7 @@ from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.gate.gate import UndecidedError
 from twin.gate.twin_process import Question, answer
+from twin.replay import audit as auditor
 from twin.replay import verdict as verdict_module
 from twin.replay.config import ReplayConfig
 from twin.replay.scene import ReplayScene
@@ -33,7 +34,7 @@ def asked(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> tuple[ReplayScene,
     """Where and with which settings a plan for the sloth would be replayed."""
     seen: list[tuple[ReplayScene, ReplayConfig]] = []
 
-    def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> Any:
+    def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig, **_: Any) -> Any:
         seen.append((scene, config))
         raise SeenError
 
@@ -72,10 +73,11 @@ ACCEPTED = Verdict(
 
 
 def accepting(monkeypatch: pytest.MonkeyPatch) -> list[ReplayConfig]:
-    """Let every replay succeed; the settings of each."""
+    """Let every replay and its audit succeed; the settings of each."""
     asked: list[ReplayConfig] = []
+    monkeypatch.setattr(auditor, "audit", lambda *_, **__: YES)
 
-    def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> Any:
+    def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig, **_: Any) -> Any:
         asked.append(config)
         return SimpleNamespace(verdict=ACCEPTED)
 
@@ -165,3 +167,24 @@ def test_a_yes_that_knows_less_than_a_scene_could_tell_says_what_is_missing(
         "the scene has no sdf.npz: only the table and the containers are in the way",
     )
     assert said.reason == said.warnings[0]
+
+
+def test_a_yes_that_the_audit_does_not_confirm_is_null_with_both_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    accepting(monkeypatch)
+    assert answer(question_of(run)).checks["audit"] == YES
+    detail = "forearm_link is 3.0 mm from box at 1.20 s by python-fcl, the clearance said 8.0 mm"
+    limits: list[int] = []
+
+    def audit(*_: Any, max_queries: int) -> Factor:
+        limits.append(max_queries)
+        return Factor(value=None, detail=detail)
+
+    monkeypatch.setattr(auditor, "audit", audit)
+    said = answer(question_of(run, max_audit_distances=77))
+    assert limits == [77]
+    assert said.accepted is None
+    assert said.reason == f"undecided: audit: {detail}"
+    assert Verdict.from_json(said.to_json()).checks["audit"].detail == detail

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.messages import (
@@ -39,6 +39,7 @@ from bridge.episode.topics import (
 )
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
+from bridge.robots.default import ARM_JOINTS
 from bridge.task.record import parse_record
 from twin.errors import TwinError
 from twin.robot.posture import PostureTrack, check_joints
@@ -214,6 +215,19 @@ MAX_FRAMES = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
+class HeardJoints:
+    """The latest joint states of an arm."""
+
+    names: tuple[str, ...]
+    position_rad: Float[np.ndarray, " num_joints"]
+    """In the order of ``names``."""
+    stamp_ns: int
+    """On the cell's own clock."""
+    received_ns: int
+    """On the receiver's."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class LiveFrames:
     """Frames taken since the last motion, and why cameras gave none."""
 
@@ -225,17 +239,17 @@ class LiveView:
     """Remembers images, transforms and the robot description of one cell; thread safe."""
 
     def __init__(self, cell: str, calibration: Calibration | None = None) -> None:
-        """Listen for ``/<cell>/cam/...``, ``/<cell>/event``, transforms and the URDF.
+        """Listen for ``/<cell>/cam/...``, events, joint states, transforms and the URDF.
 
         Args:
             cell: Its name.
-            calibration: Of the run. Cameras in it are where it says, and never where ``/tf`` does;
-                for those in the hand ``/<cell>/joint_states`` is listened for, too.
+            calibration: Of the run. Cameras in it are where it says, and never where ``/tf`` does.
         """
         self._cell = cell
         self._calibration = calibration
         self._places = {} if calibration is None else dict(calibration.cameras)
         self._joints: deque[bytes] = deque(maxlen=KEPT_JOINTS)
+        self._heard_joints: HeardJoints | None = None
         self._lock = threading.Lock()
         self._cameras: dict[str, LiveCamera] = {}
         self._static: dict[str, FrameTransform] = {}
@@ -256,11 +270,14 @@ class LiveView:
             received_ns: On the receiver's clock.
             type_name: Of an image: raw or compressed; "" is what the topic's name promises.
         """
-        if is_truth(topic) or (topic == self._joint_topic and not self.needs_joints):
+        if is_truth(topic):
             return
         try:
             with self._lock:
-                self._take(topic, data, type_name or type_of_topic(topic) or "")
+                if topic == self._joint_topic:
+                    self._take_joints(data, received_ns)
+                else:
+                    self._take(topic, data, type_name or type_of_topic(topic) or "")
                 self._heard_ns = max(self._heard_ns, received_ns)
         except (GstError, codec.MalformedMessageError, ValueError):
             self.malformed += 1
@@ -276,14 +293,25 @@ class LiveView:
                     self._static[item.child] = item
         elif topic == ROBOT_DESCRIPTION:
             self._urdf = string_from_cdr(data)
-        elif topic == self._joint_topic:
-            sample = JointSample.from_cdr(data)
-            self._joints.append(data)
-            self._newest_ns = max(self._newest_ns, sample.stamp_ns)
         elif topic == cell_topic(self._cell, EVENT):
             self._take_event(data)
         elif topic.startswith(cell_topic(self._cell, CAMERAS)):
             self._take_image(topic, data, type_name)
+
+    def _take_joints(self, data: bytes, received_ns: int) -> None:
+        sample = JointSample.from_cdr(data)
+        self._joints.append(data)
+        self._newest_ns = max(self._newest_ns, sample.stamp_ns)
+        # A gripper may publish beside the arm: it does not take the arm's place.
+        known = self._heard_joints
+        arm = set(ARM_JOINTS)
+        if known is None or arm <= set(sample.names) or not arm <= set(known.names):
+            self._heard_joints = HeardJoints(
+                names=tuple(sample.names),
+                position_rad=np.array(sample.position, dtype=np.float64),
+                stamp_ns=sample.stamp_ns,
+                received_ns=received_ns,
+            )
 
     def _take_event(self, data: bytes) -> None:
         event = parse_record(data, name="event", package="bridge.episode")
@@ -314,11 +342,6 @@ class LiveView:
     def _joint_topic(self) -> str:
         return cell_topic(self._cell, JOINT_STATES)
 
-    @property
-    def needs_joints(self) -> bool:
-        """Whether a camera was calibrated in the hand."""
-        return any(not mount.fixed for mount in self._places.values())
-
     def cameras_from(self) -> str:
         """By what the cameras are posed, in words."""
         if self._calibration is None or not self._places:
@@ -343,6 +366,11 @@ class LiveView:
         """When the last message arrived, on the receiver's clock; 0 before the first."""
         with self._lock:
             return self._heard_ns
+
+    def joints(self) -> HeardJoints | None:
+        """The latest joint states, the arm's where there are several; None before any arrived."""
+        with self._lock:
+            return self._heard_joints
 
     def executing(self) -> str | None:
         """Id of the plan that is being executed right now, None at rest."""

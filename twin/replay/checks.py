@@ -1,0 +1,254 @@
+"""What a plan must keep beside I(tau): start where the robot is, stay in its task and the limits.
+
+Each check names its cause and both numbers, found and allowed. Where joints are, and that they do
+not jump, belongs to the factor ``ik``; what is beyond the robot's other limits to ``limits``.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bridge.robots.default import ARM_JOINTS, ROBOT
+from bridge.task.plan import Plan, Stage
+from bridge.task.task_file import Task
+from twin.replay.config import ReplayConfig
+from twin.replay.dynamics import States
+from twin.replay.failure import Failure
+from twin.replay.path import JointPath
+from twin.robot.model import RobotModel
+
+ACCELERATION_WINDOW_S = 0.1
+"""Accelerations are means over so long on either side: a path of straight lines has corners, which
+a controller rounds."""
+_SLACK = 1.02
+"""Rounded numbers may exceed a limit by as little as this."""
+
+
+def start_failures(
+    plan: Plan,
+    path: JointPath,
+    measured_rad: Float[np.ndarray, " num_joints"],
+    robot: RobotModel,
+    config: ReplayConfig,
+) -> list[Failure]:
+    """Say how far a plan's first waypoint is from where the robot stands.
+
+    Args:
+        plan: Its first pose counts for the tool.
+        path: Its first posture counts for the joints.
+        measured_rad: What the encoders say.
+        robot: Whose they are.
+        config: Both limits.
+    """
+    off_rad = np.abs(path.joints_rad[0] - measured_rad)
+    joint = int(np.argmax(off_rad))
+    place_m = robot.T_base_tcp(measured_rad)[:3, 3]
+    off_m = float(np.linalg.norm(np.array(plan.tau[0].p_m) - place_m))
+    if off_rad[joint] <= config.start_rad and off_m <= config.start_m:
+        return []
+    return [
+        Failure(
+            t_ns=0,
+            cause="start_elsewhere",
+            bodies=(ARM_JOINTS[joint],),
+            detail=f"the plan starts {off_m * 1e3:.1f} mm and {off_rad[joint]:.3f} rad "
+            f"({ARM_JOINTS[joint]}) from where the robot is; the limits are "
+            f"{config.start_m * 1e3:.0f} mm and {config.start_rad:g} rad",
+        )
+    ]
+
+
+# Only the task file decides what may touch and what success is. A plan says when its stages are; it
+# may allow fewer contacts than its task, never more, and its own terminal predicates mean nothing.
+
+
+def task_failures(plan: Plan, task: Task) -> list[Failure]:
+    """Find what a plan's stages ask for that its task does not give them."""
+    tables = {str(table["id"]): table for table in task.stages}
+    failures: list[Failure] = []
+    begun: dict[str, int] = {}
+    for stage in plan.stages:
+        table = tables.get(stage.id)
+        latest_ns = max(begun.values(), default=0)
+        if table is None:
+            detail = f"stage {stage.id!r} is not one of task {task.name}: {', '.join(tables)}"
+            failures.append(_stage_failure(stage, "unknown_stage", detail))
+            continue
+        if stage.id in begun:
+            failures.append(_stage_failure(stage, "repeated_stage", f"{stage.id!r} is there twice"))
+        elif stage.t_start_ns < latest_ns or stage.t_end_ns < stage.t_start_ns:
+            detail = (
+                f"stage {stage.id!r} runs from {_s(stage.t_start_ns)} to {_s(stage.t_end_ns)}, the "
+                f"one before it begins at {_s(latest_ns)}"
+            )
+            failures.append(_stage_failure(stage, "stage_times", detail))
+        extra = [pair for pair in stage.allowed_contacts if set(pair) not in _pairs(table)]
+        if extra:
+            one, other = extra[0]
+            detail = f"the plan lets {one} touch {other} in stage {stage.id!r}; the task does not"
+            bodies = (one, other)
+            failures.append(_stage_failure(stage, "contact_not_allowed", detail, bodies))
+        begun[stage.id] = stage.t_start_ns
+        failures += _grasp_failures(plan, stage, tables, begun)
+    return failures
+
+
+def _grasp_failures(
+    plan: Plan, stage: Stage, tables: Mapping[str, Mapping[str, object]], begun: Mapping[str, int]
+) -> list[Failure]:
+    """A stage that carries or releases begins after the gripper has closed in the one that grasps.
+
+    Otherwise a plan could be in its last stage, with all that may touch there, from the beginning.
+    """
+    table = tables[stage.id]
+    name = table.get("release") or table.get("carry")
+    grasping = [key for key, item in tables.items() if name and item.get("grasp") == name]
+    if not grasping or stage.id in grasping:
+        return []
+    grasped_ns = begun.get(grasping[0])
+    closed = grasped_ns is not None and any(
+        waypoint.g == 1 and grasped_ns <= waypoint.t_ns <= stage.t_start_ns for waypoint in plan.tau
+    )
+    if closed:
+        return []
+    detail = (
+        f"stage {stage.id!r} begins at {_s(stage.t_start_ns)}, before the gripper has closed in "
+        f"{grasping[0]!r}"
+    )
+    return [_stage_failure(stage, "stage_order", detail)]
+
+
+def _stage_failure(stage: Stage, cause: str, detail: str, bodies: tuple[str, ...] = ()) -> Failure:
+    return Failure(t_ns=max(0, stage.t_start_ns), cause=cause, detail=detail, bodies=bodies)
+
+
+def _pairs(table: Mapping[str, object]) -> list[set[str]]:
+    pairs = table.get("allowed_contacts")
+    return [set(pair) for pair in pairs] if isinstance(pairs, list | tuple) else []
+
+
+def _s(t_ns: int) -> str:
+    return f"{t_ns * 1e-9:.2f} s"
+
+
+def limited_to_task(plan: Plan, task: Task) -> Plan:
+    """The same plan with the contacts that its task allows too, and its task's grasps and releases.
+
+    Stages that the task does not know allow nothing.
+    """
+    tables = {str(table["id"]): table for table in task.stages}
+    stages = []
+    for stage in plan.stages:
+        table = tables.get(stage.id, {})
+        pairs = tuple(pair for pair in stage.allowed_contacts if set(pair) in _pairs(table))
+        grasp, release = table.get("grasp"), table.get("release")
+        stages.append(replace(stage, allowed_contacts=pairs, grasp=grasp, release=release))
+    return replace(plan, stages=tuple(stages))
+
+
+# What the robot itself would refuse, or stop at.
+
+
+def path_limit_failures(path: JointPath, robot: RobotModel) -> list[Failure]:
+    """Find where a commanded path asks for more speed or acceleration than the robot has.
+
+    Speeds are asked between its knots, however near each other they are.
+    """
+    failures = []
+    times_s = path.times_ns * 1e-9
+    if len(times_s) > 1:
+        speeds = np.abs(np.diff(path.joints_rad, axis=0)) / np.diff(times_s)[:, None]
+        fastest = robot.velocity_limit_rad_s
+        failures += _over(path.times_ns[:-1], speeds, fastest, "joint_speed", "moves at", "rad/s")
+    if ROBOT.acceleration_rad_s2 is not None:
+        stamps, values = _accelerations(path)
+        limit = np.array(ROBOT.acceleration_rad_s2)
+        failures += _over(
+            stamps, values, limit, "joint_acceleration", "is accelerated at", "rad/s^2"
+        )
+    if ROBOT.tool_speed_m_s is not None and len(times_s) > 1:
+        places = robot.Ts_base_tcp(path.joints_rad)[:, :3, 3]
+        speeds_m_s = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times_s)
+        index = int(np.argmax(speeds_m_s))
+        if speeds_m_s[index] > ROBOT.tool_speed_m_s * _SLACK:
+            detail = (
+                f"the tool moves at {speeds_m_s[index]:.2f} m/s, the limit is "
+                f"{ROBOT.tool_speed_m_s:g} m/s"
+            )
+            t_ns = int(path.times_ns[index])
+            failures.append(Failure(t_ns=t_ns, cause="tool_speed", detail=detail))
+    return failures
+
+
+def _over(
+    times_ns: Int[np.ndarray, " num_times"],
+    values: Float[np.ndarray, "num_times num_joints"],
+    limit: Float[np.ndarray, " num_joints"],
+    cause: str,
+    verb: str,
+    unit: str,
+) -> list[Failure]:
+    """Name the first joint that is beyond its limit."""
+    over = ~(values <= limit * _SLACK)
+    if not np.any(over):
+        return []
+    index, joint = _first(over)
+    name = ARM_JOINTS[joint]
+    detail = f"{name} {verb} {values[index, joint]:.2f} {unit}, the limit is {limit[joint]:.2f}"
+    t_ns = max(0, int(times_ns[index]))
+    return [Failure(t_ns=t_ns, cause=cause, bodies=(name,), detail=f"{detail} {unit}")]
+
+
+def _first(over: Bool[np.ndarray, "num_times num_joints"]) -> tuple[int, int]:
+    """The first time at which something holds, and the first joint it holds of."""
+    index, joint = np.argwhere(over)[0].tolist()
+    return index, joint
+
+
+def _accelerations(
+    path: JointPath,
+) -> tuple[Int[np.ndarray, " num_times"], Float[np.ndarray, "num_times num_joints"]]:
+    """Second differences of the path, which is at rest before its start and after its end."""
+    window_ns = round(ACCELERATION_WINDOW_S * 1e9)
+    end_ns = path.end_ns()
+    stamps = np.arange(path.times_ns[0] - window_ns, end_ns + window_ns + 1, window_ns // 5)
+    before, here, after = (path.joints_at(stamps + k * window_ns) for k in (-1, 0, 1))
+    return stamps, np.abs(after - 2 * here + before) / ACCELERATION_WINDOW_S**2
+
+
+def simulated_limit_failures(path: JointPath, states: States) -> list[Failure]:
+    """Find where the arm would stop by itself: pressed too hard, or too far from its command.
+
+    Args:
+        path: What was commanded.
+        states: What physics made of it.
+    """
+    failures = []
+    limit_rad, limit_N = ROBOT.tracking_error_rad, ROBOT.contact_force_N
+    if limit_rad is not None:
+        off = np.abs(states.joints_rad - path.joints_at(states.stamps_ns))
+        over = ~(off <= limit_rad)
+        if np.any(over):
+            index, joint = _first(over)
+            name = ARM_JOINTS[joint]
+            detail = (
+                f"{name} is {off[index, joint]:.3f} rad from where it is commanded, the limit is "
+                f"{limit_rad:g} rad"
+            )
+            t_ns = int(states.stamps_ns[index])
+            failures.append(
+                Failure(t_ns=t_ns, cause="tracking_error", bodies=(name,), detail=detail)
+            )
+    if limit_N is not None and len(states.arm_force_N):
+        over_N = np.flatnonzero(~(states.arm_force_N <= limit_N))
+        if len(over_N):
+            index = int(over_N[0])
+            detail = (
+                f"the arm is pressed with {states.arm_force_N[index]:.0f} N, the limit is "
+                f"{limit_N:g} N"
+            )
+            t_ns = int(states.stamps_ns[index])
+            failures.append(Failure(t_ns=t_ns, cause="contact_force", detail=detail))
+    return failures
