@@ -55,6 +55,12 @@ class Outcome:
     schema_version: int = SCHEMA_VERSION
 
 
+SAME_ENGINE_KEY = "same_engine_as_cell"
+"""Among the settings of a replay whose engine moved the cell itself: shown, never counted."""
+SECOND_ENGINE_KEY = "second_engine"
+"""Among the settings of a replay beside the one that decides: shown, never counted."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Derived:
     """The ``derived`` metadata record: what the twin made this episode from."""

@@ -7,6 +7,23 @@ from typing import Any
 from bridge.task.record import check_record, parse_record
 
 SCHEMA_VERSION = 1
+STAND_IN_ENGINE = "mujoco"
+"""What moves the stand-in cell."""
+SAME_ENGINE = "same engine as the cell"
+"""What such a verdict carries among its warnings."""
+
+
+def is_same_engine(engine: str | None, *, stand_in: bool) -> bool:
+    """Whether a verdict comes, wholly or in part, from the engine that moved the cell itself.
+
+    Such a verdict agrees with what was recorded for a reason that no real cell gives: it is shown
+    and never counted.
+
+    Args:
+        engine: Of the verdict, as it names itself.
+        stand_in: Whether the recording is of the stand-in cell.
+    """
+    return stand_in and STAND_IN_ENGINE in (engine or "")
 
 
 @dataclass(frozen=True, kw_only=True)

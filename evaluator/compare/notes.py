@@ -8,7 +8,7 @@ from typing import Any
 from evaluator.compare.rows import RateGroup
 from evaluator.compare.trial import Trial
 from evaluator.result import Measurement, Table
-from evaluator.run_reader.episodes import DerivedFile
+from evaluator.run_reader.episodes import DerivedFile, why_not_counted
 
 SIGNIFICANT = 0.05
 LARGE_BIAS_PP = 5.0
@@ -140,10 +140,18 @@ def check_settings(trials: Sequence[Trial], derived: Sequence[DerivedFile]) -> l
         derived: All derived episodes of the run.
     """
     used = [file for trial in trials for file in trial.replays.values()]
-    if not used:
-        return []
-    found = chain(_scenes(used, derived), _settings(used), _tried(used, derived))
+    replays = [file for file in derived if file.derived.kind == "replay"]
+    found = list(_passed_over(replays))
+    if used:
+        may_count = [file for file in derived if not why_not_counted(file)]
+        found += [*_scenes(used, derived), *_settings(used), *_tried(used, may_count)]
     return [(ABOUT, text) for text in found]
+
+
+def _passed_over(replays: Iterable[DerivedFile]) -> Iterable[str]:
+    """Say which replays are shown and never counted, and why."""
+    for why, count in Counter(filter(None, map(why_not_counted, replays))).items():
+        yield f"{count} that never count were {why}"
 
 
 def _scenes(used: Sequence[DerivedFile], derived: Iterable[DerivedFile]) -> Iterable[str]:

@@ -13,14 +13,14 @@ from typing import Any
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.catalogue import outcome_of
-from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build
+from bridge.episode.metadata import SECOND_ENGINE_KEY, Derived, EpisodeInfo, Outcome, build
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import verdicts
 from bridge.errors import GstError
 from bridge.task.plan import SCHEMA_VERSION, Plan
 from bridge.task.record import parse_record
-from bridge.task.verdict import Verdict
+from bridge.task.verdict import SAME_ENGINE, Verdict, is_same_engine
 from evaluator.errors import EvaluatorError
 from evaluator.run_reader.inventory import RunFile
 
@@ -69,6 +69,7 @@ class VerdictSummary:
     failing_detail: str | None
     """Cause, bodies and time, to be read."""
     clauses: Clauses = ()
+    engine: str = ""
 
 
 def summarise_verdict(verdict: Verdict) -> VerdictSummary:
@@ -83,6 +84,7 @@ def summarise_verdict(verdict: Verdict) -> VerdictSummary:
         failing_cause=None if name is None else getattr(verdict, name).cause,
         failing_detail=_detail(verdict),
         clauses=clauses_of(verdict),
+        engine=verdict.engine,
     )
 
 
@@ -379,6 +381,16 @@ def read_derived(path: Path) -> DerivedFacts:
     return DerivedFacts(info=info, derived=derived)
 
 
+def why_not_counted(file: DerivedFile) -> str:
+    """Why a replay never enters a number, whatever it says; empty where it may."""
+    engine = file.derived.engine
+    if is_same_engine(engine, stand_in=file.info.stand_in):
+        return f"made in {engine}, the {SAME_ENGINE}"
+    if file.derived.settings.get(SECOND_ENGINE_KEY):
+        return f"made in {engine}, beside the engine that decides"
+    return ""
+
+
 def _is_dynamic(derived: Derived) -> bool:
     return derived.kind == "replay" and derived.mode == "dynamic"
 
@@ -401,7 +413,7 @@ class DerivedIndex:
     def replay(self, *, source: str, source_sha256: str, plan_id: str, trajectory: str) -> Replay:
         """Find the dynamic replay of a recorded episode's plan, planned or executed.
 
-        The newest file wins where several settings were tried.
+        The newest file wins where several settings were tried; what never counts is passed over.
         """
         made = self._replays.get((source, plan_id, trajectory), [])
         if not made:
@@ -414,7 +426,12 @@ class DerivedIndex:
                 "differs); replay it again"
             )
             return Replay(reason=reason)
-        file = _newest(current)
+        counted = [file for file in current if not why_not_counted(file)]
+        if not counted:
+            file = _newest(current)
+            why = f"{file.path.name} does not count: {why_not_counted(file)}"
+            return Replay(reason=why)
+        file = _newest(counted)
         decided = file.facts.verdict
         if file.facts.broken:
             return Replay(file=file, reason=f"{file.path.name}: {file.facts.broken}")

@@ -6,6 +6,7 @@ import traceback
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,7 @@ def answer(question: Question) -> Verdict:
     Raises:
         UndecidedError: When the nominal replay alone needs more steps than there may be.
     """
+    from twin.replay.agreement import in_each_engine  # noqa: PLC0415
     from twin.replay.dynamics import num_steps  # noqa: PLC0415
     from twin.replay.monte_carlo import replay_samples, with_probability  # noqa: PLC0415
     from twin.replay.path import MAX_DURATION_S  # noqa: PLC0415
@@ -105,7 +107,7 @@ def answer(question: Question) -> Verdict:
     most_samples = question.max_steps // steps - 1
 
     def judge(there: ReplayScene, settings: ReplayConfig) -> Verdict:
-        return replay_plan(plan, there, settings).verdict
+        return in_each_engine(settings, partial(replay_plan, plan, there))[0].verdict
 
     verdict = judge(scene, config)
     samples = replay_samples(

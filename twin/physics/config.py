@@ -1,8 +1,29 @@
 """Settings of the physics; imports nothing heavy."""
 
 from dataclasses import dataclass
+from importlib import util
+from typing import Literal
 
-from bridge.errors import refuse_outside
+from bridge.errors import UsageError, refuse_outside
+
+Engine = Literal["pybullet", "mujoco"]
+"""What moves rigid bodies."""
+ENGINES: tuple[Engine, ...] = ("pybullet", "mujoco")
+"""All of them; where several replay, the first decides."""
+
+
+def require_engine(engine: Engine) -> None:
+    """Refuse an engine that is not installed.
+
+    Raises:
+        UsageError: Naming the extra that installs it.
+    """
+    if engine == "mujoco" and util.find_spec(engine) is None:
+        message = (
+            "the engine mujoco is not installed. Install it: pip install 'robot-gst[mujoco]', or "
+            "choose --engine pybullet."
+        )
+        raise UsageError(message)
 
 
 @dataclass(frozen=True, kw_only=True)

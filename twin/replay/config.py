@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
-from twin.physics.config import PhysicsConfig
+from twin.physics.config import ENGINES, Engine, PhysicsConfig, require_engine
 from twin.robot.config import IkConfig
 
 FRICTIONS = ("object_friction", "finger_friction", "surface_friction")
@@ -134,6 +134,11 @@ class ReplayConfig:
     grasp: Annotated[Grasp, Parameter(name="--grasp")] = "friction"
     """What holds objects: friction between the fingers, or attach, which ties rigid objects to the
     tool at the first touch. The engine's name says attach wherever such a verdict is shown."""
+    engine: Annotated[Engine | Literal["both"], Parameter(name="--engine")] = "pybullet"
+    """What moves rigid bodies: pybullet, mujoco, or both, of which pybullet decides and mujoco is
+    reported where it says something else. Soft bodies are pybullet's alone."""
+    engines_must_agree: Annotated[bool, Parameter(name="--engines-must-agree")] = False
+    """With --engine both: where the two say something else, the verdict is undecided."""
     start_overlap_m: float = 0.006
     """Rigid objects that were localised into each other by up to this are moved apart; deeper ones
     are not evaluated [m]."""
@@ -180,14 +185,27 @@ class ReplayConfig:
     """Nominal physics."""
 
     def __post_init__(self) -> None:
-        """Refuse numbers beyond which no comparison would fail, and rates that do not fit."""
+        """Refuse numbers beyond which no comparison would fail, rates and engines that do not fit.
+
+        Raises:
+            UsageError: Also for an engine that is not installed.
+        """
         refuse_outside(self, RANGES)
+        for engine in self.engines():
+            require_engine(engine)
+        if self.engines_must_agree and self.engine != "both":
+            message = f"--engines-must-agree needs --engine both; it is {self.engine}."
+            raise UsageError(message)
         if self.sample_rate_hz < 1 or self.physics.rate_hz % self.sample_rate_hz:
             message = (
                 f"sample_rate_hz {self.sample_rate_hz} does not divide the physics rate "
                 f"{self.physics.rate_hz} Hz. Choose a divisor, for example 60."
             )
             raise UsageError(message)
+
+    def engines(self) -> tuple[Engine, ...]:
+        """What replays a trajectory, the one that decides first."""
+        return ENGINES if self.engine == "both" else (self.engine,)
 
 
 @Parameter(name="*")

@@ -1,0 +1,76 @@
+"""Whether the engines agree: one trajectory replayed in each, and their verdicts side by side."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from bridge.task.verdict import Factor, Verdict
+from twin.replay.config import ReplayConfig
+from twin.replay.result import ReplayResult
+
+_WORDS = {True: "accepted", False: "rejected", None: "undecided"}
+_DISAGREE = "engines disagree: "
+FACTORS = ("ik", "clearance", "terminal")
+
+
+def in_each_engine(
+    config: ReplayConfig, replay: Callable[[ReplayConfig], ReplayResult]
+) -> tuple[ReplayResult, ...]:
+    """Replay in each engine that is asked for; each verdict says where another one differs.
+
+    Args:
+        config: Which engines, and whether they must agree.
+        replay: Replays with settings that name one engine.
+
+    Returns:
+        The results in the order of ``config.engines()``: the first decides.
+    """
+    if config.mode == "kinematic" or config.engine != "both":
+        return (replay(config),)
+    alone = replace(config, engines_must_agree=False)
+    results = [replay(replace(alone, engine=engine)) for engine in config.engines()]
+    verdicts = compared([result.verdict for result in results], config.engines_must_agree)
+    return tuple(
+        replace(result, verdict=verdict) for result, verdict in zip(results, verdicts, strict=True)
+    )
+
+
+def compared(verdicts: Sequence[Verdict], must_agree: bool) -> list[Verdict]:
+    """Say in each verdict where the other engines say something else.
+
+    Args:
+        verdicts: On one trajectory, of different engines.
+        must_agree: A disagreement leaves all of them undecided.
+    """
+    if must_agree:
+        names = " and ".join(verdict.engine for verdict in verdicts)
+        named = [replace(verdict, engine=names) for verdict in verdicts]
+    else:
+        named = list(verdicts)
+    if len({verdict.accepted for verdict in verdicts}) == 1:
+        return named
+    said = _DISAGREE + "; ".join(_saying(verdict) for verdict in verdicts)
+    if must_agree:
+        named = [_undecided(verdict, verdicts, said) for verdict in named]
+    return [
+        replace(verdict, warnings=(*verdict.warnings, said), reason=verdict.reason or said)
+        for verdict in named
+    ]
+
+
+def disagreement_of(verdict: Verdict) -> str | None:
+    """What each engine says, where they say something else; None where they agree."""
+    return next((text for text in verdict.warnings if text.startswith(_DISAGREE)), None)
+
+
+def _saying(verdict: Verdict) -> str:
+    why = f" ({verdict.reason})" if verdict.reason and not verdict.accepted else ""
+    return f"{verdict.engine} {_WORDS[verdict.accepted]}{why}"
+
+
+def _undecided(verdict: Verdict, verdicts: Sequence[Verdict], said: str) -> Verdict:
+    """Leave open the factors on which the engines differ."""
+    factors: dict[str, Factor] = {}
+    for name in FACTORS:
+        if len({getattr(other, name).value for other in verdicts}) > 1:
+            factors[name] = Factor(value=None, detail=said)
+    return replace(verdict, **factors, reason=f"undecided: {' and '.join(factors)}: {said}")  # type: ignore[arg-type]
