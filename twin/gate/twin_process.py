@@ -107,7 +107,7 @@ def answer(question: Question) -> Verdict:
     most_samples = question.max_steps // steps - 1
 
     def judge(there: ReplayScene, settings: ReplayConfig) -> Verdict:
-        return in_each_engine(settings, partial(replay_plan, plan, there))[0].verdict
+        return in_each_engine(there.task, settings, partial(replay_plan, plan, there))[0].verdict
 
     verdict = judge(scene, config)
     samples = replay_samples(
@@ -133,6 +133,7 @@ class TwinProcess:
 
     def __init__(self, run_path: Path, task: Task, config: GateConfig, output: Output) -> None:
         """Start it; it imports what it needs while the gate connects."""
+        config.replay.refuse_soft(task.soft_objects)
         self._run_path, self._task, self._output = run_path, task, output
         self._config = replace(config.replay, mode="dynamic", samples=config.samples)
         self._max_steps = config.max_steps

@@ -11,6 +11,11 @@ Engine = Literal["pybullet", "mujoco"]
 ENGINES: tuple[Engine, ...] = ("pybullet", "mujoco")
 """All of them; where several replay, the first decides."""
 
+RIGID_ONLY = (
+    "the engine mujoco replays rigid objects only. Soft ones take --engine pybullet, beside which "
+    "they are solved by xpbd."
+)
+
 
 def require_engine(engine: Engine) -> None:
     """Refuse an engine that is not installed.

@@ -23,7 +23,7 @@ from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.robots.robot import Robot
 from twin.physics.arm import Hulls, Joints, PhysicsError, write_description
-from twin.physics.config import PhysicsConfig
+from twin.physics.config import RIGID_ONLY, PhysicsConfig
 from twin.physics.soft_world import SoftWorld
 from twin.physics.world import Box
 
@@ -44,10 +44,6 @@ _CONTACT = {"solref": (0.005, 1.0), "solimp": (0.95, 0.99, 0.0005, 0.5, 2.0)}
 _IMPRATIO = 10.0
 """Friction is held so much more stiffly than contact: what is grasped does not creep."""
 _OBJECT = "object/"
-RIGID_ONLY = (
-    "the engine mujoco replays rigid objects only; soft ones take --engine pybullet, whose soft "
-    "bodies are solved by xpbd."
-)
 _HULLS_AND_FIXED_LINKS = {
     "fusestatic": "false",
     "strippath": "false",

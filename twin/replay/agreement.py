@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
 from twin.replay.config import ReplayConfig
 from twin.replay.result import ReplayResult
@@ -13,17 +14,22 @@ FACTORS = ("ik", "clearance", "terminal")
 
 
 def in_each_engine(
-    config: ReplayConfig, replay: Callable[[ReplayConfig], ReplayResult]
+    task: Task, config: ReplayConfig, replay: Callable[[ReplayConfig], ReplayResult]
 ) -> tuple[ReplayResult, ...]:
     """Replay in each engine that is asked for; each verdict says where another one differs.
 
     Args:
+        task: What is replayed.
         config: Which engines, and whether they must agree.
         replay: Replays with settings that name one engine.
 
     Returns:
         The results in the order of ``config.engines()``: the first decides.
+
+    Raises:
+        UsageError: For soft objects in an engine that has none.
     """
+    config.refuse_soft(task.soft_objects)
     if config.mode == "kinematic" or config.engine != "both":
         return (replay(config),)
     alone = replace(config, engines_must_agree=False)

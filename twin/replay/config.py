@@ -1,13 +1,13 @@
 """Settings of replays, of what their samples vary and of comparisons; imports nothing heavy."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
-from twin.physics.config import ENGINES, Engine, PhysicsConfig, require_engine
+from twin.physics.config import ENGINES, RIGID_ONLY, Engine, PhysicsConfig, require_engine
 from twin.robot.config import IkConfig
 
 FRICTIONS = ("object_friction", "finger_friction", "surface_friction")
@@ -206,6 +206,15 @@ class ReplayConfig:
     def engines(self) -> tuple[Engine, ...]:
         """What replays a trajectory, the one that decides first."""
         return ENGINES if self.engine == "both" else (self.engine,)
+
+    def refuse_soft(self, soft_objects: Sequence[str]) -> None:
+        """Refuse soft objects in an engine that has none.
+
+        Raises:
+            UsageError: Naming them, and the engine that has them.
+        """
+        if soft_objects and self.mode == "dynamic" and "mujoco" in self.engines():
+            raise UsageError(f"{', '.join(soft_objects)} cannot be replayed: {RIGID_ONLY}")
 
 
 @Parameter(name="*")

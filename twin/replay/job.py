@@ -392,7 +392,7 @@ def _replay(job: ReplayJob) -> list[tuple[Verdict, dict[str, Any] | None]]:
     def replayed(config: ReplayConfig) -> ReplayResult:
         return _with_samples(source, config, _run(source, source.scene, config))
 
-    results = in_each_engine(job.config, replayed)
+    results = in_each_engine(source.scene.task, job.config, replayed)
     pairs = zip(job.engines(), results, strict=True)
     return [_write(source, engine, result) for engine, result in pairs]
 
