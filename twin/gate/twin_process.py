@@ -6,7 +6,6 @@ import traceback
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +106,9 @@ def answer(question: Question) -> Verdict:
     most_samples = question.max_steps // steps - 1
 
     def judge(there: ReplayScene, settings: ReplayConfig) -> Verdict:
-        return in_each_engine(there.task, settings, partial(replay_plan, plan, there))[0].verdict
+        return in_each_engine(
+            there.task, settings, lambda each: replay_plan(plan, there, each).verdict
+        )[0]
 
     verdict = judge(scene, config)
     samples = replay_samples(

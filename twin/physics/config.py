@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from importlib import util
 from typing import Literal
 
-from bridge.errors import UsageError, refuse_outside
+from bridge.errors import MissingDependencyError, refuse_outside
 
 Engine = Literal["pybullet", "mujoco"]
 """What moves rigid bodies."""
@@ -21,14 +21,10 @@ def require_engine(engine: Engine) -> None:
     """Refuse an engine that is not installed.
 
     Raises:
-        UsageError: Naming the extra that installs it.
+        MissingDependencyError: Naming the extra that installs it.
     """
     if engine == "mujoco" and util.find_spec(engine) is None:
-        message = (
-            "the engine mujoco is not installed. Install it: pip install 'robot-gst[mujoco]', or "
-            "choose --engine pybullet."
-        )
-        raise UsageError(message)
+        raise MissingDependencyError(package=engine, extra=engine, purpose=f"--engine {engine}")
 
 
 @dataclass(frozen=True, kw_only=True)

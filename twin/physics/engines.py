@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from bridge.errors import UsageError
+from bridge.errors import MissingDependencyError
 from twin.physics.arm import Hulls, Joints
 from twin.physics.config import ENGINES, Engine, PhysicsConfig, require_engine
 from twin.physics.engine import ENGINE_VERSION
@@ -117,7 +117,7 @@ def open_world(
         config: Rates, frictions and forces.
 
     Raises:
-        UsageError: When the engine is not installed.
+        MissingDependencyError: When the engine is not installed.
         PhysicsError: When it does not load the description, or joints are missing.
     """
     if engine == "pybullet":
@@ -132,7 +132,7 @@ def engine_version(engine: Engine) -> str:
     """Name an engine with its version, as verdicts carry it.
 
     Raises:
-        UsageError: When it is not installed.
+        MissingDependencyError: When it is not installed.
     """
     if engine == "pybullet":
         return ENGINE_VERSION
@@ -144,7 +144,7 @@ def installed_versions() -> str:
     """All engines that are installed, with their versions."""
     found = []
     for engine in ENGINES:
-        with suppress(UsageError):
+        with suppress(MissingDependencyError):
             found.append(engine_version(engine))
     return ", ".join(found)
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
 from twin.replay.config import ReplayConfig
-from twin.replay.result import ReplayResult
 
 _WORDS = {True: "accepted", False: "rejected", None: "undecided"}
 _DISAGREE = "engines disagree: "
@@ -14,33 +13,30 @@ FACTORS = ("ik", "clearance", "terminal")
 
 
 def in_each_engine(
-    task: Task, config: ReplayConfig, replay: Callable[[ReplayConfig], ReplayResult]
-) -> tuple[ReplayResult, ...]:
-    """Replay in each engine that is asked for; each verdict says where another one differs.
+    task: Task, config: ReplayConfig, judge: Callable[[ReplayConfig], Verdict]
+) -> list[Verdict]:
+    """Judge in each engine that is asked for; each verdict says where another one differs.
 
     Args:
         task: What is replayed.
         config: Which engines, and whether they must agree.
-        replay: Replays with settings that name one engine.
+        judge: Replays with settings that name one engine.
 
     Returns:
-        The results in the order of ``config.engines()``: the first decides.
+        Verdicts in the order of ``config.engines()``: the first decides.
 
     Raises:
         UsageError: For soft objects in an engine that has none.
     """
     config.refuse_soft(task.soft_objects)
     if config.mode == "kinematic" or config.engine != "both":
-        return (replay(config),)
+        return [judge(config)]
     alone = replace(config, engines_must_agree=False)
-    results = [replay(replace(alone, engine=engine)) for engine in config.engines()]
-    verdicts = compared([result.verdict for result in results], config.engines_must_agree)
-    return tuple(
-        replace(result, verdict=verdict) for result, verdict in zip(results, verdicts, strict=True)
-    )
+    verdicts = [judge(replace(alone, engine=engine)) for engine in config.engines()]
+    return compared(verdicts, must_agree=config.engines_must_agree)
 
 
-def compared(verdicts: Sequence[Verdict], must_agree: bool) -> list[Verdict]:
+def compared(verdicts: Sequence[Verdict], *, must_agree: bool) -> list[Verdict]:
     """Say in each verdict where the other engines say something else.
 
     Args:

@@ -188,7 +188,8 @@ class ReplayConfig:
         """Refuse numbers beyond which no comparison would fail, rates and engines that do not fit.
 
         Raises:
-            UsageError: Also for an engine that is not installed.
+            UsageError: Saying what does not fit.
+            MissingDependencyError: When an engine is not installed.
         """
         refuse_outside(self, RANGES)
         for engine in self.engines():

@@ -60,9 +60,6 @@ REPLAY_VERSION = 19
 MAY_STAY_OPEN = ("settled", "shape")
 """Predicates that a recording without an answer to them may succeed without."""
 
-_ALONE: dict[str, Any] = {"engines_must_agree": False}
-"""What the settings of one engine of several have not."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayJob:
@@ -170,8 +167,8 @@ class ReplayJob:
         }
 
     def _engine_names(self) -> list[str]:
-        task = load_task(self.task)
-        return [engine_of(task, replace(self.config, **_ALONE, engine=e)) for e in self.engines()]
+        task, config = load_task(self.task), replace(self.config, engines_must_agree=False)
+        return [engine_of(task, replace(config, engine=engine)) for engine in self.engines()]
 
     def _sampled_from(self) -> dict[str, Any]:
         if not self.config.samples:
@@ -389,12 +386,17 @@ def _replay(job: ReplayJob) -> list[tuple[Verdict, dict[str, Any] | None]]:
     """Replay in each engine and write an episode for each: verdicts, and where they diverge."""
     source = _open(job)
 
-    def replayed(config: ReplayConfig) -> ReplayResult:
-        return _with_samples(source, config, _run(source, source.scene, config))
+    results: list[ReplayResult] = []
 
-    results = in_each_engine(source.scene.task, job.config, replayed)
-    pairs = zip(job.engines(), results, strict=True)
-    return [_write(source, engine, result) for engine, result in pairs]
+    def judge(config: ReplayConfig) -> Verdict:
+        results.append(_with_samples(source, config, _run(source, source.scene, config)))
+        return results[-1].verdict
+
+    verdicts = in_each_engine(source.scene.task, job.config, judge)
+    return [
+        _write(source, engine, replace(result, verdict=verdict))
+        for engine, result, verdict in zip(job.engines(), results, verdicts, strict=True)
+    ]
 
 
 def _write(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from cells import ENGINES, HOME, URDF, at, cell, poses
 
-from bridge.errors import UsageError
+from bridge.errors import MissingDependencyError, UsageError
 from bridge.geometry import se3
 from twin.physics.arm import PhysicsError
 from twin.physics.config import PhysicsConfig, require_engine
@@ -19,8 +19,10 @@ from twin.physics.engines import (
     DrivenRobot,
     PhysicsWorld,
     engine_version,
+    installed_versions,
     open_world,
 )
+from twin.replay.config import ReplayConfig
 
 CUBE = np.array([0.04, 0.04, 0.04])
 each_engine = pytest.mark.parametrize("engine", ENGINES)
@@ -212,10 +214,11 @@ def test_an_engine_that_is_not_installed_is_named_with_its_extra(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(util, "find_spec", lambda name: None)
-    with pytest.raises(UsageError, match=r"robot-gst\[mujoco\]"):
+    with pytest.raises(MissingDependencyError, match=r"robot-gst\[mujoco\]"):
         open_world("mujoco", URDF, {}, PhysicsConfig())
-    with pytest.raises(UsageError, match="--engine pybullet"):
-        engine_version("mujoco")
+    with pytest.raises(MissingDependencyError, match="--engine mujoco needs it"):
+        ReplayConfig(engine="both")
+    assert installed_versions() == engine_version("pybullet")
     require_engine("pybullet")
 
 
