@@ -50,11 +50,11 @@ def compared(verdicts: Sequence[Verdict], *, must_agree: bool) -> list[Verdict]:
         named = list(verdicts)
     if len({verdict.accepted for verdict in verdicts}) == 1:
         return named
-    said = _DISAGREE + "; ".join(_saying(verdict) for verdict in verdicts)
+    answers = _DISAGREE + "; ".join(_saying(verdict) for verdict in verdicts)
     if must_agree:
-        named = [_undecided(verdict, verdicts, said) for verdict in named]
+        named = [_undecided(verdict, verdicts, answers) for verdict in named]
     return [
-        replace(verdict, warnings=(*verdict.warnings, said), reason=verdict.reason or said)
+        replace(verdict, warnings=(*verdict.warnings, answers), reason=verdict.reason or answers)
         for verdict in named
     ]
 
@@ -69,10 +69,10 @@ def _saying(verdict: Verdict) -> str:
     return f"{verdict.engine} {_WORDS[verdict.accepted]}{why}"
 
 
-def _undecided(verdict: Verdict, verdicts: Sequence[Verdict], said: str) -> Verdict:
+def _undecided(verdict: Verdict, verdicts: Sequence[Verdict], answers: str) -> Verdict:
     """Leave open the factors on which the engines differ."""
     factors: dict[str, Factor] = {}
     for name in FACTORS:
         if len({getattr(other, name).value for other in verdicts}) > 1:
-            factors[name] = Factor(value=None, detail=said)
-    return replace(verdict, **factors, reason=f"undecided: {' and '.join(factors)}: {said}")  # type: ignore[arg-type]
+            factors[name] = Factor(value=None, detail=answers)
+    return replace(verdict, **factors, reason=f"undecided: {' and '.join(factors)}: {answers}")  # type: ignore[arg-type]

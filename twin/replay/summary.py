@@ -157,13 +157,13 @@ def describe_run(summary: Mapping[str, Any]) -> str:
 def _engine_lines(rows: Rows) -> list[str]:
     """Where several engines were asked: how often they agree, and what each says where not."""
     asked = [row for row in rows if len(row.get("engines") or ()) > 1 and not row["error"]]
-    apart = [row for row in asked if row["engines_disagree"]]
+    differing = [row for row in asked if row["engines_disagree"]]
     lines = []
     if asked:
-        lines += ["", f"engines agree on {len(asked) - len(apart)} of {len(asked)} replays"]
+        lines += ["", f"engines agree on {len(asked) - len(differing)} of {len(asked)} replays"]
     lines += [
         f"  {row['episode']} {row['plan']} {row['trajectory']}: {row['engines_disagree']}"
-        for row in apart
+        for row in differing
     ]
     if any(SAME_ENGINE in row.get("warnings", ()) for row in rows):
         lines += ["", f"{SAME_ENGINE}: these verdicts are shown and never counted by evaluate"]

@@ -145,7 +145,7 @@ def test_a_box_flips_about_its_middle_axis_when_euler_says(engine: str) -> None:
     energy, momentum = _spin(rows, size, mass_kg)
     about_middle = np.einsum("ni,ni->n", rotations(rows)[:-1, :, 1], momentum)
     flips_s = np.flatnonzero(np.diff(np.sign(about_middle))) / RATE_HZ
-    np.testing.assert_allclose(flips_s[:1], _first_flip_s(size, mass_kg, omega), rtol=0.02)
+    np.testing.assert_allclose(flips_s[:1], _first_flip_s(size, mass_kg, omega), rtol=5e-3)
     # Of first order: 3 and 1.5 % of the energy, 1.5 and 0.8 % of the momentum with the flip.
     assert np.abs(energy / energy[0] - 1).max() < 0.045
     drift = np.linalg.norm(momentum - momentum[0], axis=1) / np.linalg.norm(momentum[0])
