@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bridge.episode.catalogue import outcome_of
-from bridge.episode.metadata import Outcome
+from bridge.episode.metadata import Outcome, why_not_counted
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import JointTrack
@@ -404,8 +404,8 @@ def _read_replays(
 ) -> tuple[Recording, ...]:
     """Read the replays of a recording in the order in which they were made.
 
-    Replays of other bytes than the file holds now come first. Of several replays of one trajectory
-    the last counts, as in the evaluator.
+    Replays that never count, and those of other bytes than the file holds now, come first. Of
+    several replays of one trajectory the last counts, as in the evaluator.
     """
     found = []
     for path in sorted(paths, key=lambda path: (path.stat().st_mtime_ns, path.name)):
@@ -413,8 +413,15 @@ def _read_replays(
         if replay is not None:
             found.append(replay)
             problems.texts.extend(replay.problems)
-    found.sort(key=lambda r: r.derived is not None and r.derived.source_sha256 == recording.sha256)
+    found.sort(key=lambda replay: _may_count(replay, recording))
     return tuple(found)
+
+
+def _may_count(replay: Recording, recording: Recording) -> bool:
+    made = replay.derived
+    if made is None or made.source_sha256 != recording.sha256:
+        return False
+    return not why_not_counted(made, stand_in=recording.info.stand_in)
 
 
 def _trajectory_of(replay: Recording) -> tuple[str | None, ...]:

@@ -8,7 +8,7 @@ from typing import Any
 from evaluator.compare.rows import RateGroup
 from evaluator.compare.trial import Trial
 from evaluator.result import Measurement, Table
-from evaluator.run_reader.episodes import DerivedFile, why_not_counted
+from evaluator.run_reader.episodes import DerivedFile
 
 SIGNIFICANT = 0.05
 LARGE_BIAS_PP = 5.0
@@ -143,15 +143,16 @@ def check_settings(trials: Sequence[Trial], derived: Sequence[DerivedFile]) -> l
     replays = [file for file in derived if file.derived.kind == "replay"]
     found = list(_passed_over(replays))
     if used:
-        may_count = [file for file in derived if not why_not_counted(file)]
+        may_count = [file for file in derived if not file.why_not_counted]
         found += [*_scenes(used, derived), *_settings(used), *_tried(used, may_count)]
     return [(ABOUT, text) for text in found]
 
 
 def _passed_over(replays: Iterable[DerivedFile]) -> Iterable[str]:
     """Say which replays are shown and never counted, and why."""
-    for why, count in Counter(filter(None, map(why_not_counted, replays))).items():
-        yield f"{count} that never count were {why}"
+    for why, count in Counter(file.why_not_counted for file in replays).items():
+        if why:
+            yield f"{count} that never count were {why}"
 
 
 def _scenes(used: Sequence[DerivedFile], derived: Iterable[DerivedFile]) -> Iterable[str]:

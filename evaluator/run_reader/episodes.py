@@ -13,14 +13,14 @@ from typing import Any
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.catalogue import outcome_of
-from bridge.episode.metadata import SECOND_ENGINE_KEY, Derived, EpisodeInfo, Outcome, build
+from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, why_not_counted
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import verdicts
 from bridge.errors import GstError
 from bridge.task.plan import SCHEMA_VERSION, Plan
 from bridge.task.record import parse_record
-from bridge.task.verdict import SAME_ENGINE, Verdict, is_same_engine
+from bridge.task.verdict import Verdict
 from evaluator.errors import EvaluatorError
 from evaluator.run_reader.inventory import RunFile
 
@@ -326,6 +326,11 @@ class DerivedFile:
         return self.facts.derived
 
     @property
+    def why_not_counted(self) -> str:
+        """Why it never enters a number, whatever it says; empty where it may."""
+        return why_not_counted(self.derived, stand_in=self.info.stand_in)
+
+    @property
     def episode(self) -> Episode:
         """Open it; nothing is held open, so whoever asks twice opens it twice.
 
@@ -381,16 +386,6 @@ def read_derived(path: Path) -> DerivedFacts:
     return DerivedFacts(info=info, derived=derived)
 
 
-def why_not_counted(file: DerivedFile) -> str:
-    """Why a replay never enters a number, whatever it says; empty where it may."""
-    engine = file.derived.engine
-    if is_same_engine(engine, stand_in=file.info.stand_in):
-        return f"made in {engine}, the {SAME_ENGINE}"
-    if file.derived.settings.get(SECOND_ENGINE_KEY):
-        return f"made in {engine}, beside the engine that decides"
-    return ""
-
-
 def _is_dynamic(derived: Derived) -> bool:
     return derived.kind == "replay" and derived.mode == "dynamic"
 
@@ -426,10 +421,10 @@ class DerivedIndex:
                 "differs); replay it again"
             )
             return Replay(reason=reason)
-        counted = [file for file in current if not why_not_counted(file)]
+        counted = [file for file in current if not file.why_not_counted]
         if not counted:
             file = _newest(current)
-            why = f"{file.path.name} does not count: {why_not_counted(file)}"
+            why = f"{file.path.name} does not count: {file.why_not_counted}"
             return Replay(reason=why)
         file = _newest(counted)
         decided = file.facts.verdict

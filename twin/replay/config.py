@@ -134,7 +134,9 @@ class ReplayConfig:
     grasp: Annotated[Grasp, Parameter(name="--grasp")] = "friction"
     """What holds objects: friction between the fingers, or attach, which ties rigid objects to the
     tool at the first touch. The engine's name says attach wherever such a verdict is shown."""
-    engine: Annotated[Engine | Literal["both"], Parameter(name="--engine")] = "pybullet"
+    engine: Annotated[Literal["pybullet", "mujoco", "both"], Parameter(name="--engine")] = (
+        "pybullet"
+    )
     """What moves rigid bodies: pybullet, mujoco, or both, of which pybullet decides and mujoco is
     reported where it says something else. Soft bodies are pybullet's alone."""
     engines_must_agree: Annotated[bool, Parameter(name="--engines-must-agree")] = False
