@@ -305,7 +305,8 @@ class VerdictView:
     file: str
     of_sent_plan: bool
     counts: bool
-    """False for a replay that was redone since, with other settings or in another scene."""
+    """False for a replay that was redone since, with other settings or in another scene, and for
+    one in an engine that never counts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -417,11 +418,15 @@ def _read_replays(
     return tuple(found)
 
 
+def _why_never(replay: Recording, recording: Recording) -> str:
+    made = replay.derived
+    return "" if made is None else why_not_counted(made, stand_in=recording.info.stand_in)
+
+
 def _may_count(replay: Recording, recording: Recording) -> bool:
     made = replay.derived
-    if made is None or made.source_sha256 != recording.sha256:
-        return False
-    return not why_not_counted(made, stand_in=recording.info.stand_in)
+    is_current = made is not None and made.source_sha256 == recording.sha256
+    return is_current and not _why_never(replay, recording)
 
 
 def _trajectory_of(replay: Recording) -> tuple[str | None, ...]:
@@ -451,10 +456,11 @@ def _verdicts(
         views.append(_view(title, "recorded", verdict, recording, sent_id, clock))
     last = {_trajectory_of(replay): replay for replay in replays}
     for replay in replays:
-        counts = last[_trajectory_of(replay)] is replay
+        never = _why_never(replay, recording)
+        counts = last[_trajectory_of(replay)] is replay and not never
         for _, verdict in replay.verdicts:
             title = f"{verdict.trajectory.capitalize()} in the twin"
-            subtitle = verdict.mode if counts else f"{verdict.mode}, redone since"
+            subtitle = verdict.mode if counts else f"{verdict.mode}, {never or 'redone since'}"
             views.append(_view(title, subtitle, verdict, replay, sent_id, clock, counts=counts))
     order = {"Planned in the twin": 1, "Executed in the twin": 2}
     views.sort(key=lambda view: (not view.of_sent_plan, not view.counts, order.get(view.title, 0)))
