@@ -27,8 +27,9 @@ from twin.physics.config import RIGID_ONLY, PhysicsConfig
 from twin.physics.soft_world import SoftWorld
 from twin.physics.world import Box
 
-SUBSTEPS = 2
-"""Steps of the engine in each period of control."""
+STEP_HZ = 480
+"""The engine takes whole steps in each period of control, at least so many a second: at fewer the
+motors shake."""
 LINK_FRICTION = 0.5
 """Of links other than fingers; what PyBullet gives to links without a coefficient."""
 _ARM_RAD_S = 100.0
@@ -250,7 +251,8 @@ class MujocoWorld:
         )
         self._spec = _robot_spec(urdf, hulls).copy()
         option = self._spec.option
-        option.timestep = 1.0 / (config.rate_hz * SUBSTEPS)
+        self._num_steps = -(-STEP_HZ // config.rate_hz)
+        option.timestep = 1.0 / (config.rate_hz * self._num_steps)
         option.gravity = [0.0, 0.0, -config.gravity_m_s2]
         option.integrator = mujoco.mjtIntegrator.mjINT_EULER
         option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -371,7 +373,7 @@ class MujocoWorld:
         """Advance by one control period."""
         if self._changed:
             self._compile()
-        for left in reversed(range(SUBSTEPS)):
+        for left in reversed(range(self._num_steps)):
             mujoco.mj_step1(self._model, self._data)
             self.robot.drive(left * float(self._model.opt.timestep))
             mujoco.mj_step2(self._model, self._data)

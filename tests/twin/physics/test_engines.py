@@ -118,6 +118,21 @@ def test_fingers_close_on_a_cube_hold_it_and_let_it_go(engine: str) -> None:
         assert world.T_base_object("cube")[2, 3] < T_tcp[2, 3] - 0.2
 
 
+@pytest.mark.parametrize("rate_hz", [60, 100, 240, 1000])
+def test_mujoco_grips_at_any_rate_of_control(rate_hz: int) -> None:
+    with cell("mujoco", rate_hz=rate_hz) as world:
+        world.reset_robot(HOME, 0.041)
+        world.add_free("cube", CUBE, 0.05, world.robot.T_base_link("tcp"))
+        for _ in range(rate_hz):
+            world.robot.command(HOME, np.zeros(6), 0.0)
+            world.step()
+        joints, width_m = world.robot.posture()
+        fallen = world.robot.T_base_link("tcp")[2, 3] - world.T_base_object("cube")[2, 3]
+    assert abs(fallen) < 4e-3
+    assert width_m == pytest.approx(0.04, abs=1e-3)
+    np.testing.assert_allclose(joints, HOME, atol=1e-3)
+
+
 @each_engine
 @pytest.mark.parametrize(("mass_kg", "holds"), [(1.7, True), (2.3, False)])
 def test_a_grip_holds_what_coulomb_says(engine: str, mass_kg: float, holds: bool) -> None:
