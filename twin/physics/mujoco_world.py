@@ -257,7 +257,8 @@ class MujocoWorld:
         option.integrator = mujoco.mjtIntegrator.mjINT_EULER
         option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         option.impratio = _IMPRATIO
-        self.robot = MujocoArm(self._spec, ROBOT, config)
+        self._record = ROBOT
+        self.robot = MujocoArm(self._spec, self._record, config)
         self.free_objects: list[str] = []
         self._shapes: list[_Shape] = []
         self._finger_shapes: set[str] = set()
@@ -276,13 +277,13 @@ class MujocoWorld:
 
     def _add_robot_shapes(self) -> None:
         for body in self._spec.bodies:
-            finger = body.name in ROBOT.gripper.finger_links
+            finger = body.name in self._record.gripper.finger_links
             mu = self.config.finger_friction if finger else LINK_FRICTION
             for index, geom in enumerate(body.geoms):
                 geom.name = f"{body.name}/{index}"
                 # Only explicit pairs have the product of two coefficients; nothing else meets.
                 geom.contype = geom.conaffinity = 0
-                on_table = body.name in (ROBOT.base_frame, "world")
+                on_table = body.name in (self._record.base_frame, "world")
                 self._shapes.append(
                     _Shape(name=geom.name, friction=mu, owner="robot", on_table=on_table)
                 )
@@ -328,7 +329,7 @@ class MujocoWorld:
             name=name,
             type=mujoco.mjtEq.mjEQ_WELD,
             objtype=mujoco.mjtObj.mjOBJ_BODY,
-            name1=ROBOT.tool_frame,
+            name1=self._record.tool_frame,
             name2=name,
             active=False,
         )
@@ -410,10 +411,9 @@ class MujocoWorld:
 
     def tie(self, object_id: str) -> None:
         """Fix a rigid object to the tool where it is."""
-        T_tcp_object = se3.invert(self.robot.T_base_link(ROBOT.tool_frame)) @ self.T_base_object(
-            object_id
-        )
-        q, p = se3.split(T_tcp_object)
+        T_base_tool = self.robot.T_base_link(self._record.tool_frame)
+        T_tool_object = se3.invert(T_base_tool) @ self.T_base_object(object_id)
+        q, p = se3.split(T_tool_object)
         weld = self._model.equality(_OBJECT + object_id).id
         # Anchor at the object's centre; turning counts a metre for a radian.
         self._model.eq_data[weld] = np.concatenate([np.zeros(3), p, q, [1.0], np.zeros(1)])
