@@ -1,4 +1,4 @@
-"""Rigid replay: physics alone and complete, and how far a held cube slips, at one fixed setting.
+"""Rigid replay in each engine: physics alone and complete, and how far a held cube slips.
 
 24 randomised grasps of a 30 mm to 40 mm cube (pose, mass, friction, force). The trajectory comes
 from waypoints without joints, so inverse kinematics is solved; clearance is measured 60 times per
@@ -14,13 +14,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from measure import ROOT, Target, report_targets
 
 GRASPS = int(os.environ.get("GST_BENCH_GRASPS", "24"))
+ENGINES = ("pybullet", "mujoco")
 REPEATS = int(os.environ.get("GST_BENCH_REPEATS", "100"))
 NOTE = (
     f"{GRASPS} randomised grasps, 12 s trajectories, one core, CPU time; slip of the cube in the "
@@ -106,13 +107,13 @@ def complete(scene: object, plan: object, config: object, folder: Path) -> tuple
     return time.process_time() - start, result
 
 
-def digest(repeats: int) -> str:
+def digest(engine: str, repeats: int) -> str:
     """Hash of one replay, which is the same each time, or the hashes that differ."""
     from twin.replay.verdict import replay_plan
 
     rng = np.random.default_rng(0)
     scene, plan, config = randomised(rng)
-    short = replace(config, settle_after_s=0.1)
+    short = replace(config, settle_after_s=0.1, engine=engine)
     found = set()
     for _ in range(repeats):
         result = replay_plan(plan, scene, short)
@@ -122,51 +123,81 @@ def digest(repeats: int) -> str:
     return " ".join(sorted(found))
 
 
-def other_process() -> str:
+def other_process(engine: str) -> str:
     """The hash that a fresh process finds."""
-    command = [sys.executable, __file__, "--digest"]
+    command = [sys.executable, __file__, "--digest", engine]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return done.stdout.strip()
 
 
+@dataclass
+class Measured:
+    """Of one engine, a value for each grasp."""
+
+    alone: list[float] = field(default_factory=list)
+    """Physics, times real time."""
+    whole: list[float] = field(default_factory=list)
+    """The complete replay, times real time."""
+    slips_mm: list[float] = field(default_factory=list)
+    ends_m: list[object] = field(default_factory=list)
+    """Where the cube lies in the end."""
+    placed: int = 0
+
+    def targets(self, engine: str) -> list[Target]:
+        """What it must reach."""
+        same = digest(engine, REPEATS)
+        held = float(np.isfinite(self.slips_mm).sum())
+        slip = f"median {np.median(self.slips_mm):.2f}"
+        return [
+            Target(what=f"{engine}: physics only, median", measured=float(np.median(self.alone)),
+                   limit=30.0, unit="x", at_most=False, reference=f"slowest {min(self.alone):.1f}"),
+            Target(what=f"{engine}: complete, median", measured=float(np.median(self.whole)),
+                   limit=15.0, unit="x", at_most=False, reference=f"slowest {min(self.whole):.1f}"),
+            Target(what=f"{engine}: slip, 90 % below", limit=2.0, unit="mm", reference=slip,
+                   measured=float(np.percentile(self.slips_mm, 90))),
+            Target(what=f"{engine}: held", measured=held, limit=GRASPS, at_most=False),
+            Target(what=f"{engine}: placed", measured=self.placed, limit=GRASPS, at_most=False),
+            Target(what=f"{engine}: different bytes in {REPEATS} repeats",
+                   measured=len(same.split()) - 1, limit=0),
+            Target(what=f"{engine}: another process gives other bytes",
+                   measured=float(other_process(engine) != same), limit=0),
+        ]  # fmt: skip
+
+
 def main() -> None:
-    """Measure all grasps, then repeat one."""
-    alone, whole, slips, held, placed = [], [], [], 0, 0
+    """Measure all grasps in both engines, then repeat one."""
+    found = {engine: Measured() for engine in ENGINES}
     with tempfile.TemporaryDirectory() as folder:
         for seed in range(GRASPS + 1):
             scene, plan, config = randomised(np.random.default_rng(seed))
-            seconds, lasted = physics_alone(scene, plan, config)
-            total, result = complete(scene, plan, config, Path(folder))
-            if seed == 0:
-                continue  # what is built once per process
-            alone.append(lasted / seconds)
-            whole.append(lasted / total)
-            slips.append(slip_m(result) * 1e3)
-            held += bool(np.isfinite(slips[-1]))
-            placed += result.verdict.terminal.value is True
-    same = digest(REPEATS)
-    physics = config.physics
-    rows = [
-        Target(what="physics only, median", measured=float(np.median(alone)), limit=30.0,
-               unit="x", at_most=False, reference=f"slowest {min(alone):.1f}"),
-        Target(what="complete, median", measured=float(np.median(whole)), limit=15.0, unit="x",
-               at_most=False, reference=f"slowest {min(whole):.1f}"),
-        Target(what="slip, 90 % below", measured=float(np.percentile(slips, 90)), limit=2.0,
-               unit="mm", reference=f"median {np.median(slips):.2f}"),
-        Target(what="held", measured=float(held), limit=GRASPS, at_most=False),
-        Target(what="placed", measured=float(placed), limit=GRASPS, at_most=False),
-        Target(what=f"different bytes in {REPEATS} repeats", measured=len(same.split()) - 1,
-               limit=0),
-        Target(what="another process gives other bytes", measured=float(other_process() != same),
-               limit=0),
+            for engine, of_engine in found.items():
+                settings = replace(config, engine=engine)
+                seconds, lasted = physics_alone(scene, plan, settings)
+                total, result = complete(scene, plan, settings, Path(folder))
+                if seed == 0:
+                    continue  # what is built once per process
+                of_engine.alone.append(lasted / seconds)
+                of_engine.whole.append(lasted / total)
+                of_engine.slips_mm.append(slip_m(result) * 1e3)
+                of_engine.ends_m.append(result.Ts_base_object["cube"][-1, :3, 3])
+                of_engine.placed += result.verdict.terminal.value is True
+    rows = [target for engine in ENGINES for target in found[engine].targets(engine)]
+    first, second = (np.array(found[engine].ends_m) for engine in ENGINES)
+    apart_mm = np.linalg.norm(first - second, axis=1) * 1e3
+    ratios = np.array(found["mujoco"].whole) / np.array(found["pybullet"].whole)
+    rows += [
+        Target(what="final place, one engine from the other, median", unit="mm", limit=10.0,
+               measured=float(np.median(apart_mm)), reference=f"largest {apart_mm.max():.1f}"),
+        Target(what="mujoco against pybullet, complete, median ratio of speeds", unit="x",
+               measured=float(np.median(ratios)), limit=15.0 / 55.0, at_most=False),
     ]  # fmt: skip
-    setting = {"rate_hz": physics.rate_hz, "solver_iterations": physics.solver_iterations}
+    setting = {"rate_hz": config.physics.rate_hz, "iterations": config.physics.solver_iterations}
     report_targets("replay_rigid", rows, note=NOTE, setting=setting)
 
 
 if __name__ == "__main__":
     sys.path.insert(0, str(ROOT / "tests" / "twin" / "replay"))
-    if sys.argv[1:] == ["--digest"]:
-        print(digest(1))
+    if sys.argv[1:2] == ["--digest"]:
+        print(digest(sys.argv[2], 1))
     else:
         main()

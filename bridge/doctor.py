@@ -41,6 +41,7 @@ EXTRAS = {
     "video": Extra("video streams, LeRobot videos", ("av",), is_optional=True),
     "realsense": Extra("RealSense cameras", ("pyrealsense2",), is_optional=True),
     "ur": Extra("the UR arm's model", ("example-robot-data",), is_optional=True),
+    "mujoco": Extra("replay --engine mujoco or both", ("mujoco",), is_optional=True),
     "twin": Extra("what needs torch in the twin", ("python-fcl", "torch"), is_optional=True),
     "foundation": Extra(
         "SAM 3, DINOv3, CLIP from folders of weights",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bridge.episode.catalogue import outcome_of
-from bridge.episode.metadata import Outcome
+from bridge.episode.metadata import Outcome, why_not_counted
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import JointTrack
@@ -325,7 +325,8 @@ class VerdictView:
     file: str
     of_sent_plan: bool
     counts: bool
-    """False for a replay that was redone since, with other settings or in another scene."""
+    """False for a replay that was redone since, with other settings or in another scene, and for
+    one in an engine that never counts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -430,8 +431,8 @@ def _read_replays(
 ) -> tuple[Recording, ...]:
     """Read the replays of a recording in the order in which they were made.
 
-    Replays of other bytes than the file holds now come first. Of several replays of one trajectory
-    the last counts, as in the evaluator.
+    Replays that never count, and those of other bytes than the file holds now, come first. Of
+    several replays of one trajectory the last counts, as in the evaluator.
     """
     found = []
     for path in sorted(paths, key=lambda path: (path.stat().st_mtime_ns, path.name)):
@@ -439,8 +440,19 @@ def _read_replays(
         if replay is not None:
             found.append(replay)
             problems.texts.extend(replay.problems)
-    found.sort(key=lambda r: r.derived is not None and r.derived.source_sha256 == recording.sha256)
+    found.sort(key=lambda replay: _may_count(replay, recording))
     return tuple(found)
+
+
+def _why_never(replay: Recording, recording: Recording) -> str:
+    made = replay.derived
+    return "" if made is None else why_not_counted(made, stand_in=recording.info.stand_in)
+
+
+def _may_count(replay: Recording, recording: Recording) -> bool:
+    made = replay.derived
+    is_current = made is not None and made.source_sha256 == recording.sha256
+    return is_current and not _why_never(replay, recording)
 
 
 def _trajectory_of(replay: Recording) -> tuple[str | None, ...]:
@@ -470,10 +482,11 @@ def _verdicts(
         views.append(_view(title, "recorded", verdict, recording, sent_id, clock))
     last = {_trajectory_of(replay): replay for replay in replays}
     for replay in replays:
-        counts = last[_trajectory_of(replay)] is replay
+        never = _why_never(replay, recording)
+        counts = last[_trajectory_of(replay)] is replay and not never
         for _, verdict in replay.verdicts:
             title = f"{verdict.trajectory.capitalize()} in the twin"
-            subtitle = verdict.mode if counts else f"{verdict.mode}, redone since"
+            subtitle = verdict.mode if counts else f"{verdict.mode}, {never or 'redone since'}"
             views.append(_view(title, subtitle, verdict, replay, sent_id, clock, counts=counts))
     order = {"Planned in the twin": 1, "Executed in the twin": 2}
     views.sort(key=lambda view: (not view.of_sent_plan, not view.counts, order.get(view.title, 0)))

@@ -18,7 +18,7 @@ from jaxtyping import Int
 
 from bridge.episode import streams
 from bridge.episode.catalogue import outcome_of
-from bridge.episode.metadata import Outcome
+from bridge.episode.metadata import Outcome, why_not_counted
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
@@ -365,6 +365,8 @@ def _replays(
         prefix = f"replayed/{derived.trajectory}/{derived.mode}"
         if derived.plan_id != last_plan:
             prefix += f"_of_{re.sub(NOT_IN_A_PATH, '_', str(derived.plan_id))}"
+        if why_not_counted(derived, stand_in=recording.info.stand_in):
+            prefix += f"_in_{re.sub(NOT_IN_A_PATH, '_', str(derived.engine))}"
         place = _placer(clock, replay)
         if prefix in taken:
             file.note(f"{path.name} is not shown: there is a newer one")

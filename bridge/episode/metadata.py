@@ -11,6 +11,8 @@ from functools import cache
 from types import UnionType
 from typing import Any, NamedTuple, TypeVar, get_origin
 
+from bridge.task.verdict import SAME_ENGINE, is_same_engine
+
 SCHEMA_VERSION = 1
 KINDS = ("scan", "trial", "probe", "imported")
 WITHOUT, WITH = "without_replanning", "with_replanning"
@@ -57,6 +59,12 @@ class Outcome:
     schema_version: int = SCHEMA_VERSION
 
 
+SAME_ENGINE_KEY = "same_engine_as_cell"
+"""Among the settings of a replay whose engine moved the cell itself: shown, never counted."""
+SECOND_ENGINE_KEY = "second_engine"
+"""Among the settings of a replay beside the one that decides: shown, never counted."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Derived:
     """The ``derived`` metadata record: what the twin made this episode from."""
@@ -75,6 +83,20 @@ class Derived:
     seed: int | None = None
     calibration_id: str | None = None
     settings: dict[str, Any] = field(default_factory=dict)
+
+
+def why_not_counted(derived: Derived, *, stand_in: bool) -> str:
+    """Why a replay never enters a number, whatever it says; empty where it may.
+
+    Args:
+        derived: What it was made from, and how.
+        stand_in: Whether that is a recording of the stand-in cell.
+    """
+    if is_same_engine(derived.engine, stand_in=stand_in):
+        return f"made in {derived.engine}, the {SAME_ENGINE}"
+    if derived.settings.get(SECOND_ENGINE_KEY):
+        return f"made in {derived.engine}, beside the engine that decides"
+    return ""
 
 
 Record = TypeVar("Record")

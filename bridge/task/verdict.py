@@ -11,6 +11,23 @@ SCHEMA_VERSION = 1
 CHECKS = ("start", "task", "limits", "audit")
 """Factors beside the three of I(tau), docs/gate.md: the plan starts where the robot is; it asks for
 no more than its task; the robot may do it; an independent library finds no less distance."""
+STAND_IN_ENGINE = "mujoco"
+"""What moves the stand-in cell."""
+SAME_ENGINE = "same engine as the cell"
+"""What such a verdict carries among its warnings."""
+
+
+def is_same_engine(engine: str | None, *, stand_in: bool) -> bool:
+    """Whether a verdict comes, wholly or in part, from the engine that moved the cell itself.
+
+    Such a verdict agrees with what was recorded for a reason that no real cell gives: it is shown
+    and never counted.
+
+    Args:
+        engine: Of the verdict, as it names itself.
+        stand_in: Whether the recording is of the stand-in cell.
+    """
+    return stand_in and STAND_IN_ENGINE in (engine or "")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -150,10 +150,19 @@ def check_settings(trials: Sequence[Trial], derived: Sequence[DerivedFile]) -> l
         derived: All derived episodes of the run.
     """
     used = [file for trial in trials for file in trial.replays.values()]
-    if not used:
-        return []
-    found = chain(_scenes(used, derived), _settings(used), _tried(used, derived))
+    replays = [file for file in derived if file.derived.kind == "replay"]
+    found = list(_passed_over(replays))
+    if used:
+        may_count = [file for file in derived if not file.why_not_counted]
+        found += [*_scenes(used, derived), *_settings(used), *_tried(used, may_count)]
     return [(ABOUT, text) for text in found]
+
+
+def _passed_over(replays: Iterable[DerivedFile]) -> Iterable[str]:
+    """Say which replays are shown and never counted, and why."""
+    for why, count in Counter(file.why_not_counted for file in replays).items():
+        if why:
+            yield f"{count} that never count were {why}"
 
 
 def _scenes(used: Sequence[DerivedFile], derived: Iterable[DerivedFile]) -> Iterable[str]:

@@ -1,7 +1,7 @@
 """Lay one recorded trial beside its replays: the row everything else is computed from."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from bridge.episode.topics import TCP_POSE
 from bridge.errors import BridgeError
 from bridge.exchange.trials_csv import MOST_IN_TRIAL
 from bridge.geometry.trajectory import PoseTrajectory
+from bridge.task.verdict import SAME_ENGINE, is_same_engine
 from evaluator.compare.motion import SAME_CLOCK_NS
 from evaluator.compare.rows import TcpErrorSeries, TrialRow
 from evaluator.errors import UndefinedStatisticError
@@ -67,6 +68,12 @@ def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
     """
     source, sha256 = facts.info.id, file.sha256
     lacking = _unlabelled(facts.outcome)
+    gate = facts.verdict
+    if gate is not None and is_same_engine(gate.engine, stand_in=facts.info.stand_in):
+        lacking.append(
+            f"the gate's verdict does not count: made in {gate.engine}, the {SAME_ENGINE}"
+        )
+        facts = replace(facts, verdict=None)
     found = dict.fromkeys(TRAJECTORIES, Replay())
     if facts.plan_id is None:
         lacking.append("no execution_started event: no plan was sent")

@@ -13,7 +13,7 @@ from typing import Any
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.catalogue import outcome_of
-from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build
+from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, why_not_counted
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import verdicts
@@ -69,6 +69,7 @@ class VerdictSummary:
     failing_detail: str | None
     """Cause, bodies and time, to be read."""
     clauses: Clauses = ()
+    engine: str = ""
 
 
 def summarise_verdict(verdict: Verdict) -> VerdictSummary:
@@ -83,6 +84,7 @@ def summarise_verdict(verdict: Verdict) -> VerdictSummary:
         failing_cause=None if name is None else verdict.factors()[name].cause,
         failing_detail=_detail(verdict),
         clauses=clauses_of(verdict),
+        engine=verdict.engine,
     )
 
 
@@ -334,6 +336,11 @@ class DerivedFile:
         return self.facts.derived
 
     @property
+    def why_not_counted(self) -> str:
+        """Why it never enters a number, whatever it says; empty where it may."""
+        return why_not_counted(self.derived, stand_in=self.info.stand_in)
+
+    @property
     def episode(self) -> Episode:
         """Open it; nothing is held open, so whoever asks twice opens it twice.
 
@@ -411,7 +418,7 @@ class DerivedIndex:
     def replay(self, *, source: str, source_sha256: str, plan_id: str, trajectory: str) -> Replay:
         """Find the dynamic replay of a recorded episode's plan, planned or executed.
 
-        The newest file wins where several settings were tried.
+        The newest file wins where several settings were tried; what never counts is passed over.
 
         Args:
             source: Id of the recorded episode.
@@ -430,7 +437,12 @@ class DerivedIndex:
                 "differs); replay it again"
             )
             return Replay(reason=reason)
-        file = _newest(current)
+        counted = [file for file in current if not file.why_not_counted]
+        if not counted:
+            file = _newest(current)
+            why = f"{file.path.name} does not count: {file.why_not_counted}"
+            return Replay(reason=why)
+        file = _newest(counted)
         decided = file.facts.verdict
         if file.facts.broken:
             return Replay(file=file, reason=f"{file.path.name}: {file.facts.broken}")

@@ -263,11 +263,13 @@ def write_trial(run: RunFolder, trial: Trial, *, images: bool = True) -> Path:
     return path
 
 
-def write_replay(run: RunFolder, trial: Trial, trajectory: str, accepted: bool | None) -> Path:
+def write_replay(
+    run: RunFolder, trial: Trial, trajectory: str, accepted: bool | None, engine: str = "bullet"
+) -> Path:
     """Write a dynamic replay whose clock starts at zero."""
     plan = make_plan(trial, 2 if trial.rejected_first else 1)
     source = run.episodes_dir / f"{trial.id}.mcap"
-    name = f"{trial.id}.replay.{trajectory}.dynamic.{plan.id}.bullet.a1b2c3d4.mcap"
+    name = f"{trial.id}.replay.{trajectory}.dynamic.{plan.id}.{engine}.a1b2c3d4.mcap"
     with EpisodeWriter(run.derived_dir / name) as writer:
         writer.describe(
             EpisodeInfo(id=trial.id, kind="trial", task="cube_into_box", stand_in=True),
@@ -279,13 +281,13 @@ def write_replay(run: RunFolder, trial: Trial, trajectory: str, accepted: bool |
                 trajectory=trajectory,
                 mode="dynamic",
                 scene_hash="5ce4e0" * 8,
-                engine="bullet",
+                engine=engine,
                 seed=0,
                 settings={"eps_col_m": 0.002},
             ),
         )
         log = _Log(writer)
-        said = make_verdict(plan.id, accepted, trajectory, "bullet")
+        said = make_verdict(plan.id, accepted, trajectory, engine)
         log.put("/standin/verdict", schema.VERDICT, said.to_json(), 0)
         for step in range(110):
             t_s = step / 20

@@ -73,3 +73,14 @@ def test_of_a_trajectory_replayed_twice_the_last_replay_counts_on_the_page(
     text = words(synthetic.browser_of(copy).get("/episode/trial_0002").text)
     assert "Twin, planned ✓ success" in text
     assert text.index("✓ accepted") < text.index("dynamic, redone since ✗ refused")
+
+
+def test_a_replay_in_the_engine_of_the_cell_is_shown_and_does_not_count(
+    synthetic: ModuleType, copy: RunFolder
+) -> None:
+    last = synthetic.write_replay(copy, synthetic.TRIALS[1], "planned", True, engine="mujoco")
+    os.utime(last, ns=(2 * 10**18, 2 * 10**18))
+    text = words(synthetic.browser_of(copy).get("/episode/trial_0002").text)
+    assert "Twin, planned ✗ failure" in text
+    assert "dynamic, made in mujoco, the same engine as the cell ✓ accepted" in text
+    assert "redone since" not in text

@@ -82,6 +82,7 @@ class RunMaker:
         condition: str = "without_replanning",
         start_id: str | None = "s1",
         gate: bool | str | None = "none",
+        gate_engine: str = "test",
         late_gate: bool | str | None = "none",
         late_gate_made_ns: int | None = None,
         sent: bool = True,
@@ -120,7 +121,7 @@ class RunMaker:
             log.raw("/standin/plan", schema.PLAN, never_sent.to_json(), start_ns - 2 * STEP_NS)
             if gate != "none":
                 assert not isinstance(gate, str)
-                said = verdict_of(gate, plan_id=plan_id).to_json()
+                said = replace(verdict_of(gate, plan_id=plan_id), engine=gate_engine).to_json()
                 log.raw("/standin/verdict", schema.VERDICT, said, start_ns - STEP_NS)
             if sent:
                 log.event("execution_started", plan_id, start_ns)
@@ -170,6 +171,8 @@ class RunMaker:
         varied: tuple[int, int] | None = None,
         scene_hash: str | None = None,
         settings: dict[str, Any] | None = None,
+        engine: str = "test",
+        stand_in: bool = True,
     ) -> Path:
         """Write one derived replay of a trial; ``varied``: successes and number of its samples."""
         source = self.run.episodes_dir / f"{name}.mcap"
@@ -182,13 +185,13 @@ class RunMaker:
             trajectory=trajectory,
             mode=mode,
             scene_hash=scene_hash,
-            engine="test",
+            engine=engine,
             seed=1,
             settings=settings or {},
         )
         stem = f"{name}.replay.{trajectory}.{mode}.{plan_id}.test.{tag}"
         path = self.run.derived_dir / f"{stem}.mcap"
-        info = EpisodeInfo(id=stem.replace(".", "-"), kind="trial", stand_in=True)
+        info = EpisodeInfo(id=stem.replace(".", "-"), kind="trial", stand_in=stand_in)
         with EpisodeWriter(path) as writer:
             writer.describe(info, derived=derived)
             log = _Log(writer)

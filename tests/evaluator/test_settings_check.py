@@ -109,3 +109,60 @@ def test_the_report_says_so_beside_the_rates_it_is_about(two: Any, tmp_path: Pat
     )
     assert rates < note < cells
     assert "1 groups" not in report
+
+
+def measured(comparison: Comparison, name: str) -> tuple[float | None, int | None]:
+    (found,) = [m for m in comparison.measurements if m.id == name]
+    return found.value, found.n
+
+
+def test_what_the_engine_of_the_cell_says_is_passed_over_and_counted_in_a_note(two: Any) -> None:
+    for name in ("a", "b"):
+        two.replay(name, accepted=True, engine="pybullet-1")
+    before = measured(compare_run(two.run), "agreement.sim_planned.rate")
+    for name in ("a", "b"):  # newer, and of the opposite opinion
+        two.replay(name, accepted=False, engine="mujoco-2", tag="b")
+    comparison = compare_run(two.run)
+    assert measured(comparison, "agreement.sim_planned.rate") == before == (1.0, 2)
+    assert said_of_replays(comparison) == [
+        "2 that never count were made in mujoco-2, the same engine as the cell"
+    ]
+    assert not [e for e in comparison.exclusions if "mujoco" in e.reason]
+
+
+@pytest.mark.parametrize("engine", ["mujoco-2", "pybullet-1 and mujoco-2"])
+def test_a_trial_with_nothing_but_the_cells_own_engine_is_left_out_with_the_reason(
+    two: Any, engine: str
+) -> None:
+    two.replay("a", engine="pybullet-1")
+    path = two.replay("b", engine=engine)
+    comparison = compare_run(two.run)
+    assert measured(comparison, "agreement.sim_planned.rate") == (1.0, 1)
+    reasons = [e.reason for e in comparison.exclusions if e.episode == "b"]
+    assert f"{path.name} does not count: made in {engine}, the same engine as the cell" in reasons
+
+
+def test_of_a_real_cell_mujoco_counts_unless_it_was_asked_beside_another(maker: Any) -> None:
+    maker.trial("a", stand_in=False)
+    maker.replay("a", engine="mujoco-2", stand_in=False)
+    assert measured(compare_run(maker.run), "agreement.sim_planned.rate") == (1.0, 1)
+    maker.replay(
+        "a", accepted=False, engine="mujoco-3", tag="b", stand_in=False,
+        settings={"second_engine": True},
+    )  # fmt: skip
+    comparison = compare_run(maker.run)
+    assert measured(comparison, "agreement.sim_planned.rate") == (1.0, 1)
+    assert said_of_replays(comparison) == [
+        "1 that never count were made in mujoco-3, beside the engine that decides"
+    ]
+
+
+def test_a_verdict_of_a_gate_in_the_cells_own_engine_does_not_count(maker: Any) -> None:
+    maker.trial("a", gate=True, gate_engine="pybullet-1")
+    maker.trial("b", gate=True, gate_engine="mujoco-2")
+    comparison = compare_run(maker.run)
+    assert measured(comparison, "agreement.verdict.rate") == (1.0, 1)
+    (reason,) = [e.reason for e in comparison.exclusions if "gate" in e.reason]
+    assert reason == (
+        "the gate's verdict does not count: made in mujoco-2, the same engine as the cell"
+    )

@@ -81,6 +81,7 @@ def answer(question: Question) -> Verdict:
     Raises:
         UndecidedError: When the nominal replay alone needs more steps than there may be.
     """
+    from twin.replay.agreement import in_each_engine  # noqa: PLC0415
     from twin.replay.audit import audit  # noqa: PLC0415
     from twin.replay.checks import limited_to_task  # noqa: PLC0415
     from twin.replay.dynamics import num_steps  # noqa: PLC0415
@@ -91,6 +92,7 @@ def answer(question: Question) -> Verdict:
         for_task,
         read_rebuilt_scene,
     )
+    from twin.replay.result import ReplayResult  # noqa: PLC0415
     from twin.replay.scene import ReplayScene  # noqa: PLC0415
     from twin.replay.verdict import reason_of, replay_plan  # noqa: PLC0415
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
@@ -113,14 +115,23 @@ def answer(question: Question) -> Verdict:
     most_samples = question.max_steps // steps - 1
 
     def judge(there: ReplayScene, settings: ReplayConfig) -> Verdict:
-        return replay_plan(plan, there, settings, refuse_early=True).verdict
+        return in_each_engine(
+            there.task,
+            settings,
+            lambda each: replay_plan(plan, there, each, refuse_early=True).verdict,
+        )[0]
 
-    result = replay_plan(plan, scene, config, refuse_early=True)
-    verdict = result.verdict
+    made: list[ReplayResult] = []
+
+    def judge_nominal(settings: ReplayConfig) -> Verdict:
+        made.append(replay_plan(plan, scene, settings, refuse_early=True))
+        return made[-1].verdict
+
+    verdict = in_each_engine(scene.task, config, judge_nominal)[0]
     if verdict.accepted is True:
         kept = limited_to_task(plan, scene.task)
         most = question.max_audit_distances
-        audited = audit(result, kept, scene, config, max_queries=most)
+        audited = audit(made[0], kept, scene, config, max_queries=most)
         verdict = replace(verdict, checks={**verdict.checks, "audit": audited})
         verdict = replace(verdict, reason=reason_of(verdict))
     samples = replay_samples(
@@ -146,6 +157,7 @@ class TwinProcess:
 
     def __init__(self, run_path: Path, task: Task, config: GateConfig, output: Output) -> None:
         """Start it; it imports what it needs while the gate connects."""
+        config.replay.refuse_soft(task.soft_objects)
         self._run_path, self._task, self._output = run_path, task, output
         self._config = replace(config.replay, mode="dynamic", samples=config.samples)
         self._max_steps = config.max_steps

@@ -1,8 +1,30 @@
 """Settings of the physics; imports nothing heavy."""
 
 from dataclasses import dataclass
+from importlib import util
+from typing import Literal
 
-from bridge.errors import refuse_outside
+from bridge.errors import MissingDependencyError, refuse_outside
+
+Engine = Literal["pybullet", "mujoco"]
+"""What moves rigid bodies."""
+ENGINES: tuple[Engine, ...] = ("pybullet", "mujoco")
+"""All of them; where several replay, the first decides."""
+
+RIGID_ONLY = (
+    "the engine mujoco replays rigid objects only. Soft ones take --engine pybullet, beside which "
+    "they are solved by xpbd."
+)
+
+
+def require_engine(engine: Engine) -> None:
+    """Refuse an engine that is not installed.
+
+    Raises:
+        MissingDependencyError: Naming the extra that installs it.
+    """
+    if engine == "mujoco" and util.find_spec(engine) is None:
+        raise MissingDependencyError(package=engine, extra=engine, purpose=f"--engine {engine}")
 
 
 @dataclass(frozen=True, kw_only=True)

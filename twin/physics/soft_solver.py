@@ -141,7 +141,7 @@ def add_body(
         rest,
         np.ascontiguousarray(model.tets),
         masses,
-        _samples(surface),
+        surface_samples(surface),
         np.ascontiguousarray(surface),
         young_pa,
         model.poisson,
@@ -159,7 +159,9 @@ def _node_masses(model: SoftModel) -> Float[np.ndarray, " num_nodes"]:
     return np.asarray(model.mass_kg * share / share.sum())
 
 
-def _samples(triangles: Int32[np.ndarray, "num_triangles 3"]) -> Int32[np.ndarray, "num_samples 2"]:
+def surface_samples(
+    triangles: Int32[np.ndarray, "num_triangles 3"],
+) -> Int32[np.ndarray, "num_samples 2"]:
     """Where contact is looked for: surface nodes, and middles of surface edges."""
     nodes = np.unique(triangles)
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])

@@ -117,6 +117,7 @@ class World:
         except PhysicsError:
             self.close()
             raise
+        self._undamp(self.robot.id)
         self._press = Press(self.robot)
         self.soft = SoftWorld(self._client, self.robot, urdf, mesh_hulls_m, config)
 
@@ -176,6 +177,7 @@ class World:
         """
         body = self._box(size_m, mass_kg, T_base_object)
         self._set_friction(body, self.config.object_friction)
+        self._undamp(body)
         self._anchors.add(body)
         self.soft.add_free(body, size_m, mass_kg, T_base_object)
         self.free_ids[object_id] = body
@@ -197,6 +199,12 @@ class World:
                 useMaximalCoordinates=mass_kg == 0.0,
                 physicsClientId=self._client,
             )
+        )
+
+    def _undamp(self, body: int) -> None:
+        """Nothing slows down in the air; the engine would take 3 s for 83 % of a spin's energy."""
+        pybullet.changeDynamics(
+            body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self._client
         )
 
     def _set_friction(self, body: int, friction: float) -> None:
@@ -267,6 +275,40 @@ class World:
                 total += point[10] * np.array(point[11]) + point[12] * np.array(point[13])
         return float(np.linalg.norm(total))
 
+    def tie(self, object_id: str) -> None:
+        """Fix a rigid object to the tool where it is."""
+        T_tcp_base = se3.invert(self.robot.T_base_link(TCP_FRAME))
+        q, p = se3.split(T_tcp_base @ self.T_base_object(object_id))
+        w, x, y, z = q.tolist()
+        self._constraint = int(
+            pybullet.createConstraint(
+                self.robot.id,
+                self.robot.links[TCP_FRAME],
+                self.free_ids[object_id],
+                -1,
+                pybullet.JOINT_FIXED,
+                [0, 0, 0],
+                np.asarray(p).tolist(),
+                [0, 0, 0],
+                [x, y, z, w],
+                [0, 0, 0, 1],
+                physicsClientId=self._client,
+            )
+        )
+
+    def untie(self) -> None:
+        """Let go of what is tied."""
+        pybullet.removeConstraint(self._constraint, physicsClientId=self._client)
+
+    def soft_bodies(self) -> SoftWorld:
+        """What is soft in this world."""
+        return self.soft
+
+    @property
+    def free_objects(self) -> list[str]:
+        """Rigid objects that move, in the order in which they were added."""
+        return list(self.free_ids)
+
     def _free(self, object_id: str) -> int:
         if object_id not in self.free_ids:
             known = ", ".join([*self.free_ids, *self.soft.names]) or "none"
@@ -297,63 +339,3 @@ class World:
     ) -> None:
         """Close."""
         self.close()
-
-
-# Tie an object to the tool instead of holding it by friction: ``--grasp attach``, not the
-# default.
-# For robots or grippers whose friction nobody knows. What is tied cannot slip, so a verdict made
-# this way says nothing about the grasp; the engine's name carries the word wherever it is shown.
-
-PRESS_M = 0.001
-"""Fingers that are told to go this much farther than they are press on something."""
-OPEN_M = 0.002
-"""An object is let go when the fingers are told to be this much wider than when it was tied."""
-
-
-class Attachment:
-    """Holds at most one rigid object by a fixed joint, from the touch to the command to open."""
-
-    def __init__(self, world: World) -> None:
-        """Start with empty fingers."""
-        self._world = world
-        self._constraint: int | None = None
-        self._width_m = 0.0
-
-    def update(self, command_m: float) -> None:
-        """Tie what the fingers press on, or let go. Call once per step.
-
-        Args:
-            command_m: The distance the fingers are told to have.
-        """
-        if self._constraint is not None:
-            if command_m > self._width_m + OPEN_M:
-                pybullet.removeConstraint(self._constraint, physicsClientId=self._world.client)
-                self._constraint = None
-            return
-        width_m = self._world.robot.width_m()
-        if command_m > width_m - PRESS_M:
-            return
-        for object_id in self._world.free_ids:
-            if self._world.finger_touches(object_id):
-                self._constraint, self._width_m = self._tie(object_id), width_m
-                return
-
-    def _tie(self, object_id: str) -> int:
-        T_tcp_base = se3.invert(self._world.robot.T_base_link(TCP_FRAME))
-        q, p = se3.split(T_tcp_base @ self._world.T_base_object(object_id))
-        w, x, y, z = q.tolist()
-        return int(
-            pybullet.createConstraint(
-                self._world.robot.id,
-                self._world.robot.links[TCP_FRAME],
-                self._world.free_ids[object_id],
-                -1,
-                pybullet.JOINT_FIXED,
-                [0, 0, 0],
-                np.asarray(p).tolist(),
-                [0, 0, 0],
-                [x, y, z, w],
-                [0, 0, 0, 1],
-                physicsClientId=self._world.client,
-            )
-        )

@@ -1,13 +1,13 @@
 """Settings of replays, of what their samples vary and of comparisons; imports nothing heavy."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
-from twin.physics.config import PhysicsConfig
+from twin.physics.config import ENGINES, RIGID_ONLY, Engine, PhysicsConfig, require_engine
 from twin.robot.config import IkConfig
 
 FRICTIONS = ("object_friction", "finger_friction", "surface_friction")
@@ -140,6 +140,13 @@ class ReplayConfig:
     """A plan starts no farther than this from where each joint of the robot is [rad]."""
     start_m: float = 0.01
     """Nor its tool farther than this [m]."""
+    engine: Annotated[Literal["pybullet", "mujoco", "both"], Parameter(name="--engine")] = (
+        "pybullet"
+    )
+    """What moves rigid bodies: pybullet, mujoco, or both, of which pybullet decides and mujoco is
+    reported where it says something else. Soft bodies are pybullet's alone."""
+    engines_must_agree: Annotated[bool, Parameter(name="--engines-must-agree")] = False
+    """With --engine both: where the two say something else, the verdict is undecided."""
     start_overlap_m: float = 0.006
     """Rigid objects that were localised into each other by up to this are moved apart; deeper ones
     are not evaluated [m]."""
@@ -186,14 +193,37 @@ class ReplayConfig:
     """Nominal physics."""
 
     def __post_init__(self) -> None:
-        """Refuse numbers beyond which no comparison would fail, and rates that do not fit."""
+        """Refuse numbers beyond which no comparison would fail, rates and engines that do not fit.
+
+        Raises:
+            UsageError: Saying what does not fit.
+            MissingDependencyError: When an engine is not installed.
+        """
         refuse_outside(self, RANGES)
+        for engine in self.engines():
+            require_engine(engine)
+        if self.engines_must_agree and self.engine != "both":
+            message = f"--engines-must-agree needs --engine both; it is {self.engine}."
+            raise UsageError(message)
         if self.sample_rate_hz < 1 or self.physics.rate_hz % self.sample_rate_hz:
             message = (
                 f"sample_rate_hz {self.sample_rate_hz} does not divide the physics rate "
                 f"{self.physics.rate_hz} Hz. Choose a divisor, for example 60."
             )
             raise UsageError(message)
+
+    def engines(self) -> tuple[Engine, ...]:
+        """What replays a trajectory, the one that decides first."""
+        return ENGINES if self.engine == "both" else (self.engine,)
+
+    def refuse_soft(self, soft_objects: Sequence[str]) -> None:
+        """Refuse soft objects in an engine that has none.
+
+        Raises:
+            UsageError: Naming them, and the engine that has them.
+        """
+        if soft_objects and self.mode == "dynamic" and "mujoco" in self.engines():
+            raise UsageError(f"{', '.join(soft_objects)} cannot be replayed: {RIGID_ONLY}")
 
 
 @Parameter(name="*")

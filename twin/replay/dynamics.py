@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Float32, Int
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
 from bridge.task.task_file import ObjectModel
+from twin.physics.engines import Attachment, PhysicsWorld, open_world
 from twin.physics.soft import BURST_STRETCH, SoftHealth, SoftModel
-from twin.physics.world import Attachment, World
 from twin.replay.clearance.bodies import placed_panels, placement_of
 from twin.replay.config import ReplayConfig
 from twin.replay.failure import NotEvaluatedError
@@ -47,7 +47,7 @@ def soft_models(scene: ReplayScene) -> dict[str, SoftModel]:
     return models
 
 
-def spawn(world: World, scene: ReplayScene, soft: Mapping[str, SoftModel]) -> None:
+def spawn(world: PhysicsWorld, scene: ReplayScene, soft: Mapping[str, SoftModel]) -> None:
     """Put table, containers and objects where the scene says.
 
     Args:
@@ -62,7 +62,7 @@ def spawn(world: World, scene: ReplayScene, soft: Mapping[str, SoftModel]) -> No
         model = scene.task.objects[name]
         T_free = lifted(T, outline_m(model, soft.get(name)), scene.table_height_m)
         if name in soft:
-            world.soft.add(name, soft[name], T_free)
+            world.soft_bodies().add(name, soft[name], T_free)
         else:
             world.add_free(name, np.array(model.size_m), model.mass_kg, T_free)
 
@@ -130,11 +130,14 @@ class States:
 def num_steps(end_ns: int, config: ReplayConfig) -> int:
     """Physics steps of a replay whose trajectory ends then, settling before and after included.
 
+    Each engine takes them.
+
     Args:
         end_ns: Last time of the trajectory, from its start.
         config: Rate of the physics and times to settle.
     """
-    return round(config.settle_before_s * config.physics.rate_hz) + _steps_kept(end_ns, config)
+    settling = round(config.settle_before_s * config.physics.rate_hz)
+    return len(config.engines()) * (settling + _steps_kept(end_ns, config))
 
 
 def _steps_kept(end_ns: int, config: ReplayConfig) -> int:
@@ -150,14 +153,18 @@ def simulate(
 ) -> States:
     """Follow a path with position-controlled motors and free objects.
 
-    Every run of the same inputs gives the same bits: one fresh client, fixed steps. A soft body
-    that bursts ends it: what comes after would be noise.
+    Every run of the same inputs gives the same bits: one fresh world, fixed steps. A soft body
+    that bursts ends it: what comes after would be noise. Of several engines the first moves it;
+    ``twin.replay.agreement`` asks the others.
 
     Args:
         path: Joints and gripper widths over time.
         scene: Where the objects are at the start.
         hulls: The robot's convex pieces, which stand for its meshes.
         config: Physics, grasp, rates and times to settle.
+
+    Raises:
+        UsageError: For soft bodies in an engine that has none.
     """
     rate = config.physics.rate_hz
     stride = rate // config.sample_rate_hz
@@ -170,7 +177,8 @@ def simulate(
     stamps = times_ns.tolist()
     soft = soft_models(scene)
     samples = _Samples(scene, soft)
-    with World(hulls.robot.urdf, _mesh_hulls(hulls), config.physics) as world:
+    engine = config.engines()[0]
+    with open_world(engine, hulls.robot.urdf, _mesh_hulls(hulls), config.physics) as world:
         spawn(world, scene, soft)
         world.reset_robot(postures[0], widths[0])
         world.robot.command(targets[0], [0.0] * len(targets[0]), widths[0])
@@ -216,10 +224,10 @@ class _Samples:
         self._extents: dict[str, list[np.ndarray]] = {name: [] for name in soft}
         self._burst: Burst | None = None
 
-    def take(self, world: World, t_ns: int) -> bool:
+    def take(self, world: PhysicsWorld, t_ns: int) -> bool:
         """Keep the state; False, and nothing kept, when a soft body has burst."""
         for name in self._soft:
-            found = burst_of(world.soft.health(name))
+            found = burst_of(world.soft_bodies().health(name))
             if found is not None:
                 self._burst = Burst(object_id=name, t_ns=t_ns, found=found)
                 if self._stamps:
@@ -236,11 +244,11 @@ class _Samples:
             self._poses[name].append(world.object_pose(name))
         for name in self._soft:
             self._fits[name].append(world.T_base_object(name))
-            self._nodes[name].append(world.soft.nodes_m(name).astype(np.float32))
-            self._extents[name].append(world.soft.extents_m(name))
+            self._nodes[name].append(world.soft_bodies().nodes_m(name).astype(np.float32))
+            self._extents[name].append(world.soft_bodies().extents_m(name))
         return True
 
-    def states(self, world: World) -> States:
+    def states(self, world: PhysicsWorld) -> States:
         poses = {name: self._Ts_base_object(name) for name in self._objects}
         poses |= {
             name: np.repeat(T[None], len(self._stamps), axis=0) for name, T in self._fixed.items()
@@ -266,12 +274,12 @@ class _Samples:
             raise NotEvaluatedError(f"physics lost {name}: its place is not a number any more")
         return se3.transform_from(rows[:, 3:], rows[:, :3])
 
-    def _broken(self, world: World) -> dict[str, str]:
+    def _broken(self, world: PhysicsWorld) -> dict[str, str]:
         found = {}
         if self._burst is not None:
             found[self._burst.object_id] = self._burst.found
         for name in self._soft:
-            health = world.soft.health(name)
+            health = world.soft_bodies().health(name)
             if not health.sound and name not in found:
                 found[name] = f"at the end: {health.describe()}"
         return found

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import CompressedColor
-from bridge.episode.metadata import Derived
+from bridge.episode.metadata import SAME_ENGINE_KEY, SECOND_ENGINE_KEY, Derived
 from bridge.episode.provenance import hash_settings
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -25,8 +25,9 @@ from bridge.task.plan import Plan
 from bridge.task.predicate import evaluate_success
 from bridge.task.record import parse_record
 from bridge.task.task_file import Task
-from bridge.task.verdict import Verdict
-from twin.physics.engine import ENGINE
+from bridge.task.verdict import SAME_ENGINE, Verdict, is_same_engine
+from twin.physics.config import Engine
+from twin.replay.agreement import disagreement_of, in_each_engine
 from twin.replay.config import ReplayConfig
 from twin.replay.divergence import Divergence, diverge
 from twin.replay.execution import (
@@ -57,7 +58,7 @@ from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 from twin.robot.posture import check_clock
 
-REPLAY_VERSION = 19
+REPLAY_VERSION = 20
 """Raise it when the same inputs give another replay, so that old files are redone."""
 
 START_KNOWN_NS = 1_000_000_000
@@ -125,19 +126,25 @@ class ReplayJob:
         scene = () if self.run_path is None else (self.run_path,)
         return (self.episode_path, self.folder, *scene)
 
-    def path(self) -> Path:
-        """Where the derived episode goes."""
+    def engines(self) -> tuple[Engine, ...]:
+        """What replays it, the engine that decides first; a kinematic replay moves no bodies."""
+        return self.config.engines()[: None if self.config.mode == "dynamic" else 1]
+
+    def path(self, engine: Engine | None = None) -> Path:
+        """Where the derived episode goes, of an engine or of the one that decides."""
         plan = re.sub(r"[^A-Za-z0-9_-]", "-", self.plan_id)[:60] or "plan"
-        engine = ENGINE if self.config.mode == "dynamic" else KINEMATIC_ENGINE
-        if self.config.mode == "dynamic" and self.config.grasp == "attach":
-            engine += "-attach"
+        name: str = self.engines()[0] if engine is None else engine
+        if self.config.mode == "kinematic":
+            name = KINEMATIC_ENGINE
+        elif self.config.grasp == "attach":
+            name += "-attach"
         parts = (
             self.episode_path.stem,
             "replay",
             self.trajectory,
             self.config.mode,
             plan,
-            engine,
+            name,
             hash_settings(self.settings()),
             "mcap",
         )
@@ -151,7 +158,7 @@ class ReplayJob:
         """What the settings hash covers: settings, inputs, engine and code version."""
         return {
             "replay_version": REPLAY_VERSION,
-            "engine": engine_of(self.task, self.config),
+            "engine": " and ".join(self._engine_names()),
             "episode_sha256": self.episode_sha256,
             "plan_index": self.plan_index,
             "start_ns": self.start_ns,
@@ -165,6 +172,10 @@ class ReplayJob:
             **self._sampled_from(),
             **self._compared_with(),
         }
+
+    def _engine_names(self) -> list[str]:
+        config = replace(self.config, engines_must_agree=False)
+        return [engine_of(self.task, replace(config, engine=each)) for each in self.engines()]
 
     def _sampled_from(self) -> dict[str, Any]:
         if not self.config.samples:
@@ -180,17 +191,16 @@ class ReplayJob:
 
 def row_of_existing(job: ReplayJob) -> dict[str, Any] | None:
     """Return the row of a replay that is there already, None when it must be made."""
-    if not job.path().is_file():
-        return None
+    found = []
     try:
-        episode = Episode.open(job.path())
-        verdicts = streams.verdicts(episode)
-        divergence = divergence_of(episode)
-    except GstError:
+        for engine in job.engines():
+            if not job.path(engine).is_file():
+                return None
+            episode = Episode.open(job.path(engine))
+            found.append((streams.verdicts(episode)[-1][1], divergence_of(episode)))
+    except (GstError, IndexError):
         return None
-    if not verdicts:
-        return None
-    return judged(job, verdicts[-1][1], divergence, skipped=True)
+    return judged(job, *found[0], skipped=True)
 
 
 def divergence_of(episode: Episode) -> dict[str, Any] | None:
@@ -228,6 +238,8 @@ def _row(job: ReplayJob) -> dict[str, Any]:
         "reason": None,
         "error": None,
         "engine": None,
+        "engines": list(job.engines()) if job.config.mode == "dynamic" else [],
+        "engines_disagree": None,
         "warnings": [],
         "predicates": None,
         "divergence": None,
@@ -256,6 +268,7 @@ def judged(
         "first_failing": verdict.first_failing,
         "reason": verdict.reason,
         "engine": verdict.engine,
+        "engines_disagree": disagreement_of(verdict),
         "warnings": list(verdict.warnings),
         "predicates": predicates_hold(verdict),
         "p_success": verdict.p_success,
@@ -295,11 +308,14 @@ def recorded_findings(recording: Recording, config: ReplayConfig) -> tuple[dict[
     return tuple(findings_of(task, rollout, "recorded", tolerance_m=CONTACT_M))
 
 
-def compare(job: ReplayJob, result: ReplayResult, recording: Recording, end_ns: int) -> Divergence:
+def compare(
+    job: ReplayJob, engine: Engine, result: ReplayResult, recording: Recording, end_ns: int
+) -> Divergence:
     """Lay the executed replay, the planned one if it is there, and the recording over each other.
 
     Args:
         job: The executed replay's; names the planned replay's file.
+        engine: What both were replayed in.
         result: The executed replay.
         recording: What was measured.
         end_ns: When the execution ended, from its start.
@@ -316,7 +332,7 @@ def compare(job: ReplayJob, result: ReplayResult, recording: Recording, end_ns: 
             for finding in evaluate_success(task, states_of_recording(recording, robot))
         },
     }
-    planned, planned_findings = _planned(job, recording)
+    planned, planned_findings = _planned(job, engine, recording)
     if isinstance(planned, str):
         missing = [planned]
     else:
@@ -333,8 +349,8 @@ def compare(job: ReplayJob, result: ReplayResult, recording: Recording, end_ns: 
     )
 
 
-def _planned(job: ReplayJob, recording: Recording) -> tuple[Trace | str, Findings]:
-    path = job.planned().path()
+def _planned(job: ReplayJob, engine: Engine, recording: Recording) -> tuple[Trace | str, Findings]:
+    path = job.planned().path(engine)
     if not path.is_file():
         return "the plan was not replayed: nothing planned to compare with", {}
     try:
@@ -354,7 +370,7 @@ def run_job(job: ReplayJob) -> dict[str, Any]:
     if job.problem and job.trajectory == "executed":
         return row_of_failure(job, job.problem)
     try:
-        return judged(job, *_replay(job))
+        return judged(job, *_replay(job)[0])
     except GstError as error:
         return row_of_failure(job, str(error))
 
@@ -379,26 +395,60 @@ class _Source:
     def executed(self) -> bool:
         return self.job.trajectory == "executed" and self.job.end_ns is not None
 
+    def is_same_engine(self, result: ReplayResult) -> bool:
+        """Whether the verdict is that of the engine that moved the cell itself."""
+        engine, stand_in = result.verdict.engine, self.episode.info.stand_in
+        return self.job.config.mode == "dynamic" and is_same_engine(engine, stand_in=stand_in)
+
     @property
     def end_ns(self) -> int:
         """When the trajectory ended and settling began."""
         return self.job.length_ns() if self.executed else self.plan.tau[-1].t_ns
 
 
-def _replay(job: ReplayJob) -> tuple[Verdict, dict[str, Any] | None]:
+def _replay(job: ReplayJob) -> list[tuple[Verdict, dict[str, Any] | None]]:
+    """Replay in each engine and write an episode for each: verdicts, and where they diverge."""
     source = _open(job)
-    result = _with_samples(source, _run(source, source.scene, job))
-    divergence = None
+
+    results: list[ReplayResult] = []
+
+    def judge(config: ReplayConfig) -> Verdict:
+        results.append(_with_samples(source, config, _run(source, source.scene, config)))
+        return results[-1].verdict
+
+    verdicts = in_each_engine(source.scene.task, job.config, judge)
+    return [
+        _write(source, engine, replace(result, verdict=verdict))
+        for engine, result, verdict in zip(job.engines(), results, verdicts, strict=True)
+    ]
+
+
+def _write(
+    source: _Source, engine: Engine, result: ReplayResult
+) -> tuple[Verdict, dict[str, Any] | None]:
+    job, divergence = source.job, None
     if source.executed and job.config.mode == "kinematic":
         found = recorded_findings(_recording(source), job.config)
         result = replace(result, verdict=replace(result.verdict, findings=found))
     elif source.executed:
-        divergence = compare(job, result, _recording(source), source.end_ns).to_record()
+        compared = compare(job, engine, result, _recording(source), source.end_ns)
+        divergence = compared.to_record()
+    if source.is_same_engine(result):
+        result = replace(result, verdict=_marked(result.verdict))
     images = _images(source, result) if job.render else ()
-    path = job.path()
+    path = job.path(engine)
     path.unlink(missing_ok=True)
-    write_replay(path, result, source.plan, _origin(source, result, divergence, images))
+    write_replay(path, result, source.plan, _origin(source, engine, result, divergence, images))
     return result.verdict, divergence
+
+
+def _marked(verdict: Verdict) -> Verdict:
+    """Say that the cell was moved by the same engine."""
+    return replace(
+        verdict,
+        warnings=(*verdict.warnings, SAME_ENGINE),
+        reason=verdict.reason or SAME_ENGINE,
+    )
 
 
 def _open(job: ReplayJob) -> _Source:
@@ -454,11 +504,11 @@ def recorded_start(episode: Episode, stamp_ns: int) -> Float[np.ndarray, " num_j
     return found if np.isfinite(found).all() else None
 
 
-def _run(source: _Source, scene: ReplayScene, job: ReplayJob) -> ReplayResult:
+def _run(source: _Source, scene: ReplayScene, config: ReplayConfig) -> ReplayResult:
     if not source.executed:
-        return replay_plan(source.plan_as_executed, scene, job.config)
+        return replay_plan(source.plan_as_executed, scene, config)
     arm, widths = _tracks(source)
-    return replay_joints(arm, widths, scene, job.config, plan=source.plan_as_executed)
+    return replay_joints(arm, widths, scene, config, plan=source.plan_as_executed)
 
 
 def _tracks(source: _Source) -> tuple[streams.JointTrack, streams.JointTrack]:
@@ -488,17 +538,16 @@ def _recording(source: _Source) -> Recording:
     )
 
 
-def _with_samples(source: _Source, result: ReplayResult) -> ReplayResult:
+def _with_samples(source: _Source, config: ReplayConfig, result: ReplayResult) -> ReplayResult:
     """Ask varied replays too; plans of one episode are tried against the same variations."""
-    job = source.job
-    if not job.config.samples or source.scene.missing():
+    if not config.samples or source.scene.missing():
         return result
     samples = replay_samples(
-        lambda there, config: _run(source, there, replace(job, config=config)).verdict,
+        lambda there, varied: _run(source, there, varied).verdict,
         source.scene,
-        job.config,
+        config,
         plan_id=source.plan.id,
-        identity=job.episode_sha256,
+        identity=source.job.episode_sha256,
     )
     return replace(result, verdict=with_probability(result.verdict, samples), samples=samples)
 
@@ -524,11 +573,16 @@ def _images(source: _Source, result: ReplayResult) -> tuple[tuple[str, Compresse
 
 def _origin(
     source: _Source,
+    engine: Engine,
     result: ReplayResult,
     divergence: dict[str, Any] | None,
     images: tuple[tuple[str, CompressedColor], ...],
 ) -> ReplayOrigin:
     job, episode, plan = source.job, source.episode, source.plan
+    marks = {
+        SAME_ENGINE_KEY: source.is_same_engine(result),
+        SECOND_ENGINE_KEY: engine != job.engines()[0],
+    }
     derived = Derived(
         kind="replay",
         source_episode=episode.info.id,
@@ -540,7 +594,11 @@ def _origin(
         engine=result.verdict.engine,
         seed=job.config.seed,
         calibration_id=source.scene.calibration_id,
-        settings={**job.settings(), "shape_sources": dict(source.scene.shape_sources)},
+        settings={
+            **job.settings(),
+            "shape_sources": dict(source.scene.shape_sources),
+            **{name: True for name, holds in marks.items() if holds},
+        },
     )
     return ReplayOrigin(
         info=episode.info,

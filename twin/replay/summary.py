@@ -12,6 +12,7 @@ from bridge.episode.catalogue import outcome_of
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
+from bridge.task.verdict import SAME_ENGINE
 from twin.replay.failure import NOT_EVALUATED
 
 WORDS = {True: "accepted", False: "rejected", None: "undecided"}
@@ -34,6 +35,8 @@ def count_verdicts(rows: Rows) -> dict[str, dict[str, int]]:
             key = "planned dynamic, never executed"
         if "+attach" in (row.get("engine") or ""):
             key += ", attached grasp"
+        if row.get("engines") == ["mujoco"]:
+            key += ", mujoco"
         counts.setdefault(key, Counter())["failed" if row["error"] else WORDS[row["accepted"]]] += 1
         counts[key]["n"] += 1
     words = ("n", "accepted", "rejected", "undecided", "failed")
@@ -151,6 +154,7 @@ def describe_run(summary: Mapping[str, Any]) -> str:
     executions = summary.get("executions", [])
     if executions:
         lines += ["", *_cross_lines(executions), "", *_divergence_lines(executions)]
+    lines += _engine_lines(summary["rows"])
     lines += _sample_lines(summary["rows"])
     lines += _reason_lines(summary["rows"])
     lines += skipped
@@ -158,6 +162,22 @@ def describe_run(summary: Mapping[str, Any]) -> str:
     if kept:
         lines.append(f"{kept} of {len(summary['rows'])} were there already; --force redoes them.")
     return "\n".join(lines)
+
+
+def _engine_lines(rows: Rows) -> list[str]:
+    """Where several engines were asked: how often they agree, and what each says where not."""
+    asked = [row for row in rows if len(row.get("engines") or ()) > 1 and not row["error"]]
+    differing = [row for row in asked if row["engines_disagree"]]
+    lines = []
+    if asked:
+        lines += ["", f"engines agree on {len(asked) - len(differing)} of {len(asked)} replays"]
+    lines += [
+        f"  {row['episode']} {row['plan']} {row['trajectory']}: {row['engines_disagree']}"
+        for row in differing
+    ]
+    if any(SAME_ENGINE in row.get("warnings", ()) for row in rows):
+        lines += ["", f"{SAME_ENGINE}: these verdicts are shown and never counted by evaluate"]
+    return lines
 
 
 def _reason_lines(rows: Rows) -> list[str]:

@@ -21,7 +21,7 @@ from bridge.task.predicate import (
 )
 from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
-from twin.physics.engine import ENGINE_VERSION
+from twin.physics.engines import engine_version
 from twin.replay.checks import (
     limited_to_task,
     path_limit_failures,
@@ -415,7 +415,8 @@ def engine_of(task: Task, config: ReplayConfig) -> str:
     if config.mode == "kinematic":
         return KINEMATIC_ENGINE
     soft = f"+{SOFT_ENGINE}" if task.soft_objects else ""
-    return f"{ENGINE_VERSION}{soft}{'+attach' if config.grasp == 'attach' else ''}"
+    tied = "+attach" if config.grasp == "attach" else ""
+    return f"{engine_version(config.engines()[0])}{soft}{tied}"
 
 
 def _clearance_undecided(

@@ -344,11 +344,11 @@ def is_loopback(address: str) -> bool:
 def code_version() -> str:
     """What decides the bytes of a replay, besides its job."""
     # A second, while which processes of a cluster start.
-    from twin.physics.engine import ENGINE_VERSION  # noqa: PLC0415
+    from twin.physics.engines import installed_versions  # noqa: PLC0415
     from twin.replay.job import REPLAY_VERSION  # noqa: PLC0415
 
     about = provenance.software()
-    return f"{about['version']}, replays {REPLAY_VERSION}, {ENGINE_VERSION}"
+    return f"{about['version']}, replays {REPLAY_VERSION}, {installed_versions()}"
 
 
 def _tasks(

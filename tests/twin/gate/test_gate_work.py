@@ -106,6 +106,31 @@ def test_as_many_samples_are_run_as_fit_into_the_steps_on_any_machine(
     assert answer(question).to_json() == idle.to_json()
 
 
+@pytest.mark.parametrize(("must_agree", "accepted"), [(False, True), (True, None)])
+def test_a_gate_asks_both_engines_within_the_same_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, must_agree: bool, accepted: bool | None
+) -> None:
+    asked: list[str] = []
+
+    def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> Any:
+        (engine,) = config.engines()
+        asked.append(engine)
+        terminal = Factor(value=engine == "pybullet", cause="inside")
+        return SimpleNamespace(verdict=replace(ACCEPTED, engine=engine, terminal=terminal))
+
+    monkeypatch.setattr(verdict_module, "replay_plan", replay_plan)
+    config = ReplayConfig(engine="both", engines_must_agree=must_agree)
+    run = RunFolder.create(tmp_path / "run")
+    question = question_of(run, config=config, max_steps=2 * NOMINAL_STEPS)
+    question = replace(question, task=load_task("cube_into_box"))
+    said = answer(question)
+    assert asked == ["pybullet", "mujoco"]
+    assert said.accepted is accepted
+    assert "engines disagree: pybullet accepted; mujoco rejected" in str(said.reason)
+    with pytest.raises(UndecidedError, match="600 simulated steps, and a verdict at most 599"):
+        answer(replace(question, max_steps=2 * NOMINAL_STEPS - 1))
+
+
 @pytest.mark.parametrize("t_ns", [10**400, -(10**12)])
 def test_impossible_times_are_left_for_the_replay_to_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, t_ns: int

@@ -1,12 +1,16 @@
-"""Soft bodies whose behaviour can be worked out by hand."""
+"""Soft bodies whose behaviour can be worked out by hand; lets tests here import ``cells``."""
 
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bridge.task.meshes.lattice import volumes_m3
 from twin.physics.soft import SoftModel
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 FIVE = np.array([[0, 3, 5, 6], [1, 0, 3, 5], [2, 0, 3, 6], [4, 0, 5, 6], [7, 3, 5, 6]])

@@ -88,7 +88,8 @@ def test_a_sliding_cube_stops_where_coulomb_says_and_stays_there(urdf: str) -> N
             world.step()
             path.append(world.T_base_object("slab")[0, 3] - start)
     assert path[-1] == pytest.approx(speed**2 / (2 * friction * G), rel=0.05)
-    assert max(path) - path[-1] < 1e-4, "an anchor that was dragged along pulls it back"
+    # An anchor's own spring, at the last speed that it saw: 0.10 mm.
+    assert max(path) - path[-1] < 2e-4, "an anchor that was dragged along pulls it back"
 
 
 @pytest.mark.parametrize("turn_rad", [0.0, 1.2])

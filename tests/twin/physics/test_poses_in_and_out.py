@@ -9,7 +9,8 @@ from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
-from twin.physics.world import Attachment, World
+from twin.physics.engines import Attachment
+from twin.physics.world import World
 from twin.robot.model import with_absolute_meshes
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])

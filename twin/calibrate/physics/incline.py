@@ -16,7 +16,7 @@ from twin.physics.engine import pybullet
 SLOPE_RAD = np.deg2rad(45.0)
 STEEPER_RAD = np.deg2rad(4.0)
 """The slope that is measured on is this much steeper than the one that would just hold: slow enough
-that an engine's drag in the air does not count."""
+that what an engine does to fast contact does not count."""
 TURNS = 6
 SLAB_M = (0.10, 0.10, 0.02)
 """Flat, so that it slides instead of tipping over."""
@@ -78,7 +78,13 @@ def _slide(
         )
         body = pybullet.createMultiBody(mass, shape, -1, [0, 0, height], physicsClientId=client)
         pybullet.changeDynamics(
-            body, -1, lateralFriction=mu, frictionAnchor=1, physicsClientId=client
+            body,
+            -1,
+            lateralFriction=mu,
+            frictionAnchor=1,
+            linearDamping=0.0,
+            angularDamping=0.0,
+            physicsClientId=client,
         )
         bodies.append(body)
     pybullet.setGravity(0, 0, -g, physicsClientId=client)

@@ -9,7 +9,8 @@ import pytest
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from twin.physics.config import PhysicsConfig
-from twin.physics.world import Attachment, World
+from twin.physics.engines import Attachment
+from twin.physics.world import World
 from twin.replay.config import ReplayConfig
 from twin.replay.verdict import engine_of
 from twin.robot.model import with_absolute_meshes

@@ -12,19 +12,20 @@ from mcap.reader import make_reader
 
 from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import JointSample, string_to_cdr
-from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.metadata import SAME_ENGINE_KEY, SECOND_ENGINE_KEY, EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.process_pool import ProcessPool, Serial
-from bridge.task.verdict import Factor, Verdict
+from bridge.task.verdict import SAME_ENGINE, Factor, Verdict
 from bridge.terminal import Output
 from twin import cli
 from twin.replay import job as job_module
 from twin.replay import runner as runner_module
 from twin.replay import workers
 from twin.replay.config import ReplayConfig, ReplayRunConfig
+from twin.replay.divergence import diverge
 from twin.replay.job import ReplayJob, divergence_of, row_of_failure
 from twin.replay.result import ReplayResult
 from twin.replay.runner import Execution, execution_of
@@ -54,7 +55,9 @@ def run(
     track, widths = script.recorded_tracks(good, start_ns=START)
     with EpisodeWriter(folder.episodes_dir / "trial_0001.mcap") as writer:
         writer.describe(
-            EpisodeInfo(id="trial_0001", kind="trial", task="cube_into_box", cell="standin")
+            EpisodeInfo(
+                id="trial_0001", kind="trial", task="cube_into_box", cell="standin", stand_in=True
+            )
         )
         writer.write(
             "/robot_description", string_to_cdr(scene.urdf), type_name=schema.STRING, log_time_ns=T0
@@ -177,6 +180,80 @@ def _check_file(run: RunFolder, pattern: str) -> None:
     assert verdict.accepted is True
     cube = streams.pose_track(episode, streams.object_pose_topics(episode)["cube"])
     assert np.linalg.norm(cube.p_m[-1] - cube.p_m[0]) > 0.2
+
+
+@pytest.mark.slow
+def test_both_engines_write_an_episode_each_and_the_first_decides(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = ReplayRunConfig(replay=replace(QUICK, engine="both"))
+    summary = replay_run(run, config, QUIET)
+    dynamic = [row for row in summary["rows"] if row["mode"] == "dynamic"]
+    assert len(dynamic) == 3
+    for row in dynamic:
+        assert row["accepted"] is True
+        assert row["engines"] == ["pybullet", "mujoco"]
+        assert row["engines_disagree"] is None
+        assert ".pybullet." in row["file"]
+    assert "engines agree on 3 of 3 replays" in describe_run(summary)
+    for engine, marks in (
+        ("pybullet", {}),
+        ("mujoco", {SAME_ENGINE_KEY: True, SECOND_ENGINE_KEY: True}),
+    ):
+        paths = run.derived(f"trial_0001.replay.*.dynamic.*.{engine}.*")
+        assert len(paths) == 3
+        for path in paths:
+            episode = Episode.open(path)
+            ((_, verdict),) = streams.verdicts(episode)
+            assert episode.derived is not None
+            assert verdict.engine == episode.derived.engine
+            assert str(verdict.engine).startswith(f"{engine}-")
+            keys = (SAME_ENGINE_KEY, SECOND_ENGINE_KEY)
+            settings = episode.derived.settings
+            assert {key: settings[key] for key in keys if key in settings} == marks
+            assert (SAME_ENGINE in verdict.warnings) is bool(marks)
+    again = replay_run(run, config, QUIET)
+    assert all(row["skipped"] for row in again["rows"])
+    run.derived("*.mujoco.*")[0].unlink()
+    done: list[ReplayJob] = []
+    monkeypatch.setattr(runner_module, "run_job", lambda job: done.append(job) or dynamic[0])
+    replay_run(run, config, QUIET)
+    assert len(done) == 1, "an engine's episode that is missing is made again"
+
+
+def test_engines_that_must_agree_make_a_row_null_and_say_why(
+    run: RunFolder, script: SimpleNamespace, good: ReplayResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def replay(config: ReplayConfig, plan: Any) -> ReplayResult:
+        (engine,) = config.engines()
+        terminal = Factor(value=engine == "pybullet", cause="inside", detail="30 mm outside")
+        verdict = replace(good.verdict, plan_id=plan.id, engine=f"{engine}-1", terminal=terminal)
+        return replace(good, verdict=replace(verdict, reason=None))
+
+    def planned(plan: Any, scene: Any, config: ReplayConfig) -> ReplayResult:
+        return replay(config, plan)
+
+    def executed(*args: Any, plan: Any) -> ReplayResult:
+        return replay(args[-1], plan)
+
+    monkeypatch.setattr(job_module, "replay_plan", planned)
+    monkeypatch.setattr(job_module, "replay_joints", executed)
+    monkeypatch.setattr(job_module, "compare", lambda *_: diverge("round-1", [], QUICK.divergence))
+    for must_agree, accepted in ((False, True), (True, None)):
+        replayed = replace(QUICK, engine="both", engines_must_agree=must_agree)
+        summary = replay_run(run, ReplayRunConfig(replay=replayed), QUIET)
+        (row,) = [row for row in summary["rows"] if row["plan"] == "round-0"]
+        assert row["accepted"] is accepted
+        assert "pybullet-1 accepted; mujoco-1 rejected" in row["engines_disagree"]
+        said = describe_run(summary)
+        assert "engines agree on 0 of 3 replays" in said
+        assert "round-0 planned: engines disagree: pybullet-1 accepted" in said
+    for path in run.derived("*.planned.dynamic.round-0.*.*.mcap"):
+        episode = Episode.open(path)
+        assert episode.derived is not None
+        if " and " in str(episode.derived.engine):
+            assert episode.derived.settings[SAME_ENGINE_KEY], "the cell's engine has its say in it"
+            assert streams.verdicts(episode)[0][1].accepted is None
 
 
 class PoolForReplays(ProcessPool):

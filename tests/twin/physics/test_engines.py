@@ -1,0 +1,269 @@
+"""Both engines do what a replay asks of a world, and refuse what they cannot do."""
+
+import hashlib
+import subprocess
+import sys
+from importlib import util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cells import ENGINES, HOME, URDF, at, cell, poses
+
+from bridge.errors import MissingDependencyError, UsageError
+from bridge.geometry import se3
+from twin.physics.arm import PhysicsError
+from twin.physics.config import PhysicsConfig, require_engine
+from twin.physics.engines import (
+    Attachment,
+    DrivenRobot,
+    PhysicsWorld,
+    engine_version,
+    installed_versions,
+    open_world,
+)
+from twin.replay.config import ReplayConfig
+
+CUBE = np.array([0.04, 0.04, 0.04])
+each_engine = pytest.mark.parametrize("engine", ENGINES)
+DROPPED = """
+import sys
+sys.path.insert(0, {folder!r})
+from test_engines import dropped
+print(*[dropped(engine) for engine in {engines!r}])
+"""
+
+
+def dropped(engine: str) -> str:
+    """Hash of all poses of two cubes that fall on the table, and on each other."""
+    digest = hashlib.sha256()
+    with cell(engine) as world:
+        world.add_table(0.0)
+        world.add_free("low", CUBE, 0.05, at(0.5, 0.0, 0.05))
+        world.add_free("high", CUBE, 0.05, at(0.51, 0.01, 0.12))
+        world.reset_robot(HOME, 0.08)
+        for _ in range(60):
+            world.robot.command(HOME, np.zeros(6), 0.08)
+            world.step()
+            for name in world.free_objects:
+                digest.update(np.array(world.object_pose(name)).tobytes())
+            digest.update(world.robot.posture()[0].tobytes())
+    return digest.hexdigest()
+
+
+@each_engine
+def test_each_is_a_world_with_a_robot_of_its_name(engine: str) -> None:
+    with cell(engine) as world:
+        assert isinstance(world, PhysicsWorld)
+        assert isinstance(world.robot, DrivenRobot)
+    assert engine_version(engine).startswith(f"{engine}-")
+
+
+def test_every_run_gives_the_same_bits_also_in_another_process() -> None:
+    once = [dropped(engine) for engine in ENGINES]
+    assert [dropped(engine) for engine in ENGINES] == once
+    script = DROPPED.format(folder=str(Path(__file__).parent), engines=ENGINES)
+    command = [sys.executable, "-c", script]
+    other = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert other.stdout.split() == once
+
+
+@each_engine
+def test_the_arm_follows_a_fast_motion(engine: str) -> None:
+    with cell(engine) as world:
+        world.reset_robot(HOME, 0.05)
+        t = np.arange(1, 241) / 240
+        path = HOME + 0.5 * (1 - np.cos(np.pi * t))[:, None] * np.array([1, 0.5, -0.5, 1, 1, 1])
+        before, off = HOME, []
+        for target in path:
+            world.robot.command(target, (target - before) * 240, 0.05)
+            world.step()
+            joints, width_m = world.robot.posture()
+            off.append(np.abs(joints - target).max())
+            before = target
+    assert max(off) < 1e-2
+    assert width_m == pytest.approx(0.05, abs=1e-4)
+
+
+@each_engine
+def test_fingers_close_on_a_cube_hold_it_and_let_it_go(engine: str) -> None:
+    with cell(engine) as world:
+        world.reset_robot(HOME, 0.06)
+        T_tcp = world.robot.T_base_link("tcp")
+        world.add_free("cube", CUBE, 0.05, T_tcp)
+        widths = []
+        for _ in range(240):
+            # Held where it is until the fingers are there: 0.1 s of a fall is 5 cm.
+            world.robot.command(HOME, np.zeros(6), 0.02)
+            world.step()
+            widths.append(world.robot.width_m())
+            if world.finger_touches("cube"):
+                break
+        closing_m_s = (0.06 - widths[-1]) / len(widths) * 240
+        assert closing_m_s <= 2 * 0.1 * 1.05, "each finger goes by 0.1 m/s at most"
+    with cell(engine) as world:
+        world.reset_robot(HOME, 0.041)
+        world.add_free("cube", CUBE, 0.05, world.robot.T_base_link("tcp"))
+        for _ in range(240):
+            world.robot.command(HOME, np.zeros(6), 0.0)
+            world.step()
+        assert world.robot.width_m() == pytest.approx(0.04, abs=1e-3)
+        assert world.finger_touches("cube")
+        fallen = world.robot.T_base_link("tcp")[2, 3] - world.T_base_object("cube")[2, 3]
+        assert abs(fallen) < 4e-3
+        for _ in range(120):
+            world.robot.command(HOME, np.zeros(6), 0.08)
+            world.step()
+        assert not world.finger_touches("cube")
+        assert world.T_base_object("cube")[2, 3] < T_tcp[2, 3] - 0.2
+
+
+@pytest.mark.parametrize("rate_hz", [60, 100, 240, 1000])
+def test_mujoco_grips_at_any_rate_of_control(rate_hz: int) -> None:
+    with cell("mujoco", rate_hz=rate_hz) as world:
+        world.reset_robot(HOME, 0.041)
+        world.add_free("cube", CUBE, 0.05, world.robot.T_base_link("tcp"))
+        for _ in range(rate_hz):
+            world.robot.command(HOME, np.zeros(6), 0.0)
+            world.step()
+        joints, width_m = world.robot.posture()
+        fallen = world.robot.T_base_link("tcp")[2, 3] - world.T_base_object("cube")[2, 3]
+    assert abs(fallen) < 4e-3
+    assert width_m == pytest.approx(0.04, abs=1e-3)
+    np.testing.assert_allclose(joints, HOME, atol=1e-3)
+
+
+@each_engine
+@pytest.mark.parametrize(("mass_kg", "holds"), [(1.7, True), (2.3, False)])
+def test_a_grip_holds_what_coulomb_says(engine: str, mass_kg: float, holds: bool) -> None:
+    """Two pads with 20 N and friction 0.5 carry 20 N, which is 2.0 kg."""
+    with cell(engine, object_friction=0.5) as world:
+        world.reset_robot(HOME, 0.0401)
+        world.add_free("cube", CUBE, mass_kg, world.robot.T_base_link("tcp"))
+        for _ in range(240):
+            world.robot.command(HOME, np.zeros(6), 0.0)
+            world.step()
+        fallen = world.robot.T_base_link("tcp")[2, 3] - world.T_base_object("cube")[2, 3]
+    assert (fallen < 0.01) == holds
+
+
+@each_engine
+def test_the_arm_feels_the_weight_of_what_it_holds_and_not_its_own_grip(engine: str) -> None:
+    """Two pads of 20 N cancel out; what is left is the object's weight."""
+    mass_kg, forces_N = 0.5, []
+    with cell(engine) as world:
+        world.reset_robot(HOME, 0.0401)
+        world.add_free("cube", CUBE, mass_kg, world.robot.T_base_link("tcp"))
+        for _ in range(240):
+            world.robot.command(HOME, np.zeros(6), 0.0)
+            world.step()
+            forces_N.append(world.arm_force_N())
+    assert np.mean(forces_N[120:]) == pytest.approx(mass_kg * 9.81, rel=0.05)
+
+
+@each_engine
+@pytest.mark.parametrize("tied", [True, False])
+def test_what_is_attached_needs_no_friction(engine: str, tied: bool) -> None:
+    with cell(engine, finger_friction=0.0, object_friction=0.02) as world:
+        world.reset_robot(HOME, 0.045)
+        T = world.robot.T_base_link("tcp")
+        world.add_free("cube", CUBE, 0.05, T)
+        tie, drops = Attachment(world), []
+        for width_m in (0.02, 0.08):
+            for _ in range(120):
+                world.robot.command(HOME, np.zeros(6), width_m)
+                world.step()
+                if tied:
+                    tie.update(width_m)
+            drops.append(float(T[2, 3] - world.T_base_object("cube")[2, 3]))
+    assert (abs(drops[0]) < 5e-3) is tied
+    assert drops[1] > 0.1
+
+
+@each_engine
+def test_a_tool_told_to_go_through_the_table_stops_on_it_within_its_torque(engine: str) -> None:
+    over = np.array([0.0, -1.4, 1.9, -2.07, -1.57, 0.0])
+    with cell(engine) as world:
+        world.add_table(0.0)
+        world.reset_robot(over, 0.02)
+        height_m = world.robot.T_base_link("tcp")[2, 3]
+        into = over + np.array([0, 0.3, 0, -0.3, 0, 0])
+        for step in range(480):
+            share = min(1.0, step / 240)
+            world.robot.command(over + share * (into - over), np.zeros(6), 0.02)
+            world.step()
+        low_m = world.robot.T_base_link("tcp")[2, 3]
+        joints, _ = world.robot.posture()
+    assert height_m > 0.09
+    # The tips are 10 mm below the tool's frame.
+    assert -0.005 < low_m < 0.03
+    assert np.isfinite(joints).all()
+
+
+@each_engine
+def test_a_description_without_fingers_is_refused_by_name(engine: str) -> None:
+    with pytest.raises(PhysicsError, match="lacks gripper_left_finger_joint"):
+        cell(engine, URDF.replace("gripper_left_finger_joint", "thumb_joint"))
+
+
+@each_engine
+def test_what_is_no_description_is_refused(engine: str) -> None:
+    broken = URDF.replace('<parent link="gripper_base"', '<parent link="nowhere"', 1)
+    with pytest.raises(PhysicsError, match="does not load the robot description"):
+        cell(engine, broken)
+
+
+@each_engine
+def test_an_object_that_is_not_there_is_named_with_those_that_are(engine: str) -> None:
+    with cell(engine) as world:
+        world.add_free("cube", CUBE, 0.05, at(0.5, 0.0, 0.05))
+        with pytest.raises(PhysicsError, match=r"no object 'duck'.*There are: cube"):
+            world.object_pose("duck")
+
+
+def test_what_is_added_later_leaves_the_rest_where_it_is() -> None:
+    with cell("mujoco") as world:
+        world.add_table(0.0)
+        world.add_free("first", CUBE, 0.05, at(0.8, 0.3, 0.3))
+        world.reset_robot(HOME, 0.05)
+        falling = poses(world, "first", 30)[-1]
+        world.add_free("second", CUBE, 0.05, at(0.8, -0.3, 0.0201))
+        np.testing.assert_allclose(world.object_pose("first"), falling, atol=1e-12)
+        np.testing.assert_allclose(world.robot.posture()[0], HOME, atol=1e-6)
+        after = poses(world, "first", 1)[-1]
+    assert (falling[2] - after[2]) * 240 == pytest.approx(9.81 * 30.75 / 240, rel=1e-3)
+
+
+def test_mujoco_has_no_soft_bodies_and_says_what_has() -> None:
+    with cell("mujoco") as world, pytest.raises(UsageError, match="--engine pybullet"):
+        world.soft_bodies()
+
+
+def test_an_engine_that_is_not_installed_is_named_with_its_extra(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(util, "find_spec", lambda name: None)
+    with pytest.raises(MissingDependencyError, match=r"robot-gst\[mujoco\]"):
+        open_world("mujoco", URDF, {}, PhysicsConfig())
+    with pytest.raises(MissingDependencyError, match="--engine mujoco needs it"):
+        ReplayConfig(engine="both")
+    assert installed_versions() == engine_version("pybullet")
+    require_engine("pybullet")
+
+
+def test_both_lift_and_carry_alike() -> None:
+    """The same commands end with the same cube in the same place, to 3 mm and 10 mrad."""
+    ends = []
+    for engine in ENGINES:
+        with cell(engine) as world:
+            world.reset_robot(HOME, 0.041)
+            world.add_free("cube", CUBE, 0.05, world.robot.T_base_link("tcp"))
+            for step in range(480):
+                target = HOME + min(1.0, step / 360) * np.array([0.4, 0.1, 0.1, 0, 0, 0.3])
+                world.robot.command(target, np.zeros(6), 0.02)
+                world.step()
+            T = se3.invert(world.robot.T_base_link("tcp")) @ world.T_base_object("cube")
+            ends.append((T, world.T_base_object("cube")))
+    for one, other in zip(*ends, strict=True):
+        np.testing.assert_allclose(one[:3, 3], other[:3, 3], atol=3e-3)
+        np.testing.assert_allclose(one, other, atol=1e-2)

@@ -1,0 +1,193 @@
+"""What a replay asks of a physics engine, and which engines answer."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib import metadata
+from types import TracebackType
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.errors import MissingDependencyError
+from twin.physics.arm import Hulls, Joints
+from twin.physics.config import ENGINES, Engine, PhysicsConfig, require_engine
+from twin.physics.engine import ENGINE_VERSION
+from twin.physics.soft_world import SoftWorld
+from twin.physics.world import Box, World
+
+
+@runtime_checkable
+class DrivenRobot(Protocol):
+    """An arm with a gripper that follows commands."""
+
+    def command(self, joints_rad: Joints, velocity_rad_s: Joints, width_m: float) -> None:
+        """Set the targets that the motors follow from the next step on."""
+
+    def posture(self) -> tuple[Float[np.ndarray, " num_joints"], float]:
+        """Where the arm is, and the distance between the finger pads."""
+
+    def width_m(self) -> float:
+        """Distance between the finger pads."""
+
+    def T_base_link(self, link: str) -> Float[np.ndarray, "4 4"]:
+        """Pose of a link's frame."""
+
+
+@runtime_checkable
+class PhysicsWorld(Protocol):
+    """One simulated cell, whatever engine moves it. A context manager.
+
+    The robot stands at the origin. Contact has Coulomb friction with the product of both partners'
+    coefficients. The same calls give the same bits on every run.
+    """
+
+    @property
+    def config(self) -> PhysicsConfig:
+        """Rates, frictions and forces."""
+
+    @property
+    def robot(self) -> DrivenRobot:
+        """The arm with its gripper."""
+
+    def soft_bodies(self) -> SoftWorld:
+        """What is soft in this world; an engine for rigid bodies only raises ``UsageError``."""
+
+    @property
+    def free_objects(self) -> Sequence[str]:
+        """Rigid objects that move, in the order in which they were added."""
+
+    def add_table(self, height_m: float) -> object:
+        """Add the table: a slab whose top is at the height."""
+
+    def add_static(self, boxes: Sequence[Box], T_base_owner: Float[np.ndarray, "4 4"]) -> object:
+        """Add solid boxes that never move."""
+
+    def add_free(
+        self,
+        object_id: str,
+        size_m: Float[np.ndarray, "3"],
+        mass_kg: float,
+        T_base_object: Float[np.ndarray, "4 4"],
+    ) -> None:
+        """Add a solid box that moves."""
+
+    def reset_robot(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
+        """Put the robot into a posture at rest, without simulating."""
+
+    def step(self) -> None:
+        """Advance by one control period, 1 / ``rate_hz``."""
+
+    def object_pose(self, object_id: str) -> tuple[float, ...]:
+        """Position [m] and quaternion wxyz of an object that moves, seven numbers."""
+
+    def T_base_object(self, object_id: str) -> Float[np.ndarray, "4 4"]:
+        """Pose of an object that moves."""
+
+    def finger_touches(self, object_id: str) -> bool:
+        """Whether a finger is in contact with an object that moves."""
+
+    def arm_force_N(self) -> float:
+        """Size of the force that rigid bodies exert on the arm in all; a grasp's cancel out."""
+
+    def tie(self, object_id: str) -> None:
+        """Fix a rigid object to the tool where it is."""
+
+    def untie(self) -> None:
+        """Let go of what is tied."""
+
+    def __enter__(self) -> "PhysicsWorld":
+        """Use as a context manager."""
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Free what the engine holds."""
+
+
+def open_world(
+    engine: Engine, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig
+) -> PhysicsWorld:
+    """Make an empty world with the robot in it.
+
+    Args:
+        engine: What moves it.
+        urdf: Description without package URIs.
+        mesh_hulls_m: Per link, hulls that replace its collision meshes [m].
+        config: Rates, frictions and forces.
+
+    Raises:
+        MissingDependencyError: When the engine is not installed.
+        PhysicsError: When it does not load the description, or joints are missing.
+    """
+    if engine == "pybullet":
+        return World(urdf, mesh_hulls_m, config)
+    require_engine(engine)
+    from twin.physics.mujoco_world import MujocoWorld  # noqa: PLC0415  # an extra of its own
+
+    return MujocoWorld(urdf, mesh_hulls_m, config)
+
+
+def engine_version(engine: Engine) -> str:
+    """Name an engine with its version, as verdicts carry it.
+
+    Raises:
+        MissingDependencyError: When it is not installed.
+    """
+    if engine == "pybullet":
+        return ENGINE_VERSION
+    require_engine(engine)
+    return f"{engine}-{metadata.version(engine)}"
+
+
+def installed_versions() -> str:
+    """All engines that are installed, with their versions."""
+    found = []
+    for engine in ENGINES:
+        with suppress(MissingDependencyError):
+            found.append(engine_version(engine))
+    return ", ".join(found)
+
+
+# Tie an object to the tool instead of holding it by friction: ``--grasp attach``, not the
+# default.
+# For robots or grippers whose friction nobody knows. What is tied cannot slip, so a verdict made
+# this way says nothing about the grasp; the engine's name carries the word wherever it is shown.
+
+PRESS_M = 0.001
+"""Fingers that are told to go this much farther than they are press on something."""
+OPEN_M = 0.002
+"""An object is let go when the fingers are told to be this much wider than when it was tied."""
+
+
+class Attachment:
+    """Holds at most one rigid object by a fixed joint, from the touch to the command to open."""
+
+    def __init__(self, world: PhysicsWorld) -> None:
+        """Start with empty fingers."""
+        self._world = world
+        self._tied = False
+        self._width_m = 0.0
+
+    def update(self, command_m: float) -> None:
+        """Tie what the fingers press on, or let go. Call once per step.
+
+        Args:
+            command_m: The distance the fingers are told to have.
+        """
+        if self._tied:
+            if command_m > self._width_m + OPEN_M:
+                self._world.untie()
+                self._tied = False
+            return
+        width_m = self._world.robot.width_m()
+        if command_m > width_m - PRESS_M:
+            return
+        for object_id in self._world.free_objects:
+            if self._world.finger_touches(object_id):
+                self._world.tie(object_id)
+                self._tied, self._width_m = True, width_m
+                return

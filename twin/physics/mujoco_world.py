@@ -1,0 +1,460 @@
+"""One simulated cell in MuJoCo: the second engine, for rigid bodies.
+
+Robot, boxes, masses and commands are those of ``twin.physics.world``. What differs is how contact
+is solved: MuJoCo minimises over all contact forces at once and lets bodies sink in a little, so its
+grasps neither slip as PyBullet's do nor fail where its iterations end.
+"""
+
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from bridge.errors import UsageError
+from bridge.geometry import se3
+from bridge.robots.default import ROBOT
+from bridge.robots.robot import Robot
+from twin.physics.arm import Hulls, Joints, PhysicsError, write_description
+from twin.physics.config import RIGID_ONLY, PhysicsConfig
+from twin.physics.soft_world import SoftWorld
+from twin.physics.world import Box
+
+STEP_HZ = 480
+"""The engine takes whole steps in each period of control, at least so many a second: at fewer the
+motors shake."""
+LINK_FRICTION = 0.5
+"""Of links other than fingers; what PyBullet gives to links without a coefficient."""
+_ARM_RAD_S = 100.0
+"""Natural frequency of the arm's controller, critically damped; the largest that stays well below
+one radian in each step."""
+_FINGER_N_M = 20_000.0
+"""Stiffness of a finger's drive: its whole force within a millimetre of where it should be."""
+_FINGER_N_s_m = 80.0
+_FINGER_ARMATURE_KG = 0.2
+"""Reflected inertia of a finger's motor; light fingers would shake at this step."""
+_CONTACT = {"solref": (0.005, 1.0), "solimp": (0.95, 0.99, 0.0005, 0.5, 2.0)}
+"""Contact as hard as the step allows: 20 N sink in by less than 0.1 mm."""
+_IMPRATIO = 10.0
+"""Friction is held so much more stiffly than contact: what is grasped does not creep."""
+_OBJECT = "object/"
+_HULLS_AND_FIXED_LINKS = {
+    "fusestatic": "false",
+    "strippath": "false",
+    "discardvisual": "false",
+    "balanceinertia": "false",
+}
+
+
+@lru_cache(maxsize=4)
+def _robot_spec(urdf: str, hulls: tuple[tuple[str, tuple[bytes, ...]], ...]) -> Any:
+    """The robot as MuJoCo reads the description that PyBullet gets too; copy it before use.
+
+    Raises:
+        PhysicsError: When MuJoCo does not load it.
+    """
+    points = {link: [np.frombuffer(raw).reshape(-1, 3) for raw in raws] for link, raws in hulls}
+    with tempfile.TemporaryDirectory(prefix="robot-gst-physics-") as folder:
+        root = ET.fromstring(write_description(urdf, points, Path(folder)).read_text())
+        ET.SubElement(ET.SubElement(root, "mujoco"), "compiler", _HULLS_AND_FIXED_LINKS)
+        assets = {str(path): path.read_bytes() for path in Path(folder).glob("*.obj")}
+        try:
+            spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"), assets=assets)
+            spec.copy().compile()
+        except ValueError as error:
+            message = (
+                f"MuJoCo does not load the robot description ({error}). "
+                "Check its links and collision meshes."
+            )
+            raise PhysicsError(message) from error
+    return spec
+
+
+class MujocoArm:
+    """The robot of one world."""
+
+    def __init__(self, spec: Any, record: Robot, config: PhysicsConfig) -> None:
+        """Give the joints motors.
+
+        Args:
+            spec: Of the world, with the robot in it.
+            record: Which joints and links are whose.
+            config: Frictions and forces.
+
+        Raises:
+            PhysicsError: When joints or links are missing.
+        """
+        _check_names(spec, record)
+        self._record, self._config = record, config
+        self._drives = record.gripper.fingers
+        self._model: Any = None
+        self._data: Any = None
+        # Until it is told otherwise it stays where the description puts it.
+        self._target_rad: Any = np.zeros(len(record.joints))
+        self._speed_rad_s: Any = np.zeros(len(record.joints))
+        self._target_m = self._ramp_m = 0.0
+        efforts = np.array([float(spec.joint(name).actfrcrange[1]) for name in record.joints])
+        self._driven = efforts > 0
+        for name, effort in zip(record.joints, efforts.tolist(), strict=True):
+            _add_motor(spec, name, effort)
+        for finger in self._drives:
+            joint, force = spec.joint(finger.joint), config.grip_force_N
+            joint.armature, joint.actfrcrange = _FINGER_ARMATURE_KG, [-force, force]
+            motor = _add_motor(spec, finger.joint, force)
+            motor.set_to_position(kp=_FINGER_N_M, kv=_FINGER_N_s_m)
+        first, *others = self._drives
+        for other in others:  # they move together, as by a gear
+            gear = spec.add_equality(
+                type=mujoco.mjtEq.mjEQ_JOINT, name1=other.joint, name2=first.joint
+            )
+            ratio = other.per_m / first.per_m
+            gear.data[:5] = [other.closed - ratio * first.closed, ratio, 0.0, 0.0, 0.0]
+            gear.solref = _CONTACT["solref"]
+
+    def bind(self, model: Any, data: Any) -> None:
+        """Take the compiled world; call again when it was compiled again."""
+        self._model, self._data = model, data
+        joints = [model.joint(name) for name in self._record.joints]
+        fingers = [model.joint(finger.joint) for finger in self._drives]
+        self._arm = np.array([int(joint.qposadr[0]) for joint in joints])
+        self._arm_dofs = np.array([int(joint.dofadr[0]) for joint in joints])
+        self._fingers = np.array([int(joint.qposadr[0]) for joint in fingers])
+        self._finger_dofs = np.array([int(joint.dofadr[0]) for joint in fingers])
+        self._wanted, self._torques = np.zeros(model.nv), np.zeros(model.nv)
+
+    def reset(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
+        """Put the robot into a posture at rest, without simulating."""
+        data = self._data
+        data.qpos[self._arm], data.qvel[self._arm_dofs] = joints_rad, 0.0
+        data.qpos[self._fingers] = [finger.value(width_m) for finger in self._drives]
+        data.qvel[self._finger_dofs] = 0.0
+        self._ramp_m = width_m
+        self.command(joints_rad, np.zeros(len(self._arm)), width_m)
+        mujoco.mj_forward(self._model, data)
+
+    def command(self, joints_rad: Joints, velocity_rad_s: Joints, width_m: float) -> None:
+        """Set the position targets that the motors follow from the next step on."""
+        self._target_rad, self._speed_rad_s = np.asarray(joints_rad), np.asarray(velocity_rad_s)
+        self._target_m = min(max(width_m, 0.0), self._record.gripper.max_width_m)
+
+    def drive(self, left_s: float) -> None:
+        """Set the motors for one step of the engine, whose positions and velocities are known.
+
+        Args:
+            left_s: From the end of that step to when the command is to be reached.
+        """
+        data, count = self._data, len(self._arm)
+        # Computed torque: what moves the arm as it should, gravity and inertia taken out.
+        far = self._target_rad - left_s * self._speed_rad_s - data.qpos[self._arm]
+        slow = self._speed_rad_s - data.qvel[self._arm_dofs]
+        wanted = _ARM_RAD_S * (_ARM_RAD_S * far + 2.0 * slow)
+        self._wanted[self._arm_dofs] = np.where(self._driven, wanted, 0.0)
+        mujoco.mj_mulM(self._model, data, self._torques, self._wanted)
+        data.ctrl[:count] = (self._torques + data.qfrc_bias)[self._arm_dofs]
+        # A ramp as fast as both fingers may be, no farther from them than their force reaches.
+        config, here = self._config, self.width_m()
+        stride = 2.0 * config.finger_speed_m_s * float(self._model.opt.timestep)
+        reach = 2.0 * config.grip_force_N / _FINGER_N_M
+        ramp = self._ramp_m + min(max(self._target_m - self._ramp_m, -stride), stride)
+        self._ramp_m = min(max(ramp, here - reach), here + reach)
+        data.ctrl[count:] = [finger.value(self._ramp_m) for finger in self._drives]
+
+    def posture(self) -> tuple[Float[np.ndarray, " num_joints"], float]:
+        """Where the arm is, and the distance between the finger pads."""
+        return np.array(self._data.qpos[self._arm]), self.width_m()
+
+    def width_m(self) -> float:
+        """Distance between the finger pads."""
+        values = self._data.qpos[self._fingers].tolist()
+        widths = [
+            (value - finger.closed) / finger.per_m
+            for value, finger in zip(values, self._drives, strict=True)
+        ]
+        return float(sum(widths) / len(widths))
+
+    def T_base_link(self, link: str) -> Float[np.ndarray, "4 4"]:
+        """Pose of a link's frame."""
+        mujoco.mj_kinematics(self._model, self._data)
+        body = self._data.body(link)
+        return se3.transform_from(np.array(body.xquat), np.array(body.xpos))
+
+
+def _check_names(spec: Any, record: Robot) -> None:
+    joints = [joint.name for joint in spec.joints]
+    links = [body.name for body in spec.bodies]
+    wanted = (*record.joints, *(finger.joint for finger in record.gripper.fingers))
+    missing = [name for name in wanted if name not in joints]
+    missing += [
+        name for name in (record.tool_frame, *record.gripper.finger_links) if name not in links
+    ]
+    if missing:
+        message = (
+            f"the robot description lacks {', '.join(missing)}; it has the joints "
+            f"{', '.join(joints)}. Physics needs the arm and two prismatic fingers."
+        )
+        raise PhysicsError(message)
+
+
+def _add_motor(spec: Any, joint: str, most: float) -> Any:
+    """Let a motor act on a joint, with so much force or torque at most."""
+    motor = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    if most > 0:
+        motor.forcelimited, motor.forcerange = True, [-most, most]
+    else:  # a joint without effort is passive
+        motor.gainprm[0] = 0.0
+    return motor
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Shape:
+    """One solid, and what may meet it."""
+
+    name: str
+    friction: float
+    owner: Literal["robot", "static", "object"]
+    on_table: bool = False
+    """Of the robot's base, which touches the table by construction."""
+    table: bool = False
+
+    def meets(self, other: "_Shape") -> bool:
+        """Whether contact between the two counts: something of a pair must move by itself."""
+        if self.owner == other.owner:
+            return self.owner == "object"
+        return not ((self.on_table and other.table) or (self.table and other.on_table))
+
+
+class MujocoWorld:
+    """One simulated cell. A context manager, as every world; there is nothing to free."""
+
+    def __init__(self, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig) -> None:
+        """Load the robot with its base at the origin.
+
+        Args:
+            urdf: Description without package URIs.
+            mesh_hulls_m: Per link, hulls that replace its collision meshes [m].
+            config: Rates, frictions and forces.
+
+        Raises:
+            PhysicsError: When MuJoCo does not load the description or joints are missing.
+        """
+        self.config = config
+        hulls = tuple(
+            (link, tuple(np.asarray(points, dtype=np.float64).tobytes() for points in several))
+            for link, several in mesh_hulls_m.items()
+        )
+        self._spec = _robot_spec(urdf, hulls).copy()
+        option = self._spec.option
+        self._num_steps = -(-STEP_HZ // config.rate_hz)
+        option.timestep = 1.0 / (config.rate_hz * self._num_steps)
+        option.gravity = [0.0, 0.0, -config.gravity_m_s2]
+        option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        option.impratio = _IMPRATIO
+        self._record = ROBOT
+        self.robot = MujocoArm(self._spec, self._record, config)
+        self.free_objects: list[str] = []
+        self._shapes: list[_Shape] = []
+        self._finger_shapes: set[str] = set()
+        self._add_robot_shapes()
+        self._model: Any = None
+        self._data: Any = None
+        self._compile()
+
+    def soft_bodies(self) -> SoftWorld:
+        """Soft bodies, which this engine does not replay.
+
+        Raises:
+            UsageError: Always.
+        """
+        raise UsageError(RIGID_ONLY)
+
+    def _add_robot_shapes(self) -> None:
+        for body in self._spec.bodies:
+            finger = body.name in self._record.gripper.finger_links
+            mu = self.config.finger_friction if finger else LINK_FRICTION
+            for index, geom in enumerate(body.geoms):
+                geom.name = f"{body.name}/{index}"
+                # Only explicit pairs have the product of two coefficients; nothing else meets.
+                geom.contype = geom.conaffinity = 0
+                on_table = body.name in (self._record.base_frame, "world")
+                self._shapes.append(
+                    _Shape(name=geom.name, friction=mu, owner="robot", on_table=on_table)
+                )
+                if finger:
+                    self._finger_shapes.add(geom.name)
+
+    def add_table(self, height_m: float, size_m: float = 4.0, thickness_m: float = 0.4) -> None:
+        """Add the table: a slab whose top is at the height."""
+        T = np.eye(4)
+        T[2, 3] = height_m - thickness_m / 2
+        self._add_static(np.array([size_m, size_m, thickness_m]), T, table=True)
+
+    def add_static(self, boxes: Sequence[Box], T_base_owner: Float[np.ndarray, "4 4"]) -> None:
+        """Add solid boxes that never move."""
+        for centre, extents in boxes:
+            T_owner_box = np.eye(4)
+            T_owner_box[:3, 3] = centre
+            self._add_static(extents, T_base_owner @ T_owner_box, table=False)
+
+    def _add_static(
+        self, size_m: Float[np.ndarray, "3"], T: Float[np.ndarray, "4 4"], *, table: bool
+    ) -> None:
+        q, p = se3.split(T)
+        name = f"static/{len(self._shapes)}"
+        self._spec.worldbody.add_geom(name=name, pos=p, quat=q, **_box(size_m))
+        friction = self.config.surface_friction
+        self._pair(_Shape(name=name, friction=friction, owner="static", table=table))
+
+    def add_free(
+        self,
+        object_id: str,
+        size_m: Float[np.ndarray, "3"],
+        mass_kg: float,
+        T_base_object: Float[np.ndarray, "4 4"],
+    ) -> None:
+        """Add a solid box that moves."""
+        q, p = se3.split(T_base_object)
+        name = _OBJECT + object_id
+        body = self._spec.worldbody.add_body(name=name, pos=p, quat=q)
+        body.add_freejoint(name=name)
+        body.add_geom(name=name, mass=mass_kg, **_box(size_m))
+        weld = self._spec.add_equality(
+            name=name,
+            type=mujoco.mjtEq.mjEQ_WELD,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            name1=self._record.tool_frame,
+            name2=name,
+            active=False,
+        )
+        weld.solref = _CONTACT["solref"]
+        self.free_objects.append(object_id)
+        self._pair(_Shape(name=name, friction=self.config.object_friction, owner="object"))
+
+    def _pair(self, shape: _Shape) -> None:
+        """Let a shape meet those that are there already."""
+        for other in self._shapes:
+            if shape.meets(other):
+                mu = shape.friction * other.friction
+                pair = self._spec.add_pair(geomname1=other.name, geomname2=shape.name, condim=3)
+                pair.friction[:2] = mu
+                pair.solref, pair.solimp = _CONTACT["solref"], _CONTACT["solimp"]
+        self._shapes.append(shape)
+        self._changed = True
+
+    def _compile(self) -> None:
+        """Compile what was added; what is there already stays where it is."""
+        if self._model is None:
+            self._model = self._spec.compile()
+            self._data = mujoco.MjData(self._model)
+        else:
+            self._model, self._data = self._spec.recompile(self._model, self._data)
+        self._changed = False
+        self.robot.bind(self._model, self._data)
+        self._addresses = {
+            name: int(self._model.joint(_OBJECT + name).qposadr[0]) for name in self.free_objects
+        }
+        self._geoms = {name: int(self._model.geom(_OBJECT + name).id) for name in self.free_objects}
+        self._robot_geoms = {
+            int(self._model.geom(shape.name).id) for shape in self._shapes if shape.owner == "robot"
+        }
+        self._finger_geoms = {int(self._model.geom(name).id) for name in self._finger_shapes}
+        mujoco.mj_forward(self._model, self._data)
+
+    def reset_robot(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
+        """Put the robot into a posture at rest, without simulating."""
+        if self._changed:
+            self._compile()
+        self.robot.reset(joints_rad, width_m)
+
+    def step(self) -> None:
+        """Advance by one control period."""
+        if self._changed:
+            self._compile()
+        for left in reversed(range(self._num_steps)):
+            mujoco.mj_step1(self._model, self._data)
+            self.robot.drive(left * float(self._model.opt.timestep))
+            mujoco.mj_step2(self._model, self._data)
+
+    def object_pose(self, object_id: str) -> tuple[float, ...]:
+        """Position [m] and quaternion wxyz of an object that moves, seven numbers."""
+        start = self._address(object_id)
+        # Not the body's frame, which is that of before the last step.
+        return tuple(self._data.qpos[start : start + 7].tolist())
+
+    def T_base_object(self, object_id: str) -> Float[np.ndarray, "4 4"]:
+        """Pose of an object that moves."""
+        pose = np.array(self.object_pose(object_id))
+        return se3.transform_from(pose[3:], pose[:3])
+
+    def finger_touches(self, object_id: str) -> bool:
+        """Whether a finger is in contact with an object that moves."""
+        self._address(object_id)
+        mine = self._geoms[object_id]
+        return any(
+            (first == mine and second in self._finger_geoms)
+            or (second == mine and first in self._finger_geoms)
+            for first, second in self._data.contact.geom.tolist()
+        )
+
+    def arm_force_N(self) -> float:
+        """Size of the force that rigid bodies exert on the arm in all; a grasp's cancel out."""
+        total, force = np.zeros(3), np.zeros(6)
+        for index, (first, second) in enumerate(self._data.contact.geom.tolist()):
+            mujoco.mj_contactForce(self._model, self._data, index, force)
+            # In the contact's axes, on the second shape: the first axis leads from first to second.
+            pushed = self._data.contact.frame[index].reshape(3, 3).T @ force[:3]
+            total += pushed if second in self._robot_geoms else 0.0
+            total -= pushed if first in self._robot_geoms else 0.0
+        return float(np.linalg.norm(total))
+
+    def _address(self, object_id: str) -> int:
+        if self._changed:
+            self._compile()
+        if object_id not in self._addresses:
+            known = ", ".join(self.free_objects) or "none"
+            message = f"no object {object_id!r} moves in this world. There are: {known}."
+            raise PhysicsError(message)
+        return self._addresses[object_id]
+
+    def tie(self, object_id: str) -> None:
+        """Fix a rigid object to the tool where it is."""
+        T_base_tool = self.robot.T_base_link(self._record.tool_frame)
+        T_tool_object = se3.invert(T_base_tool) @ self.T_base_object(object_id)
+        q, p = se3.split(T_tool_object)
+        weld = self._model.equality(_OBJECT + object_id).id
+        # Anchor at the object's centre; turning counts a metre for a radian.
+        self._model.eq_data[weld] = np.concatenate([np.zeros(3), p, q, [1.0], np.zeros(1)])
+        self._data.eq_active[weld] = 1
+
+    def untie(self) -> None:
+        """Let go of what is tied."""
+        for object_id in self.free_objects:
+            self._data.eq_active[self._model.equality(_OBJECT + object_id).id] = 0
+
+    def __enter__(self) -> "MujocoWorld":
+        """Use as a context manager."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Nothing to free: model and data go with the world."""
+
+
+def _box(size_m: Float[np.ndarray, "3"]) -> dict[str, Any]:
+    return {
+        "type": mujoco.mjtGeom.mjGEOM_BOX,
+        "size": (np.asarray(size_m) / 2).tolist(),
+        "contype": 0,
+        "conaffinity": 0,
+    }
