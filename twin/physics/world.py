@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.robots.default import BASE_FRAME, TCP_FRAME
 from twin.physics.arm import Arm, Hulls, PhysicsError, Press
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import give_client_back, pybullet, take_client
@@ -138,9 +137,8 @@ class World:
         extents = np.array([size_m, size_m, thickness_m])
         body = self.add_static([(centre, extents)], np.eye(4))[0]
         # The robot stands on the table: its base touches it by construction.
-        self._ignore(body, -1)
-        if BASE_FRAME in self.robot.links:
-            self._ignore(body, self.robot.links[BASE_FRAME])
+        for link in (-1, *self.robot.base_links):
+            self._ignore(body, link)
         return body
 
     def _ignore(self, body: int, link: int) -> None:
@@ -307,13 +305,14 @@ class Attachment:
                 return
 
     def _tie(self, object_id: str) -> int:
-        T_tcp_base = se3.invert(self._world.robot.T_base_link(TCP_FRAME))
+        tool = self._world.robot.record.tool_frame
+        T_tcp_base = se3.invert(self._world.robot.T_base_link(tool))
         q, p = se3.split(T_tcp_base @ self._world.T_base_object(object_id))
         w, x, y, z = q.tolist()
         return int(
             pybullet.createConstraint(
                 self._world.robot.id,
-                self._world.robot.links[TCP_FRAME],
+                self._world.robot.links[tool],
                 self._world.free_ids[object_id],
                 -1,
                 pybullet.JOINT_FIXED,

@@ -17,6 +17,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import EpisodeError, GstError
+from bridge.robots.robot import robot_of
 from bridge.task.plan import Plan
 from bridge.task.predicate import evaluate_success
 from bridge.task.record import parse_record
@@ -51,7 +52,7 @@ from twin.replay.trace import (
 from twin.replay.verdict import KINEMATIC_ENGINE, engine_of, findings_of, replay_joints, replay_plan
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
-from twin.robot.posture import check_clock
+from twin.robot.posture import check_clock, width_track
 
 REPLAY_VERSION = 18
 """Raise it when the same inputs give another replay, so that old files are redone."""
@@ -429,7 +430,7 @@ def _tracks(source: _Source) -> tuple[streams.JointTrack, streams.JointTrack]:
     check_length(job.length_ns(), source.plan)
     arm = cut_track(streams.joint_track(episode, JOINT_STATES), job.start_ns, end_ns)
     check_covers(arm, "joints", end_ns, source.plan)
-    widths = cut_track(streams.joint_track(episode, GRIPPER_STATE), job.start_ns, end_ns)
+    widths = cut_track(width_track(episode, robot_of(source.scene.urdf)), job.start_ns, end_ns)
     check_covers(widths, "gripper widths", end_ns, source.plan)
     return arm, widths
 
@@ -441,7 +442,9 @@ def _recording(source: _Source) -> Recording:
     seen_ns = job.end.seen_ns
     return Recording(
         plan=source.plan_as_executed,
-        path=path_of_execution(arm, widths, source.plan_as_executed, kinematic),
+        path=path_of_execution(
+            arm, widths, source.plan_as_executed, kinematic, robot_of(source.scene.urdf)
+        ),
         scene=source.scene,
         end=source.correction.state(job.end),
         end_seen_ns=job.length_ns() if seen_ns is None else seen_ns - job.start_ns,

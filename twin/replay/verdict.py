@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bridge.episode.streams import JointTrack
+from bridge.robots.robot import robot_of
 from bridge.task.plan import Plan
 from bridge.task.predicate import (
     ALLOWED_CONTACTS,
@@ -195,7 +196,7 @@ def replay_joints(
     Raises:
         UnusablePlanError: When a track is empty or names other joints.
     """
-    path = path_of_execution(track, widths, plan, config)
+    path = path_of_execution(track, widths, plan, config, robot_of(scene.urdf))
     return _replay(path, [], None, plan, scene, config, trajectory="executed")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from twin.robot.config import IkConfig
-from twin.robot.inverse import HOME_RAD, NUM_BRANCHES, UrInverse, solve_ik
+from twin.robot.inverse import NUM_BRANCHES, UrInverse, solve_ik
 from twin.robot.model import RobotModel
 
 Clearance = Callable[
@@ -73,7 +73,7 @@ def follow_poses(
         # A path that passes through a straight wrist must not leave its branch for that pose.
         known = np.flatnonzero(valid.any(axis=1) & ~singular)
         if len(known):
-            tree = _Tree(inverse, raw[known], valid[known], start_rad)
+            tree = _Tree(inverse, raw[known], valid[known], start_rad, robot.home_rad)
             branch[known], joints[known] = tree.choose(clearance)
     exact = inverse is not None and inverse.geometry.deviation < _EXACT_M
     return _completed(robot, Ts_base_tcp, joints, branch, start_rad, config, exact=exact)
@@ -118,12 +118,13 @@ class _Tree:
         raw: Float[np.ndarray, "num_poses 8 6"],
         valid: Bool[np.ndarray, "num_poses 8"],
         start_rad: Float[np.ndarray, "6"] | None,
+        home_rad: Float[np.ndarray, "6"],
     ) -> None:
         self._inverse = inverse
         self._raw = raw
         self._start = start_rad
         self._steps = _step_costs(raw, valid)
-        near = raw[0] - (HOME_RAD if start_rad is None else start_rad)
+        near = raw[0] - (home_rad if start_rad is None else start_rad)
         weight = _HOME_WEIGHT if start_rad is None else 1.0
         first = weight * np.square(_wrapped(near)).sum(axis=-1)
         self._first = np.where(valid[0], first, np.inf)

@@ -18,8 +18,6 @@ from bridge.geometry import se3
 from twin.robot.config import IkConfig
 from twin.robot.model import RobotModel
 
-HOME_RAD = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
-"""Where a search begins that knows no better; treat as constant."""
 _CONVERGED = 1e-8
 """Norm of the error twist at which iterating stops: far below the tolerance, so that a round
 trip is exact and the tolerance decides feasibility only."""
@@ -59,7 +57,7 @@ def solve_ik(
     Returns:
         The best solution found; ``reached`` says whether it is one.
     """
-    start = HOME_RAD if warm_start_rad is None else warm_start_rad
+    start = robot.home_rad if warm_start_rad is None else warm_start_rad
     best = _descend(robot, T_base_tcp, start, config)
     if best.reached:
         return best

@@ -23,7 +23,8 @@ from bridge.episode.topics import (
     cell_topic,
 )
 from bridge.errors import PathNotFoundError, UsageError
-from bridge.robots.default import ARM_JOINTS, GRIPPER_WIDTH, ROBOT
+from bridge.robots.default import ARM_JOINTS, ROBOT
+from bridge.robots.robot import GRIPPER_WIDTH
 from bridge.sources.device_samples import Announcer, HostClock, NumberedPublisher
 from bridge.sources.ur import messages
 from bridge.sources.ur.config import ControllerError, UrConfig

@@ -39,6 +39,7 @@ from bridge.episode.topics import (
 )
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
+from bridge.robots.robot import robot_of
 from bridge.task.record import parse_record
 from twin.errors import TwinError
 from twin.robot.posture import PostureTrack, check_joints
@@ -96,7 +97,7 @@ class LiveCell:
         arm = joint_track_of(self.joints)
         if arm is None:
             raise CameraNotReadyError("no joint states have arrived, and it is in the hand")
-        check_joints(arm, "the cell")
+        check_joints(arm, "the cell", robot_of(self.urdf))
         return PostureTrack(urdf=self.urdf, arm=arm, widths=None)
 
     def poses(
