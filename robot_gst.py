@@ -139,6 +139,17 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
             ),
         ),
     ),
+    "robot": (
+        "Robot files: arms, grippers and tools.",
+        (
+            (
+                "check",
+                "twin.cli:robot_check",
+                "Joints, limits, frames, gripper; what is refused.",
+                "mine.toml",
+            ),
+        ),
+    ),
     "import": (
         "Import recordings of other programs into a run.",
         (

@@ -20,8 +20,7 @@ from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
-from bridge.robots.default import BASE_FRAME, ROBOT
-from bridge.robots.robot import resolve_mesh
+from bridge.robots.robot import resolve_mesh, robot_of
 from bridge.task.task_file import Task
 from dashboards.errors import DashboardError
 from dashboards.frames import media_type
@@ -137,7 +136,7 @@ def log_robot(
 ) -> bool:
     """Log the robot under ``<prefix>/robot``; when it cannot be drawn, note why and return False.
 
-    Each finger joint is at half the gripper width.
+    Finger joints are where their law puts them at the gripper's width.
     """
     if urdf is None:
         file.note("the robot is not drawn: the episode holds no robot description")
@@ -169,7 +168,7 @@ def log_robot(
     for index, name in enumerate(joints.names):
         _move(file, tree, prefix, name, joints, joints.position[:, index])
     if widths is not None:
-        for finger in ROBOT.gripper.fingers:
+        for finger in robot_of(urdf).gripper.fingers:
             values = finger.value(widths.position[:, 0])
             _move(file, tree, prefix, finger.joint, widths, values)
     return True
@@ -192,7 +191,7 @@ def _move(
 
 
 def drawable(urdf: str) -> str:
-    """Return the URDF with only its visuals, absolute meshes, and ``base_link`` as its root.
+    """Return the URDF with only its visuals, absolute meshes, and the robot's base as its root.
 
     Raises:
         DashboardError: When the text is not a URDF.
@@ -212,7 +211,7 @@ def drawable(urdf: str) -> str:
             link.remove(collision)
         for mesh in link.iter("mesh"):
             mesh.set("filename", str(resolve_mesh(mesh.get("filename", ""))))
-    _drop_above(robot, BASE_FRAME)
+    _drop_above(robot, robot_of(urdf).base_frame)
     return ET.tostring(robot, encoding="unicode")
 
 

@@ -6,7 +6,6 @@ machine's speed; the wall clock is the last resort against what hangs.
 """
 
 import queue
-import re
 import threading
 import time
 import traceback
@@ -19,7 +18,7 @@ from jaxtyping import Float
 
 from bridge.episode.topics import ROBOT_DESCRIPTION
 from bridge.errors import GstError
-from bridge.robots.default import BASE_FRAME
+from bridge.robots.robot import robot_name, robot_of
 from bridge.task.plan import Plan
 from bridge.task.task_file import ObjectModel, Task
 from bridge.task.verdict import Factor, Verdict
@@ -237,11 +236,6 @@ class Gate:
                 f"plan {plan.id} is for task {plan.task!r}; this gate judges {self._task.name!r}. "
                 "Start it with --task."
             )
-        if plan.frame != BASE_FRAME:
-            raise UndecidedError(
-                f"plan {plan.id} is given in frame {plan.frame!r}; only {BASE_FRAME!r}, the "
-                "robot's root, is judged"
-            )
         urdf = self._perception.urdf()
         if urdf is None:
             raise UndecidedError(f"no robot description has arrived on {ROBOT_DESCRIPTION}")
@@ -249,6 +243,12 @@ class Gate:
         if plan.robot != robot:
             raise UndecidedError(
                 f"plan {plan.id} is for robot {plan.robot!r}; the cell's robot is {robot!r}"
+            )
+        base_frame = robot_of(urdf).base_frame
+        if plan.frame != base_frame:
+            raise UndecidedError(
+                f"plan {plan.id} is given in frame {plan.frame!r}; only {base_frame!r}, the "
+                "robot's base, is judged"
             )
         running = self._perception.executing()
         if running is not None:
@@ -343,9 +343,3 @@ def no_verdict(plan: Plan, reason: str) -> Verdict:
         seed=0,
         reason=reason,
     )
-
-
-def robot_name(urdf: str) -> str:
-    """Return the name in a URDF's ``<robot>`` element, "" when there is none."""
-    found = re.search(r"<robot\b[^>]*?\bname\s*=\s*[\"']([^\"']*)[\"']", urdf)
-    return found[1] if found else ""

@@ -21,6 +21,7 @@ from bridge.episode.topics import (
     cell_topic,
 )
 from bridge.errors import UsageError
+from bridge.robots.robot import read_robot
 from bridge.task.task_file import load_task
 from bridge.terminal import Output, printable, stop_signals
 from bridge.wire.config import WireConfig
@@ -126,7 +127,8 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
         message = f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'."
         raise UsageError(message)
     run, task = RunFolder.open(path), load_task(config.task)
-    perception = LiveView(config.cell, read_calibration(run))
+    urdf = read_robot(config.robot).description() if config.robot else None
+    perception = LiveView(config.cell, read_calibration(run), urdf)
     wire = WireConfig(connect=config.connect, config=config.zenoh_config)
     with (
         stop_signals() as stopped,

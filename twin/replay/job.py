@@ -17,7 +17,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import EpisodeError, GstError
-from bridge.robots.robot import robot_of
+from bridge.robots.robot import read_robot, robot_of
 from bridge.task.plan import Plan
 from bridge.task.predicate import evaluate_success
 from bridge.task.record import parse_record
@@ -90,6 +90,8 @@ class ReplayJob:
     calibration_id: str | None = None
     render: bool = False
     """Also draw what the recorded cameras would have seen."""
+    robot: str = ""
+    """Robot file whose description is used; "": the recorded one."""
     problem: str = ""
     """Why the plan's execution, of which there was one, cannot be replayed."""
 
@@ -117,7 +119,8 @@ class ReplayJob:
     def needed_paths(self) -> tuple[Path, ...]:
         """What a process on another machine must see."""
         scene = () if self.run_path is None else (self.run_path,)
-        return (self.episode_path, self.folder, *scene)
+        robot = (Path(self.robot).resolve(),) if self.robot.endswith(".toml") else ()
+        return (self.episode_path, self.folder, *scene, *robot)
 
     def path(self) -> Path:
         """Where the derived episode goes."""
@@ -156,6 +159,7 @@ class ReplayJob:
             "shapes": dict(self.shapes),
             "calibration_id": self.calibration_id,
             "render": self.render,
+            **({"robot": read_robot(self.robot).description()} if self.robot else {}),
             **self._sampled_from(),
             **self._compared_with(),
         }
@@ -381,6 +385,8 @@ def _replay(job: ReplayJob) -> tuple[Verdict, dict[str, Any] | None]:
 def _open(job: ReplayJob) -> _Source:
     episode = Episode.open(job.episode_path)
     urdf = streams.robot_description(episode)
+    if job.robot:
+        urdf = read_robot(job.robot).description()
     if urdf is None:
         raise EpisodeError(
             path=job.episode_path,

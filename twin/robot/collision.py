@@ -171,7 +171,7 @@ class RobotHulls:
         """Build the hulls and choose the pairs of links that must stay apart."""
         self.robot = robot
         self.hulls: list[LinkHull] = link_hulls(robot)
-        self._frame_ids = [robot.model.getFrameId(hull.link) for hull in self.hulls]
+        self._frame_ids = [robot.frame_id(hull.link) for hull in self.hulls]
         # Views of pinocchio's own memory: to ask for them costs more than the kinematics.
         frames = [robot.data.oMf[frame_id] for frame_id in self._frame_ids]
         self._rotation_views = [frame.rotation for frame in frames]

@@ -250,7 +250,7 @@ class RobotModel:
         self._leader_ids = np.array([self._q_id(m.leader) for m in followers], dtype=np.int64)
         self._ratios = np.array([m.multiplier for m in followers])
         self._shifts = np.array([m.offset for m in followers])
-        self.tcp_id = int(self.model.getFrameId(self.record.tool_frame))
+        self.tcp_id = self.frame_id(self.record.tool_frame)
         self.lower_rad: Float[np.ndarray, " num_joints"] = self._arm(self.model.lowerPositionLimit)
         self.upper_rad: Float[np.ndarray, " num_joints"] = self._arm(self.model.upperPositionLimit)
         self.velocity_limit_rad_s: Float[np.ndarray, " num_joints"] = self._arm(
@@ -298,8 +298,9 @@ class RobotModel:
     def _check_serial(self, followers: set[str]) -> None:
         """The arm's joints, and no others, lie one behind the other between base and tool."""
         names = list(self.model.names)
-        tool = self.model.frames[self.model.getFrameId(self.record.tool_frame)]
-        chain, joint = [], int(tool.parentJoint)
+        tool = self.model.frames[self.frame_id(self.record.tool_frame)]
+        chain: list[str] = []
+        joint = int(tool.parentJoint)
         while joint:
             chain.insert(0, names[joint])
             joint = int(self.model.parents[joint])
@@ -351,7 +352,7 @@ class RobotModel:
                 found=f"lacks the base frame {base!r}",
                 hint=f"It has: {', '.join(frame.name for frame in self.model.frames)}.",
             )
-        frame = self.model.frames[self.model.getFrameId(base)]
+        frame = self.model.frames[self.frame_id(base)]
         if frame.parentJoint != 0:
             raise RobotDescriptionError(
                 found=f"moves the base frame {base!r} by {self.model.names[frame.parentJoint]!r}",
@@ -362,7 +363,7 @@ class RobotModel:
     def _home(self) -> Float[np.ndarray, " num_joints"]:
         """The record's posture, or the middle of the limits."""
         if self.record.home_rad is None:
-            return (self.lower_rad + self.upper_rad) / 2
+            return np.asarray((self.lower_rad + self.upper_rad) / 2)
         home = np.array(self.record.home_rad)
         for name, value, low, high in zip(
             self.joints, home, self.lower_rad, self.upper_rad, strict=True
@@ -381,6 +382,12 @@ class RobotModel:
     def _slides(self, name: str) -> bool:
         joint = self._joint(name)
         return bool(joint.nq == 1 and joint.shortname().startswith("JointModelP"))
+
+    def frame_id(self, name: str) -> int:
+        """Where pinocchio keeps a link; a joint may have the same name."""
+        if self.model.existFrame(name, pin.FrameType.BODY):
+            return int(self.model.getFrameId(name, pin.FrameType.BODY))
+        return int(self.model.getFrameId(name))
 
     def effort_id(self, name: str) -> int:
         """Where pinocchio keeps the limit of a joint's torque."""
@@ -429,7 +436,7 @@ class RobotModel:
             names = ", ".join(frame.name for frame in self.model.frames)
             raise RobotDescriptionError(found=f"lacks {link!r}", hint=f"It has: {names}.")
         pin.forwardKinematics(self.model, self.data, self.configuration(joints_rad, width_m))
-        T = pin.updateFramePlacement(self.model, self.data, self.model.getFrameId(link))
+        T = pin.updateFramePlacement(self.model, self.data, self.frame_id(link))
         return np.array(T.homogeneous)
 
 

@@ -16,7 +16,6 @@ from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.schema import StampedMessage
 from bridge.episode.topics import EVENT, cell_topic
-from bridge.robots.default import ARM_JOINTS, BASE_FRAME
 
 # Messages of one layout are serialised once; then only stamp and numbers change from sample to
 # sample. At 500 samples a second and six topics a general serialiser would cost a quarter of a
@@ -150,45 +149,40 @@ def joints_template(names: tuple[str, ...], *, velocities: bool) -> MessageTempl
     return MessageTemplate(schema.JOINT_STATE, build, count * (2 if velocities else 1))
 
 
-def pose_template() -> MessageTemplate:
+def pose_template(base_frame: str) -> MessageTemplate:
     """geometry_msgs/PoseStamped in base_link, filled with ``tool_pose``."""
 
     def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
         pose = {"position": _named("xyz", numbers), "orientation": _named("xyzw", numbers[3:])}
-        return {"header": {"stamp": stamp, "frame_id": BASE_FRAME}, "pose": pose}
+        return {"header": {"stamp": stamp, "frame_id": base_frame}, "pose": pose}
 
     return MessageTemplate(schema.POSE_STAMPED, build, 7)
 
 
-def frame_template() -> MessageTemplate:
+def frame_template(base_frame: str) -> MessageTemplate:
     """tf2_msgs/TFMessage with the tool's frame, so that a camera at the wrist has a place."""
 
     def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
         transform = {"translation": _named("xyz", numbers), "rotation": _named("xyzw", numbers[3:])}
-        header = {"stamp": stamp, "frame_id": BASE_FRAME}
+        header = {"stamp": stamp, "frame_id": base_frame}
         item = {"header": header, "child_frame_id": CONTROLLER_TCP_FRAME, "transform": transform}
         return {"transforms": [item]}
 
     return MessageTemplate(schema.TF_MESSAGE, build, 7)
 
 
-def wrench_template() -> MessageTemplate:
+def wrench_template(base_frame: str) -> MessageTemplate:
     """geometry_msgs/WrenchStamped along base_link, filled with ``tool_wrench``."""
 
     def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
         wrench = {"force": _named("xyz", numbers), "torque": _named("xyz", numbers[3:])}
-        return {"header": {"stamp": stamp, "frame_id": BASE_FRAME}, "wrench": wrench}
+        return {"header": {"stamp": stamp, "frame_id": base_frame}, "wrench": wrench}
 
     return MessageTemplate(schema.WRENCH_STAMPED, build, 6)
 
 
 def _named(axes: str, numbers: Sequence[float]) -> dict[str, float]:
     return dict(zip(axes, numbers, strict=False))
-
-
-def arm_template() -> MessageTemplate:
-    """Positions and velocities of the arm's joints."""
-    return joints_template(ARM_JOINTS, velocities=True)
 
 
 def mode_event(

@@ -94,7 +94,7 @@ class Reach:
         self._per_rad = np.zeros((len(hulls.hulls), len(joint_ids)))
         self._fingers = np.zeros(len(hulls.hulls))
         for row, hull in enumerate(hulls.hulls):
-            frame = model.frames[model.getFrameId(hull.link)]
+            frame = model.frames[robot.frame_id(hull.link)]
             points = hull.points_m @ frame.placement.rotation.T + frame.placement.translation
             reach = ends_m = float(np.linalg.norm(points, axis=1).max())
             joint = int(frame.parentJoint)

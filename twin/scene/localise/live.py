@@ -211,13 +211,16 @@ class LiveFrames:
 class LiveView:
     """Remembers images, transforms and the robot description of one cell; thread safe."""
 
-    def __init__(self, cell: str, calibration: Calibration | None = None) -> None:
+    def __init__(
+        self, cell: str, calibration: Calibration | None = None, urdf: str | None = None
+    ) -> None:
         """Listen for ``/<cell>/cam/...``, ``/<cell>/event``, transforms and the URDF.
 
         Args:
             cell: Its name.
             calibration: Of the run. Cameras in it are where it says, and never where ``/tf`` does;
                 for those in the hand ``/<cell>/joint_states`` is listened for, too.
+            urdf: The robot description, whatever is published; None: what is published.
         """
         self._cell = cell
         self._calibration = calibration
@@ -227,7 +230,8 @@ class LiveView:
         self._cameras: dict[str, LiveCamera] = {}
         self._static: dict[str, FrameTransform] = {}
         self._moving: deque[FrameTransform] = deque(maxlen=KEPT_TRANSFORMS)
-        self._urdf: str | None = None
+        self._urdf = urdf
+        self._hears_urdf = urdf is None
         self._executing: str | None = None
         self._quiet_since_ns = 0
         self._newest_ns = 0
@@ -262,7 +266,7 @@ class LiveView:
                 if item.child in self._static or len(self._static) < MAX_FRAMES:
                     self._static[item.child] = item
         elif topic == ROBOT_DESCRIPTION:
-            self._urdf = string_from_cdr(data)
+            self._urdf = string_from_cdr(data) if self._hears_urdf else self._urdf
         elif topic == self._joint_topic:
             sample = JointSample.from_cdr(data)
             self._joints.append(data)
@@ -360,8 +364,9 @@ class LiveView:
             return LiveFrames(
                 frames=[], reasons=[f"no images on {cell_topic(self._cell, CAMERAS)}**"]
             )
+        base_frame = robot_of(urdf or "").base_frame
         cell = LiveCell(
-            tree=TransformTree(rooted_in_base(transforms)),
+            tree=TransformTree(rooted_in_base(transforms, base_frame)),
             mounts=self._places,
             joints=joints,
             urdf=urdf,
@@ -379,7 +384,7 @@ class LiveView:
                 )
             except GstError as error:
                 reasons.append(f"{camera_id}: {error}")
-        root = common_root([item.root for item in found.values()])
+        root = common_root([item.root for item in found.values()], base_frame)
         reasons += [
             f"{camera_id}: its poses are in frame {item.root!r}, not in {root!r}"
             for camera_id, item in found.items()
