@@ -115,7 +115,8 @@ NUM_POSE = 6
 """Numbers that a pose determines: joints beyond these are redundant."""
 NUM_POSTURES = 4096
 """Random postures among which starts are chosen."""
-_STARTS_PER_RESTART = 3
+_STARTS_PER_RESTART = 10
+"""A pose out of reach then costs some tenths of a second, once for a plan."""
 _TURN_M = 0.3
 """A turn by one radian counts as so many metres where poses are compared: an arm's last links."""
 
