@@ -20,7 +20,7 @@ from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
-from bridge.robots.robot import resolve_mesh, robot_of
+from bridge.robots.robot import RECORD_TAG, resolve_mesh, robot_of
 from bridge.task.task_file import Task
 from dashboards.errors import DashboardError
 from dashboards.frames import media_type
@@ -206,6 +206,8 @@ def drawable(urdf: str) -> str:
         message = f"the robot description has the root element <{robot.tag}>, not <robot>."
         raise DashboardError(message)
     robot.set("name", "robot")
+    for record in robot.findall(RECORD_TAG):
+        robot.remove(record)
     for link in robot.findall("link"):
         for collision in link.findall("collision"):
             link.remove(collision)

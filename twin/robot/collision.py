@@ -264,9 +264,7 @@ class RobotHulls:
         width_m = min(_WIDTH_M, robot.record.gripper.max_width_m)
         self.place(robot.home_rad, width_m)
         candidates = [
-            pair
-            for pair in candidates
-            if not self._said_to_overlap(*pair) and self._distance_m(*pair) > 0
+            pair for pair in candidates if not self._listed(*pair) and self._distance_m(*pair) > 0
         ]
         rng = np.random.default_rng(0)
         overlaps = np.zeros(len(candidates))
@@ -279,7 +277,7 @@ class RobotHulls:
             if count < _ALWAYS * _SAMPLES
         ]
 
-    def _said_to_overlap(self, first: int, second: int) -> bool:
+    def _listed(self, first: int, second: int) -> bool:
         links = {self.hulls[first].link, self.hulls[second].link}
         return any(links == set(pair) for pair in self.robot.record.may_overlap)
 

@@ -32,6 +32,7 @@ from bridge.task.verdict import Verdict
 from twin.gate.twin_process import Question, answer
 from twin.replay import runner
 from twin.replay.config import ReplayConfig
+from twin.replay.path import UnusablePlanError
 from twin.replay.scene import ReplayScene, StartState, StartStates
 from twin.replay.verdict import replay_plan
 from twin.robot.model import load_robot
@@ -115,7 +116,13 @@ def tracks_of(plan: Plan, scene: ReplayScene, script: SimpleNamespace) -> list[J
     return list(tracks[: 2 if robot.gripper.fingers else 1])
 
 
-def record_trial(run: RunFolder, plan: Plan, scene: ReplayScene, tracks: list[JointTrack]) -> None:
+def record_trial(
+    run: RunFolder,
+    plan: Plan,
+    scene: ReplayScene,
+    tracks: list[JointTrack],
+    urdf: str | None = None,
+) -> None:
     """A trial with one plan that was executed, and a camera beside the table."""
     robot = load_robot(scene.urdf).record
     end = int(tracks[0].stamps_ns[-1])
@@ -131,7 +138,7 @@ def record_trial(run: RunFolder, plan: Plan, scene: ReplayScene, tracks: list[Jo
         def say(topic: str, data: bytes, kind: str, stamp: int) -> None:
             writer.write(topic, data, type_name=kind, log_time_ns=stamp)
 
-        say("/robot_description", string_to_cdr(scene.urdf), schema.STRING, T0)
+        say("/robot_description", string_to_cdr(urdf or scene.urdf), schema.STRING, T0)
         say("/tf_static", transforms_to_cdr([side]), schema.TF_MESSAGE, T0)
         eye = CameraInfo(stamp_ns=T0, frame_id="side", camera=CAMERA)
         say("/lab/cam/side/color/info", eye.to_cdr(), schema.CAMERA_INFO, T0)
@@ -236,6 +243,40 @@ def test_an_arm_is_replayed_judged_and_drawn(
     assert (verdict.ik.value, verdict.clearance.value) == (True, True)
     assert verdict.accepted is (case.cube_m is not None), verdict.reason
     check_picture(run, scene)
+
+
+def test_another_robot_can_be_named_than_the_recorded_description(
+    tmp_path: Path, script: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A driver publishes the bare URDF under its own name: the file says the rest."""
+    case = CASES["kinova"]
+    scene = scene_of(case, script)
+    plan = line_plan(scene)
+    run = RunFolder.create(tmp_path / "run")
+    bare = read_robot(case.robot).arm_urdf()
+    record_trial(run, plan, scene, tracks_of(plan, scene, script), urdf=bare)
+    start = StartState(Ts_base_object=dict(scene.Ts_base_object))
+    phase = Phase(name="start", plan_id=None, after_ns=None, before_ns=None)
+    states = StartStates(scene.task, [phase], [start])
+    monkeypatch.setattr(runner, "localised_starts", lambda *_, **__: states)
+    words = ["replay", str(run.path), "--workers", "1", "--quiet"]
+    assert robot_gst.run(words) == 1  # taken for the default robot, whose joints it lacks
+    assert not list(run.derived_dir.glob("*.replay.*.mcap"))
+    assert robot_gst.run([*words, "--robot", case.robot]) == 0
+    replays = list(run.derived_dir.glob("*.replay.*.mcap"))
+    assert len(replays) == 3
+    for path in replays:
+        episode = Episode.open(path)
+        assert streams.joint_track(episode).names == read_robot(case.robot).joints
+        assert streams.recorded_robot(episode).name == case.robot
+
+
+def test_a_fixed_tool_grasps_nothing(script: SimpleNamespace) -> None:
+    scene = scene_of(CASES["kinova"], script)
+    plan = line_plan(scene)
+    closing = replace(plan, tau=(plan.tau[0], replace(plan.tau[1], g=1), plan.tau[2]))
+    with pytest.raises(UnusablePlanError, match=r"closes a gripper.*'kinova_j2s6s200' has no"):
+        replay_plan(closing, scene, ReplayConfig(mode="kinematic"))
 
 
 def check_replay(episode: Episode, robot: Robot, plan: Plan, *, picks: bool) -> None:
