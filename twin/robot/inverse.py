@@ -65,7 +65,9 @@ def solve_ik(
         best = _descend(robot, T_base_tcp, start, config)
         if not best.reached:
             best = _from_random(robot, T_base_tcp, best, config)
-        return best if best.reached else _from_branches(robot, T_base_tcp, best, start, config)
+        if not best.reached and config.restarts:
+            best = _from_branches(robot, T_base_tcp, best, start, config)
+        return best
     best = _descend(robot, T_base_tcp, start, config, bounded=True)
     if not best.reached:
         best = _from_nearest(robot, T_base_tcp, best, config)
