@@ -17,6 +17,8 @@ from twin.errors import TwinError
 from twin.gate.config import GateConfig
 from twin.gate.gate import Gate, PlanTooLargeError, no_verdict, robot_name
 
+DAMAGED = '<robot name="ur5_parallel_gripper"><robot_gst>{}</robot_gst></robot>'
+
 
 def test_the_verdict_is_the_replays_from_the_localised_poses() -> None:
     seen: dict[str, Any] = {}
@@ -52,6 +54,9 @@ def test_a_task_with_soft_objects_is_replayed_like_any_other() -> None:
 
 def test_an_accepted_plan_is_accepted() -> None:
     assert gate_with().judge(PLAN.to_json()).accepted is True
+    panda = FakePerception(description='<robot name="panda"/>')
+    plan = replace(PLAN, robot="panda", frame="panda_link0")
+    assert gate_with(perception=panda).judge(plan.to_json()).accepted is True
 
 
 @pytest.mark.parametrize(
@@ -71,6 +76,16 @@ def test_an_accepted_plan_is_accepted() -> None:
         ),
         ({"replay": raising(TwinError("no waypoints"))}, PLAN, "no waypoints"),
         ({}, replace(PLAN, frame="world"), "is given in frame 'world'"),
+        (
+            {"perception": FakePerception(description='<robot name="panda"/>')},
+            replace(PLAN, robot="panda"),
+            "is given in frame 'base_link'; only 'panda_link0'",
+        ),
+        (
+            {"perception": FakePerception(description=DAMAGED)},
+            PLAN,
+            "carries a record that is not a robot: robot lacks name",
+        ),
         ({}, replace(PLAN, robot="panda"), "for robot 'panda'; the cell's robot is 'ur5"),
         ({}, replace(PLAN, task="fold_towel"), "for task 'fold_towel'; this gate judges"),
     ],
