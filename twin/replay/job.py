@@ -159,10 +159,15 @@ class ReplayJob:
             "shapes": dict(self.shapes),
             "calibration_id": self.calibration_id,
             "render": self.render,
-            **({"robot": read_robot(self.robot).description()} if self.robot else {}),
+            **self._named_robot(),
             **self._sampled_from(),
             **self._compared_with(),
         }
+
+    def _named_robot(self) -> dict[str, Any]:
+        if not self.robot:
+            return {}
+        return {"robot": hash_settings({"urdf": read_robot(self.robot).description()})}
 
     def _sampled_from(self) -> dict[str, Any]:
         if not self.config.samples:

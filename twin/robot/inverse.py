@@ -8,6 +8,7 @@ towards home.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -159,9 +160,40 @@ def _from_nearest(
     return best
 
 
+_DISTINCT_RAD = 0.5
+_MOST_SOLUTIONS = 8
+_LOOKED_AT = 80
+"""Nearest known postures from which further solutions are looked for."""
+
+
+def solutions(
+    robot: RobotModel, T_base_tcp: Float[np.ndarray, "4 4"], config: IkConfig
+) -> Iterator[IkSolution]:
+    """Yield what ``solve_ik`` finds, then other solutions of an arm without a closed form.
+
+    Each differs from all before by half a radian in some joint. They are looked for one at a time.
+    """
+    first = solve_ik(robot, T_base_tcp, config)
+    yield first
+    if not first.reached:
+        return
+    rows, tree = _postures(robot)
+    found = [first.joints_rad]
+    _, near = tree.query(_features(T_base_tcp[None])[0], k=_LOOKED_AT)
+    for index in near.tolist():
+        other = _descend(robot, T_base_tcp, rows[index], config, bounded=True)
+        away = other.joints_rad - np.array(found)
+        if other.reached and np.abs(away).max(axis=1).min() > _DISTINCT_RAD:
+            yield other
+            found.append(other.joints_rad)
+            if len(found) == _MOST_SOLUTIONS:
+                return
+
+
 _TOWARDS = 40
 """Steps towards a wanted posture within what the pose leaves open."""
-_SETTLED_RAD = 1e-3
+_STEP_RAD, _SETTLED_RAD = 0.3, 1e-3
+"""Longest such step, and one that is none."""
 
 
 def _nearer(
@@ -202,9 +234,6 @@ def _nearer(
             break
         best = other
     return best
-
-
-_STEP_RAD = 0.3
 
 
 def _descend(

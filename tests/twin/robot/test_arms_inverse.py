@@ -7,7 +7,7 @@ from bridge.geometry import se3
 from bridge.robots.robot import read_robot
 from twin.robot.config import IkConfig
 from twin.robot.follow import follow_poses
-from twin.robot.inverse import UrInverse, pose_error, solve_ik
+from twin.robot.inverse import UrInverse, pose_error, solutions, solve_ik
 from twin.robot.model import RobotModel, load_robot
 
 ITERATED = ("panda", "kinova_j2s6s200", "xarm7_parallel_gripper", "z1")
@@ -107,3 +107,31 @@ def test_a_warm_start_keeps_seven_joints_near_it() -> None:
         found = solve_ik(robot, T, IkConfig(), warm_start_rad=row)
         assert found.reached
         assert np.abs(found.joints_rad - row).max() < 0.3
+
+
+@pytest.mark.parametrize("name", ["panda", "kinova_j2s6s200"])
+def test_a_path_is_followed_from_another_posture_where_the_first_one_ends_or_touches(
+    name: str,
+) -> None:
+    """Somebody stands where the arm would be that begins nearest to home."""
+    robot, config = model(name), IkConfig()
+    q, p = se3.split(robot.T_base_tcp(robot.home_rad))
+    shares = np.linspace(0.0, 1.0, 20)[:, None]
+    Ts = se3.transform_from(np.tile(q, (20, 1)), p + shares * np.array([0.02, 0.05, -0.03]))
+    found = [item.joints_rad for item in solutions(robot, Ts[0], config)]
+    assert len(found) > 2
+    for row in found:
+        np.testing.assert_allclose(robot.T_base_tcp(row), Ts[0], atol=1e-6)
+    plain = follow_poses(robot, Ts, start_rad=None, config=config)
+    np.testing.assert_allclose(plain.joints_rad[0], found[0], atol=1e-6)
+    asked = []
+
+    def clearance(rows: np.ndarray) -> np.ndarray:
+        asked.append(len(rows))
+        return np.abs(rows - plain.joints_rad[0]).max(axis=1) - 0.4
+
+    other = follow_poses(robot, Ts, start_rad=None, config=config, clearance=clearance)
+    assert other.reached.all()
+    assert len(asked) > 1
+    assert np.abs(other.joints_rad - plain.joints_rad[0]).max(axis=1).min() > 0.4
+    np.testing.assert_allclose(robot.Ts_base_tcp(other.joints_rad), Ts, atol=1e-6)
