@@ -20,7 +20,7 @@ from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
-from bridge.robots.robot import RECORD_TAG, resolve_mesh, robot_of
+from bridge.robots.robot import RECORD_TAG, mimics_of, resolve_mesh, robot_of
 from bridge.task.task_file import Task
 from dashboards.errors import DashboardError
 from dashboards.frames import media_type
@@ -171,6 +171,10 @@ def log_robot(
         for finger in robot_of(urdf).gripper.fingers:
             values = finger.value(widths.position[:, 0])
             _move(file, tree, prefix, finger.joint, widths, values)
+            for item in mimics_of(urdf):
+                if item.leader == finger.joint:
+                    follows = item.multiplier * values + item.offset
+                    _move(file, tree, prefix, item.joint, widths, follows)
     return True
 
 

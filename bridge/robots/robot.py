@@ -300,6 +300,42 @@ def robot_of(urdf: str) -> Robot:
     return read_robot(name if name in files else DEFAULT_ROBOT)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Mimic:
+    """A joint of a URDF that goes where another one goes: multiplier * leader + offset."""
+
+    joint: str
+    leader: str
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
+def mimics_of(urdf: str) -> tuple[Mimic, ...]:
+    """Read the joints of a URDF that follow another one; what is no number becomes NaN."""
+    found = []
+    for joint in ET.fromstring(urdf).findall("joint"):
+        element = joint.find("mimic")
+        if element is not None:
+            numbers = (element.get("multiplier", "1"), element.get("offset", "0"))
+            multiplier, offset = map(_number, numbers)
+            found.append(
+                Mimic(
+                    joint=joint.get("name", ""),
+                    leader=element.get("joint", ""),
+                    multiplier=multiplier,
+                    offset=offset,
+                )
+            )
+    return tuple(found)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def robot_name(urdf: str) -> str:
     """Return the name in a URDF's ``<robot>`` element, "" when there is none."""
     found = re.search(r"<robot\b[^>]*?\bname\s*=\s*[\"']([^\"']*)[\"']", urdf)

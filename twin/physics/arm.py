@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
-from bridge.robots.robot import Finger, Robot, robot_of
+from bridge.robots.robot import Finger, Mimic, Robot, mimics_of, robot_of
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
@@ -110,14 +110,6 @@ class PhysicsError(TwinError):
     """The physics engine refused or lost something."""
 
 
-def _mimics(urdf: str) -> dict[str, ET.Element]:
-    """Joints that follow another one, which PyBullet takes for free ones."""
-    found = {
-        joint.get("name", ""): joint.find("mimic") for joint in ET.fromstring(urdf).iter("joint")
-    }
-    return {name: mimic for name, mimic in found.items() if mimic is not None}
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Drive:
     """A finger joint with a motor: one of the record's, or one that mimics one of them."""
@@ -160,7 +152,7 @@ class Arm:
         self.record: Robot = robot_of(urdf)
         self._max_width_m = self.record.gripper.max_width_m
         self.id = self._load(urdf, mesh_hulls_m)
-        self._index_joints(_mimics(urdf))
+        self._index_joints(mimics_of(urdf))
         self._couple_fingers()
         self._target_m = self._max_width_m
         self._arm_order: tuple[list[float], list[float]] | None = None
@@ -188,7 +180,7 @@ class Arm:
                 )
                 raise PhysicsError(message) from error
 
-    def _index_joints(self, mimics: Mapping[str, ET.Element]) -> None:
+    def _index_joints(self, mimics: Sequence[Mimic]) -> None:
         record, gripper = self.record, self.record.gripper
         self._joints: dict[str, int] = {}
         self.links: dict[str, int] = {}
@@ -230,7 +222,7 @@ class Arm:
             if index in self._fingers:
                 self.opening_axes[name] = self._opening(index)
 
-    def _driven(self, mimics: Mapping[str, ET.Element]) -> list[_Drive]:
+    def _driven(self, mimics: Sequence[Mimic]) -> list[_Drive]:
         """The joints that open the gripper, leaders and followers."""
         leaders = {item.joint: item for item in self.record.gripper.fingers}
         drives = [
@@ -238,13 +230,13 @@ class Arm:
         ]
         return drives + [
             _Drive(
-                index=self._joints[name],
-                finger=leaders[mimic.get("joint", "")],
-                multiplier=float(mimic.get("multiplier", "1")),
-                offset=float(mimic.get("offset", "0")),
+                index=self._joints[item.joint],
+                finger=leaders[item.leader],
+                multiplier=item.multiplier,
+                offset=item.offset,
             )
-            for name, mimic in mimics.items()
-            if mimic.get("joint") in leaders and name not in leaders
+            for item in mimics
+            if item.leader in leaders and item.joint not in leaders
         ]
 
     def _opening(self, index: int) -> tuple[float, ...]:

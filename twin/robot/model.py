@@ -7,7 +7,7 @@ scratch memory: use it from one thread at a time.
 
 import math
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -16,10 +16,8 @@ import pinocchio as pin
 from jaxtyping import Float
 
 from bridge.episode.topics import ROBOT_DESCRIPTION
-from bridge.robots.robot import Robot, resolve_mesh, robot_of
+from bridge.robots.robot import Mimic, Robot, mimics_of, resolve_mesh, robot_of
 from twin.errors import TwinError
-
-_MIMIC_DEFAULTS = (("multiplier", "1"), ("offset", "0"))
 
 
 class RobotDescriptionError(TwinError):
@@ -31,17 +29,7 @@ class RobotDescriptionError(TwinError):
         super().__init__(f"the robot description {found}. {hint}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Mimic:
-    """A joint that goes where another one goes: multiplier * leader + offset."""
-
-    joint: str
-    leader: str
-    multiplier: float
-    offset: float
-
-
-def mimicked(urdf: str) -> list[Mimic]:
+def mimicked(urdf: str) -> tuple[Mimic, ...]:
     """Read the joints that follow another joint, which pinocchio takes for free ones.
 
     Raises:
@@ -49,35 +37,23 @@ def mimicked(urdf: str) -> list[Mimic]:
             itself, or by a number that is none.
     """
     root = parse_description(urdf)
-    joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
-    followers = {
-        name: element
-        for name, joint in joints.items()
-        if (element := joint.find("mimic")) is not None
-    }
-    return [
-        _mimic(name, element, set(joints) - set(followers)) for name, element in followers.items()
-    ]
-
-
-def _mimic(name: str, element: ET.Element, leaders: set[str]) -> Mimic:
-    leader = element.get("joint", "")
-    if leader not in leaders:
-        raise RobotDescriptionError(
-            found=f"lets the joint {name!r} mimic {leader!r}, which is not there or mimics another",
-            hint="Let it mimic a joint that moves by itself.",
-        )
-    try:
-        numbers = [float(element.get(key, default)) for key, default in _MIMIC_DEFAULTS]
-    except ValueError:
-        numbers = [math.nan]
-    if not all(map(math.isfinite, numbers)):
-        raise RobotDescriptionError(
-            found=f"lets the joint {name!r} mimic {leader!r} by something that is not a number",
-            hint="Give multiplier and offset as numbers.",
-        )
-    multiplier, offset = numbers
-    return Mimic(joint=name, leader=leader, multiplier=multiplier, offset=offset)
+    found = mimics_of(urdf)
+    leaders = {joint.get("name", "") for joint in root.findall("joint")}
+    leaders -= {item.joint for item in found}
+    for item in found:
+        if item.leader not in leaders:
+            raise RobotDescriptionError(
+                found=f"lets the joint {item.joint!r} mimic {item.leader!r}, which is not there or "
+                "mimics another",
+                hint="Let it mimic a joint that moves by itself.",
+            )
+        if not (math.isfinite(item.multiplier) and math.isfinite(item.offset)):
+            raise RobotDescriptionError(
+                found=f"lets the joint {item.joint!r} mimic {item.leader!r} by something that is "
+                "not a number",
+                hint="Give multiplier and offset as numbers.",
+            )
+    return found
 
 
 def with_absolute_meshes(urdf: str, *, keep_visuals: bool = False) -> str:
@@ -334,7 +310,7 @@ class RobotModel:
                     hint="Give lower, upper and velocity as numbers, lower below upper.",
                 )
 
-    def _check_followers(self, followers: list[Mimic]) -> None:
+    def _check_followers(self, followers: Sequence[Mimic]) -> None:
         for item in followers:
             for name in (item.joint, item.leader):
                 if not self.model.existJointName(name) or self._joint(name).nq != 1:
