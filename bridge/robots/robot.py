@@ -311,7 +311,7 @@ class Mimic:
 
 
 def mimics_of(urdf: str) -> tuple[Mimic, ...]:
-    """Read the joints of a URDF that follow another one; what is no number becomes NaN."""
+    """Read the joints of a URDF that follow another one; what is not a number becomes NaN."""
     found = []
     for joint in ET.fromstring(urdf).findall("joint"):
         element = joint.find("mimic")
