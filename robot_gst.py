@@ -152,6 +152,17 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
             ("new", f"{TASKS}:new", "Write a task file to start from.", "cube_onto_block"),
         ),
     ),
+    "robot": (
+        "Robot files: arms, grippers and tools.",
+        (
+            (
+                "check",
+                "twin.cli:robot_check",
+                "Joints, limits, frames, gripper; what is refused.",
+                "mine.toml",
+            ),
+        ),
+    ),
     "import": (
         "Import recordings of other programs into a run.",
         (

@@ -20,8 +20,7 @@ from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
-from bridge.robots.default import BASE_FRAME, ROBOT
-from bridge.robots.robot import resolve_mesh
+from bridge.robots.robot import RECORD_TAG, mimics_of, resolve_mesh, robot_of
 from bridge.task.task_file import Task
 from dashboards.errors import DashboardError
 from dashboards.frames import media_type
@@ -148,7 +147,7 @@ def log_robot(
 ) -> bool:
     """Log the robot under ``<prefix>/robot``; when it cannot be drawn, note why and return False.
 
-    Each finger joint is at half the gripper width.
+    Finger joints are where their law puts them at the gripper's width.
 
     Args:
         file: The Rerun file being written.
@@ -187,9 +186,13 @@ def log_robot(
     for index, name in enumerate(joints.names):
         _move(file, tree, prefix, name, joints, joints.position[:, index])
     if widths is not None:
-        for finger in ROBOT.gripper.fingers:
+        for finger in robot_of(urdf).gripper.fingers:
             values = finger.value(widths.position[:, 0])
             _move(file, tree, prefix, finger.joint, widths, values)
+            for item in mimics_of(urdf):
+                if item.leader == finger.joint:
+                    follows = item.multiplier * values + item.offset
+                    _move(file, tree, prefix, item.joint, widths, follows)
     return True
 
 
@@ -210,7 +213,7 @@ def _move(
 
 
 def drawable(urdf: str) -> str:
-    """Return the URDF with only its visuals, absolute meshes, and ``base_link`` as its root.
+    """Return the URDF with only its visuals, absolute meshes, and the robot's base as its root.
 
     Raises:
         DashboardError: When the text is not a URDF.
@@ -225,12 +228,14 @@ def drawable(urdf: str) -> str:
         message = f"the robot description has the root element <{robot.tag}>, not <robot>."
         raise DashboardError(message)
     robot.set("name", "robot")
+    for record in robot.findall(RECORD_TAG):
+        robot.remove(record)
     for link in robot.findall("link"):
         for collision in link.findall("collision"):
             link.remove(collision)
         for mesh in link.iter("mesh"):
             mesh.set("filename", str(resolve_mesh(mesh.get("filename", ""))))
-    _drop_above(robot, BASE_FRAME)
+    _drop_above(robot, robot_of(urdf).base_frame)
     return ET.tostring(robot, encoding="unicode")
 
 

@@ -138,6 +138,29 @@ def import_splats(
     return 0
 
 
+def robot_check(
+    robot: str,
+    /,
+    *,
+    urdf_out: Path | None = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Look at a robot file: its joints, limits, frames and gripper, and what is unsupported.
+
+    Example: robot-gst robot check mine.toml --urdf-out mine.urdf
+
+    Args:
+        robot: Robot file, or the name of one that ships with the package.
+        urdf_out: Write the description that carries the record there, to be published.
+        output: How to talk.
+    """
+    from twin.robot.check import check_robot, describe_robot
+
+    found = check_robot(robot, urdf_out=urdf_out)
+    output.result(found, describe_robot(found))
+    return 0
+
+
 def calibrate(
     run: Path,
     /,

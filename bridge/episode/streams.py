@@ -38,6 +38,7 @@ from bridge.errors import EpisodeError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.geometry.trajectory import PoseTrajectory
+from bridge.robots.robot import Robot, robot_of
 from bridge.task.find import ATTACHMENT, Attached, find_task_file
 from bridge.task.plan import Plan
 from bridge.task.record import parse_record
@@ -356,6 +357,11 @@ def object_pose_topics(episode: Episode) -> dict[str, str]:
         for topic in episode.topics_of_type(schema.POSE_STAMPED)
         if OBJECTS in topic
     }
+
+
+def recorded_robot(episode: Episode) -> Robot:
+    """Return the robot an episode was recorded with; one without a description: the default."""
+    return robot_of(robot_description(episode) or "")
 
 
 def robot_description(episode: Episode) -> str | None:

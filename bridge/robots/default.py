@@ -4,9 +4,9 @@ Nothing of the UR5 is copied into this project: its URDF is read from the instal
 and the gripper (``datasets/robots/parallel_gripper.urdf``) is hung on ``tool0``.
 """
 
-from bridge.robots.robot import read_robot
+from bridge.robots.robot import DEFAULT_ROBOT, read_robot
 
-ROBOT = read_robot("ur5_parallel_gripper")
+ROBOT = read_robot(DEFAULT_ROBOT)
 ROBOT_NAME = ROBOT.name
 BASE_FRAME = ROBOT.base_frame
 TCP_FRAME = ROBOT.tool_frame
@@ -16,5 +16,3 @@ FINGER_LINKS = ROBOT.gripper.finger_links
 GRIPPER = ROBOT.gripper.name
 GRIPPER_LINKS = ROBOT.gripper.links
 MAX_WIDTH_M = ROBOT.gripper.max_width_m
-GRIPPER_WIDTH = "gripper_width"
-"""The one joint in the messages of a gripper's state: the distance between its pads [m]."""

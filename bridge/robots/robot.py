@@ -2,43 +2,102 @@
 
 A robot file names a URDF, by package or by path, and what a URDF cannot say: which joints are the
 arm's and in which order, which frame is the base and which the tool, how far the fingers are open.
-``default`` holds the robot that is meant where nobody names another.
+The record travels inside the description (``Robot.description``), so that whoever receives a URDF
+knows whose it is. Every field is explained in docs/robots.md.
 """
 
+import json
 import math
 import re
 import sysconfig
 import tomllib
+import types
+import typing
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from difflib import get_close_matches
+from functools import lru_cache
+from html import unescape
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from bridge.data_files import dataset_file
+from bridge.data_files import dataset_file, datasets_folder
 from bridge.errors import MissingDependencyError, UsageError
 
 SCHEMA_VERSION = 1
 Width = TypeVar("Width", float, np.ndarray)
 PACKAGE = "example-robot-data"
 """The package of robot descriptions that ``package://`` may name."""
+DEFAULT_ROBOT = "ur5_parallel_gripper"
+"""Whose a description is that neither carries a record nor has the name of a robot file: until
+robots had files, every episode was recorded with it."""
+GRIPPER_WIDTH = "gripper_width"
+"""The one joint in the messages of a gripper's state: the distance between its pads [m]."""
+RECORD_TAG = "robot_gst"
+"""Element of a URDF that holds the record; readers of URDF pass over what they do not know."""
+NUM_JOINTS = (6, 7)
+"""Joints of an arm."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finger:
-    """A joint that opens the gripper; its value grows linearly with the width."""
+    """A joint that opens the gripper, and how its value follows from the width.
+
+    Of the three laws one holds: the line ``closed + per_m * width``; with ``link_m`` the lever
+    ``width = offset_m + link_m * sin(value - zero_rad)``; or the lines between rows of ``table``.
+    """
 
     joint: str
+    turns: bool = False
+    """Whether the joint turns; else it slides."""
     closed: float = 0.0
     """Value when the width is 0 [m or rad]."""
     per_m: float = 0.5
     """Change of the value with the width [m/m or rad/m]; 0.5: one of two that slide."""
+    link_m: float = 0.0
+    """Length from the joint's axis to the pad, summed over the jaws that move; negative where a
+    rising value closes them; 0: no lever [m]."""
+    offset_m: float = 0.0
+    """Width at which the lever is parallel to the closing pads' face [m]."""
+    zero_rad: float = 0.0
+    """Value there."""
+    table: tuple[tuple[float, float], ...] = ()
+    """Rows of width [m] and value [m or rad], widths rising."""
 
     def value(self, width_m: Width) -> Width:
         """Where the joint is at a distance between the pads, or at several [m or rad]."""
+        if self.table:
+            widths, values = zip(*self.table, strict=True)
+            return typing.cast(Width, np.interp(width_m, widths, values))
+        if self.link_m:
+            sine = np.clip((width_m - self.offset_m) / self.link_m, -1.0, 1.0)
+            return typing.cast(Width, self.zero_rad + np.arcsin(sine))
         return self.closed + self.per_m * width_m
+
+    def width(self, value: Width) -> Width:
+        """The distance between the pads at a value of the joint, or at several [m]."""
+        if self.table:
+            rows = sorted((value, width) for width, value in self.table)
+            values, widths = zip(*rows, strict=True)
+            return typing.cast(Width, np.interp(value, values, widths))
+        if self.link_m:
+            sine = np.sin(value - self.zero_rad)
+            return typing.cast(Width, self.offset_m + self.link_m * sine)
+        return (value - self.closed) / self.per_m
+
+    def slope(self, width_m: float) -> float:
+        """Change of the value with the width, there [m/m or rad/m]."""
+        if self.table:
+            widths, values = (np.array(column) for column in zip(*self.table, strict=True))
+            row = int(np.clip(np.searchsorted(widths, width_m, "right"), 1, len(widths) - 1))
+            rise = values[row] - values[row - 1]
+            return float(rise / (widths[row] - widths[row - 1]))
+        if self.link_m:
+            return 1.0 / (self.link_m * math.cos(float(self.value(width_m)) - self.zero_rad))
+        return self.per_m
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +109,7 @@ class Gripper:
     links: tuple[str, ...] = ()
     """The fingers and what carries them."""
     finger_links: tuple[str, ...] = ()
+    """Those that close on objects."""
     fingers: tuple[Finger, ...] = ()
     """Joints that are driven: two, or one that the others follow by ``mimic`` in the URDF."""
     max_width_m: float = 0.0
@@ -66,6 +126,10 @@ class Robot:
     attached: tuple[str, ...] = ()
     """URDF files whose links and joints are added: gripper, tool. Each is mounted by a joint of its
     own whose parent is a link of the arm."""
+    flange: str = ""
+    """Link of the arm that attached files are mounted on; "": the one that they name."""
+    prefix: str = ""
+    """Put before every joint, link and frame: of this file, and of the URDF where it lacks it."""
     joints: tuple[str, ...]
     """The arm's, base to flange: the order of every array of joint values."""
     base_frame: str = "base_link"
@@ -73,40 +137,133 @@ class Robot:
     tool_frame: str = "tcp"
     """What plans move: between the pads of a gripper."""
     gripper: Gripper = Gripper()
+    held: tuple[str, ...] = ()
+    """Joints of the URDF that do not move: they become fixed, at 0."""
+    may_overlap: tuple[tuple[str, str], ...] = ()
+    """Pairs of links whose hulls overlap without touching."""
+    home_rad: tuple[float, ...] | None = None
+    """A posture free of contact, where searches begin; None: the middle of the limits."""
     payload_kg: float | None = None
     """What it may carry, without its gripper; None: not known."""
+    position_rad: tuple[tuple[float, float], ...] | None = None
+    """Lowest and highest value of each joint [rad]; None: those of the URDF."""
     velocity_rad_s: tuple[float, ...] | None = None
     """Limit of each joint [rad/s]; None: those of the URDF."""
     acceleration_rad_s2: tuple[float, ...] | None = None
+    """Limit of each joint [rad/s2]; None: not known."""
     tool_speed_m_s: float | None = None
     """Fastest its tool may be commanded [m/s]; None: not known."""
     contact_force_N: float | None = None
     """Force on the arm beyond which it stops by itself; None: not known."""
     tracking_error_rad: float | None = None
     """How far a joint may be from where it is commanded before the arm stops by itself."""
-    hulls: str = ""
-    """Folder of convex hulls, ``<link>.ply``; "": they are made from the collision meshes."""
+    mesh_folders: Mapping[str, str] = field(default_factory=dict)
+    """Folders, relative to the robot file, of other packages that ``package://`` names."""
     folder: Path = Path()
     """Where the robot file lies."""
+
+    @property
+    def finger_joints(self) -> tuple[str, ...]:
+        """Joints of the fingers that are driven."""
+        return tuple(finger.joint for finger in self.gripper.fingers)
 
     def arm_urdf(self) -> str:
         """Return the URDF text of the bare arm, as its package or file holds it."""
         return self._file(self.urdf).read_text()
 
     def urdf_text(self) -> str:
-        """Return the URDF text with all that is attached; mesh names stay as they are."""
-        arm = ET.parse(self._file(self.urdf)).getroot()
+        """Return the URDF text with all that is attached.
+
+        Meshes of packages that are not known everywhere become paths.
+
+        Raises:
+            UsageError: A file or a mesh is missing, or an attached file hangs on nothing.
+        """
+        arm = self._parsed(self.urdf)
         for element in [item for item in arm if item.tag in ("transmission", "gazebo")]:
             arm.remove(element)
         for name in self.attached:
-            arm.extend(list(ET.parse(self._file(name)).getroot()))
+            part = self._parsed(name)
+            self._mount(part, arm, name)
+            arm.extend(list(part))
+        if self.prefix:
+            _put_before(self.prefix, arm)
+        for joint in arm.findall("joint"):
+            if joint.get("name") in self.held:
+                joint.set("type", "fixed")
         arm.set("name", self.name)
         return ET.tostring(arm, encoding="unicode")
+
+    def description(self) -> str:
+        """Return the URDF text with this record in it: what is published and recorded.
+
+        A URDF of the default robot needs none.
+        """
+        text = self.urdf_text()
+        if self.name == DEFAULT_ROBOT:
+            return text
+        record = {key: value for key, value in asdict(self).items() if key not in _OF_FILES}
+        root = ET.fromstring(text)
+        ET.SubElement(root, RECORD_TAG).text = json.dumps(record, separators=(",", ":"))
+        return ET.tostring(root, encoding="unicode")
+
+    def _parsed(self, uri: str) -> ET.Element:
+        path = self._file(uri)
+        try:
+            root = ET.parse(path).getroot()
+        except ET.ParseError as error:
+            raise UsageError(f"{path} is not XML ({error}).") from error
+        if root.tag != "robot":
+            raise UsageError(f"{path} has the root element <{root.tag}>, not <robot>.")
+        for mesh in root.iter("mesh"):
+            mesh.set("filename", self._mesh(mesh.get("filename", ""), path.parent))
+        return root
+
+    def _mesh(self, uri: str, folder: Path) -> str:
+        """Leave the meshes of the known package; find those of others."""
+        match = re.fullmatch(r"package://([^/]+)/(.+)", uri)
+        if match is None:
+            path = Path(uri.removeprefix("file://"))
+            return str(resolve_mesh(str(path if path.is_absolute() else folder / path)))
+        if match[1] in self.mesh_folders:
+            path = self.folder / self.mesh_folders[match[1]] / match[2]
+            return str(resolve_mesh(str(path.resolve())))
+        return uri
+
+    def _mount(self, part: ET.Element, arm: ET.Element, name: str) -> None:
+        own = {link.get("name") for link in part.findall("link")}
+        links = {link.get("name") for link in arm.findall("link")}
+        for parent in part.findall("joint/parent"):
+            if parent.get("link") in own:
+                continue
+            if self.flange:
+                parent.set("link", self.flange.removeprefix(self.prefix))
+            mount = parent.get("link", "")
+            if not {mount, self.prefix + mount} & links:
+                raise UsageError(
+                    f"{name} hangs on {mount!r}, which the arm of {self.name!r} lacks. Set flange "
+                    f"to one of: {', '.join(str(link) for link in sorted(links, key=str))}."
+                )
 
     def _file(self, uri: str) -> Path:
         if uri.startswith("package://"):
             return resolve_mesh(uri)
         return resolve_mesh(str(self.folder / uri))
+
+
+_OF_FILES = ("attached", "flange", "prefix", "held", "mesh_folders", "folder")
+"""Fields that say how the URDF is put together: a description is put together already."""
+
+
+def _put_before(prefix: str, root: ET.Element) -> None:
+    """Rename links and joints, and what refers to them."""
+    elements = [(item, "name") for item in [*root.findall("link"), *root.findall("joint")]]
+    elements += [(item, "link") for tag in ("parent", "child") for item in root.iter(tag)]
+    elements += [(item, "joint") for item in root.iter("mimic")]
+    for item, key in elements:
+        name = item.get(key, "")
+        if name and not name.startswith(prefix):
+            item.set(key, prefix + name)
 
 
 def read_robot(name: str) -> Robot:
@@ -120,52 +277,225 @@ def read_robot(name: str) -> Robot:
         table = tomllib.loads(path.read_text())
         if table.pop("schema_version", None) != SCHEMA_VERSION:
             raise ValueError(f"schema_version is not {SCHEMA_VERSION}")
-        gripper = dict(table.pop("gripper", {}))
-        fingers = [_record(Finger, item) for item in gripper.pop("fingers", ())]
-        robot: Robot = _record(
-            Robot,
-            {**table, "folder": path.parent},
-            gripper=_record(Gripper, gripper, fingers=tuple(fingers)),
-        )
-        _check(robot)
+        return _robot_from({**table, "folder": path.parent})
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, TypeError, ValueError) as error:
-        raise UsageError(f"{path} is not a robot file: {error}.") from error
+        raise UsageError(f"{path} is not a robot file: {error}. See docs/robots.md.") from error
+
+
+@lru_cache(maxsize=16)
+def robot_of(urdf: str) -> Robot:
+    """Return the robot that a description is of.
+
+    That is the record the description carries; else the robot file that has the name of the URDF;
+    else the default robot, with which old episodes were recorded.
+
+    Raises:
+        UsageError: It carries a record that is damaged.
+    """
+    carried = re.search(rf"<{RECORD_TAG}\b[^>]*>(.*?)</{RECORD_TAG}>", urdf, re.DOTALL)
+    if carried is not None:
+        try:
+            return _robot_from(json.loads(unescape(carried[1])))
+        except (TypeError, ValueError, AttributeError) as error:
+            raise UsageError(
+                f"the robot description carries a record that is not a robot: {error}. "
+                "Name the robot's file: --robot FILE.toml."
+            ) from error
+    name = robot_name(urdf)
+    files = {path.stem for path in (datasets_folder() / "robots").glob("*.toml")}
+    return read_robot(name if name in files else DEFAULT_ROBOT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mimic:
+    """A joint of a URDF that goes where another one goes: multiplier * leader + offset."""
+
+    joint: str
+    leader: str
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
+def mimics_of(urdf: str) -> tuple[Mimic, ...]:
+    """Read the joints of a URDF that follow another one; what is not a number becomes NaN."""
+    found = []
+    for joint in ET.fromstring(urdf).findall("joint"):
+        element = joint.find("mimic")
+        if element is not None:
+            numbers = (element.get("multiplier", "1"), element.get("offset", "0"))
+            multiplier, offset = map(_number, numbers)
+            found.append(
+                Mimic(
+                    joint=joint.get("name", ""),
+                    leader=element.get("joint", ""),
+                    multiplier=multiplier,
+                    offset=offset,
+                )
+            )
+    return tuple(found)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def robot_name(urdf: str) -> str:
+    """Return the name in a URDF's ``<robot>`` element, "" when there is none."""
+    found = re.search(r"<robot\b[^>]*?\bname\s*=\s*[\"']([^\"']*)[\"']", urdf)
+    return found[1] if found else ""
+
+
+def _robot_from(table: Mapping[str, Any]) -> Robot:
+    """Make the record of a table, names with their prefix.
+
+    Raises:
+        ValueError: Naming the field.
+    """
+    gripper = dict(table.get("gripper", {}))
+    fingers = tuple(_record(Finger, item, "gripper.fingers") for item in gripper.pop("fingers", ()))
+    robot: Robot = _record(
+        Robot,
+        {key: value for key, value in table.items() if key != "gripper"},
+        "robot",
+        gripper=_record(Gripper, gripper, "gripper", fingers=fingers),
+    )
+    robot = _prefixed(robot)
+    _check_names(robot)
+    _check_numbers(robot)
     return robot
 
 
-def _record(kind: type, table: dict[str, Any], **made: Any) -> Any:
-    unknown = table.keys() - {field.name for field in fields(kind)}
-    if unknown:
-        raise ValueError(f"{kind.__name__.lower()} has no {', '.join(sorted(unknown))}")
-    values = {key: tuple(item) if isinstance(item, list) else item for key, item in table.items()}
-    return kind(**values, **made)
+def _record(kind: type, table: Mapping[str, Any], where: str, **made: Any) -> Any:
+    """Check keys and types against a dataclass, and make it."""
+    hints = typing.get_type_hints(kind)
+    allowed = [item.name for item in fields(kind)]
+    values = dict(made)
+    for key, value in table.items():
+        if key not in allowed:
+            near = get_close_matches(key, allowed, n=1)
+            guess = f"; did you mean {near[0]!r}?" if near else "."
+            raise ValueError(f"{where} has no {key}{guess} It may have: {', '.join(allowed)}")
+        values[key] = _fitting(f"{where}.{key}", value, hints[key])
+    for item in fields(kind):
+        if item.name not in values and item.default is item.default_factory:
+            raise ValueError(f"{where} lacks {item.name}")
+    return kind(**values)
 
 
-def _check(robot: Robot) -> None:
+def _fitting(where: str, value: Any, hint: Any) -> Any:
+    """Return a value of the annotated type: TOML has lists for tuples."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is types.UnionType:
+        return None if value is None else _fitting(where, value, arguments[0])
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        if math.isfinite(value):
+            return float(value)
+    elif hint in (str, bool, Path) and isinstance(value, hint):
+        return value
+    elif origin is tuple and isinstance(value, list | tuple):
+        endless = arguments[-1] is Ellipsis
+        if endless or len(value) == len(arguments):
+            kinds = [arguments[0]] * len(value) if endless else arguments
+            return tuple(_fitting(where, *pair) for pair in zip(value, kinds, strict=True))
+    elif origin is Mapping and isinstance(value, Mapping):
+        return {key: _fitting(f"{where}.{key}", item, str) for key, item in value.items()}
+    raise ValueError(f"{where} cannot be {value!r}")
+
+
+def _prefixed(robot: Robot) -> Robot:
+    """Put the prefix before all names that the file gives without it."""
+    before = robot.prefix
+    if not before:
+        return robot
+
+    def named(name: str) -> str:
+        return name if name.startswith(before) else before + name
+
     gripper = robot.gripper
-    joints = (*robot.joints, *(finger.joint for finger in gripper.fingers))
-    named: dict[str, tuple[object, ...]] = {"joints": joints, "links": gripper.links}
+    return replace(
+        robot,
+        joints=tuple(map(named, robot.joints)),
+        base_frame=named(robot.base_frame),
+        tool_frame=named(robot.tool_frame),
+        held=tuple(map(named, robot.held)),
+        may_overlap=tuple((named(one), named(other)) for one, other in robot.may_overlap),
+        gripper=replace(
+            gripper,
+            links=tuple(map(named, gripper.links)),
+            finger_links=tuple(map(named, gripper.finger_links)),
+            fingers=tuple(replace(item, joint=named(item.joint)) for item in gripper.fingers),
+        ),
+    )
+
+
+def _check_names(robot: Robot) -> None:
+    gripper = robot.gripper
+    named: dict[str, tuple[str, ...]] = {
+        "joints": (*robot.joints, *robot.finger_joints, *robot.held),
+        "links": gripper.links,
+    }
     for what, values in named.items():
-        if not all(isinstance(item, str) and item for item in values):
+        if not all(values):
             raise ValueError(f"{what} must be names")
         if len(set(values)) != len(values):
-            raise ValueError(f"{what} are named twice: {', '.join(map(str, values))}")
-    if not robot.joints:
-        raise ValueError("it has no joints")
+            twice = sorted({name for name in values if values.count(name) > 1})
+            raise ValueError(f"{what} are named twice: {', '.join(twice)}")
+    if len(robot.joints) not in NUM_JOINTS:
+        raise ValueError(
+            f"joints lists {len(robot.joints)}; arms of {NUM_JOINTS[0]} or {NUM_JOINTS[1]} joints "
+            "are supported"
+        )
     if not set(gripper.finger_links) <= set(gripper.links):
         raise ValueError("finger_links must be among the gripper's links")
+
+
+def _check_numbers(robot: Robot) -> None:
+    gripper, count = robot.gripper, len(robot.joints)
     if gripper.fingers and not gripper.max_width_m > 0:
-        raise ValueError("a gripper with fingers needs max_width_m")
+        raise ValueError("a gripper with fingers needs max_width_m, the width when open")
+    if gripper.fingers and len(gripper.finger_links) != 2:
+        raise ValueError("a gripper with fingers needs two finger_links, between which it holds")
+    for finger in gripper.fingers:
+        _check_finger(finger, gripper.max_width_m)
     for what in ("velocity_rad_s", "acceleration_rad_s2"):
-        limits: Iterable[float] | None = getattr(robot, what)
-        if limits is not None:
-            limits = tuple(limits)
-            if len(limits) != len(robot.joints) or not all(0 < x < math.inf for x in limits):
-                raise ValueError(f"{what} must hold one positive number per joint")
+        limits = getattr(robot, what)
+        if limits is not None and (len(limits) != count or not all(x > 0 for x in limits)):
+            raise ValueError(f"{what} must hold one positive number per joint")
+    if robot.home_rad is not None and len(robot.home_rad) != count:
+        raise ValueError("home_rad must hold one number per joint")
+    ranges = robot.position_rad
+    if ranges is not None and (len(ranges) != count or not all(a < b for a, b in ranges)):
+        raise ValueError("position_rad must hold a lower and a higher number per joint")
     for what in ("tool_speed_m_s", "contact_force_N", "tracking_error_rad"):
         limit = getattr(robot, what)
-        if limit is not None and not 0 < limit < math.inf:
-            raise ValueError(f"{what} must be a positive number")
+        if limit is not None and not limit > 0:
+            raise ValueError(f"{what} must be above 0")
+    if robot.payload_kg is not None and not robot.payload_kg > 0:
+        raise ValueError("payload_kg must be above 0")
+
+
+def _check_finger(finger: Finger, max_width_m: float) -> None:
+    if finger.table:
+        widths, values = zip(*finger.table, strict=True)
+        steps = np.sign(np.diff(values))
+        if len(widths) < 2 or np.any(np.diff(widths) <= 0) or abs(steps.sum()) != len(steps):
+            raise ValueError(
+                f"the table of {finger.joint} needs rows of [width, value], widths rising and "
+                "values all rising or all falling"
+            )
+    elif finger.link_m:
+        if not finger.turns:
+            raise ValueError(f"link_m of {finger.joint} is the lever of a joint that turns = true")
+        ends = np.array([-finger.offset_m, max_width_m - finger.offset_m]) / finger.link_m
+        if np.any(np.abs(ends) >= 1.0):
+            raise ValueError(
+                f"link_m of {finger.joint} is too short for widths from 0 to {max_width_m}"
+            )
+    elif finger.per_m == 0:
+        raise ValueError(f"per_m of {finger.joint} is 0: its width says nothing")
 
 
 def resolve_mesh(uri: str) -> Path:
@@ -185,7 +515,8 @@ def resolve_mesh(uri: str) -> Path:
             raise UsageError(f"mesh {uri!r} leaves its package folder.")
     else:
         raise UsageError(
-            f"mesh {uri!r} is in package {match[1]!r}; only {PACKAGE!r} is known here."
+            f"mesh {uri!r} is in package {match[1]!r}; only {PACKAGE!r} is known here. "
+            "Say where it lies under mesh_folders in the robot file."
         )
     if not path.is_file():
         raise UsageError(f"mesh {uri!r} is not there ({path}).")
@@ -196,6 +527,6 @@ def _data_root() -> Path:
     root = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix" / "share" / PACKAGE
     if not root.is_dir():
         raise MissingDependencyError(
-            package=PACKAGE, extra="replay", purpose="the default robot (UR5)"
+            package=PACKAGE, extra="replay", purpose="a robot of that package"
         )
     return root

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rerun as rr
 import rerun.chunk as rc
+from rerun.urdf import UrdfTree
 from rerun_cell import CUBE_STL, T_BASE_CAMERA, urdf, write_cell_run, write_splats
 
 from bridge.episode import schema
@@ -20,6 +21,7 @@ from bridge.episode.streams import joint_track
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.robots.default import ARM_JOINTS
+from bridge.robots.robot import read_robot
 from dashboards.errors import DashboardError
 from dashboards.rerun_entities import drawable, read_splats
 from dashboards.rerun_file import RerunFile
@@ -234,6 +236,18 @@ def test_the_drawn_robot_stands_on_base_link_whatever_is_above_it(tmp_path: Path
         drawable("<robot")
     with pytest.raises(DashboardError, match="root element <xacro>"):
         drawable("<xacro/>")
+
+
+@pytest.mark.parametrize("name", ["panda", "left_ur5_parallel_gripper", "kinova_j2s6s200"])
+def test_any_robot_is_drawn_with_its_base_as_root(name: str, tmp_path: Path) -> None:
+    pytest.importorskip("pinocchio")
+    robot = read_robot(name)
+    path = tmp_path / "robot.urdf"
+    path.write_text(drawable(robot.description()))
+    tree = UrdfTree.from_file_path(path)
+    assert tree.root_link().name == robot.base_frame
+    for joint in (*robot.joints, *robot.finger_joints):
+        assert tree.get_joint_by_name(joint) is not None
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")

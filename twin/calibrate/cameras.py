@@ -18,7 +18,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import CAMERAS, DEPTH_IMAGE, DEPTH_INFO, TARGET_POSE, is_truth
 from bridge.errors import BridgeError, GstError, UsageError
 from bridge.geometry import se3
-from bridge.robots.default import BASE_FRAME
+from bridge.robots.robot import robot_of
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.hand_eye import TargetCamera, find_camera
@@ -192,7 +192,7 @@ def _nominal_pose(seen: _Seen, camera_id: str) -> Float[np.ndarray, "4 4"] | Non
         root = tree.root_of(frame)
     except BridgeError:
         return None
-    return T if root == BASE_FRAME else None
+    return T if root == streams.recorded_robot(seen.episode).base_frame else None
 
 
 class NothingToCalibrateError(UsageError):
@@ -217,11 +217,13 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
     """
     episodes = _readable(run, output)
     where = {} if config.pairs is not None else placement(episodes)
+    base = _base_frame(episodes)
     found: dict[str, Any] = {}
     reasons: dict[str, str] = {}
     for camera_id in _wanted(episodes, where, config):
         try:
-            found[camera_id] = _camera(episodes, camera_id, where.get(camera_id, NO_DEPTH), config)
+            place = where.get(camera_id, NO_DEPTH)
+            found[camera_id] = _camera(episodes, camera_id, place, config, base)
         except GstError as error:
             if config.camera:
                 raise
@@ -243,6 +245,12 @@ def _readable(run: RunFolder, output: Output) -> list[Episode]:
     return episodes
 
 
+def _base_frame(episodes: Sequence[Episode]) -> str:
+    """The base of the robot that was recorded."""
+    described = [item for item in episodes if streams.robot_description(item) is not None]
+    return next((streams.recorded_robot(item) for item in described), robot_of("")).base_frame
+
+
 def _wanted(
     episodes: Sequence[Episode], where: Mapping[str, str], config: CalibrateConfig
 ) -> list[str]:
@@ -255,12 +263,12 @@ def _wanted(
 
 
 def _camera(
-    episodes: Sequence[Episode], camera_id: str, where: str, config: CalibrateConfig
+    episodes: Sequence[Episode], camera_id: str, where: str, config: CalibrateConfig, base: str
 ) -> dict[str, Any]:
     if config.pairs is not None:
-        return _from_target(read_pairs(config.pairs), config)
+        return _from_target(read_pairs(config.pairs), config, base)
     if camera_id in target_cameras(episodes):
-        return _from_target(recorded_pairs(episodes, camera_id, config.link), config)
+        return _from_target(recorded_pairs(episodes, camera_id, config.link), config, base)
     topic = f"...{CAMERAS}{camera_id}{TARGET_POSE}"
     if where == NO_DEPTH:
         message = (
@@ -279,27 +287,29 @@ def _camera(
     found = find_fixed_camera(
         with_depth, camera_id, max_postures=config.max_postures, seed=config.seed
     )
-    return fixed_record(found)
+    return fixed_record(found, base)
 
 
-def _from_target(pairs: PosePairs, config: CalibrateConfig) -> dict[str, Any]:
-    return target_record(find_camera(pairs, config.mount, seed=config.seed), pairs, config.link)
+def _from_target(pairs: PosePairs, config: CalibrateConfig, base: str) -> dict[str, Any]:
+    found = find_camera(pairs, config.mount, seed=config.seed)
+    return target_record(found, pairs, config.link, base)
 
 
-def target_record(found: TargetCamera, pairs: PosePairs, link: str) -> dict[str, Any]:
+def target_record(found: TargetCamera, pairs: PosePairs, link: str, base: str) -> dict[str, Any]:
     """Say what pose pairs gave.
 
     Args:
         found: The solution, and how the camera is mounted.
         pairs: What it was found from; its source is recorded.
         link: Robot link that carries the camera, or the target of a fixed camera.
+        base: The robot's base frame.
     """
     solution = found.solution
     in_hand = found.mount == "hand"
     return {
         "method": "target pose pairs, AX = ZB",
         "mount": found.mount,
-        "link": link if in_hand else BASE_FRAME,
+        "link": link if in_hand else base,
         "stream": "color",
         "T_link_camera": se3.pose_record(solution.X if in_hand else solution.Z),
         "T_base_target" if in_hand else "T_effector_target": se3.pose_record(
@@ -316,12 +326,12 @@ def target_record(found: TargetCamera, pairs: PosePairs, link: str) -> dict[str,
     }
 
 
-def fixed_record(found: FixedCamera) -> dict[str, Any]:
+def fixed_record(found: FixedCamera, base: str) -> dict[str, Any]:
     """Say what the robot seen by a fixed camera gave."""
     record = {
         "method": "depth of the robot against its description",
         "mount": "fixed",
-        "link": BASE_FRAME,
+        "link": base,
         "stream": "depth",
         "T_link_camera": se3.pose_record(found.alignment.T_base_source),
         **found.alignment.to_record(),

@@ -26,6 +26,9 @@ class GateConfig:
     task: str = "cube_into_box"
     """The task whose objects and success predicate count: a name of the run's tasks/ or of
     datasets/tasks, or a file."""
+    robot: str = ""
+    """Robot file, by name or path, whose description takes the place of the published one; none:
+    the robot that the cell describes (docs/robots.md)."""
     max_steps: int = 100_000
     """Simulated steps behind one verdict, the varied replays' among them: the deadline that gives
     the same verdict on every machine. A plan that alone needs more gets no verdict."""

@@ -6,7 +6,6 @@ machine's speed; the wall clock is the last resort against what hangs.
 """
 
 import queue
-import re
 import threading
 import time
 import traceback
@@ -19,7 +18,7 @@ from jaxtyping import Float
 
 from bridge.episode.topics import JOINT_STATES, ROBOT_DESCRIPTION, cell_topic
 from bridge.errors import GstError
-from bridge.robots.default import ARM_JOINTS, BASE_FRAME
+from bridge.robots.robot import Robot, robot_name, robot_of
 from bridge.task.plan import Plan
 from bridge.task.task_file import ObjectModel, Task
 from bridge.task.verdict import Factor, Verdict
@@ -258,7 +257,7 @@ class Gate:
                 raise UndecidedError(
                     f"nothing has arrived from the cell for {silent_ns * 1e-9:.0f} s"
                 )
-            start_rad = self._where_the_arm_is(arrived_ns)
+            start_rad = self._where_the_arm_is(arrived_ns, robot_of(urdf))
             verdict = self._judged(plan, urdf, start_rad, ends_s)
             # A cell that waits for the verdict may stand still meanwhile: not counted as silence.
             self._contact_ns = self._now_ns() - silent_ns
@@ -269,11 +268,12 @@ class Gate:
             traceback.print_exc()
             return no_verdict(plan, f"internal error: {type(error).__name__}: {error}")
 
-    def _where_the_arm_is(self, arrived_ns: int) -> Joints:
+    def _where_the_arm_is(self, arrived_ns: int, robot: Robot) -> Joints:
         """The arm's joints as the cell said last, in their order [rad].
 
         Args:
             arrived_ns: When the plan came, on the receiver's clock.
+            robot: Whose joints they must be.
 
         Raises:
             UndecidedError: When they are not known, or not of now.
@@ -282,7 +282,7 @@ class Gate:
         topic = cell_topic(self._config.cell, JOINT_STATES)
         if heard is None:
             raise UndecidedError(f"no joint states have arrived on {topic}")
-        missing = [name for name in ARM_JOINTS if name not in heard.names]
+        missing = [name for name in robot.joints if name not in heard.names]
         if missing:
             raise UndecidedError(
                 f"the joint states on {topic} are of another robot: they name "
@@ -296,7 +296,7 @@ class Gate:
                 f"the joint states on {topic} are {age_s:.1f} s old, and only those of the last "
                 f"{limit_s:g} s say where the robot is (--max-joint-age-s)"
             )
-        order = [heard.names.index(name) for name in ARM_JOINTS]
+        order = [heard.names.index(name) for name in robot.joints]
         values: Joints = np.asarray(heard.position_rad, dtype=np.float64)
         if len(values) != len(heard.names) or not np.isfinite(values[order]).all():
             raise UndecidedError(f"the joint states on {topic} hold no numbers for every joint")
@@ -314,7 +314,7 @@ class Gate:
         verdict = self._likely(verdict)
         if verdict.accepted is True:
             self._look_again(found, frames, ends_s)
-            self._feel_again(start_rad)
+            self._feel_again(start_rad, robot_of(urdf))
         return verdict
 
     def _check(self, plan: Plan) -> str:
@@ -324,11 +324,6 @@ class Gate:
                 f"plan {plan.id} is for task {plan.task!r}; this gate judges {self._task.name!r}. "
                 "Start it with --task."
             )
-        if plan.frame != BASE_FRAME:
-            raise UndecidedError(
-                f"plan {plan.id} is given in frame {plan.frame!r}; only {BASE_FRAME!r}, the "
-                "robot's root, is judged"
-            )
         urdf = self._perception.urdf()
         if urdf is None:
             raise UndecidedError(f"no robot description has arrived on {ROBOT_DESCRIPTION}")
@@ -336,6 +331,12 @@ class Gate:
         if plan.robot != robot:
             raise UndecidedError(
                 f"plan {plan.id} is for robot {plan.robot!r}; the cell's robot is {robot!r}"
+            )
+        base_frame = robot_of(urdf).base_frame
+        if plan.frame != base_frame:
+            raise UndecidedError(
+                f"plan {plan.id} is given in frame {plan.frame!r}; only {base_frame!r}, the "
+                "robot's base, is judged"
             )
         running = self._perception.executing()
         if running is not None:
@@ -415,18 +416,18 @@ class Gate:
         if moved:
             raise UndecidedError(f"moved while the plan was being judged: {'; '.join(moved)}")
 
-    def _feel_again(self, start_rad: Joints) -> None:
+    def _feel_again(self, start_rad: Joints, robot: Robot) -> None:
         """Before a yes: the arm must still be where the plan was judged from.
 
         Raises:
             UndecidedError: When it is not, or nobody says so.
         """
         arrived_ns = self._contact_ns  # a cell that waits may be silent meanwhile
-        off_rad = np.abs(self._where_the_arm_is(arrived_ns) - start_rad)
+        off_rad = np.abs(self._where_the_arm_is(arrived_ns, robot) - start_rad)
         joint = int(np.argmax(off_rad))
         if not off_rad[joint] <= self._config.replay.start_rad:
             raise UndecidedError(
-                f"the arm moved while the plan was being judged: {ARM_JOINTS[joint]} by "
+                f"the arm moved while the plan was being judged: {robot.joints[joint]} by "
                 f"{off_rad[joint]:.3f} rad"
             )
 
@@ -454,9 +455,3 @@ def no_verdict(plan: Plan, reason: str) -> Verdict:
         seed=0,
         reason=reason,
     )
-
-
-def robot_name(urdf: str) -> str:
-    """Return the name in a URDF's ``<robot>`` element, "" when there is none."""
-    found = re.search(r"<robot\b[^>]*?\bname\s*=\s*[\"']([^\"']*)[\"']", urdf)
-    return found[1] if found else ""

@@ -21,6 +21,7 @@ from bridge.episode.topics import (
     cell_topic,
 )
 from bridge.errors import UsageError
+from bridge.robots.robot import read_robot
 from bridge.task.find import chosen_task_file
 from bridge.task.task_file import Task
 from bridge.terminal import Output, printable, stop_signals
@@ -162,7 +163,8 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
         raise UsageError(message)
     run = RunFolder.open(path)
     task = chosen_task_file(config.task, tasks_dir=run.tasks_dir).task()
-    perception = LiveView(config.cell, read_calibration(run))
+    urdf = read_robot(config.robot).description() if config.robot else None
+    perception = LiveView(config.cell, read_calibration(run), urdf)
     wire = WireConfig(connect=config.connect, config=config.zenoh_config)
     with (
         stop_signals() as stopped,

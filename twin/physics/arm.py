@@ -3,6 +3,7 @@
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
-from bridge.robots.default import ARM_JOINTS, FINGER_JOINTS, FINGER_LINKS, MAX_WIDTH_M, TCP_FRAME
+from bridge.robots.robot import Finger, Mimic, Robot, mimics_of, robot_of
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
@@ -109,6 +110,28 @@ class PhysicsError(TwinError):
     """The physics engine refused or lost something."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Drive:
+    """A finger joint with a motor: one of the record's, or one that mimics one of them."""
+
+    index: int
+    finger: Finger
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+    def value(self, width_m: float) -> float:
+        """Where the joint is at a distance between the pads."""
+        return self.multiplier * self.finger.value(width_m) + self.offset
+
+    def width_m(self, value: float) -> float:
+        """The distance between the pads at a value of the joint."""
+        return self.finger.width((value - self.offset) / self.multiplier)
+
+    def slope(self, width_m: float) -> float:
+        """Change of the value with the width."""
+        return self.multiplier * self.finger.slope(width_m)
+
+
 class Arm:
     """One robot with its base at the origin of a PyBullet client."""
 
@@ -126,10 +149,12 @@ class Arm:
         """
         self._client = client
         self._config = config
+        self.record: Robot = robot_of(urdf)
+        self._max_width_m = self.record.gripper.max_width_m
         self.id = self._load(urdf, mesh_hulls_m)
-        self._index_joints()
+        self._index_joints(mimics_of(urdf))
         self._couple_fingers()
-        self._target_m = MAX_WIDTH_M / 2
+        self._target_m = self._max_width_m
         self._arm_order: tuple[list[float], list[float]] | None = None
         self._finger_order: tuple[float, float, float] | None = None
         self._press_m_s: float | None = None
@@ -155,12 +180,14 @@ class Arm:
                 )
                 raise PhysicsError(message) from error
 
-    def _index_joints(self) -> None:
+    def _index_joints(self, mimics: Sequence[Mimic]) -> None:
+        record, gripper = self.record, self.record.gripper
         self._joints: dict[str, int] = {}
         self.links: dict[str, int] = {}
         self._efforts: dict[str, float] = {}
         self.opening_axes: dict[str, tuple[float, ...]] = {}
         parents: dict[str, int] = {}
+        fixed: set[int] = {-1}
         client = self._client
         for index in range(pybullet.getNumJoints(self.id, physicsClientId=client)):
             item = pybullet.getJointInfo(self.id, index, physicsClientId=client)
@@ -169,20 +196,62 @@ class Arm:
             self._efforts[item[1].decode()] = item[10]
             self.opening_axes[item[12].decode()] = tuple(item[13])
             parents[item[12].decode()] = item[16]
-        missing = [name for name in (*ARM_JOINTS, *FINGER_JOINTS) if name not in self._joints] + [
-            name for name in (TCP_FRAME, *FINGER_LINKS) if name not in self.links
+            if item[2] == pybullet.JOINT_FIXED and item[16] in fixed:
+                fixed.add(index)
+        self.base_links = tuple(sorted(fixed - {-1}))
+        """What no joint moves."""
+        wanted = (*record.joints, *record.finger_joints)
+        missing = [name for name in wanted if name not in self._joints] + [
+            name for name in (record.tool_frame, *gripper.finger_links) if name not in self.links
         ]
         if missing:
             message = (
                 f"the robot description lacks {', '.join(missing)}; it has the joints "
-                f"{', '.join(self._joints)}. Physics needs the arm and two prismatic fingers."
+                f"{', '.join(self._joints)}. Physics needs the arm and the fingers of "
+                f"{record.name!r}."
             )
             raise PhysicsError(message)
-        self._arm = [self._joints[name] for name in ARM_JOINTS]
-        self._fingers = [self._joints[name] for name in FINGER_JOINTS]
-        self.finger_links = [self.links[name] for name in FINGER_LINKS]
-        self._finger_parent = parents[FINGER_LINKS[0]]
-        self._arm_forces = [self._efforts[name] for name in ARM_JOINTS]
+        self._arm = [self._joints[name] for name in record.joints]
+        self._drives = self._driven(mimics)
+        self._fingers = [drive.index for drive in self._drives]
+        self.finger_links = [self.links[name] for name in gripper.finger_links]
+        carriers = [parents[name] for name, index in self.links.items() if index in self._fingers]
+        self._finger_parent = carriers[0] if carriers else self.links[record.tool_frame]
+        self._arm_forces = [self._efforts[name] for name in record.joints]
+        for name, index in self.links.items():
+            if index in self._fingers:
+                self.opening_axes[name] = self._opening(index)
+
+    def _driven(self, mimics: Sequence[Mimic]) -> list[_Drive]:
+        """The joints that open the gripper, leaders and followers."""
+        leaders = {item.joint: item for item in self.record.gripper.fingers}
+        drives = [
+            _Drive(index=self._joints[name], finger=finger) for name, finger in leaders.items()
+        ]
+        return drives + [
+            _Drive(
+                index=self._joints[item.joint],
+                finger=leaders[item.leader],
+                multiplier=item.multiplier,
+                offset=item.offset,
+            )
+            for item in mimics
+            if item.leader in leaders and item.joint not in leaders
+        ]
+
+    def _opening(self, index: int) -> tuple[float, ...]:
+        """Direction in which a finger's pad goes when the gripper opens, in the finger's frame."""
+        item = pybullet.getJointInfo(self.id, index, physicsClientId=self._client)
+        drive = next(drive for drive in self._drives if drive.index == index)
+        opens = 1.0 if drive.slope(self._max_width_m / 2) > 0 else -1.0
+        axis = np.array(item[13]) * opens
+        if item[2] == pybullet.JOINT_REVOLUTE:
+            p, (x, y, z, w) = self.link_poses([index])[0]
+            T_finger_base = se3.invert(se3.transform_from(np.array([w, x, y, z]), np.array(p)))
+            pad = se3.apply(T_finger_base, self.T_base_link(self.record.tool_frame)[:3, 3])
+            axis = np.cross(axis, pad)
+            axis /= np.linalg.norm(axis)
+        return tuple(axis.tolist())
 
     def _couple_fingers(self) -> None:
         for link in self.finger_links:
@@ -192,11 +261,14 @@ class Arm:
                 lateralFriction=self._config.finger_friction,
                 physicsClientId=self._client,
             )
+        if len(self._fingers) != 2:
+            return
+        first, second = (drive.slope(self._max_width_m / 2) for drive in self._drives)
         gear = pybullet.createConstraint(
             self.id,
-            self.finger_links[0],
+            self._fingers[0],
             self.id,
-            self.finger_links[1],
+            self._fingers[1],
             pybullet.JOINT_GEAR,
             [0, 1, 0],
             [0, 0, 0],
@@ -205,7 +277,7 @@ class Arm:
         )
         pybullet.changeConstraint(
             gear,
-            gearRatio=-1,
+            gearRatio=-first / second,
             erp=0.2,
             maxForce=10 * self._config.grip_force_N,
             physicsClientId=self._client,
@@ -222,9 +294,9 @@ class Arm:
             pybullet.resetJointState(
                 self.id, index, float(value), 0.0, physicsClientId=self._client
             )
-        for index in self._fingers:
+        for drive in self._drives:
             pybullet.resetJointState(
-                self.id, index, float(width_m) / 2, 0.0, physicsClientId=self._client
+                self.id, drive.index, drive.value(float(width_m)), 0.0, physicsClientId=self._client
             )
 
     def command(self, joints_rad: Joints, velocity_rad_s: Joints, width_m: float) -> None:
@@ -250,7 +322,9 @@ class Arm:
                 physicsClientId=self._client,
             )
             self._arm_order = order
-        target_m = min(max(width_m, 0.0), MAX_WIDTH_M) / 2
+        if not self._drives:
+            return
+        target_m = min(max(width_m, 0.0), self._max_width_m)
         if target_m > self._target_m:
             self.closing, self._press_m_s = False, None
         elif target_m < self._target_m:
@@ -273,21 +347,28 @@ class Arm:
     def fingers(self) -> list[tuple[float, float]]:
         """How far each finger is from being as closed as it was told [m], and its speed [m/s]."""
         states = pybullet.getJointStates(self.id, self._fingers, physicsClientId=self._client)
-        return [(state[0] - self._target_m, state[1]) for state in states]
+        share, found = 1.0 / len(self._drives), []
+        for drive, state in zip(self._drives, states, strict=True):
+            width_m = drive.width_m(state[0])
+            short_m = share * (width_m - self._target_m)
+            found.append((short_m, share * state[1] / drive.slope(width_m)))
+        return found
 
     def _drive_fingers(self, target_m: float, speed_m_s: float, gain: float = _GAIN) -> None:
         order = (target_m, speed_m_s, gain)
         if self._finger_order == order:
             return
         self._finger_order = order
-        for index in self._fingers:
+        for drive in self._drives:
+            # Of the width each finger has its share; what a joint does per metre of that.
+            lever = len(self._drives) * abs(drive.slope(target_m))
             pybullet.setJointMotorControl2(
                 self.id,
-                index,
+                drive.index,
                 pybullet.POSITION_CONTROL,
-                targetPosition=target_m,
-                force=self._config.grip_force_N,
-                maxVelocity=speed_m_s,
+                targetPosition=drive.value(target_m),
+                force=self._config.grip_force_N / lever,
+                maxVelocity=speed_m_s * lever,
                 positionGain=gain,
                 physicsClientId=self._client,
             )
@@ -301,14 +382,14 @@ class Arm:
         Args:
             reaction_N: Mean over both fingers of what pushes them apart.
         """
-        top, here = self._config.finger_speed_m_s, self.width_m() / 2
+        top, here = self._config.finger_speed_m_s, self.width_m()
         speed = top * (1.0 - reaction_N / self._config.grip_force_N)
         if self._target_m >= here:
             self._drive_fingers(self._target_m, top)
         elif speed >= 0:
             self._drive_fingers(self._target_m, max(speed, SLOWEST_M_S))
         else:
-            self._drive_fingers(MAX_WIDTH_M / 2, min(-speed, top))
+            self._drive_fingers(self._max_width_m, min(-speed, top))
 
     def joints_rad(self) -> Float[np.ndarray, " num_joints"]:
         """Where the arm is."""
@@ -318,7 +399,14 @@ class Arm:
     def width_m(self) -> float:
         """Distance between the finger pads."""
         states = pybullet.getJointStates(self.id, self._fingers, physicsClientId=self._client)
-        return float(sum(state[0] for state in states))
+        return self._width_m([state[0] for state in states])
+
+    def _width_m(self, values: Sequence[float]) -> float:
+        """The distance between the pads, mean of what each finger says; 0 of a fixed tool."""
+        if not values:
+            return 0.0
+        widths = [drive.width_m(value) for drive, value in zip(self._drives, values, strict=True)]
+        return float(sum(widths)) / len(widths)
 
     def posture(self) -> tuple[Float[np.ndarray, " num_joints"], float]:
         """Where the arm is, and the distance between the finger pads; one question for both."""
@@ -327,7 +415,7 @@ class Arm:
         )
         places = [state[0] for state in states]
         count = len(self._arm)
-        return np.array(places[:count]), float(sum(places[count:]))
+        return np.array(places[:count]), self._width_m(places[count:])
 
     def link_poses(self, links: Sequence[int]) -> list[LinkPose]:
         """Position [m] and quaternion xyzw of the frames of links, base frame."""
@@ -414,7 +502,7 @@ class Press:
             self._found = 0
 
     def _stalled(self) -> bool:
-        return all(
+        return bool(self._arm.finger_links) and all(
             short_m > SHORT_M and abs(speed_m_s) < STALLED_M_S
             for short_m, speed_m_s in self._arm.fingers()
         )

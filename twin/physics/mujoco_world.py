@@ -10,6 +10,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -20,8 +21,7 @@ from jaxtyping import Float
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.robots.default import ROBOT
-from bridge.robots.robot import Robot
+from bridge.robots.robot import Robot, mimics_of, robot_of
 from twin.physics.arm import Hulls, Joints, PhysicsError, write_description
 from twin.physics.config import RIGID_ONLY, PhysicsConfig
 from twin.physics.soft_world import SoftWorld
@@ -109,8 +109,7 @@ class MujocoArm:
             joint.armature, joint.actfrcrange = _FINGER_ARMATURE_KG, [-force, force]
             motor = _add_motor(spec, finger.joint, force)
             motor.set_to_position(kp=_FINGER_N_M, kv=_FINGER_N_s_m)
-        first, *others = self._drives
-        for other in others:  # they move together, as by a gear
+        for first, other in pairwise(self._drives):  # they move together, as by a gear
             gear = spec.add_equality(
                 type=mujoco.mjtEq.mjEQ_JOINT, name1=other.joint, name2=first.joint
             )
@@ -173,17 +172,32 @@ class MujocoArm:
     def width_m(self) -> float:
         """Distance between the finger pads."""
         values = self._data.qpos[self._fingers].tolist()
-        widths = [
-            (value - finger.closed) / finger.per_m
-            for value, finger in zip(values, self._drives, strict=True)
-        ]
-        return float(sum(widths) / len(widths))
+        widths = [finger.width(value) for value, finger in zip(values, self._drives, strict=True)]
+        return float(sum(widths) / len(widths)) if widths else 0.0
 
     def T_base_link(self, link: str) -> Float[np.ndarray, "4 4"]:
         """Pose of a link's frame."""
         mujoco.mj_kinematics(self._model, self._data)
         body = self._data.body(link)
         return se3.transform_from(np.array(body.xquat), np.array(body.xpos))
+
+
+def _refuse_gripper(record: Robot, urdf: str) -> None:
+    """Fingers with motors of their own that slide in proportion to the width, or a fixed tool.
+
+    Raises:
+        PhysicsError: For fingers that turn, follow a lever or a table, or mimic another one.
+    """
+    fingers = record.gripper.fingers
+    followers = [item.joint for item in mimics_of(urdf) if item.leader in record.finger_joints]
+    others = [item.joint for item in fingers if item.turns or item.link_m or item.table]
+    unfit = others + [name for name in followers if name not in record.finger_joints]
+    if unfit:
+        message = (
+            f"MuJoCo replays fingers that slide, each with a motor of its own; of {record.name!r} "
+            f"{', '.join(unfit)} turns or follows another joint. Use --engine pybullet."
+        )
+        raise PhysicsError(message)
 
 
 def _check_names(spec: Any, record: Robot) -> None:
@@ -257,7 +271,8 @@ class MujocoWorld:
         option.integrator = mujoco.mjtIntegrator.mjINT_EULER
         option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         option.impratio = _IMPRATIO
-        self._record = ROBOT
+        self._record = robot_of(urdf)
+        _refuse_gripper(self._record, urdf)
         self.robot = MujocoArm(self._spec, self._record, config)
         self.free_objects: list[str] = []
         self._shapes: list[_Shape] = []

@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.robots.default import BASE_FRAME, TCP_FRAME
 from twin.physics.arm import Arm, Hulls, PhysicsError, Press
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import give_client_back, pybullet, take_client
@@ -150,9 +149,8 @@ class World:
         extents = np.array([size_m, size_m, thickness_m])
         body = self.add_static([(centre, extents)], np.eye(4))[0]
         # The robot stands on the table: its base touches it by construction.
-        self._ignore(body, -1)
-        if BASE_FRAME in self.robot.links:
-            self._ignore(body, self.robot.links[BASE_FRAME])
+        for link in (-1, *self.robot.base_links):
+            self._ignore(body, link)
         return body
 
     def _ignore(self, body: int, link: int) -> None:
@@ -277,13 +275,14 @@ class World:
 
     def tie(self, object_id: str) -> None:
         """Fix a rigid object to the tool where it is."""
-        T_tcp_base = se3.invert(self.robot.T_base_link(TCP_FRAME))
+        tool = self.robot.record.tool_frame
+        T_tcp_base = se3.invert(self.robot.T_base_link(tool))
         q, p = se3.split(T_tcp_base @ self.T_base_object(object_id))
         w, x, y, z = q.tolist()
         self._constraint = int(
             pybullet.createConstraint(
                 self.robot.id,
-                self.robot.links[TCP_FRAME],
+                self.robot.links[tool],
                 self.free_ids[object_id],
                 -1,
                 pybullet.JOINT_FIXED,

@@ -28,7 +28,7 @@ from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan
 from bridge.task.task_file import BASKET
 from bridge.task.verdict import Factor
-from twin.replay.clearance.bodies import SCENE, TABLE, group_of, placed_panels
+from twin.replay.clearance.bodies import SCENE, TABLE, names_of, placed_panels
 from twin.replay.clearance.monitor import MAX_LEAP_M, Allowed, active_stage, allowed_pairs
 from twin.replay.clearance.static_obstacles import stationary_links
 from twin.replay.config import ReplayConfig
@@ -225,7 +225,8 @@ class _Audit:
 
     def _may_touch(self, body: str, other: str, states: _States) -> Bool[np.ndarray, " n"]:
         """At which states the stage allows the pair."""
-        pairs = {frozenset((group_of(body), other)), frozenset((body, other))}
+        names = names_of(body, self._robot.record.gripper)
+        pairs = {frozenset((name, other)) for name in names}
         allowed = np.array([bool(pairs & item) for item in states.allowed], dtype=bool)
         return np.asarray(allowed[states.stage])
 

@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bridge.robots.default import ARM_JOINTS, ROBOT
 from bridge.task.plan import Plan, Stage
 from bridge.task.task_file import Task
 from twin.replay.config import ReplayConfig
@@ -52,9 +51,9 @@ def start_failures(
         Failure(
             t_ns=0,
             cause="start_elsewhere",
-            bodies=(ARM_JOINTS[joint],),
+            bodies=(robot.record.joints[joint],),
             detail=f"the plan starts {off_m * 1e3:.1f} mm and {off_rad[joint]:.3f} rad "
-            f"({ARM_JOINTS[joint]}) from where the robot is; the limits are "
+            f"({robot.record.joints[joint]}) from where the robot is; the limits are "
             f"{config.start_m * 1e3:.0f} mm and {config.start_rad:g} rad",
         )
     ]
@@ -151,31 +150,33 @@ def limited_to_task(plan: Plan, task: Task) -> Plan:
 # What the robot itself would refuse, or stop at.
 
 
+_SPEED = ("joint_speed", "moves at", "rad/s")
+_ACCELERATION = ("joint_acceleration", "is accelerated at", "rad/s^2")
+
+
 def path_limit_failures(path: JointPath, robot: RobotModel) -> list[Failure]:
     """Find where a commanded path asks for more speed or acceleration than the robot has.
 
     Speeds are asked between its knots, however near each other they are.
     """
-    failures = []
+    failures, record = [], robot.record
     times_s = path.times_ns * 1e-9
     if len(times_s) > 1:
         speeds = np.abs(np.diff(path.joints_rad, axis=0)) / np.diff(times_s)[:, None]
         fastest = robot.velocity_limit_rad_s
-        failures += _over(path.times_ns[:-1], speeds, fastest, "joint_speed", "moves at", "rad/s")
-    if ROBOT.acceleration_rad_s2 is not None:
+        failures += _over(path.times_ns[:-1], speeds, fastest, robot, _SPEED)
+    if record.acceleration_rad_s2 is not None:
         stamps, values = _accelerations(path)
-        limit = np.array(ROBOT.acceleration_rad_s2)
-        failures += _over(
-            stamps, values, limit, "joint_acceleration", "is accelerated at", "rad/s^2"
-        )
-    if ROBOT.tool_speed_m_s is not None and len(times_s) > 1:
+        limit = np.array(record.acceleration_rad_s2)
+        failures += _over(stamps, values, limit, robot, _ACCELERATION)
+    if record.tool_speed_m_s is not None and len(times_s) > 1:
         places = robot.Ts_base_tcp(path.joints_rad)[:, :3, 3]
         speeds_m_s = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times_s)
         index = int(np.argmax(speeds_m_s))
-        if speeds_m_s[index] > ROBOT.tool_speed_m_s * _SLACK:
+        if speeds_m_s[index] > record.tool_speed_m_s * _SLACK:
             detail = (
                 f"the tool moves at {speeds_m_s[index]:.2f} m/s, the limit is "
-                f"{ROBOT.tool_speed_m_s:g} m/s"
+                f"{record.tool_speed_m_s:g} m/s"
             )
             t_ns = int(path.times_ns[index])
             failures.append(Failure(t_ns=t_ns, cause="tool_speed", detail=detail))
@@ -186,16 +187,15 @@ def _over(
     times_ns: Int[np.ndarray, " num_times"],
     values: Float[np.ndarray, "num_times num_joints"],
     limit: Float[np.ndarray, " num_joints"],
-    cause: str,
-    verb: str,
-    unit: str,
+    robot: RobotModel,
+    words: tuple[str, str, str],
 ) -> list[Failure]:
-    """Name the first joint that is beyond its limit."""
+    """Name the first joint that is beyond its limit; ``words`` are cause, verb and unit."""
     over = ~(values <= limit * _SLACK)
     if not np.any(over):
         return []
     index, joint = _first(over)
-    name = ARM_JOINTS[joint]
+    name, (cause, verb, unit) = robot.record.joints[joint], words
     detail = f"{name} {verb} {values[index, joint]:.2f} {unit}, the limit is {limit[joint]:.2f}"
     t_ns = max(0, int(times_ns[index]))
     return [Failure(t_ns=t_ns, cause=cause, bodies=(name,), detail=f"{detail} {unit}")]
@@ -218,21 +218,22 @@ def _accelerations(
     return stamps, np.abs(after - 2 * here + before) / ACCELERATION_WINDOW_S**2
 
 
-def simulated_limit_failures(path: JointPath, states: States) -> list[Failure]:
+def simulated_limit_failures(path: JointPath, states: States, robot: RobotModel) -> list[Failure]:
     """Find where the arm would stop by itself: pressed too hard, or too far from its command.
 
     Args:
         path: What was commanded.
         states: What physics made of it.
+        robot: Whose limits count.
     """
-    failures = []
-    limit_rad, limit_N = ROBOT.tracking_error_rad, ROBOT.contact_force_N
+    failures, record = [], robot.record
+    limit_rad, limit_N = record.tracking_error_rad, record.contact_force_N
     if limit_rad is not None:
         off = np.abs(states.joints_rad - path.joints_at(states.stamps_ns))
         over = ~(off <= limit_rad)
         if np.any(over):
             index, joint = _first(over)
-            name = ARM_JOINTS[joint]
+            name = record.joints[joint]
             detail = (
                 f"{name} is {off[index, joint]:.3f} rad from where it is commanded, the limit is "
                 f"{limit_rad:g} rad"

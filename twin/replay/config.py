@@ -246,6 +246,9 @@ class ReplayRunConfig:
     """Also draw what the recorded cameras would have seen, with the rebuilt scene's Gaussians."""
     force: bool = False
     """Redo replays that are there already."""
+    robot: str = ""
+    """Robot file, by name or path, whose description takes the place of the recorded one; none:
+    the robot that each episode was recorded with (docs/robots.md)."""
     relocalise: bool = False
     """Redo the localisation of objects that is there already."""
     replay: Annotated[ReplayConfig, Parameter(name="replay")] = field(default_factory=ReplayConfig)

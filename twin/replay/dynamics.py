@@ -23,6 +23,7 @@ from twin.replay.failure import NotEvaluatedError
 from twin.replay.path import JointPath
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, convex_hull, signed_distance
+from twin.robot.model import check_dynamics
 
 LIFT_M = 0.0002
 """Objects localised into their support start this far above it instead."""
@@ -166,6 +167,7 @@ def simulate(
     Raises:
         UsageError: For soft bodies in an engine that has none.
     """
+    check_dynamics(hulls.robot)
     rate = config.physics.rate_hz
     stride = rate // config.sample_rate_hz
     total = _steps_kept(path.end_ns(), config)

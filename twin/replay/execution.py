@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.episode.streams import JointTrack
 from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES
-from bridge.robots.default import ARM_JOINTS, GRIPPER_WIDTH, MAX_WIDTH_M
+from bridge.robots.robot import GRIPPER_WIDTH, Robot
 from bridge.task.plan import Plan, Stage
 from twin.replay.config import ReplayConfig
 from twin.replay.path import MAX_DURATION_S, WIDTH_SLACK_M, JointPath, UnusablePlanError
@@ -78,12 +78,13 @@ def check_track(track: JointTrack, what: str, plan: Plan) -> None:
         raise _not_recorded(plan, what, int(gaps_ns.max()), f"from {at_s:.1f} s on")
 
 
-def gripper_widths(widths: JointTrack, plan: Plan) -> JointTrack:
+def gripper_widths(widths: JointTrack, plan: Plan, robot: Robot) -> JointTrack:
     """The recorded distances between the finger pads [m] alone, if that is what they are.
 
     Args:
         widths: The gripper's joints as they were recorded.
         plan: What was executed; named in messages.
+        robot: Says how wide its gripper opens.
 
     Raises:
         UnusablePlanError: For several joints of which none has the name, for what ``check_track``
@@ -105,11 +106,12 @@ def gripper_widths(widths: JointTrack, plan: Plan) -> JointTrack:
     )
     check_track(found, "gripper widths", plan)
     low, high = float(found.position.min()), float(found.position.max())
-    if low < -WIDTH_SLACK_M or high > MAX_WIDTH_M + WIDTH_SLACK_M:
+    most_m = robot.gripper.max_width_m
+    if low < -WIDTH_SLACK_M or high > most_m + WIDTH_SLACK_M:
         raise UnusablePlanError(
             plan_id=plan.id,
             found=f"was executed with gripper widths from {low:.3f} to {high:.3f}",
-            hint=f"{GRIPPER_WIDTH} is the distance between the pads in metres, 0 to {MAX_WIDTH_M}.",
+            hint=f"{GRIPPER_WIDTH} is the distance between the pads in metres, 0 to {most_m}.",
         )
     return found
 
@@ -131,7 +133,7 @@ _LATENESS_NS = 2_000_000_000
 
 
 def path_of_execution(
-    track: JointTrack, widths: JointTrack, plan: Plan, config: ReplayConfig
+    track: JointTrack, widths: JointTrack, plan: Plan, config: ReplayConfig, robot: Robot
 ) -> JointPath:
     """Turn recorded tracks into a path that starts at time 0.
 
@@ -145,6 +147,7 @@ def path_of_execution(
         widths: Recorded widths of the gripper, on the same clock.
         plan: What was executed: says when the gripper was to be closed.
         config: Mode and ``squeeze_m``.
+        robot: Whose joints are wanted.
 
     Raises:
         UnusablePlanError: When a track is empty, has gaps, names other joints, or holds what is no
@@ -156,17 +159,19 @@ def path_of_execution(
             found="was executed without recorded joints or gripper",
             hint=f"Record {JOINT_STATES} and {GRIPPER_STATE} over the whole execution.",
         )
-    missing = [name for name in ARM_JOINTS if name not in track.names]
+    missing = [name for name in robot.joints if name not in track.names]
     if missing:
         raise UnusablePlanError(
             plan_id=plan.id,
             found=f"was recorded without the joints {', '.join(missing)}",
             hint=f"The recording has {', '.join(track.names)}.",
         )
-    order = [track.names.index(name) for name in ARM_JOINTS]
-    arm = JointTrack(names=ARM_JOINTS, stamps_ns=track.stamps_ns, position=track.position[:, order])
+    order = [track.names.index(name) for name in robot.joints]
+    arm = JointTrack(
+        names=robot.joints, stamps_ns=track.stamps_ns, position=track.position[:, order]
+    )
     check_track(arm, "joints", plan)
-    widths = gripper_widths(widths, plan)
+    widths = gripper_widths(widths, plan, robot)
     first_ns = int(track.stamps_ns[0])
     times, keep = np.unique(track.stamps_ns - first_ns, return_index=True)
     width_times, width_keep = np.unique(widths.stamps_ns - first_ns, return_index=True)

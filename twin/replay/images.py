@@ -21,7 +21,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
 from bridge.media.color import encode_jpeg
-from bridge.robots.default import BASE_FRAME
+from bridge.robots.robot import robot_of
 from twin.replay.dynamics import soft_models
 from twin.replay.rebuilt_scene import Correction
 from twin.replay.result import ReplayResult
@@ -115,7 +115,11 @@ def render_replay(
         seen = _Eye(tree=tree)
         if camera_id in places:
             seen = _calibrated(episode, camera_id, places[camera_id], stamps)
-        T_tcp_camera = _mounting(episode, seen.tree, info.frame_id, result) if planned else None
+        T_tcp_camera = (
+            _mounting(episode, seen.tree, info.frame_id, result, robot_of(scene.urdf).base_frame)
+            if planned
+            else None
+        )
         for stamp_ns in stamps:
             if T_tcp_camera is None and stamp_ns in seen.lost_ns:
                 continue
@@ -205,10 +209,10 @@ def _stamps(
 
 
 def _mounting(
-    episode: Episode, tree: TransformTree, frame_id: str, result: ReplayResult
+    episode: Episode, tree: TransformTree, frame_id: str, result: ReplayResult, base_frame: str
 ) -> Float[np.ndarray, "4 4"] | None:
     """Where a camera sits in the hand; None for one that stands still."""
-    if tree.root_of(frame_id) != BASE_FRAME:
+    if tree.root_of(frame_id) != base_frame:
         return None
     T_base_camera = carried_camera(episode, frame_id, result.joints_rad[0], tree)
     return None if T_base_camera is None else se3.invert(result.Ts_base_tcp[0]) @ T_base_camera

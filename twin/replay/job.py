@@ -4,7 +4,7 @@ An executed replay is laid over the planned one and the recording before it is w
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import EpisodeError, GstError
-from bridge.robots.default import ARM_JOINTS
+from bridge.robots.robot import read_robot, robot_of
 from bridge.task.plan import Plan
 from bridge.task.predicate import evaluate_success
 from bridge.task.record import parse_record
@@ -56,7 +56,7 @@ from twin.replay.trace import (
 from twin.replay.verdict import KINEMATIC_ENGINE, engine_of, findings_of, replay_joints, replay_plan
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
-from twin.robot.posture import check_clock
+from twin.robot.posture import check_clock, width_track
 
 REPLAY_VERSION = 20
 """Raise it when the same inputs give another replay, so that old files are redone."""
@@ -97,6 +97,8 @@ class ReplayJob:
     calibration_id: str | None = None
     render: bool = False
     """Also draw what the recorded cameras would have seen."""
+    robot: str = ""
+    """Robot file whose description is used; "": the recorded one."""
     problem: str = ""
     """Why the plan's execution, of which there was one, cannot be replayed."""
 
@@ -124,7 +126,8 @@ class ReplayJob:
     def needed_paths(self) -> tuple[Path, ...]:
         """What a process on another machine must see."""
         scene = () if self.run_path is None else (self.run_path,)
-        return (self.episode_path, self.folder, *scene)
+        robot = (Path(self.robot).resolve(),) if self.robot.endswith(".toml") else ()
+        return (self.episode_path, self.folder, *scene, *robot)
 
     def engines(self) -> tuple[Engine, ...]:
         """What replays it, the engine that decides first; a kinematic replay moves no bodies."""
@@ -169,6 +172,7 @@ class ReplayJob:
             "shapes": dict(self.shapes),
             "calibration_id": self.calibration_id,
             "render": self.render,
+            **self._named_robot(),
             **self._sampled_from(),
             **self._compared_with(),
         }
@@ -176,6 +180,11 @@ class ReplayJob:
     def _engine_names(self) -> list[str]:
         config = replace(self.config, engines_must_agree=False)
         return [engine_of(self.task, replace(config, engine=each)) for each in self.engines()]
+
+    def _named_robot(self) -> dict[str, Any]:
+        if not self.robot:
+            return {}
+        return {"robot": hash_settings({"urdf": read_robot(self.robot).description()})}
 
     def _sampled_from(self) -> dict[str, Any]:
         if not self.config.samples:
@@ -454,6 +463,8 @@ def _marked(verdict: Verdict) -> Verdict:
 def _open(job: ReplayJob) -> _Source:
     episode = Episode.open(job.episode_path)
     urdf = streams.robot_description(episode)
+    if job.robot:
+        urdf = read_robot(job.robot).description()
     if urdf is None:
         raise EpisodeError(
             path=job.episode_path,
@@ -476,7 +487,8 @@ def _open(job: ReplayJob) -> _Source:
     )
     executed = job.trajectory == "executed" and job.end_ns is not None
     if job.trajectory == "planned":
-        scene = replace(scene, start_rad=recorded_start(episode, job.start_ns))
+        joints = robot_of(urdf).joints
+        scene = replace(scene, start_rad=recorded_start(episode, job.start_ns, joints))
     events = streams.events(episode) if executed else []
     plan_as_executed = replace(plan, stages=stages_as_executed(plan, events, job.start_ns))
     return _Source(
@@ -490,16 +502,18 @@ def _open(job: ReplayJob) -> _Source:
     )
 
 
-def recorded_start(episode: Episode, stamp_ns: int) -> Float[np.ndarray, " num_joints"] | None:
+def recorded_start(
+    episode: Episode, stamp_ns: int, joints: Sequence[str]
+) -> Float[np.ndarray, " num_joints"] | None:
     """Where the arm was recorded to be when a plan began [rad]; None where nobody recorded it."""
     try:
         track = streams.joint_track(episode, JOINT_STATES)
     except GstError:
         return None
     near = np.abs(track.stamps_ns - stamp_ns) <= START_KNOWN_NS
-    if not near.any() or not set(ARM_JOINTS) <= set(track.names):
+    if not near.any() or not set(joints) <= set(track.names):
         return None
-    order = [track.names.index(name) for name in ARM_JOINTS]
+    order = [track.names.index(name) for name in joints]
     found: Float[np.ndarray, " num_joints"] = track.at(np.array([stamp_ns]))[0, order]
     return found if np.isfinite(found).all() else None
 
@@ -519,7 +533,7 @@ def _tracks(source: _Source) -> tuple[streams.JointTrack, streams.JointTrack]:
     check_length(job.length_ns(), source.plan)
     arm = cut_track(streams.joint_track(episode, JOINT_STATES), job.start_ns, end_ns)
     check_covers(arm, "joints", end_ns, source.plan)
-    widths = cut_track(streams.joint_track(episode, GRIPPER_STATE), job.start_ns, end_ns)
+    widths = cut_track(width_track(episode, robot_of(source.scene.urdf)), job.start_ns, end_ns)
     check_covers(widths, "gripper widths", end_ns, source.plan)
     return arm, widths
 
@@ -531,7 +545,9 @@ def _recording(source: _Source) -> Recording:
     seen_ns = job.end.seen_ns
     return Recording(
         plan=source.plan_as_executed,
-        path=path_of_execution(arm, widths, source.plan_as_executed, kinematic),
+        path=path_of_execution(
+            arm, widths, source.plan_as_executed, kinematic, robot_of(source.scene.urdf)
+        ),
         scene=source.scene,
         end=source.correction.state(job.end),
         end_seen_ns=job.length_ns() if seen_ns is None else seen_ns - job.start_ns,

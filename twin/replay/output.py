@@ -32,8 +32,9 @@ from bridge.episode.topics import (
     object_topic,
 )
 from bridge.episode.writer import EpisodeWriter
-from bridge.robots.default import ARM_JOINTS, BASE_FRAME, GRIPPER, GRIPPER_WIDTH
+from bridge.robots.robot import GRIPPER_WIDTH, robot_of
 from bridge.task.plan import Plan, Stage
+from twin.replay.clearance.bodies import GRIPPER
 from twin.replay.result import ReplayResult, stretches_ns
 
 MIN_CLEARANCE = "min_clearance_m"
@@ -98,11 +99,12 @@ def write_replay(path: Path, result: ReplayResult, plan: Plan, origin: ReplayOri
 
 def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterator[_Message]:
     prefix, start = f"/{origin.cell}", origin.start_ns
+    robot = robot_of(origin.urdf)
     yield _Message(start, ROBOT_DESCRIPTION, schema.STRING, string_to_cdr(origin.urdf))
     yield _Message(start, f"{prefix}{PLAN}", schema.PLAN, plan.to_json())
     stamps = start + result.stamps_ns
     for topic, names, values in (
-        (JOINT_STATES, ARM_JOINTS, result.joints_rad),
+        (JOINT_STATES, robot.joints, result.joints_rad),
         (GRIPPER_STATE, (GRIPPER_WIDTH,), result.width_m[:, None]),
         (CLEARANCE, (MIN_CLEARANCE,), result.clearance_m[:, None]),
     ):
@@ -112,9 +114,9 @@ def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterato
         object_topic(origin.cell, name, "pose"): Ts for name, Ts in result.Ts_base_object.items()
     }
     for topic, Ts in poses.items():
-        rows = pose_messages(stamps, BASE_FRAME, Ts)
+        rows = pose_messages(stamps, robot.base_frame, Ts)
         yield from _stamped(stamps, topic, schema.POSE_STAMPED, rows)
-    yield from _nodes(result, origin.cell, start)
+    yield from _nodes(result, origin.cell, start, robot.base_frame)
     yield from _contacts(result, prefix, start)
     for camera_id, image in origin.images:
         topic = camera_topic(origin.cell, camera_id, RENDERED_IMAGE)
@@ -129,16 +131,14 @@ def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterato
         yield _Message(end, f"{prefix}{DIVERGENCE}", schema.DIVERGENCE, data)
 
 
-def _nodes(result: ReplayResult, cell: str, start_ns: int) -> Iterator[_Message]:
+def _nodes(result: ReplayResult, cell: str, start_ns: int, frame_id: str) -> Iterator[_Message]:
     for name, nodes in result.nodes_m.items():
         due_ns = 0
         for t_ns, points in zip(result.stamps_ns.tolist(), nodes, strict=True):
             if t_ns < due_ns:
                 continue
             due_ns = t_ns + NODES_PERIOD_NS
-            sample = PointCloudSample(
-                stamp_ns=start_ns + t_ns, frame_id=BASE_FRAME, points_m=points
-            )
+            sample = PointCloudSample(stamp_ns=start_ns + t_ns, frame_id=frame_id, points_m=points)
             topic = object_topic(cell, name, "nodes")
             yield _Message(sample.stamp_ns, topic, schema.POINT_CLOUD, sample.to_cdr())
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
-from bridge.robots.default import ARM_JOINTS, BASE_FRAME, MAX_WIDTH_M
+from bridge.robots.robot import Robot
 from bridge.task.plan import Plan, Waypoint
 from twin.errors import TwinError
 from twin.replay.clearance.bodies import own_links
@@ -57,8 +57,8 @@ def limit_failure(
     return Failure(
         t_ns=t_ns,
         cause="joint_limit",
-        bodies=(ARM_JOINTS[joint],),
-        detail=f"{ARM_JOINTS[joint]} is at {joints_rad[joint]:.3f} rad, its limits are "
+        bodies=(robot.joints[joint],),
+        detail=f"{robot.joints[joint]} is at {joints_rad[joint]:.3f} rad, its limits are "
         f"{robot.lower_rad[joint]:.3f} to {robot.upper_rad[joint]:.3f} rad",
     )
 
@@ -83,7 +83,7 @@ def jumps(
     speeds = steps / (np.diff(times_ns)[:, None] * 1e-9)
     failures = []
     for cause, values, limit, unit in (
-        ("joint_jump", steps, np.full(len(ARM_JOINTS), config.max_joint_step_rad), "rad"),
+        ("joint_jump", steps, np.full(len(robot.joints), config.max_joint_step_rad), "rad"),
         ("joint_speed", speeds, robot.velocity_limit_rad_s * _SPEED_SLACK, "rad/s"),
     ):
         over = values > limit
@@ -93,8 +93,8 @@ def jumps(
                 Failure(
                     t_ns=int(times_ns[index]),
                     cause=cause,
-                    bodies=(ARM_JOINTS[joint],),
-                    detail=f"{ARM_JOINTS[joint]} changes by {values[index, joint]:.2f} {unit}, "
+                    bodies=(robot.joints[joint],),
+                    detail=f"{robot.joints[joint]} changes by {values[index, joint]:.2f} {unit}, "
                     f"the limit is {limit[joint]:.2f} {unit}",
                 )
             )
@@ -131,7 +131,12 @@ def check_usable(plan: Plan, robot: RobotModel) -> None:
     Raises:
         UnusablePlanError: Naming the first thing that is wrong.
     """
-    wrong = _about_times(plan) or _about_numbers(plan) or _about_whose(plan, robot)
+    wrong = (
+        _about_times(plan)
+        or _about_whose(plan, robot)
+        or _about_numbers(plan, robot.record)
+        or _about_grasps(plan, robot.record)
+    )
     if wrong is not None:
         found, hint = wrong
         raise UnusablePlanError(plan_id=plan.id, found=found, hint=hint)
@@ -157,7 +162,7 @@ def _about_times(plan: Plan) -> _Wrong | None:
     return None
 
 
-def _about_numbers(plan: Plan) -> _Wrong | None:
+def _about_numbers(plan: Plan, robot: Robot) -> _Wrong | None:
     try:
         p, q = np.abs(plan.positions_m()), np.abs(plan.quaternions_wxyz()).max(axis=1)
         widths = _floats(w.width_m for w in plan.tau if w.width_m is not None)
@@ -172,9 +177,18 @@ def _about_numbers(plan: Plan) -> _Wrong | None:
         found = "has joints or gripper widths that are not finite"
         return found, "Send joints_rad and width_m as numbers, or leave them out."
     low, high = (float(f(widths)) if len(widths) else 0.0 for f in (np.min, np.max))
-    if low < -WIDTH_SLACK_M or high > MAX_WIDTH_M + WIDTH_SLACK_M:
+    most_m = robot.gripper.max_width_m
+    if low < -WIDTH_SLACK_M or high > most_m + WIDTH_SLACK_M:
         found = f"has gripper widths from {low:.3f} to {high:.3f}"
-        return found, f"width_m is the distance between the pads in metres, 0 to {MAX_WIDTH_M}."
+        return found, f"width_m is the distance between the pads in metres, 0 to {most_m}."
+    return None
+
+
+def _about_grasps(plan: Plan, robot: Robot) -> _Wrong | None:
+    grasps = any(w.g == 1 for w in plan.tau) or any(stage.grasp for stage in plan.stages)
+    if grasps and not robot.gripper.fingers:
+        found = f"closes a gripper, and the tool of {robot.name!r} has no fingers"
+        return found, "Send plans without grasps, g = 0 throughout, or describe its gripper."
     return None
 
 
@@ -183,13 +197,14 @@ def _floats(values: Iterable[float]) -> Float[np.ndarray, " num_values"]:
 
 
 def _about_whose(plan: Plan, robot: RobotModel) -> _Wrong | None:
-    if plan.frame != BASE_FRAME:
-        return f"is in the frame {plan.frame!r}", f"Transform it to {BASE_FRAME!r}."
+    base = robot.record.base_frame
+    if plan.frame != base:
+        return f"is in the frame {plan.frame!r}", f"Transform it to {base!r}."
     if plan.robot != robot.name:
         hint = f"The robot that was described is {robot.name!r}."
         return f"is for the robot {plan.robot!r}", hint
-    if plan.joint_names and set(plan.joint_names) != set(ARM_JOINTS):
-        hint = f"The robot has {', '.join(ARM_JOINTS)}."
+    if plan.joint_names and set(plan.joint_names) != set(robot.joints):
+        hint = f"The robot has {', '.join(robot.joints)}."
         return f"names the joints {', '.join(plan.joint_names)}", hint
     return None
 
@@ -271,7 +286,9 @@ def path_of_plan(
     """
     check_usable(plan, robot)
     knots = _Knots()
-    for is_open, group in groupby(_targets(plan, config), key=lambda target: target.given is None):
+    for is_open, group in groupby(
+        _targets(plan, robot, config), key=lambda target: target.given is None
+    ):
         run = list(group)
         if is_open:
             _follow(knots, run, robot, config, clearance, start_rad)
@@ -283,7 +300,7 @@ def path_of_plan(
         times_ns=np.array(knots.times_ns, dtype=np.int64),
         joints_rad=np.stack(knots.joints),
         width_times_ns=plan.times_ns(),
-        width_m=np.array([_width(waypoint) for waypoint in plan.tau]),
+        width_m=np.array([_width(waypoint, robot.record) for waypoint in plan.tau]),
         first_close_ns=next((w.t_ns for w in plan.tau if w.g == 1), None),
     )
     return path, knots.failures, knots.unreachable_ns
@@ -362,19 +379,19 @@ def _take_given(knots: _Knots, run: list[_Target], robot: RobotModel, config: Re
         knots.add(target.t_ns, given)
 
 
-def _targets(plan: Plan, config: ReplayConfig) -> list[_Target]:
+def _targets(plan: Plan, robot: RobotModel, config: ReplayConfig) -> list[_Target]:
     """Waypoints, and where joints are not given the poses on the straight line between them."""
     times = plan.times_ns()
     quats = plan.quaternions_wxyz()
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)  # slerp needs unit length
     poses = PoseTrajectory(times, plan.positions_m(), quats)
     order = (
-        [list(plan.joint_names).index(name) for name in ARM_JOINTS] if plan.joint_names else None
+        [list(plan.joint_names).index(name) for name in robot.joints] if plan.joint_names else None
     )
     targets: list[_Target] = []
     step_ns = round(config.path_step_s * 1e9)
     for index, waypoint in enumerate(plan.tau):
-        given = _given_joints(plan.id, waypoint, order)
+        given = _given_joints(plan.id, waypoint, len(robot.joints), order)
         if given is None and index > 0:
             count = int(np.ceil((times[index] - times[index - 1]) / step_ns))
             between = np.linspace(times[index - 1], times[index], count + 1)[1:-1]
@@ -388,24 +405,24 @@ def _targets(plan: Plan, config: ReplayConfig) -> list[_Target]:
 
 
 def _given_joints(
-    plan_id: str, waypoint: Waypoint, order: list[int] | None
+    plan_id: str, waypoint: Waypoint, count: int, order: list[int] | None
 ) -> Float[np.ndarray, " num_joints"] | None:
     if waypoint.joints_rad is None:
         return None
     joints = np.array(waypoint.joints_rad, dtype=np.float64)
-    if len(joints) != len(ARM_JOINTS):
+    if len(joints) != count:
         raise UnusablePlanError(
             plan_id=plan_id,
             found=f"gives {len(joints)} joints at {waypoint.t_ns * 1e-9:.2f} s",
-            hint=f"Give {len(ARM_JOINTS)}, or none.",
+            hint=f"Give {count}, or none.",
         )
     return joints if order is None else joints[order]
 
 
-def _width(waypoint: Waypoint) -> float:
+def _width(waypoint: Waypoint, robot: Robot) -> float:
     if waypoint.width_m is not None:
         return float(waypoint.width_m)
-    return 0.0 if waypoint.g == 1 else MAX_WIDTH_M
+    return 0.0 if waypoint.g == 1 else robot.gripper.max_width_m
 
 
 def _unreachable(t_ns: int, T: Float[np.ndarray, "4 4"], error_m: float) -> Failure:

@@ -131,6 +131,7 @@ def jobs_of(item: Preparation) -> list[ReplayJob]:
             shapes=item.shapes,
             calibration_id=None if calibration is None else calibration.calibration_id,
             render=config.render,
+            robot=config.robot,
             problem=execution.problem,
         )
         jobs.append(common)

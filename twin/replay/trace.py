@@ -15,10 +15,10 @@ from bridge.episode.reader import Episode
 from bridge.episode.topics import GRIPPER_STATE, TCP_POSE
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
-from bridge.robots.default import GRIPPER
 from bridge.task.plan import Plan
 from bridge.task.predicate import Rollout
 from bridge.task.record import parse_record
+from twin.replay.clearance.bodies import GRIPPER
 from twin.replay.clearance.monitor import ClearanceMonitor
 from twin.replay.config import ReplayConfig
 from twin.replay.execution import closed_mask

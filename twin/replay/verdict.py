@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bridge.episode.streams import JointTrack
+from bridge.robots.robot import robot_of
 from bridge.task.check import REFERENCES
 from bridge.task.plan import Plan
 from bridge.task.predicate import (
@@ -235,7 +236,7 @@ def replay_joints(
     Raises:
         UnusablePlanError: When a track is empty or names other joints.
     """
-    path = path_of_execution(track, widths, plan, config)
+    path = path_of_execution(track, widths, plan, config, robot_of(scene.urdf))
     return _replay(Commanded(path=path, trajectory="executed"), plan, scene, config)
 
 
@@ -287,7 +288,8 @@ def _replay(
         states = first_of(states)
     clearance_m = _clearance_m(monitor, states, list(scene.movable()))
     if physics and commanded.trajectory == "planned":
-        checks = {**checks, "limits": checks["limits"] + simulated_limit_failures(path, states)}
+        simulated = simulated_limit_failures(path, states, robot)
+        checks = {**checks, "limits": checks["limits"] + simulated}
     result = ReplayResult(
         verdict=_undecided(plan, commanded.trajectory, config, scene),
         stamps_ns=states.stamps_ns,

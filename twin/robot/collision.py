@@ -9,7 +9,6 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
-from bridge.robots.default import FINGER_LINKS
 from twin.robot.model import RobotDescriptionError, RobotModel
 
 # Convex hulls of the robot's links, the one shape that pinocchio, coal and PyBullet all share.
@@ -99,6 +98,8 @@ def _points(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:
         corners: Float[np.ndarray, "8 3"] = np.array(list(product((-1.0, 1.0), repeat=3)))
         corners *= np.array(shape.halfSide)
         return corners
+    if isinstance(shape, coal.Sphere):
+        return _circumscribed(float(shape.radius))
     if isinstance(shape, coal.Cylinder):
         angle = np.arange(_CYLINDER_SIDES) * 2 * np.pi / _CYLINDER_SIDES
         # Corners on the circumscribed circle: the prism contains the cylinder (safe side).
@@ -110,13 +111,26 @@ def _points(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:
         return prism
     raise RobotDescriptionError(
         found=f"has a collision shape {type(shape).__name__} at {item.name}",
-        hint="Known: mesh, box, cylinder.",
+        hint="Known: mesh, box, cylinder, sphere.",
     )
+
+
+def _circumscribed(radius_m: float) -> Float[np.ndarray, "num_points 3"]:
+    """Points whose hull contains a sphere: on rings about z, farther out than the sphere."""
+    step = np.pi / (_CYLINDER_SIDES // 2)
+    angles = np.arange(_CYLINDER_SIDES) * step
+    tilts, ones = np.arange(0, _CYLINDER_SIDES // 2 + 1)[:, None] * step, np.ones(len(angles))
+    rings = [np.sin(tilts) * np.cos(angles), np.sin(tilts) * np.sin(angles), np.cos(tilts) * ones]
+    points: Float[np.ndarray, "num_points 3"] = np.stack(rings, axis=-1).reshape(-1, 3)
+    # A face between neighbouring points lies inside the sphere by at most two half steps.
+    return np.asarray(points * (radius_m / np.cos(step / 2) ** 2))
 
 
 _SAMPLES = 60
 _ALWAYS = 0.95
 """Pairs that overlap in this share of random postures overlap by construction of their hulls."""
+_WIDTH_M = 0.04
+"""Opening in those postures, where the gripper is as wide."""
 
 _SIGNED = coal.DistanceRequest()
 _SIGNED.enable_signed_distance = True
@@ -164,7 +178,7 @@ class RobotHulls:
         """Build the hulls and choose the pairs of links that must stay apart."""
         self.robot = robot
         self.hulls: list[LinkHull] = link_hulls(robot)
-        self._frame_ids = [robot.model.getFrameId(hull.link) for hull in self.hulls]
+        self._frame_ids = [robot.frame_id(hull.link) for hull in self.hulls]
         # Views of pinocchio's own memory: to ask for them costs more than the kinematics.
         frames = [robot.data.oMf[frame_id] for frame_id in self._frame_ids]
         self._rotation_views = [frame.rotation for frame in frames]
@@ -244,25 +258,40 @@ class RobotHulls:
         )
 
     def _pairs(self) -> list[tuple[int, int]]:
-        """All pairs but neighbours, the two fingers, and hulls that overlap in every posture."""
+        """All pairs but neighbours, the two fingers, and hulls that overlap by construction.
+
+        That is: in every posture, in the one at home, or because the robot file says so.
+        """
+        fingers = set(self.robot.record.gripper.finger_links)
         joints = [self.robot.model.frames[frame_id].parentJoint for frame_id in self._frame_ids]
         candidates = [
             (first, second)
             for first in range(len(self.hulls))
             for second in range(first + 1, len(self.hulls))
             if not self._neighbours(joints[first], joints[second])
-            and not {self.hulls[first].link, self.hulls[second].link} <= set(FINGER_LINKS)
+            and not {self.hulls[first].link, self.hulls[second].link} <= fingers
+        ]
+        robot = self.robot
+        low, high = np.maximum(robot.lower_rad, -np.pi), np.minimum(robot.upper_rad, np.pi)
+        width_m = min(_WIDTH_M, robot.record.gripper.max_width_m)
+        self.place(robot.home_rad, width_m)
+        candidates = [
+            pair for pair in candidates if not self._listed(*pair) and self._distance_m(*pair) > 0
         ]
         rng = np.random.default_rng(0)
         overlaps = np.zeros(len(candidates))
         for _ in range(_SAMPLES):
-            self.place(rng.uniform(-np.pi, np.pi, len(self.robot.arm_ids)), 0.04)
+            self.place(rng.uniform(low, high), width_m)
             overlaps += [self._distance_m(*pair) <= 0 for pair in candidates]
         return [
             pair
             for pair, count in zip(candidates, overlaps, strict=True)
             if count < _ALWAYS * _SAMPLES
         ]
+
+    def _listed(self, first: int, second: int) -> bool:
+        links = {self.hulls[first].link, self.hulls[second].link}
+        return any(links == set(pair) for pair in self.robot.record.may_overlap)
 
     def _neighbours(self, first: int, second: int) -> bool:
         parents = self.robot.model.parents

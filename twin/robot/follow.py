@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from twin.robot.config import IkConfig
-from twin.robot.inverse import HOME_RAD, NUM_BRANCHES, UrInverse, solve_ik
+from twin.robot.inverse import NUM_BRANCHES, UrInverse, solutions, solve_ik
 from twin.robot.model import RobotModel
 
 Clearance = Callable[
@@ -66,6 +66,8 @@ def follow_poses(
     """
     inverse = UrInverse.for_robot(robot)
     count = len(Ts_base_tcp)
+    if inverse is None and start_rad is None and count:
+        return _freest(robot, Ts_base_tcp, config, clearance)
     joints = np.zeros((count, len(robot.arm_ids)))
     branch = np.full(count, NO_BRANCH, dtype=np.int64)
     if inverse is not None and count:
@@ -73,10 +75,39 @@ def follow_poses(
         # A path that passes through a straight wrist must not leave its branch for that pose.
         known = np.flatnonzero(valid.any(axis=1) & ~singular)
         if len(known):
-            tree = _Tree(inverse, raw[known], valid[known], start_rad)
+            tree = _Tree(inverse, raw[known], valid[known], start_rad, robot.home_rad)
             branch[known], joints[known] = tree.choose(clearance)
     exact = inverse is not None and inverse.geometry.deviation < _EXACT_M
     return _completed(robot, Ts_base_tcp, joints, branch, start_rad, config, exact=exact)
+
+
+def _freest(
+    robot: RobotModel,
+    Ts_base_tcp: Float[np.ndarray, "num_poses 4 4"],
+    config: IkConfig,
+    clearance: Clearance | None,
+) -> Followed:
+    """Iterate from several postures for the first pose, until one leads to the end freely.
+
+    That is without a jump and without a touch; else the one that comes farthest is kept.
+    """
+    best: tuple[tuple[int, int, int], Followed] | None = None
+    unknown = np.full(len(Ts_base_tcp), NO_BRANCH, dtype=np.int64)
+    nothing = np.zeros((len(Ts_base_tcp), len(robot.joints)))
+    for first in solutions(robot, Ts_base_tcp[0], config):
+        start_rad = first.joints_rad
+        way = _completed(robot, Ts_base_tcp, nothing, unknown, start_rad, config, exact=False)
+        steps = np.abs(np.diff(way.joints_rad[way.reached], axis=0))
+        asked = way.joints_rad[way.reached][:: -(-len(Ts_base_tcp) // _MAX_ASKED)]
+        touching = clearance is not None and len(asked) and clearance(asked) < 0
+        rank = (int((~way.reached).sum()), int((steps > _JUMP_RAD).sum()), int(np.sum(touching)))
+        if best is None or rank < best[0]:
+            best = (rank, way)
+        if not any(rank):
+            break
+    if best is None:
+        raise AssertionError("a search always ends with something")
+    return best[1]
 
 
 def _completed(
@@ -118,12 +149,13 @@ class _Tree:
         raw: Float[np.ndarray, "num_poses 8 6"],
         valid: Bool[np.ndarray, "num_poses 8"],
         start_rad: Float[np.ndarray, "6"] | None,
+        home_rad: Float[np.ndarray, "6"],
     ) -> None:
         self._inverse = inverse
         self._raw = raw
         self._start = start_rad
         self._steps = _step_costs(raw, valid)
-        near = raw[0] - (HOME_RAD if start_rad is None else start_rad)
+        near = raw[0] - (home_rad if start_rad is None else start_rad)
         weight = _HOME_WEIGHT if start_rad is None else 1.0
         first = weight * np.square(_wrapped(near)).sum(axis=-1)
         self._first = np.where(valid[0], first, np.inf)

@@ -1,11 +1,14 @@
 """Inverse kinematics: joints that put the tool centre point where a plan wants it.
 
 Levenberg-Marquardt on the SE(3) error with a warm start, because the next waypoint of a
-trajectory is near; random restarts, from a fixed seed, only where there is no warm start. Works
-for any arm; for UR-type arms the closed form gives all eight branches at once.
+trajectory is near. Where it fails, the descent begins again from elsewhere: for UR-type arms, whose
+closed form gives all eight branches at once, from random postures of a fixed seed; for all others
+from those of many random postures whose poses are nearest. What a seventh joint leaves open goes
+towards home.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -13,13 +16,12 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Bool, Float
 from scipy.linalg.lapack import dposv
+from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
 from twin.robot.config import IkConfig
 from twin.robot.model import RobotModel
 
-HOME_RAD = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
-"""Where a search begins that knows no better; treat as constant."""
 _CONVERGED = 1e-8
 """Norm of the error twist at which iterating stops: far below the tolerance, so that a round
 trip is exact and the tolerance decides feasibility only."""
@@ -71,10 +73,27 @@ def solve_ik(
     Returns:
         The best solution found; ``reached`` says whether it is one.
     """
-    start = HOME_RAD if warm_start_rad is None else warm_start_rad
-    best = _descend(robot, T_base_tcp, start, config)
-    if best.reached:
+    start = robot.home_rad if warm_start_rad is None else warm_start_rad
+    if UrInverse.for_robot(robot) is not None:
+        best = _descend(robot, T_base_tcp, start, config)
+        if not best.reached:
+            best = _from_random(robot, T_base_tcp, best, config)
+        if not best.reached and config.restarts:
+            best = _from_branches(robot, T_base_tcp, best, start, config)
         return best
+    best = _descend(robot, T_base_tcp, start, config, bounded=True)
+    if not best.reached:
+        best = _from_nearest(robot, T_base_tcp, best, config)
+        return _nearer(robot, T_base_tcp, best, start, config) if best.reached else best
+    if warm_start_rad is None and len(start) > NUM_POSE:
+        return _nearer(robot, T_base_tcp, best, start, config)
+    return best
+
+
+def _from_random(
+    robot: RobotModel, T_base_tcp: Float[np.ndarray, "4 4"], best: IkSolution, config: IkConfig
+) -> IkSolution:
+    """Begin at random postures."""
     rng = np.random.default_rng(config.seed)
     span = np.minimum(np.pi, (robot.upper_rad - robot.lower_rad) / 2)
     for _ in range(config.restarts):
@@ -87,13 +106,160 @@ def solve_ik(
     return best
 
 
+def _from_branches(
+    robot: RobotModel,
+    T_base_tcp: Float[np.ndarray, "4 4"],
+    best: IkSolution,
+    near_rad: Float[np.ndarray, " num_joints"],
+    config: IkConfig,
+) -> IkSolution:
+    """Begin at the branches of the closed form, which knows stretched arms; the nearest first."""
+    inverse = UrInverse.for_robot(robot)
+    if inverse is None:
+        return best
+    raw, valid, _ = inverse.solve(T_base_tcp[None])
+    rows = raw[0, valid[0]]
+    for row in rows[np.argsort(np.abs(rows - near_rad).sum(axis=1), kind="stable")]:
+        other = _descend(robot, T_base_tcp, row, config)
+        if other.reached:
+            return other
+    return best
+
+
+NUM_POSE = 6
+"""Numbers that a pose determines: joints beyond these are redundant."""
+NUM_POSTURES = 4096
+"""Random postures among which starts are chosen."""
+_STARTS_PER_RESTART = 10
+"""A pose out of reach then costs some tenths of a second, once for a plan."""
+_TURN_M = 0.3
+"""A turn by one radian counts as so many metres where poses are compared: an arm's last links."""
+
+
+@lru_cache(maxsize=8)
+def _postures(robot: RobotModel) -> tuple[Float[np.ndarray, "num_postures num_joints"], cKDTree]:
+    """Random postures within the limits, one turn at most, and a tree of their tool poses."""
+    rng = np.random.default_rng(0)
+    middle = (robot.lower_rad + robot.upper_rad) / 2
+    half = np.minimum(np.pi, (robot.upper_rad - robot.lower_rad) / 2)
+    rows = middle + rng.uniform(-half, half, (NUM_POSTURES, len(middle)))
+    return rows, cKDTree(_features(robot.Ts_base_tcp(rows)))
+
+
+def _features(Ts: Float[np.ndarray, "num_poses 4 4"]) -> Float[np.ndarray, "num_poses 12"]:
+    """Positions and scaled axes: near where poses are near."""
+    axes = Ts[:, :3, :3].reshape(len(Ts), 9) * (_TURN_M / np.sqrt(2))
+    return np.concatenate([Ts[:, :3, 3], axes], axis=1)
+
+
+def _from_nearest(
+    robot: RobotModel, T_base_tcp: Float[np.ndarray, "4 4"], best: IkSolution, config: IkConfig
+) -> IkSolution:
+    """Begin at the postures whose poses are nearest."""
+    if not np.isfinite(T_base_tcp).all():
+        return best
+    rows, tree = _postures(robot)
+    count = min(_STARTS_PER_RESTART * config.restarts, len(rows))
+    if not count:
+        return best
+    _, found = tree.query(_features(T_base_tcp[None])[0], k=count)
+    for index in np.atleast_1d(found).tolist():
+        other = _descend(robot, T_base_tcp, rows[index], config, bounded=True)
+        if other.reached or other.position_error_m < best.position_error_m:
+            best = other
+        if best.reached:
+            break
+    return best
+
+
+_DISTINCT_RAD = 0.5
+_MOST_SOLUTIONS = 8
+_LOOKED_AT = 80
+"""Nearest known postures from which further solutions are looked for."""
+
+
+def solutions(
+    robot: RobotModel, T_base_tcp: Float[np.ndarray, "4 4"], config: IkConfig
+) -> Iterator[IkSolution]:
+    """Yield what ``solve_ik`` finds, then other solutions of an arm without a closed form.
+
+    Each differs from all before by half a radian in some joint. They are looked for one at a time.
+    """
+    first = solve_ik(robot, T_base_tcp, config)
+    yield first
+    if not first.reached:
+        return
+    rows, tree = _postures(robot)
+    found = [first.joints_rad]
+    _, near = tree.query(_features(T_base_tcp[None])[0], k=_LOOKED_AT)
+    for index in near.tolist():
+        other = _descend(robot, T_base_tcp, rows[index], config, bounded=True)
+        away = other.joints_rad - np.array(found)
+        if other.reached and np.abs(away).max(axis=1).min() > _DISTINCT_RAD:
+            yield other
+            found.append(other.joints_rad)
+            if len(found) == _MOST_SOLUTIONS:
+                return
+
+
+_TOWARDS = 40
+"""Steps towards a wanted posture within what the pose leaves open."""
+_STEP_RAD, _SETTLED_RAD = 0.3, 1e-3
+"""Longest such step, and one that is none."""
+
+
+def _nearer(
+    robot: RobotModel,
+    T_base_tcp: Float[np.ndarray, "4 4"],
+    found: IkSolution,
+    wanted_rad: Float[np.ndarray, " num_joints"],
+    config: IkConfig,
+) -> IkSolution:
+    """Go from a solution to the one near it that is nearest to a posture.
+
+    Whole turns first, then along the null space of the Jacobian, each step followed by a descent.
+    """
+    turns = np.rint((wanted_rad - found.joints_rad) / _TURN)
+    turned = found.joints_rad + _TURN * turns
+    inside = (turned >= robot.lower_rad) & (turned <= robot.upper_rad)
+    joints = np.where(inside, turned, found.joints_rad)
+    best = _descend(robot, T_base_tcp, joints, config, bounded=True)
+    if not best.reached:
+        return found
+    if len(joints) <= NUM_POSE:
+        return best
+    for _ in range(_TOWARDS):
+        q = robot.configuration(best.joints_rad)
+        pin.computeJointJacobians(robot.model, robot.data, q)
+        pin.updateFramePlacement(robot.model, robot.data, robot.tcp_id)
+        full = pin.getFrameJacobian(robot.model, robot.data, robot.tcp_id, pin.LOCAL)
+        jacobian = full[:, robot.arm_velocity_ids]
+        away = wanted_rad - best.joints_rad
+        step = away - np.linalg.pinv(jacobian, rcond=1e-4) @ (jacobian @ away)
+        size = float(np.abs(step).max())
+        if size < _SETTLED_RAD:
+            break
+        step *= min(1.0, _STEP_RAD / size)
+        other = _descend(robot, T_base_tcp, best.joints_rad + step, config, bounded=True)
+        closer = np.linalg.norm(wanted_rad - other.joints_rad) < np.linalg.norm(away)
+        if not (other.reached and closer):
+            break
+        best = other
+    return best
+
+
 def _descend(
     robot: RobotModel,
     T_base_tcp: Float[np.ndarray, "4 4"],
     start_rad: Float[np.ndarray, " num_joints"],
     config: IkConfig,
+    *,
+    bounded: bool = False,
 ) -> IkSolution:
-    """One descent. Calls into pinocchio take a microsecond each, so each is made once a step."""
+    """One descent. Calls into pinocchio take a microsecond each, so each is made once a step.
+
+    ``bounded`` leaves out joints that a limit stops: the others then do their part.
+    """
     model, data, tcp_id = robot.model, robot.data, robot.tcp_id
     lower, upper, arm = robot.lower_rad, robot.upper_rad, robot.arm_ids
     target = pin.SE3(T_base_tcp)
@@ -115,6 +281,10 @@ def _descend(
             damping = max(damping * 0.2, 1e-9)
             full = pin.getFrameJacobian(model, data, tcp_id, pin.LOCAL)
             jacobian = full[:, robot.arm_velocity_ids]
+            if bounded:
+                pull = jacobian.T @ trial
+                stopped = ((joints <= lower) & (pull < 0)) | ((joints >= upper) & (pull > 0))
+                jacobian = np.where(stopped, 0.0, jacobian)
         else:
             damping *= 10.0
             if not damping < _MAX_DAMPING:
@@ -288,8 +458,9 @@ def _link(theta: float, a_m: float, d_m: float, alpha: float) -> Float[np.ndarra
 
 NUM_BRANCHES = 8
 """Branch number: 4 * shoulder + 2 * wrist + elbow, each 0 or 1."""
-_BEYOND = 1e-9
-"""A cosine may leave [-1, 1] by this: a stretched arm, reached to a fraction of a nanometre."""
+_BEYOND, _BEYOND_PER_M = 1e-9, 100.0
+"""A cosine may leave [-1, 1] by this: a stretched arm, reached to a fraction of a nanometre; and by
+so much more per metre by which the closed form misses the description."""
 _SINGULAR = 1e-9
 """Sine of the fifth joint below which the sixth may be anything."""
 _LIMIT_SLACK_RAD = 1e-9
@@ -357,6 +528,7 @@ def _angles(
 ]:
     """Angles of the Denavit-Hartenberg chain; axes of the arrays: pose, shoulder, wrist, elbow."""
     g = geometry
+    beyond = _BEYOND + (_BEYOND_PER_M * g.deviation if g.deviation > _BEYOND else 0.0)
     T = se3.invert(g.T_base_0) @ Ts_base_tcp @ se3.invert(g.T_6_tcp)
     R = T[:, :3, :3]
     x, y, z = (T[:, i, 3, None] for i in range(3))
@@ -364,7 +536,7 @@ def _angles(
 
     radius = np.hypot(x, y)
     sine = np.divide(g.d4_m, radius, out=np.full_like(radius, 2.0), where=radius > _SINGULAR)
-    valid = (np.abs(sine) <= 1 + _BEYOND)[..., None, None]
+    valid = (np.abs(sine) <= 1 + beyond)[..., None, None]
     lean = np.arcsin(np.clip(sine, -1.0, 1.0))
     first = np.arctan2(y, x) + np.concatenate([lean, np.pi - lean], axis=1)
     c1, s1 = np.cos(first), np.sin(first)
@@ -392,7 +564,7 @@ def _angles(
     px = (x * c1 + y * s1)[..., None] - g.d5_m * across
     py = z[..., None] - g.d5_m * up
     c3 = (px**2 + py**2 - g.a2_m**2 - g.a3_m**2) / (2 * g.a2_m * g.a3_m)
-    valid = valid & ((np.abs(c3) <= 1 + _BEYOND) & (np.hypot(px, py) > _SINGULAR))[..., None]
+    valid = valid & ((np.abs(c3) <= 1 + beyond) & (np.hypot(px, py) > _SINGULAR))[..., None]
     c3 = np.clip(c3, -1.0, 1.0)
     s3 = np.sqrt((1.0 - c3) * (1.0 + c3))
     elbow = np.array([1.0, -1.0])

@@ -1,12 +1,13 @@
 """The robot as pinocchio sees it: its URDF, joint limits, forward kinematics of arm and gripper.
 
-One arm of revolute joints and, where the description has them, two prismatic fingers that open by
-half of the gripper width each. A model keeps scratch memory: use it from one thread at a time.
+One serial arm of joints that turn and, where its record has them, fingers that open with the
+width. Poses are in the record's base frame, wherever the description's root is. A model keeps
+scratch memory: use it from one thread at a time.
 """
 
 import math
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -15,11 +16,8 @@ import pinocchio as pin
 from jaxtyping import Float
 
 from bridge.episode.topics import ROBOT_DESCRIPTION
-from bridge.robots.default import ARM_JOINTS, BASE_FRAME, FINGER_JOINTS, ROBOT, TCP_FRAME
-from bridge.robots.robot import resolve_mesh
+from bridge.robots.robot import Mimic, Robot, mimics_of, resolve_mesh, robot_of
 from twin.errors import TwinError
-
-_MIMIC_DEFAULTS = (("multiplier", "1"), ("offset", "0"))
 
 
 class RobotDescriptionError(TwinError):
@@ -31,17 +29,7 @@ class RobotDescriptionError(TwinError):
         super().__init__(f"the robot description {found}. {hint}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Mimic:
-    """A joint that goes where another one goes: multiplier * leader + offset."""
-
-    joint: str
-    leader: str
-    multiplier: float
-    offset: float
-
-
-def mimicked(urdf: str) -> list[Mimic]:
+def mimicked(urdf: str) -> tuple[Mimic, ...]:
     """Read the joints that follow another joint, which pinocchio takes for free ones.
 
     Raises:
@@ -49,35 +37,23 @@ def mimicked(urdf: str) -> list[Mimic]:
             itself, or by a number that is none.
     """
     root = parse_description(urdf)
-    joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
-    followers = {
-        name: element
-        for name, joint in joints.items()
-        if (element := joint.find("mimic")) is not None
-    }
-    return [
-        _mimic(name, element, set(joints) - set(followers)) for name, element in followers.items()
-    ]
-
-
-def _mimic(name: str, element: ET.Element, leaders: set[str]) -> Mimic:
-    leader = element.get("joint", "")
-    if leader not in leaders:
-        raise RobotDescriptionError(
-            found=f"lets the joint {name!r} mimic {leader!r}, which is not there or mimics another",
-            hint="Let it mimic a joint that moves by itself.",
-        )
-    try:
-        numbers = [float(element.get(key, default)) for key, default in _MIMIC_DEFAULTS]
-    except ValueError:
-        numbers = [math.nan]
-    if not all(map(math.isfinite, numbers)):
-        raise RobotDescriptionError(
-            found=f"lets the joint {name!r} mimic {leader!r} by something that is not a number",
-            hint="Give multiplier and offset as numbers.",
-        )
-    multiplier, offset = numbers
-    return Mimic(joint=name, leader=leader, multiplier=multiplier, offset=offset)
+    found = mimics_of(urdf)
+    leaders = {joint.get("name", "") for joint in root.findall("joint")}
+    leaders -= {item.joint for item in found}
+    for item in found:
+        if item.leader not in leaders:
+            raise RobotDescriptionError(
+                found=f"lets the joint {item.joint!r} mimic {item.leader!r}, which is not there or "
+                "mimics another",
+                hint="Let it mimic a joint that moves by itself.",
+            )
+        if not (math.isfinite(item.multiplier) and math.isfinite(item.offset)):
+            raise RobotDescriptionError(
+                found=f"lets the joint {item.joint!r} mimic {item.leader!r} by something that is "
+                "not a number",
+                hint="Give multiplier and offset as numbers.",
+            )
+    return found
 
 
 def with_absolute_meshes(urdf: str, *, keep_visuals: bool = False) -> str:
@@ -136,91 +112,199 @@ def _check_names(root: ET.Element) -> None:
 
 
 _SAME_FRAME = 1e-6
+_TURNS_RAD = 2 * np.pi
+"""Limit, to both sides, of a joint that turns without end."""
+_ROOT = "gst_root"
+"""Link that is put above the root of a description whose base lies elsewhere."""
+_REFUSED = ("floating", "planar")
+_KINDS = ("fixed", "revolute", "prismatic", "continuous", *_REFUSED)
+
+
+def _with_limits(urdf: str, record: Robot) -> str:
+    """Write the record's limits into a description; the arm's endless joints get two turns.
+
+    Raises:
+        RobotDescriptionError: A joint of a kind that no serial arm has.
+    """
+    root = parse_description(urdf)
+    joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
+    for name, joint in joints.items():
+        kind = joint.get("type", "")
+        if kind in _REFUSED or kind not in _KINDS:
+            raise RobotDescriptionError(
+                found=f"has the joint {name!r} of the type {kind!r}",
+                hint="A serial arm on a fixed base is needed, of joints with one axis each.",
+            )
+    changed = False
+    for index, name in enumerate(record.joints):
+        found = joints.get(name)
+        if found is None:
+            continue
+        limits: dict[str, float] = {}
+        if found.get("type") == "continuous":
+            found.set("type", "revolute")
+            limits |= {"lower": -_TURNS_RAD, "upper": _TURNS_RAD}
+        if record.position_rad is not None:
+            limits |= dict(zip(("lower", "upper"), record.position_rad[index], strict=True))
+        if record.velocity_rad_s is not None:
+            limits["velocity"] = record.velocity_rad_s[index]
+        if limits:
+            element = found.find("limit")
+            if element is None:
+                element = ET.SubElement(found, "limit", effort="0", velocity="0")
+            for key, value in limits.items():
+                element.set(key, repr(value))
+            changed = True
+    return ET.tostring(root, encoding="unicode") if changed else urdf
+
+
+def _rooted(urdf: str, T_base_root: Float[np.ndarray, "4 4"]) -> str:
+    """Put a root above a description where its base is, so that every engine counts from there."""
+    root = parse_description(urdf)
+    children = {child.get("link") for child in root.findall("joint/child")}
+    old = next(link.get("name", "") for link in root if _is_root(link, children))
+    ET.SubElement(root, "link", name=_ROOT)
+    joint = ET.SubElement(root, "joint", name=f"{_ROOT}_joint", type="fixed")
+    ET.SubElement(joint, "parent", link=_ROOT)
+    ET.SubElement(joint, "child", link=old)
+    numbers = [*T_base_root[:3, 3], *pin.rpy.matrixToRpy(T_base_root[:3, :3])]
+    texts = [repr(float(value)) for value in numbers]
+    ET.SubElement(joint, "origin", xyz=" ".join(texts[:3]), rpy=" ".join(texts[3:]))
+    return ET.tostring(root, encoding="unicode")
+
+
+def _is_root(element: ET.Element, children: set[str | None]) -> bool:
+    return element.tag == "link" and element.get("name") not in children
+
+
+_OTHER_ROBOT = "Another robot's file is named by --robot FILE.toml."
+
+
+def _built(urdf: str) -> pin.Model:
+    try:
+        return pin.buildModelFromXML(urdf)
+    except (ValueError, RuntimeError) as error:
+        raise RobotDescriptionError(
+            found=f"is refused by pinocchio ({str(error)[:200]})", hint="Check it."
+        ) from error
 
 
 class RobotModel:
-    """Kinematics of one robot, joints in the order of ``ARM_JOINTS``."""
+    """Kinematics of one robot, joints in the order of its record."""
 
     def __init__(self, urdf: str) -> None:
         """Build from a URDF text; use ``load_robot``, which remembers.
 
         Raises:
-            RobotDescriptionError: When joints or the frame ``tcp`` are missing, joints are of
-                another kind than is needed, or the base link is not where the root is.
+            RobotDescriptionError: When a joint or frame of the record is missing, the joints are
+                no serial arm, or the base moves.
+            UsageError: When a mesh is missing.
         """
-        self.urdf = with_absolute_meshes(urdf)
+        self.record: Robot = robot_of(urdf)
         mimics = mimicked(urdf)
-        try:
-            self.model = pin.buildModelFromXML(self.urdf)
-        except (ValueError, RuntimeError) as error:
-            raise RobotDescriptionError(
-                found=f"is refused by pinocchio ({str(error)[:200]})", hint="Check it."
-            ) from error
-        self.name = str(self.model.name)
+        self.urdf = _with_limits(with_absolute_meshes(urdf), self.record)
+        self.model = _built(self.urdf)
         self._check_names()
+        T_root_base = self._T_root_base()
+        if np.abs(T_root_base - np.eye(4)).max() > _SAME_FRAME:
+            self.urdf = _rooted(self.urdf, np.linalg.inv(T_root_base))
+            self.model = _built(self.urdf)
+        self.name = str(self.model.name)
         self._check_joints()
-        self._check_base()
         self.data = self.model.createData()
         self._neutral: Float[np.ndarray, " num_values"] = pin.neutral(self.model)
-        self.arm_ids = np.array([self._q_id(name) for name in ARM_JOINTS])
+        self.arm_ids = np.array([self._q_id(name) for name in self.joints])
         self.arm_velocity_ids = np.array(
-            [int(self.model.joints[self.model.getJointId(name)].idx_v) for name in ARM_JOINTS]
+            [int(self.model.joints[self.model.getJointId(name)].idx_v) for name in self.joints]
         )
         self._fingers = [
             (self._q_id(finger.joint), finger)
-            for finger in ROBOT.gripper.fingers
+            for finger in self.record.gripper.fingers
             if self.model.existJointName(finger.joint)
         ]
         followers = [m for m in mimics if self.model.existJointName(m.joint)]
         self._check_followers(followers)
+        self._check_serial({m.joint for m in followers})
+        self.followers: tuple[Mimic, ...] = tuple(followers)
         self._follower_ids = np.array([self._q_id(m.joint) for m in followers], dtype=np.int64)
         self._leader_ids = np.array([self._q_id(m.leader) for m in followers], dtype=np.int64)
         self._ratios = np.array([m.multiplier for m in followers])
         self._shifts = np.array([m.offset for m in followers])
-        self.tcp_id = int(self.model.getFrameId(TCP_FRAME))
+        self.tcp_id = self.frame_id(self.record.tool_frame)
         self.lower_rad: Float[np.ndarray, " num_joints"] = self._arm(self.model.lowerPositionLimit)
         self.upper_rad: Float[np.ndarray, " num_joints"] = self._arm(self.model.upperPositionLimit)
         self.velocity_limit_rad_s: Float[np.ndarray, " num_joints"] = self._arm(
             self.model.velocityLimit
         )
         self._check_limits()
+        self.home_rad = self._home()
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the arm's joints, base to flange."""
+        return self.record.joints
 
     def _check_names(self) -> None:
-        missing = [name for name in ARM_JOINTS if not self.model.existJointName(name)]
+        missing = [name for name in self.joints if not self.model.existJointName(name)]
         if missing:
             raise RobotDescriptionError(
-                found=f"lacks the joints {', '.join(missing)}",
-                hint=f"It has: {', '.join(list(self.model.names)[1:])}.",
+                found=f"lacks the joints {', '.join(missing)} of {self.record.name}",
+                hint=f"It has: {', '.join(list(self.model.names)[1:])}. {_OTHER_ROBOT}",
             )
-        if not self.model.existFrame(TCP_FRAME):
+        if not self.model.existFrame(self.record.tool_frame):
             raise RobotDescriptionError(
-                found=f"lacks the frame {TCP_FRAME!r}",
-                hint="Add a link of that name where plans put the tool centre point.",
+                found=f"lacks the frame {self.record.tool_frame!r}",
+                hint="Add a link of that name where plans put the tool centre point. "
+                f"{_OTHER_ROBOT}",
             )
 
     def _check_joints(self) -> None:
-        for name in ARM_JOINTS:
-            if self._joint(name).nq != 1:
-                raise RobotDescriptionError(
-                    found=f"has the joint {name!r}, which turns without end",
-                    hint="Make it revolute and give it limits.",
-                )
+        for name in self.joints:
             if self._slides(name):
                 raise RobotDescriptionError(
                     found=f"has the joint {name!r}, which slides",
-                    hint="An arm of six joints that turn is needed.",
+                    hint="An arm of six or seven joints that turn is needed.",
                 )
-        for name in FINGER_JOINTS:
-            if self.model.existJointName(name) and not self._slides(name):
+        for finger in self.record.gripper.fingers:
+            name, wanted = finger.joint, "turn" if finger.turns else "slide"
+            if not self.model.existJointName(name):
+                continue
+            if self._joint(name).nq != 1 or self._slides(name) == finger.turns:
                 raise RobotDescriptionError(
-                    found=f"has the finger joint {name!r}, which does not slide",
-                    hint="Two prismatic fingers are needed, each open by half of the width.",
+                    found=f"has the finger joint {name!r}, which does not {wanted}",
+                    hint="Say of it in the robot file whether it turns, and give it limits.",
                 )
+
+    def _check_serial(self, followers: set[str]) -> None:
+        """The arm's joints, and no others, lie one behind the other between base and tool."""
+        names = list(self.model.names)
+        tool = self.model.frames[self.frame_id(self.record.tool_frame)]
+        chain: list[str] = []
+        joint = int(tool.parentJoint)
+        while joint:
+            chain.insert(0, names[joint])
+            joint = int(self.model.parents[joint])
+        aside = [name for name in self.joints if name not in chain]
+        if aside:
+            raise RobotDescriptionError(
+                found=f"has {', '.join(aside)} on a branch that does not carry the tool frame "
+                f"{self.record.tool_frame!r}",
+                hint=f"The tool is moved by {', '.join(chain) or 'no joint'}.",
+            )
+        known = {*self.joints, *self.record.finger_joints, *followers}
+        more = [name for name in names[1:] if name not in known]
+        if more or [name for name in chain if name in self.joints] != list(self.joints):
+            raise RobotDescriptionError(
+                found=f"moves by {', '.join(more or chain)}, "
+                + ("which is neither arm nor finger" if more else "in another order"),
+                hint="List the arm's joints from base to tool as joints, those that never move as "
+                "held, the fingers' under gripper.fingers.",
+            )
 
     def _check_limits(self) -> None:
         """Nothing is ever beyond a limit that is not a number."""
         rows = zip(
-            ARM_JOINTS, self.lower_rad, self.upper_rad, self.velocity_limit_rad_s, strict=True
+            self.joints, self.lower_rad, self.upper_rad, self.velocity_limit_rad_s, strict=True
         )
         for name, low, high, speed in rows:
             if not (low < high and speed >= 0):
@@ -230,7 +314,7 @@ class RobotModel:
                     hint="Give lower, upper and velocity as numbers, lower below upper.",
                 )
 
-    def _check_followers(self, followers: list[Mimic]) -> None:
+    def _check_followers(self, followers: Sequence[Mimic]) -> None:
         for item in followers:
             for name in (item.joint, item.leader):
                 if not self.model.existJointName(name) or self._joint(name).nq != 1:
@@ -240,19 +324,37 @@ class RobotModel:
                         hint="Make both revolute or prismatic, with limits.",
                     )
 
-    def _check_base(self) -> None:
-        """Plans and objects are given in the base link, kinematics in the root."""
-        if not self.model.existFrame(BASE_FRAME):
-            return
-        frame = self.model.frames[self.model.getFrameId(BASE_FRAME)]
-        T_root_base = np.array(frame.placement.homogeneous)
-        if frame.parentJoint != 0 or np.abs(T_root_base - np.eye(4)).max() > _SAME_FRAME:
-            x, y, z = T_root_base[:3, 3]
+    def _T_root_base(self) -> Float[np.ndarray, "4 4"]:
+        """Where the base is in the description's root, which may be another frame."""
+        base = self.record.base_frame
+        if not self.model.existFrame(base):
             raise RobotDescriptionError(
-                found=f"puts {BASE_FRAME!r} elsewhere than its root {self.model.frames[1].name!r}: "
-                f"at ({x:.3f}, {y:.3f}, {z:.3f}) m, or turned",
-                hint=f"Plans and objects are given in {BASE_FRAME!r}: let it be the root.",
+                found=f"lacks the base frame {base!r}",
+                hint=f"It has: {', '.join(frame.name for frame in self.model.frames)}.",
             )
+        frame = self.model.frames[self.frame_id(base)]
+        if frame.parentJoint != 0:
+            raise RobotDescriptionError(
+                found=f"moves the base frame {base!r} by {self.model.names[frame.parentJoint]!r}",
+                hint="Name a frame that no joint moves as base_frame.",
+            )
+        return np.array(frame.placement.homogeneous)
+
+    def _home(self) -> Float[np.ndarray, " num_joints"]:
+        """The record's posture, or the middle of the limits."""
+        if self.record.home_rad is None:
+            return np.asarray((self.lower_rad + self.upper_rad) / 2)
+        home = np.array(self.record.home_rad)
+        for name, value, low, high in zip(
+            self.joints, home, self.lower_rad, self.upper_rad, strict=True
+        ):
+            if not low <= value <= high:
+                raise RobotDescriptionError(
+                    found=f"limits the joint {name!r} to {low:.3f} to {high:.3f} rad, and home_rad "
+                    f"puts it at {value:.3f}",
+                    hint="Choose a posture within the limits.",
+                )
+        return home
 
     def _joint(self, name: str) -> Any:
         return self.model.joints[self.model.getJointId(name)]
@@ -260,6 +362,16 @@ class RobotModel:
     def _slides(self, name: str) -> bool:
         joint = self._joint(name)
         return bool(joint.nq == 1 and joint.shortname().startswith("JointModelP"))
+
+    def frame_id(self, name: str) -> int:
+        """Where pinocchio keeps a link; a joint may have the same name."""
+        if self.model.existFrame(name, pin.FrameType.BODY):
+            return int(self.model.getFrameId(name, pin.FrameType.BODY))
+        return int(self.model.getFrameId(name))
+
+    def effort_id(self, name: str) -> int:
+        """Where pinocchio keeps the limit of a joint's torque."""
+        return int(self._joint(name).idx_v)
 
     def _q_id(self, name: str) -> int:
         return int(self.model.joints[self.model.getJointId(name)].idx_q)
@@ -314,8 +426,31 @@ class RobotModel:
             names = ", ".join(frame.name for frame in self.model.frames)
             raise RobotDescriptionError(found=f"lacks {link!r}", hint=f"It has: {names}.")
         pin.forwardKinematics(self.model, self.data, self.configuration(joints_rad, width_m))
-        T = pin.updateFramePlacement(self.model, self.data, self.model.getFrameId(link))
+        T = pin.updateFramePlacement(self.model, self.data, self.frame_id(link))
         return np.array(T.homogeneous)
+
+
+def check_dynamics(robot: RobotModel) -> None:
+    """Refuse an arm whose motors or masses nobody knows: it cannot be simulated.
+
+    Raises:
+        RobotDescriptionError: Naming the joint, and what it moves.
+    """
+    model = robot.model
+    for name in (*robot.joints, *robot.record.finger_joints, *(m.joint for m in robot.followers)):
+        joint = model.getJointId(name)
+        inertia = model.inertias[joint]
+        moved = [frame.name for frame in model.frames if frame.parentJoint == joint]
+        if not inertia.mass > 0 or not np.linalg.eigvalsh(inertia.inertia).min() > 0:
+            raise RobotDescriptionError(
+                found=f"gives no inertia to what {name!r} moves: {', '.join(moved[1:])}",
+                hint="Give its links <inertial> with a mass and an inertia above 0.",
+            )
+        if name in robot.joints and not model.effortLimit[robot.effort_id(name)] > 0:
+            raise RobotDescriptionError(
+                found=f"gives the joint {name!r} no effort",
+                hint="Set <limit effort=...> to the torque of its motor in Nm.",
+            )
 
 
 @lru_cache(maxsize=4)

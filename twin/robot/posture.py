@@ -11,7 +11,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack, joint_track, robot_description
 from bridge.episode.topics import GRIPPER_STATE, ROBOT_DESCRIPTION
 from bridge.errors import EpisodeError
-from bridge.robots.default import ARM_JOINTS
+from bridge.robots.robot import GRIPPER_WIDTH, Robot, robot_of
 from twin.errors import TwinError
 from twin.robot.model import RobotDescriptionError
 
@@ -81,7 +81,7 @@ class Posture:
     """One configuration of arm and gripper."""
 
     joints_rad: Float[np.ndarray, " num_joints"]
-    """In the order of ``bridge.robots.default.ARM_JOINTS``."""
+    """In the order of the robot's ``joints``."""
     width_m: float = 0.0
     """Opening of the gripper."""
 
@@ -104,7 +104,7 @@ class PostureTrack:
     def at(self, stamp_ns: int) -> Posture:
         """Interpolate linearly."""
         stamps = np.array([stamp_ns])
-        order = [self.arm.names.index(name) for name in ARM_JOINTS]
+        order = [self.arm.names.index(name) for name in robot_of(self.urdf).joints]
         width = 0.0 if self.widths is None else float(self.widths.at(stamps)[0, 0])
         return Posture(joints_rad=self.arm.at(stamps)[0, order], width_m=width)
 
@@ -147,25 +147,50 @@ def posture_track(episode: Episode) -> PostureTrack:
             hint=f"Record {ROBOT_DESCRIPTION}, or attach the URDF as robot.urdf.",
         )
     arm = joint_track(episode)
-    check_joints(arm, f"episode {episode.info.id}")
+    robot = robot_of(urdf)
+    check_joints(arm, f"episode {episode.info.id}", robot)
     try:
-        widths = joint_track(episode, GRIPPER_STATE)
+        widths: JointTrack | None = width_track(episode, robot)
     except EpisodeError:
         widths = None
     return PostureTrack(urdf=urdf, arm=arm, widths=widths)
 
 
-def check_joints(arm: JointTrack, source: str) -> None:
-    """See that joint states are of the robots that are known here.
+def width_track(episode: Episode, robot: Robot) -> JointTrack:
+    """Read the recorded distance between the fingers' pads [m].
+
+    Where no gripper state was recorded, it follows from a finger among the joint states. A fixed
+    tool has no width: 0 whenever the joints were recorded.
+
+    Raises:
+        EpisodeError: Neither was recorded.
+    """
+    fingers = robot.gripper.fingers
+    try:
+        return joint_track(episode, GRIPPER_STATE)
+    except EpisodeError:
+        arm = joint_track(episode)
+        finger = next((item for item in fingers if item.joint in arm.names), None)
+        if fingers and finger is None:
+            raise
+    widths = np.zeros(len(arm.stamps_ns))
+    if finger is not None:
+        widths = np.asarray(finger.width(arm.position[:, arm.names.index(finger.joint)]))
+    return JointTrack(names=(GRIPPER_WIDTH,), stamps_ns=arm.stamps_ns, position=widths[:, None])
+
+
+def check_joints(arm: JointTrack, source: str, robot: Robot) -> None:
+    """See that joint states are of the robot that is meant.
 
     Args:
         arm: Joint states as they came.
         source: Who sent them, as the message names it.
+        robot: The one that is meant.
 
     Raises:
         RobotDescriptionError: A joint of the arm is missing in what a source sent.
     """
-    missing = [name for name in ARM_JOINTS if name not in arm.names]
+    missing = [name for name in robot.joints if name not in arm.names]
     if missing:
         raise RobotDescriptionError(
             found=f"does not fit {source}, which lacks {', '.join(missing)}",

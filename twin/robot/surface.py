@@ -21,6 +21,8 @@ from twin.robot.collision import collision_geometry
 from twin.robot.model import RobotDescriptionError, RobotModel
 from twin.robot.posture import Posture
 
+_NOT_READ = (".dae", ".DAE")
+"""Meshes that Open3D does not read, and pinocchio did."""
 NOT_SEEN = ("ee_link",)
 """Markers inside other links, not parts of the robot."""
 
@@ -197,6 +199,10 @@ def _mesh(item: Any) -> tuple[np.ndarray, np.ndarray]:
             [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
         )
         return corners, np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+    if isinstance(shape, coal.BVHModelBase) and Path(str(item.meshPath)).suffix in _NOT_READ:
+        corners = [shape.tri_indices(index) for index in range(shape.num_tris)]
+        triangles = [[item[0], item[1], item[2]] for item in corners]
+        return np.array(shape.vertices()), np.array(triangles, dtype=np.int64)
     if isinstance(shape, coal.BVHModelBase):
         mesh = open3d.io.read_triangle_mesh(Path(str(item.meshPath)))
         vertices = np.asarray(mesh.vertices) * np.array(item.meshScale)

@@ -16,7 +16,6 @@ from bridge.errors import BridgeError, GstError, UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_png
-from bridge.robots.default import ARM_JOINTS, BASE_FRAME
 from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture, posture_track
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at, unknown_mask
@@ -102,8 +101,9 @@ def _posture(episode: Episode, stamp_ns: int, config: RenderConfig) -> tuple[str
         width_m = recorded.width_m if config.width_m is None else config.width_m
         return track.urdf, Posture(joints_rad=recorded.joints_rad, width_m=width_m)
     joints = np.array(config.joints, dtype=np.float64)
-    if len(joints) != len(ARM_JOINTS) or not np.isfinite(joints).all():
-        message = f"--joints takes {len(ARM_JOINTS)} angles in rad: {', '.join(ARM_JOINTS)}."
+    names = streams.recorded_robot(episode).joints
+    if len(joints) != len(names) or not np.isfinite(joints).all():
+        message = f"--joints takes {len(names)} angles in rad: {', '.join(names)}."
         raise UsageError(message)
     urdf = streams.robot_description(episode)
     if urdf is None:
@@ -308,7 +308,7 @@ def _view_of(
             f"{scene.record.get('frame')!r}: say where to stand with --eye and --target."
         )
         raise UsageError(message)
-    if config.joints is not None and root == BASE_FRAME:
+    if config.joints is not None and root == streams.recorded_robot(episode).base_frame:
         T_base_camera = carried_camera(episode, info.frame_id, np.array(config.joints), tree)
         if T_base_camera is not None:
             return info.camera, T_base_camera

@@ -276,9 +276,9 @@ class RenderConfig:
     """Stand here instead, in metres in the scene's frame; needs --target."""
     target: tuple[float, float, float] | None = None
     """Look at this point, in metres in the scene's frame."""
-    joints: tuple[float, float, float, float, float, float] | None = None
-    """Put the arm into this posture, in rad from shoulder to wrist; a camera in its hand comes
-    along. Default: as recorded at --at-s."""
+    joints: Annotated[tuple[float, ...] | None, Parameter(consume_multiple=True)] = None
+    """Put the arm into this posture, one angle in rad for each joint from base to flange; a camera
+    in its hand comes along. Default: as recorded at --at-s."""
     width_m: float | None = None
     """Opening of the gripper in metres; default: as recorded, closed with --joints."""
     object: tuple[str, ...] = ()

@@ -42,7 +42,8 @@ from bridge.episode.topics import (
 )
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
-from bridge.robots.default import ARM_JOINTS, BASE_FRAME, GRIPPER_WIDTH
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME
+from bridge.robots.robot import GRIPPER_WIDTH
 from bridge.task.plan import Plan
 from bridge.task.record import check_record
 from bridge.wire.qos import Qos

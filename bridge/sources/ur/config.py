@@ -8,10 +8,10 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from bridge.episode.topics import refuse_bad_name
 from bridge.errors import BridgeError, UsageError, refuse_outside
+from bridge.robots.robot import DEFAULT_ROBOT
 
 Value = bool | int | float | tuple[float, ...] | tuple[int, ...]
 _SIGNAL = re.compile(r"([a-z_]+):(\d{1,2})")
@@ -120,10 +120,11 @@ class UrConfig:
     """Distance between the fingers when open [m]."""
     gripper_closed_m: float = 0.0
     """Distance between the fingers when closed [m]."""
-    robot: Literal["ur5_parallel_gripper", "ur5", "none"] = "ur5_parallel_gripper"
-    """URDF to publish; none publishes none."""
+    robot: str = DEFAULT_ROBOT
+    """Robot file, by name or path (docs/robots.md): its description is published and its joint
+    names are used; ur5 publishes the bare arm, none publishes no description."""
     urdf: Path | None = None
-    """URDF file of your arm, instead of --robot."""
+    """URDF file of your arm, instead of that of --robot."""
 
     def __post_init__(self) -> None:
         """Refuse what no controller can send."""

@@ -14,7 +14,6 @@ from bridge.episode import schema
 from bridge.episode.cdr.batch import MessageTemplate, Stamp, named
 from bridge.episode.schema import StampedMessage
 from bridge.episode.topics import EVENT, cell_topic
-from bridge.robots.default import BASE_FRAME
 
 _ROBOT = {
     -1: "NO_CONTROLLER",
@@ -83,24 +82,24 @@ def tool_wrench(wrench: Sequence[float]) -> tuple[float, ...]:
     return -fx, -fy, fz, -tx, -ty, tz
 
 
-def frame_template() -> MessageTemplate:
+def frame_template(base_frame: str) -> MessageTemplate:
     """tf2_msgs/TFMessage with the tool's frame, so that a camera at the wrist has a place."""
 
     def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
         transform = {"translation": named("xyz", numbers), "rotation": named("xyzw", numbers[3:])}
-        header = {"stamp": stamp, "frame_id": BASE_FRAME}
+        header = {"stamp": stamp, "frame_id": base_frame}
         item = {"header": header, "child_frame_id": CONTROLLER_TCP_FRAME, "transform": transform}
         return {"transforms": [item]}
 
     return MessageTemplate(schema.TF_MESSAGE, build, 7)
 
 
-def wrench_template() -> MessageTemplate:
+def wrench_template(base_frame: str) -> MessageTemplate:
     """geometry_msgs/WrenchStamped along base_link, filled with ``tool_wrench``."""
 
     def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
         wrench = {"force": named("xyz", numbers), "torque": named("xyz", numbers[3:])}
-        return {"header": {"stamp": stamp, "frame_id": BASE_FRAME}, "wrench": wrench}
+        return {"header": {"stamp": stamp, "frame_id": base_frame}, "wrench": wrench}
 
     return MessageTemplate(schema.WRENCH_STAMPED, build, 6)
 

@@ -24,7 +24,7 @@ from bridge.episode.topics import (
     cell_topic,
 )
 from bridge.errors import PathNotFoundError, UsageError
-from bridge.robots.default import ARM_JOINTS, BASE_FRAME, GRIPPER_WIDTH, ROBOT
+from bridge.robots.robot import DEFAULT_ROBOT, GRIPPER_WIDTH, Robot, read_robot, robot_of
 from bridge.sources.device_samples import Announcer, HostClock, NumberedPublisher
 from bridge.sources.ur import messages
 from bridge.sources.ur.config import ControllerError, UrConfig
@@ -57,6 +57,11 @@ class _Topic(NamedTuple):
     template: MessageTemplate
 
 
+BARE_UR5 = "ur5"
+"""What --robot calls the default robot's arm without its gripper."""
+NUM_JOINTS = 6
+
+
 def wish_of(config: UrConfig) -> Wish:
     """What the controller is asked for."""
     gripper = config.make_gripper()
@@ -67,27 +72,28 @@ def wish_of(config: UrConfig) -> Wish:
 class ArmPublisher:
     """Publishes one arm over any number of connections to its controller."""
 
-    def __init__(self, session: WireSession, config: UrConfig, announcer: Announcer) -> None:
+    def __init__(
+        self, session: WireSession, config: UrConfig, announcer: Announcer, robot: Robot
+    ) -> None:
         """Announce nothing yet: the topics follow from what the controller knows."""
         self._session = session
         self._cell = cell = config.cell
         self._announcer = announcer
         self._gripper = config.make_gripper()
         state = schema.JOINT_STATE
-        targets = joint_template(ARM_JOINTS)
+        base = robot.base_frame
+        targets = joint_template(robot.joints)
         width = joint_template((GRIPPER_WIDTH,))
         speed = joint_template((messages.SPEED_NAME,))
-        joints = joint_template(ARM_JOINTS, velocities=True)
+        joints = joint_template(robot.joints, velocities=True)
         self._joints = _Topic(cell_topic(cell, JOINT_STATES), state, joints)
         self._targets = _Topic(cell_topic(cell, JOINT_TARGETS), state, targets)
-        self._pose = _Topic(
-            cell_topic(cell, TCP_POSE), schema.POSE_STAMPED, pose_template(BASE_FRAME)
-        )
+        self._pose = _Topic(cell_topic(cell, TCP_POSE), schema.POSE_STAMPED, pose_template(base))
         self._wrench = _Topic(
-            cell_topic(cell, TCP_WRENCH), schema.WRENCH_STAMPED, messages.wrench_template()
+            cell_topic(cell, TCP_WRENCH), schema.WRENCH_STAMPED, messages.wrench_template(base)
         )
         self._width = _Topic(cell_topic(cell, GRIPPER_STATE), state, width)
-        self._frame = _Topic(TF, schema.TF_MESSAGE, messages.frame_template())
+        self._frame = _Topic(TF, schema.TF_MESSAGE, messages.frame_template(base))
         self._speed = _Topic(cell_topic(cell, SPEED_SCALING), state, speed)
         self._streams: dict[str, NumberedPublisher] = {}
         self._clock = HostClock()
@@ -223,11 +229,12 @@ class UrSource:
         """
         host, config = self.host, self.config
         urdf = read_urdf(config)
+        robot = _robot(config, urdf)
         client: RtdeClient | None = _connect(session, host, config, output)
         announcer = Announcer(session)
         if urdf is not None:
             announcer.fact("urdf", _description(urdf, session.now_ns()))
-        arm = ArmPublisher(session, config, announcer)
+        arm = ArmPublisher(session, config, announcer, robot)
         connections = 1
         try:
             while client is not None:
@@ -253,17 +260,38 @@ def describe_counts(counts: dict[str, Any]) -> str:
 
 
 def read_urdf(config: UrConfig) -> str | None:
-    """The robot's description: a file, a UR5 from the data package, or none.
+    """The robot's description: a file, that of a robot file, or none.
 
     Raises:
         PathNotFoundError: When the file is not there.
-        MissingDependencyError: When the UR5's data package is not installed.
+        MissingDependencyError: When the data package of its URDF is not installed.
+        UsageError: When there is no such robot.
     """
     if config.urdf is not None:
         return _read_urdf_file(config.urdf)
     if config.robot == "none":
         return None
-    return ROBOT.urdf_text() if config.robot == "ur5_parallel_gripper" else ROBOT.arm_urdf()
+    if config.robot == BARE_UR5:
+        return read_robot(DEFAULT_ROBOT).arm_urdf()
+    return read_robot(config.robot).description()
+
+
+def _robot(config: UrConfig, urdf: str | None) -> Robot:
+    """The robot whose joints the controller moves.
+
+    Raises:
+        UsageError: A robot that does not have the six joints of a UR.
+    """
+    if config.urdf is not None and config.robot not in ("none", BARE_UR5):
+        robot = read_robot(config.robot)
+    else:
+        robot = robot_of(urdf or "")
+    if len(robot.joints) != NUM_JOINTS:
+        raise UsageError(
+            f"--robot {robot.name} has {len(robot.joints)} joints; a UR controller moves "
+            f"{NUM_JOINTS}."
+        )
+    return robot
 
 
 def _read_urdf_file(path: Path) -> str:

@@ -39,14 +39,14 @@ def test_poses_and_frames_are_those_of_the_record(stamp_ns: int, pose: list[floa
     assert (found.stamp_ns, found.frame_id) == (stamp_ns, "base_link")
     q_wxyz, p_m = np.array([turned[6], *turned[3:6]]), np.array(turned[:3])
     np.testing.assert_allclose(found.T_frame_body, se3.transform_from(q_wxyz, p_m), atol=1e-12)
-    (item,) = read_transforms(messages.frame_template().fill(stamp_ns, turned))
+    (item,) = read_transforms(messages.frame_template("base_link").fill(stamp_ns, turned))
     assert (item.parent, item.child) == ("base_link", "tool0_controller")
     np.testing.assert_array_equal(item.T_parent_child, found.T_frame_body)
     again = FrameTransform(
         stamp_ns=stamp_ns, parent=item.parent, child=item.child, T_parent_child=np.eye(4)
     )
     identity = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    filled = messages.frame_template().fill(stamp_ns, identity)
+    filled = messages.frame_template("base_link").fill(stamp_ns, identity)
     assert filled == transforms_to_cdr([again])
 
 

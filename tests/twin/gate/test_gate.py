@@ -10,6 +10,7 @@ import pytest
 from gate_fakes import HOME, PLAN, URDF, FakePerception, accept, found, gate_with, raising
 
 from bridge.errors import InvalidRecordError
+from bridge.robots.robot import read_robot
 from bridge.task.plan import Plan
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
@@ -26,6 +27,9 @@ from twin.gate.gate import (
 
 def arm(**changes: Any) -> Any:
     return SimpleNamespace(**{**vars(HOME), **changes})
+
+
+DAMAGED = '<robot name="ur5_parallel_gripper"><robot_gst>{}</robot_gst></robot>'
 
 
 def test_the_verdict_is_the_replays_from_the_localised_poses() -> None:
@@ -65,6 +69,11 @@ def test_a_task_with_soft_objects_is_replayed_like_any_other() -> None:
 
 def test_an_accepted_plan_is_accepted() -> None:
     assert gate_with().judge(PLAN.to_json()).accepted is True
+    record = read_robot("panda")
+    there = arm(names=record.joints, position_rad=np.zeros(7))
+    panda = FakePerception(description='<robot name="panda"/>', arm=there)
+    plan = replace(PLAN, robot="panda", frame=record.base_frame)
+    assert gate_with(perception=panda).judge(plan.to_json()).accepted is True
 
 
 @pytest.mark.parametrize(
@@ -118,6 +127,16 @@ def test_an_accepted_plan_is_accepted() -> None:
         ),
         ({"replay": raising(TwinError("no waypoints"))}, PLAN, "no waypoints"),
         ({}, replace(PLAN, frame="world"), "is given in frame 'world'"),
+        (
+            {"perception": FakePerception(description='<robot name="panda"/>')},
+            replace(PLAN, robot="panda"),
+            "is given in frame 'base_link'; only 'panda_link0'",
+        ),
+        (
+            {"perception": FakePerception(description=DAMAGED)},
+            PLAN,
+            "carries a record that is not a robot: robot lacks name",
+        ),
         ({}, replace(PLAN, robot="panda"), "for robot 'panda'; the cell's robot is 'ur5"),
         ({}, replace(PLAN, task="fold_towel"), "for task 'fold_towel'; this gate judges"),
     ],

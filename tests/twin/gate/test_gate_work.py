@@ -112,13 +112,14 @@ def test_a_gate_asks_both_engines_within_the_same_steps(
 ) -> None:
     asked: list[str] = []
 
-    def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> Any:
+    def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig, **_: Any) -> Any:
         (engine,) = config.engines()
         asked.append(engine)
         terminal = Factor(value=engine == "pybullet", cause="inside")
         return SimpleNamespace(verdict=replace(ACCEPTED, engine=engine, terminal=terminal))
 
     monkeypatch.setattr(verdict_module, "replay_plan", replay_plan)
+    monkeypatch.setattr(auditor, "audit", lambda *_, **__: YES)
     config = ReplayConfig(engine="both", engines_must_agree=must_agree)
     run = RunFolder.create(tmp_path / "run")
     question = question_of(run, config=config, max_steps=2 * NOMINAL_STEPS)

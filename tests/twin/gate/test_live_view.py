@@ -169,3 +169,6 @@ def test_the_robot_description_is_remembered() -> None:
     assert view.urdf() is None
     view.take("/robot_description", string_to_cdr("<robot/>"), 0)
     assert view.urdf() == "<robot/>"
+    told = LiveView("standin", urdf='<robot name="panda"/>')
+    told.take("/robot_description", string_to_cdr("<robot/>"), 0)
+    assert told.urdf() == '<robot name="panda"/>'

@@ -7,7 +7,8 @@ import numpy as np
 from bridge.episode.streams import JointTrack
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
-from bridge.robots.default import ARM_JOINTS, ROBOT, ROBOT_NAME
+from bridge.robots.default import ARM_JOINTS, ROBOT
+from bridge.robots.robot import robot_of
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.task_file import Task, load_task
 from twin.replay.result import ReplayResult
@@ -63,6 +64,7 @@ def pick_and_place(
     plan_id: str = "scripted",
 ) -> Plan:
     """Above, down, close, up, over the box, open, away: 11 seconds, divided by the pace."""
+    robot = robot_of(scene.urdf)
     T = scene.Ts_base_object["cube"]
     yaw = float(np.arctan2(T[1, 0], T[0, 0]))
     x, y, z = (T[:3, 3] + np.array(grasp_offset_m)).tolist()
@@ -86,7 +88,7 @@ def pick_and_place(
             p_m=p,
             q_wxyz=downward(angle),
             g=g,
-            width_m=CLOSED_M if g else OPEN_M,
+            width_m=CLOSED_M if g else min(OPEN_M, robot.gripper.max_width_m),
         )
         for t, p, angle, g in knots
     )
@@ -95,8 +97,8 @@ def pick_and_place(
         planner="test",
         policy="scripted",
         condition="without_replanning",
-        robot=ROBOT_NAME,
-        frame="base_link",
+        robot=robot.name,
+        frame=robot.base_frame,
         instruction=scene.task.instruction,
         task=scene.task.name,
         stages=stages_of(scene.task, pace),
@@ -124,16 +126,16 @@ def with_joints(plan: Plan, scene: ReplayScene, step_s: float = 0.04) -> Plan:
                 joints_rad=tuple(joints.tolist()),
             )
         )
-    return replace(plan, tau=tuple(tau), joint_names=ARM_JOINTS)
+    return replace(plan, tau=tuple(tau), joint_names=robot.joints)
 
 
 def recorded_tracks(
-    result: ReplayResult, start_ns: int = 0, rate_hz: int = 125
+    result: ReplayResult, start_ns: int = 0, rate_hz: int = 125, names: tuple[str, ...] = ARM_JOINTS
 ) -> tuple[JointTrack, JointTrack]:
     """What encoders would have said of a replay."""
     end = int(result.stamps_ns[-1])
     stamps = np.arange(0, end, round(1e9 / rate_hz), dtype=np.int64)
-    arm = JointTrack(names=ARM_JOINTS, stamps_ns=result.stamps_ns, position=result.joints_rad)
+    arm = JointTrack(names=names, stamps_ns=result.stamps_ns, position=result.joints_rad)
     grip = JointTrack(
         names=("gripper_width",), stamps_ns=result.stamps_ns, position=result.width_m[:, None]
     )

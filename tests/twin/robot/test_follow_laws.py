@@ -8,7 +8,7 @@ import pytest
 from bridge.robots.default import ROBOT
 from twin.robot.config import IkConfig
 from twin.robot.follow import follow_poses
-from twin.robot.inverse import HOME_RAD, UrInverse, pose_error
+from twin.robot.inverse import UrInverse, pose_error
 from twin.robot.model import RobotModel, load_robot
 
 NEARLY_STRAIGHT = np.array([0.2, -1.4, 1.6, -0.9, 0.1, 0.3])
@@ -60,7 +60,7 @@ def test_of_branches_that_move_alike_the_one_nearest_home_is_chosen(robot: Robot
     assert inverse is not None
     raw, valid, _ = inverse.solve(T)
     assert valid.all()
-    away = raw[0] - HOME_RAD
+    away = raw[0] - robot.home_rad
     away -= 2 * np.pi * np.rint(away / (2 * np.pi))
     nearest = int(np.square(away).sum(axis=1).argmin())
     followed = follow_poses(robot, np.repeat(T, 3, axis=0), start_rad=None, config=IkConfig())

@@ -1,18 +1,27 @@
 """Laws of postures: when a pose is reached, which whole turns fit, when an arm stands still."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bridge.episode import schema
+from bridge.episode.cdr.messages import JointSample
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import EpisodeError
 from bridge.robots.default import ARM_JOINTS, ROBOT
+from bridge.robots.robot import Gripper, read_robot
 from twin.robot.config import IkConfig
 from twin.robot.inverse import UrInverse, solve_ik
 from twin.robot.model import RobotModel, load_robot
-from twin.robot.posture import PostureTrack
+from twin.robot.posture import PostureTrack, width_track
 
 POSTURE = np.array([0.3, -1.3, 1.5, -1.6, -1.4, 0.4])
 
@@ -66,3 +75,34 @@ def test_one_joint_that_moves_is_enough_to_be_moving(joint: int) -> None:
     track = PostureTrack(urdf="", arm=arm, widths=None)
     assert track.is_stationary(500_000_000)
     assert not track.is_stationary(1_500_000_000)
+
+
+def test_the_width_follows_from_a_finger_among_the_joint_states(tmp_path: Path) -> None:
+    """A Panda's driver sends its fingers with the arm, and no gripper state."""
+    robot = read_robot("panda")
+    path = tmp_path / "trial_0001.mcap"
+    names = (*robot.joints, "panda_finger_joint1")
+    with EpisodeWriter(path) as writer:
+        writer.describe(EpisodeInfo(id="trial_0001", kind="trial"))
+        for index, half_m in enumerate((0.04, 0.01)):
+            sample = JointSample(
+                stamp_ns=index * 10**9,
+                names=names,
+                position=np.array([0.0] * 7 + [half_m]),
+                velocity=np.zeros(0),
+                effort=np.zeros(0),
+            )
+            writer.write(
+                "/cell/joint_states",
+                sample.to_cdr(),
+                type_name=schema.JOINT_STATE,
+                log_time_ns=sample.stamp_ns,
+            )
+    episode = Episode.open(path)
+    widths = width_track(episode, robot)
+    assert widths.names == ("gripper_width",)
+    np.testing.assert_allclose(widths.position[:, 0], [0.08, 0.02])
+    with pytest.raises(EpisodeError):
+        width_track(episode, ROBOT)
+    fixed = replace(robot, gripper=Gripper())
+    assert width_track(episode, fixed).position.tolist() == [[0.0], [0.0]]

@@ -16,7 +16,7 @@ from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
 from bridge.geometry.signals import runs_of_true
-from bridge.robots.default import ARM_JOINTS, MAX_WIDTH_M
+from bridge.robots.robot import Robot, robot_of
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from bridge.terminal import Output
@@ -109,16 +109,17 @@ def commands_of(episode: Episode, plan: Plan, start_ns: int) -> Series:
         plan: Only events of this plan count; its waypoints stand in where there are none.
         start_ns: Time 0 of the answer, on the recording's clock.
     """
-    times, widths = [0.0], [MAX_WIDTH_M]
+    open_m = streams.recorded_robot(episode).gripper.max_width_m
+    times, widths = [0.0], [open_m]
     for event in streams.events(episode):
         if event["type"] == "gripper" and event.get("plan_id") == plan.id:
             told = (event.get("data") or {}).get("width_m")
-            shut = 0.0 if event.get("text") == "close" else MAX_WIDTH_M
+            shut = 0.0 if event.get("text") == "close" else open_m
             times.append((int(event["stamp_ns"]) - start_ns) * 1e-9)
             widths.append(shut if told is None else float(told))
     if len(times) == 1:
         for waypoint in plan.tau:
-            shut = 0.0 if waypoint.g else MAX_WIDTH_M
+            shut = 0.0 if waypoint.g else open_m
             times.append(waypoint.t_ns * 1e-9)
             widths.append(shut if waypoint.width_m is None else waypoint.width_m)
     return np.array(times), np.array(widths)
@@ -269,7 +270,8 @@ def read_case(run: RunFolder, episode: Episode) -> Case:
     before, after = _localised(path, plan.id)
     objects = _moving(task, before, after)
     arm = streams.joint_track(episode)
-    _check_joints(arm, start_ns, end_ns)
+    robot = robot_of(urdf)
+    _check_joints(arm, start_ns, end_ns, robot)
     times_s = (arm.stamps_ns - start_ns) * 1e-9
     inside = (times_s >= 0.0) & (arm.stamps_ns <= end_ns)
     commands = commands_of(episode, plan, start_ns)
@@ -278,7 +280,7 @@ def read_case(run: RunFolder, episode: Episode) -> Case:
     stretches = _stretches(arm, urdf, (start_ns, end_ns), moving, after, commands, widths)
     hold_times, held = holds(commands, widths)
     kept = np.array([np.any((stretches[:, 0] < t) & (t < stretches[:, 1])) for t in hold_times])
-    order = [arm.names.index(name) for name in ARM_JOINTS]
+    order = [arm.names.index(name) for name in robot.joints]
     nowhere, unknown = np.full(3, np.nan), np.diag(np.square(UNKNOWN_SIGMA))
     return Case(
         episode=episode.info.id,
@@ -361,8 +363,8 @@ def _covariance(record: Mapping[str, Any]) -> Float[np.ndarray, "3 3"]:
     return np.array(numbers, dtype=np.float64).reshape(6, 6)[np.ix_(PLANAR, PLANAR)]
 
 
-def _check_joints(arm: streams.JointTrack, start_ns: int, end_ns: int) -> None:
-    missing = [name for name in ARM_JOINTS if name not in arm.names]
+def _check_joints(arm: streams.JointTrack, start_ns: int, end_ns: int, robot: Robot) -> None:
+    missing = [name for name in robot.joints if name not in arm.names]
     if missing:
         message = f"joints without a recording: {', '.join(missing)}."
         raise UnusableCaseError(message)
@@ -370,7 +372,7 @@ def _check_joints(arm: streams.JointTrack, start_ns: int, end_ns: int) -> None:
     stamps = arm.stamps_ns[during]
     if len(stamps) < 2 or np.diff(stamps).max() > LONGEST_GAP_S * 1e9:
         raise UnusableCaseError("joint states have gaps while the plan was executed.")
-    order = [arm.names.index(name) for name in ARM_JOINTS]
+    order = [arm.names.index(name) for name in robot.joints]
     if not np.isfinite(arm.position[during][:, order]).all():
         raise UnusableCaseError(
             "joint states hold what is not a number while the plan was executed."
@@ -390,8 +392,9 @@ def _stretches(
     start_ns, end_ns = executed_ns
     times_s = np.arange(0.0, (end_ns - start_ns) * 1e-9, GRID_S)
     stamps = start_ns + np.rint(times_s * 1e9).astype(np.int64)
-    joints = arm.at(stamps)[:, [arm.names.index(name) for name in ARM_JOINTS]]
-    tool = load_robot(urdf).Ts_base_tcp(joints)[:, :3, 3]
+    robot = load_robot(urdf)
+    joints = arm.at(stamps)[:, [arm.names.index(name) for name in robot.joints]]
+    tool = robot.Ts_base_tcp(joints)[:, :3, 3]
     busy = np.zeros(len(times_s), dtype=bool)
     for key, item in before.items():
         start = item.T_base_object[:3, 3]

@@ -14,7 +14,6 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.geometry.signals import lag_between_steps
 from bridge.process_pool import default_size
-from bridge.robots.default import ARM_JOINTS
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.physics.cases import Case, read_cases
@@ -62,13 +61,14 @@ def delay_of(episode: Episode) -> float | None:
         if interval is None or any(item.joints_rad is None for item in plan.tau):
             continue
         track = streams.joint_track(episode)
-        if set(ARM_JOINTS) - set(track.names):
+        names = streams.recorded_robot(episode).joints
+        if set(names) - set(track.names):
             return None
         told = np.array([item.joints_rad for item in plan.tau], dtype=np.float64)
         end_s = min((interval[1] - interval[0]) * 1e-9, FIRST_S)
         times_s = np.arange(0.0, end_s, 0.008)
         stamps = interval[0] + np.rint(times_s * 1e9).astype(np.int64)
-        seen = track.at(stamps)[:, [track.names.index(name) for name in ARM_JOINTS]]
+        seen = track.at(stamps)[:, [track.names.index(name) for name in names]]
         return best_shift_s(plan.times_ns() * 1e-9, told, times_s, seen)
     return None
 

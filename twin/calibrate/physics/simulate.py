@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.process_pool import Failed, ProcessPool
-from bridge.robots.default import GRIPPER_LINKS
+from bridge.robots.robot import robot_of
 from bridge.task.predicate import Rollout, all_hold, evaluate_success
 from twin.calibrate.physics.cases import Case, Prediction, planar
 from twin.calibrate.physics.parameters import (
@@ -166,9 +166,9 @@ def _settle(
 @lru_cache(maxsize=4)
 def gripper_only(urdf: str) -> str:
     """Leave only the gripper's collision shapes in a description, and no pictures."""
-    root = parse_description(urdf)
+    root, gripper = parse_description(urdf), robot_of(urdf).gripper
     for link in root.findall("link"):
-        drop = ["visual"] if link.get("name") in GRIPPER_LINKS else ["visual", "collision"]
+        drop = ["visual"] if link.get("name") in gripper.links else ["visual", "collision"]
         for tag in drop:
             for element in link.findall(tag):
                 link.remove(element)

@@ -10,13 +10,14 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry.mesh import box_corners
-from bridge.robots.default import GRIPPER_LINKS
+from bridge.robots.robot import Gripper
 from bridge.task.task_file import ObjectModel
 from twin.replay._clearance import Bounds
 from twin.robot.collision import RobotHulls, convex_hull
 
 TABLE = "table"
 GRIPPER = "gripper"
+"""What task files call the links of any robot's gripper."""
 SCENE = "scene"
 """What stands still and has no name of its own."""
 
@@ -70,9 +71,9 @@ def half_space_solid(body: str) -> Solid:
     return Solid(body, shape, np.array([0.0, 0.0, -_FAR_M]), float("inf"), half)
 
 
-def group_of(body: str) -> str:
-    """The name stages allow contacts by."""
-    return GRIPPER if body in GRIPPER_LINKS else body
+def names_of(body: str, gripper: Gripper) -> tuple[str, ...]:
+    """The names stages allow contacts by: a body's own, and its group's."""
+    return (GRIPPER, gripper.name, body) if body in gripper.links else (body,)
 
 
 def placement_of(T: Float[np.ndarray, "4 4"]) -> coal.Transform3s:

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float, Int, Int32
 from scipy.spatial import ConvexHull, cKDTree
 
-from bridge.robots.default import GRIPPER_LINKS
 from twin.replay._clearance import nearest
 from twin.replay.clearance.distance_grid import GridLookup
 from twin.robot.collision import RobotHulls
@@ -182,9 +181,10 @@ def robot_bounding_spheres(hulls: RobotHulls, left_out: frozenset[str]) -> Bound
         hulls: The robot's convex pieces.
         left_out: Links without spheres.
     """
+    gripper = hulls.robot.record.gripper.links
     return BoundingSpheres(
         [
-            bounding_spheres_of(hull.points_m, FINE_M if hull.link in GRIPPER_LINKS else ARM_FINE_M)
+            bounding_spheres_of(hull.points_m, FINE_M if hull.link in gripper else ARM_FINE_M)
             for hull in hulls.hulls
             if hull.link not in left_out
         ]

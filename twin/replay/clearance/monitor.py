@@ -17,16 +17,17 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.robots.default import ARM_JOINTS, FINGER_LINKS
+from bridge.robots.robot import Gripper
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan, Stage
 from bridge.task.predicate import Contact
-from twin.replay.clearance.bodies import GRIPPER, group_of, placement_of, planes_of
+from twin.replay.clearance.bodies import GRIPPER, names_of, placement_of, planes_of
 from twin.replay.clearance.surroundings import Pair, Surroundings
 from twin.replay.config import ReplayConfig
 from twin.replay.failure import Failure
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, signed_distance
+from twin.robot.model import RobotModel
 
 # What may have happened between two states: how far anything moved, and the state half way.
 # A point that travels s between two instants is never farther than s / 2 from where it was at one
@@ -82,6 +83,10 @@ def half_way(a: State, b: State) -> State:
     )
 
 
+_WIDTHS = 33
+"""Openings at which a finger's law is asked how fast it moves."""
+
+
 class Reach:
     """How far a joint can move any point of each link, per radian."""
 
@@ -89,13 +94,13 @@ class Reach:
         """Add up the lengths of the links between each joint and each hull."""
         robot = hulls.robot
         model = robot.model
-        joint_ids = [int(model.getJointId(name)) for name in ARM_JOINTS]
+        joint_ids = [int(model.getJointId(name)) for name in robot.joints]
         self._per_rad = np.zeros((len(hulls.hulls), len(joint_ids)))
         self._fingers = np.zeros(len(hulls.hulls))
         for row, hull in enumerate(hulls.hulls):
-            frame = model.frames[model.getFrameId(hull.link)]
+            frame = model.frames[robot.frame_id(hull.link)]
             points = hull.points_m @ frame.placement.rotation.T + frame.placement.translation
-            reach = float(np.linalg.norm(points, axis=1).max())
+            reach = ends_m = float(np.linalg.norm(points, axis=1).max())
             joint = int(frame.parentJoint)
             while joint:
                 if joint in joint_ids:
@@ -104,7 +109,7 @@ class Reach:
                 reach += float(np.linalg.norm(model.jointPlacements[joint].translation))
                 reach += _slide_m(model, joint)
                 joint = int(model.parents[joint])
-            self._fingers[row] = 0.5 if hull.link in FINGER_LINKS else 0.0
+            self._fingers[row] = _per_width(robot, int(frame.parentJoint), reach=ends_m)
 
     def travel_m(self, a: State, b: State) -> Float[np.ndarray, " num_links"]:
         """How far any point of each link moved at most [m], when the joints moved straight.
@@ -115,6 +120,21 @@ class Reach:
         """
         turned = np.abs(b.joints_rad - a.joints_rad)
         return np.asarray(self._per_rad @ turned + self._fingers * abs(b.width_m - a.width_m))
+
+
+def _per_width(robot: RobotModel, joint: int, *, reach: float) -> float:
+    """How far a point of a finger moves at most per width, when its joint moves it."""
+    gripper, name = robot.record.gripper, str(robot.model.names[joint])
+    laws = {finger.joint: (finger, 1.0) for finger in gripper.fingers}
+    for item in robot.followers:
+        if item.leader in laws:
+            laws[item.joint] = (laws[item.leader][0], item.multiplier)
+    if name not in laws:
+        return 0.0
+    finger, ratio = laws[name]
+    widths = np.linspace(0.0, gripper.max_width_m, _WIDTHS).tolist()
+    slope = abs(ratio) * max(abs(finger.slope(width)) for width in widths)
+    return slope * (reach if finger.turns else 1.0)
 
 
 def object_travel_m(a: State, b: State, name: str, radius_m: float) -> float:
@@ -182,6 +202,7 @@ class ClearanceMonitor:
         self.config = config
         self.hulls = hulls
         self.stages = plan.stages
+        self._gripper = hulls.robot.record.gripper
         self.failures: list[Failure] = []
         self._scene = scene
         self._around = Surroundings(scene, hulls, config.eps_col_m)
@@ -246,7 +267,7 @@ class ClearanceMonitor:
             state.Ts_base_object,
             moved,
             near_m=self.config.eps_col_m + _LOOK_AHEAD_M,
-            counts=lambda body, other: not _may_touch(body, other, allowed),
+            counts=lambda body, other: not _may_touch(body, other, allowed, self._gripper),
         )
         distances |= self._around.measure_nodes(self._links, state.nodes_m, soft)
         return _Look(state, distances, cut, allowed)
@@ -283,7 +304,7 @@ class ClearanceMonitor:
             if max(objects_m.get(body, 0.0), objects_m.get(other, 0.0)) > MAX_LEAP_M:
                 continue
             limit = eps
-            if _may_touch(body, other, a.allowed) or _may_touch(body, other, b.allowed):
+            if any(_may_touch(body, other, look.allowed, self._gripper) for look in (a, b)):
                 # Objects push each other and the fingers; only what stands still can be run into.
                 if piece < 0 or other in objects_m:
                     continue
@@ -364,7 +385,7 @@ class ClearanceMonitor:
 
     def _judge(self, t_ns: int, body: str, other: str, distance: float, allowed: Allowed) -> float:
         """Note a pair that is too close; returns its distance if the pair may not touch."""
-        may_touch = _may_touch(body, other, allowed)
+        may_touch = _may_touch(body, other, allowed, self._gripper)
         if distance < self.config.eps_col_m:
             self._note(t_ns, (body, other), distance, may_touch)
         if may_touch:
@@ -443,5 +464,5 @@ def allowed_pairs(stages: tuple[Stage, ...], t_ns: int) -> Allowed:
 
 
 @lru_cache(maxsize=4096)
-def _may_touch(body: str, other: str, allowed: Allowed) -> bool:
-    return frozenset((group_of(body), other)) in allowed or frozenset((body, other)) in allowed
+def _may_touch(body: str, other: str, allowed: Allowed, gripper: Gripper) -> bool:
+    return any(frozenset((name, other)) in allowed for name in names_of(body, gripper))

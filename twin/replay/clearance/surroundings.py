@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
-from bridge.robots.default import GRIPPER_LINKS, MAX_WIDTH_M
 from twin.replay.clearance.bodies import (
     SCENE,
     TABLE,
@@ -271,7 +270,7 @@ def posture_clearance(
         config: Its ``eps_col_m`` is taken off.
     """
     around = Surroundings(scene, hulls, config.eps_col_m)
-    links = own_links(hulls)
+    links, gripper = own_links(hulls), hulls.robot.record.gripper
 
     def margin_m(
         joints_rad: Float[np.ndarray, "num_postures num_joints"],
@@ -279,16 +278,16 @@ def posture_clearance(
         return np.array([one(row) for row in joints_rad])
 
     def one(joints_rad: Float[np.ndarray, " num_joints"]) -> float:
-        hulls.place(joints_rad, MAX_WIDTH_M)
+        hulls.place(joints_rad, gripper.max_width_m)
         if links.touch():
             return hulls.self_distance().distance_m
         distances, _ = around.measure(
             {},
             [],
             near_m=config.eps_col_m,
-            counts=lambda body, other: body not in GRIPPER_LINKS,
+            counts=lambda body, other: body not in gripper.links,
         )
-        arm = [d for (body, *_), d in distances.items() if body not in GRIPPER_LINKS]
+        arm = [d for (body, *_), d in distances.items() if body not in gripper.links]
         return min(arm, default=np.inf) - config.eps_col_m
 
     return margin_m

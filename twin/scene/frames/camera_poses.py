@@ -18,7 +18,6 @@ from bridge.episode.cdr.messages import FrameTransform, transforms_from_cdr
 from bridge.episode.reader import Episode
 from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
-from bridge.robots.default import BASE_FRAME
 from bridge.terminal import Output
 from twin.scene.frames.odometry import CameraPath, TrackConfig, follow_camera
 from twin.scene.frames.pairing import UnusableCameraError, name_of, paired_stamps_ns
@@ -134,10 +133,10 @@ def base_tree(episode: Episode) -> TransformTree:
     transforms: list[FrameTransform] = []
     for message in episode.messages(episode.topics_of_type(schema.TF_MESSAGE)):
         transforms.extend(transforms_from_cdr(message.data))
-    return TransformTree(rooted_in_base(transforms))
+    return TransformTree(rooted_in_base(transforms, streams.recorded_robot(episode).base_frame))
 
 
-def rooted_in_base(transforms: Sequence[FrameTransform]) -> list[FrameTransform]:
+def rooted_in_base(transforms: Sequence[FrameTransform], base_frame: str) -> list[FrameTransform]:
     """Turn round what lies between the robot's base and the root above it.
 
     Drivers often hang the base on a frame ``world``. Joints, plans and objects are given in the
@@ -146,7 +145,7 @@ def rooted_in_base(transforms: Sequence[FrameTransform]) -> list[FrameTransform]
     """
     parents = {item.child: item.parent for item in transforms}
     above: list[str] = []
-    frame = BASE_FRAME
+    frame = base_frame
     while frame in parents and frame not in above:
         above.append(frame)
         frame = parents[frame]

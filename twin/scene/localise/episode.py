@@ -16,7 +16,6 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import LOCALISATION, cell_topic, object_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError
-from bridge.robots.default import BASE_FRAME
 from bridge.task.task_file import Task
 from twin.scene.frames.selection import rgbd_camera_ids
 from twin.scene.localise.mesh_fit import MeshSurface, ScannedSurfaces, scanned_surfaces
@@ -165,13 +164,14 @@ def write_localised(
     )
     if path.exists() and not force and _made_from(path, derived):
         return path
+    base_frame = streams.recorded_robot(episode).base_frame
     poses = calibrated_cameras(episode, calibration)
     phases = _localised_phases(episode, task, config, scanned, poses)
     path.unlink(missing_ok=True)
     with EpisodeWriter(path) as writer:
         writer.describe(episode.info, derived=derived)
         for phase, objects in phases:
-            _write_phase(writer, _cell_of(episode), phase, objects)
+            _write_phase(writer, _cell_of(episode), phase, objects, base_frame)
     return path
 
 
@@ -237,7 +237,11 @@ def _cell_of(episode: Episode) -> str:
 
 
 def _write_phase(
-    writer: EpisodeWriter, cell: str, phase: Phase, objects: dict[str, LocalisedObject]
+    writer: EpisodeWriter,
+    cell: str,
+    phase: Phase,
+    objects: dict[str, LocalisedObject],
+    base_frame: str,
 ) -> None:
     for object_id, found in objects.items():
         stamp_ns = found.stamp_ns or phase.after_ns or phase.before_ns or 0
@@ -251,7 +255,7 @@ def _write_phase(
         )
         if found.T_base_object is not None:
             sample = PoseSample(
-                stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=found.T_base_object
+                stamp_ns=stamp_ns, frame_id=base_frame, T_frame_body=found.T_base_object
             )
             writer.write(
                 object_topic(cell, object_id, "pose"),

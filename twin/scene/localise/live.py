@@ -39,7 +39,7 @@ from bridge.episode.topics import (
 )
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
-from bridge.robots.default import ARM_JOINTS
+from bridge.robots.robot import robot_of
 from bridge.task.record import parse_record
 from twin.errors import TwinError
 from twin.robot.posture import PostureTrack, check_joints
@@ -97,7 +97,7 @@ class LiveCell:
         arm = joint_track_of(self.joints)
         if arm is None:
             raise CameraNotReadyError("no joint states have arrived, and it is in the hand")
-        check_joints(arm, "the cell")
+        check_joints(arm, "the cell", robot_of(self.urdf))
         return PostureTrack(urdf=self.urdf, arm=arm, widths=None)
 
     def poses(
@@ -238,12 +238,15 @@ class LiveFrames:
 class LiveView:
     """Remembers images, transforms and the robot description of one cell; thread safe."""
 
-    def __init__(self, cell: str, calibration: Calibration | None = None) -> None:
+    def __init__(
+        self, cell: str, calibration: Calibration | None = None, urdf: str | None = None
+    ) -> None:
         """Listen for ``/<cell>/cam/...``, events, joint states, transforms and the URDF.
 
         Args:
             cell: Its name.
             calibration: Of the run. Cameras in it are where it says, and never where ``/tf`` does.
+            urdf: The robot description, whatever is published; None: what is published.
         """
         self._cell = cell
         self._calibration = calibration
@@ -254,7 +257,8 @@ class LiveView:
         self._cameras: dict[str, LiveCamera] = {}
         self._static: dict[str, FrameTransform] = {}
         self._moving: deque[FrameTransform] = deque(maxlen=KEPT_TRANSFORMS)
-        self._urdf: str | None = None
+        self._urdf = urdf
+        self._hears_urdf = urdf is None
         self._executing: str | None = None
         self._quiet_since_ns = 0
         self._newest_ns = 0
@@ -292,7 +296,7 @@ class LiveView:
                 if item.child in self._static or len(self._static) < MAX_FRAMES:
                     self._static[item.child] = item
         elif topic == ROBOT_DESCRIPTION:
-            self._urdf = string_from_cdr(data)
+            self._urdf = string_from_cdr(data) if self._hears_urdf else self._urdf
         elif topic == cell_topic(self._cell, EVENT):
             self._take_event(data)
         elif topic.startswith(cell_topic(self._cell, CAMERAS)):
@@ -304,14 +308,20 @@ class LiveView:
         self._newest_ns = max(self._newest_ns, sample.stamp_ns)
         # A gripper may publish beside the arm: it does not take the arm's place.
         known = self._heard_joints
-        arm = set(ARM_JOINTS)
-        if known is None or arm <= set(sample.names) or not arm <= set(known.names):
+        if known is None or self._is_of_arm(sample.names) or not self._is_of_arm(known.names):
             self._heard_joints = HeardJoints(
                 names=tuple(sample.names),
                 position_rad=np.array(sample.position, dtype=np.float64),
                 stamp_ns=sample.stamp_ns,
                 received_ns=received_ns,
             )
+
+    def _is_of_arm(self, names: Sequence[str]) -> bool:
+        """Whether joint states name the whole arm; before its description, as many as ever."""
+        if self._urdf is not None:
+            return set(robot_of(self._urdf).joints) <= set(names)
+        known = self._heard_joints
+        return known is None or len(names) >= len(known.names)
 
     def _take_event(self, data: bytes) -> None:
         event = parse_record(data, name="event", package="bridge.episode")
@@ -401,8 +411,9 @@ class LiveView:
             return LiveFrames(
                 frames=[], reasons=[f"no images on {cell_topic(self._cell, CAMERAS)}**"]
             )
+        base_frame = robot_of(urdf or "").base_frame
         cell = LiveCell(
-            tree=TransformTree(rooted_in_base(transforms)),
+            tree=TransformTree(rooted_in_base(transforms, base_frame)),
             mounts=self._places,
             joints=joints,
             urdf=urdf,
@@ -420,7 +431,7 @@ class LiveView:
                 )
             except GstError as error:
                 reasons.append(f"{camera_id}: {error}")
-        root = common_root([item.root for item in found.values()])
+        root = common_root([item.root for item in found.values()], base_frame)
         reasons += [
             f"{camera_id}: its poses are in frame {item.root!r}, not in {root!r}"
             for camera_id, item in found.items()

@@ -11,7 +11,6 @@ from bridge.episode.reader import Episode
 from bridge.episode.streams import RgbdFrame
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError
-from bridge.robots.default import BASE_FRAME
 from twin.scene.frames.camera_poses import (
     CameraPoses,
     base_tree,
@@ -76,7 +75,8 @@ def stationary_frames(
             failed.append(error)
     if failed and not usable:
         raise failed[0]
-    root = common_root([item.root for item in usable.values()])
+    base_frame = streams.recorded_robot(episode).base_frame
+    root = common_root([item.root for item in usable.values()], base_frame)
     frames: list[RgbdFrame] = []
     for camera_id, item in usable.items():
         if item.root != root:
@@ -132,9 +132,9 @@ def _between(
     return [int(stamp) for stamp in stamps_ns[wanted]]
 
 
-def common_root(roots: Sequence[str]) -> str | None:
+def common_root(roots: Sequence[str], base_frame: str) -> str | None:
     """The frame in which objects are looked for: the robot's base where a camera is posed in it."""
-    return BASE_FRAME if BASE_FRAME in roots else next(iter(roots), None)
+    return base_frame if base_frame in roots else next(iter(roots), None)
 
 
 def with_true_depth(frame: RgbdFrame, poses: CameraPoses) -> RgbdFrame:

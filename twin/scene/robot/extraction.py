@@ -14,11 +14,10 @@ from scipy.ndimage import binary_dilation
 
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.streams import RgbdFrame
+from bridge.episode.streams import RgbdFrame, recorded_robot
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.robots.default import BASE_FRAME
 from bridge.terminal import Output
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import PostureTrack, distinct_postures, posture_track
@@ -257,7 +256,7 @@ def find_robot(choices: Sequence[FrameChoice], output: Output) -> FoundRobot:
     """
     root = root_frame(choices[0])
     episodes = list({choice.episode.path: choice.episode for choice in choices}.values())
-    if root == BASE_FRAME:
+    if root in {recorded_robot(episode).base_frame for episode in episodes}:
         frames = RobotFrames(episodes)
         return FoundRobot(frames=frames, remark=frames.remark)
     try:

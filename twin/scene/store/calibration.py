@@ -20,7 +20,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
 from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
-from bridge.robots.default import BASE_FRAME
+from bridge.robots.robot import robot_of
 from bridge.whole_file import write_whole
 from twin.errors import UnreadableFileError
 from twin.robot.model import load_robot
@@ -28,6 +28,8 @@ from twin.robot.posture import PostureTrack, posture_track
 
 CALIBRATION_FILE = "calibration.json"
 CALIBRATION_VERSION = 1
+_OLD_BASE = "base_link"
+"""Link of fixed cameras in files that do not say how a camera is mounted."""
 UNNAMED = ("calibration_id", "software", "physics_history")
 """What does not change what a calibration does, and so not its name."""
 
@@ -49,11 +51,8 @@ class MountedCamera:
     T_link_camera: Float[np.ndarray, "4 4"]
     depth_scale: float = 1.0
     """True depth divided by measured depth, where that was identified."""
-
-    @property
-    def fixed(self) -> bool:
-        """Whether the camera stands still."""
-        return self.link == BASE_FRAME
+    fixed: bool = False
+    """Whether the camera stands still."""
 
     def to_record(self) -> dict[str, Any]:
         """Plain numbers: all that poses made with it depend on."""
@@ -105,6 +104,7 @@ def _mount(record: Mapping[str, Any]) -> MountedCamera:
         stream=str(record["stream"]),
         T_link_camera=se3.pose_from_record(record["T_link_camera"]),
         depth_scale=float(record.get("depth_scale", 1.0)),
+        fixed=record.get("mount", "fixed" if record["link"] == _OLD_BASE else "hand") == "fixed",
     )
 
 
@@ -223,12 +223,13 @@ def mounted_tree(
         at = int(stamps_ns[0]) if len(stamps_ns) else 0
         T_color_depth = se3.invert(tree.T_root_frame(color, at)) @ tree.T_root_frame(depth, at)
     T_camera_color = np.eye(4) if mount.stream == "color" else se3.invert(T_color_depth)
+    base = mount.link if track is None else robot_of(track.urdf).base_frame
     edges = []
     for stamp, T_base_link in zip(stamps_ns, _links(mount, stamps_ns, track), strict=True):
         T_base_color = T_base_link @ mount.T_link_camera @ T_camera_color
-        edges.append(_edge(color, T_base_color, int(stamp)))
+        edges.append(_edge(base, color, T_base_color, int(stamp)))
         if color != depth:
-            edges.append(_edge(depth, T_base_color @ T_color_depth, int(stamp)))
+            edges.append(_edge(base, depth, T_base_color @ T_color_depth, int(stamp)))
     return TransformTree(edges)
 
 
@@ -276,5 +277,5 @@ def unknown_postures(
     )
 
 
-def _edge(child: str, T: np.ndarray, stamp_ns: int) -> FrameTransform:
-    return FrameTransform(stamp_ns=stamp_ns, parent=BASE_FRAME, child=child, T_parent_child=T)
+def _edge(parent: str, child: str, T: np.ndarray, stamp_ns: int) -> FrameTransform:
+    return FrameTransform(stamp_ns=stamp_ns, parent=parent, child=child, T_parent_child=T)

@@ -20,7 +20,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import JointTrack
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
-from bridge.robots.default import ARM_JOINTS
+from bridge.robots.default import ARM_JOINTS, ROBOT
 from bridge.task.plan import Plan, Waypoint
 from bridge.task.task_file import Task
 from twin.calibrate.physics import cases as cases_module
@@ -320,9 +320,9 @@ def test_joints_that_are_no_numbers_teach_nothing() -> None:
     position = np.zeros((len(stamps), 6))
     position[3] = np.nan
     arm = JointTrack(names=ARM_JOINTS, stamps_ns=stamps, position=position)
-    cases_module._check_joints(arm, int(stamps[10]), int(stamps[-1]))
+    cases_module._check_joints(arm, int(stamps[10]), int(stamps[-1]), ROBOT)
     with pytest.raises(UnusableCaseError, match="not a number while the plan was executed"):
-        cases_module._check_joints(arm, 0, int(stamps[-1]))
+        cases_module._check_joints(arm, 0, int(stamps[-1]), ROBOT)
 
 
 def test_widths_that_are_no_numbers_teach_nothing(

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bridge.robots.default import ROBOT
 from bridge.task.predicate import evaluate_success
 from bridge.task.task_file import SoftMaterial
 from twin.replay.config import ReplayConfig
@@ -32,7 +33,7 @@ def recorded(
         end["cube"] = scene.Ts_base_object["cube"]
     return Recording(
         plan=plan,
-        path=path_of_execution(track, widths, plan, CONFIG),
+        path=path_of_execution(track, widths, plan, CONFIG, ROBOT),
         scene=scene,
         end=StartState(Ts_base_object=end),
         end_seen_ns=int(good.stamps_ns[-1]) + 300_000_000,
@@ -111,7 +112,7 @@ def test_a_touch_that_no_stage_allows_is_inferred_from_the_joints(
     low = replay_plan(plan, scene, CONFIG)
     low = replace(low, width_m=np.where(low.width_m < 0.06, 0.04, low.width_m))
     track, widths = script.recorded_tracks(low)
-    path = path_of_execution(track, widths, strict, CONFIG)
+    path = path_of_execution(track, widths, strict, CONFIG, ROBOT)
     dragged = replace(recorded(script, good, plan=strict), path=path)
     findings = recorded_findings(dragged, CONFIG)
     (contacts,) = [item for item in findings if item["kind"] == "allowed_contacts"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bridge.episode.streams import JointTrack
-from bridge.robots.default import ARM_JOINTS
+from bridge.robots.default import ARM_JOINTS, ROBOT
 from twin.replay.config import ReplayConfig
 from twin.replay.execution import (
     check_covers,
@@ -44,7 +44,7 @@ def test_the_command_presses_only_while_something_is_held(script: SimpleNamespac
     times, width = recorded_grasp(0.2)
     track = JointTrack(names=ARM_JOINTS, stamps_ns=times, position=np.zeros((len(times), 6)))
     widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
-    path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig())
+    path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig(), ROBOT)
     at = {t: float(path.width_at(np.array([round(t * 1e9)]))[0]) for t in (0.5, 3.0, 5.2)}
     assert at[0.5] == pytest.approx(OPEN_M, abs=1e-3)
     assert at[3.0] == pytest.approx(HELD_M - 0.01, abs=1e-3)
@@ -59,7 +59,7 @@ def test_stamps_count_from_the_first_one_and_repeats_are_dropped(script: SimpleN
     width = np.append(width, width[-1])
     track = JointTrack(names=ARM_JOINTS, stamps_ns=stamps, position=np.zeros((len(stamps), 6)))
     widths = JointTrack(names=("gripper_width",), stamps_ns=stamps, position=width[:, None])
-    path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig())
+    path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig(), ROBOT)
     assert path.times_ns[0] == 0
     assert np.all(np.diff(path.times_ns) > 0)
     assert path.end_ns() == times[-1]
@@ -70,7 +70,7 @@ def test_a_kinematic_path_keeps_the_recorded_width(script: SimpleNamespace) -> N
     track = JointTrack(names=ARM_JOINTS, stamps_ns=times, position=np.zeros((len(times), 6)))
     widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
     config = ReplayConfig(mode="kinematic")
-    path = path_of_execution(track, widths, script.plan(script.scene()), config)
+    path = path_of_execution(track, widths, script.plan(script.scene()), config, ROBOT)
     assert np.array_equal(path.width_m, width)
 
 
@@ -98,7 +98,7 @@ def test_joints_that_were_not_recorded_are_not_made_up(script: SimpleNamespace) 
         names=ARM_JOINTS, stamps_ns=times[there], position=np.zeros((int(there.sum()), 6))
     )
     with pytest.raises(UnusablePlanError, match=r"for 1\.0 s from 2\.0 s on"):
-        path_of_execution(track, widths, plan, ReplayConfig())
+        path_of_execution(track, widths, plan, ReplayConfig(), ROBOT)
 
 
 def test_a_recording_that_stops_early_or_starts_late_is_refused(script: SimpleNamespace) -> None:
@@ -111,7 +111,7 @@ def test_a_recording_that_stops_early_or_starts_late_is_refused(script: SimpleNa
         check_covers(cut, "joints", 5_000_000_000, plan)
     late = cut_track(track, 1_000_000_000, 3_000_000_000)
     with pytest.raises(UnusablePlanError, match=r"for 1\.0 s from 0\.0 s on"):
-        path_of_execution(late, late, plan, ReplayConfig())
+        path_of_execution(late, late, plan, ReplayConfig(), ROBOT)
 
 
 def still_arm(times: np.ndarray) -> JointTrack:
@@ -134,7 +134,7 @@ def test_widths_that_are_no_distances_in_metres_are_refused(
     with pytest.raises(
         UnusablePlanError, match=r"gripper widths from -?\d.* in metres, 0 to 0\.085"
     ):
-        path_of_execution(still_arm(times), widths, plan, ReplayConfig())
+        path_of_execution(still_arm(times), widths, plan, ReplayConfig(), ROBOT)
 
 
 def test_of_several_joints_of_a_gripper_the_one_with_the_name_counts(
@@ -146,7 +146,9 @@ def test_of_several_joints_of_a_gripper_the_one_with_the_name_counts(
 
     def path(*names: str) -> JointPath:
         widths = JointTrack(names=names, stamps_ns=times, position=both)
-        return path_of_execution(still_arm(times), widths, plan, ReplayConfig(mode="kinematic"))
+        return path_of_execution(
+            still_arm(times), widths, plan, ReplayConfig(mode="kinematic"), ROBOT
+        )
 
     assert np.array_equal(path("current", "gripper_width").width_m, width)
     with pytest.raises(UnusablePlanError, match=r"several joints of the gripper: left, right"):
@@ -161,7 +163,7 @@ def test_a_joint_that_is_not_the_arms_may_say_nothing(script: SimpleNamespace) -
     position[:, 0] = np.nan
     track = JointTrack(names=names, stamps_ns=times, position=position)
     widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
-    path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig())
+    path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig(), ROBOT)
     assert path.joints_rad[0] == pytest.approx([0.6, 0.5, 0.4, 0.3, 0.2, 0.1])
 
 
@@ -173,7 +175,7 @@ def test_widths_that_were_not_recorded_are_not_made_up(script: SimpleNamespace) 
         names=("gripper_width",), stamps_ns=times[there], position=width[there, None]
     )
     with pytest.raises(UnusablePlanError, match=r"no gripper widths were recorded for 3\.0 s from"):
-        path_of_execution(still_arm(times), widths, plan, ReplayConfig())
+        path_of_execution(still_arm(times), widths, plan, ReplayConfig(), ROBOT)
     with pytest.raises(UnusablePlanError, match=r"no gripper widths were recorded for 2\.0 s at"):
         check_covers(widths, "gripper widths", int(times[-1]) + 2_000_000_000, plan)
 

@@ -74,7 +74,7 @@ def test_a_missing_mesh_is_named(script: SimpleNamespace) -> None:
 
 def test_a_mimicking_finger_moves_with_the_one_it_mimics() -> None:
     urdf = ROBOT.urdf_text().replace("gripper_right_finger_joint", "other_finger_joint")
-    plain = RobotModel(urdf)
+    plain = load_robot(ROBOT.urdf_text())
     mimic = '<mimic joint="gripper_left_finger_joint" multiplier="0.5" offset="0.001"/>'
     following = RobotModel(
         re.sub(r'(<joint name="other_finger_joint".*?)(</joint>)', rf"\g<1>{mimic}\g<2>", urdf)
@@ -104,11 +104,22 @@ def test_a_joint_that_mimics_nothing_is_refused_by_name(mimic: str, found: str) 
         RobotModel(urdf)
 
 
-def test_an_endless_joint_is_refused_by_name() -> None:
+def test_an_endless_joint_gets_two_turns_to_both_sides() -> None:
     urdf = re.sub(
         r'(<joint name="wrist_3_joint" type=")revolute', r"\g<1>continuous", ROBOT.urdf_text()
     )
-    with pytest.raises(RobotDescriptionError, match=r"wrist_3_joint.*without end"):
+    robot = RobotModel(urdf)
+    assert (robot.lower_rad[5], robot.upper_rad[5]) == (-4 * np.pi / 2, 4 * np.pi / 2)
+    plain = load_robot(ROBOT.urdf_text())
+    np.testing.assert_array_equal(robot.T_base_tcp(HOME), plain.T_base_tcp(HOME))
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar", "screw"])
+def test_joints_that_no_serial_arm_has_are_refused_by_name(kind: str) -> None:
+    urdf = re.sub(
+        r'(<joint name="wrist_3_joint" type=")revolute', rf"\g<1>{kind}", ROBOT.urdf_text()
+    )
+    with pytest.raises(RobotDescriptionError, match=rf"'wrist_3_joint' of the type '{kind}'"):
         RobotModel(urdf)
 
 
@@ -158,11 +169,24 @@ def test_limits_between_which_nothing_lies_are_refused_by_name(which: str, value
 
 
 @pytest.mark.parametrize("origin", ['xyz="0 0 0.8" rpy="0 0 0"', 'xyz="0 0 0" rpy="0 0 3.14159"'])
-def test_a_base_that_is_not_the_root_is_refused_with_where_it_is(origin: str) -> None:
-    """On a pedestal, say: plans are given in the base, kinematics would be those of the floor."""
+def test_poses_count_from_the_base_wherever_the_root_is(origin: str) -> None:
+    """On a pedestal, say: plans are given in the base, and kinematics and hulls must be too."""
     urdf = changed("world_joint", r"<origin[^>]*/>", f"<origin {origin}/>")
-    with pytest.raises(RobotDescriptionError, match=r"'base_link' elsewhere than its root 'world'"):
-        RobotModel(urdf)
+    robot, plain = RobotModel(urdf), load_robot(ROBOT.urdf_text())
+    np.testing.assert_allclose(robot.T_base_tcp(HOME), plain.T_base_tcp(HOME), atol=1e-9)
+    hulls, others = RobotHulls(robot), RobotHulls(plain)
+    for each in (hulls, others):
+        each.place(HOME, 0.03)
+    np.testing.assert_allclose(hulls.rotations, others.rotations, atol=1e-9)
+    np.testing.assert_allclose(hulls.translations, others.translations, atol=1e-9)
+    for one, other in zip(hulls.hulls, others.hulls, strict=True):
+        np.testing.assert_allclose(one.points_m, other.points_m, atol=1e-9)
+
+
+def test_a_base_that_a_joint_moves_is_refused_with_the_joint() -> None:
+    robot = replace(ROBOT, name="mine", base_frame="forearm_link")
+    with pytest.raises(RobotDescriptionError, match=r"'forearm_link' by 'elbow_joint'"):
+        RobotModel(robot.description())
 
 
 @pytest.mark.parametrize("leader", ["world_joint", "endless"])

@@ -12,6 +12,7 @@ from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
+from bridge.robots.default import ROBOT
 from bridge.task.task_file import load_task
 from twin.replay.config import ReplayConfig
 from twin.replay.execution import path_of_execution
@@ -36,7 +37,7 @@ def test_numbers_that_are_none_in_a_log_are_named_with_their_time(
     tracks[which] = replace(tracks[which], position=position)
     plan = script.plan(script.scene())
     with pytest.raises(UnusablePlanError, match=rf"{word} that are no numbers at 1\.00 s"):
-        path_of_execution(*tracks, plan, ReplayConfig())
+        path_of_execution(*tracks, plan, ReplayConfig(), ROBOT)
 
 
 def episode_with(path: Path, stamps_s: list[float]) -> Episode:

@@ -38,7 +38,7 @@ def recorded(path: Path, names: Sequence[str], rows: Sequence[Sequence[float]]) 
 def test_joints_are_read_at_the_plans_time_in_the_arms_order(tmp_path: Path) -> None:
     names = [*reversed(ARM_JOINTS), "finger"]
     episode = recorded(tmp_path, names, [[6, 5, 4, 3, 2, 1, 9.0], [8, 7, 6, 5, 4, 3, 9.0]])
-    found = recorded_start(episode, 10 * S + S // 2)
+    found = recorded_start(episode, 10 * S + S // 2, ARM_JOINTS)
     assert found is not None
     assert found == pytest.approx([2.0, 3.0, 4.0, 5.0, 6.0, 7.0])
 
@@ -48,13 +48,13 @@ def test_a_start_that_nobody_recorded_is_not_known(tmp_path: Path) -> None:
     (tmp_path / "b").mkdir()
     (tmp_path / "c").mkdir()
     arm = recorded(tmp_path / "a", ARM_JOINTS, [[0.0] * 6, [0.0] * 6])
-    assert recorded_start(arm, 12 * S) is not None
-    assert recorded_start(arm, 12 * S + 1) is None
-    assert recorded_start(arm, 9 * S - 1) is None
+    assert recorded_start(arm, 12 * S, ARM_JOINTS) is not None
+    assert recorded_start(arm, 12 * S + 1, ARM_JOINTS) is None
+    assert recorded_start(arm, 9 * S - 1, ARM_JOINTS) is None
     other = recorded(tmp_path / "b", [f"panda_joint{k}" for k in range(6)], [[0.0] * 6])
-    assert recorded_start(other, 10 * S) is None
+    assert recorded_start(other, 10 * S, ARM_JOINTS) is None
     broken = recorded(tmp_path / "c", ARM_JOINTS, [[np.nan] * 6])
-    assert recorded_start(broken, 10 * S) is None
+    assert recorded_start(broken, 10 * S, ARM_JOINTS) is None
     with EpisodeWriter(tmp_path / "none.mcap") as writer:
         writer.describe(EpisodeInfo(id="none", kind="trial"))
-    assert recorded_start(Episode.open(tmp_path / "none.mcap"), 10 * S) is None
+    assert recorded_start(Episode.open(tmp_path / "none.mcap"), 10 * S, ARM_JOINTS) is None

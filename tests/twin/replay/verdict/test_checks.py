@@ -238,7 +238,8 @@ def test_a_robot_that_would_stop_by_itself_is_not_told_to_go_on() -> None:
         finger_contact={},
         arm_force_N=np.array([149.0, 151.0]),
     )
-    tracking, force = simulated_limit_failures(path, states)
+    robot = load_robot(ROBOT.urdf_text())
+    tracking, force = simulated_limit_failures(path, states, robot)
     assert (tracking.cause, tracking.bodies, tracking.t_ns) == (
         "tracking_error",
         ("elbow_joint",),
@@ -246,7 +247,8 @@ def test_a_robot_that_would_stop_by_itself_is_not_told_to_go_on() -> None:
     )
     assert force.cause == "contact_force"
     assert "151 N, the limit is 150 N" in force.detail
-    assert simulated_limit_failures(path, replace(states, joints_rad=path.joints_rad))[0] == force
+    at_command = replace(states, joints_rad=path.joints_rad)
+    assert simulated_limit_failures(path, at_command, robot)[0] == force
 
 
 def test_early_refusal_and_whole_replay_agree_on_plans_that_physics_need_not_see(

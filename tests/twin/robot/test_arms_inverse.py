@@ -1,0 +1,137 @@
+"""Inverse kinematics of arms without a closed form finds what a dense random search finds."""
+
+import numpy as np
+import pytest
+
+from bridge.geometry import se3
+from bridge.robots.robot import read_robot
+from twin.robot.config import IkConfig
+from twin.robot.follow import follow_poses
+from twin.robot.inverse import UrInverse, pose_error, solutions, solve_ik
+from twin.robot.model import RobotModel, load_robot
+
+ITERATED = ("panda", "kinova_j2s6s200", "xarm7_parallel_gripper", "z1")
+CLOSED = ("ur3_parallel_gripper", "ur10_parallel_gripper", "ur10e_parallel_gripper")
+STRAIGHT = {"ur5_parallel_gripper": (2, 0.0), "kinova_j2s6s200": (2, np.pi), "panda": (3, -0.0698)}
+"""The joint that stretches an arm, and where it does."""
+
+
+def model(name: str) -> RobotModel:
+    return load_robot(read_robot(name).description())
+
+
+def postures(robot: RobotModel, count: int, seed: int) -> np.ndarray:
+    """Anywhere within the limits, every fourth with a joint at one of its ends."""
+    rng = np.random.default_rng(seed)
+    rows = rng.uniform(robot.lower_rad, robot.upper_rad, (count, len(robot.joints)))
+    for row in rows[::4]:
+        joint = rng.integers(len(row))
+        row[joint] = rng.choice([robot.lower_rad[joint], robot.upper_rad[joint]])
+    return rows
+
+
+def check_reached(robot: RobotModel, rows: np.ndarray) -> None:
+    config = IkConfig()
+    for row in rows:
+        T = robot.T_base_tcp(row)
+        found = solve_ik(robot, T, config)
+        assert found.reached, row.tolist()
+        position_m, rotation_rad = pose_error(robot, found.joints_rad, T)
+        assert position_m <= config.position_tolerance_m
+        assert rotation_rad <= config.rotation_tolerance_rad
+        assert np.all(found.joints_rad >= robot.lower_rad)
+        assert np.all(found.joints_rad <= robot.upper_rad)
+
+
+@pytest.mark.parametrize("name", ITERATED)
+def test_every_pose_that_some_posture_reaches_is_reached(name: str) -> None:
+    robot = model(name)
+    assert UrInverse.for_robot(robot) is None
+    check_reached(robot, postures(robot, 200, seed=2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*ITERATED, *CLOSED])
+def test_thousands_of_poses_are_reached(name: str) -> None:
+    robot = model(name)
+    assert (UrInverse.for_robot(robot) is not None) == (name in CLOSED)
+    check_reached(robot, postures(robot, 2000, seed=3))
+
+
+@pytest.mark.parametrize("name", STRAIGHT)
+def test_stretched_arms_are_reached(name: str) -> None:
+    """Here the Jacobian loses a direction, and of 500 poses three were called unreachable."""
+    robot, (joint, value) = model(name), STRAIGHT[name]
+    rows = postures(robot, 60, seed=5)
+    rows[:, joint] = value
+    check_reached(robot, rows)
+
+
+def test_a_pose_out_of_reach_of_seven_joints_is_not_reached() -> None:
+    robot = model("panda")
+    T = robot.T_base_tcp(robot.home_rad)
+    T[:3, 3] = (1.5, 0.0, 0.3)
+    found = solve_ik(robot, T, IkConfig(restarts=2))
+    assert not found.reached
+    assert found.position_error_m > 0.4
+    T[:3, :3] = np.nan
+    assert not solve_ik(robot, T, IkConfig(restarts=2)).reached
+
+
+@pytest.mark.parametrize("name", ["panda", "xarm7_parallel_gripper"])
+def test_the_seventh_joint_goes_towards_home_and_then_moves_least(name: str) -> None:
+    robot = model(name)
+    q, p = se3.split(robot.T_base_tcp(robot.home_rad))
+    shares = np.linspace(0.0, 1.0, 60)[:, None]
+    Ts = se3.transform_from(np.tile(q, (60, 1)), p + shares * np.array([0.05, 0.15, -0.1]))
+    followed = follow_poses(robot, Ts, start_rad=None, config=IkConfig())
+    assert followed.reached.all()
+    np.testing.assert_allclose(followed.joints_rad[0], robot.home_rad, atol=1e-6)
+    assert np.abs(np.diff(followed.joints_rad, axis=0)).max() < 0.02
+    again = follow_poses(robot, Ts, start_rad=None, config=IkConfig())
+    assert np.array_equal(again.joints_rad, followed.joints_rad)
+    # What the pose leaves open: found from elsewhere, it comes to the same side of the arm.
+    rng = np.random.default_rng(0)
+    far = solve_ik(robot, Ts[0], IkConfig()).joints_rad
+    assert np.abs(far - robot.home_rad).max() < 1e-6
+    other = rng.uniform(robot.lower_rad, robot.upper_rad)
+    free = solve_ik(robot, robot.T_base_tcp(other), IkConfig()).joints_rad
+    assert np.linalg.norm(free - robot.home_rad) <= np.linalg.norm(other - robot.home_rad) + 1e-6
+
+
+def test_a_warm_start_keeps_seven_joints_near_it() -> None:
+    robot, rng = model("panda"), np.random.default_rng(4)
+    low, high = robot.lower_rad + 0.3, robot.upper_rad - 0.3
+    for row in rng.uniform(low, high, (20, 7)):
+        T = robot.T_base_tcp(row + rng.normal(0.0, 0.01, 7))
+        found = solve_ik(robot, T, IkConfig(), warm_start_rad=row)
+        assert found.reached
+        assert np.abs(found.joints_rad - row).max() < 0.3
+
+
+@pytest.mark.parametrize("name", ["panda", "kinova_j2s6s200"])
+def test_a_path_is_followed_from_another_posture_where_the_first_one_ends_or_touches(
+    name: str,
+) -> None:
+    """Somebody stands where the arm would be that begins nearest to home."""
+    robot, config = model(name), IkConfig()
+    q, p = se3.split(robot.T_base_tcp(robot.home_rad))
+    shares = np.linspace(0.0, 1.0, 20)[:, None]
+    Ts = se3.transform_from(np.tile(q, (20, 1)), p + shares * np.array([0.02, 0.05, -0.03]))
+    found = [item.joints_rad for item in solutions(robot, Ts[0], config)]
+    assert len(found) > 2
+    for row in found:
+        np.testing.assert_allclose(robot.T_base_tcp(row), Ts[0], atol=1e-6)
+    plain = follow_poses(robot, Ts, start_rad=None, config=config)
+    np.testing.assert_allclose(plain.joints_rad[0], found[0], atol=1e-6)
+    asked = []
+
+    def clearance(rows: np.ndarray) -> np.ndarray:
+        asked.append(len(rows))
+        return np.abs(rows - plain.joints_rad[0]).max(axis=1) - 0.4
+
+    other = follow_poses(robot, Ts, start_rad=None, config=config, clearance=clearance)
+    assert other.reached.all()
+    assert len(asked) > 1
+    assert np.abs(other.joints_rad - plain.joints_rad[0]).max(axis=1).min() > 0.4
+    np.testing.assert_allclose(robot.Ts_base_tcp(other.joints_rad), Ts, atol=1e-6)

@@ -1,0 +1,143 @@
+"""Look at a robot file before anything is recorded with it: what it says, and what is missing."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bridge.errors import GstError, UsageError
+from bridge.robots.robot import Gripper, read_robot
+from twin.robot.collision import RobotHulls
+from twin.robot.config import IkConfig
+from twin.robot.inverse import UrInverse, solve_ik
+from twin.robot.model import RobotModel, check_dynamics
+
+_POSES, _SEED = 20, 0
+
+
+def check_robot(name: str, *, urdf_out: Path | None = None) -> dict[str, Any]:
+    """Read a robot file, build all that replays need of it, and say what was found.
+
+    Args:
+        name: Name in ``datasets/robots``, or path of a robot file.
+        urdf_out: Where the description goes that carries the record; None: nowhere.
+
+    Raises:
+        UsageError: The file or its URDF cannot be used; names the joint, frame or mesh.
+    """
+    record = read_robot(name)
+    try:
+        text = record.description()
+        robot = RobotModel(text)
+        hulls = RobotHulls(robot)
+        check_dynamics(robot)
+    except GstError as error:
+        raise UsageError(f"{record.name}: {error}") from error
+    if urdf_out is not None:
+        urdf_out.parent.mkdir(parents=True, exist_ok=True)
+        urdf_out.write_text(text)
+    gripper = record.gripper
+    return {
+        "name": record.name,
+        "base_frame": record.base_frame,
+        "tool_frame": record.tool_frame,
+        "home_tool_m": robot.T_base_tcp(robot.home_rad)[:3, 3].round(4).tolist(),
+        "joints": [
+            {
+                "name": joint,
+                "lower_rad": float(robot.lower_rad[index]),
+                "upper_rad": float(robot.upper_rad[index]),
+                "velocity_rad_s": float(robot.velocity_limit_rad_s[index]),
+                "acceleration_rad_s2": None
+                if record.acceleration_rad_s2 is None
+                else record.acceleration_rad_s2[index],
+                "effort_Nm": float(robot.model.effortLimit[robot.effort_id(joint)]),
+                "home_rad": float(robot.home_rad[index]),
+            }
+            for index, joint in enumerate(robot.joints)
+        ],
+        "gripper": _widths(gripper),
+        "mass_kg": float(sum(inertia.mass for inertia in robot.model.inertias)),
+        "payload_kg": record.payload_kg,
+        "hulls": len(hulls.hulls),
+        "inverse": "closed form" if UrInverse.for_robot(robot) is not None else "iteration",
+        "reached": f"{_reached(robot)} of {_POSES} random poses",
+        "limits": _limits_of_use(robot, hulls),
+    }
+
+
+def _widths(gripper: Gripper) -> dict[str, Any] | None:
+    """Each finger joint's value when closed, half open and open."""
+    if not gripper.fingers:
+        return None
+    ends = (0.0, gripper.max_width_m / 2, gripper.max_width_m)
+    return {
+        "max_width_m": gripper.max_width_m,
+        "fingers": {
+            finger.joint: {f"{width:g}": float(finger.value(width)) for width in ends}
+            for finger in gripper.fingers
+        },
+    }
+
+
+def _reached(robot: RobotModel) -> int:
+    """Of random poses that some posture reaches, those that the solver finds one for."""
+    rng = np.random.default_rng(_SEED)
+    postures = rng.uniform(robot.lower_rad, robot.upper_rad, (_POSES, len(robot.joints)))
+    return sum(solve_ik(robot, robot.T_base_tcp(row), IkConfig()).reached for row in postures)
+
+
+def _limits_of_use(robot: RobotModel, hulls: RobotHulls) -> list[str]:
+    """What cannot be done with this robot, or is not known of it."""
+    record, found = robot.record, []
+    lost = [name for name in record.finger_joints if not robot.model.existJointName(name)]
+    if lost:
+        found.append(f"the URDF lacks the finger joints {', '.join(lost)}: no dynamic replay")
+    if not record.gripper.fingers:
+        found.append("a fixed tool: plans that grasp are refused")
+    bare = [link for link in record.gripper.finger_links if link not in _linked(hulls)]
+    if bare:
+        found.append(f"{', '.join(bare)} have no collision shapes: they touch nothing")
+    if record.acceleration_rad_s2 is None:
+        found.append("acceleration limits are not known")
+    if record.payload_kg is None:
+        found.append("the payload is not known")
+    hulls.place(robot.home_rad, record.gripper.max_width_m)
+    if hulls.self_distance().distance_m <= 0:
+        found.append(f"links touch at home: {' and '.join(hulls.self_distance().links)}")
+    return found
+
+
+def _linked(hulls: RobotHulls) -> set[str]:
+    return {hull.link for hull in hulls.hulls}
+
+
+def describe_robot(found: dict[str, Any]) -> str:
+    """What a person should look at."""
+    lines = [
+        f"{found['name']}: {len(found['joints'])} joints, {found['mass_kg']:.1f} kg, "
+        f"payload {_or_unknown(found['payload_kg'], 'kg')}",
+        f"base {found['base_frame']}, tool {found['tool_frame']}, at home at "
+        f"({', '.join(f'{value:.3f}' for value in found['home_tool_m'])}) m",
+    ]
+    lines += [
+        f"  {joint['name']}: {joint['lower_rad']:.3f} to {joint['upper_rad']:.3f} rad, "
+        f"{joint['velocity_rad_s']:.2f} rad/s, "
+        f"{_or_unknown(joint['acceleration_rad_s2'], 'rad/s2')}, {joint['effort_Nm']:.0f} Nm, "
+        f"home {joint['home_rad']:.3f}"
+        for joint in found["joints"]
+    ]
+    if found["gripper"] is not None:
+        for joint, values in found["gripper"]["fingers"].items():
+            told = ", ".join(f"{width} m at {value:.4f}" for width, value in values.items())
+            lines.append(f"  gripper {joint}: {told}")
+    lines.append(
+        f"{found['hulls']} collision hulls; inverse kinematics by {found['inverse']}, "
+        f"{found['reached']} reached"
+    )
+    lines += [f"note: {text}" for text in found["limits"]]
+    return "\n".join(lines)
+
+
+def _or_unknown(value: float | None, unit: str) -> str:
+    return "unknown" if value is None else f"{value:g} {unit}"
