@@ -253,6 +253,8 @@ def _table(lines: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
             "Always yes is right as often as trials succeed: the base rate. Geometric rule: each "
             "grasp encloses its object, which then moves with the hand, drops straight down where "
             "it is released and is where the task wants it; no physics, and no number that was "
-            "fitted to outcomes. Differences are paired, with 95 % Tango intervals.",
+            "fitted to outcomes. Cell's own engine: the planned replay in the engine that moves "
+            "the stand-in cell (replay --engine both), from the same start. Differences are "
+            "paired, with 95 % Tango intervals.",
         ),
     )

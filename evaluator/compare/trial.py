@@ -31,6 +31,8 @@ from evaluator.run_reader.inventory import RunFile
 from evaluator.run_reader.tracks import Tracks, read_tracks
 
 TRAJECTORIES = ("planned", "executed")
+CELLS_ENGINE = "cell's own engine"
+"""A forecast that needs no twin of the cell's physics: the engine that moved the stand-in cell."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +77,7 @@ def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
         )
         facts = replace(facts, verdict=None)
     found = dict.fromkeys(TRAJECTORIES, Replay())
+    cells_engine: bool | None = None
     if facts.plan_id is None:
         lacking.append("no execution_started event: no plan was sent")
     else:
@@ -85,13 +88,19 @@ def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
             for trajectory in TRAJECTORIES
         }
         lacking += [replay.reason for replay in found.values() if replay.reason is not None]
+        cells_engine = index.answer_of_cells_engine(
+            source=source, source_sha256=sha256, plan_id=facts.plan_id
+        )
     localised = index.localised(source=source, source_sha256=sha256)
     if localised is not None and localised.facts.broken:
         lacking.append(f"{localised.path.name}: {localised.facts.broken}")
     replays = {name: replay.file for name, replay in found.items() if replay.file is not None}
+    row = _row(file, facts, found, localised, replays)
+    if cells_engine is not None:
+        row = replace(row, baselines=((CELLS_ENGINE, cells_engine),))
     return Trial(
         file=file,
-        row=_row(file, facts, found, localised, replays),
+        row=row,
         lacking=tuple(lacking),
         impossible_count=_impossible_count(facts.outcome),
         replays=replays,

@@ -20,7 +20,7 @@ from bridge.episode.streams import verdicts
 from bridge.errors import GstError
 from bridge.task.plan import SCHEMA_VERSION, Plan
 from bridge.task.record import parse_record
-from bridge.task.verdict import Verdict
+from bridge.task.verdict import STAND_IN_ENGINE, Verdict
 from evaluator.errors import EvaluatorError
 from evaluator.run_reader.inventory import RunFile
 
@@ -453,6 +453,28 @@ class DerivedIndex:
             why = decided.why_undecided
             undecided = f"the twin could not decide the {trajectory} replay: {why}"
         return Replay(file=file, verdict=decided, reason=undecided)
+
+    def answer_of_cells_engine(
+        self, *, source: str, source_sha256: str, plan_id: str
+    ) -> bool | None:
+        """What the planned replay in the engine that moved the stand-in cell says of a plan.
+
+        It never counts as the twin's answer; it is what another simulation has to be held against.
+        None without such a replay, or where it could not decide.
+
+        Args:
+            source: Id of the recorded episode.
+            source_sha256: Its hash as it is now; a replay of another version does not count.
+            plan_id: Plan that was sent.
+        """
+        made = _current(self._replays.get((source, plan_id, "planned"), []), source_sha256)
+        alone = [
+            file
+            for file in made
+            if file.info.stand_in and (file.derived.engine or "").startswith(STAND_IN_ENGINE)
+        ]
+        decided = _newest(alone).facts.verdict if alone else None
+        return None if decided is None or " and " in (decided.engine or "") else decided.accepted
 
     def localised(self, *, source: str, source_sha256: str) -> DerivedFile | None:
         """Find the newest localisation of a recorded episode.

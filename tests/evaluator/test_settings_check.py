@@ -8,6 +8,7 @@ import pytest
 from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.writer import EpisodeWriter
 from evaluator.compare import Comparison, compare_run
+from evaluator.compare.trial import CELLS_ENGINE
 from evaluator.report.write import write_report
 
 OLD, NEW = "0123456789ab", "ba9876543210"
@@ -128,6 +129,19 @@ def test_what_the_engine_of_the_cell_says_is_passed_over_and_counted_in_a_note(t
         "2 that never count were made in mujoco-2, the same engine as the cell"
     ]
     assert not [e for e in comparison.exclusions if "mujoco" in e.reason]
+
+
+def test_the_cells_own_engine_is_held_beside_the_twin_and_never_counted(two: Any) -> None:
+    two.replay("a", engine="pybullet-1")
+    two.replay("a", accepted=False, engine="mujoco-2", tag="b")
+    comparison = compare_run(two.run)
+    row = next(row for row in comparison.rows if row.episode == "a")
+    assert row.sim_planned is True
+    assert dict(row.baselines) == {CELLS_ENGINE: False}
+    rate = next(
+        m for m in comparison.measurements if m.id == "baseline.sim_planned.cell_s_own_engine.rate"
+    )
+    assert (rate.k, rate.n) == (0, 1)
 
 
 @pytest.mark.parametrize("engine", ["mujoco-2", "pybullet-1 and mujoco-2"])
