@@ -120,6 +120,12 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
                 "DIR --episode scan",
             ),
             (
+                "episode",
+                f"{PUBLISH}:publish_episode",
+                "Play an episode back with its own timing.",
+                "FILE --rate 2 --topics 'lab/**'",
+            ),
+            (
                 "realsense",
                 f"{PUBLISH}:publish_realsense",
                 "RealSense cameras: colour, depth, calibration.",

@@ -16,8 +16,14 @@ _ROS_KEY = re.compile(
     r"^\d+/(?P<topic>.+)/(?P<type>[^/]+)/(?P<hash>RIHS01_[0-9a-f]{64}|TypeHashNotSupported)$"
 )
 _FORBIDDEN = re.compile(r"[*$?#]")
-_CDR, _JSON = "application/cdr", "application/json"
-_ENCODINGS = {_CDR: "cdr", _JSON: "json"}
+_BYTES = "zenoh/bytes"
+"""What zenoh itself says of a message without an encoding."""
+_ENCODINGS = {
+    f"application/{name}": name
+    for name in ("cdr", "json", "protobuf", "cbor", "msgpack", "flatbuffer", "ros1")
+}
+"""MCAP's message encodings, by the zenoh encoding that stands for each."""
+_SYNONYMS = {"text/json": "json", "application/x-protobuf": "protobuf"}
 NO_HASH = "TypeHashNotSupported"
 """What ROS 2 Humble writes where later releases write a hash."""
 
@@ -67,8 +73,10 @@ def ros_type(dds_name: str) -> str:
 
 
 def encoding_of(type_name: str, message_encoding: str) -> str:
-    """Name a type in a zenoh encoding."""
-    kind = next((k for k, name in _ENCODINGS.items() if name == message_encoding), _CDR)
+    """Name a type in a zenoh encoding; "" stands for what nobody knows."""
+    kind = f"application/{message_encoding}"
+    if kind not in _ENCODINGS:
+        kind = _BYTES
     return f"{kind};{type_name}" if type_name else kind
 
 
@@ -76,4 +84,4 @@ def encoding_of(type_name: str, message_encoding: str) -> str:
 def parse_encoding(encoding: str) -> tuple[str, str]:
     """Split a zenoh encoding into (type name, MCAP message encoding); "" where unknown."""
     kind, _, type_name = encoding.partition(";")
-    return type_name, _ENCODINGS.get(kind, "")
+    return type_name, _ENCODINGS.get(kind) or _SYNONYMS.get(kind, "")

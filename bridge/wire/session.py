@@ -212,16 +212,27 @@ class WireSession:
         """The clock that stamps ``received_ns``; it never runs backwards."""
         return self._clock.now_ns()
 
-    def publisher(self, topic: str, type_name: str, *, qos: Qos = Qos.RELIABLE) -> WirePublisher:
+    def publisher(
+        self,
+        topic: str,
+        type_name: str,
+        *,
+        qos: Qos = Qos.RELIABLE,
+        message_encoding: str | None = None,
+    ) -> WirePublisher:
         """Announce a topic.
 
         Args:
             topic: With its leading slash.
-            type_name: As in ``bridge.episode.schema``; foreign types count as CDR.
+            type_name: As in ``bridge.episode.schema``.
             qos: What happens when the network is behind; control loops use ``Qos.CONTROL``.
+            message_encoding: cdr, json, protobuf ...; that of the type where it is left out, and
+                foreign types then count as CDR.
         """
-        known = schema.schema_for(type_name)
-        encoding = keys.encoding_of(type_name, known.message_encoding if known else "cdr")
+        if message_encoding is None:
+            known = schema.schema_for(type_name)
+            message_encoding = known.message_encoding if known else "cdr"
+        encoding = keys.encoding_of(type_name, message_encoding)
         control = zenoh.CongestionControl
         try:
             inner = self._inner.declare_publisher(
