@@ -27,6 +27,11 @@ GRIPPER_STATE = "/gripper/state"
 SPEED_SCALING = "/speed_scaling"
 TCP_POSE = "/tcp/pose"
 TCP_WRENCH = "/tcp/wrench"
+WRENCH = "/wrench"
+IMU = "/imu"
+ODOMETRY = "/odometry"
+AUDIO = "/audio"
+POINTS = "/points"
 PLAN = "/plan"
 PLAN_TRAJECTORY = "/plan/trajectory"
 PLAN_PATH = "/plan/path"
@@ -41,6 +46,7 @@ CONTACT = "/replay/contact"
 DIVERGENCE = "/replay/divergence"
 CAMERAS = "/cam/"
 OBJECTS = "/object/"
+TACTILE = "/tactile/"
 
 COLOR_IMAGE = "/color/image"
 COLOR_INFO = "/color/info"
@@ -78,6 +84,13 @@ _TYPES: tuple[tuple[str, str], ...] = (
     (f"{OBJECTS}[^/]+/pose$", schema.POSE_STAMPED),
     (f"{OBJECTS}[^/]+/nodes$", schema.POINT_CLOUD),
     (f"{LOCALISATION}$", schema.LOCALISATION),
+    (f"{WRENCH}$", schema.WRENCH_STAMPED),
+    (f"{IMU}$", schema.IMU),
+    (f"{ODOMETRY}$", schema.ODOMETRY),
+    (f"{AUDIO}$", schema.RAW_AUDIO),
+    (f"{POINTS}$", schema.POINT_CLOUD),
+    (f"{TACTILE}[^/]+/image$", schema.IMAGE),
+    (f"{TACTILE}[^/]+/array$", schema.FLOAT_ARRAY),
     (f"^{DROPS}$", schema.DROPS),
 )
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -105,9 +118,12 @@ def type_of_topic(topic: str) -> str | None:
 
 def service_of_topic(topic: str) -> Service:
     """Say how a topic should travel when the network is behind; ``wire.qos`` has the presets."""
-    if topic.endswith((COLOR_IMAGE, DEPTH_IMAGE)):
+    if topic.endswith((COLOR_IMAGE, DEPTH_IMAGE, POINTS)) or TACTILE in topic:
         return "camera"
-    control = (JOINT_STATES, JOINT_TARGETS, GRIPPER_STATE, SPEED_SCALING, TCP_POSE, TCP_WRENCH, TF)
+    control = (
+        *(JOINT_STATES, JOINT_TARGETS, GRIPPER_STATE, SPEED_SCALING, TCP_POSE, WRENCH, TF),
+        *(IMU, ODOMETRY),
+    )
     return "control" if topic.endswith(control) else "reliable"
 
 

@@ -46,30 +46,38 @@ class Channels:
         """Begin without channels."""
         self._summary = summary
         self._schemas: dict[tuple[str, str, bytes], tuple[int, bytes]] = {}
-        self._channels: dict[tuple[str, str, int], Channel] = {}
-        self._known: dict[tuple[str, int, str], tuple[Channel, schema.Schema | None]] = {}
+        self._channels: dict[tuple[str, str, int, str], Channel] = {}
+        self._known: dict[tuple[str, int, str, str], tuple[Channel, schema.Schema | None]] = {}
 
-    def find(self, topic: str, record: schema.Schema | None, message_encoding: str) -> Channel:
+    def find(
+        self,
+        topic: str,
+        record: schema.Schema | None,
+        message_encoding: str,
+        image_encoding: str = "",
+    ) -> Channel:
         """Return the channel of a topic.
 
         Args:
             topic: With its leading slash.
             record: Schema of the messages, or none.
             message_encoding: Used where there is no schema.
+            image_encoding: Of raw images; each has a channel of its own, which names it.
         """
         # Comparing schemas by identity spares hashing their text for every message; the value
         # keeps the schema alive, so that its identity is not given to another.
-        quick_key = (topic, id(record), message_encoding)
+        quick_key = (topic, id(record), message_encoding, image_encoding)
         found = self._known.get(quick_key)
         if found is not None:
             return found[0]
         encoding = message_encoding if record is None else record.message_encoding
         schema_id, definition = (0, b"") if record is None else self._schema(record)
-        key = (topic, encoding, schema_id)
+        key = (topic, encoding, schema_id, image_encoding)
         channel = self._channels.get(key)
         if channel is None:
             channel_id = len(self._channels) + 1
-            encoded = mcap_format.channel(channel_id, schema_id, topic, encoding)
+            about = {"image_encoding": image_encoding} if image_encoding else {}
+            encoded = mcap_format.channel(channel_id, schema_id, topic, encoding, about)
             type_name = "" if record is None else record.name
             channel = Channel(channel_id, type_name, definition + encoded)
             self._channels[key] = channel
@@ -246,9 +254,10 @@ class EpisodeWriter:
         log_time_ns: int,
         publish_time_ns: int | None = None,
         sequence: int | None = None,
+        image_encoding: str = "",
     ) -> None:
         """Append one message with the given schema, or none; the bytes are kept as they are."""
-        channel = self._channels.find(topic, schema_record, message_encoding)
+        channel = self._channels.find(topic, schema_record, message_encoding, image_encoding)
         length = num_bytes(data) if isinstance(data, Buffer) else sum(map(num_bytes, data))
         if self._pending or self._file.failed:
             self._write_pending()

@@ -17,7 +17,7 @@ from bridge.episode.topics import DROPS, EVENT, cell_topic
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 from bridge.errors import BridgeError, MissingDependencyError
 from bridge.record.config import BYTES_PER_MB, DiskConfig, RecorderConfig
-from bridge.record.inspection import MessageState, inspector, resolve_type
+from bridge.record.inspection import MessageState, inspector, resolve_type, stamp_reader
 from bridge.record.ledger import Ledger
 from bridge.record.queue import Command, Dropped, Item, second_of
 from bridge.wire.rmw import ros_schema, type_hash_of
@@ -35,6 +35,8 @@ class Channel:
     inspect: Callable[[bytes], MessageState]
     last_ns: list[int]
     """Shared by the channels of a topic."""
+    stamp_ns: Callable[[bytes], int | None] | None
+    """Reads the time in a message itself, where its type has one."""
 
     def later(self, stamp_ns: int) -> int:
         """Log times of a topic never run backwards, also when two threads deliver at once."""
@@ -90,7 +92,7 @@ class Channels:
             )
         look = inspector("" if is_strange else type_name, sample.message_encoding)
         last_ns = self._last_ns.setdefault(topic, [0])
-        return Channel(record, look, last_ns)
+        return Channel(record, look, last_ns, stamp_reader(record))
 
     def _schema(self, sample: WireSample, type_name: str) -> tuple[schema.Schema | None, bool]:
         """The schema to register: a known one, one with a name only, or none; and if it is strange.
@@ -348,7 +350,7 @@ class EpisodeRecording:
             return
         finding = item.finding or channel.inspect(item.sample.data)
         try:
-            self._append(channel, item.sample, item.sample.received_ns)
+            self._append(channel, item.sample, item.sample.received_ns, item.image_encoding)
         except OSError:
             self.ledger.count_refused(item)
             raise
@@ -360,9 +362,13 @@ class EpisodeRecording:
         if channel is not None:
             self._append(channel, sample, sample.received_ns)
 
-    def _append(self, channel: Channel, sample: WireSample, stamp_ns: int) -> None:
+    def _append(
+        self, channel: Channel, sample: WireSample, stamp_ns: int, image_encoding: str = ""
+    ) -> None:
         log_ns = channel.later(stamp_ns)
         source_ns = sample.source_ns
+        if source_ns is None and channel.stamp_ns is not None:
+            source_ns = channel.stamp_ns(sample.data)
         self._parts.writer.write_foreign(
             sample.topic,
             sample.data,
@@ -371,6 +377,7 @@ class EpisodeRecording:
             log_time_ns=log_ns,
             publish_time_ns=source_ns if source_ns is not None and source_ns >= 0 else log_ns,
             sequence=sample.sequence,
+            image_encoding=image_encoding,
         )
 
     def tick(self, now_ns: int, health: dict[str, int]) -> None:

@@ -162,6 +162,8 @@ class Item:
     """Made here of this message, and written behind it; in no account."""
     for_preview: bool = False
     """Nobody records; only a preview is made of it."""
+    image_encoding: str = ""
+    """Of a raw image, for example 16UC1: another one is written to a channel of its own."""
 
     @property
     def received_ns(self) -> int:
