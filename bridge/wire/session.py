@@ -126,6 +126,8 @@ class WireSample:
     source_gid: bytes | None
     """16 bytes that no other publisher has."""
     received_ns: int
+    attachment_bytes: int = 0
+    """Size of the attachment, whether it could be read or not."""
     oversize_bytes: int = 0
     """Size of a payload beyond the subscription's limit; then ``data`` is empty, not a copy."""
 
@@ -137,7 +139,8 @@ def copy_sample(sample: Any, received_ns: int, *, max_bytes: int = sys.maxsize) 
     named = keys.read_key(str(sample.key_expr))
     type_name, message_encoding = keys.parse_encoding(str(sample.encoding))
     raw = sample.attachment
-    note = publisher.decode(None if raw is None else raw.to_bytes())
+    attachment = None if raw is None else raw.to_bytes()
+    note = publisher.decode(attachment)
     if note is None:
         sequence, gid = _source_of(sample.source_info)
         source_ns = None
@@ -153,6 +156,7 @@ def copy_sample(sample: Any, received_ns: int, *, max_bytes: int = sys.maxsize) 
         sequence=sequence,
         source_gid=gid,
         received_ns=received_ns,
+        attachment_bytes=0 if attachment is None else len(attachment),
         oversize_bytes=size if is_oversize else 0,
     )
 

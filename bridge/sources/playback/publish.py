@@ -262,6 +262,8 @@ class EpisodeSource:
         for path in self.episode.missing_parts:
             output.say(f"{path.name} is missing; what it held is not played")
         self._serve_control(session)
+        for cell in sorted({name.split("/")[1] for name in self.topics if name.count("/") > 1}):
+            session.declare_alive(f"{cell}/alive")
         publishers = self._publishers(session)
         sent = dict.fromkeys(self.topics, 0)
         late_s = array("d")
