@@ -377,7 +377,7 @@ class EpisodeRecording:
             log_time_ns=log_ns,
             publish_time_ns=source_ns if source_ns is not None and source_ns >= 0 else log_ns,
             sequence=sample.sequence,
-            image_encoding=image_encoding,
+            about=(("image_encoding", image_encoding),) if image_encoding else (),
         )
 
     def tick(self, now_ns: int, health: dict[str, int]) -> None:
