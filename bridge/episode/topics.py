@@ -30,7 +30,6 @@ TCP_WRENCH = "/tcp/wrench"
 WRENCH = "/wrench"
 IMU = "/imu"
 ODOMETRY = "/odometry"
-AUDIO = "/audio"
 POINTS = "/points"
 PLAN = "/plan"
 PLAN_TRAJECTORY = "/plan/trajectory"
@@ -84,13 +83,6 @@ _TYPES: tuple[tuple[str, str], ...] = (
     (f"{OBJECTS}[^/]+/pose$", schema.POSE_STAMPED),
     (f"{OBJECTS}[^/]+/nodes$", schema.POINT_CLOUD),
     (f"{LOCALISATION}$", schema.LOCALISATION),
-    (f"{WRENCH}$", schema.WRENCH_STAMPED),
-    (f"{IMU}$", schema.IMU),
-    (f"{ODOMETRY}$", schema.ODOMETRY),
-    (f"{AUDIO}$", schema.RAW_AUDIO),
-    (f"{POINTS}$", schema.POINT_CLOUD),
-    (f"{TACTILE}[^/]+/image$", schema.IMAGE),
-    (f"{TACTILE}[^/]+/array$", schema.FLOAT_ARRAY),
     (f"^{DROPS}$", schema.DROPS),
 )
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")

@@ -25,7 +25,7 @@ Kind = Literal["wrong", "missing"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
+class Breach:
     """One thing that a publisher does not do as the contract says."""
 
     about: str
@@ -61,7 +61,7 @@ class TopicHeard:
     last_source_ns: int | None = None
     offsets_ns: list[int] = field(default_factory=list)
     unset_headers: int = 0
-    findings: list[Finding] = field(default_factory=list)
+    findings: list[Breach] = field(default_factory=list)
 
     @property
     def rate_hz(self) -> float:
@@ -203,15 +203,15 @@ class WireListener:
         return heard
 
 
-def _of_encoding(heard: TopicHeard) -> list[Finding]:
+def _of_encoding(heard: TopicHeard) -> list[Breach]:
     found = []
     if not heard.message_encoding:
         text = "none that is known; send application/cdr;TYPE (or json, protobuf ...)"
-        found.append(Finding(about="encoding", kind="missing", text=text))
+        found.append(Breach(about="encoding", kind="missing", text=text))
     if not heard.type_name:
         guessed = type_of_topic(heard.topic)
         text = "it names no type" + (f"; {guessed} is taken from the topic" if guessed else "")
-        found.append(Finding(about="encoding", kind="missing", text=text))
+        found.append(Breach(about="encoding", kind="missing", text=text))
     return found
 
 
@@ -221,50 +221,50 @@ _STATES = {
 }
 
 
-def _of_payload(heard: TopicHeard) -> list[Finding]:
+def _of_payload(heard: TopicHeard) -> list[Breach]:
     return [
-        Finding(about="payload", kind="wrong", text=f"{count} of {heard.messages} messages {text}")
+        Breach(about="payload", kind="wrong", text=f"{count} of {heard.messages} messages {text}")
         for state, text in _STATES.items()
         if state is not GOOD and (count := heard.states.get(state, 0))
     ]
 
 
-def _of_attachment(heard: TopicHeard) -> list[Finding]:
+def _of_attachment(heard: TopicHeard) -> list[Breach]:
     found = []
     if heard.odd_attachments:
         sizes = ", ".join(map(str, sorted(heard.odd_attachments)))
         text = f"{sizes} bytes; it has 33 (or 77): sequence, time, 16, publisher id"
-        found.append(Finding(about="attachment", kind="wrong", text=text))
+        found.append(Breach(about="attachment", kind="wrong", text=text))
     elif heard.unnumbered:
         text = f"none on {heard.unnumbered} of {heard.messages} messages"
-        found.append(Finding(about="attachment", kind="missing", text=text))
+        found.append(Breach(about="attachment", kind="missing", text=text))
     if heard.unnumbered:
         text = "messages without a number: their losses cannot be seen"
-        found.append(Finding(about="sequence", kind="missing", text=text))
+        found.append(Breach(about="sequence", kind="missing", text=text))
     if heard.lost > 0:
         text = f"{heard.lost} of {heard.messages + heard.lost} numbers were skipped: lost messages"
-        found.append(Finding(about="sequence", kind="wrong", text=text))
+        found.append(Breach(about="sequence", kind="wrong", text=text))
     if heard.not_counted:
         text = f"{heard.not_counted} numbers do not count on; each message gets the next one"
-        found.append(Finding(about="sequence", kind="wrong", text=text))
+        found.append(Breach(about="sequence", kind="wrong", text=text))
     return found
 
 
-def _of_time(heard: TopicHeard) -> list[Finding]:
+def _of_time(heard: TopicHeard) -> list[Breach]:
     found = []
     if heard.unstamped and heard.unset_headers:
         text = "neither an attachment nor header.stamp says when a message was made"
-        found.append(Finding(about="time", kind="missing", text=text))
+        found.append(Breach(about="time", kind="missing", text=text))
     elif heard.unstamped and not heard.offsets_ns:
         text = "nothing says when a message was made; its arrival counts instead"
-        found.append(Finding(about="time", kind="missing", text=text))
+        found.append(Breach(about="time", kind="missing", text=text))
     if heard.stamped_back:
         text = f"{heard.stamped_back} messages are stamped before the one that came before them"
-        found.append(Finding(about="time", kind="wrong", text=text))
+        found.append(Breach(about="time", kind="wrong", text=text))
     if heard.offsets_ns:
         offset_ns = round(statistics.median(heard.offsets_ns))
         if abs(offset_ns) > FAR_NS:
-            found.append(Finding(about="time", kind="wrong", text=_far(heard, offset_ns)))
+            found.append(Breach(about="time", kind="wrong", text=_far(heard, offset_ns)))
     return found
 
 
@@ -277,7 +277,7 @@ def _far(heard: TopicHeard, offset_ns: int) -> str:
     return f"stamps are {abs(offset_ns) / NS_PER_S:.3g} s {side} this computer's clock"
 
 
-def _of_liveliness(heard: TopicHeard, tokens: frozenset[str]) -> list[Finding]:
+def _of_liveliness(heard: TopicHeard, tokens: frozenset[str]) -> list[Breach]:
     parts = heard.topic.strip("/").split("/")
     prefixes = {"/".join(parts[:count]) + ALIVE for count in range(1, len(parts) + 1)}
     if prefixes & tokens:
@@ -286,14 +286,14 @@ def _of_liveliness(heard: TopicHeard, tokens: frozenset[str]) -> list[Finding]:
     if any(each is not None and each.topic == heard.topic for each in endpoints):
         return []
     text = f"no token {parts[0]}{ALIVE}: nobody notices when this publisher is gone"
-    return [Finding(about="liveliness", kind="missing", text=text)]
+    return [Breach(about="liveliness", kind="missing", text=text)]
 
 
-def _of_rate(heard: TopicHeard, rate_hz: float | None) -> list[Finding]:
+def _of_rate(heard: TopicHeard, rate_hz: float | None) -> list[Breach]:
     if rate_hz is None or abs(heard.rate_hz - rate_hz) <= RATE_TOLERANCE * rate_hz:
         return []
     text = f"{heard.rate_hz:.1f} Hz, expected {rate_hz:g} Hz within {RATE_TOLERANCE:.0%}"
-    return [Finding(about="rate", kind="wrong", text=text)]
+    return [Breach(about="rate", kind="wrong", text=text)]
 
 
 def describe_heard(key: str, heard: list[TopicHeard]) -> str:

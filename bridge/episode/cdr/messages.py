@@ -237,6 +237,23 @@ def _no_color(encoding: str) -> codec.MalformedMessageError:
     return codec.MalformedMessageError(type_name=schema.IMAGE, found=found)
 
 
+def raw_color_to_cdr(
+    stamp_ns: int, frame_id: str, image_u8: UInt8[np.ndarray, "height width 3"]
+) -> bytes:
+    """Serialise an sRGB image as sensor_msgs/Image of encoding rgb8."""
+    height, width = image_u8.shape[:2]
+    message = {
+        "header": _header(stamp_ns, frame_id),
+        "height": height,
+        "width": width,
+        "encoding": "rgb8",
+        "is_bigendian": 0,
+        "step": 3 * width,
+        "data": image_u8.tobytes(),
+    }
+    return codec.encode(schema.IMAGE, message)
+
+
 def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColor:
     """Read a colour image, compressed or raw; both have ``stamp_ns`` and ``image_u8()``.
 

@@ -138,6 +138,18 @@ def test_another_encoding_of_a_running_camera_is_another_channel(
     assert len({each.id for each, _, _ in found}) == 1
 
 
+def test_a_topic_called_like_a_sensor_may_carry_another_type(
+    recorder: Recorder, run: RunFolder, make_sample: Make
+) -> None:
+    text = b"\0\1\0\0\2\0\0\0x\0"
+    named = make_sample(topic="/lab/points", type_name="std_msgs/msg/String", data=text)
+    unnamed = make_sample(topic="/lab/base/imu", type_name="", message_encoding="", data=text)
+    path = recorded(recorder, run, [named, unnamed])
+    kinds = {channel.topic: each and each.name for each, channel, _ in read(path)}
+    assert kinds == {"/lab/points": "std_msgs/msg/String", "/lab/base/imu": None}
+    assert check_episode(path).faults == []
+
+
 def test_protobuf_and_json_keep_their_encoding_and_their_name(
     recorder: Recorder, run: RunFolder, make_sample: Make
 ) -> None:
