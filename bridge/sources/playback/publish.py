@@ -4,6 +4,7 @@ Publish times are those of the episode, so that a recording of the playback has 
 numbers are counted anew: a gap in the new recording was lost on this way, not on the first one.
 """
 
+import contextlib
 import json
 import queue
 import sys
@@ -15,8 +16,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from mcap import records
 
 from bridge.clock import NS_PER_S, ns_from_s
+from bridge.episode import schema
 from bridge.episode.mcap.messages import Selection, Stored, merged
 from bridge.episode.reader import Episode
 from bridge.episode.topics import DROPS, TF_STATIC, is_latched
@@ -192,6 +195,7 @@ class EpisodeSource:
         """
         self.episode = Episode.open(path)
         self.config = config
+        self._defined: set[str] = set()
         self.pace = Pace(config.rate, paused=config.paused)
         counts = {topic: each.count for topic, each in self.episode.topics().items()}
         there = [topic for topic in counts if topic != DROPS]
@@ -316,12 +320,28 @@ class EpisodeSource:
                     continue
                 record = file.schema_of(channel)
                 key = (channel.topic, record.name if record else "", channel.message_encoding)
+                if record is not None:
+                    self._define(session, record, channel.message_encoding)
                 if key not in made:
                     made[key] = session.publisher(
                         self.names[channel.topic], key[1], message_encoding=key[2]
                     )
                 found[id(file), channel.id] = made[key]
         return found
+
+    def _define(self, session: WireSession, record: records.Schema, message_encoding: str) -> None:
+        """Send the definition of a type that only the episode knows."""
+        is_new = record.name not in self._defined
+        if is_new and record.data and schema.schema_for(record.name) is None:
+            self._defined.add(record.name)
+            made = schema.Schema(
+                name=record.name,
+                schema_encoding=record.encoding,
+                message_encoding=message_encoding,
+                data=record.data,
+            )
+            with contextlib.suppress(BadTopicError):  # then only its name is recorded again
+                session.define(made)
 
 
 def _check_name(path: Path, name: str) -> None:

@@ -8,6 +8,7 @@ import shutil
 import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Any
 import pytest
 import zenoh
 from loopback import free_endpoint
+from mcap.reader import make_reader
 
 from bridge.episode import schema
 from bridge.episode.cdr import codec
@@ -321,3 +323,53 @@ def test_the_command_ends_with_0_3_and_2(endpoint: str, spawn: Spawn) -> None:
     assert (silent.returncode, out[:24]) == (3, "nothing came on demo/**;")
     wrong = spawn(*command, "--seconds", "-1")
     assert wrong.wait(WAIT_S) == 2
+
+
+def test_a_publisher_may_tell_what_its_types_are(
+    router: WireSession, wild: Wild, run: RunFolder, endpoint: str
+) -> None:
+    """Before its first message, and to a recorder that comes later; never against a known type."""
+    text = b'{"type": "object"}'
+    query: list[str] = []
+
+    def answer(asked: Any) -> None:
+        with asked:
+            query.append(str(asked.key_expr))
+            asked.reply("@schema/jsonschema/acme/Late", text)
+
+    queryable = wild.session.declare_queryable("@schema/jsonschema/acme/Late", answer)
+    with open_session(WireConfig(connect=(endpoint,))) as session:
+        session.collect_definitions()
+        assert query == ["@schema/**"]
+        recorder = Recorder(run, now_ns=session.now_ns)
+        heard = threading.Semaphore(0)
+
+        def take(sample: Any) -> None:
+            recorder.receive(sample)
+            heard.release()
+
+        session.subscribe("demo/**", take)
+        recorder.start(EpisodeInfo(id="t1", kind="trial", cell="demo"))
+        wild.session.put("@schema/protobuf/acme.Grasp", b"descriptor")
+        wild.session.put("@schema/ros2msg/sensor_msgs/msg/JointState", b"string lie\n")
+        wild.session.put("@schema/nonsense/acme/Note", b"?")
+        sent = {
+            "demo/late": ("application/json;acme/Late", b"{}"),
+            "demo/grasp": ("application/protobuf;acme.Grasp", b"\x08\x01"),
+            "demo/note": ("application/json;acme/Note", b"{}"),
+            "demo/joint_states": ("application/cdr;sensor_msgs/msg/JointState", b"\0\1\0\0"),
+        }
+        for key, (encoding, data) in sent.items():
+            wild.send(1, key=key, encoding=encoding, data=data)
+        for _ in sent:
+            assert heard.acquire(timeout=WAIT_S)
+        recorder.stop()
+        recorder.close()
+    queryable.undeclare()
+    with (run.episodes_dir / "t1.mcap").open("rb") as stream:
+        found = {c.topic: s for s, c, _ in make_reader(stream).iter_messages() if s is not None}
+    assert (found["/demo/late"].encoding, found["/demo/late"].data) == ("jsonschema", text)
+    grasp = found["/demo/grasp"]
+    assert (grasp.name, grasp.encoding, grasp.data) == ("acme.Grasp", "protobuf", b"descriptor")
+    assert (found["/demo/note"].encoding, found["/demo/note"].data) == ("", b"")
+    assert found["/demo/joint_states"].data.startswith(b"std_msgs/Header header")

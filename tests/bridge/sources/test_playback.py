@@ -99,13 +99,13 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "first.mcap"
 
 
-def stored(path: Path) -> list[tuple[str, str, str, int, bytes]]:
+def stored(path: Path) -> list[tuple[str, tuple[str, str, bytes] | None, str, int, bytes]]:
     """What a file holds, in order, but what its recorder itself wrote."""
     with path.open("rb") as stream:
         return [
             (
                 channel.topic,
-                each.name if each else "",
+                (each.name, each.encoding, each.data) if each else None,
                 channel.message_encoding,
                 message.publish_time,
                 message.data,
