@@ -121,6 +121,12 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
                 "DIR --episode scan",
             ),
             (
+                "episode",
+                f"{PUBLISH}:publish_episode",
+                "Play an episode back with its own timing.",
+                "FILE --rate 2 --topics 'lab/**'",
+            ),
+            (
                 "realsense",
                 f"{PUBLISH}:publish_realsense",
                 "RealSense cameras: colour, depth, calibration.",
@@ -176,7 +182,7 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
             (
                 "rosbag2",
                 f"{EXCHANGE}:import_rosbag2",
-                "A rosbag2 recording in MCAP, byte for byte.",
+                "A rosbag2 recording, byte for byte.",
                 "BAG runs/x",
             ),
             (
@@ -218,6 +224,12 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
                 "tum",
                 f"{EXCHANGE}:export_tum",
                 "Cameras as folders of the TUM RGB-D layout.",
+                "EPISODE DIR",
+            ),
+            (
+                "rosbag2",
+                f"{EXCHANGE}:export_rosbag2",
+                "An episode as a rosbag2 folder.",
                 "EPISODE DIR",
             ),
             (

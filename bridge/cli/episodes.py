@@ -2,14 +2,16 @@
 
 import textwrap
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
 from bridge.episode.catalogue_store import UNLABELLED, CatalogueQuery
+from bridge.errors import refuse_outside
 from bridge.terminal import Advance, Output
+from bridge.wire.config import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
     from bridge.episode.catalogue_store import Entry
@@ -17,6 +19,31 @@ if TYPE_CHECKING:
     from bridge.episode.recover import RecoveryReport
 
 OUTPUT = Output()
+
+
+@dataclass(frozen=True, kw_only=True)
+class WireCheck:
+    """Listening to a publisher."""
+
+    wire: str | None = None
+    """Key expression of what to listen to, for example lab/** or lab/joint_states."""
+    seconds: float = 5.0
+    """How long to listen [s]."""
+    rate_hz: float | None = None
+    """What every topic should have [Hz]; 10 % off is wrong."""
+    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    """Where the recorder, or another zenoh router, listens."""
+    listen: tuple[str, ...] = ()
+    """Be the router that the publisher connects to, instead."""
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None
+    """zenoh configuration (JSON5)."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense."""
+        refuse_outside(self, {"seconds": (0.01, 86_400.0), "rate_hz": (1e-3, 1e6)})
+
+
+WIRE = WireCheck()
 
 
 def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
@@ -86,19 +113,33 @@ def _outcome(kind: str, outcome: "Outcome | None") -> str:
     return f"{outcome.result} ({outcome.detail})" if unknown else outcome.result
 
 
-def check(episodes: list[Path], /, *, rerun: bool = False, output: Output = OUTPUT) -> int:
+def check(
+    episodes: tuple[Path, ...] = (),
+    /,
+    *,
+    rerun: bool = False,
+    wire: Annotated[WireCheck, Parameter(name="*", group="A publisher")] = WIRE,
+    output: Output = OUTPUT,
+) -> int:
     """Verify episodes (CRCs, indexes, counts, decoding) and list dropped messages.
 
     Exit code 0: clean, 3: messages were dropped, 1: broken. Example: robot-gst check runs/demo
+    With --wire it listens to a publisher instead and says what of the contract (docs/wire.md) it
+    does not keep: robot-gst check --wire "lab/**" --seconds 5
 
     Args:
         episodes: Episode files, or folders to search for them; parts go with their episode.
         rerun: Let Rerun's own checker read each file too.
+        wire: What to listen to, and where.
         output: How to talk.
     """
     from bridge.episode.check import check_all
     from bridge.errors import UsageError
 
+    if wire.wire is not None:
+        if episodes or rerun:
+            raise UsageError("--wire listens to a publisher; give episodes in another command.")
+        return _check_wire(wire.wire, wire, output)
     files: list[Path] = []
     unfinished: list[Path] = []
     for path in episodes:
@@ -129,6 +170,29 @@ def check(episodes: list[Path], /, *, rerun: bool = False, output: Output = OUTP
     codes = {report.exit_code for report in reports}
     codes |= {1 for path in episodes if path.suffix == ".part"}
     return 1 if 1 in codes else max(codes, default=0)
+
+
+def _check_wire(key: str, config: WireCheck, output: Output) -> int:
+    from bridge.record.wire_check import WireListener, describe_heard
+    from bridge.terminal import stop_signals
+    from bridge.wire.config import WireConfig
+    from bridge.wire.session import open_session
+
+    if config.listen:
+        wire = WireConfig(
+            mode="router", connect=(), listen=config.listen, config=config.zenoh_config
+        )
+    else:
+        wire = WireConfig(connect=config.connect, config=config.zenoh_config)
+    with stop_signals() as stop, open_session(wire) as session:
+        listener = WireListener(session, key.lstrip("/"))
+        where = ", ".join(config.listen or config.connect)
+        output.say(f"listening to {key} on {where} for {config.seconds:g} s")
+        stop.wait(config.seconds)
+        heard = listener.finish(rate_hz=config.rate_hz)
+    data = {"key": key, "topics": [each.to_json() for each in heard]}
+    output.result(data, describe_heard(key, heard))
+    return 3 if not heard or any(each.findings for each in heard) else 0
 
 
 def doctor(*, output: Output = OUTPUT) -> int:

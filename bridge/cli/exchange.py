@@ -136,6 +136,43 @@ def export_lerobot(
     return 0
 
 
+def export_rosbag2(
+    episode: Path,
+    out: Path,
+    /,
+    *,
+    json_topics: Literal["leave-out", "string"] = "leave-out",
+    force: bool = False,
+    output: Output = OUTPUT,
+) -> int:
+    """Write an episode as a rosbag2 folder: one MCAP file and metadata.yaml.
+
+    ROS 2 messages stay byte for byte, with their definitions, times and numbers.
+    Example: robot-gst export rosbag2 runs/demo/episodes/trial_0001.mcap bags/trial_0001
+
+    Args:
+        episode: An episode file.
+        out: The folder to make.
+        json_topics: Topics of JSON records: left out, or as std_msgs/String.
+        force: Replace an earlier export.
+        output: How to talk.
+    """
+    from bridge.episode.reader import Episode
+    from bridge.exchange.rosbag2_export import export_bag
+
+    opened = Episode.open(episode)
+    total = sum(item.count for item in opened.topics().values())
+    with output.progress("export", total) as advance:
+        report = export_bag(
+            opened, out, json_as_string=json_topics == "string", force=force, advance=advance
+        )
+    lines = [f"{out}: {report.messages} messages on {len(report.topics)} topics"]
+    lines += [f"  left out: {topic} ({why})" for topic, why in report.left_out.items()]
+    data = {"out": str(out), "topics": report.topics, "left_out": report.left_out}
+    output.result({**data, "messages": report.messages}, "\n".join(lines))
+    return 0
+
+
 def import_lerobot(
     folder: Path,
     run: Path,
@@ -311,12 +348,13 @@ def import_kinova(folder: Path, run: Path, /, *, output: Output = OUTPUT) -> int
 def import_rosbag2(
     bag: Path, run: Path, /, *, episode: str | None = None, output: Output = OUTPUT
 ) -> int:
-    """Turn a rosbag2 recording in MCAP into an episode; every message stays byte for byte.
+    """Turn a rosbag2 recording into an episode; every message stays byte for byte.
 
+    MCAP or sqlite3; what rosbag2 compressed with zstd, file or message, is unpacked.
     Example: robot-gst import rosbag2 bags/monday runs/monday
 
     Args:
-        bag: A .mcap file, or the folder with metadata.yaml, split files included.
+        bag: A file of a bag, or the folder with metadata.yaml, split files included.
         run: Run folder; made where needed.
         episode: Id of the new episode; by default from the name of the bag.
         output: How to talk.
@@ -326,7 +364,8 @@ def import_rosbag2(
     from bridge.episode.run_folder import RunFolder
     from bridge.exchange.rosbag2 import count_messages, import_bag
 
-    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", bag.resolve().name.removesuffix(".mcap")).strip("_-")
+    stem = re.sub(r"(\.mcap|\.db3)?(\.zstd)?$", "", bag.resolve().name)
+    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", stem).strip("_-")
     total = count_messages(bag)
     with output.progress("import", total) as advance:
         report = import_bag(

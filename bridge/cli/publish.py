@@ -1,17 +1,24 @@
-"""Commands that publish: an RGB-D folder, the stand-in cell, RealSense cameras, a UR arm."""
+"""Commands that publish: a folder, an episode, the stand-in cell, RealSense cameras, a UR arm."""
 
 import contextlib
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
 from bridge.sources.folder.config import FolderConfig
+from bridge.sources.playback.config import PlaybackConfig
 from bridge.sources.realsense.config import RealSenseConfig
 from bridge.sources.standin.settings import SessionConfig
 from bridge.sources.ur.config import UrConfig
 from bridge.terminal import Output, stop_signals
 from bridge.wire.config import DEFAULT_ENDPOINT
+
+if TYPE_CHECKING:
+    from bridge.record.control import RecorderClient
+    from bridge.sources.playback.publish import Pace
 
 OUTPUT = Output()
 FOLDER = FolderConfig()
@@ -45,7 +52,6 @@ def publish_folder(
         zenoh_config: zenoh configuration (JSON5).
         output: How to talk.
     """
-    from bridge.errors import GstError
     from bridge.record.control import RecorderClient
     from bridge.record.status import describe_answer
     from bridge.sources.folder.messages import read_index
@@ -55,27 +61,135 @@ def publish_folder(
 
     index = read_index(folder, config)
     output.say(f"{index.path}: {index.summary}")
-    answer: dict[str, Any] | None = None
     wire = WireConfig(connect=connect, config=zenoh_config)
+    info = {"kind": "scan", "cell": config.cell, "tags": [f"folder:{index.name}"]}
     with stop_signals() as stop, open_session(wire) as session:
         client = RecorderClient(session, recorder)
-        if episode is not None:
-            info = {"kind": "scan", "cell": config.cell, "tags": [f"folder:{index.name}"]}
-            client.start(episode, info)
-        try:
+        with _recorded(client, episode, info) as answer:  # a part of a folder is no scan
             sent = FolderSource(index, config, fast).run(session, stop, output)
-        except GstError:
-            if episode is not None:  # a part of a folder is no scan
-                with contextlib.suppress(GstError):  # the first error is the one to show
-                    client.stop(discard=True)
-            raise
-        if episode is not None:
-            answer = client.stop()
     text = f"{sent['frames']} of {sent['of']} frames, {sent['messages']} messages sent"
-    if answer is not None:
+    if answer:
         text += f"\n{describe_answer(answer)}"
-    output.result({"sent": sent, "recorded": answer}, text)
+    output.result({"sent": sent, "recorded": answer or None}, text)
     return 0
+
+
+@contextlib.contextmanager
+def _recorded(
+    client: "RecorderClient", episode: str | None, info: dict[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """Have the recorder record while the context lasts; an error throws the episode away.
+
+    Args:
+        client: The recorder.
+        episode: Id of the new episode; None records nothing.
+        info: What it is, as ``RecorderClient.start`` takes it.
+
+    Yields:
+        What the recorder says at the end; empty until then, and where nothing is recorded.
+    """
+    from bridge.errors import GstError
+
+    answer: dict[str, Any] = {}
+    if episode is not None:
+        client.start(episode, info)
+    try:
+        yield answer
+    except GstError:
+        if episode is not None:
+            with contextlib.suppress(GstError):  # the first error is the one to show
+                client.stop(discard=True)
+        raise
+    if episode is not None:
+        answer.update(client.stop())
+
+
+PLAYBACK = PlaybackConfig()
+Duration = Annotated[float | None, Parameter(name=("--duration", "--duration-s"))]
+
+
+def publish_episode(
+    file: Path,
+    /,
+    *,
+    config: Annotated[PlaybackConfig, Parameter(name="*")] = PLAYBACK,
+    duration_s: Duration = None,
+    episode: str | None = None,
+    recorder: str = "main",
+    connect: tuple[str, ...] = LOOPBACK,
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Play an episode back: the same bytes in the same order, as far apart as they came.
+
+    On a terminal the space bar pauses; so does robot-gst ctl pause --recorder playback.
+    Example: robot-gst publish episode runs/monday/episodes/trial_0001.mcap --rate 2 --episode again
+    Under other names: robot-gst publish episode FILE --topics "lab/**" --remap /lab:=/twin
+
+    Args:
+        file: A finished episode, or any other MCAP file.
+        config: What, how fast, and under which names.
+        duration_s: Stop after this long [s].
+        episode: Ask the recorder to record this episode from the first to the last message.
+        recorder: Name of the recorder.
+        connect: Where it listens.
+        zenoh_config: zenoh configuration (JSON5).
+        output: How to talk.
+    """
+    from dataclasses import asdict
+
+    from bridge.record.control import RecorderClient
+    from bridge.record.status import describe_answer
+    from bridge.sources.playback.publish import EpisodeSource, describe_counts
+    from bridge.sources.source import stopping
+    from bridge.wire.config import WireConfig
+    from bridge.wire.session import open_session
+
+    source = EpisodeSource(file, config)
+    about = source.episode.info
+    output.say(
+        f"{file}: {source.num_messages} messages on {len(source.topics)} topics, "
+        f"{source.episode.duration_s:.1f} s"
+    )
+    info = {**asdict(about), "tags": [*about.tags, f"playback:{about.id}"]}
+    wire = WireConfig(connect=connect, config=zenoh_config)
+    with stopping(duration_s) as stop, open_session(wire) as session:
+        client = RecorderClient(session, recorder)
+        with _recorded(client, episode, info) as answer, _space_bar(source.pace, output.say):
+            sent = source.run(session, stop, output)
+    text = describe_counts(sent)
+    if answer:
+        text += f"\n{describe_answer(answer)}"
+    output.result({"sent": sent, "recorded": answer or None}, text)
+    return 0
+
+
+KEY_PERIOD_S = 0.05
+
+
+@contextlib.contextmanager
+def _space_bar(pace: "Pace", say: Callable[[str], None]) -> Iterator[None]:
+    """Let the space bar pause a playback and go on with it; nothing without a terminal."""
+    from bridge.record.process import pressed_key, single_keys
+
+    ended = threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(KEY_PERIOD_S):
+            if pressed_key() == " ":
+                say(pace.toggle())
+
+    with single_keys() as has_keys:
+        watcher = threading.Thread(target=watch, name="space bar", daemon=True)
+        if has_keys:
+            say("paused; the space bar begins" if pace.is_paused else "the space bar pauses")
+            watcher.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            if has_keys:
+                watcher.join()
 
 
 def publish_standin(
@@ -112,7 +226,6 @@ def publish_standin(
 
 REALSENSE = RealSenseConfig()
 UR = UrConfig()
-Duration = Annotated[float | None, Parameter(name=("--duration", "--duration-s"))]
 
 
 def publish_realsense(

@@ -246,7 +246,7 @@ def _check_metadata(episode: Episode, faults: Faults) -> None:
         expected = type_of_topic(topic)
         if expected is None or not item.count or item.type_name in (expected, ""):
             continue
-        images = {schema.IMAGE, schema.COMPRESSED_IMAGE}
+        images = {schema.IMAGE, schema.COMPRESSED_IMAGE, schema.COMPRESSED_VIDEO}
         if topic.endswith("/image") and expected in images and item.type_name in images:
             continue
         faults.add(f"{topic} carries {item.type_name}, expected {expected}")

@@ -25,6 +25,24 @@ DEFINITIONS: dict[str, str] = {
     "geometry_msgs/msg/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose\n",
     "geometry_msgs/msg/Wrench": "geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque\n",
     "geometry_msgs/msg/WrenchStamped": "std_msgs/Header header\ngeometry_msgs/Wrench wrench\n",
+    "geometry_msgs/msg/Twist": ("geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n"),
+    "geometry_msgs/msg/PoseWithCovariance": ("geometry_msgs/Pose pose\nfloat64[36] covariance\n"),
+    "geometry_msgs/msg/TwistWithCovariance": (
+        "geometry_msgs/Twist twist\nfloat64[36] covariance\n"
+    ),
+    "nav_msgs/msg/Odometry": (
+        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
+        "geometry_msgs/TwistWithCovariance twist\n"
+    ),
+    "std_msgs/msg/MultiArrayDimension": "string label\nuint32 size\nuint32 stride\n",
+    "std_msgs/msg/MultiArrayLayout": "std_msgs/MultiArrayDimension[] dim\nuint32 data_offset\n",
+    "std_msgs/msg/Float32MultiArray": "std_msgs/MultiArrayLayout layout\nfloat32[] data\n",
+    "sensor_msgs/msg/Imu": (
+        "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\n"
+        "float64[9] orientation_covariance\ngeometry_msgs/Vector3 angular_velocity\n"
+        "float64[9] angular_velocity_covariance\ngeometry_msgs/Vector3 linear_acceleration\n"
+        "float64[9] linear_acceleration_covariance\n"
+    ),
     "geometry_msgs/msg/Transform": (
         "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
     ),
@@ -112,6 +130,9 @@ STRING = "std_msgs/msg/String"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+ODOMETRY = "nav_msgs/msg/Odometry"
+IMU = "sensor_msgs/msg/Imu"
+FLOAT_ARRAY = "std_msgs/msg/Float32MultiArray"
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 PLAN = "gst/Plan"
 VERDICT = "gst/Verdict"
@@ -126,6 +147,7 @@ ENTRY = "recorder/Entry"
 ADVICE = "gst/Advice"
 POSES_IN_FRAME = "foxglove.PosesInFrame"
 COMPRESSED_VIDEO = "foxglove.CompressedVideo"
+RAW_AUDIO = "foxglove.RawAudio"
 
 _JSON_SCHEMAS = {
     PLAN: ("bridge.task", "schemas/plan.schema.json"),
@@ -167,17 +189,36 @@ def schema_for(name: str) -> Schema | None:
         return Schema(
             name=name, schema_encoding="jsonschema", message_encoding="json", data=text.encode()
         )
-    if name == COMPRESSED_VIDEO:
+    if name in PROTOBUF_MEMBERS:
         return Schema(
             name=name,
             schema_encoding="protobuf",
             message_encoding="protobuf",
-            data=_video_descriptor(),
+            data=_foxglove_descriptor(name),
         )
     return None
 
 
-def _video_descriptor() -> bytes:
+_TIME = ("timestamp", 1, protobuf.MESSAGE_TYPE, ".google.protobuf.Timestamp")
+PROTOBUF_MEMBERS = {
+    COMPRESSED_VIDEO: (
+        _TIME,
+        ("frame_id", 2, protobuf.STRING_TYPE, ""),
+        ("data", 3, protobuf.BYTES_TYPE, ""),
+        ("format", 4, protobuf.STRING_TYPE, ""),
+    ),
+    RAW_AUDIO: (
+        _TIME,
+        ("data", 2, protobuf.BYTES_TYPE, ""),
+        ("format", 3, protobuf.STRING_TYPE, ""),
+        ("sample_rate", 4, protobuf.FIXED32_TYPE, ""),
+        ("number_of_channels", 5, protobuf.FIXED32_TYPE, ""),
+    ),
+}
+"""Foxglove's types with their time in field 1: name, number, type of each field."""
+
+
+def _foxglove_descriptor(name: str) -> bytes:
     timestamp = "google/protobuf/timestamp.proto"
     return protobuf.file_descriptor(
         name=timestamp,
@@ -185,16 +226,11 @@ def _video_descriptor() -> bytes:
         message="Timestamp",
         members=[("seconds", 1, protobuf.INT64_TYPE, ""), ("nanos", 2, protobuf.INT32_TYPE, "")],
     ) + protobuf.file_descriptor(
-        name="foxglove/CompressedVideo.proto",
+        name=name.replace(".", "/") + ".proto",
         package="foxglove",
-        message="CompressedVideo",
+        message=name.removeprefix("foxglove."),
         imports=[timestamp],
-        members=[
-            ("timestamp", 1, protobuf.MESSAGE_TYPE, ".google.protobuf.Timestamp"),
-            ("frame_id", 2, protobuf.STRING_TYPE, ""),
-            ("data", 3, protobuf.BYTES_TYPE, ""),
-            ("format", 4, protobuf.STRING_TYPE, ""),
-        ],
+        members=PROTOBUF_MEMBERS[name],
     )
 
 

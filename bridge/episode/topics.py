@@ -27,6 +27,10 @@ GRIPPER_STATE = "/gripper/state"
 SPEED_SCALING = "/speed_scaling"
 TCP_POSE = "/tcp/pose"
 TCP_WRENCH = "/tcp/wrench"
+WRENCH = "/wrench"
+IMU = "/imu"
+ODOMETRY = "/odometry"
+POINTS = "/points"
 PLAN = "/plan"
 PLAN_TRAJECTORY = "/plan/trajectory"
 PLAN_PATH = "/plan/path"
@@ -41,6 +45,7 @@ CONTACT = "/replay/contact"
 DIVERGENCE = "/replay/divergence"
 CAMERAS = "/cam/"
 OBJECTS = "/object/"
+TACTILE = "/tactile/"
 
 COLOR_IMAGE = "/color/image"
 COLOR_INFO = "/color/info"
@@ -122,9 +127,12 @@ def type_of_topic(topic: str) -> str | None:
 
 def service_of_topic(topic: str) -> Service:
     """Say how a topic should travel when the network is behind; ``wire.qos`` has the presets."""
-    if topic.endswith((COLOR_IMAGE, DEPTH_IMAGE)):
+    if topic.endswith((COLOR_IMAGE, DEPTH_IMAGE, POINTS)) or TACTILE in topic:
         return "camera"
-    control = (JOINT_STATES, JOINT_TARGETS, GRIPPER_STATE, SPEED_SCALING, TCP_POSE, TCP_WRENCH, TF)
+    control = (
+        *(JOINT_STATES, JOINT_TARGETS, GRIPPER_STATE, SPEED_SCALING, TCP_POSE, WRENCH, TF),
+        *(IMU, ODOMETRY),
+    )
     return "control" if topic.endswith(control) else "reliable"
 
 

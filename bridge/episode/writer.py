@@ -36,6 +36,10 @@ class Channel:
         self.group: OpenChunk | None = None
 
 
+About = tuple[tuple[str, str], ...]
+"""Names and texts of a channel's metadata."""
+
+
 class Channels:
     """Finds or makes the channel of a message, and tells the summary of new ones.
 
@@ -46,30 +50,37 @@ class Channels:
         """Begin without channels."""
         self._summary = summary
         self._schemas: dict[tuple[str, str, bytes], tuple[int, bytes]] = {}
-        self._channels: dict[tuple[str, str, int], Channel] = {}
-        self._known: dict[tuple[str, int, str], tuple[Channel, schema.Schema | None]] = {}
+        self._channels: dict[tuple[str, str, int, About], Channel] = {}
+        self._known: dict[tuple[str, int, str, About], tuple[Channel, schema.Schema | None]] = {}
 
-    def find(self, topic: str, record: schema.Schema | None, message_encoding: str) -> Channel:
+    def find(
+        self,
+        topic: str,
+        record: schema.Schema | None,
+        message_encoding: str,
+        about: About = (),
+    ) -> Channel:
         """Return the channel of a topic.
 
         Args:
             topic: With its leading slash.
             record: Schema of the messages, or none.
             message_encoding: Used where there is no schema.
+            about: What the channel's metadata says; another text is another channel.
         """
         # Comparing schemas by identity spares hashing their text for every message; the value
         # keeps the schema alive, so that its identity is not given to another.
-        quick_key = (topic, id(record), message_encoding)
+        quick_key = (topic, id(record), message_encoding, about)
         found = self._known.get(quick_key)
         if found is not None:
             return found[0]
         encoding = message_encoding if record is None else record.message_encoding
         schema_id, definition = (0, b"") if record is None else self._schema(record)
-        key = (topic, encoding, schema_id)
+        key = (topic, encoding, schema_id, about)
         channel = self._channels.get(key)
         if channel is None:
             channel_id = len(self._channels) + 1
-            encoded = mcap_format.channel(channel_id, schema_id, topic, encoding)
+            encoded = mcap_format.channel(channel_id, schema_id, topic, encoding, dict(about))
             type_name = "" if record is None else record.name
             channel = Channel(channel_id, type_name, definition + encoded)
             self._channels[key] = channel
@@ -259,6 +270,7 @@ class EpisodeWriter:
         log_time_ns: int,
         publish_time_ns: int | None = None,
         sequence: int | None = None,
+        about: About = (),
     ) -> None:
         """Append one message with the given schema, or none; the bytes are kept as they are.
 
@@ -270,8 +282,9 @@ class EpisodeWriter:
             log_time_ns: When it was received [ns since 1970].
             publish_time_ns: When it was sent [ns since 1970]; None: the log time.
             sequence: The publisher's number of it; None counts on from the message before.
+            about: Metadata of its channel: one topic with two texts has two channels.
         """
-        channel = self._channels.find(topic, schema_record, message_encoding)
+        channel = self._channels.find(topic, schema_record, message_encoding, about)
         length = num_bytes(data) if isinstance(data, Buffer) else sum(map(num_bytes, data))
         if self._pending or self._file.failed:
             self._write_pending()

@@ -1,11 +1,14 @@
-"""rosbag2 recordings in MCAP files, one or a folder of them, as one episode.
+"""rosbag2 recordings, MCAP or sqlite3, one file or a folder of them, as one episode.
 
-Nothing is interpreted: payloads, schemas, sequence numbers and both times are kept as they are.
-What an episode has no place for (quality of service, how often a topic was silent) is kept in the
-metadata record ``source``. Layout of ``metadata.yaml``: rosbag2_storage's ``BagMetadata``.
+What rosbag2 compressed is unpacked. Nothing else is interpreted: payloads, schemas, sequence
+numbers and both times are kept as they are. What an episode has no place for (quality of service,
+how often a topic was silent) is kept in the metadata record ``source``. Layout of
+``metadata.yaml``: rosbag2_storage's ``BagMetadata``.
 """
 
+import heapq
 import json
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,30 +18,30 @@ from mcap import records
 
 from bridge.episode import schema
 from bridge.episode.mcap.file import McapFile, damaged
-from bridge.episode.mcap.messages import Selection, Stored, merged
+from bridge.episode.mcap.messages import Selection, merged
 from bridge.episode.mcap.walk import DAMAGE
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.provenance import hash_file
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.episode.writer import EpisodeWriter
-from bridge.errors import BridgeError, EpisodeError, MissingDependencyError, PathNotFoundError
+from bridge.errors import EpisodeError, MissingDependencyError, PathNotFoundError
+from bridge.exchange.rosbag2_storage import (
+    SQLITE_MAGIC,
+    BagFormatError,
+    BagMessage,
+    SqliteBag,
+    unpack_file,
+    unpack_message,
+)
 
 METADATA_FILE = "metadata.yaml"
+STORAGES = ("mcap", "sqlite3")
 MAX_METADATA_BYTES = 16 << 20
 OWN_RECORDS = frozenset(
     {"episode", "software", "outcome", "derived", "drops", "recorder", "split", "source"}
     | {"recovered"}
 )
 """Metadata names that mean something in an episode; those of the source get a prefix."""
-
-
-class BagFormatError(BridgeError):
-    """A bag is not what this import reads."""
-
-    def __init__(self, *, path: Path, found: str, hint: str) -> None:
-        """Remember the file."""
-        self.path = path
-        super().__init__(f"{path}: {found}. {hint}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,26 +56,26 @@ class ImportReport:
 
 
 def find_files(source: Path) -> list[Path]:
-    """Return the MCAP files of a bag in their order; a single file is its own bag.
+    """Return the files of a bag in their order; a single file is its own bag.
 
     Raises:
         PathNotFoundError: When there is nothing, or a file that ``metadata.yaml`` lists is gone.
-        BagFormatError: When the bag is compressed as a whole, or is no MCAP bag.
+        BagFormatError: When the bag is stored or compressed in a way that is not known here.
         MissingDependencyError: When ``metadata.yaml`` cannot be read for want of a YAML reader.
     """
     if source.is_file():
         return [source]
     if not source.is_dir():
-        hint = "Give a .mcap file, or the folder that holds metadata.yaml."
+        hint = "Give a file of the bag, or the folder that holds metadata.yaml."
         raise PathNotFoundError(path=source, what="bag", hint=hint)
     about = source / METADATA_FILE
     if about.is_file():
         return _listed_files(about)
-    files = sorted(source.glob("*.mcap"))
-    if not files:
-        hint = "Give a .mcap file, or the folder that holds metadata.yaml."
-        raise PathNotFoundError(path=source / "*.mcap", what="bag file", hint=hint)
-    return files
+    for pattern in ("*.mcap", "*.db3", "*.mcap.zstd", "*.db3.zstd"):
+        if files := sorted(source.glob(pattern)):
+            return files
+    hint = "Give a file of the bag, or the folder that holds metadata.yaml."
+    raise PathNotFoundError(path=source / "*.mcap", what="bag file", hint=hint)
 
 
 def _listed_files(about: Path) -> list[Path]:
@@ -82,14 +85,16 @@ def _listed_files(about: Path) -> list[Path]:
         raise BagFormatError(
             path=about,
             found="it lists no files under rosbag2_bagfile_information",
-            hint="Restore it, or remove it to import every .mcap file of the folder.",
+            hint="Restore it, or remove it to import every file of the folder.",
         )
     storage = record.get("storage_identifier", "mcap")
-    if storage != "mcap":
+    if storage not in STORAGES:
+        found = f"its storage is {storage!r}; {' and '.join(STORAGES)} are read"
         hint = "Convert the bag first: ros2 bag convert with storage_id mcap."
-        raise BagFormatError(path=about, found=f"its storage is {storage!r}, not mcap", hint=hint)
-    if record.get("compression_mode"):
-        found = f"it is compressed by rosbag2 ({record['compression_mode']})"
+        raise BagFormatError(path=about, found=found, hint=hint)
+    mode, kind = record.get("compression_mode"), record.get("compression_format")
+    if mode and str(mode).lower() != "none" and kind != "zstd":
+        found = f"it is compressed with {kind!r} ({mode}); zstd is read"
         hint = "Convert it first: ros2 bag convert without a compression_mode."
         raise BagFormatError(path=about, found=found, hint=hint)
     return [_listed_file(about, str(name)) for name in names]
@@ -97,6 +102,8 @@ def _listed_files(about: Path) -> list[Path]:
 
 def _listed_file(about: Path, name: str) -> Path:
     path = about.parent / name
+    if not path.exists() and name == f"{about.parent.name}/{path.name}":  # before version 4
+        path = about.parent / path.name
     if not path.resolve().is_relative_to(about.parent.resolve()):
         found = f"it lists {name!r}, which lies outside its folder"
         raise BagFormatError(path=about, found=found, hint="Import that file by its own name.")
@@ -114,7 +121,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         raise MissingDependencyError(
             package="ruamel.yaml", extra="record", purpose=f"reading {METADATA_FILE}"
         ) from error
-    hint = "Remove it to import every .mcap file of the folder."
+    hint = "Remove it to import every file of the folder."
     if path.stat().st_size > MAX_METADATA_BYTES:
         raise BagFormatError(path=path, found="it is larger than any bag's", hint=hint)
     try:
@@ -145,32 +152,73 @@ def import_bag(
         UsageError: When the episode exists already.
     """
     check_episode_id(episode_id)
-    files = [_open(path) for path in find_files(source)]
+    sources = find_files(source)
+    with tempfile.TemporaryDirectory(prefix="rosbag2_", dir=run.episodes_dir.parent) as folder:
+        bag = _open_bag([unpack_file(path, Path(folder)) for path in sources])
+        try:
+            return _import(bag, sources, run, episode_id, advance)
+        finally:
+            bag.close()
+
+
+def _import(
+    bag: "_McapBag | _SqliteBags",
+    sources: list[Path],
+    run: RunFolder,
+    episode_id: str,
+    advance: Callable[[int, str], None],
+) -> ImportReport:
     writer = EpisodeWriter(run.episodes_dir / f"{episode_id}.mcap")
     counts: dict[str, int] = {}
     try:
         writer.describe(EpisodeInfo(id=episode_id, kind="imported", tags=("rosbag2",)))
-        _copy_attachments(files, writer)
-        for done, item in enumerate(_copied(files, writer), start=1):
-            counts[item.channel.topic] = counts.get(item.channel.topic, 0) + 1
+        bag.copy_attachments(writer)
+        for done, item in enumerate(bag.messages(), start=1):
+            writer.write_foreign(
+                item.topic,
+                item.data,
+                schema_record=item.record,
+                message_encoding=item.message_encoding,
+                log_time_ns=item.log_time_ns,
+                publish_time_ns=item.publish_time_ns,
+                sequence=item.sequence,
+            )
+            counts[item.topic] = counts.get(item.topic, 0) + 1
             if done % 1000 == 0:
-                advance(done, item.channel.topic)
-        _copy_metadata(files, writer)
+                advance(done, item.topic)
+        about = bag.copy_metadata(writer)
+        about["files"] = [
+            {"name": path.name, "sha256": hash_file(path), **more}
+            for path, more in zip(sources, about["files"], strict=True)
+        ]
+        values = {name: json.dumps(value) for name, value in about.items()}
+        writer.add_metadata("source", values)
         path = writer.close()
     except BaseException:
         writer.discard()
         raise
-    names = [file.path.name for file in files]
+    names = [path.name for path in sources]
     return ImportReport(path=path, files=names, messages=sum(counts.values()), topics=counts)
 
 
 def count_messages(source: Path) -> int:
-    """Messages a bag says it holds, for progress."""
-    statistics = (_open(path).summary.statistics for path in find_files(source))
+    """Messages a bag says it holds, for progress; 0 where it does not say it at once."""
+    if source.is_dir() and (about := source / METADATA_FILE).is_file():
+        record = _read_yaml(about).get("rosbag2_bagfile_information")
+        count = record.get("message_count") if isinstance(record, dict) else None
+        return count if isinstance(count, int) and count > 0 else 0
+    paths = [path for path in find_files(source) if path.suffix == ".mcap"]
+    statistics = (_open_mcap(path).summary.statistics for path in paths)
     return sum(item.message_count for item in statistics if item is not None)
 
 
-def _open(path: Path) -> McapFile:
+def _open_bag(paths: list[Path]) -> "_McapBag | _SqliteBags":
+    with paths[0].open("rb") as stream:
+        is_database = stream.read(len(SQLITE_MAGIC)) == SQLITE_MAGIC
+    return _SqliteBags(paths) if is_database else _McapBag(paths)
+
+
+def _open_mcap(path: Path) -> McapFile:
     try:
         return McapFile(path)
     except DAMAGE as error:
@@ -181,23 +229,67 @@ def _open(path: Path) -> McapFile:
         ) from error
 
 
-def _copied(files: list[McapFile], writer: EpisodeWriter) -> Iterator[Stored]:
-    """Write every message of all files in log order."""
-    schemas: dict[tuple[int, int], schema.Schema | None] = {}
-    for item in merged(files, Selection()):
-        key = (id(item.file), item.channel.id)
-        if key not in schemas:
-            schemas[key] = _schema_of(item.file, item.channel)
-        writer.write_foreign(
-            item.channel.topic,
-            item.data,
-            schema_record=schemas[key],
-            message_encoding=item.channel.message_encoding,
-            log_time_ns=item.log_time_ns,
-            publish_time_ns=item.publish_time_ns,
-            sequence=item.sequence,
+class _SqliteBags:
+    """The databases of one bag."""
+
+    def __init__(self, paths: list[Path]) -> None:
+        self._bags = [SqliteBag(path) for path in paths]
+
+    def close(self) -> None:
+        for bag in self._bags:
+            bag.close()
+
+    def messages(self) -> Iterator[BagMessage]:
+        yield from heapq.merge(
+            *(bag.messages() for bag in self._bags), key=lambda item: item.log_time_ns
         )
-        yield item
+
+    def copy_attachments(self, writer: EpisodeWriter) -> None:
+        """A database has none."""
+
+    def copy_metadata(self, writer: EpisodeWriter) -> dict[str, Any]:
+        topics = [topic for bag in self._bags for topic in bag.topics.values()]
+        return {
+            "format": "rosbag2 sqlite3",
+            "files": [{} for _ in self._bags],
+            "channels": {
+                topic.name: {"offered_qos_profiles": topic.qos} for topic in topics if topic.qos
+            },
+            "times": "a bag of this kind has one time for each message; it is both times here",
+        }
+
+
+class _McapBag:
+    """The MCAP files of one bag."""
+
+    def __init__(self, paths: list[Path]) -> None:
+        self._files = [_open_mcap(path) for path in paths]
+
+    def close(self) -> None:
+        """Files are open only while they are read."""
+
+    def messages(self) -> Iterator[BagMessage]:
+        schemas: dict[tuple[int, int], schema.Schema | None] = {}
+        for item in merged(self._files, Selection()):
+            key = (id(item.file), item.channel.id)
+            if key not in schemas:
+                schemas[key] = _schema_of(item.file, item.channel)
+            is_cdr = item.channel.message_encoding == "cdr"
+            yield BagMessage(
+                item.channel.topic,
+                schemas[key],
+                item.channel.message_encoding,
+                item.log_time_ns,
+                item.publish_time_ns,
+                item.sequence,
+                unpack_message(item.file.path, item.data) if is_cdr else item.data,
+            )
+
+    def copy_attachments(self, writer: EpisodeWriter) -> None:
+        _copy_attachments(self._files, writer)
+
+    def copy_metadata(self, writer: EpisodeWriter) -> dict[str, Any]:
+        return _copy_metadata(self._files, writer)
 
 
 def _schema_of(file: McapFile, channel: records.Channel) -> schema.Schema | None:
@@ -223,14 +315,16 @@ def _copy_attachments(files: list[McapFile], writer: EpisodeWriter) -> None:
             raise damaged(file.path, error) from error
 
 
-def _copy_metadata(files: list[McapFile], writer: EpisodeWriter) -> None:
+def _copy_metadata(files: list[McapFile], writer: EpisodeWriter) -> dict[str, Any]:
     for file in files:
         for record in file.metadata:
             prefix = "source." if record.name in OWN_RECORDS else ""
             writer.add_metadata(prefix + record.name, record.metadata)
-    values = {
+    return {
         "format": "rosbag2 MCAP",
-        "files": [_about(file) for file in files],
+        "files": [
+            {"profile": file.header.profile, "library": file.header.library} for file in files
+        ],
         "channels": {
             channel.topic: channel.metadata
             for file in files
@@ -238,16 +332,6 @@ def _copy_metadata(files: list[McapFile], writer: EpisodeWriter) -> None:
             if channel.metadata
         },
         "silent_topics": sorted(_silent(files)),
-    }
-    writer.add_metadata("source", {name: json.dumps(value) for name, value in values.items()})
-
-
-def _about(file: McapFile) -> dict[str, Any]:
-    return {
-        "name": file.path.name,
-        "sha256": hash_file(file.path),
-        "profile": file.header.profile,
-        "library": file.header.library,
     }
 
 

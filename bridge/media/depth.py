@@ -4,7 +4,7 @@ import struct
 from collections.abc import Iterable
 
 import numpy as np
-from jaxtyping import UInt8, UInt16
+from jaxtyping import Float32, UInt8, UInt16
 
 from bridge.media.color import MAX_PIXELS, UnreadableImageError, open_image
 
@@ -44,6 +44,19 @@ def to_millimetres(
     invalid = np.isin(stored, list(invalid_values)) | (values == 0)
     millimetres = np.rint(values * (unit_m * 1e3))
     return np.where(invalid | (millimetres > 65535), 0, millimetres).astype(np.uint16)
+
+
+def from_metres(
+    depth_m: Float32[np.ndarray, "height width"],
+) -> UInt16[np.ndarray, "height width"]:
+    """Round metres to whole millimetres; NaN, infinity and what does not fit become 0.
+
+    REP 118 says so of ``32FC1``: NaN is no measurement, infinity too near or too far.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        millimetres = np.rint(depth_m * np.float32(1e3))
+        is_valid = (millimetres > 0) & (millimetres <= 65535)
+    return np.where(is_valid, millimetres, 0).astype(np.uint16)
 
 
 # Every image starts with 12 bytes that matter to 32-bit depth only (an int32 and two float32).

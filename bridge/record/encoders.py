@@ -17,6 +17,7 @@ from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.images import (
     COLOR_LAYOUTS,
     DEPTH_ENCODINGS,
+    FLOAT_DEPTH,
     depth_to_compact,
     image_header,
     image_to_jpeg,
@@ -128,6 +129,7 @@ class ImageEncoder:
             header = image_header(sample.data)
             item.finding = GOOD if fits(header) else MessageState.UNDECODABLE
             if item.finding is GOOD:
+                item.image_encoding = header.encoding
                 self._transcode(item, header.encoding)
         except MalformedMessageError:
             item.finding = MessageState.UNDECODABLE
@@ -145,7 +147,10 @@ class ImageEncoder:
             self.kinds[topic] = "depth"
             if self._config.depth == "compact":
                 data = depth_to_compact(item.sample.data)
+        elif encoding == FLOAT_DEPTH:  # recorded as it came: RVL holds whole millimetres only
+            self.kinds[topic] = "depth"
         if data is not None:
+            item.image_encoding = ""
             item.sample = replace(
                 item.sample, data=data, type_name=schema.COMPRESSED_IMAGE, type_hash=""
             )

@@ -17,7 +17,7 @@ from bridge.episode.topics import DROPS, EVENT, cell_topic
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 from bridge.errors import BridgeError, MissingDependencyError
 from bridge.record.config import BYTES_PER_MB, DiskConfig, RecorderConfig
-from bridge.record.inspection import MessageState, inspector, resolve_type
+from bridge.record.inspection import MessageState, inspector, resolve_type, stamp_reader
 from bridge.record.ledger import Ledger
 from bridge.record.queue import Command, Dropped, Item, second_of
 from bridge.task.find import ATTACHMENT, MEDIA_TYPE
@@ -37,6 +37,8 @@ class Channel:
     inspect: Callable[[bytes], MessageState]
     last_ns: list[int]
     """Shared by the channels of a topic."""
+    stamp_ns: Callable[[bytes], int | None] | None
+    """Reads the time in a message itself, where its type has one."""
 
     def later(self, stamp_ns: int) -> int:
         """Log times of a topic never run backwards, also when two threads deliver at once."""
@@ -62,7 +64,7 @@ class Channels:
         self._msg_folder = msg_folder
         self._max_topics = max_topics
         self._warn = warn
-        self._channels: dict[tuple[str, str, str, str], Channel] = {}
+        self._channels: dict[tuple[str, str, str, str, bool], Channel] = {}
         self._last_ns: dict[str, list[int]] = {}
         self._records: dict[str, schema.Schema | None] = {}
         self._hashes: dict[str, str] = {}
@@ -74,7 +76,8 @@ class Channels:
             sample: With the topic, the encoding and the hash of the type.
             type_name: The type after ``resolve_type``; "" where nobody knows it.
         """
-        key = (sample.topic, type_name, sample.message_encoding, sample.type_hash)
+        is_defined = sample.definition is not None
+        key = (sample.topic, type_name, sample.message_encoding, sample.type_hash, is_defined)
         channel = self._channels.get(key)
         if channel is None and len(self._channels) < self._max_topics:
             channel = self._channels[key] = self._new(sample, type_name)
@@ -103,7 +106,7 @@ class Channels:
             )
         look = inspector("" if is_strange else type_name, sample.message_encoding)
         last_ns = self._last_ns.setdefault(topic, [0])
-        return Channel(record, look, last_ns)
+        return Channel(record, look, last_ns, stamp_reader(record))
 
     def _schema(self, sample: WireSample, type_name: str) -> tuple[schema.Schema | None, bool]:
         """The schema to register: a known one, one with a name only, or none; and if it is strange.
@@ -115,6 +118,8 @@ class Channels:
             return None, False
         encoding = sample.message_encoding
         known = schema.schema_for(type_name)
+        if known is None and sample.definition is not None:
+            return sample.definition, False
         if encoding not in ("", known.message_encoding if known else "cdr"):
             return _name_only(type_name, encoding), False
         type_hash = sample.type_hash if sample.type_hash.startswith(HASH_PREFIX) else ""
@@ -381,7 +386,7 @@ class EpisodeRecording:
             return
         finding = item.finding or channel.inspect(item.sample.data)
         try:
-            self._append(channel, item.sample, item.sample.received_ns)
+            self._append(channel, item.sample, item.sample.received_ns, item.image_encoding)
         except OSError:
             self.ledger.count_refused(item)
             raise
@@ -393,9 +398,13 @@ class EpisodeRecording:
         if channel is not None:
             self._append(channel, sample, sample.received_ns)
 
-    def _append(self, channel: Channel, sample: WireSample, stamp_ns: int) -> None:
+    def _append(
+        self, channel: Channel, sample: WireSample, stamp_ns: int, image_encoding: str = ""
+    ) -> None:
         log_ns = channel.later(stamp_ns)
         source_ns = sample.source_ns
+        if source_ns is None and channel.stamp_ns is not None:
+            source_ns = channel.stamp_ns(sample.data)
         self._parts.writer.write_foreign(
             sample.topic,
             sample.data,
@@ -404,6 +413,7 @@ class EpisodeRecording:
             log_time_ns=log_ns,
             publish_time_ns=source_ns if source_ns is not None and source_ns >= 0 else log_ns,
             sequence=sample.sequence,
+            about=(("image_encoding", image_encoding),) if image_encoding else (),
         )
 
     def tick(self, now_ns: int, health: dict[str, int]) -> None:

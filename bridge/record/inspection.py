@@ -5,15 +5,17 @@ the first and last bytes of a JPEG. ``robot-gst check`` decodes everything after
 """
 
 import json
+import re
 import struct
 from collections.abc import Callable
 from enum import StrEnum
-from functools import lru_cache
+from functools import lru_cache, partial
 
+from bridge.clock import NS_PER_S, join_ns
 from bridge.episode import schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.images import DEPTH_ENCODINGS, ImageHeader, image_header
-from bridge.episode.cdr.messages import VideoFrame
+from bridge.episode.cdr.images import DEPTH_ENCODINGS, FLOAT_DEPTH, ImageHeader, image_header
+from bridge.episode.cdr.messages import VideoFrame, foxglove_stamp_ns
 from bridge.episode.topics import type_of_topic
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
@@ -73,12 +75,53 @@ def inspector(type_name: str, message_encoding: str) -> Callable[[bytes], Messag
     if known.message_encoding == "json":
         version = schema.json_schema_version(type_name)
         return lambda data: _inspect_json(version, data)
-    return _inspect_video
+    return lambda data: _inspect_protobuf(type_name, data)
 
 
-def _inspect_video(data: bytes) -> MessageState:
+def stamp_reader(record: schema.Schema | None) -> Callable[[bytes], int | None] | None:
+    """Return what reads the time in a message itself, or None for types without one.
+
+    For messages that came without an attachment: ``header.stamp`` of a ROS 2 type, the timestamp
+    of Foxglove's video and audio.
+    """
+    if record is None:
+        return None
+    if record.name in schema.PROTOBUF_MEMBERS and record.message_encoding == "protobuf":
+        return partial(_protobuf_stamp_ns, record.name)
+    if record.schema_encoding == "ros2msg" and _FIRST_IS_HEADER.match(record.data):
+        return _header_stamp_ns
+    return None
+
+
+_FIRST_IS_HEADER = re.compile(rb"(?:\s*(?:#[^\n]*)?\n)*\s*std_msgs/(?:msg/)?Header\s+header\b")
+
+
+def _protobuf_stamp_ns(type_name: str, data: bytes) -> int | None:
     try:
-        VideoFrame.from_protobuf(data)
+        return foxglove_stamp_ns(type_name, data) or None
+    except codec.MalformedMessageError:
+        return None
+
+
+def _header_stamp_ns(data: bytes) -> int | None:
+    """The stamp stands behind the 4 bytes of encapsulation; one of 0 was never set."""
+    if len(data) < _STAMPED_BYTES or data[1] not in (0, 1):
+        return None
+    sec, nanosec = struct.unpack_from("<iI" if data[1] else ">iI", data, 4)
+    if sec < 0 or nanosec >= NS_PER_S:
+        return None
+    return join_ns(sec, nanosec) or None
+
+
+_STAMPED_BYTES = 12
+
+
+def _inspect_protobuf(type_name: str, data: bytes) -> MessageState:
+    try:
+        if type_name == schema.COMPRESSED_VIDEO:
+            VideoFrame.from_protobuf(data)
+        else:
+            foxglove_stamp_ns(type_name, data)
     except codec.MalformedMessageError:
         return MessageState.UNDECODABLE
     return GOOD
@@ -100,7 +143,9 @@ def fits(header: ImageHeader) -> bool:
     """Say whether an image has as many bytes as its size and step ask for."""
     if header.data_length != header.height * header.step:
         return False
-    return header.encoding not in DEPTH_ENCODINGS or header.step >= 2 * header.width
+    pixel_bytes = 4 if header.encoding == FLOAT_DEPTH else 2
+    is_depth = header.encoding in (*DEPTH_ENCODINGS, FLOAT_DEPTH)
+    return not is_depth or header.step >= pixel_bytes * header.width
 
 
 def _is_cut_jpeg(data: bytes) -> bool:

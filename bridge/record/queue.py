@@ -172,6 +172,8 @@ class Item:
     """Made here of this message, and written behind it; in no account."""
     for_preview: bool = False
     """Nobody records; only a preview is made of it."""
+    image_encoding: str = ""
+    """Of a raw image, for example 16UC1: another one is written to a channel of its own."""
 
     @property
     def received_ns(self) -> int:
@@ -242,6 +244,8 @@ class Flow:
     topic: str
     type_name: str
     is_image: bool
+    is_bulk: bool
+    """Also video, which goes past the encoders."""
     is_ledger: bool
     """The topic on which a recorder says what it lost; nobody else may."""
     seen: int = 0
@@ -321,7 +325,7 @@ class InputQueue:
                 if not for_preview:
                     return
             size = len(sample.data)
-            is_bulk = flow.is_image or size >= BULK_BYTES
+            is_bulk = flow.is_bulk or size >= BULK_BYTES
             cost = size + OVERHEAD_BYTES
             if not self._fits(flow, sample, step, cost=cost, is_bulk=is_bulk):
                 return
@@ -346,6 +350,7 @@ class InputQueue:
             topic,
             type_name,
             is_image=type_name in IMAGE_TYPES,
+            is_bulk=type_name in IMAGE_TYPES or type_name == schema.COMPRESSED_VIDEO,
             is_ledger=topic == DROPS,
         )
         self._flows[sample.topic, sample.type_name] = flow

@@ -55,13 +55,13 @@ def run_source(
     from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
 
     output.detail(f"{source.name} publishes {', '.join(source.topics)}")
-    with _stopping(duration_s) as stop, open_session(wire) as session:
+    with stopping(duration_s) as stop, open_session(wire) as session:
         return source.run(session, stop, output)
 
 
 @contextmanager
-def _stopping(duration_s: float | None) -> Iterator[threading.Event]:
-    """An event that is set by a signal, or when the time is over."""
+def stopping(duration_s: float | None) -> Iterator[threading.Event]:
+    """Set an event on SIGINT, on SIGTERM, or when the time is over; None: never."""
     with stop_signals() as stop:
         timer = None if duration_s is None else threading.Timer(duration_s, stop.set)
         if timer is not None:

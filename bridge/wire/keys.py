@@ -16,8 +16,14 @@ _ROS_KEY = re.compile(
     r"^\d+/(?P<topic>.+)/(?P<type>[^/]+)/(?P<hash>RIHS01_[0-9a-f]{64}|TypeHashNotSupported)$"
 )
 _FORBIDDEN = re.compile(r"[*$?#]")
-_CDR, _JSON = "application/cdr", "application/json"
-_ENCODINGS = {_CDR: "cdr", _JSON: "json"}
+_BYTES = "zenoh/bytes"
+"""What zenoh itself says of a message without an encoding."""
+_ENCODINGS = {
+    f"application/{name}": name
+    for name in ("cdr", "json", "protobuf", "cbor", "msgpack", "flatbuffer", "ros1")
+}
+"""MCAP's message encodings, by the zenoh encoding that stands for each."""
+_SYNONYMS = {"text/json": "json", "application/x-protobuf": "protobuf"}
 NO_HASH = "TypeHashNotSupported"
 """What ROS 2 Humble writes where later releases write a hash."""
 
@@ -66,14 +72,48 @@ def ros_type(dds_name: str) -> str:
     return "/".join(parts).removesuffix("_")
 
 
+DEFINITIONS = "@schema"
+"""Publishers of types that nobody knows put their definitions below this key."""
+_SCHEMA_ENCODINGS = {
+    "ros2msg": "cdr",
+    "ros2idl": "cdr",
+    "ros1msg": "ros1",
+    "protobuf": "protobuf",
+    "flatbuffer": "flatbuffer",
+    "jsonschema": "json",
+}
+"""MCAP's schema encodings, and the message encoding that goes with each."""
+
+
+def definition_key(type_name: str, schema_encoding: str) -> str:
+    """Name the key of a type's definition: ``@schema/jsonschema/acme/Note``.
+
+    Raises:
+        BadTopicError: When the type's name cannot be part of a key.
+    """
+    return f"{DEFINITIONS}/{key_from_topic(f'/{schema_encoding}/{type_name}')}"
+
+
+def read_definition_key(key: str) -> tuple[str, str, str] | None:
+    """Return type name, schema encoding and message encoding of a definition's key, or None."""
+    _, _, rest = key.partition(f"{DEFINITIONS}/")
+    schema_encoding, _, type_name = rest.partition("/")
+    message_encoding = _SCHEMA_ENCODINGS.get(schema_encoding)
+    if message_encoding is None or not type_name:
+        return None
+    return type_name, schema_encoding, message_encoding
+
+
 def encoding_of(type_name: str, message_encoding: str) -> str:
     """Name a type in a zenoh encoding.
 
     Args:
         type_name: Such as ``sensor_msgs/msg/JointState``; "" for unknown.
-        message_encoding: Such as ``cdr`` or ``json``; one not known is written as CDR.
+        message_encoding: Such as ``cdr`` or ``json``; of one not known nothing is said.
     """
-    kind = next((k for k, name in _ENCODINGS.items() if name == message_encoding), _CDR)
+    kind = f"application/{message_encoding}"
+    if kind not in _ENCODINGS:
+        kind = _BYTES
     return f"{kind};{type_name}" if type_name else kind
 
 
@@ -81,4 +121,4 @@ def encoding_of(type_name: str, message_encoding: str) -> str:
 def parse_encoding(encoding: str) -> tuple[str, str]:
     """Split a zenoh encoding into (type name, MCAP message encoding); "" where unknown."""
     kind, _, type_name = encoding.partition(";")
-    return type_name, _ENCODINGS.get(kind, "")
+    return type_name, _ENCODINGS.get(kind) or _SYNONYMS.get(kind, "")

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from types import TracebackType
@@ -126,24 +126,41 @@ class WireSample:
     source_gid: bytes | None
     """16 bytes that no other publisher has."""
     received_ns: int
+    attachment_bytes: int = 0
+    """Size of the attachment, whether it could be read or not."""
+    definition: schema.Schema | None = None
+    """What the publisher says its type is, where it does."""
     oversize_bytes: int = 0
     """Size of a payload beyond the subscription's limit; then ``data`` is empty, not a copy."""
 
 
-def copy_sample(sample: Any, received_ns: int, *, max_bytes: int = sys.maxsize) -> WireSample:
+NO_DEFINITIONS: Mapping[tuple[str, str], schema.Schema] = {}
+MAX_DEFINITIONS = 1000
+MAX_DEFINITION_BYTES = 4_000_000
+
+
+def copy_sample(
+    sample: Any,
+    received_ns: int,
+    *,
+    max_bytes: int = sys.maxsize,
+    definitions: Mapping[tuple[str, str], schema.Schema] = NO_DEFINITIONS,
+) -> WireSample:
     """Read a zenoh sample. Its payload is copied: a kept one would pin the sender's memory.
 
     Args:
         sample: A ``zenoh.Sample``.
         received_ns: When it came in [ns since 1970].
         max_bytes: A larger payload is left out, its size stands in ``oversize_bytes``.
+        definitions: What publishers told of their types, by type name and message encoding.
     """
     size = len(sample.payload)
     is_oversize = size > max_bytes
     named = keys.read_key(str(sample.key_expr))
     type_name, message_encoding = keys.parse_encoding(str(sample.encoding))
     raw = sample.attachment
-    note = publisher.decode(None if raw is None else raw.to_bytes())
+    attachment = None if raw is None else raw.to_bytes()
+    note = publisher.decode(attachment)
     if note is None:
         sequence, gid = _source_of(sample.source_info)
         source_ns = None
@@ -159,6 +176,8 @@ def copy_sample(sample: Any, received_ns: int, *, max_bytes: int = sys.maxsize) 
         sequence=sequence,
         source_gid=gid,
         received_ns=received_ns,
+        definition=definitions.get((type_name, message_encoding)) if definitions else None,
+        attachment_bytes=0 if attachment is None else len(attachment),
         oversize_bytes=size if is_oversize else 0,
     )
 
@@ -212,22 +231,34 @@ class WireSession:
         self._clock = AnchoredClock()
         self._services: list[Service] = []
         self._alive: list[AliveToken] = []
+        self._definitions: dict[tuple[str, str], schema.Schema] = {}
         self._pool = SharedPool(shared_memory_mb * BYTES_PER_MB) if shared_memory_mb else None
 
     def now_ns(self) -> int:
         """The clock that stamps ``received_ns``; it never runs backwards."""
         return self._clock.now_ns()
 
-    def publisher(self, topic: str, type_name: str, *, qos: Qos = Qos.RELIABLE) -> WirePublisher:
+    def publisher(
+        self,
+        topic: str,
+        type_name: str,
+        *,
+        qos: Qos = Qos.RELIABLE,
+        message_encoding: str | None = None,
+    ) -> WirePublisher:
         """Announce a topic.
 
         Args:
             topic: With its leading slash.
-            type_name: As in ``bridge.episode.schema``; foreign types count as CDR.
+            type_name: As in ``bridge.episode.schema``.
             qos: What happens when the network is behind; control loops use ``Qos.CONTROL``.
+            message_encoding: cdr, json, protobuf ...; that of the type where it is left out, and
+                foreign types then count as CDR.
         """
-        known = schema.schema_for(type_name)
-        encoding = keys.encoding_of(type_name, known.message_encoding if known else "cdr")
+        if message_encoding is None:
+            known = schema.schema_for(type_name)
+            message_encoding = known.message_encoding if known else "cdr"
+        encoding = keys.encoding_of(type_name, message_encoding)
         control = zenoh.CongestionControl
         try:
             inner = self._inner.declare_publisher(
@@ -258,7 +289,8 @@ class WireSession:
 
         def on_sample(sample: Any) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
-                callback(copy_sample(sample, self._clock.now_ns(), max_bytes=max_bytes))
+                now_ns, known = self._clock.now_ns(), self._definitions
+                callback(copy_sample(sample, now_ns, max_bytes=max_bytes, definitions=known))
 
         handler = zenoh.handlers.Callback(on_sample, indirect=False)
         try:
@@ -266,6 +298,42 @@ class WireSession:
         except zenoh.ZError as error:
             message = f"cannot subscribe to {key_expression!r}: {cause_of(error)}."
             raise WireConfigError(message) from error
+
+    def define(self, record: schema.Schema) -> None:
+        """Tell what a type is that nobody knows, now and to whoever asks later.
+
+        Call it before the first message, from the thread that publishes.
+
+        Raises:
+            BadTopicError: When the type's name cannot be part of a key.
+        """
+        key = keys.definition_key(record.name, record.schema_encoding)
+        self.serve(key, lambda request: record.data)
+        self._inner.put(key, record.data, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def collect_definitions(self, *, timeout_s: float = 2.0) -> None:
+        """Learn what publishers say of their types; samples that follow carry it.
+
+        Subscribe to their topics afterwards.
+        """
+
+        def learn(sample: WireSample) -> None:
+            named = keys.read_definition_key(sample.topic.removeprefix("/"))
+            is_full = len(self._definitions) >= MAX_DEFINITIONS
+            if named is None or sample.oversize_bytes or is_full:
+                return
+            type_name, schema_encoding, message_encoding = named
+            self._definitions[type_name, message_encoding] = schema.Schema(
+                name=type_name,
+                schema_encoding=schema_encoding,
+                message_encoding=message_encoding,
+                data=sample.data,
+            )
+
+        everything = f"{keys.DEFINITIONS}/**"
+        self.subscribe(everything, learn, max_bytes=MAX_DEFINITION_BYTES)
+        for sample in self.query_all(everything, timeout_s=timeout_s):
+            learn(sample)
 
     def serve(
         self,

@@ -199,7 +199,7 @@ def _stamps(
     if executed and topic is not None:
         found = (
             color_from_message(message.type_name, message.data).stamp_ns
-            for message in episode.messages([topic])
+            for message in streams.image_messages(episode, [topic])
         )
         stamps = [stamp_ns for stamp_ns in found if start_ns <= stamp_ns <= end_ns]
     else:

@@ -28,6 +28,8 @@ COLOR_LAYOUTS = {
 SUBSAMPLING = "420"
 """Half the work and the size of full colour; cameras interpolate their colour anyway."""
 DEPTH_ENCODINGS = ("16UC1", "mono16")
+FLOAT_DEPTH = "32FC1"
+"""Depth in metres; NaN, infinity and 0 are no measurement (REP 118)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,6 +16,7 @@ from bridge.episode.cdr.codec import MalformedMessageError, Message
 from bridge.episode.cdr.images import (
     COLOR_LAYOUTS,
     DEPTH_ENCODINGS,
+    FLOAT_DEPTH,
     image_header,
     image_to_jpeg,
     pixel_rows,
@@ -60,6 +61,33 @@ class VideoFrame:
             raise MalformedMessageError(
                 type_name=schema.COMPRESSED_VIDEO, found=str(error)
             ) from error
+
+
+def foxglove_stamp_ns(type_name: str, data: bytes) -> int:
+    """Walk through a message of one of our protobuf types and return its time [ns].
+
+    Raises:
+        MalformedMessageError: The bytes are no such message.
+    """
+    kinds = {number: kind for _, number, kind, _ in schema.PROTOBUF_MEMBERS[type_name]}
+    stamp_ns = 0
+    try:
+        for number, value in protobuf.fields(memoryview(data)):
+            if number not in kinds:
+                continue
+            if isinstance(value, int):
+                raise ValueError(_not_bytes(number))
+            if kinds[number] == protobuf.FIXED32_TYPE and len(value) != FIXED32_BYTES:
+                message = f"field {number} has {len(value)} bytes, not {FIXED32_BYTES}"
+                raise ValueError(message)
+            if number == 1:
+                stamp_ns = _stamp(bytes(value))
+    except ValueError as error:
+        raise MalformedMessageError(type_name=type_name, found=str(error)) from error
+    return stamp_ns
+
+
+FIXED32_BYTES = 4
 
 
 def _not_bytes(number: int) -> str:
@@ -215,6 +243,23 @@ def _no_color(encoding: str) -> codec.MalformedMessageError:
     return codec.MalformedMessageError(type_name=schema.IMAGE, found=found)
 
 
+def raw_color_to_cdr(
+    stamp_ns: int, frame_id: str, image_u8: UInt8[np.ndarray, "height width 3"]
+) -> bytes:
+    """Serialise an sRGB image as sensor_msgs/Image of encoding rgb8."""
+    height, width = image_u8.shape[:2]
+    message = {
+        "header": _header(stamp_ns, frame_id),
+        "height": height,
+        "width": width,
+        "encoding": "rgb8",
+        "is_bigendian": 0,
+        "step": 3 * width,
+        "data": image_u8.tobytes(),
+    }
+    return codec.encode(schema.IMAGE, message)
+
+
 def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColor:
     """Read a colour image, compressed or raw; both have ``stamp_ns`` and ``image_u8()``.
 
@@ -270,8 +315,19 @@ class DepthImage:
 
     @staticmethod
     def from_cdr(data: bytes) -> "DepthImage":
-        """Read a sensor_msgs/Image; refuses other encodings and sizes that do not match."""
+        """Read a sensor_msgs/Image; refuses other encodings and sizes that do not match.
+
+        Metres of encoding 32FC1 are rounded to whole millimetres.
+        """
         header = image_header(data)
+        if header.encoding == FLOAT_DEPTH:
+            rows = np.ascontiguousarray(pixel_rows(data, header, 4))
+            depth_m = rows.view(">f4" if header.is_bigendian else "<f4").astype(np.float32)
+            return DepthImage(
+                stamp_ns=header.stamp_ns,
+                frame_id=header.frame_id,
+                depth_mm=depth.from_metres(depth_m),
+            )
         if header.encoding not in DEPTH_ENCODINGS:
             raise codec.MalformedMessageError(
                 type_name=schema.IMAGE, found=f"encoding {header.encoding!r}, expected '16UC1'"

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
+from types import MappingProxyType
 from typing import TypeAlias
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -94,17 +95,24 @@ def schema(schema_id: int, name: str, encoding: str, data: bytes) -> bytes:
     return record(SCHEMA, struct.pack("<H", schema_id), text(name), text(encoding), size, data)
 
 
-def channel(channel_id: int, schema_id: int, topic: str, message_encoding: str) -> bytes:
-    """Encode a channel; schema id 0 is none.
+def channel(
+    channel_id: int,
+    schema_id: int,
+    topic: str,
+    message_encoding: str,
+    about: Mapping[str, str] = MappingProxyType({}),
+) -> bytes:
+    """Encode a channel with its metadata; schema id 0 is none.
 
     Args:
         channel_id: 0 to 65535, once in a file.
         schema_id: Of a schema before it in the file, or 0.
         topic: With its leading slash.
         message_encoding: Such as ``cdr`` or ``json``.
+        about: Metadata of the channel.
     """
     ids = struct.pack("<HH", channel_id, schema_id)
-    return record(CHANNEL, ids, text(topic), text(message_encoding), text_map({}))
+    return record(CHANNEL, ids, text(topic), text(message_encoding), text_map(about))
 
 
 def chunk_head(

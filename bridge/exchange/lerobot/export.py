@@ -24,6 +24,7 @@ from bridge.episode.streams import (
     events,
     execution_ns,
     find_camera_topic,
+    image_messages,
     joint_track,
     plans,
 )
@@ -139,7 +140,7 @@ def row_images(
         wanted: Number of the image that each row takes, counted from 0 in log order.
     """
     row = 0
-    for number, message in enumerate(episode.messages([_topic(episode, camera)])):
+    for number, message in enumerate(image_messages(episode, [_topic(episode, camera)])):
         if row == len(wanted):
             return
         if number != wanted[row]:
@@ -163,7 +164,7 @@ def _image_stamps(
     """Stamps of a camera's images and their place in the file; those out of order left out."""
     stamps: list[int] = []
     numbers: list[int] = []
-    for number, message in enumerate(episode.messages([_topic(episode, camera)])):
+    for number, message in enumerate(image_messages(episode, [_topic(episode, camera)])):
         with message_named(episode, message.topic, number + 1):
             stamp_ns = color_from_message(message.type_name, message.data).stamp_ns
         if not stamps or stamp_ns > stamps[-1]:

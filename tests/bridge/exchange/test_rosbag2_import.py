@@ -119,7 +119,12 @@ def test_a_folder_without_metadata_is_all_its_files(tmp_path: Path) -> None:
     [
         ("", ("gone.mcap",), PathNotFoundError, "gone.mcap"),
         ("", ("../outside.mcap",), BridgeError, "lies outside its folder"),
-        ("  compression_mode: FILE\n", ("x.mcap.zstd",), BridgeError, "compressed by rosbag2"),
+        (
+            "  compression_mode: FILE\n  compression_format: lz4\n",
+            ("x",),
+            BridgeError,
+            "zstd is read",
+        ),
         ("  broken: [\n", ("x.mcap",), BridgeError, "it is no YAML"),
         ("  relative_file_paths: 3\n", (), BridgeError, "it is no YAML|lists no files"),
     ],
@@ -137,8 +142,8 @@ def test_a_bag_that_cannot_be_read_is_one_sentence(
 def test_another_storage_is_refused(tmp_path: Path) -> None:
     folder = folder_bag(tmp_path / "bag", "x.db3")
     about = folder / "metadata.yaml"
-    about.write_text(about.read_text().replace(": mcap", ": sqlite3"))
-    with pytest.raises(BridgeError, match="its storage is 'sqlite3', not mcap"):
+    about.write_text(about.read_text().replace(": mcap", ": leveldb"))
+    with pytest.raises(BridgeError, match="its storage is 'leveldb'; mcap and sqlite3 are read"):
         find_files(folder)
 
 

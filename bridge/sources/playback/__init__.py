@@ -1,0 +1,1 @@
+"""Plays an episode back onto zenoh, with its own timing."""

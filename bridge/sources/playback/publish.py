@@ -1,0 +1,371 @@
+"""Publishes what an episode holds: the same bytes in the same order, as far apart as they came.
+
+Publish times are those of the episode, so that a recording of the playback has them too. Sequence
+numbers are counted anew: a gap in the new recording was lost on this way, not on the first one.
+"""
+
+import contextlib
+import json
+import queue
+import sys
+import threading
+import time
+from array import array
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap import records
+
+from bridge.clock import NS_PER_S, ns_from_s
+from bridge.episode import schema
+from bridge.episode.mcap.messages import Selection, Stored, merged
+from bridge.episode.reader import Episode
+from bridge.episode.topics import DROPS, TF_STATIC, is_latched
+from bridge.errors import UsageError
+from bridge.sources.playback.config import PlaybackConfig, choose_topics, rename_topics
+from bridge.terminal import Output
+from bridge.wire.errors import BadTopicError
+from bridge.wire.keys import key_from_topic
+from bridge.wire.session import WirePublisher, WireSession
+
+SLICE_S = 0.05
+"""A playback that waits looks this often whether it was paused."""
+SWITCH_S = 0.0005
+"""The thread that reads gives way to the one that sends after this long, not after 5 ms."""
+LATEST_NS = 2**63 - 1
+"""The latest publish time that an attachment can hold."""
+
+
+class Due(NamedTuple):
+    """A message and its place in the time of the playback."""
+
+    at_ns: int
+    """Log time, counted on through every repetition."""
+    item: Stored
+
+
+class Pace:
+    """Says when a message is due; stands still while paused."""
+
+    def __init__(
+        self,
+        rate: float,
+        *,
+        paused: bool = False,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Begin with the first message.
+
+        Args:
+            rate: Times as fast as recorded.
+            paused: Wait before the first message.
+            monotonic: The clock [s].
+        """
+        self._rate = rate
+        self._monotonic = monotonic
+        self._lock = threading.Lock()
+        self._running = threading.Event()
+        self._first_ns: int | None = None
+        self._began_s = 0.0
+        self._paused_s = 0.0
+        """When the pause began that lasts."""
+        if not paused:
+            self._running.set()
+
+    @property
+    def is_paused(self) -> bool:
+        """Whether it stands still."""
+        return not self._running.is_set()
+
+    def pause(self) -> None:
+        """Stand still."""
+        with self._lock:
+            if self._running.is_set():
+                self._paused_s = self._monotonic()
+                self._running.clear()
+
+    def resume(self) -> None:
+        """Go on where it stood still."""
+        with self._lock:
+            if not self._running.is_set():
+                self._began_s += self._monotonic() - self._paused_s
+                self._running.set()
+
+    def toggle(self) -> str:
+        """Pause or go on, and say which."""
+        (self.resume if self.is_paused else self.pause)()
+        return "paused" if self.is_paused else "playing"
+
+    def wait(self, at_ns: int, stop: threading.Event) -> float | None:
+        """Wait until a message is due.
+
+        Args:
+            at_ns: Its time in the episode [ns].
+            stop: Ends the wait.
+
+        Returns:
+            How late it is [s], or None when the playback was stopped.
+        """
+        while not stop.is_set():
+            if not self._running.is_set():
+                self._running.wait(SLICE_S)
+                continue
+            if self._first_ns is None:
+                self._first_ns, self._began_s = at_ns, self._monotonic()
+            with self._lock:
+                due_s = self._began_s + (at_ns - self._first_ns) / (NS_PER_S * self._rate)
+            left_s = due_s - self._monotonic()
+            if left_s <= 0:
+                return -left_s
+            stop.wait(min(left_s, SLICE_S))
+        return None
+
+
+BATCH_MESSAGES = 256
+BATCH_BYTES = 4_000_000
+BATCHES_AHEAD = 8
+
+
+class ReadAhead:
+    """Reads messages on a thread of its own, so that unpacking a chunk delays none of them."""
+
+    def __init__(self, messages: Iterator[Due]) -> None:
+        """Begin to read."""
+        self._messages = messages
+        self._batches: queue.Queue[list[Due]] = queue.Queue(BATCHES_AHEAD)
+        self._closed = threading.Event()
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._read, name="read ahead", daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        batch: list[Due] = []
+        size = 0
+        try:
+            for message in self._messages:
+                batch.append(message)
+                size += len(message.item.data)
+                if len(batch) >= BATCH_MESSAGES or size >= BATCH_BYTES:
+                    if not self._hand_over(batch):
+                        return
+                    batch, size = [], 0
+        except Exception as error:  # noqa: BLE001  # raised again where the messages are used
+            self._error = error
+        if not batch or self._hand_over(batch):
+            self._hand_over([])
+
+    def _hand_over(self, batch: list[Due]) -> bool:
+        while not self._closed.is_set():
+            try:
+                self._batches.put(batch, timeout=SLICE_S)
+            except queue.Full:
+                continue
+            return True
+        return False
+
+    def __iter__(self) -> Iterator[Due]:
+        """Yield the messages; an error of reading comes after those before it."""
+        while batch := self._batches.get():
+            yield from batch
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        """Stop reading."""
+        self._closed.set()
+        self._thread.join()
+
+
+class EpisodeSource:
+    """An episode as a ``bridge.sources.source.Source``."""
+
+    def __init__(self, path: Path, config: PlaybackConfig) -> None:
+        """Open an episode and choose what is sent.
+
+        Args:
+            path: A finished episode, or any other MCAP file.
+            config: What, how fast, and under which names.
+
+        Raises:
+            PathNotFoundError: When the file is not there.
+            EpisodeError: When it is no MCAP file, or was never finished.
+            UsageError: When nothing is chosen, or a name cannot travel on zenoh.
+        """
+        self.episode = Episode.open(path)
+        self.config = config
+        self._defined: set[str] = set()
+        self.pace = Pace(config.rate, paused=config.paused)
+        counts = {topic: each.count for topic, each in self.episode.topics().items()}
+        there = [topic for topic in counts if topic != DROPS]
+        self.names = rename_topics(config.remap, choose_topics(config.topics, there))
+        for name in self.names.values():
+            _check_name(path, name)
+        self.num_messages = sum(counts[topic] for topic in self.names)
+        if not self.num_messages:
+            listed = ", ".join(self.names) or "it has no topics"
+            raise UsageError(f"{path} holds no messages to play ({listed}).")
+        self.start_ns = self.episode.start_ns + ns_from_s(config.start_s)
+        if self.start_ns > self.episode.end_ns:
+            raise UsageError(
+                f"--start-s {config.start_s:g} is behind the end of {path}, which lasts "
+                f"{self.episode.duration_s:.3f} s."
+            )
+
+    @property
+    def name(self) -> str:
+        """The episode's id."""
+        return self.episode.info.id
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The topics it sends, by the names they get."""
+        return tuple(self.names.values())
+
+    def messages(self) -> Iterator[Due]:
+        """Yield what is sent, again and again with ``loop``; the recorder's drop log stays out."""
+        wanted = frozenset(self.names)
+        before = list(self._latched_before())
+        step_ns = self._pass_ns()
+        shift_ns = 0
+        while True:
+            for item in before:
+                yield Due(shift_ns + self.start_ns, item)
+            for item in merged(self.episode.files, Selection(wanted, self.start_ns)):
+                yield Due(shift_ns + item.log_time_ns, item)
+            if not self.config.loop:
+                return
+            shift_ns += step_ns
+
+    def _pass_ns(self) -> int:
+        """From one pass to the next: the last message is followed as soon as an average one is."""
+        length_ns = self.episode.end_ns - self.start_ns
+        return length_ns + (length_ns // self.num_messages or NS_PER_S)
+
+    def _latched_before(self) -> Iterator[Stored]:
+        """What was latched when the playback begins: the last of each topic, and all frames."""
+        if self.start_ns <= self.episode.start_ns:
+            return
+        latched = frozenset(topic for topic in self.names if is_latched(topic))
+        last: dict[tuple[str, int], Stored] = {}
+        for item in merged(self.episode.files, Selection(latched, None, self.start_ns)):
+            topic = item.channel.topic
+            last[topic, len(last) if topic == TF_STATIC else 0] = item
+        yield from last.values()
+
+    def run(self, session: WireSession, stop: threading.Event, output: Output) -> dict[str, Any]:
+        """Send every message at its time.
+
+        Returns:
+            Messages sent in all and by topic, and how late they were [ms].
+
+        Raises:
+            EpisodeError: When the file turns out to be damaged; what lies before was sent.
+        """
+        for path in self.episode.missing_parts:
+            output.say(f"{path.name} is missing; what it held is not played")
+        self._serve_control(session)
+        for cell in sorted({name.split("/")[1] for name in self.topics if name.count("/") > 1}):
+            session.declare_alive(f"{cell}/alive")
+        publishers = self._publishers(session)
+        sent = dict.fromkeys(self.topics, 0)
+        late_s = array("d")
+        ahead = ReadAhead(self.messages())
+        switch_s = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH_S)
+        try:
+            with output.progress("play", self.num_messages) as advance:
+                for at_ns, item in ahead:
+                    waited_s = self.pace.wait(at_ns, stop)
+                    if waited_s is None:
+                        break
+                    late_s.append(waited_s)
+                    publisher = publishers[id(item.file), item.channel.id]
+                    publisher.put(item.data, source_ns=min(item.publish_time_ns, LATEST_NS))
+                    sent[self.names[item.channel.topic]] += 1
+                    advance(len(late_s), "")
+        finally:
+            sys.setswitchinterval(switch_s)
+            ahead.close()
+        return {
+            "episode": self.name,
+            "messages": len(late_s),
+            "of": self.num_messages,
+            "topics": sent,
+            "late_ms": _lateness_ms(late_s),
+        }
+
+    def _serve_control(self, session: WireSession) -> None:
+        """Answer ``robot-gst ctl pause`` and ``resume``."""
+
+        def answer(act: Callable[[], None]) -> Callable[[bytes], bytes]:
+            def handler(payload: bytes) -> bytes:
+                act()
+                state = "paused" if self.pace.is_paused else "playing"
+                return json.dumps({"ok": True, "episode": self.name, "state": state}).encode()
+
+            return handler
+
+        for verb, act in (("pause", self.pace.pause), ("resume", self.pace.resume)):
+            session.serve(f"rec/{self.config.name}/ctl/{verb}", answer(act))
+
+    def _publishers(self, session: WireSession) -> dict[tuple[int, int], WirePublisher]:
+        """A publisher for each topic with one definition, by file and channel."""
+        made: dict[tuple[str, str, str], WirePublisher] = {}
+        found: dict[tuple[int, int], WirePublisher] = {}
+        for file in self.episode.files:
+            for channel in file.summary.channels.values():
+                if channel.topic not in self.names:
+                    continue
+                record = file.schema_of(channel)
+                key = (channel.topic, record.name if record else "", channel.message_encoding)
+                if record is not None:
+                    self._define(session, record, channel.message_encoding)
+                if key not in made:
+                    made[key] = session.publisher(
+                        self.names[channel.topic], key[1], message_encoding=key[2]
+                    )
+                found[id(file), channel.id] = made[key]
+        return found
+
+    def _define(self, session: WireSession, record: records.Schema, message_encoding: str) -> None:
+        """Send the definition of a type that only the episode knows."""
+        is_new = record.name not in self._defined
+        if is_new and record.data and schema.schema_for(record.name) is None:
+            self._defined.add(record.name)
+            made = schema.Schema(
+                name=record.name,
+                schema_encoding=record.encoding,
+                message_encoding=message_encoding,
+                data=record.data,
+            )
+            with contextlib.suppress(BadTopicError):  # then only its name is recorded again
+                session.define(made)
+
+
+def _check_name(path: Path, name: str) -> None:
+    try:
+        key_from_topic(name)
+    except BadTopicError as error:
+        raise UsageError(
+            f"{path}: {error} Rename it with --remap, or choose others with --topics."
+        ) from error
+
+
+def _lateness_ms(late_s: "array[float]") -> dict[str, float]:
+    """How long after their time messages left [ms]: median, 99th percentile, largest."""
+    if not late_s:
+        return {}
+    late_ms = np.frombuffer(late_s, dtype=np.float64) * 1e3
+    median, p99 = np.percentile(late_ms, (50, 99)).tolist()
+    return {"median": median, "p99": p99, "max": float(late_ms.max())}
+
+
+def describe_counts(counts: dict[str, Any]) -> str:
+    """One line for people."""
+    topics = sum(count > 0 for count in counts["topics"].values())
+    text = f"{counts['episode']}: {counts['messages']} messages on {topics} topics sent"
+    if counts["late_ms"]:
+        text += f", 99 % of them at most {counts['late_ms']['p99']:.1f} ms late"
+    return text

@@ -1,0 +1,375 @@
+"""docs/wire.md, kept by a publisher that knows nothing of us, and broken in every way there is."""
+
+import ast
+import json
+import os
+import re
+import shutil
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from loopback import free_endpoint
+from mcap.reader import make_reader
+
+from bridge.episode import schema
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.messages import JointSample
+from bridge.episode.check import check_episode
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.record.recorder import Recorder
+from bridge.record.wire_check import TopicHeard, WireListener
+from bridge.wire.config import WireConfig
+from bridge.wire.publisher import Attachment, encode
+from bridge.wire.session import WireSession, open_session
+
+ROOT = Path(__file__).resolve().parents[3]
+EXAMPLES = ROOT / "docs" / "examples" / "zenoh"
+PYTHON = EXAMPLES / "publish_joints.py"
+JOINTS = "/demo/joint_states"
+WAIT_S = 20.0
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+@pytest.fixture
+def router(endpoint: str) -> Iterator[WireSession]:
+    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
+        yield session
+
+
+Spawn = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def spawn() -> Iterator[Spawn]:
+    children: list[subprocess.Popen[str]] = []
+
+    def start(*arguments: str) -> "subprocess.Popen[str]":
+        pipe = subprocess.PIPE
+        env = {**os.environ, "PYTHONPATH": str(ROOT)}
+        child = subprocess.Popen(
+            [sys.executable, *arguments], env=env, stdout=pipe, stderr=pipe, text=True
+        )
+        children.append(child)
+        return child
+
+    yield start
+    for child in children:
+        if child.poll() is None:
+            child.kill()
+        child.communicate()
+
+
+def test_the_example_knows_nothing_of_us_and_is_short() -> None:
+    tree = ast.parse(PYTHON.read_text())
+    names = {
+        alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for alias in node.names
+    }
+    assert names == {"json", "math", "struct", "sys", "time", "uuid", "zenoh"}
+    paths = [*EXAMPLES.glob("publish_joints.*"), *EXAMPLES.glob("joint_bytes.*")]
+    assert len(paths) == 6
+    for path in paths:
+        assert len(path.read_text().splitlines()) <= 100, path.name
+
+
+C_MAIN = """
+#include <stdio.h>
+#include "joint_bytes.h"
+static void show(const uint8_t* data, size_t length) {
+    for (size_t i = 0; i < length; i++) printf("%02x", data[i]);
+    printf("\\n");
+}
+int main() {
+    uint8_t gid[16], out[256];
+    const double position_rad[3] = {0.5, -0.5, 0};
+    for (int i = 0; i < 16; i++) gid[i] = (uint8_t)i;
+    show(out, attachment(out, -7, 1700000000123456789, gid));
+    show(out, joint_state(out, 1700000000123456789, position_rad));
+}
+"""
+RUST_MAIN = """
+#[path = "EXAMPLES/joint_bytes.rs"] mod joint_bytes;
+fn show(data: Vec<u8>) {
+    println!("{}", data.iter().map(|b| format!("{b:02x}")).collect::<String>());
+}
+fn main() {
+    let gid: [u8; 16] = std::array::from_fn(|i| i as u8);
+    show(joint_bytes::attachment(-7, 1700000000123456789, &gid));
+    show(joint_bytes::joint_state(1700000000123456789, [0.5, -0.5, 0.0]));
+}
+"""
+COMPILERS = {
+    "c": ["gcc", "-std=c11", "-Wall", "-Wextra", "-Werror", f"-I{EXAMPLES}", "main.c"],
+    "cpp": ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", f"-I{EXAMPLES}", "main.cpp"],
+    "rs": ["rustc", "main.rs"],
+}
+
+
+@pytest.mark.parametrize("language", COMPILERS)
+def test_the_bytes_of_every_language_are_the_same(tmp_path: Path, language: str) -> None:
+    command = COMPILERS[language]
+    if shutil.which(command[0]) is None:
+        pytest.skip(f"{command[0]} is not here")
+    text = RUST_MAIN.replace("EXAMPLES", str(EXAMPLES)) if language == "rs" else C_MAIN
+    (tmp_path / f"main.{language}").write_text(text)
+    made = subprocess.run(
+        [*command, "-o", "program"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    if language == "rs" and "linker" in made.stderr:
+        pytest.skip("rustc has no linker here")
+    assert made.returncode == 0, made.stderr
+    out = subprocess.run(
+        [str(tmp_path / "program")], capture_output=True, text=True, check=True
+    ).stdout
+    note, message = (bytes.fromhex(line) for line in out.split())
+    stamp_ns = 1_700_000_000_123_456_789
+    assert note == encode(Attachment(sequence=-7, source_ns=stamp_ns, gid=bytes(range(16))))
+    joints = JointSample.from_cdr(message)
+    assert (joints.stamp_ns, joints.names) == (stamp_ns, ("shoulder", "elbow", "wrist"))
+    assert joints.position.tolist() == [0.5, -0.5, 0.0]
+    assert codec.encode(schema.JOINT_STATE, codec.decode(schema.JOINT_STATE, message)) == message
+
+
+@pytest.mark.parametrize(
+    ("header", "command"),
+    [
+        ("zenoh.h", ["gcc", "-std=c11", "publish_joints.c", "-lzenohc", "-lm"]),
+        ("zenoh.hxx", ["g++", "-std=c++17", "-DZENOHCXX_ZENOHC", "publish_joints.cpp", "-lzenohc"]),
+    ],
+)
+def test_the_example_in_c_and_c_plus_plus_is_recorded_where_zenoh_is_installed(
+    router: WireSession, endpoint: str, tmp_path: Path, header: str, command: list[str]
+) -> None:
+    found = [Path(folder) / header for folder in ("/usr/include", "/usr/local/include")]
+    if shutil.which(command[0]) is None or not any(path.is_file() for path in found):
+        pytest.skip(f"not run: {command[0]} with {header} is not here")
+    program = str(tmp_path / "program")
+    subprocess.run([*command, "-o", program], cwd=EXAMPLES, check=True)
+    listener = WireListener(router, "demo/**", enough=59)
+    subprocess.run([program, endpoint, "demo", "60", "1000", "7"], timeout=WAIT_S, check=True)
+    assert listener.is_enough.wait(WAIT_S)
+    assert list(findings(listener.finish())) == ["wrong sequence"]
+
+
+@pytest.mark.parametrize("left_out", [(), (7, 8, 20)])
+def test_the_example_is_recorded_clean_and_its_losses_are_seen_exactly(
+    router: WireSession, endpoint: str, run: RunFolder, spawn: Spawn, left_out: tuple[int, ...]
+) -> None:
+    recorder = Recorder(run, now_ns=router.now_ns)
+    router.subscribe("**", recorder.receive)
+    recorder.start(EpisodeInfo(id="t1", kind="trial", cell="demo"))
+    publisher = spawn(str(PYTHON), endpoint, "demo", "60", "1000", *map(str, left_out))
+    _, said = publisher.communicate(timeout=WAIT_S)
+    assert publisher.returncode == 0, said
+    end_s = time.monotonic() + WAIT_S
+    while recorder.input_queue.seen().get(JOINTS, 0) < 60 - len(left_out):
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+    answer = recorder.stop()
+    recorder.close()
+    assert (answer["messages"], answer["lost"]) == (60 - len(left_out), len(left_out))
+    assert answer["undecodable"] == 0
+    path = run.episodes_dir / "t1.mcap"
+    report = check_episode(path)
+    assert report.exit_code == (3 if left_out else 0), report.lines()
+    messages = list(Episode.open(path).messages([JOINTS]))
+    assert [each.sequence for each in messages] == [n for n in range(60) if n not in left_out]
+    for each in messages:
+        sec, nanosec = struct.unpack_from("<iI", each.data, 4)
+        assert each.publish_time_ns == sec * 10**9 + nanosec
+        assert each.type_name == schema.JOINT_STATE
+
+
+class Wild:
+    """A plain zenoh client that keeps as much of the contract as it is told to."""
+
+    def __init__(self, endpoint: str) -> None:
+        """Connect."""
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+        config.insert_json5("scouting/multicast/enabled", "false")
+        self.session = zenoh.open(config)
+        self.tokens: list[Any] = []
+
+    def alive(self, key: str) -> None:
+        self.tokens.append(self.session.liveliness().declare_token(key))
+
+    def send(
+        self,
+        count: int = 5,
+        *,
+        key: str = "demo/joint_states",
+        encoding: str = "application/cdr;sensor_msgs/msg/JointState",
+        numbers: Callable[[int], int] | None = lambda number: number,
+        stamp: Callable[[int], int] = lambda number: time.time_ns(),
+        raw: bytes | None = None,
+        data: bytes = b"\0\1\0\0" + struct.pack("<iI", 1_700_000_000, 0) + bytes(4 * 5),
+    ) -> None:
+        publisher = self.session.declare_publisher(key, encoding=encoding)
+        for number in range(count):
+            note = raw
+            if numbers is not None and raw is None:
+                note = encode(
+                    Attachment(sequence=numbers(number), source_ns=stamp(number), gid=b"wild" * 4)
+                )
+            publisher.put(data, attachment=note)
+
+
+@pytest.fixture
+def wild(router: WireSession, endpoint: str) -> Iterator[Wild]:
+    made = Wild(endpoint)
+    yield made
+    made.session.close()
+
+
+def findings(heard: list[TopicHeard]) -> dict[str, str]:
+    (topic,) = heard
+    return {f"{each.kind} {each.about}": each.text for each in topic.findings}
+
+
+def listen(router: WireSession, act: Callable[[], None], *, messages: int) -> list[TopicHeard]:
+    listener = WireListener(router, "demo/**", enough=messages)
+    act()
+    assert listener.is_enough.wait(WAIT_S)
+    return listener.finish()
+
+
+def test_who_keeps_the_contract_has_no_findings(router: WireSession, wild: Wild) -> None:
+    wild.alive("demo/alive")
+    (topic,) = listen(router, wild.send, messages=5)
+    assert topic.findings == []
+    assert (topic.messages, len(topic.last_numbers), topic.lost) == (5, 1, 0)
+    assert topic.lines()[1] == (
+        "  ok       encoding, payload, attachment, sequence, time, liveliness, rate"
+    )
+
+
+@pytest.mark.parametrize(
+    ("breach", "finding", "words"),
+    [
+        ({"encoding": "zenoh/bytes"}, "missing encoding", "sensor_msgs/msg/JointState is taken"),
+        ({"encoding": "application/cdr"}, "missing encoding", "names no type"),
+        ({"numbers": None}, "missing attachment", "none on 5 of 5 messages"),
+        ({"numbers": None}, "missing sequence", "their losses cannot be seen"),
+        ({"raw": b"x" * 20}, "wrong attachment", "20 bytes; it has 33"),
+        ({"numbers": lambda n: 3 * n}, "wrong sequence", "8 of 13 numbers were skipped"),
+        ({"numbers": lambda n: 4}, "wrong sequence", "4 numbers do not count on"),
+        ({"stamp": lambda n: time.time_ns() // 1000}, "wrong time", "look like microseconds"),
+        ({"stamp": lambda n: int(time.time())}, "wrong time", "look like seconds"),
+        ({"stamp": lambda n: time.time_ns() + 10**11}, "wrong time", "100 s ahead of"),
+        ({"stamp": lambda n: time.time_ns() - n * 10**8}, "wrong time", "4 messages are stamped"),
+        ({"data": b"\0\1\0\0junk"}, "wrong payload", "5 of 5 messages are not what"),
+        ({"numbers": None, "data": b"\0\1\0\0" + bytes(28)}, "missing time", "nor header.stamp"),
+    ],
+)
+def test_every_breach_is_named(
+    router: WireSession, wild: Wild, breach: dict[str, Any], finding: str, words: str
+) -> None:
+    wild.alive("demo/alive")
+    found = findings(listen(router, lambda: wild.send(**breach), messages=5))
+    assert words in found[finding], found
+
+
+def test_a_missing_token_and_a_wrong_rate_are_named(router: WireSession, wild: Wild) -> None:
+    listener = WireListener(router, "demo/**", enough=5)
+    wild.send()
+    assert listener.is_enough.wait(WAIT_S)
+    found = findings(listener.finish(rate_hz=1e6 * 0.9))
+    assert "no token demo/alive" in found["missing liveliness"]
+    assert "expected 900000 Hz" in found["wrong rate"]
+
+
+def test_a_token_of_a_part_of_the_cell_counts_and_that_of_another_does_not(
+    router: WireSession, wild: Wild
+) -> None:
+    wild.alive("other/alive")
+    wild.alive("dem/alive")
+    assert "missing liveliness" in findings(listen(router, wild.send, messages=5))
+    wild.alive("demo/arm/alive")
+    act = lambda: wild.send(key="demo/arm/joint_states")  # noqa: E731
+    assert findings(listen(router, act, messages=5)) == {}
+
+
+@pytest.mark.slow
+def test_the_command_ends_with_0_3_and_2(endpoint: str, spawn: Spawn) -> None:
+    command = (str(ROOT / "robot_gst.py"), "check", "--wire", "demo/**", "--listen", endpoint)
+    for left_out, code, words in (((), 0, r"ok +encoding, payload"), (("4",), 3, r"1 of \d+ num")):
+        check = spawn(*command, "--seconds", "3")
+        assert check.stderr is not None
+        assert "listening to demo/**" in check.stderr.readline()
+        spawn(str(PYTHON), endpoint, "demo", "240", "500", *left_out)
+        out, said = check.communicate(timeout=WAIT_S)
+        assert check.returncode == code, out + said
+        assert re.search(words, out), out
+    silent = spawn(*command, "--seconds", "0.1")
+    out, _ = silent.communicate(timeout=WAIT_S)
+    assert (silent.returncode, out[:24]) == (3, "nothing came on demo/**;")
+    wrong = spawn(*command, "--seconds", "-1")
+    assert wrong.wait(WAIT_S) == 2
+
+
+def test_a_publisher_may_tell_what_its_types_are(
+    router: WireSession, wild: Wild, run: RunFolder, endpoint: str
+) -> None:
+    """Before its first message, and to a recorder that comes later; never against a known type."""
+    text = b'{"type": "object"}'
+    query: list[str] = []
+
+    def answer(asked: Any) -> None:
+        with asked:
+            query.append(str(asked.key_expr))
+            asked.reply("@schema/jsonschema/acme/Late", text)
+
+    queryable = wild.session.declare_queryable("@schema/jsonschema/acme/Late", answer)
+    with open_session(WireConfig(connect=(endpoint,))) as session:
+        session.collect_definitions()
+        assert query == ["@schema/**"]
+        recorder = Recorder(run, now_ns=session.now_ns)
+        heard = threading.Semaphore(0)
+
+        def take(sample: Any) -> None:
+            recorder.receive(sample)
+            heard.release()
+
+        session.subscribe("demo/**", take)
+        recorder.start(EpisodeInfo(id="t1", kind="trial", cell="demo"))
+        wild.session.put("@schema/protobuf/acme.Grasp", b"descriptor")
+        wild.session.put("@schema/ros2msg/sensor_msgs/msg/JointState", b"string lie\n")
+        wild.session.put("@schema/nonsense/acme/Note", b"?")
+        sent = {
+            "demo/late": ("application/json;acme/Late", b"{}"),
+            "demo/grasp": ("application/protobuf;acme.Grasp", b"\x08\x01"),
+            "demo/note": ("application/json;acme/Note", b"{}"),
+            "demo/joint_states": ("application/cdr;sensor_msgs/msg/JointState", b"\0\1\0\0"),
+        }
+        for key, (encoding, data) in sent.items():
+            wild.send(1, key=key, encoding=encoding, data=data)
+        for _ in sent:
+            assert heard.acquire(timeout=WAIT_S)
+        recorder.stop()
+        recorder.close()
+    queryable.undeclare()
+    with (run.episodes_dir / "t1.mcap").open("rb") as stream:
+        found = {c.topic: s for s, c, _ in make_reader(stream).iter_messages() if s is not None}
+    assert (found["/demo/late"].encoding, found["/demo/late"].data) == ("jsonschema", text)
+    grasp = found["/demo/grasp"]
+    assert (grasp.name, grasp.encoding, grasp.data) == ("acme.Grasp", "protobuf", b"descriptor")
+    assert (found["/demo/note"].encoding, found["/demo/note"].data) == ("", b"")
+    assert found["/demo/joint_states"].data.startswith(b"std_msgs/Header header")
